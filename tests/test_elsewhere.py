@@ -10,14 +10,19 @@ import pytest
 from helpers.plants import pd_pendulum
 from helpers.problems import lqr, pendulum
 from helpers.table import each_row
+from typer.testing import CliRunner
 
 import drake_diff as dd
+import drake_diff.artifact.save as evidence
 from drake_diff.artifact import elsewhere
+from drake_diff.artifact.measurement import elsewhere_evidence
 from drake_diff.artifact.other_plants import followed_in
+from drake_diff.cli.main import app
 from drake_diff.engines.load import load_engine
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.optimize.elsewhere import Follower
 from drake_diff.optimize.solution import Solution, Status
+from drake_diff.record.solve import EvidenceRecord, FollowedEvidence
 
 # A ball that does not turn, on slides along x and z, over flat ground.
 BALL = """<sdf version="1.9" xmlns:drake="drake"><world name="flat">
@@ -237,12 +242,10 @@ def test_a_plan_with_other_parameters_is_not_given_to_another_simulator(load):
 
 def test_a_simulator_that_is_not_installed_is_told(write_urdf, monkeypatch):
     solution = given(write_urdf(time_step=0.05), [0, 0], np.ones((4, 1)))
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    for name in [name for name in sys.modules if name.startswith("drake_diff.engines.mujoco")]:
-        monkeypatch.delitem(sys.modules, name)
+    no_mujoco(monkeypatch)
     found = elsewhere(solution).elsewhere
     assert not found["mujoco"][0].measured
-    assert "in mujoco: not measured: this engine needs MuJoCo" in found.sentence
+    assert "in mujoco: not measured: it is not installed: this engine needs MuJoCo" in found.sentence
     assert not found.holds
 
 
@@ -259,3 +262,111 @@ def test_bad_input_is_refused(write_urdf):
     engine = load_engine("mujoco", solution.problem.model, time_step=0.03)
     with pytest.raises(InputError, match=r"a whole part of 0\.05"):
         followed_in(Follower(solution.plan), engine)
+
+
+@pytest.fixture(scope="module")
+def pushed(tmp_path_factory):
+    """A block that is pushed to 1 m in two steps a second holds in its own steps, and not where the sums are others."""
+    path = tmp_path_factory.mktemp("elsewhere") / "stop.urdf"
+    path.write_text(STOP.replace('upper="0.5"', 'upper="2"'))
+    model = dd.load_model(path, time_step=0.05)
+    effort = dd.QuadraticCost(R=[[1.0]])
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=effort)
+    return elsewhere(dd.solve(problem, method="shooting"))
+
+
+def test_a_record_has_it_and_verify_measures_it_again(pushed, tmp_path):
+    record = dd.save(pushed, tmp_path / "run")
+    found = pushed.elsewhere
+    assert record.elsewhere.sentence == found.sentence
+    assert [row.holds for row in record.elsewhere.rows] == [row.holds for row in found.rows]
+    assert [row.goal_error for row in record.elsewhere.rows] == [row.goal_error for row in found.rows]
+    assert [row.time_step_s for row in record.elsewhere.rows] == [0.05, 0.025, 0.0125, None, 0.001]
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "<h2>In other plants</h2>" in page
+    assert found.sentence in page
+    assert dd.verify(tmp_path / "run").require().verdict == "holds"
+
+
+@each_row(
+    "change, words",
+    [
+        (lambda part: part["rows"][3].update(goal_error=0.0), "elsewhere.rows[3].goal_error: recorded 0"),
+        (lambda part: part.update(sentence="it holds everywhere"), "elsewhere.sentence: recorded it holds everywhere"),
+    ],
+)
+def test_a_record_that_lies_of_it_is_found(pushed, tmp_path, monkeypatch, change, words):
+    honest = evidence.record_of
+
+    def lying(measurement, folder):
+        fields = honest(measurement, folder).model_dump()
+        change(fields["elsewhere"])
+        return EvidenceRecord.model_validate(fields)
+
+    monkeypatch.setattr(evidence, "record_of", lying)
+    dd.save(pushed, tmp_path / "run")
+    monkeypatch.undo()
+    found = dd.verify(tmp_path / "run")
+    assert found.verdict == "broken"
+    assert any(words in complaint for complaint in found.complaints), found.complaints
+
+
+def test_a_row_that_holds_although_something_fails_is_no_record(pushed):
+    row = elsewhere_evidence(pushed.elsewhere).rows[0].model_dump()
+    assert row["holds"]
+    for change in ({"failures": ["it fell"]}, {"unlike": ["mass: 1; 2"]}, {"measured": False}, {"holds": False}):
+        with pytest.raises(ValueError, match="against what it says of it"):
+            FollowedEvidence.model_validate({**row, **change})
+
+
+@each_row("there, words", [(True, "mujoco is not installed here"), (False, "mujoco was not installed where")])
+def test_what_a_simulator_said_that_is_not_installed_stands_unchecked(pushed, tmp_path, monkeypatch, there, words):
+    with monkeypatch.context() as without:
+        if not there:
+            no_mujoco(without)
+        dd.save(elsewhere(pushed), tmp_path / "run")
+    with monkeypatch.context() as without:
+        if there:
+            no_mujoco(without)
+        found = dd.verify(tmp_path / "run")
+    assert found.verdict == "holds", found
+    assert any(words in line for line in found.unchecked), found.unchecked
+
+
+def no_mujoco(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    for name in [name for name in sys.modules if name.startswith("drake_diff.engines.mujoco")]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+def test_the_command_follows_a_plan_elsewhere_where_it_is_asked_to(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stop.urdf").write_text(STOP.replace('upper="0.5"', 'upper="2"'))
+    (tmp_path / "push.py").write_text(SCRIPT)
+    done = CliRunner().invoke(app, ["run", "push.py", "--elsewhere"])
+    assert done.exit_code == 0, done.output
+    assert "followed in continuous time, TVLQR: holds" in done.output
+    assert dd.load_record("artifacts/push").elsewhere is not None
+    (tmp_path / "plain.py").write_text(PLAIN)
+    done = CliRunner().invoke(app, ["run", "plain.py", "--elsewhere"])
+    assert done.exit_code != 0
+    assert not (tmp_path / "artifacts" / "plain").exists()
+
+
+SCRIPT = """
+import drake_diff as dd
+
+def problem():
+    model = dd.load_model("stop.urdf", time_step=0.02)
+    return dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=50, running_cost=dd.QuadraticCost(R=[[1.0]]))
+
+solve_options = {"method": "shooting"}
+"""
+PLAIN = """
+import drake_diff as dd
+
+def problem():
+    block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+    effort = dd.QuadraticCost(R=[[1.0]])
+    return dd.Problem(block, x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=1.0, running_cost=effort)
+"""

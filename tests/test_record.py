@@ -26,8 +26,8 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.record.parts import Metric
 from drake_diff.record.provenance import named_files
 from drake_diff.record.read import KINDS
-from drake_diff.record.sealed import canonical, own_sha256
-from drake_diff.record.solve import EvidenceRecord
+from drake_diff.record.sealed import SCHEMA_VERSION, canonical, own_sha256
+from drake_diff.record.solve import EvidenceRecord, FollowedEvidence
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 JSON = st.recursive(
@@ -69,7 +69,9 @@ def records_of(model):
     if "reason" in fields and "value" in fields:
         fields["reason"] = st.text(min_size=1, max_size=12)
     if model is EvidenceRecord:
-        fields |= {"schema_version": st.just("2.0.0"), "verdict": st.just("fail")}
+        fields |= {"schema_version": st.just(SCHEMA_VERSION), "verdict": st.just("fail")}
+    if model is FollowedEvidence:
+        return st.builds(model, **fields | {"holds": st.just(False), "measured": st.just(False)})
     return st.builds(model, **fields)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.artifact.measurement import measure
+from drake_diff.artifact.other_plants import NOT_INSTALLED, elsewhere
 from drake_diff.artifact.rerun import PLAN, plan_fields, resolve, solve_again
 from drake_diff.artifact.save import REPLAY, REPORT, record_of, write_files
 from drake_diff.artifact.sections import COSTS, unknown_functions
@@ -43,6 +44,7 @@ class Again:
 
     `apart` is how far the plan of the search is from the recorded one, relative, 0 where they are the same to the last
     bit; `unrepeated` says why the search was not run again, and `missing` which keys of the record rest on that.
+    `unchecked` are parts of the record that could not be measured on this machine, and stand as they are recorded.
     """
 
     fields: dict[str, Any]
@@ -50,6 +52,7 @@ class Again:
     apart: float = 0.0
     unrepeated: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
+    unchecked: tuple[str, ...] = ()
 
 
 def why_not_repeated(record: EvidenceRecord) -> tuple[str, ...]:
@@ -109,12 +112,31 @@ def _apart(found: Solution, told: Solution) -> float:
 
 def _written(solution: Solution, record: EvidenceRecord, apart: float) -> Again:
     """All files of `solution`, made in a folder of their own."""
+    if record.elsewhere is not None:
+        solution = elsewhere(solution, record.elsewhere.engines)
     with TemporaryDirectory() as folder:
         place, measurement = Path(folder), measure(solution)
-        again = _as_given(record_of(measurement, place), record)
+        again, unchecked = _but_for_simulators(_as_given(record_of(measurement, place), record), record)
         write_files(place, measurement, again)
         files = {path.name: path.read_bytes() for path in place.iterdir()}
-    return Again(again.model_dump(mode="json"), files, apart)
+    return Again(again.model_dump(mode="json"), files, apart, unchecked=unchecked)
+
+
+def _but_for_simulators(again: EvidenceRecord, record: EvidenceRecord) -> tuple[EvidenceRecord, tuple[str, ...]]:
+    """With what `record` says of simulators that are not installed here, or were not there, and which these are."""
+    if again.elsewhere is None or record.elsewhere is None or len(again.elsewhere.rows) != len(record.elsewhere.rows):
+        return again, ()
+    rows, unchecked = [], []
+    for here, there in zip(again.elsewhere.rows, record.elsewhere.rows, strict=True):
+        lacking = [row for row in (here, there) if any(why.startswith(NOT_INSTALLED) for why in row.failures)]
+        rows.append(there if lacking else here)
+        if lacking and here.plant == there.plant:
+            where = "was not installed where the record was made" if lacking[0] is there else "is not installed here"
+            unchecked.append(f"elsewhere.rows[{len(rows) - 1}] and elsewhere.sentence: {there.plant} {where}")
+    if not unchecked:
+        return again, ()
+    kept = again.elsewhere.model_copy(update={"rows": rows, "sentence": record.elsewhere.sentence})
+    return again.model_copy(update={"elsewhere": kept}), tuple(unchecked)
 
 
 def _as_given(again: EvidenceRecord, record: EvidenceRecord) -> EvidenceRecord:

@@ -146,6 +146,11 @@ def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[Check]:
     text = f"not kept: {_listed(broken)}" if broken else f"all {len(decided)} bounds are kept"
     found.append(Check("Plan", "fail" if failed else "undecided" if broken else "pass", text))
     found += _of_replays(m, record["replays"])
+    if record["elsewhere"] is not None:
+        rows = record["elsewhere"]["rows"]
+        lost = any(row["measured"] and not row["holds"] for row in rows)
+        kind = "warn" if lost else "pass" if all(row["holds"] for row in rows) else "info"
+        found.append(Check("In other plants", kind, record["elsewhere"]["sentence"]))
     certificates = record["gradient"]["certificates"]
     agree = sum(c["verdict"] == "agree" for c in certificates)
     kind = "info" if not certificates else "pass" if agree == len(certificates) else "undecided"

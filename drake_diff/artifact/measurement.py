@@ -21,12 +21,13 @@ from drake_diff.model.parameters import Parameter, ParameterVector, applied
 from drake_diff.model.plant import FLOATING, bodies, joints
 from drake_diff.model.step import set_state
 from drake_diff.motion.rollout import CONTINUOUS, STEPS, Rollout, drift, smooth_mean
+from drake_diff.optimize.elsewhere import Elsewhere, Followed
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.record.parts import Event, Failure, Label, Metric
-from drake_diff.record.solve import ReplayEvidence
+from drake_diff.record.solve import ElsewhereEvidence, FollowedEvidence, ReplayEvidence
 
 AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
 ON_THE_PLANT = {  # by the problem's motion
@@ -299,6 +300,35 @@ def replay_evidence(r: Replay) -> ReplayEvidence:
         holds=r.holds,
         failures=list(r.failures),
     )
+
+
+def elsewhere_evidence(found: Elsewhere | None) -> ElsewhereEvidence | None:
+    """Where else a plan holds, as it stands in a record."""
+    if found is None:
+        return None
+
+    def row(r: Followed) -> FollowedEvidence:
+        measures = (r.goal_error, r.bound_violation, r.penetration, r.off)
+        goal, bound, depth, off = (float(v) if math.isfinite(v) else None for v in measures)
+        return FollowedEvidence(
+            plant=r.plant,
+            where=r.where,
+            control=r.control,
+            time_step_s=r.time_step or None,
+            measured=r.measured,
+            goal_error=goal,
+            bound_violation=bound,
+            penetration_m=depth,
+            off_plan=off,
+            left_plan_s=r.left_at,
+            holds=r.holds,
+            failures=list(r.failures),
+            unlike=list(r.unlike),
+            remark=r.remark,
+        )
+
+    rows = [row(r) for r in found.rows]
+    return ElsewhereEvidence(sentence=found.sentence, engines=list(found.engines), period_s=found.period, rows=rows)
 
 
 def failure_of(error: Exception) -> Failure:

@@ -16,6 +16,7 @@ from drake_diff.optimize.elsewhere import LONGEST, Elsewhere, Followed, Follower
 from drake_diff.optimize.solution import Solution
 
 SIMULATORS = ("mujoco",)
+NOT_INSTALLED = "it is not installed: "  # the failure of a simulator, begins so
 
 
 def elsewhere(solution: Solution, engines: Sequence[str] = SIMULATORS) -> Solution:
@@ -68,7 +69,9 @@ def _in_simulator(follower: Follower, name: str) -> Followed:
         if name == "mujoco":  # which takes any step of a model that Drake has at one alone
             return followed_in(follower, load_engine(name, plan.problem.model, time_step=follower.period / parts))
         return followed_in(follower, load_engine(name, plan.problem.model.at_time_step(follower.period / parts)))
-    except (MissingDependencyError, ModelError) as error:
+    except MissingDependencyError as error:
+        return follower.missing(name, f"{NOT_INSTALLED}{error}")
+    except ModelError as error:
         return follower.missing(name, str(error))
 
 

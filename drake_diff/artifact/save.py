@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any, overload
 
-from drake_diff.artifact.measurement import Measurement, failure_of, measure, replay_evidence
+from drake_diff.artifact.measurement import Measurement, elsewhere_evidence, failure_of, measure, replay_evidence
 from drake_diff.artifact.phased import begin_phases, phases_record, save_phases
 from drake_diff.artifact.rerun import PLAN, TRACE, write_plan
 from drake_diff.artifact.sections import asked, found
@@ -120,6 +120,7 @@ def record_of(m: Measurement, folder: Path) -> EvidenceRecord:
         invariants=m.invariants,
         events=m.events,
         replays=[replay_evidence(r) for r in m.replays],
+        elsewhere=elsewhere_evidence(m.solution.elsewhere),
         failures=m.failures,
         **asked(m.solution.problem, m.solution),
         **found(m.solution),

@@ -290,7 +290,7 @@ def _solve_again(found: Verification, record: EvidenceRecord) -> Verification:
     problems = [*_odd_schema(record), *_odd_trace(trace, plan, record)]
     with rebuilt(record.model, record.contract.get("source"), trace.attachments) as model:
         again = made_again(record, model, plan)
-    fields, unchecked = Compared(record.FILE), [*UNCHECKED, GIVEN, *_others(record, FILES)]
+    fields, unchecked = Compared(record.FILE), [*UNCHECKED, GIVEN, *_others(record, FILES), *again.unchecked]
     compare_fields(fields, record.model_dump(mode="json"), again.fields)
     compared = [fields]
     for name in FILES:
@@ -436,5 +436,8 @@ def _odd_contract(record: EvidenceRecord, again: dict[str, Any]) -> Iterator[str
 
 def _other_versions(record: SealedRecord) -> tuple[str, ...]:
     was, now = record.provenance.packages, provenance_of().packages
-    names = [n for n in ("drake", "drake-diff", "numpy", "casadi") if was.get(n) != now.get(n)]
+    used = ["drake", "drake-diff", "numpy", "casadi"]
+    if isinstance(record, EvidenceRecord) and record.elsewhere is not None:
+        used += record.elsewhere.engines
+    names = [n for n in used if was.get(n) != now.get(n)]
     return tuple(f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names)

@@ -32,23 +32,31 @@ def add_commands(app: typer.Typer) -> None:
 def run(
     script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="A Python file with a function problem().")],
     out: Annotated[Path | None, out_option("artifacts/<script>")] = None,
+    elsewhere: Annotated[
+        bool, typer.Option("--elsewhere", help="Follow the plan in finer steps, continuous time and MuJoCo too.")
+    ] = False,
 ) -> None:
     """Solve the problem that SCRIPT defines, measure the solution again, and write the run directory.
 
-    SCRIPT may also define solve_options, a dictionary of arguments of drake_diff.solve.
+    SCRIPT may also define solve_options, a dictionary of arguments of drake_diff.solve. With --elsewhere the plan is
+    followed in other plants too, and the record says where it holds; the exit status does not depend on that.
     Exit status 0 only if the solution passes every check.
     """
     module = _loaded(script)
     problem, options = module.problem(), getattr(module, "solve_options", {})
     directory = out or Path("artifacts") / script.stem
     # Only here: a script that is missing or wrong is refused before Drake is loaded.
+    from drake_diff.artifact.other_plants import elsewhere as follow_elsewhere
     from drake_diff.artifact.save import begin, save, save_failure
     from drake_diff.optimize.problem.phases import PhasedProblem
     from drake_diff.optimize.problem.problem import Problem
+    from drake_diff.optimize.solution import Solution
     from drake_diff.optimize.solve import solve
 
     if not isinstance(problem, (Problem, PhasedProblem)):
         raise InputError("problem()", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
+    if elsewhere and not (isinstance(problem, Problem) and problem.has_model):
+        raise InputError("--elsewhere", got="a problem without a model, or in phases", expected="a model's problem")
     if not isinstance(options, dict):
         raise InputError("solve_options", got=type(options).__name__, expected="a dictionary")
     known = [name for name in inspect.signature(solve).parameters if name not in ("problem", "progress", "on_start")]
@@ -69,6 +77,9 @@ def run(
         if begun:
             save_failure(error, directory, problem)
         raise
+    if elsewhere and isinstance(solution, Solution):
+        with progress_line("following it elsewhere"):
+            solution = follow_elsewhere(solution)
     record = save(solution, directory)
     (_show_phases if isinstance(problem, PhasedProblem) else _show_record)(record)
     show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
@@ -114,6 +125,10 @@ def _show_record(record: Any) -> None:
         told = plain("holds") if replay.holds else plain(f"does not hold: {replay.failures[0]}", "red")
         goal = "-" if replay.goal_error is None else f"{replay.goal_error:.3g}"
         show(f"replayed {replay.variant}, {replay.control}: goal error {goal},", told)
+    for row in record.elsewhere.rows if record.elsewhere is not None else ():
+        why = "" if row.holds else f": {'; '.join((*row.unlike, *row.failures))}"
+        verdict = "holds" if row.holds else "does not hold" if row.measured else "not measured"
+        show(f"followed {row.where}, {row.control}:", plain(verdict + why, "red" if row.measured and why else ""))
     for p in record.parameters:
         moved = f", from {p.start:.6g}" if p.optimized else ""
         show(f"{p.name} = {p.value:.9g} {p.unit}{moved}, derivative from {p.derivative_source}")

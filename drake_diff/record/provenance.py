@@ -37,7 +37,7 @@ LIBRARIES = (".so", ".dll", ".dylib")  # plugins of Gazebo, which Drake does not
 UNSAID = (None, (), "skip")  # options of `load_model` that change nothing are not recorded
 READABLE = (*MESHES, *FORMATS)
 WRITERS = ("mcap", "mcap-protobuf-support", "protobuf", "foxglove-schemas-protobuf", "pydantic")
-PACKAGES = ("drake", "drake-diff", "numpy", "casadi", "pin", "numba", *WRITERS)
+PACKAGES = ("drake", "drake-diff", "numpy", "casadi", "pin", "numba", "mujoco", *WRITERS)
 
 
 def gradient_evidence(certificate: Certificate) -> Certified:

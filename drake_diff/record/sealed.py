@@ -20,7 +20,7 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.record.parts import FileEvidence, ModelInput, Part, Provenance
 from drake_diff.record.provenance import file_evidence
 
-SCHEMA_VERSION = "2.0.0"  # a new major one where a field goes or changes its meaning, a minor one where one is added
+SCHEMA_VERSION = "2.1.0"  # a new major one where a field goes or changes its meaning, a minor one where one is added
 SCHEMAS = Path(__file__).parent.parent / "schema"
 MOST_NAMES = 5  # of files, in a printed record
 APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run

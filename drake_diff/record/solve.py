@@ -132,6 +132,44 @@ class ReplayEvidence(Part):
     failures: list[str]
 
 
+class FollowedEvidence(Part):
+    """A plant in which the plan was followed by its own feedback; a measure is None where there is no motion.
+
+    `off_plan` is how far from the plan it ends, as a part of the worst state's range, `left_plan_s` from when on it is
+    further from the plan than allowed, and `unlike` what is another in this plant than in the plan's.
+    """
+
+    plant: str
+    where: str
+    control: str
+    time_step_s: float | None  # null in continuous time
+    measured: bool
+    goal_error: float | None
+    bound_violation: float | None
+    penetration_m: float | None
+    off_plan: float | None
+    left_plan_s: float | None
+    holds: bool
+    failures: list[str]
+    unlike: list[str]
+    remark: str
+
+    @model_validator(mode="after")
+    def _holds_only_without_failures(self) -> "FollowedEvidence":
+        if self.holds != (self.measured and not self.failures and not self.unlike):
+            raise ValueError(f"{self.where}: holds is {self.holds}, against what it says of it")
+        return self
+
+
+class ElsewhereEvidence(Part):
+    """Where the plan holds beside the plant that it was made on: evidence that no verdict rests on."""
+
+    sentence: str
+    engines: list[str]  # that were asked for
+    period_s: float  # how long each command of the controller is held
+    rows: list[FollowedEvidence]
+
+
 class EvidenceRecord(SealedRecord):
     """Everything a stranger needs to judge one solve; the motion is in plan.npz and trace.mcap.
 
@@ -155,6 +193,7 @@ class EvidenceRecord(SealedRecord):
     action: ActionInterface
     events: list[Event] = Field(default_factory=list)
     replays: list[ReplayEvidence] = Field(default_factory=list)
+    elsewhere: ElsewhereEvidence | None = None  # null where nobody asked
     failures: list[Failure] = Field(default_factory=list)
 
     @model_validator(mode="after")
