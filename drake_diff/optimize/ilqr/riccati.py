@@ -73,64 +73,61 @@ class AffinePolicy:
 def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePolicy | None:
     """The best policy, `regularization` added to the inputs' Hessian; None if that is not positive definite.
 
-    The recursion is that of [dx; 1], so that V = [[P, s], [s', c]] is all that remains to be paid and
-    K = [feedback, feedforward] all that is done, in the fewest products: NumPy's calls are what a sweep's time goes to.
+    The recursion is that of [1; dx], so that V = [[c, s'], [s, P]] is all that remains to be paid and
+    K = [feedforward, feedback] all that is done, in the fewest products: NumPy's calls, and memory that is new at every
+    knot, are what a sweep's time goes to.
     """
-    w, (count, m) = problem.num_states + 1, problem.lower.shape
-    F, H, V = _with_a_one(problem)
-    Q, K, free = np.empty_like(H), np.empty((count, m, w)), np.ones((count, m), dtype=bool)
+    n, (count, m) = problem.num_states, problem.lower.shape
+    w = n + 1
+    F, VF, Q = np.zeros((w, w + m)), np.empty((w, w + m)), np.empty((w + m, w + m))
+    F[0, 0] = 1.0
+    V, K, free = np.empty((count + 1, w, w)), np.empty((count, m, w)), np.ones((count, m), dtype=bool)
+    gradients, hessians = np.empty((count, m)), np.empty((count, m, m))  # of the inputs
+    V[-1, 0, 0], V[-1, 0, 1:], V[-1, 1:, 0] = 0.0, problem.final_gradient, problem.final_gradient
+    V[-1, 1:, 1:] = problem.final_hessian
     bounded = np.asarray((np.isfinite(problem.lower) | np.isfinite(problem.upper)).any(axis=1))
-    ridge = regularization * np.eye(m)
+    ridge, Q_uu, Q_ux, gaps = regularization * np.eye(m), Q[w:, w:], Q[w:, :w], bool(np.any(problem.gaps))
     try:
         for k in range(count - 1, -1, -1):
-            Q_k = F[k].T.dot(V[k + 1].dot(F[k]), out=Q[k])
-            Q_k += H[k]
-            Q_uu, Q_ux = Q_k[w:, w:], Q_k[w:, :w]
-            K_k = _gains(Q_uu + ridge, Q_ux)
+            F[1:, 1:] = problem.F[k]
+            if gaps:
+                F[1:, 0] = problem.gaps[k]
+            F.T.dot(V[k + 1].dot(F, out=VF), out=Q)
+            Q[1:, 1:] += problem.hessians[k]
+            Q[0, 1:] += problem.gradients[k]
+            Q[1:, 0] += problem.gradients[k]
+            hessian = Q_uu + ridge if regularization else Q_uu
+            K_k = _gains(hessian, Q_ux)
             if bounded[k]:
-                K_k, free[k] = _within(Q_uu + ridge, Q_ux, K_k, problem.lower[k], problem.upper[k])
-            W = Q_k[:w, :w] + K_k.T.dot(Q_uu.dot(K_k) + Q_ux) + Q_ux.T.dot(K_k)
+                K_k, free[k] = _within(hessian, Q_ux, K_k, problem.lower[k], problem.upper[k])
+            W = Q[:w, :w] + K_k.T.dot(Q_uu.dot(K_k) + Q_ux) + Q_ux.T.dot(K_k)
             np.add(W, W.T, out=V[k])
             V[k] *= 0.5
-            K[k] = K_k
-        P, s = V[:, :-1, :-1], V[:, :-1, -1]
+            K[k], gradients[k], hessians[k] = K_k, Q[w:, 0], Q_uu
+        P, s = V[:, 1:, 1:], V[:, 0, 1:]
         start, left = _best_start(problem, P[0], s[0], regularization)
     except np.linalg.LinAlgError:
         return None
-    q_u, d = Q[:, w:, w - 1], K[:, :, -1]
-    slope = float(np.sum(q_u * d) + s[0] @ start)
-    curvature = float(np.einsum("ki,kij,kj->", d, Q[:, w:, w:], d) + start @ P[0] @ start)
-    gradient = float(np.abs(q_u[free]).max(initial=left))
+    d = K[:, :, 0]
+    slope = float(np.sum(gradients * d) + s[0] @ start)
+    curvature = float(np.sum((hessians @ d[:, :, None])[:, :, 0] * d) + start @ P[0] @ start)
+    gradient = float(np.abs(gradients[free]).max(initial=left))
     if not math.isfinite(slope + curvature):  # NaN passes for positive definite
         return None
-    return AffinePolicy(start, d, K[:, :, :-1], s, P, slope, curvature, gradient)
-
-
-def _with_a_one(problem: LinearQuadratic) -> tuple[Array, Array, Array]:
-    """(F (N, n+1, n+1+m), H (N, n+1+m, n+1+m), V (N+1, n+1, n+1)) of [dx; 1; du], of V the last alone."""
-    n, (count, m) = problem.num_states, problem.lower.shape
-    where = np.r_[:n, n + 1 : n + 1 + m]  # of [dx; du]
-    F, H = np.zeros((count, n + 1, n + 1 + m)), np.zeros((count, n + 1 + m, n + 1 + m))
-    F[:, :n, where], F[:, :n, n], F[:, n, n] = problem.F, problem.gaps, 1.0
-    H[:, where[:, None], where] = problem.hessians
-    H[:, n, where] = H[:, where, n] = problem.gradients
-    V = np.zeros((count + 1, n + 1, n + 1))
-    V[-1, :n, :n] = problem.final_hessian
-    V[-1, n, :n] = V[-1, :n, n] = problem.final_gradient
-    return F, H, V
+    return AffinePolicy(start, d, K[:, :, 1:], s, P, slope, curvature, gradient)
 
 
 def _within(
     hessian: Array, Q_ux: Array, K: Array, lower: Array, upper: Array
 ) -> tuple[Array, NDArray[np.bool_] | bool]:
     """(K (m, n+1), which inputs (m,) no bound holds): `K` itself if its feedforward leaves no bound."""
-    d = K[:, -1]
+    d = K[:, 0]
     if (d >= lower).all() and (d <= upper).all():
         return K, True
-    d, free = minimize_in_box(hessian, Q_ux[:, -1], lower, upper)
+    d, free = minimize_in_box(hessian, Q_ux[:, 0], lower, upper)
     K = np.zeros_like(Q_ux)
     K[free] = _gains(hessian[np.ix_(free, free)], Q_ux[free])
-    K[:, -1] = d
+    K[:, 0] = d
     return K, free
 
 
