@@ -15,6 +15,7 @@ from helpers.table import each_row
 from pydrake.multibody.tree import RpyFloatingJoint
 
 import drake_diff as dd
+from drake_diff._base import compiled
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified, is_own
 from drake_diff.derivatives.joint_impulses import NEAR_RIGID, JointImpulses
@@ -404,6 +405,7 @@ def test_joints_that_are_coupled_are_linearized_at_once():
 
 
 def test_a_wrong_derivative_at_a_limit_is_refused_on_the_model(monkeypatch):
+    monkeypatch.setattr(compiled, "has_numba", lambda: False)
     right = JointImpulses.by_motion
     monkeypatch.setattr(JointImpulses, "by_motion", lambda *a: 1.001 * right(*a))
     model = limited_pendulum()

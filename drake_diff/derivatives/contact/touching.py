@@ -1,6 +1,6 @@
 """All pairs of a model that may touch: spheres by `pairs`, others as SceneGraph finds them, by `witness`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,13 @@ from drake_diff.derivatives.contact.witness import WitnessPairs, read_witness_pa
 from drake_diff.derivatives.steps import Steps
 from drake_diff.model.model import Model
 
+SPHERES, JOINT_LIMITS = "spheres", "joint limits"  # what acts in a step, beside pairs of other shapes
+
+
+def is_iterated(kind: str) -> bool:
+    """Whether SceneGraph comes to the point of contact of such shapes by an iteration; see `AllPairs.kinds`."""
+    return kind not in (SPHERES, JOINT_LIMITS) and not {"Sphere", "HalfSpace"} & set(kind.split(" and "))
+
 
 @dataclass(frozen=True, eq=False)
 class Placed:
@@ -20,6 +27,7 @@ class Placed:
     state: Indices  # (M,) of what was found
     pair: Indices  # (M,)
     found: Array  # (M, 7) the middle, the normal and phi
+    to_one_side: set[int] = field(default_factory=set)  # the states in which how that changes is known to one side only
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +60,16 @@ class AllPairs:
             poses[i] = model.plant.EvalBodyPoseInWorld(model.double.context, body).GetAsMatrix34()
 
     def kinds(self, placed: Placed, count: int) -> list[set[str]]:
-        """Of each of `count` states with contact what kinds of shapes touch: spheres, or two others by their names."""
+        """Of each of `count` states with contact what kinds of shapes touch: spheres, or two others by their names.
+
+        Those whose change is known to one side only are kinds of their own.
+        """
         found: list[set[str]] = [set() for _ in range(count)]
         for state, pair in zip(placed.state, placed.pair, strict=True):
             shapes = self.others.shapes[pair - len(self.spheres.ids)]
-            found[state].add(" and ".join(sorted(type(shape).__name__ for shape in shapes)))
-        return [kinds or {"spheres"} for kinds in found]
+            side = " and to one side" if int(state) in placed.to_one_side else ""
+            found[state].add(" and ".join(sorted(type(shape).__name__ for shape in shapes)) + side)
+        return [kinds or {SPHERES} for kinds in found]
 
     def touching(self, placed: Placed) -> Touches:
         """What overlaps; how what SceneGraph found changes is not in it yet: see `complete`."""
@@ -71,7 +83,7 @@ class AllPairs:
         return Touches(placed.state, placed.pair, found[:, :3], found[:, 6], found[:, 3:6], nothing)
 
     def complete(self, touch: Touches, placed: Placed, twists: Array) -> dict[int, str]:
-        """Say of what SceneGraph found how it changes; the states of those of which it is not known, and why.
+        """Say of what SceneGraph found how it changes; the states of which it is not known, and why.
 
         `twists` (M, nv, 6) are those of the first shape in the second by the degrees of freedom, at the middle.
         """
@@ -80,11 +92,12 @@ class AllPairs:
             which = np.flatnonzero(touch.pair == pair)
             a, b = (placed.poses[touch.state[which], side] for side in self.sides[pair])
             of = np.concatenate([touch.middle[which], touch.normal[which], touch.phi[which, None]], axis=1)
-            touch.change[which], known = self.others.change(int(pair) - count, (a, b), of, twists[which])
+            touch.change[which], known, sided = self.others.change(int(pair) - count, (a, b), of, twists[which])
             names = " and a ".join(type(shape).__name__ for shape in self.others.shapes[pair - count])
             bodies = " and ".join(body.name() for body in self.others.bodies[pair - count])
             for state in touch.state[which[~known]]:
                 unknown[int(state)] = f"where Drake finds a {names} to touch, of {bodies}, jumps or has no derivative"
+            placed.to_one_side.update(touch.state[which[sided]].tolist())
         return unknown
 
 

@@ -3,8 +3,9 @@
 There are two ways to the derivative of what SceneGraph finds. Where it finds the deepest points themselves, it has a
 closed form. Where it does not, as between boxes and cylinders, whose contact point is that of an iteration, and where
 shapes lie flat on each other as long as only the joints between them move, SceneGraph itself is differenced along the
-motions that these joints have. Where what it finds jumps, as beside the rim of a cylinder where its iteration ends at a
-tolerance, there is no derivative, and the contact is not known.
+motions that these joints have. Where what it finds jumps to one side, as between faces that lie on each other, whose
+corner that is deepest is a matter of rounding, it is that of the other side, on which Drake's step is. Where it jumps
+anyhow, as beside the rim of a cylinder where the iteration ends at a tolerance, the contact is not known.
 
 Of two shapes that overlap, A and B, with support functions s_A and s_B, Drake's normal n from B to A is where the
 overlap s_B(n) + s_A(-n) is smallest, and is -phi there. Near its deepest point p_A a shape is known by the directions F
@@ -50,8 +51,8 @@ Flags = NDArray[np.bool_]
 KINDS = (Sphere, HalfSpace, Box, Cylinder, Capsule, Ellipsoid, Convex, Mesh)
 FLAT = 1e-8  # what of a normal, a unit vector, is rounding
 SAME_POINT = 1e-9  # [m] how far the closed form's points may be from those that are found
-DIFFERENCE = 1e-5  # [m or rad] SceneGraph's iterations leave 1e-10 where they end by themselves
-SAME_SLOPE = 1e-4  # of the largest: over DIFFERENCE and twice that
+DIFFERENCES = (1e-5, 1e-4, 1e-6)  # [m or rad] SceneGraph's iterations leave 1e-10 where they end by themselves
+SAME_SLOPE = 1e-4  # of the largest: over a difference and twice that
 PROPER = 1e-6  # [m] the least curvature of the overlap at its smallest, and the least sine between two flat directions
 
 
@@ -207,27 +208,28 @@ class WitnessPairs:
                 found.append((i, np.concatenate([middle, sign * of.nhat_BA_W, [-of.depth]])))
         return found
 
-    def change(self, pair: int, poses: tuple[Array, Array], of: Array, twists: Array) -> tuple[Array, Flags]:
-        """(M, 7, 6) of `pairs.Touches`, and which (M,) are known, of M overlaps `of` (M, 7) of one pair.
+    def change(self, pair: int, poses: tuple[Array, Array], of: Array, twists: Array) -> tuple[Array, Flags, Flags]:
+        """(M, 7, 6) of `pairs.Touches`, which (M,) are known and which to one side only, of M overlaps `of` (M, 7).
 
         With the bodies at `poses` (M, 3, 4) each, and the twists (M, nv, 6) of the first in the second at the middle.
         """
         a, b = self.known[pair]
         if a is None or b is None:
-            return np.zeros((len(of), 7, 6)), np.zeros(len(of), dtype=bool)
+            return np.zeros((len(of), 7, 6)), *np.zeros((2, len(of)), dtype=bool)
         placed = _times(poses[0], a.pose), _times(poses[1], b.pose)
         change, known = overlap_change(a, b, Overlaps(placed, of[:, :3], of[:, 3:6], of[:, 6]))
+        to_one_side = np.zeros(len(of), dtype=bool)
         for k in np.flatnonzero(~known):
             if pair not in self.scenes:
                 self.scenes[pair] = PairScene(*self.shapes[pair])
             R, X_a, X_b = placed[1][k, :, :3], RigidTransform(placed[0][k]), RigidTransform(placed[1][k])
             own = np.concatenate([twists[k, :, :3] @ R, twists[k, :, 3:] @ R], axis=1)
-            local = self.scenes[pair].change(X_b.inverse() @ X_a, own[np.abs(own).max(axis=1) > FLAT])
+            local, to_one_side[k] = self.scenes[pair].change(X_b.inverse() @ X_a, own[np.abs(own).max(axis=1) > FLAT])
             if local is not None:
                 known[k] = True
                 turned = np.concatenate([local[:, :3] @ R.T, local[:, 3:] @ R.T], axis=1)
                 change[k] = np.concatenate([R @ turned[:3], R @ turned[3:6], turned[6:]])
-        return change, known
+        return change, known, to_one_side
 
 
 def _times(pose: Array, other: Array) -> Array:
@@ -321,6 +323,11 @@ def _system(H: Array, f_a: Array, f_b: Array) -> tuple[Array, Flags]:
     return left, proper
 
 
+def _same(slope: Array, other: Array, times: float = 1.0) -> bool:
+    """Whether two slopes over different widths are of one curve; one-sided ones may be further apart."""
+    return bool(np.abs(slope - other).max() <= times * SAME_SLOPE * max(1.0, float(np.abs(slope).max())))
+
+
 def _tangent(normal: Array) -> Array:
     """(M, 3, 2) two unit vectors square to each normal (M, 3) and to each other."""
     other = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
@@ -356,8 +363,10 @@ class PairScene:
         middle = (found[0].p_WCa + found[0].p_WCb) / 2
         return np.concatenate([middle, sign * found[0].nhat_BA_W, [-found[0].depth]])
 
-    def change(self, pose: RigidTransform, twists: Array) -> Array | None:
+    def change(self, pose: RigidTransform, twists: Array) -> tuple[Array | None, bool]:
         """(7, 6) the derivative along the span of `twists` (K, 6) of a at the middle, 0 across it; None where none is.
+
+        And whether it is one to one side only.
 
         All in b's frame. Where the shapes turn about one direction alone it does not matter where along it they touch:
         that of the middle is 0 there, also where SceneGraph leaves it to rounding, as between a face and a cylinder.
@@ -368,15 +377,31 @@ class PairScene:
         _, turns, axes = np.linalg.svd(twists[:, 3:], full_matrices=True)
         if not (turns[1:] > FLAT * max(1.0, float(turns[0]))).any():
             matters[:3, :3] -= np.outer(axes[0], axes[0])
+        to_one_side = False
         for direction in directions[sizes > SAME_SLOPE * max(1.0, float(sizes[0]))]:
+            slope, sided = self._slope(pose, here, direction, matters)
+            if slope is None:
+                return None, False
+            to_one_side |= sided
+            change += slope[:, None] * direction
+        return change, to_one_side
+
+    def _slope(self, pose: RigidTransform, here: Array, direction: Array, matters: Array) -> tuple[Array | None, bool]:
+        """(7,) along a direction, of both sides together or, where what is found jumps on one, of the other."""
+        for d in DIFFERENCES:
             near, far = (
-                matters @ (self._moved(pose, here, d * direction) - self._moved(pose, here, -d * direction)) / (2 * d)
-                for d in (DIFFERENCE, 2 * DIFFERENCE)
+                {
+                    sign: matters @ (self._moved(pose, here, sign * e * direction) - here) / (sign * e)
+                    for sign in (1, -1)
+                }
+                for e in (d, 2 * d)
             )
-            if not np.abs(near - far).max() <= SAME_SLOPE * max(1.0, float(np.abs(near).max())):
-                return None
-            change += near[:, None] * direction
-        return change
+            if _same(both := (near[1] + near[-1]) / 2, (far[1] + far[-1]) / 2) and _same(near[1], near[-1], 1e2):
+                return both, False
+            stays = [2 * near[sign] - far[sign] for sign in (1, -1) if _same(near[sign], far[sign])]
+            if len(stays) == 1:
+                return stays[0], True
+        return None, False
 
     def _moved(self, pose: RigidTransform, here: Array, motion: Array) -> Array:
         """What is found after a small motion (6,) of a, about the middle."""
