@@ -18,11 +18,13 @@ from drake_diff.derivatives.contact.material import QUANTITIES, material_change
 from drake_diff.derivatives.contact.touching import JOINT_LIMITS, is_iterated
 from drake_diff.derivatives.implicit import RESIDUAL_TOLERANCE, differentiate_equation, form_of
 from drake_diff.derivatives.polish import polished_steps
+from drake_diff.derivatives.reduced import Reduced
 from drake_diff.derivatives.smooth_step import SmoothStep, build_analytic
 from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, Steps
 from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.tree import OwnDynamics
+from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select, write_autodiff
 from drake_diff.model.step import advance, set_state
@@ -51,6 +53,8 @@ class Analytic:
         parameters = steps.vector.parameters
         if parameters and any(p.kind.quantity not in QUANTITIES for p in parameters):
             return Refusal("derivatives by parameters other than of contact are asked for")
+        if steps.model.coupling is not None:
+            return self._of_reduced(steps, steps.model.coupling)
         smooth = analytic_of(steps.model)
         if isinstance(smooth, Refusal):
             return smooth
@@ -73,6 +77,29 @@ class Analytic:
             refused = {k: e for k, e in refused.items() if not known[k]} | _refusals(known, left, why)
             refused |= {k: NotSmoothError(of_step) for k, of_step in of_steps.items() if not known[k]}
         return Jacobians(values, refused, notes)
+
+    def _of_reduced(self, steps: Steps, coupling: Coupling) -> Jacobians | Refusal:
+        """Where mimic joints are reduced: from the whole plant's."""
+        model = steps.model
+        if steps.vector.parameters:
+            return Refusal("mimic joints are reduced, and parameters are asked for")
+        smooth = analytic_of(model.whole)
+        if isinstance(smooth, Refusal):
+            return smooth
+        reduced = model.cache("reduced steps", lambda: Reduced.of(model, coupling, smooth), of_structure=True)
+        whole, same = reduced.whole(steps)
+        found = self.differentiate(whole)
+        if isinstance(found, Refusal):
+            return found
+        values, refused = reduced.jacobians(steps, whole, found.values), dict(found.refused)
+        refused |= {int(k): NotSmoothError("it leads elsewhere") for k in np.flatnonzero(~same)}
+        trial = model.cache("trial of reduced steps", _Trial, of_structure=True)
+        for k in range(len(steps)):
+            if k not in refused:
+                _certify(steps, k, values[k], [trial] if trial.left and not trial.refusal else [], iterated=False)
+                if trial.refusal:
+                    return Refusal(trial.refusal)
+        return Jacobians(values, refused, found.notes)
 
 
 def _refusals(known: Flags, of: NDArray[np.intp], why: str) -> dict[int, DrakeDiffError]:
