@@ -12,7 +12,8 @@ from helpers.table import each_row
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
+from drake_diff.derivatives.reduced import Reduced
+from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.plant import actuators
 from drake_diff.model.plant import joints as joints_of
@@ -451,3 +452,35 @@ def test_certificates_of_reduced_coordinates_agree_in_motion_and_refuse_a_plante
     wrong = np.array(true.A)
     wrong[random.integers(8, 16), random.integers(0, 16)] += 0.01 * np.abs(wrong).max()
     assert dd.certify(model, x, u, derivatives=replace(true, A=wrong)).verdict == "disagree"
+
+
+@pytest.mark.parametrize("name", ["panda.urdf", "talos_full_v2.urdf"])
+def test_steps_of_reduced_robots_have_the_derivative_of_their_own_equation(name):
+    """In flight, and on the ground in spheres: AutoDiffXd."""
+    ground = (
+        {"ground": 0.8, "contact": "ground", "meshes": "spheres"} if name.startswith("talos") else {"contact": False}
+    )
+    model = dd.load_model(robot_file(name), time_step=0.02, actuators="all", mimic="reduce", **ground)
+    random, x = np.random.default_rng(2), model.default_state
+    x[model.nq :] = 0.2 * random.standard_normal(model.nv)
+    for z in (1.0, 0.95):
+        if name.startswith("talos"):
+            x[6] = z
+        u = random.standard_normal(model.nu)
+        found = dd.differentiate_step(model, x, u, method="analytic")
+        exact = dd.differentiate_step(model, x, u, method="autodiff")
+        for mine, other in ((found.A, exact.A), (found.B, exact.B)):
+            np.testing.assert_allclose(mine, other, rtol=0, atol=1e-10 * np.abs(exact.A).max())
+
+
+def test_a_wrong_way_back_from_the_whole_plant_is_refused(monkeypatch):
+    """By a hundred thousandth."""
+    model = dd.load_model(robot_file("panda.urdf"), time_step=0.02, actuators="all", mimic="reduce", contact=False)
+    right = Reduced.jacobians
+
+    def wrong(self, steps, whole, of_whole):
+        return right(self, steps, whole, of_whole) * 1.00001
+
+    monkeypatch.setattr(Reduced, "jacobians", wrong)
+    with pytest.raises(GradientError, match="differs from AutoDiffXd's"):
+        dd.differentiate_step(model, model.default_state, np.ones(model.nu), method="analytic")
