@@ -85,6 +85,7 @@ def test_a_column_of_zeros_is_zero():
 def test_a_wide_bend_and_a_far_corner_are_no_doubt():
     assert doubt(lambda x: x + 100 * x**2, [[1.0]]) == ""
     assert doubt(lambda x: x + np.maximum(x - 1e-3, 0.0), [[1.0]]) == ""  # a contact that begins farther away
+    assert doubt(lambda x: np.hstack([x[:, 1:] ** 2, x]), [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) == ""  # a bowl
 
 
 @pytest.mark.parametrize("name", ["go2.urdf", "solo12.urdf"])

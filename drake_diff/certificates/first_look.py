@@ -16,17 +16,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.differences import RATIO_SQUARED, Difference
-from drake_diff.certificates.judgement import POWER, Scales, weighed
-from drake_diff.certificates.neighbourhood import STEPS
+from drake_diff.certificates.certificate import Certificate
+from drake_diff.certificates.judgement import POWER, VERDICTS, Flags, Scales, weighed
 
 DIRECTIONS = 6
 MISS, QUANTILE = 1e-4, 0.17209  # where the distribution of chi^2 with 6 degrees of freedom is MISS
 LEAST = 1.5  # the sum of squares of a column of z: six normal numbers have 6
 WIDTHS = tuple(10.0 ** (-k / 2) for k in (9, 10, 11))  # 3e-5, 1e-5, 3e-6
-WIDE = 8e-3, 1e-3  # of all columns at once, to both sides: what is flat there, but for jumps, is stairs
-FLAT = 1e-2  # of the change: see WIDE
+WIDE = 8e-3, 4e-3  # of all columns at once, to both sides: what is flat there, but for jumps, is stairs
+FLAT, ALIKE = 1e-2, 0.2  # of the change: see WIDE
 SEEDED = 11
 LARGEST, WIDEST = 3.0, 1e2  # of the numbers, and a weight over the middle one: no column is moved by more than 1e-2
 ROUNDS = 20  # of balancing weights
@@ -101,16 +101,26 @@ class FirstLook:
         corner = self._corners()
         if not np.all((corner <= allowed) | (corner <= hidden)):
             return "slopes ahead and behind do not approach each other"
-        risen = np.abs(self.wide).max(axis=0).min(axis=0)  # on both sides
-        said = np.linalg.norm(self.derivative * np.minimum(self.weights * WIDE[0], STEPS[0]), axis=1)
-        if np.any((said <= FLAT * risen) & (risen > self.rounding)):
+        if np.any(self._stairs()):
             return "a row is flat here, and changes farther away"
         return ""
+
+    def _stairs(self) -> Flags:
+        """(m,) rows that are flat here and change to both sides farther away, not as smooth curves do, h^2 and h^3."""
+        risen = np.abs(self.wide).max(axis=0).min(axis=0)
+        said = np.linalg.norm(self.derivative * np.minimum(self.weights, 1.0), axis=1) * WIDE[0]
+        ahead, behind = self.wide[:, 0], self.wide[:, 1]
+        left = said + FLAT * risen + self.rounding
+        bent = np.ones(len(risen), dtype=bool)
+        for part, order in (((ahead + behind) / 2, 2), ((ahead - behind) / 2, 3)):
+            expected = part[0] * (WIDE[1] / WIDE[0]) ** order
+            bent &= np.abs(part[1] - expected) <= ALIKE * np.abs(expected) + left
+        return np.asarray((said <= FLAT * risen) & (risen > self.rounding) & ~bent)
 
     @property
     def _per_weight(self) -> Array:
         """(n,) zero where the weight is."""
-        return np.array([1 / w if w else 0.0 for w in self.weights])
+        return np.array([1 / w if w else 0.0 for w in self.weights.tolist()])
 
     def _gaps(self) -> Array:
         return np.asarray(self.directions @ self.derivative.T - self.slopes)
@@ -132,6 +142,38 @@ class FirstLook:
         return FirstLook(**parts | {"derivative": derivative})
 
 
+def certificate_by(
+    look: FirstLook,
+    *,
+    scale: Array,
+    rows: tuple[str, ...],
+    columns: tuple[str, ...],
+    told: str,
+    method: str,
+    subject: str,
+) -> Certificate:
+    """The certificate of a derivative in which `look` leaves no doubt."""
+    noticeable = frozen(look.noticeable / scale)
+    return Certificate(
+        rows=rows,
+        columns=columns,
+        derivative=frozen(look.derivative / scale),
+        difference=frozen(look.difference / scale),
+        tolerance=noticeable,
+        noticeable=noticeable,
+        size=frozen(look.size / scale),
+        codes=np.full(look.derivative.shape, VERDICTS.index("agree")),
+        reasons={},
+        around=None,
+        scale=scale,
+        stopped=0.0,
+        second=look.second,
+        told="; ".join(text for text in (look.told, told) if text),
+        method=method,
+        subject=subject,
+    )
+
+
 class LookAt:
     """Where a function R^n -> R^m is to be taken to look at its derivative (m, n), by the scaled displacements."""
 
@@ -142,10 +184,10 @@ class LookAt:
         self.directions = z * self.weights
         small = np.multiply.outer([1.0, -1.0], np.multiply.outer(WIDTHS, self.directions)).reshape(-1, n)
         signs = np.where(z[0] > 0, 1.0, -1.0)
-        wide = np.multiply.outer(WIDE, np.multiply.outer([1.0, -1.0], signs * self.weights)).reshape(-1, n)
+        line = signs * np.minimum(self.weights, 1.0)
+        wide = np.multiply.outer(WIDE, np.multiply.outer([1.0, -1.0], line)).reshape(-1, n)
         unmoved = np.multiply.outer([WIDTHS[0], -WIDE[0]], signs * (self.weights == 0))
-        points = np.vstack([np.zeros((1, n)), small, wide, unmoved])
-        self.displacements = np.clip(points, -STEPS[0], STEPS[0])  # small ones are below
+        self.displacements = np.vstack([np.zeros((1, n)), small, wide, unmoved])  # by at most 1e-2
 
     def taken(self, values: Array, minus: Difference = np.subtract) -> FirstLook:
         """What the values (p, m) at the `displacements` (p, n) say; `minus` subtracts two of them."""

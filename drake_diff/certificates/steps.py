@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.arrays import Array
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.certify import (
     LEAP,
@@ -19,8 +19,7 @@ from drake_diff.certificates.certify import (
     state_scale,
     with_room,
 )
-from drake_diff.certificates.first_look import FirstLook, LookAt
-from drake_diff.certificates.judgement import VERDICTS
+from drake_diff.certificates.first_look import FirstLook, LookAt, certificate_by
 from drake_diff.derivatives.polish import polished_steps
 from drake_diff.derivatives.sources import step_at
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
@@ -68,27 +67,17 @@ class StepLook:
         """That the derivative is the step's; None where that is in doubt."""
         if self.look is None or self.doubt:
             return None
-        look, d, model, scale = self.look, self.derivatives, self.step.model, self.step.scale
+        d, model, names = self.derivatives, self.step.model, self.step.space.names
         solved = differences_of_solved(self.left) if self.left >= 0 else ""
         shared = SHARED if "finite_difference" in (d.method, *d.sources) else ""
-        noticeable = frozen(look.noticeable / scale)
-        return Certificate(
-            rows=self.step.space.names,
-            columns=self.step.space.names + model.input_names + self.step.vector.names,
-            derivative=frozen(look.derivative / scale),
-            difference=frozen(look.difference / scale),
-            tolerance=noticeable,
-            noticeable=noticeable,
-            size=frozen(look.size / scale),
-            codes=np.full(look.derivative.shape, VERDICTS.index("agree")),
-            reasons={},
+        return certificate_by(
+            self.look,
+            scale=self.step.scale,
+            rows=names,
+            columns=names + model.input_names + self.step.vector.names,
+            told="; ".join(text for text in (solved, shared) if text),
             method=" + ".join(dict.fromkeys((d.method, *d.sources))),
             subject=f"the step of {model.name}",
-            around=None,
-            scale=scale,
-            stopped=0.0,
-            second=look.second,
-            told="; ".join(text for text in (look.told, solved, shared) if text),
         )
 
 

@@ -15,7 +15,7 @@ from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import TIME_STEP
 from drake_diff.motion.rollout import STEPS
-from drake_diff.optimize.certified import certified_knots, certify_equations
+from drake_diff.optimize.certified import certify_equations, first_knots, telling_knots
 from drake_diff.optimize.continuation import Stages, solve_continuation
 from drake_diff.optimize.guess import Guess
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
@@ -71,7 +71,14 @@ class Run:
         problem, limits, report = self.problem, self.limits, self.report
         transcription = Transcription(self.searched or problem, self.scheme)
         try:
-            before = certify_equations(self.problem, transcription.jacobian, guess.xs, guess.us, transcription.task)
+            before = certify_equations(
+                self.problem,
+                transcription.jacobian,
+                guess.xs,
+                guess.us,
+                transcription.task,
+                knots=first_knots(guess.us),
+            )
         except (GradientError, SimulationError) as error:
             return refused(self._draft(guess.xs, guess.us), error)
         us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
@@ -148,7 +155,8 @@ class Run:
         """By Drake's own DirectCollocation."""
         jacobian = EquationsOfMotion(self.problem.model).jacobian
         try:
-            certificates = certify_equations(self.problem, jacobian, guess.xs, guess.us)
+            first = first_knots(guess.us)
+            certificates = certify_equations(self.problem, jacobian, guess.xs, guess.us, knots=first)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(guess.xs, guess.us), error)
         result, xs, us, u_final = solve_collocation(
@@ -243,7 +251,7 @@ class Run:
         given, values = xs if segmented or around else None, self._first_values(guess)
         variables = ShootingVariables(self.problem, around=given)
         try:
-            xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values))
+            xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values), found=False)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us), error)
         if blindness and not may_be_blind:
@@ -254,7 +262,7 @@ class Run:
             z = variables.pack(xs[0], us, result.parameters)
             if self.method == "shooting" and len(result.z) == variables.size:
                 z = np.clip(result.z, *variables.limits())  # which solvers keep within their tolerance
-            xs, us, after, blindness = self._look_at(variables, z)
+            xs, us, after, blindness = self._look_at(variables, z, found=True)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us, certificates=before), error)
         values = variables.parameters(z).values
@@ -328,20 +336,27 @@ class Run:
         found |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.start}
         return Solution(self.problem, self.method, self.solver, Status.FAILED, "", frozen(xs), frozen(us), **found)
 
-    def _look_at(self, variables: ShootingVariables, z: Array) -> tuple[Array, Array, tuple[Certificate, ...], str]:
-        """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach."""
+    def _look_at(
+        self, variables: ShootingVariables, z: Array, *, found: bool
+    ) -> tuple[Array, Array, tuple[Certificate, ...], str]:
+        """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach.
+
+        Of what a search `found` these are the steps that tell most.
+        """
         us = variables.unpack(z)[1]
         xs, parameters = variables.states(z), variables.parameters(z).to_dict()
         model, design = self.problem.model, self.problem.design
         if design.has_step and not design.moves_step:
             model = model.at_time_step(float(parameters.pop(TIME_STEP)[0]))
 
-        knots = certified_knots(us) if self.problem.motion == STEPS else ()  # else see `slope`, of the whole plan
-        keys = {int(k): xs[k].tobytes() + us[k].tobytes() + repr(parameters).encode() for k in knots}
+        keys: dict[int, bytes] = {}
+        if self.problem.motion == STEPS:  # else see `slope`, of the whole plan
+            knots = telling_knots(xs[: len(us) + 1]) if found else first_knots(us)
+            keys = {k: xs[k].tobytes() + us[k].tobytes() + repr(parameters).encode() for k in knots.tolist()}
         # That of a search which ends where it began is known.
         new = [k for k, key in keys.items() if key not in self.certified]
         if new:
-            found = certify_steps(model, xs[new], us[new], parameters=parameters)
-            self.certified.update(zip([keys[k] for k in new], found, strict=True))
+            taken = certify_steps(model, xs[new], us[new], parameters=parameters)
+            self.certified.update(zip([keys[k] for k in new], taken, strict=True))
         certificates = tuple(self.certified[key] for key in keys.values())
         return xs, us, certificates, why_blind(self.problem, variables, z)
