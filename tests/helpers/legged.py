@@ -34,18 +34,47 @@ class Legged:
     low: tuple[float, ...]
     weight: float
     gains: tuple[float, float]
-    folder: str = ""
     base: str = "base_link"
 
 
-def _legs(hip, knee, back=1, times=4):
-    """Hips and knees of so many legs; those behind the first two are bent `back` times as much."""
-    return tuple(v for leg in range(times) for v in (0.0, *(np.array([hip, knee]) * (back if leg >= 2 else 1))))
+def _legs(hip, knee, *, hind=1, count=4):
+    """Hips and knees of so many legs; those behind the first two are bent `hind` times as much."""
+    return tuple(v for leg in range(count) for v in (0.0, *(np.array([hip, knee]) * (hind if leg >= 2 else 1))))
 
 
 SOLO_FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+GO2_FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
+ANYMAL_FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
 LEGGED = {
-    "solo12": Legged("solo12.urdf", SOLO_FEET, 0.016, _legs(0.8, -1.6, -1), _legs(1.2, -2.4, -1), 24.5, (5.0, 0.1)),
+    "solo12": Legged(
+        file="solo12.urdf",
+        feet=SOLO_FEET,
+        radius=0.016,
+        high=_legs(0.8, -1.6, hind=-1),
+        low=_legs(1.2, -2.4, hind=-1),
+        weight=24.5,
+        gains=(5.0, 0.1),
+    ),
+    "go2": Legged(
+        file="go2.urdf",
+        feet=GO2_FEET,
+        radius=0.022,
+        high=_legs(0.8, -1.6),
+        low=_legs(1.2, -2.4),
+        weight=158.0,
+        gains=(80.0, 2.0),
+        base="base",
+    ),
+    "anymal": Legged(
+        file="anymal_b_simple_description/robots/anymal.urdf",
+        feet=ANYMAL_FEET,
+        radius=0.031,
+        high=_legs(0.5, -1.0, hind=-1),
+        low=_legs(1.0, -2.0, hind=-1),
+        weight=299.0,
+        gains=(300.0, 8.0),
+        base="base",
+    ),
 }
 
 
@@ -54,7 +83,7 @@ def robot_on_feet(name):
     """A file of that robot in which its feet are spheres of the stiffness that lets them sink by SINK, and all else
     is left out that can touch."""
     robot = LEGGED[name]
-    tree = ElementTree.parse(robot_file(f"{robot.folder}{robot.file}"))
+    tree = ElementTree.parse(robot_file(robot.file))
     root = tree.getroot()
     root.set("xmlns:drake", "http://drake.mit.edu")
     for link in root.findall("link"):
@@ -73,7 +102,7 @@ def robot_on_feet(name):
                 ("mu_static", FRICTION),
             ):
                 ElementTree.SubElement(properties, f"drake:{quantity}", value=str(value))
-    path = Path(tempfile.mkdtemp(prefix="drake_diff_legged_")) / robot.file
+    path = Path(tempfile.mkdtemp(prefix="drake_diff_legged_")) / Path(robot.file).name
     tree.write(path)
     return path
 

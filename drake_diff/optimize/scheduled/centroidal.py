@@ -14,9 +14,9 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 
 ROUNDS = 3
-ALIKE, CHANGE, MOMENT, NEAR = 1e-2, 1.0, 1.0, 1.0  # weights, of forces in weights of the robot and lengths in its size
+ALIKE, CHANGE, MOMENT, NEAR = 1e-2, 1.0, 100.0, 0.1  # weights, of forces in weights of the robot and lengths in its size
 STEP = 0.02  # [s] of which these weights are; they are rates, so that they say the same in steps of another length
-SHARE = 0.02  # of an even share of the weight: what a standing point carries at least
+SHARE = 0.2  # of an even share of the weight: what a standing point carries at least
 
 
 def plan_forces(

@@ -18,6 +18,8 @@ from drake_diff.optimize.scheduled.centroidal import plan_forces
 from drake_diff.optimize.scheduled.legs import Legs
 
 LANDS = 1e-3  # [m] how much deeper than it stands a foot lands: one that misses the ground meets it a step later
+LEVELLED = 6  # steps in which the soles become alike in depth
+RUNS_OUT = 0.4  # [s] in which a first spin of the base does
 RISE = 2.0  # the power of a swing's arc: a foot that leaves and lands slowly
 BY_INPUT, BY_FORCE, BY_BASE = 1e3, 1.0, 1e-3  # how willingly inputs, forces and the base's acceleration give way
 
@@ -55,6 +57,7 @@ def scheduled_motion(
     begun, (mass_at, mass_by) = legs.points(), legs.center_of_mass()
     on = touching(carries)
     places, arcs = _foot_ways(begun, last, on, clearance)
+    places[:, :, 2] = _level(begun[:, 2], len(on))
     s = smooth(np.linspace(0, 1, len(on)))
     way = mass_at + s[:, None] * (over - mass_at)
     gravity = np.asarray(model.double.plant.gravity_field().gravity_vector())
@@ -66,9 +69,9 @@ def scheduled_motion(
     places[:, :, 2] += arcs + _lifts(mass[:, 2], on)
     landing = on & ~np.vstack([on[:1], on[:-1]])
     places[landing, 2] -= LANDS
-    turn, qs = legs.apart(end, first), [first]
+    ways, qs = s[:, None] * legs.apart(end, first) + _run_out(legs, x0[model.nq :], h * np.arange(len(on))), [first]
     for k in range(1, len(on)):
-        wish = legs.moved(first, s[k] * turn)
+        wish = legs.moved(first, ways[k])
         qs.append(legs.posture(qs[-1], wish, mass[k], places[k], on[k] & on[k - 1]))
     vs = [x0[model.nq :]] + [legs.apart(b, a) / h for a, b in pairwise(qs)]
     xs = np.array([np.concatenate(pair) for pair in zip(qs, vs, strict=True)])
@@ -107,6 +110,24 @@ def _foot_ways(first: Array, last: Array, on: Mask, clearance: float) -> tuple[A
             open_end = b == len(on) - 1 and not on[b, i]
             arcs[a : b + 1, i] = clearance * (smooth(s) if open_end else (4 * s * (1 - s)) ** RISE)
     return places, arcs
+
+
+def _run_out(legs: Legs, v: Array, times: Array) -> Array:
+    """(N+1, nv) how a first spin of the base, of v (nv,), goes on for a while and comes back."""
+    spin = np.zeros(legs.model.nv)
+    turn = slice(legs.base_v, legs.base_v + 3)
+    spin[turn] = v[turn]
+    return np.asarray((times * np.maximum(1 - times / min(RUNS_OUT, times[-1]), 0.0) ** 3)[:, None] * spin)
+
+
+def _level(heights: Array, count: int) -> Array:
+    """(N+1, n) [m] of soles that first are at `heights` (n,), and soon all as deep as they are on average.
+
+    Some of a robot that stands on four feet hardly touch, and would soon not touch at all.
+    """
+    sink = -float(np.mean(np.maximum(-heights, 0.0)))
+    s = smooth(np.clip(np.arange(count) / LEVELLED, 0.0, 1.0))[:, None]
+    return np.asarray(heights + s * (sink - heights))
 
 
 def _lifts(heights: Array, on: Mask) -> Array:

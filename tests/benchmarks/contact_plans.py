@@ -1,0 +1,192 @@
+"""Plans with contact: each task from starts drawn by a seed, solved, verified, and looked at by a referee of its own.
+
+    python tests/benchmarks/contact_plans.py --seed 0 --starts 5 --jobs 2
+    python tests/benchmarks/contact_plans.py --tasks solo12_jump,solo12_trot --crocoddyl /path/to/its/python
+
+The referee is Drake alone: it builds the plant, sends it the plan's inputs, and measures what the task asks. A plan that
+solve calls verified and the referee does not find is false. Times are processor seconds of one thread: of the whole
+solve with its verification, of an iteration of its search, and of Drake's own simulation of the motion.
+"""
+
+import argparse
+import contextlib
+import importlib
+import json
+import logging
+import os
+import subprocess
+import sys
+import time
+import warnings
+import zlib
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+
+import numpy as np  # noqa: E402
+from pydrake.systems.analysis import Simulator  # noqa: E402
+
+MODULES = ("legged_tasks", "manipulation_tasks")
+REPEATS = 3  # of a simulation, the quickest of which counts
+AGAIN = 1e-6  # what the referee's own motion may be off the plan's in a step: another order of sums
+
+
+def every_task():
+    found = {}
+    for name in MODULES:
+        if (Path(__file__).parent / f"{name}.py").exists():
+            found |= importlib.import_module(name).TASKS
+    return found
+
+
+def simulated(plant, diagram, x0, us, h):
+    """(states (N+1, nx), seconds) of Drake's own simulation, each input held for a step."""
+    best, xs = np.inf, None
+    for _ in range(REPEATS):
+        simulator = Simulator(diagram)
+        context = simulator.get_mutable_context()
+        own = plant.GetMyMutableContextFromRoot(context)
+        plant.SetPositionsAndVelocities(own, x0)
+        port = plant.get_actuation_input_port()
+        value = port.FixValue(own, us[0])
+        simulator.Initialize()
+        begun, found = time.process_time(), [np.array(x0)]
+        for k, u in enumerate(us):
+            value.GetMutableData().set_value(u)
+            simulator.AdvanceTo((k + 1) * h)
+            found.append(plant.GetPositionsAndVelocities(own))
+        best, xs = min(best, time.process_time() - begun), np.array(found)
+    return xs, best
+
+
+def referee(task, solution):
+    """(what is not as asked, seconds of Drake's simulation) of a plan, by Drake alone."""
+    model = task.problem.model
+    if task.build is not None:
+        plant, diagram = task.build(model.time_step)
+    else:
+        plant, diagram = model.plant, model.diagram
+    us = np.asarray(solution.us)
+    xs, seconds = simulated(plant, diagram, np.asarray(task.problem.x0), us, model.time_step)
+    found = []
+    for name, measure, allowed in task.asks:
+        miss = measure(xs, us)
+        if not miss <= allowed:
+            found.append(f"{name}: {miss:.3g} of {allowed:g}")
+    lower, upper = task.problem.bounds.u_lower, task.problem.bounds.u_upper
+    beyond = float(np.max(np.maximum(us - upper, lower - us)))
+    if beyond > AGAIN:
+        found.append(f"an input is {beyond:.3g} beyond its limit")
+    return found, seconds
+
+
+def one(name, seed, start, crocoddyl):
+    """A row of the table: one task from one start."""
+    warnings.simplefilter("ignore")
+    logging.getLogger("drake").setLevel(logging.ERROR)
+    import drake_diff as dd
+
+    random = np.random.default_rng([seed, zlib.crc32(name.encode()), start])
+    row = {"task": name, "start": start, "solved": False, "verified": False, "false": False}
+    begun = time.process_time()
+    try:
+        task = every_task()[name](random)
+    except dd.exceptions.DrakeDiffError as error:
+        return row | {"message": f"no guess: {error}", "guess_s": time.process_time() - begun}
+    row["guess_s"] = time.process_time() - begun
+    # What a process does once (it compiles, it certifies a source) is not a task's: a solve of one iteration does it.
+    with contextlib.suppress(dd.exceptions.DrakeDiffError):
+        dd.solve(task.problem, **{**task.options, "max_iterations": 1})
+    ticks, begun = [], time.process_time()
+    solution = dd.solve(task.problem, **{**task.options, "callback": lambda _: ticks.append(time.process_time())})
+    row["cpu_s"] = time.process_time() - begun
+    row["iterations"] = max(len(solution.iterations) - 1, 0)
+    row["status"], row["message"] = solution.status.value, solution.message
+    row["verified"] = bool(solution.success)
+    row["search_s"] = ticks[-1] - begun if ticks else float("nan")
+    wrong, row["simulation_s"] = ["no inputs"], float("nan")
+    if np.all(np.isfinite(solution.us)):
+        try:
+            wrong, row["simulation_s"] = referee(task, solution)
+        except RuntimeError as error:  # Drake cannot take a step
+            wrong = [str(error)[:100]]
+    row["wrong"] = wrong
+    row["solved"] = not wrong
+    row["false"] = row["verified"] and bool(wrong)
+    if len(ticks) > 1:
+        row["iteration_s"] = (ticks[-1] - ticks[0]) / (len(ticks) - 1)
+    if crocoddyl and task.schedule is not None:
+        row["crocoddyl"] = beside(crocoddyl, task)
+    return row
+
+
+def beside(python, task):
+    """What Crocoddyl makes of the same task, in its own environment, told when each foot stands."""
+    from legged_tasks import told
+
+    script = Path(__file__).parent / "contact_plans_crocoddyl.py"
+    run = subprocess.run([python, script], input=json.dumps(told(task)), capture_output=True, text=True, check=False)
+    if run.returncode:
+        return {"error": run.stderr.strip().splitlines()[-1][:200] if run.stderr.strip() else "no answer"}
+    return json.loads(run.stdout.strip().splitlines()[-1])
+
+
+def told_of(rows):
+    """A line of the table for a task."""
+
+    def middle(key):
+        values = [row[key] for row in rows if np.isfinite(row.get(key, np.nan))]
+        return float(np.median(values)) if values else float("nan")
+
+    count = len(rows)
+    ratio = middle("iteration_s") / middle("simulation_s")
+    others = [row["crocoddyl"] for row in rows if "crocoddyl" in row]
+    solved = [other for other in others if other.get("solved")]
+    other = f"{np.median([o['cpu_s'] for o in solved]):.2f} s, {len(solved)} of {len(others)}" if solved else "-"
+    numbers = [sum(row[key] for row in rows) for key in ("solved", "verified", "false")]
+    return (
+        f"| {rows[0]['task']} | {numbers[0]} of {count} | {numbers[1]} of {count} | {numbers[2]} | {middle('guess_s'):.2f} s "
+        f"| {middle('cpu_s'):.2f} s | {middle('search_s'):.2f} s | {middle('iterations'):.0f} "
+        f"| {1e3 * middle('simulation_s'):.1f} ms | {ratio:.1f} | {other} |"
+    )
+
+
+HEAD = """| Task | Referee | Verified | False | Guess | Solve | Search | Iterations | Drake | Iteration / Drake | Crocoddyl |
+|---|---|---|---|---|---|---|---|---|---|---|"""
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--starts", type=int, default=5)
+    parser.add_argument("--tasks", default="", help="names or their beginnings, with commas; all where empty")
+    parser.add_argument("--jobs", type=int, default=1, help="processes, each with one start at a time")
+    parser.add_argument("--crocoddyl", default="", help="a Python that has Crocoddyl")
+    parser.add_argument("--json", default="", help="where all rows are written")
+    parser.add_argument("--why", action="store_true", help="tells of each start that is not verified why")
+    arguments = parser.parse_args()
+    begin = tuple(filter(None, arguments.tasks.split(",")))
+    names = [name for name in every_task() if not begin or name.startswith(begin)]
+    asked = [(name, arguments.seed, start, arguments.crocoddyl) for name in names for start in range(arguments.starts)]
+    print(f"seed {arguments.seed}, {arguments.starts} starts, Drake steps of the tasks' own length\n{HEAD}", flush=True)
+    rows, open_rows = [], {}
+    with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
+        for row in pool.map(one, *zip(*asked, strict=True)) if asked else ():
+            rows.append(row)
+            open_rows.setdefault(row["task"], []).append(row)
+            if arguments.why and not (row["verified"] and row["solved"]):
+                print(f"  {row['task']} {row['start']}: {row.get('message', '')[:300]} {row.get('wrong', '')}", flush=True)
+            if len(open_rows[row["task"]]) == arguments.starts:
+                print(told_of(open_rows[row["task"]]), flush=True)
+    if arguments.json:
+        Path(arguments.json).write_text(json.dumps(rows, indent=1))
+    totals = [sum(row[key] for row in rows) for key in ("solved", "verified", "false")]
+    print(f"\n{len(rows)} starts: the referee finds {totals[0]}, {totals[1]} verified, {totals[2]} false")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+"""Tasks of robots on legs: stand up, lower, lift a foot, jump in place and forward, trot, recover from a push.
+
+Each start is drawn: joints about a posture, held by a PD controller until the robot rests, and of a push the velocity
+of the base. The user says which foot stands when, and where the robot is to end.
+"""
+
+from collections.abc import Sequence
+from functools import cache, partial
+
+import numpy as np
+from contact_task import Task, Tasks
+from helpers.legged import DISSIPATION, FRICTION, LEGGED, RELAXATION, legged_model, rest, robot_on_feet
+from pydrake.geometry import HalfSpace, ProximityProperties
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
+from pydrake.multibody.tree import JointIndex
+from pydrake.systems.framework import DiagramBuilder
+
+import drake_diff as dd
+
+TIME_STEP = 0.02
+DRAWN = 0.08  # [rad] how far a joint's first position is drawn from its posture's
+PUSH, SPIN = 0.35, 0.5  # [m/s], [rad/s] the largest velocity of a push of Solo12; of others by their height
+HEIGHTS = {"solo12": 0.23, "go2": 0.31, "anymal": 0.45}  # [m] of the base, standing
+AT_PLACE, AT_REST, LEVEL, SPINS = 0.05, 0.3, 0.1, 1.0  # [m], [m/s], [rad], [rad/s] of the base at the end
+IN_AIR = 0.01  # [m] every foot that is to be in the air, in the middle of its way
+OPTIONS = {"method": "ilqr", "tolerance": 1e-4, "max_iterations": 100}
+
+Phases = Sequence[tuple[float, Sequence[str]]]  # [s], and the feet that stand
+
+
+def stand_up(robot, random):
+    high, low = LEGGED[robot].high, LEGGED[robot].low
+    return _task(robot, random, "stand", low, high, [(0.6, ALL)], "stands up from a crouch")
+
+
+def lower(robot, random):
+    high, low = LEGGED[robot].high, LEGGED[robot].low
+    return _task(robot, random, "lower", high, low, [(0.6, ALL)], "lowers its body")
+
+
+def lift(robot, random):
+    high = LEGGED[robot].high
+    phases = [(0.5, ALL), (0.5, (1, 2, 3)), (0.3, ALL)]
+    return _task(robot, random, "lift", high, high, phases, "shifts its weight and lifts a foot for half a second")
+
+
+def jump(robot, random):
+    high = LEGGED[robot].high
+    return _task(robot, random, "jump", high, high, [(0.4, ALL), (0.16, ()), (0.5, ALL)], "jumps and lands")
+
+
+def forward(robot, random):
+    high = LEGGED[robot].high
+    phases = [(0.4, ALL), (0.16, ()), (0.5, ALL)]
+    way = 0.5 * HEIGHTS[robot]
+    return _task(robot, random, "forward", high, high, phases, f"jumps {way:.2f} m forward and lands", way=way)
+
+
+def trot(robot, random):
+    high, way = LEGGED[robot].high, 0.6 * HEIGHTS[robot]
+    one, other = (0, 3), (1, 2)
+    phases = [(0.1, ALL), (0.16, one), (0.04, ALL), (0.16, other), (0.04, ALL), (0.16, one), (0.4, ALL)]
+    return _task(robot, random, "trot", high, high, phases, f"trots three steps, {way:.2f} m forward", way=way)
+
+
+def push(robot, random):
+    high = LEGGED[robot].high
+    return _task(robot, random, "push", high, high, [(1.0, ALL)], "comes to rest after a push", pushed=True)
+
+
+ALL = (0, 1, 2, 3)
+KINDS = {"stand": stand_up, "lower": lower, "lift": lift, "jump": jump, "forward": forward, "trot": trot, "push": push}
+TASKS: Tasks = {f"{robot}_{kind}": partial(make, robot) for robot in LEGGED for kind, make in KINDS.items()}
+
+
+def _task(robot, random, kind, first, last, phases, text, *, way=0.0, pushed=False):
+    model, facts = legged_model(robot, TIME_STEP), LEGGED[robot]
+    nq = model.nq
+    x0 = rest(robot, model, np.array(first) + DRAWN * random.uniform(-1, 1, len(first)))
+    end = np.array(_posture(robot, last))
+    end[4:6] = x0[4:6] + [way, 0.0]
+    if pushed:
+        x0[nq:] = _pushed(robot, model, x0, random)
+    steps = [(round(seconds / TIME_STEP), [facts.feet[i] for i in feet]) for seconds, feet in phases]
+    schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet)
+    guess = schedule.guess(model, x0, end, swing=0.15 * HEIGHTS[robot])
+    goals = [
+        schedule,
+        dd.FrameGoal(facts.base, position=end[4:7], tolerance=AT_PLACE),
+        dd.FrameVelocityGoal(
+            facts.base, tolerance=AT_REST, angular_velocity=(0.0, 0.0, 0.0), angular_tolerance=SPINS
+        ),
+        dd.KeepLevel(facts.base, tolerance=LEVEL, knots=-1),
+    ]
+    follow = schedule.follow(model, guess)
+    problem = dd.Problem(model, x0=x0, num_steps=schedule.num_steps, goals=goals, **follow)
+    plant = _kinematics(robot)
+    asks = [
+        ("base from its place [m]", partial(_off_place, end[4:7]), AT_PLACE),
+        ("base from level [rad]", _tilt, LEVEL),
+        ("speed of the base [m/s]", partial(_speed, nq), AT_REST),
+    ]
+    knot = 0
+    for count, standing in steps:
+        middle, swinging = knot + count // 2, [foot for foot in facts.feet if foot not in standing]
+        asks += [(f"{foot} short of its clearance [m]", partial(_low, plant, facts, foot, middle), 0.0) for foot in swinging]
+        knot += count
+    return Task(
+        name=f"{robot}_{kind}",
+        problem=problem,
+        goal_text=text,
+        options={**OPTIONS, "initial_guess": guess},
+        asks=tuple(asks),
+        schedule=schedule,
+        build=partial(build, robot),
+    )
+
+
+@cache
+def _posture(robot, joints):
+    """(nq,) as the robot rests with joints at about these."""
+    model = legged_model(robot, TIME_STEP)
+    return tuple(rest(robot, model, np.array(joints))[: model.nq])
+
+
+def _pushed(robot, model, x0, random):
+    """(nv,) the base moves as pushed, and the joints so that the feet stay where they are."""
+    plant, facts = model.plant, LEGGED[robot]
+    part = np.sqrt(HEIGHTS[robot] / HEIGHTS["solo12"])
+    v = np.zeros(model.nv)
+    v[:3] = SPIN * random.uniform(-1, 1, 3)
+    v[3:5] = PUSH * part * random.uniform(-1, 1, 2)
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, x0[: model.nq])
+    rows = []
+    for foot in facts.feet:
+        frame = plant.GetBodyByName(foot).body_frame()
+        kind = _velocities()
+        world = plant.world_frame()
+        rows.append(plant.CalcJacobianTranslationalVelocity(context, kind, frame, np.zeros(3), world, world))
+    by_v = np.vstack(rows)
+    v[6:] = -np.linalg.lstsq(by_v[:, 6:], by_v[:, :6] @ v[:6], rcond=None)[0]
+    return v
+
+
+def _velocities():
+    from pydrake.multibody.tree import JacobianWrtVariable
+
+    return JacobianWrtVariable.kV
+
+
+# What a referee measures, by Drake alone.
+
+
+def build(robot, time_step):
+    """(plant, diagram) of the robot on its feet at a time step, 0 for continuous, by Drake's own parser."""
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(
+        time_step=time_step,
+        contact_model="point",
+        discrete_contact_approximation="sap",
+        sap_near_rigid_threshold=0.1,
+        use_sampled_output_ports=False,
+    )
+    plant, _ = AddMultibodyPlant(config, builder)
+    Parser(plant).AddModels(str(robot_on_feet(robot)))
+    for i in range(plant.num_joints()):
+        joint = plant.get_joint(JointIndex(i))
+        if joint.num_velocities() == 1 and not plant.HasJointActuatorNamed(joint.name()):
+            plant.AddJointActuator(joint.name(), joint)
+    ground = ProximityProperties()
+    ground.AddProperty("material", "coulomb_friction", CoulombFriction(FRICTION, FRICTION))
+    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", ground)
+    plant.Finalize()
+    return plant, builder.Build()
+
+
+@cache
+def _kinematics(robot):
+    """A plant and its context in which only places are asked for."""
+    plant, _ = build(robot, TIME_STEP)
+    return plant, plant.CreateDefaultContext()
+
+
+def _off_place(place, xs, us):
+    return float(np.linalg.norm(xs[-1, 4:7] - place))
+
+
+def _tilt(xs, us):
+    w, x, y, z = xs[-1, :4] / np.linalg.norm(xs[-1, :4])
+    return float(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
+
+
+def _speed(nq, xs, us):
+    return float(np.linalg.norm(xs[-1, nq + 3 : nq + 6]))
+
+
+def _low(twin, facts, foot, knot, xs, us):
+    plant, context = twin
+    plant.SetPositions(context, xs[knot, : plant.num_positions()])
+    height = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(foot)).translation()[2] - facts.radius
+    return float(max(IN_AIR - height, 0.0))
