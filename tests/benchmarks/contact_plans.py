@@ -3,9 +3,9 @@
     python tests/benchmarks/contact_plans.py --seed 0 --starts 5 --jobs 2
     python tests/benchmarks/contact_plans.py --tasks solo12_jump,solo12_trot --crocoddyl /path/to/its/python
 
-The referee is Drake alone: it builds the plant, sends it the plan's inputs, and measures what the task asks. A plan that
-solve calls verified and the referee does not find is false. Times are processor seconds of one thread: of the whole
-solve with its verification, of an iteration of its search, and of Drake's own simulation of the motion.
+The referee is Drake alone: it builds the plant, sends it the plan's inputs, and measures what the task asks. A plan
+that solve calls verified and the referee does not find is false. Times are processor seconds of one thread: of the
+whole solve with its verification, of an iteration of its search, and of Drake's own simulation of the motion.
 """
 
 import argparse
@@ -148,15 +148,26 @@ def told_of(rows):
     solved = [other for other in others if other.get("solved")]
     other = f"{np.median([o['cpu_s'] for o in solved]):.2f} s, {len(solved)} of {len(others)}" if solved else "-"
     numbers = [sum(row[key] for row in rows) for key in ("solved", "verified", "false")]
-    return (
-        f"| {rows[0]['task']} | {numbers[0]} of {count} | {numbers[1]} of {count} | {numbers[2]} | {middle('guess_s'):.2f} s "
-        f"| {middle('cpu_s'):.2f} s | {middle('search_s'):.2f} s | {middle('iterations'):.0f} "
-        f"| {1e3 * middle('simulation_s'):.1f} ms | {ratio:.1f} | {other} |"
-    )
+    seconds = [f"{middle(key):.2f} s" for key in ("guess_s", "cpu_s", "search_s")]
+    found = [f"{numbers[0]} of {count}", f"{numbers[1]} of {count}", str(numbers[2])]
+    rest = [f"{middle('iterations'):.0f}", f"{1e3 * middle('simulation_s'):.1f} ms", f"{ratio:.1f}", other]
+    return "| " + " | ".join([rows[0]["task"], *found, *seconds, *rest]) + " |"
 
 
-HEAD = """| Task | Referee | Verified | False | Guess | Solve | Search | Iterations | Drake | Iteration / Drake | Crocoddyl |
-|---|---|---|---|---|---|---|---|---|---|---|"""
+COLUMNS = (
+    "Task",
+    "Referee",
+    "Verified",
+    "False",
+    "Guess",
+    "Solve",
+    "of it to the end of the search",
+    "Iterations",
+    "Drake",
+    "Iteration / Drake",
+    "Crocoddyl",
+)
+HEAD = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|"
 
 
 def main():
@@ -179,7 +190,9 @@ def main():
             rows.append(row)
             open_rows.setdefault(row["task"], []).append(row)
             if arguments.why and not (row["verified"] and row["solved"]):
-                print(f"  {row['task']} {row['start']}: {row.get('message', '')[:300]} {row.get('wrong', '')}", flush=True)
+                print(
+                    f"  {row['task']} {row['start']}: {row.get('message', '')[:300]} {row.get('wrong', '')}", flush=True
+                )
             if len(open_rows[row["task"]]) == arguments.starts:
                 print(told_of(open_rows[row["task"]]), flush=True)
     if arguments.json:

@@ -1,7 +1,7 @@
 """Tasks of robots on legs: stand up, lower, lift a foot, jump in place and forward, trot, recover from a push.
 
-Each start is drawn: joints about a posture, held by a PD controller until the robot rests, and of a push the velocity
-of the base. The user says which foot stands when, and where the robot is to end.
+Each start is drawn: where the feet are about a posture, the base's place and turn, and of a push its velocity. A PD
+controller holds it until it rests. The user says which foot stands when, and where the robot is to end.
 """
 
 from collections.abc import Sequence
@@ -9,18 +9,17 @@ from functools import cache, partial
 
 import numpy as np
 from contact_task import Task, Tasks
-from helpers.legged import DISSIPATION, FRICTION, LEGGED, RELAXATION, legged_model, rest, robot_on_feet
+from helpers.legged import FRICTION, LEGGED, legged_model, rest, robot_on_feet
 from pydrake.geometry import HalfSpace, ProximityProperties
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
-from pydrake.multibody.tree import JointIndex
+from pydrake.multibody.tree import JacobianWrtVariable, JointIndex
 from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
 
-TIME_STEP = 0.02
-DRAWN = 0.08  # [rad] how far a joint's first position is drawn from its posture's
+TIME_STEP, OF_JUMPS = 0.02, 0.01  # [s]; where a robot flies at 1 m/s a foot moves by a third of its size in 10 ms
 PUSH, SPIN = 0.35, 0.5  # [m/s], [rad/s] the largest velocity of a push of Solo12; of others by their height
 HEIGHTS = {"solo12": 0.23, "go2": 0.31, "anymal": 0.45}  # [m] of the base, standing
 AT_PLACE, AT_REST, LEVEL, SPINS = 0.05, 0.3, 0.1, 1.0  # [m], [m/s], [rad], [rad/s] of the base at the end
@@ -76,22 +75,21 @@ TASKS: Tasks = {f"{robot}_{kind}": partial(make, robot) for robot in LEGGED for 
 
 
 def _task(robot, random, kind, first, last, phases, text, *, way=0.0, pushed=False):
-    model, facts = legged_model(robot, TIME_STEP), LEGGED[robot]
+    h = OF_JUMPS if kind in ("jump", "forward") and robot == "solo12" else TIME_STEP
+    model, facts = legged_model(robot, h), LEGGED[robot]
     nq = model.nq
-    x0 = rest(robot, model, np.array(first) + DRAWN * random.uniform(-1, 1, len(first)))
+    x0 = rest(robot, model, np.array(first), random)
     end = np.array(_posture(robot, last))
-    end[4:6] = x0[4:6] + [way, 0.0]
+    end[4:6] = x0[4] + way, x0[5]
     if pushed:
         x0[nq:] = _pushed(robot, model, x0, random)
-    steps = [(round(seconds / TIME_STEP), [facts.feet[i] for i in feet]) for seconds, feet in phases]
+    steps = [(round(seconds / h), [facts.feet[i] for i in feet]) for seconds, feet in phases]
     schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet)
     guess = schedule.guess(model, x0, end, swing=0.15 * HEIGHTS[robot])
     goals = [
         schedule,
         dd.FrameGoal(facts.base, position=end[4:7], tolerance=AT_PLACE),
-        dd.FrameVelocityGoal(
-            facts.base, tolerance=AT_REST, angular_velocity=(0.0, 0.0, 0.0), angular_tolerance=SPINS
-        ),
+        dd.FrameVelocityGoal(facts.base, tolerance=AT_REST, angular_velocity=(0.0, 0.0, 0.0), angular_tolerance=SPINS),
         dd.KeepLevel(facts.base, tolerance=LEVEL, knots=-1),
     ]
     follow = schedule.follow(model, guess)
@@ -105,7 +103,9 @@ def _task(robot, random, kind, first, last, phases, text, *, way=0.0, pushed=Fal
     knot = 0
     for count, standing in steps:
         middle, swinging = knot + count // 2, [foot for foot in facts.feet if foot not in standing]
-        asks += [(f"{foot} short of its clearance [m]", partial(_low, plant, facts, foot, middle), 0.0) for foot in swinging]
+        asks += [
+            (f"{foot} short of its clearance [m]", partial(_low, plant, facts, foot, middle), 0.0) for foot in swinging
+        ]
         knot += count
     return Task(
         name=f"{robot}_{kind}",
@@ -137,18 +137,11 @@ def _pushed(robot, model, x0, random):
     rows = []
     for foot in facts.feet:
         frame = plant.GetBodyByName(foot).body_frame()
-        kind = _velocities()
-        world = plant.world_frame()
+        kind, world = JacobianWrtVariable.kV, plant.world_frame()
         rows.append(plant.CalcJacobianTranslationalVelocity(context, kind, frame, np.zeros(3), world, world))
     by_v = np.vstack(rows)
     v[6:] = -np.linalg.lstsq(by_v[:, 6:], by_v[:, :6] @ v[:6], rcond=None)[0]
     return v
-
-
-def _velocities():
-    from pydrake.multibody.tree import JacobianWrtVariable
-
-    return JacobianWrtVariable.kV
 
 
 # What a referee measures, by Drake alone.
@@ -189,7 +182,7 @@ def _off_place(place, xs, us):
 
 
 def _tilt(xs, us):
-    w, x, y, z = xs[-1, :4] / np.linalg.norm(xs[-1, :4])
+    _, x, y, _ = xs[-1, :4] / np.linalg.norm(xs[-1, :4])
     return float(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
 
 
@@ -202,3 +195,23 @@ def _low(twin, facts, foot, knot, xs, us):
     plant.SetPositions(context, xs[knot, : plant.num_positions()])
     height = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(foot)).translation()[2] - facts.radius
     return float(max(IN_AIR - height, 0.0))
+
+
+def told(task):
+    """What another program needs to know of a task: plain values for JSON."""
+    robot = task.name.rsplit("_", 1)[0]
+    facts, problem = LEGGED[robot], task.problem
+    model = problem.model
+    return {
+        "file": str(robot_on_feet(robot)),
+        "feet": facts.feet,
+        "base": facts.base,
+        "friction": FRICTION,
+        "positions": list(model.state_names[: model.nq]),
+        "x0": np.asarray(problem.x0).tolist(),
+        "end": np.asarray(task.options["initial_guess"][0][-1]).tolist(),
+        "time_step": model.time_step,
+        "phases": task.schedule.phases,
+        "swing": 0.15 * HEIGHTS[robot],
+        "at_place": AT_PLACE,
+    }

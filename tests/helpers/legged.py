@@ -12,11 +12,13 @@ import numpy as np
 import drake_diff as dd
 from drake_diff.exceptions import ModelWarning
 from drake_diff.model.step import advance
+from drake_diff.optimize.scheduled.legs import Legs
 
 from .models import robot_file
 
 SINK = 1.25e-3  # [m] of a foot under an even share of the weight: what plans of 10 to 20 ms are found with
 RELAXATION, DISSIPATION, FRICTION = 0.05, 0.5, 0.7  # [s], [s/m]
+DRAWN, TURNED = 0.08, 0.05  # of the base's height, how far feet and centre of mass are drawn; [rad]
 SETTLES, SETTLE_STEP = 0.6, 0.002  # [s] of a PD controller that brings a posture to rest
 
 
@@ -123,25 +125,32 @@ def legged_model(name, time_step=0.02):
         )
 
 
-def rest(name, model, joints, turn=(0.0, 0.0, 0.0)):
-    """(nx,) a state at rest, the joints held at about `joints` by a PD controller, with the base turned [rad] first."""
+def rest(name, model, joints, random=None):
+    """(nx,) a state at rest, the joints held at about `joints` by a PD controller.
+
+    With a `random` generator the feet are drawn from about where they are, and the centre of mass and the base's turn.
+    """
     robot, fine = LEGGED[name], model.at_time_step(SETTLE_STEP)
     nq, count = model.nq, len(joints)
     x = np.array(model.default_state)
     x[:nq] = 0.0
-    quaternion = np.concatenate([[1.0], np.array(turn) / 2])
-    x[:4], x[nq - count : nq] = quaternion / np.linalg.norm(quaternion), joints
-    context = model.plant.CreateDefaultContext()
-    model.plant.SetPositions(context, x[:nq])
-    bottoms = [
-        model.plant.EvalBodyPoseInWorld(context, model.plant.GetBodyByName(foot)).translation()[2] - robot.radius
-        for foot in robot.feet
-    ]
-    x[6] -= min(bottoms) + SINK
+    x[0], x[nq - count : nq] = 1.0, joints
+    legs = Legs(model, robot.feet, x[:nq])
+    legs.put(x[:nq])
+    x[6] -= np.mean(legs.points()[:, 2]) + SINK
+    if random is not None:
+        legs.put(x[:nq])
+        places, mass, size = legs.points(), np.array(legs.center_of_mass()[0]), DRAWN * x[6]
+        places[:, :2] += size * random.uniform(-1, 1, (len(places), 2))
+        places[:, 2] = -SINK
+        turn = np.zeros(model.nv)
+        turn[:3] = TURNED * random.uniform(-1, 1, 3)
+        mass += size * random.uniform(-1, 1, 3)
+        x[:nq] = legs.posture(x[:nq], legs.moved(x[:nq], turn), mass, places, np.zeros(len(places), dtype=bool))
     kp, kd = robot.gains
-    drive = model.actuation[-count:]
+    drive, held = model.actuation[-count:], x[nq - count : nq].copy()
     for _ in range(round(SETTLES / SETTLE_STEP)):
-        torque = kp * (joints - x[nq - count : nq]) - kd * x[-count:]
+        torque = kp * (held - x[nq - count : nq]) - kd * x[-count:]
         x = np.array(advance(fine.double, x, np.linalg.solve(drive, torque)))
     x[nq:] = 0.0
     return x

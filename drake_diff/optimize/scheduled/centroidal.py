@@ -14,9 +14,14 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 
 ROUNDS = 3
-ALIKE, CHANGE, MOMENT, NEAR = 1e-2, 1.0, 100.0, 0.1  # weights, of forces in weights of the robot and lengths in its size
+ALIKE, CHANGE, MOMENT, NEAR = (
+    1e-2,
+    1.0,
+    100.0,
+    0.1,
+)  # weights, of forces in weights of the robot and lengths in its size
 STEP = 0.02  # [s] of which these weights are; they are rates, so that they say the same in steps of another length
-SHARE = 0.2  # of an even share of the weight: what a standing point carries at least
+SHARES = 0.5, 0.2, 0.02  # of an even share of the weight: what a standing point carries at least; the first that can be
 
 
 def plan_forces(
@@ -42,17 +47,25 @@ def plan_forces(
         friction: The largest sideways force, as a part of the upright one.
     """
     size = max(float(np.max(np.ptp(places[0], axis=0))) / 2, 1e-3)
-    found = np.array(way)
-    for _ in range(ROUNDS):
-        program = _Program(mass, gravity, time_step, size, stands)
-        program.follow(start, way)
-        program.share(friction)
-        program.keep_turn(places, found)
-        solved = program.solve()
-        if isinstance(solved, Refusal):
-            return solved
-        found, forces = solved
-    return found, forces
+
+    def rounds(least: float) -> tuple[Array, Array] | Refusal:
+        found: tuple[Array, Array] | Refusal = (np.array(way), np.zeros(0))
+        for _ in range(ROUNDS):
+            if isinstance(found, Refusal):
+                break
+            program = _Program(mass, gravity, time_step, size, stands)
+            program.follow(start, way)
+            program.share(friction, least)
+            program.keep_turn(places, found[0])
+            found = program.solve()
+        return found
+
+    tried = (rounds(least) for least in SHARES)
+    found: tuple[Array, Array] | Refusal = Refusal("")
+    for found in tried:
+        if not isinstance(found, Refusal):
+            break
+    return found
 
 
 class _Program:
@@ -91,7 +104,7 @@ class _Program:
         near = np.sqrt(NEAR * self.part) / self.size * np.eye(at.size)
         program.Add2NormSquaredCost(near, near @ way.ravel(), at.ravel())
 
-    def share(self, friction: float) -> None:
+    def share(self, friction: float, least: float) -> None:
         """Forces within friction, upwards, alike among the points, and alike from step to step."""
         program, steps = self.program, {(int(k), int(i)): j for j, (k, i) in enumerate(self.carries)}
         sides = np.array([[1, 0, -friction], [-1, 0, -friction], [0, 1, -friction], [0, -1, -friction]])
@@ -100,7 +113,7 @@ class _Program:
         for (k, i), j in steps.items():
             force, share = self.forces[j], 1 / len(self.of_step[k])
             program.AddLinearConstraint(sides, np.full(4, -np.inf), np.zeros(4), force)
-            program.AddBoundingBoxConstraint(SHARE * share, np.inf, force[2])
+            program.AddBoundingBoxConstraint(least * share, np.inf, force[2])
             program.Add2NormSquaredCost(alike, alike @ (share * up), force)
             before = steps.get((k - 1, i))
             if before is not None:

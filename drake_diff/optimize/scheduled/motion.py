@@ -69,7 +69,7 @@ def scheduled_motion(
     places[:, :, 2] += arcs + _lifts(mass[:, 2], on)
     landing = on & ~np.vstack([on[:1], on[:-1]])
     places[landing, 2] -= LANDS
-    ways, qs = s[:, None] * legs.apart(end, first) + _run_out(legs, x0[model.nq :], h * np.arange(len(on))), [first]
+    ways, qs = s[:, None] * legs.apart(end, first) + _run_out(legs, x0[model.nq :], h, len(on)), [first]
     for k in range(1, len(on)):
         wish = legs.moved(first, ways[k])
         qs.append(legs.posture(qs[-1], wish, mass[k], places[k], on[k] & on[k - 1]))
@@ -112,10 +112,10 @@ def _foot_ways(first: Array, last: Array, on: Mask, clearance: float) -> tuple[A
     return places, arcs
 
 
-def _run_out(legs: Legs, v: Array, times: Array) -> Array:
+def _run_out(legs: Legs, v: Array, h: float, count: int) -> Array:
     """(N+1, nv) how a first spin of the base, of v (nv,), goes on for a while and comes back."""
     spin = np.zeros(legs.model.nv)
-    turn = slice(legs.base_v, legs.base_v + 3)
+    turn, times = slice(legs.base_v, legs.base_v + 3), h * np.arange(float(count))
     spin[turn] = v[turn]
     return np.asarray((times * np.maximum(1 - times / min(RUNS_OUT, times[-1]), 0.0) ** 3)[:, None] * spin)
 
@@ -150,6 +150,7 @@ def _inputs(legs: Legs, x: Array, v_next: Array, forces: Array, carries: Array) 
     by_force = legs.jacobians()[0][carries].reshape(-1, model.nv).T
     needed = needed - by_force @ forces[carries].ravel()
     gives = -np.asarray(twin.mass_matrix())[:, base : base + 6]
-    columns = np.hstack([BY_INPUT * model.actuation, BY_FORCE * by_force, BY_BASE * gives])
+    part = forces[carries][:, 2] / max(float(np.mean(forces[carries][:, 2])), 1e-9) if carries.any() else np.zeros(0)
+    columns = np.hstack([BY_INPUT * model.actuation, BY_FORCE * by_force * np.repeat(part, 3), BY_BASE * gives])
     found = np.linalg.lstsq(columns, needed, rcond=1e-9)[0]
     return np.asarray(BY_INPUT * found[: model.nu])
