@@ -19,7 +19,7 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import Motion, expand, jacobians_along
 from drake_diff.optimize.ilqr.ilqr import _Search, costs_to_go, solve_ilqr
-from drake_diff.optimize.ilqr.riccati import minimize_in_box, solve_riccati
+from drake_diff.optimize.ilqr.riccati import LinearQuadratic, minimize_in_box, solve_riccati
 from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.solution import Status
 
@@ -458,13 +458,67 @@ def swing_up(**changes):
 
 
 def test_a_swing_up_converges_as_newtons_method_does():
-    """44 steps; more than 190 without the dynamics' curvature by differences."""
+    """47 steps; more than 190 without the dynamics' curvature by differences."""
     problem = swing_up()
     solution = dd.solve(problem, method="ilqr")
     assert solution.success, solution.message
     assert len(solution.iterations) < 70
     shooting = dd.solve(problem, method="shooting", solver="ipopt", initial_guess=solution)
     assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize(("file", "goal"), [("cart_pole.urdf", [0, np.pi, 0, 0]), ("acrobot.xml", [np.pi, 0, 0, 0])])
+def test_a_step_takes_few_rollouts(file, goal, monkeypatch):
+    """At most 2.5 for each step that is taken, where full steps are too long: halving from 1 took 3.2."""
+    rolled, roll = [], _Search._roll
+
+    def counted(self, *args):
+        rolled.append(args)
+        return roll(self, *args)
+
+    monkeypatch.setattr(_Search, "_roll", counted)
+    model = dd.load_model(MODELS / file, time_step=0.02)
+    cost = dd.QuadraticCost(Q=100 * np.eye(4), x_ref=goal)
+    effort = dd.QuadraticCost(R=[[0.01]])
+    problem = dd.Problem(model, x0=np.zeros(4), num_steps=100, running_cost=effort, final_cost=cost)
+    us = np.full((100, 1), 0.1)
+    xs = dd.rollout(model, problem.x0, us).xs
+    result, _, _ = solve_ilqr(problem, xs, us, limits=Limits(60, 60.0, 1e-6), report=None)
+    steps = result.iterations[1:]
+    assert sum(row.step < 1 for row in steps) > 10
+    assert len(rolled) <= 2.5 * len(steps)
+    assert steps[-1].objective < 1e-2 * result.iterations[0].objective
+
+
+def test_a_ridge_is_in_the_units_of_what_it_is_added_to():
+    """With one input in other units, 1000 times as many of them, the regularized motion is the same."""
+    plain, p = [], _around(np.ones(2))
+    for scale in (np.ones(2), np.array([1.0, 1000.0])):
+        policy = solve_riccati(_around(scale), 0.7)
+        plain.append(policy.feedforward * scale)
+    np.testing.assert_allclose(plain[1], plain[0], rtol=1e-9)  # a Cholesky factor's rounding
+    assert np.abs(solve_riccati(p, 0.0).feedforward - plain[0]).max() > 1e-3
+
+
+def _around(scale):
+    """A linear-quadratic problem of three states, whose two inputs are in units of `scale`."""
+    random = np.random.default_rng(4)
+    F, g = random.standard_normal((5, 3, 5)), random.standard_normal((5, 5))
+    H = np.tile(np.eye(5), (5, 1, 1))
+    into = np.diag(np.concatenate([np.ones(3), scale]))
+    one = np.full((5, 2), np.inf)
+    return LinearQuadratic(
+        F @ into,
+        np.zeros((5, 3)),
+        g @ into,
+        into @ H @ into,
+        np.ones(3),
+        np.eye(3),
+        -one,
+        one,
+        np.zeros(3),
+        np.zeros(3),
+    )
 
 
 def test_no_riccati_problem_is_solved_twice(monkeypatch):

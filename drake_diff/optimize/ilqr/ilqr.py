@@ -35,10 +35,16 @@ from drake_diff.optimize.program import (
     ctrl_c,
 )
 
-SMALLEST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-8, 1e8
+# Regularization, of the inputs' own curvature: the least at all, the first that is tried, and the last.
+SMALLEST_REGULARIZATION, FIRST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-4, 1e-3, 1e8
+ROUNDING_OF_CURVATURE = 1e-8  # of the inputs' curvature: what makes one that is only just not positive definite so
+HARDER = 8.0  # the factor between two regularizations
 SUFFICIENT_DECREASE = 1e-4
-STEP_SIZES = tuple(0.5 ** np.arange(12))
-CUT_BACK, SHORT = 1 / 8, 1 / 32  # two such steps: the model reaches too far; several: a search crawls
+TRIALS = 5  # sizes along one policy; then a shorter policy is asked for
+LONGER = 2.0  # times a step that had been cut back: the first size that is tried after it
+MOST_CUT, LEAST_CUT = 0.1, 0.5  # of a size that was too long: the parabola's minimum is kept between
+LONG, TINY = 1 / 2, 1 / 100  # from a step that long on less regularization will do; below that it takes more
+SHORT, LITTLE = 1 / 32, 1e-2  # several steps cut back to that, each of which gains so little of the cost: it crawls
 # Of the cost: a promise below this is lost in the rounding of the cost's sum.
 ROUNDING = 1e-13
 # Of what the next update of the multipliers changes in the augmented cost: what a minimization before it may leave.
@@ -85,8 +91,8 @@ def solve_ilqr(
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
 
-    After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump.
-    Before that it regularizes where steps are short, as the model reaches too far. `least_penalty` is what constraints
+    After `patience` steps that had to be cut back to less than SHORT and gain LITTLE, with no better between them, the
+    search ends as inaccurate: it crawls along a jump. `least_penalty` is what constraints
     weigh from the start, `values` (np,) are those of the problem's `design` to begin with, its own where None;
     `begun` are the multipliers of a search like this one. A motion
     on the way that cannot be stepped or differentiated is a step that is too long, which the message counts; raises
@@ -122,7 +128,7 @@ def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
 
 
 def _least_regularized(solve: _Solve, model: LinearQuadratic) -> AffinePolicy | None:
-    return solve(model, 0.0) or solve(model, SMALLEST_REGULARIZATION)
+    return solve(model, 0.0) or solve(model, ROUNDING_OF_CURVATURE)
 
 
 def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: float) -> bool:
@@ -159,7 +165,8 @@ class _Search:
         self.constraints.start(*self.motion.point, self.cost, float(np.sum(self.motion.gaps**2)))
         self.jacobians: Array | None = None
         self.gap_weight = 0.0
-        self.regularization = 0.0
+        self.regularization, self.ahead = 0.0, 1.0  # how far is tried first, as a part of a step not regularized
+        self.crawled = 0  # steps cut back to less than SHORT that gained LITTLE, since the last better one
         self.gains = math.inf, math.inf  # of the merit, by the last two steps of this minimization
         self.stalled = False
         self.refusals, self.refusal = 0, ""  # trial motions that could not be differentiated, and why the last
@@ -185,7 +192,7 @@ class _Search:
             if final and exhausted:
                 return Outcome.INFEASIBLE if stands else Outcome.INACCURATE
             self.constraints.update(*self.motion.point)
-            self.gains = math.inf, math.inf
+            self.gains, self.ahead = (math.inf, math.inf), 1.0
             final = reached or exhausted
             if not final:
                 self.constraints.penalty *= GROWTH
@@ -197,8 +204,7 @@ class _Search:
             outcome = self._step(model, final)
             if outcome is not None:
                 return outcome
-            steps = [row.step for row in self.rows[1:]]
-            if len(steps) >= self.patience and max(steps[-int(self.patience) :]) < SHORT:  # it crawls along a jump
+            if self.crawled >= self.patience:  # along a jump
                 self.stalled = True
                 return Outcome.INACCURATE
             if interrupted.is_set():
@@ -241,9 +247,6 @@ class _Search:
             policies = (solve(one, self.regularization) for one in models)
             policy = next((p for p in policies if p is not None and p.expected >= 0), None)
             if policy is not None and self._search_along(model, policy):
-                is_cut_back = math.isfinite(self.patience) and all(row.step <= CUT_BACK for row in self.rows[-2:])
-                relaxed = self.regularization / 8 if self.regularization / 8 > SMALLEST_REGULARIZATION else 0.0
-                self.regularization = self._tightened() if is_cut_back else relaxed
                 return None
             if is_reached(ROUNDING * scale):
                 return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
@@ -254,37 +257,60 @@ class _Search:
         return Outcome.NO_GRADIENT if self.refusals > refusals else Outcome.INACCURATE
 
     def _tightened(self) -> float:
-        return max(8 * self.regularization, SMALLEST_REGULARIZATION)
+        return max(HARDER * self.regularization, FIRST_REGULARIZATION)
 
     def _search_along(self, model: LinearQuadratic, policy: AffinePolicy) -> bool:
-        """Take the largest of `STEP_SIZES` that lowers the merit enough, if there is one."""
+        """Take a step along `policy` that lowers the merit enough, if a few sizes find one.
+
+        Tried first is the full one, or twice the last step where that had to be cut back; where a size is too long,
+        next is where the parabola through the slope and what was found has its minimum.
+        """
         slope, distance = policy.slope, self.motion.distance
         if distance:
             slope, curvature = slope_along(model, policy)
             self.gap_weight = max(self.gap_weight, 2 * (slope + max(curvature, 0) / 2) / distance)
             slope -= self.gap_weight * distance
-        merit = self._merit(self.motion, self.cost)
-        for size in STEP_SIZES:
-            try:
-                motion = self._roll(policy, size)
-                with np.errstate(all="ignore"):  # a merit that is not finite is no decrease
-                    cost = self._objective(motion)
-                    found = self._merit(motion, cost)
-            except SimulationError:
-                continue  # too long a step: a shorter one is tried next
-            if found <= merit + SUFFICIENT_DECREASE * size * slope:
-                try:
-                    jacobians = jacobians_along(self.problem, motion)
-                except (GradientError, SimulationError) as error:
-                    self.refusals, self.refusal = self.refusals + 1, str(error)
-                    continue
-                self.motion, self.cost, self.jacobians = motion, cost, jacobians
-                self.gains = self.gains[1], merit - found
-                self.rows.append(Iteration(len(self.rows), cost, self._infeasibility(), policy.gradient, size))
-                if self.report:
-                    self.report.row(self.rows[-1])
+        merit, size = self._merit(self.motion, self.cost), min(1.0, self.ahead * (1 + self.regularization))
+        for trial in range(TRIALS):
+            found = self._try(policy, size, merit, slope)
+            if found is None:
+                self.ahead = LONGER * size / (1 + self.regularization) if trial else 1.0
+                crawls = size < SHORT and self.gains[1] < LITTLE * abs(merit)
+                self.crawled = self.crawled + (trial > 0) if crawls else 0
+                if size >= LONG:
+                    relaxed = self.regularization / HARDER
+                    self.regularization = relaxed if relaxed > SMALLEST_REGULARIZATION else 0.0
+                elif size < TINY and trial:
+                    self.regularization = self._tightened()
                 return True
+            excess = found - merit - slope * size
+            least = -slope * size**2 / (2 * excess) if excess > 0 else 0.0  # 0 where what was found is infinite
+            size = min(max(least, MOST_CUT * size), LEAST_CUT * size)
+        self.ahead = 1.0  # the next policy is shorter itself
         return False
+
+    def _try(self, policy: AffinePolicy, size: float, merit: float, slope: float) -> float | None:
+        """None if the step was taken, as it lowers `merit` enough; else the merit there, infinite if it has none."""
+        try:
+            motion = self._roll(policy, size)
+        except SimulationError:
+            return math.inf
+        with np.errstate(all="ignore"):  # a merit that is not finite is no decrease
+            cost = self._objective(motion)
+            found = self._merit(motion, cost)
+        if not found <= merit + SUFFICIENT_DECREASE * size * slope:
+            return found if math.isfinite(found) else math.inf
+        try:
+            jacobians = jacobians_along(self.problem, motion)
+        except (GradientError, SimulationError) as error:
+            self.refusals, self.refusal = self.refusals + 1, str(error)
+            return math.inf
+        self.motion, self.cost, self.jacobians = motion, cost, jacobians
+        self.gains = self.gains[1], merit - found
+        self.rows.append(Iteration(len(self.rows), cost, self._infeasibility(), policy.gradient, size))
+        if self.report:
+            self.report.row(self.rows[-1])
+        return None
 
     def _roll(self, policy: AffinePolicy, size: float) -> Motion:
         """Step from x_0 with feedback, each gap shrunk to 1 - `size` of itself."""

@@ -15,6 +15,7 @@ from drake_diff._base.arrays import Array
 
 BOX_ITERATIONS = 30
 HALVINGS = 0.5 ** np.arange(20)
+LEAST_SCALE = 1e-12  # of the largest diagonal entry: an input of no effect has a ridge too
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,9 @@ class AffinePolicy:
 
 
 def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePolicy | None:
-    """The best policy, `regularization` added to the inputs' Hessian; None if that is not positive definite.
+    """The best policy, `regularization` times its own diagonal added to the inputs' Hessian.
+
+    None if that is not positive definite. So the step is about 1 + `regularization` times shorter, whatever the units.
 
     The recursion is that of [1; dx], so that V = [[c, s'], [s, P]] is all that remains to be paid and
     K = [feedforward, feedback] all that is done, in the fewest products: NumPy's calls, and memory that is new at every
@@ -86,7 +89,7 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePoli
     V[-1, 0, 0], V[-1, 0, 1:], V[-1, 1:, 0] = 0.0, problem.final_gradient, problem.final_gradient
     V[-1, 1:, 1:] = problem.final_hessian
     bounded = np.asarray((np.isfinite(problem.lower) | np.isfinite(problem.upper)).any(axis=1))
-    ridge, Q_uu, Q_ux, gaps = regularization * np.eye(m), Q[w:, w:], Q[w:, :w], bool(np.any(problem.gaps))
+    Q_uu, Q_ux, gaps = Q[w:, w:], Q[w:, :w], bool(np.any(problem.gaps))
     try:
         for k in range(count - 1, -1, -1):
             F[1:, 1:] = problem.F[k]
@@ -96,7 +99,7 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePoli
             Q[1:, 1:] += problem.hessians[k]
             Q[0, 1:] += problem.gradients[k]
             Q[1:, 0] += problem.gradients[k]
-            hessian = Q_uu + ridge if regularization else Q_uu
+            hessian = _with_ridge(Q_uu, regularization)
             K_k = _gains(hessian, Q_ux)
             if bounded[k]:
                 K_k, free[k] = _within(hessian, Q_ux, K_k, problem.lower[k], problem.upper[k])
@@ -137,10 +140,23 @@ def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: fl
     moves = np.flatnonzero(problem.start_lower < problem.start_upper)
     if not len(moves):
         return start, 0.0
-    hessian = P[np.ix_(moves, moves)] + regularization * np.eye(len(moves))
+    hessian = _with_ridge(P[np.ix_(moves, moves)], regularization)
     lower, upper = problem.start_lower[moves], problem.start_upper[moves]
     start[moves], free = minimize_in_box(hessian, s[moves], lower, upper)
     return start, float(np.abs(s[moves[free]]).max(initial=0.0))
+
+
+def _with_ridge(hessian: Array, regularization: float) -> Array:
+    """`hessian` with `regularization` times its diagonal added, of entries that are far below the largest a part of it.
+
+    The ridge of an all-zero diagonal is `regularization` itself.
+    """
+    if not regularization:
+        return hessian
+    diagonal = np.abs(np.diagonal(hessian))
+    largest = np.max(diagonal)
+    scale = np.maximum(diagonal, LEAST_SCALE * largest) if largest > 0 else np.ones(len(diagonal))
+    return np.asarray(hessian + regularization * np.diag(scale))
 
 
 def _gains(hessian: Array, Q_ux: Array) -> Array:
