@@ -18,12 +18,6 @@ class Band:
     below: Array  # (N, n, n) in row k + 1 of column k
     beneath: Array  # (N, n, n) in row k + 2
 
-    def plus(self, added: Array) -> "Band":
-        """With `added` (N, n) on the diagonal."""
-        diagonal, own = np.array(self.diagonal), np.arange(added.shape[1])
-        diagonal[:, own, own] += added
-        return Band(diagonal, self.below, self.beneath)
-
     def solve(self, right: Array) -> Array | None:
         """(N n,) the solution for the right side (N, n); None where the matrix is not positive definite."""
         N, n = right.shape

@@ -10,14 +10,16 @@ as in Drake's step (see `derivatives.smooth_step`), but for f_c, which is smooth
 
 phi + h vn being the distance after the step, F the force of what just touches, sigma the reach, s the speed at which
 friction begins to slide and d a dissipation that leaves no rebound: 1 - vn / w for vn < 0, (1 - vn / (2 w))^2 to 2 w,
-then 0. Inverse dynamics need no contact solver, and everything here has a closed form.
+then 0. Links of one tree push each other on the true plant alone. Inverse dynamics need no contact solver, and
+everything here has a closed form.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, cross, skew
 from drake_diff._base.refusal import Refusal
@@ -234,6 +236,18 @@ def _within(pairs: ContactPairs, poses: Array, far: float) -> Touches:
     return replace(touch, middle=touch.middle + further, phi=touch.phi + far, change=change)
 
 
+def _of_one_tree(pairs: ContactPairs, rows: Array, topology: Topology) -> NDArray[np.bool_]:
+    """(P,) whether the same root carries both, by which degrees of freedom move each body (bodies, nv)."""
+    first = np.where(rows.any(axis=1), np.argmax(rows > 0, axis=1), -1 - np.arange(len(rows)))
+    return np.asarray(first[pairs.sphere_body] == first[pairs.other_body])
+
+
+def _part(pairs: ContactPairs, kept: NDArray[np.bool_]) -> ContactPairs:
+    ids = tuple(pair for pair, keep in zip(pairs.ids, kept, strict=True) if keep)
+    arrays = {f.name: getattr(pairs, f.name)[kept] for f in fields(pairs) if f.name not in ("bodies", "ids")}
+    return replace(pairs, ids=ids, **arrays)
+
+
 def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
     """Of a tree of hinges, slides and free bodies whose contacts are of spheres; else why there is none."""
     form = form_of(model)
@@ -246,18 +260,20 @@ def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
     tree = tree_of(model, free=True)
     if isinstance(tree, Refusal):
         return tree
-    description, pairs = describe_tree(model), read_pairs(model)
+    description = describe_tree(model)
     topology = topology_of(description)
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
     labels[model.plant.world_body().index()] = "world"
-    rows = [topology.bodies[labels[body.index()]] for body in pairs.bodies]
+    all_pairs = read_pairs(model)
+    rows = np.array([topology.bodies[labels[body.index()]] for body in all_pairs.bodies]).reshape(-1, model.nv)
+    pairs = _part(all_pairs, ~_of_one_tree(all_pairs, rows, topology))
     return RelaxedPlant(
         model=model,
         tree=tree,
         coordinates=description.coordinates,
         pairs=pairs,
         topology=topology,
-        by_body=np.array(rows).reshape(-1, model.nv),
+        by_body=rows,
         material=read_material(model.double, pairs),
         actuation=np.asarray(form.actuation),
         labels=labels,

@@ -146,6 +146,17 @@ class RelaxedSearch:
 
     # ------------------------------------------------------------------ the augmented cost
 
+    @property
+    def learned(self) -> tuple[Any, ...]:
+        """Multipliers and penalties, to go back to."""
+        own = self.rest_multipliers, self.input_multipliers, self.rest_penalty, self.input_penalty
+        return (*own, self.constraints.forces, self.constraints.penalty)
+
+    @learned.setter
+    def learned(self, learned: tuple[Any, ...]) -> None:
+        self.rest_multipliers, self.input_multipliers, self.rest_penalty, self.input_penalty, forces, penalty = learned
+        self.constraints.forces, self.constraints.penalty = forces, penalty
+
     def _start(self, motion: RelaxedMotion) -> None:
         self.started = True
         cost = self.problem.objective(motion.xs, motion.us)
@@ -266,9 +277,12 @@ class RelaxedSearch:
         return g, H
 
     def _step(self, gradient: Array, band: Band, damping: float) -> Array | None:
-        size = np.einsum("kii->ki", band.diagonal)
-        added = damping * np.maximum(size, SMALLEST * np.max(size)) + np.finfo(float).tiny
-        return band.plus(added).solve(-gradient.reshape(size.shape))
+        """Gauss-Newton's step with a damping of how speeds change: a whole motion may shift, no knot alone."""
+        size = np.mean(np.einsum("kii->ki", band.diagonal), axis=0)
+        held = damping * np.diag(np.maximum(size, SMALLEST * np.max(size)) + np.finfo(float).tiny)
+        diagonal = band.diagonal + 2 * held
+        diagonal[-1] -= held
+        return Band(diagonal, band.below - held, band.beneath).solve(-gradient.reshape(self.count, self.nv))
 
     def _moved(self, q: Array, step: Array) -> Array:
         d = step.reshape(self.count, self.nv)

@@ -1,12 +1,11 @@
 """Relaxed stages of a search through contact, and the motion of the true plant that they lead to.
 
 The reach of contact shrinks from stage to stage, and each begins where the one before ended. The true plant then
-follows what each stage found, under the feedback of a linear-quadratic regulator: the one that comes nearest is where
+follows what each stage found, under the feedback of a linear-quadratic regulator: the one that it follows best is where
 the search on the true plant begins. A stage only warms up the next, and the schedule goes on where one does not end.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.plant import bodies
-from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import Motion, jacobians_along
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic, solve_riccati
 from drake_diff.optimize.problem.problem import Problem
@@ -30,18 +28,8 @@ SLIP, LEAST_SLIP = 0.1, 0.02  # [m/s] in the first stage, and in any
 REBOUND = 0.1  # [m/s] contact that parts faster than twice that does not push
 SHARE = 1 / 3  # of its weight that pushes a body which just touches
 WITHOUT_GRAVITY = 1.0  # [m/s^2]
-INPUTS = 0.1  # of a state's range: what the whole range of an input is worth to the regulator
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """What one stage found, and where the true plant gets that follows it; `merit` orders those."""
-
-    softness: Softness
-    found: Found
-    xs: Array
-    us: Array
-    miss: float
+# What the whole range of an input is worth to the regulator, where that of a state's is 1; at the last it does nothing.
+WEIGHTS = (0.1, 10.0, 1e9)
 
 
 def describe(problem: Problem) -> RelaxedPlant:
@@ -57,13 +45,17 @@ def describe(problem: Problem) -> RelaxedPlant:
 
 
 def relaxed_schedule(problem: Problem, plant: RelaxedPlant) -> tuple[Softness, ...]:
-    """The stages, from the model's sizes and masses: reaches from half of the thinnest shape or a sixth of the gap."""
+    """The stages, from the model's sizes and masses: reaches from half of the thinnest shape or a sixth of the gap.
+
+    What just touches pushes with a third of the lighter one's weight, and no contact is stiffer than the model's own.
+    """
     model = problem.model
     gap = float(np.min(plant.distances(problem.x0[None, : model.nq])))
     first = float(np.clip(max(thinnest_geometry(model)[0] / 2, gap / NEAREST), SMALLEST_REACH, LARGEST_REACH))
-    force, found = _weights(problem, plant) * SHARE, []
+    weight, stiffest, found = _weights(problem, plant) * SHARE, plant.material.stiffness * np.log(2), []
     for number in range(STAGES):
         reach = first / 2**number
+        force = np.minimum(weight, stiffest * reach)
         found.append(Softness(reach, force, max(LEAST_SLIP, SLIP / 2**number), REBOUND))
     return tuple(found)
 
@@ -96,8 +88,9 @@ def solve_relaxed(
     log: Callable[[Softness, Found], None],
     tell: Callable[[str], None],
 ) -> tuple[Array, Array]:
-    """The motion of the true plant (xs (N+1, nx), us (N, nu)) that comes nearest, from the positions of a guess xs."""
-    search, stages = RelaxedSearch(problem, plant), list[Stage]()
+    """The motion of the true plant (xs (N+1, nx), us (N, nu)) that follows a stage best; it begins at a guess's xs."""
+    search, starts = RelaxedSearch(problem, plant), list[tuple[float, Array, Array]]()
+    closed: tuple[Array, Any] | None = None
     q = np.array(xs[:, : problem.model.nq])
     q[0] = problem.x0[: problem.model.nq]
     for i, _ in plant.coordinates.free:
@@ -106,20 +99,24 @@ def solve_relaxed(
         found = search.run(q, softness, ITERATIONS, is_over, tell)
         q = found.motion.q
         log(softness, found)
-        followed = follow(problem, found.motion.xs, found.motion.us)
-        if followed is not None:
-            stages.append(Stage(softness, found, *followed, search.constraints.violation(*followed)))
+        for weight in WEIGHTS:
+            followed = follow(problem, found.motion.xs, found.motion.us, weight)
+            if followed is not None:
+                apart = (followed[0] - found.motion.xs) / problem.ranges(found.motion.xs)
+                starts.append((float(np.mean(apart**2)) + found.gap + found.violation, *followed))
         if is_over():
             break
-    if not stages:
+        if found.ended != "inaccurate":
+            closed = q, search.learned
+        elif closed is not None:  # the next one begins where the last that closed ended
+            q, search.learned = closed
+    if not starts:
         raise SimulationError("the true plant can follow none of the relaxed stages")
-    measure = AugmentedLagrangian(problem)
-    measure.penalty = search.constraints.penalty
-    best = min(stages, key=lambda s: problem.objective(s.xs, s.us) + measure.value(s.xs, s.us))
-    return best.xs, best.us
+    _, xs, us = min(starts, key=lambda start: start[0])
+    return xs, us
 
 
-def follow(problem: Problem, xs: Array, us: Array) -> tuple[Array, Array] | None:
+def follow(problem: Problem, xs: Array, us: Array, weight: float) -> tuple[Array, Array] | None:
     """The true plant as it follows xs (N+1, nx), us (N, nu) under feedback; None where it cannot be stepped along."""
     bounds = problem.bounds
     us = np.clip(us, bounds.u_lower, bounds.u_upper)
@@ -128,7 +125,7 @@ def follow(problem: Problem, xs: Array, us: Array) -> tuple[Array, Array] | None
         with problem.intervals(problem.parameters) as intervals:
             for k, u in enumerate(us):
                 ends[k] = intervals.end(xs[k], u)
-            feedback = _feedback(problem, xs, us, ends)
+            feedback = _feedback(problem, xs, us, ends, weight)
             found, inputs = np.array(xs), np.array(us)
             found[0] = problem.x0
             for k in range(len(us)):
@@ -139,13 +136,13 @@ def follow(problem: Problem, xs: Array, us: Array) -> tuple[Array, Array] | None
     return (found, inputs) if np.all(np.isfinite(found)) else None
 
 
-def _feedback(problem: Problem, xs: Array, us: Array, ends: Array) -> Array:
-    """(N, nu, nx) that of the regulator which weighs states by their ranges along xs and inputs by theirs."""
+def _feedback(problem: Problem, xs: Array, us: Array, ends: Array, weight: float) -> Array:
+    """(N, nu, nx) that of the regulator which weighs states by their ranges along xs, inputs by theirs and `weight`."""
     (N, nu), nx = us.shape, problem.nx
     F = jacobians_along(problem, Motion(xs, us, ends - xs[1:]))
     limit = np.minimum(np.abs(problem.bounds.u_lower), np.abs(problem.bounds.u_upper))
     size = np.where(np.isfinite(limit), limit, np.maximum(np.max(np.abs(us), axis=0), 1.0))
-    Q, R = 1 / problem.ranges(xs) ** 2, INPUTS / size**2
+    Q, R = 1 / problem.ranges(xs) ** 2, weight / size**2
     model = LinearQuadratic(
         F=F,
         gaps=np.zeros((N, nx)),
