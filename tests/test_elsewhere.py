@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.models import ball_on_ground
 from helpers.plants import pd_pendulum
 from helpers.problems import lqr, pendulum
 from helpers.table import each_row
@@ -24,29 +25,8 @@ from drake_diff.optimize.elsewhere import Follower
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.record.solve import EvidenceRecord, FollowedEvidence
 
-# A ball that does not turn, on slides along x and z, over flat ground.
-BALL = """<sdf version="1.9" xmlns:drake="drake"><world name="flat">
-<model name="ground"><static>true</static><link name="ground"><collision name="ground">
-<geometry><plane><normal>0 0 1</normal></plane></geometry>{material}</collision></link></model>
-<model name="ball"><link name="slider"><inertial><mass>0.001</mass></inertial></link>
-<link name="ball"><inertial><mass>1</mass></inertial>
-<collision name="ball"><geometry><sphere><radius>0.1</radius></sphere></geometry>{material}</collision></link>
-<joint name="x" type="prismatic"><parent>world</parent><child>slider</child>
-<axis><xyz>1 0 0</xyz><limit><effort>0</effort></limit></axis></joint>
-<joint name="z" type="prismatic"><parent>slider</parent><child>ball</child>
-<axis><xyz>0 0 1</xyz><limit><effort>0</effort></limit></axis></joint>
-</model></world></sdf>"""
-MATERIAL = """<drake:proximity_properties><drake:point_contact_stiffness>{k}</drake:point_contact_stiffness>
-<drake:relaxation_time>{tau}</drake:relaxation_time><drake:mu_static>{mu}</drake:mu_static>
-<drake:mu_dynamic>{mu}</drake:mu_dynamic></drake:proximity_properties>"""
 FREE = math.nan
 G, MU, STIFF = 9.81, 0.4, 2e4
-
-
-def ball(tmp_path, time_step, *, k=STIFF, tau=0.01, mu=MU):
-    path = tmp_path / "ball.sdf"
-    path.write_text(BALL.format(material=MATERIAL.format(k=k, tau=tau, mu=mu)))
-    return dd.load_model(path, time_step=time_step)
 
 
 def given(model, x0, us, **fields):
@@ -60,7 +40,7 @@ def given(model, x0, us, **fields):
 
 def slide(tmp_path, speed=1.0, **fields):
     """It slides to rest within v^2 / (2 mu g) and v / (mu g), on a spring that its weight presses by m g / k."""
-    model = ball(tmp_path, 0.01)
+    model = ball_on_ground(tmp_path, time_step=0.01, stiffness=STIFF, relaxation_time=0.01, friction=MU)
     x0 = [0, 0.1 - G * 1.001 / (STIFF / 2), speed, 0]
     distance, count = speed**2 / (2 * MU * G), round(1.2 * speed / (MU * G) / 0.01)
     return given(model, x0, np.zeros((count, 0)), x_goal=[distance, FREE, 0, 0], **fields), distance
@@ -170,7 +150,7 @@ def test_a_simulator_with_a_number_that_is_20_percent_off_is_told(tmp_path, quan
 def test_a_plan_that_lives_by_its_coarse_step_is_told_where_it_does_not_hold(tmp_path):
     """A spring without loss throws a ball back to where it fell from; a step that is longer than the blow stops it."""
     h, fall = 0.02, 0.1
-    model = ball(tmp_path, h, k=1e6, tau=0.0)
+    model = ball_on_ground(tmp_path, time_step=h, stiffness=1e6, relaxation_time=0.0, friction=MU)
     count = round(2 * math.sqrt(2 * fall / G) / h)
     solution = given(model, [0, 0.1 + fall, 0, 0], np.zeros((count, 0)), x_goal=[FREE, 0.1, FREE, 0])
     found = elsewhere(solution).elsewhere
@@ -187,7 +167,7 @@ def test_a_plan_that_lives_by_its_coarse_step_is_told_where_it_does_not_hold(tmp
 
 def test_where_nothing_is_asked_of_the_end_the_plans_own_end_is(tmp_path):
     """The same ball, and a cost alone: without it, a motion that ends anywhere would hold."""
-    model = ball(tmp_path, 0.02, k=1e6, tau=0.0)
+    model = ball_on_ground(tmp_path, time_step=0.02, stiffness=1e6, relaxation_time=0.0, friction=MU)
     found = elsewhere(given(model, [0, 0.2, 0, 0], np.zeros((14, 0)))).elsewhere
     assert found.rows[0].holds
     (row,) = found["continuous time"]

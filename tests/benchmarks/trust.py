@@ -41,6 +41,7 @@ PARTS = (
     "undefined",
     "truth",
     "impact",
+    "elsewhere",
 )
 
 

@@ -1,6 +1,7 @@
 """What many tests load or build: the models of this repository, robots, and plants under construction."""
 
 import warnings
+import zlib
 from importlib.metadata import files
 from pathlib import Path
 
@@ -110,3 +111,28 @@ def robot(name, tmp_path):
 def ur5():
     with pytest.warns(ModelWarning):  # meshes skipped
         return dd.load_model(robot_file("ur5_robot.urdf"), time_step=0.02)
+
+
+# A ball that does not turn, on slides along x and z, over flat ground.
+BALL_ON_GROUND = """<sdf version="1.9" xmlns:drake="drake"><world name="flat">
+<model name="ground"><static>true</static><link name="ground"><collision name="ground">
+<geometry><plane><normal>0 0 1</normal></plane></geometry>{material}</collision></link></model>
+<model name="ball"><link name="slider"><inertial><mass>0.001</mass></inertial></link>
+<link name="ball"><inertial><mass>1</mass></inertial>
+<collision name="ball"><geometry><sphere><radius>0.1</radius></sphere></geometry>{material}</collision></link>
+<joint name="x" type="prismatic"><parent>world</parent><child>slider</child>
+<axis><xyz>1 0 0</xyz><limit><effort>0</effort></limit></axis></joint>
+<joint name="z" type="prismatic"><parent>slider</parent><child>ball</child>
+<axis><xyz>0 0 1</xyz><limit><effort>0</effort></limit></axis></joint>
+</model></world></sdf>"""
+MATERIAL = """<drake:proximity_properties><drake:point_contact_stiffness>{k}</drake:point_contact_stiffness>
+<drake:relaxation_time>{tau}</drake:relaxation_time><drake:mu_static>{mu}</drake:mu_static>
+<drake:mu_dynamic>{mu}</drake:mu_dynamic></drake:proximity_properties>"""
+
+
+def ball_on_ground(folder, *, time_step, stiffness, relaxation_time, friction=0.4):
+    """That ball, and the ground, each of this stiffness [N/m] and relaxation time [s]; its file is in `folder`."""
+    text = BALL_ON_GROUND.format(material=MATERIAL.format(k=stiffness, tau=relaxation_time, mu=friction))
+    path = folder / f"ball_{zlib.crc32(text.encode())}.sdf"  # a model is built again from its file
+    path.write_text(text)
+    return dd.load_model(path, time_step=time_step)

@@ -1,0 +1,142 @@
+"""Where else a plan is said to hold: how often that is true, by formulas of what becomes of it there.
+
+Balls fall on springs with losses, and what discrete steps make of the blow is the plan: where they are in continuous
+time is found by SciPy, from one formula of the force. Balls slide to rest over d = v^2 / (2 mu g) in MuJoCo, where one
+number is off.
+"""
+
+import re
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from helpers.models import ball_on_ground
+from scipy.integrate import solve_ivp
+from trust import Figure
+
+import drake_diff as dd
+from drake_diff.artifact.other_plants import followed_in
+from drake_diff.engines.load import load_engine
+from drake_diff.optimize.elsewhere import STATE_TOLERANCE, WIDER, Follower
+from drake_diff.optimize.solution import Solution, Status
+
+COUNT = 120
+G, RADIUS, FREE = 9.81, 0.1, np.nan
+CLEAR = 0.8  # a miss of more than this part of what is allowed, and of less than its inverse, decides nothing
+OFF = 0.2  # how far a number of MuJoCo's is off
+# By what it is: where it stands in the MJCF.
+NUMBERS = {
+    "friction": r'(pair [^>]*friction=")([0-9.e+-]+) ([0-9.e+-]+)',
+    "stiffness": r'(pair [^>]*solref=")(-[0-9.e+-]+)',
+    "mass": r'(body name="ball" [^>]*>\s*<inertial mass=")([0-9.e+-]+)',
+    "gravity": r'(gravity="[0-9.e+-]+ [0-9.e+-]+ )(-[0-9.e+-]+)',
+    "damping": r'(joint name="x" [^>]* damping=")([0-9.e+-]+)',
+    "shapes": r'(geom name="ball[^>]* size=")([0-9.e+-]+)',
+}
+
+
+def measure(seed: int, count: int) -> list[Figure]:
+    with tempfile.TemporaryDirectory() as folder:
+        return _measured(np.random.default_rng(seed), count, Path(folder))
+
+
+def _measured(random, count, folder):
+    said = {True: [0, 0], False: [0, 0]}  # by the truth: told so, of all
+    for _ in range(count):
+        truth, held = fallen(random, folder)
+        if truth is not None:
+            said[truth][0] += held == truth
+            said[truth][1] += 1
+    told, motions, wrong, right = [0, 0], [0, 0], 0, 0
+    for k in range(max(count // 2, 1)):
+        quantity = [*NUMBERS, ""][k % (len(NUMBERS) + 1)]
+        truth, row = slid(random, quantity, folder)
+        if quantity:
+            told[0] += any(line.startswith(f"{quantity}: ") for line in row.unlike) and not row.holds
+            told[1] += 1
+        else:
+            wrong += bool(row.unlike)
+            right += 1
+        if truth is not None:
+            motions[0] += (not row.failures) == truth
+            motions[1] += 1
+    return [
+        Figure("plans that do not hold in continuous time, told", *said[False], 0.99, True),
+        Figure("plans that hold in continuous time, told", *said[True], 0.95, True),
+        Figure("simulators one of whose numbers is 20 % off, told with its name", *told, 1.0, True),
+        Figure("right simulators said to be others", wrong, right, 0.0, False),
+        Figure(
+            "slides in a simulator, right or not, judged by their motion as their formula says", *motions, 0.99, True
+        ),
+    ]
+
+
+def given(model, x0, steps, goal):
+    xs = dd.rollout(model, x0, num_steps=steps).xs
+    end = xs[-1] if goal is None else np.array(goal)
+    keep = np.isfinite(end) if goal is not None else np.array([False, True, False, False])
+    asked = {"x_goal": np.where(keep, end, FREE), "optimize": "initial_state", "final_cost": lambda x: x[0]}
+    problem = dd.Problem(model, x0=x0, num_steps=steps, **asked)
+    return Solution(problem, "given", "none", Status.CONVERGED, "given", xs, np.zeros((steps, 0)))
+
+
+def fallen(random, folder):
+    """(whether it holds in continuous time, None where that is near; what was said)."""
+    k, tau = 10 ** random.uniform(4.3, 6), float(random.choice([0.0, 10 ** random.uniform(-4, -2)]))
+    h, fall = float(random.choice([0.005, 0.01, 0.02, 0.05])), random.uniform(0.02, 0.15)
+    model = ball_on_ground(folder, time_step=h, stiffness=k, relaxation_time=tau)
+    x0 = np.array([0.0, RADIUS + fall, 0.0, 0.0])
+    steps = max(2, round(random.uniform(1.2, 3.0) * np.sqrt(2 * fall / G) / h))
+    solution = given(model, x0, steps, None)
+    height = by_formula(k / 2, 2 * tau, fall, steps * h)
+    miss = abs(height + RADIUS - solution.xs[-1, 1])
+    part = miss / (STATE_TOLERANCE * solution.plan.scale[1])
+    row = Follower(solution.plan).in_continuous_time()
+    return (None if CLEAR < part < 1 / CLEAR else bool(part <= 1)), row.holds
+
+
+def by_formula(k, tau, fall, duration):
+    """[m] over the ground of a ball of 1 kg after it fell on a spring that never pulls: f = k (d + tau d')+, d > 0."""
+
+    def rates(_, state):
+        z, v = state
+        push = max(0.0, k * (-z - tau * v)) if z < 0 else 0.0
+        return [v, push - G]
+
+    step = min(1e-4, 0.02 / np.sqrt(k))
+    found = solve_ivp(rates, (0, duration), [fall, 0.0], method="RK45", max_step=step, rtol=1e-8, atol=1e-10)
+    return found.y[0, -1]
+
+
+def slid(random, quantity, folder):
+    """(whether its motion ends where it was to, None where that is near or not told by the formula; the row)."""
+    mu, speed, h = random.uniform(0.2, 0.8), random.uniform(0.5, 2.0), float(random.choice([0.005, 0.01]))
+    model = ball_on_ground(folder, time_step=h, stiffness=2e4, relaxation_time=0.01, friction=mu)
+    steps = round(1.3 * speed / (mu * G) / h)
+    distance = speed**2 / (2 * mu * G)
+    x0 = [0.0, RADIUS - G / 1e4, speed, 0.0]
+    solution = given(model, x0, steps, [distance, FREE, 0.0, FREE])
+    engine = load_engine("mujoco", model, time_step=0.001)
+    off = 1 + OFF * float(random.choice([-1, 1]))
+    if quantity:
+        text = planted(engine.mjcf, quantity, off)
+        (folder / "other.xml").write_text(text)
+        engine = load_engine("mujoco", model, path=folder / "other.xml")
+    row = followed_in(Follower(solution.plan), engine)
+    if quantity not in ("", "friction", "mass"):
+        return None, row
+    miss = abs(distance / (off if quantity == "friction" else 1.0) - distance)
+    part = miss / (WIDER * STATE_TOLERANCE * solution.plan.scale[0])
+    return (None if CLEAR < part < 1 / CLEAR else bool(part <= 1)), row
+
+
+def planted(text, quantity, off):
+    """The MJCF with a number 20 % off; a damping of nothing becomes one."""
+
+    def changed(found):
+        numbers = [float(number) for number in found.groups()[1:]]
+        return found.group(1) + " ".join(repr(off * number if number else OFF) for number in numbers)
+
+    text, times = re.subn(NUMBERS[quantity], changed, text)
+    assert times == 1, quantity
+    return text
