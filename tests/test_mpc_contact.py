@@ -126,3 +126,25 @@ def test_where_derivatives_are_wrong_the_last_plan_is_followed(solo, monkeypatch
     monkeypatch.setattr(realtime, "linearize", turned)
     mpc(struck(model, rest, 0.6), 0.0)
     assert "followed further: no step lowers what is paid" in mpc.status
+
+
+def test_it_pushes_from_a_guess_that_does_not_touch(two_spheres):
+    """A sphere pushes another, 0.1 m apart at first, to 0.5 m, and stops: by a cost that wants it behind the other.
+
+    0.5 kg against 5 N s/m stops within 2 cm from 0.2 m/s.
+    """
+    model = two_spheres(damping=5.0)
+    times, x0, steps = 0.02 * np.arange(101), np.array([0.0, 0.3, 0.0, 0.0]), 100
+    wanted = 0.3 + 0.2 * np.clip(times, 0, 1)
+    speeds = np.where(times < 1, 0.2, 0.0)
+    xs = np.column_stack([wanted - 0.2, wanted, speeds, speeds])  # two radii of 0.1 m behind
+    weight = np.diag([20.0, 200.0, 1.0, 1.0])
+    follow = dd.optimize.TrackingCost((times, xs), Q=weight, R=[[1e-3]])
+    ends = dd.QuadraticCost(Q=weight, x_ref=xs[-1])
+    problem = dd.Problem(model, x0=x0, num_steps=steps, running_cost=follow, final_cost=ends)
+    still = np.tile(x0, (steps + 1, 1)), np.zeros((steps, 1))
+    mpc = dd.loop.MPC(problem, horizon=20, plan=still)
+    run = dd.loop.closed_loop(model, mpc, x0, 90)
+    assert run.motion.xs[0, 1] - run.motion.xs[0, 0] == pytest.approx(0.3)
+    assert run.motion.xs[-1, 1] == pytest.approx(0.5, abs=0.02)
+    assert abs(run.motion.xs[-1, 3]) < 0.02

@@ -7,6 +7,7 @@ LQR. Without a goal, the problem's own costs go on over the moving horizon.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -33,6 +34,8 @@ from drake_diff.optimize.solve import solve
 PLAN_STEPS = 300  # of the first plan, made once
 DAMPED = 1e-3  # of the cost of a step, for a move by a whole range: the least damping
 PLENTY, NEAR = 100, 1e-6  # after so many, with limits that hold, a plan will do of which a step promises no more
+# Of what a plan that touches costs: a step that gains less ends it, at a damping of up to so much.
+SETTLED, MOST_DAMPED = 1e-4, 1.0
 FOLLOWED = "the last plan is followed further"
 FAR_MORE = 2.0  # than was planned: what the last gains may cost from where the plant is before others are tried
 FIXED_POINT_STEPS, AT_REST = 20, 1e-10
@@ -271,14 +274,17 @@ class MPC:
     def _plan_the_whole(self, xs: Array, us: Array) -> Motion:
         """A minimum near the given plan, whose costs-to-go are the tails."""
         problem, rolling = self._problem, self._rolling
-        stretch = rolling.stretch(0, problem.num_steps).along(xs)
+        stretch, paid = rolling.stretch(0, problem.num_steps), np.inf
         xs, us = np.array(xs), np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
         xs[0] = problem.x0
         motion, ranges = Motion(xs, us, stretch.ends(xs[:-1], us)), problem.ranges(xs)
         efforts = np.maximum(np.ptp(us, axis=0), SMALLEST_RANGE)
+        if np.max(np.abs(motion.gaps) / ranges) > GAP and problem.model.contract.contact.collision_pairs:
+            stretch = replace(stretch, rolls=True)  # what is no motion says nothing of what touches
         unit = abs(stretch.cost(xs, us)) / problem.num_steps / np.concatenate([ranges, efforts]) ** 2
         damping = 0.0
         for i in range(PLAN_STEPS):
+            stretch = stretch if stretch.rolls else stretch.along(motion.xs)
             found = take_step(stretch, motion, damping * unit if damping else None)
             if isinstance(found, Refusal):
                 raise InputError("plan", got=found.reason, expected="a plan near which a minimum is found")
@@ -286,6 +292,9 @@ class MPC:
             is_near = i >= PLENTY and not step.whole and step.promised <= NEAR * (1 + abs(step.merit))
             if damping <= DAMPED and (step.is_reached or not step.size or is_near):
                 break
+            if stretch.rolls and damping <= MOST_DAMPED and paid - step.merit <= SETTLED * (1 + abs(step.merit)):
+                break  # a minimum at a kink is never reached
+            paid = step.merit if stretch.rolls else np.inf
             less = damping / 8 if damping > DAMPED else 0.0
             damping = max(8 * damping, DAMPED) if step.size < 1.0 else less
         if damping:  # gains and costs-to-go are those of the problem itself

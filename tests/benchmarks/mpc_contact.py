@@ -1,13 +1,17 @@
-"""MPC of models that touch, in real time on one core: a standing quadruped under blows, and a trot.
+"""MPC of models that touch, in real time on one core: quadrupeds that stand and trot, a push, a spinner, under blows.
 
     pip install -e '.[test]'
-    python tests/benchmarks/mpc_contact.py [--only stand,trot] [--count 20] [--seed 0] [--markdown FILE]
+    python tests/benchmarks/mpc_contact.py [--only stand,trot,push,aside,spin] [--count 20] [--seed 0] [--markdown FILE]
 
 The robots are those of example-robot-data with feet, a ground and a PD controller in each motor, as quadrupeds have.
 `dd.loop.MPC` plans with steps of 20 ms and is asked at 50 Hz. What it drives is no plan's model: Drake's Simulator in
 steps of 1 ms, under the old input while the controller's thread computes. An answer that takes longer than the period
 is missed: the old input is held for the whole tick. A blow is an impulse at the trunk's centre of mass, given as the
-speed that the whole robot would have by it. Beside it, the same blows meet the PD controllers alone.
+speed that the whole robot would have by it. Beside it, the same blows meet the PD controllers alone; in a trot they
+follow its joints' reference.
+
+A ball on two motors pushes a box 0.4 m ahead, and a finger of two joints turns a spinner by 1 rad: both from where they
+touch and from where they do not, and what is pushed is struck. Beside them, the inputs of the plan alone.
 """
 
 import argparse
@@ -18,6 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
@@ -25,18 +30,26 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np  # noqa: E402
-from helpers.robots import example_robot  # noqa: E402
-from pydrake.multibody.plant import MultibodyPlant  # noqa: E402
-from pydrake.multibody.tree import JacobianWrtVariable  # noqa: E402
+from helpers.models import MODELS  # noqa: E402
+from helpers.robots import FOOT, example_robot  # noqa: E402
+from pydrake.multibody.parsing import Parser  # noqa: E402
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant  # noqa: E402
+from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
+from pydrake.systems.framework import DiagramBuilder  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
 from drake_diff._base.statistics import success_rate  # noqa: E402
 from drake_diff.loop.mpc import FOLLOWED  # noqa: E402
 
-FINE, TICK, HORIZON = 1e-3, 0.02, 10  # [s], [s], knots
+FINE, TICK, HORIZON, LONG = 1e-3, 0.02, 10, 30  # [s], [s], knots of a quadruped, and of what is pushed
 SPEEDS = (0.3, 0.6, 0.9, 1.2, 1.5)  # [m/s] of the blows
 AFTER = 2.0  # [s] in which a robot has to be as it was
+SOME = (0.0, 0.3, 0.6)  # [m/s] of those in a trot
+STRUCK, ASIDE = (0.0, 0.2, 0.4), (0.1,)  # [m/s] of the box: back towards the ball, and from any side
+TURNED = (0.0, 1.0, 2.0)  # [rad/s] of the spinner, back
+GAIT, SPEED, LIFT, TROTS = 0.4, 0.2, 0.05, 3.0  # [s], [m/s], [m], [s]
+ON_THE_WAY, LIFTED = 0.6, 0.01  # of the reference, and [m] each foot: what a trot has to come, and to lift
 TILTED, LOWER, MOVES = 0.2, 0.04, 0.5  # [rad], [m], [m/s or rad/s]: what is no recovery
 LEG = (0.0, 0.8, -1.6)
 
@@ -97,6 +110,49 @@ def standing(robot):
     return dd.loop.MPC(problem, horizon=HORIZON, plan=plan), plan
 
 
+def trot_reference(robot, times):
+    """Joints' sinusoids: diagonal feet swing in turn; (xs (n, nx), torques (n, nu) beside the controllers')."""
+    model, rest, nq, reach = model_of(robot, TICK), rest_of(robot, TICK), 19, 2 * robot.link * np.cos(LEG[1])
+
+    def joints(t):
+        ramp, found = min(max(t, 0.0) / GAIT, 1.0), []
+        for diagonal in (0.0, 0.5, 0.5, 0.0):
+            part, long = (t / GAIT + diagonal) % 1, SPEED * GAIT / 2 * ramp
+            swing = 2 * part - 1
+            x = long * (0.5 - 2 * part) if part < 0.5 else long * (swing - np.sin(2 * np.pi * swing) / 2 / np.pi - 0.5)
+            z = reach - LIFT * ramp * (0.0 if part < 0.5 else np.sin(np.pi * swing) ** 2)
+            knee = -2 * np.arccos(min(np.hypot(x, z) / (2 * robot.link), 1.0))
+            found += [0.0, np.arctan2(-x, z) - knee / 2, knee]
+        return np.array(found)
+
+    q = np.array([joints(t) for t in times])
+    v = np.array([(joints(t + 1e-4) - joints(t - 1e-4)) / 2e-4 for t in times])
+    kp, kd = robot.gains
+    xs, stance, ahead = np.tile(rest, (len(times), 1)), np.tile(LEG, 4), SPEED * np.minimum(times / GAIT, 1.0)
+    xs[:, 7:nq] += q - stance
+    xs[:, nq + 3], xs[:, nq + 6 :] = ahead, v
+    xs[:, 4] += np.concatenate([[0.0], np.cumsum(TICK * ahead[:-1])])
+    assert model.nq == nq
+    return xs, kp * (q - stance) + kd * v
+
+
+@cache
+def trotting(robot):
+    """(MPC, reference)."""
+    model, steps = model_of(robot, TICK), round(TROTS / TICK) + HORIZON
+    times = TICK * np.arange(steps + 1)
+    xs, us = trot_reference(robot, times)
+    Q, R = weights(model, robot)
+    Q[4, 4], Q[22, 22] = 200, 20
+    Q[range(7, 19), range(7, 19)], Q[range(25, 37), range(25, 37)] = 10, 0.1
+    problem = dd.Problem(
+        model, x0=xs[0], num_steps=steps, bounds=bounds(model, robot),
+        running_cost=dd.optimize.TrackingCost((times, xs, us), Q=Q, R=R),
+        final_cost=dd.QuadraticCost(Q=Q, x_ref=xs[-1]),
+    )  # fmt: skip
+    return dd.loop.MPC(problem, horizon=HORIZON, plan=(xs, us[:-1])), (xs, us)
+
+
 class Plant:
     """The referee's: Drake's Simulator in steps of FINE."""
 
@@ -110,6 +166,8 @@ class Plant:
             self.plant.get_desired_state_input_port(instance).FixValue(self.context, target)
         self.input = self.plant.get_actuation_input_port().FixValue(self.context, np.zeros(model.nu))
         self.trunk = self.plant.GetBodyByName(robot.trunk)
+        named = [self.plant.get_body(BodyIndex(i)) for i in range(1, self.plant.num_bodies())]
+        self.feet = [body for body in named if self.plant.GetCollisionGeometriesForBody(body)]
         self.mass, self.steps = self.plant.CalcTotalMass(self.context), 0
 
     @property
@@ -121,6 +179,10 @@ class Plant:
         self.plant.SetPositionsAndVelocities(self.context, x)
         self.simulator.Initialize()
         self.steps = 0
+
+    def heights(self):
+        """[m] of the feet over the ground."""
+        return [body.EvalPoseInWorld(self.context).translation()[2] - FOOT for body in self.feet]
 
     def go_on(self, u, to):
         """Until the step `to` under u."""
@@ -147,6 +209,7 @@ class Run:
     taken: list[float] = field(default_factory=list)
     statuses: list[str] = field(default_factory=list)
     lost: bool = False
+    heights: list[list[float]] = field(default_factory=list)  # [m] of the feet over the ground
 
     @property
     def missed(self):
@@ -176,7 +239,169 @@ def drive(plant, controller, x, ticks, blow=None, first=None):
             run.lost = True
             break
         run.xs.append(plant.x)
+        run.heights.append(plant.heights())
     return run
+
+
+SPINNER = """<sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="spinner">
+{links}
+<joint name="base" type="revolute"><parent>world</parent><child>upper</child><axis><xyz>0 0 1</xyz>
+ <limit><effort>2</effort></limit><dynamics><damping>0.05</damping></dynamics></axis></joint>
+<joint name="knuckle" type="revolute"><pose relative_to="upper">0.2 0 0 0 0 0</pose><parent>upper</parent>
+ <child>lower</child><axis><xyz>0 0 1</xyz><limit><effort>2</effort></limit>
+ <dynamics><damping>0.05</damping></dynamics></axis></joint>
+<joint name="pivot" type="revolute"><parent>world</parent><child>bar</child><axis><xyz>0 0 1</xyz>
+ <limit><effort>0</effort></limit><dynamics><damping>0.02</damping></dynamics></axis></joint>
+</model></sdf>"""
+LINK = """<link name="{name}"><pose>{at}</pose><inertial><pose>{com} 0 0 0 0 0</pose><mass>{mass}</mass><inertia>
+<ixx>{i}</ixx><iyy>{i}</iyy><izz>{i}</izz><ixy>0</ixy><ixz>0</ixz><iyz>0</iyz></inertia></inertial>{shape}</link>"""
+SHAPE = """<collision name="tip"><pose>{at}</pose><geometry>{shape}</geometry><drake:proximity_properties>
+<drake:point_contact_stiffness>20000</drake:point_contact_stiffness><drake:relaxation_time>0.1</drake:relaxation_time>
+<drake:hunt_crossley_dissipation>50</drake:hunt_crossley_dissipation><drake:mu_static>0.3</drake:mu_static>
+<drake:mu_dynamic>0.3</drake:mu_dynamic></drake:proximity_properties></collision>"""
+
+
+def spinner_text():
+    """A finger of two links of 0.2 m in the plane, and a bar of 0.3 m on a pivot 0.3 m ahead; gravity is across."""
+    tip = SHAPE.format(at="0.2 0 0 0 0 0", shape="<sphere><radius>0.02</radius></sphere>")
+    bar = SHAPE.format(at="0 0 0 0 1.5707963 0", shape="<capsule><radius>0.015</radius><length>0.3</length></capsule>")
+    upper = LINK.format(name="upper", at="0 0 0 0 0 0", com=0.1, mass=0.3, i=1e-3, shape="")
+    lower = LINK.format(name="lower", at="0.2 0 0 0 0 0", com=0.1, mass=0.2, i=7e-4, shape=tip)
+    pivoted = LINK.format(name="bar", at="0.3 0 0 0 0 0", com=0, mass=0.2, i=1.5e-3, shape=bar)
+    return SPINNER.format(links="\n".join((upper, lower, pivoted)))
+
+
+class Table:
+    """A plant in a plane as pydrake alone reads and steps it."""
+
+    def __init__(self, text):
+        builder = DiagramBuilder()
+        self.plant, _ = AddMultibodyPlantSceneGraph(builder, FINE)
+        self.plant.SetUseSampledOutputPorts(False)
+        Parser(self.plant).AddModelsFromString(text, "sdf")
+        self.plant.Finalize()
+        self.simulator = Simulator(builder.Build())
+        self.context = self.plant.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+        port = self.plant.get_actuation_input_port()
+        self.input, self.steps = port.FixValue(self.context, np.zeros(port.size())), 0
+
+    x, start, go_on = Plant.x, Plant.start, Plant.go_on
+
+    def heights(self):
+        """There are no feet."""
+        return []
+
+    def push(self, change):
+        """By a jump of the speeds."""
+        self.plant.SetVelocities(self.context, self.plant.GetVelocities(self.context) + change)
+
+
+@dataclass(frozen=True)
+class Pushed:
+    """What is pushed: its file, first states that touch and that do not, a reference, weights, a blow and a verdict."""
+
+    text: str
+    starts: dict[str, np.ndarray]
+    xs: np.ndarray
+    weights: tuple[np.ndarray, np.ndarray]
+    blow: Callable[[np.random.Generator, float], np.ndarray]
+    ends: Callable[[np.ndarray], bool]
+    effort: float
+
+
+def box_push(most=np.pi / 4):
+    """The ball behind the box takes it 0.4 m ahead in 2 s, and stops; blows within `most` of straight back."""
+    times = TICK * np.arange(round(3.5 / TICK) + HORIZON + 1)
+    part = np.clip(times / 2, 0, 1)
+    way = 0.4 * (3 * part**2 - 2 * part**3)
+    speed = np.where(part < 1, 0.4 * 6 * part * (1 - part) / 2, 0.0)
+    xs = np.zeros((len(times), 10))
+    xs[:, 0], xs[:, 3], xs[:, 5], xs[:, 8] = way, way - 0.2, speed, speed
+    apart = np.array([0, 0, 0, -0.3, 0.0, 0, 0, 0, 0, 0.0])
+
+    def ends(x):
+        return np.hypot(x[0] - 0.4, x[1]) <= 0.03 and abs(x[2]) <= 0.2 and np.max(np.abs(x[5:8])) <= 0.05
+
+    def blow(random, size):
+        angle = np.pi + random.uniform(-most, most)
+        return np.array([size * np.cos(angle), size * np.sin(angle), 3 * size * random.uniform(-1, 1), 0, 0])
+
+    states = np.diag([200.0, 200, 50, 20, 2, 1, 1, 1, 0.5, 0.5])
+    return Pushed(
+        (MODELS / "box_push.sdf").read_text(), {"touching": xs[0], "apart": apart}, xs, (states, 1e-3 * np.eye(2)),
+        blow, ends, 20.0,
+    )  # fmt: skip
+
+
+def spin():
+    """The finger's tip turns the bar by 1 rad in 1.5 s, and stops."""
+    times = TICK * np.arange(round(3.0 / TICK) + HORIZON + 1)
+    part = np.clip(times / 1.5, 0, 1)
+    angle, rate_ = 3 * part**2 - 2 * part**3, np.where(part < 1, 6 * part * (1 - part) / 1.5, 0.0)
+
+    def finger(turned, gap):
+        """The joints with the tip beside the bar, 0.1 m from its pivot on the far side, which it pushes ahead."""
+        along, across = np.array([np.cos(turned), np.sin(turned)]), np.array([np.sin(turned), -np.cos(turned)])
+        x, y = np.array([0.3, 0.0]) - 0.1 * along - (0.035 + gap) * across
+        knuckle = -np.arccos(np.clip((x * x + y * y) / 0.08 - 1, -1, 1))
+        return np.arctan2(y, x) - knuckle / 2, knuckle
+
+    xs = np.zeros((len(times), 6))
+    xs[:, :2], xs[:, 2] = [finger(a, 0.0) for a in angle], angle
+    xs[:, 3:5], xs[:, 5] = np.gradient(xs[:, :2], TICK, axis=0), rate_
+    apart = np.array([*finger(0.0, 0.05), 0, 0, 0, 0])
+
+    def ends(x):
+        return abs(x[2] - 1) <= 0.1 and abs(x[5]) <= 0.1
+
+    states = np.diag([20.0, 20, 200, 0.1, 0.1, 1])
+    touching = np.array([*xs[0, :3], 0, 0, 0])
+    return Pushed(
+        spinner_text(), {"touching": touching, "apart": apart}, xs, (states, 1e-2 * np.eye(2)),
+        lambda random, size: np.array([0, 0, -size * random.uniform(0.5, 1)]), ends, 2.0,
+    )  # fmt: skip
+
+
+@cache
+def model_of_text(text):
+    folder = Path(mkdtemp())
+    (folder / "task.sdf").write_text(text)
+    return dd.load_model(folder / "task.sdf", time_step=TICK)
+
+
+def pushes(name, make, sizes, unit):
+    """Rows of a push from where it touches and where it does not."""
+
+    def rows(seed, count):
+        task, found_rows = make(), []
+        model, table = model_of_text(task.text), Table(task.text)
+        steps, most = len(task.xs) - 1, np.full(2, task.effort)
+        Q, R = task.weights
+        times = TICK * np.arange(steps + 1)
+        for where, x0 in task.starts.items():
+            problem = dd.Problem(
+                model, x0=x0, num_steps=steps, bounds=dd.Bounds(u_lower=-most, u_upper=most),
+                running_cost=dd.optimize.TrackingCost((times, task.xs), Q=Q, R=R),
+                final_cost=dd.QuadraticCost(Q=Q, x_ref=task.xs[-1]),
+            )  # fmt: skip
+            guess = np.tile(x0, (steps + 1, 1)), np.zeros((steps, 2))
+            if where == "touching":
+                guess = np.vstack([x0, task.xs[1:]]), np.zeros((steps, 2))
+            mpc = dd.loop.MPC(problem, horizon=LONG, plan=guess)
+            planned, ticks = mpc.plan[1], steps - HORIZON
+            for size in sizes:
+                runs, alone = [], 0
+                for i in range(count):
+                    random = np.random.default_rng([seed, i, 5])
+                    blow = int(random.integers(30, 90)), task.blow(random, size)
+                    mpc.start(x0)
+                    runs.append(drive(table, mpc, x0, ticks, blow))
+                    alone += bool(task.ends(drive(table, Played(planned), x0, ticks, blow).xs[-1]))
+                good = sum(not r.lost and bool(task.ends(r.xs[-1])) for r in runs)
+                found_rows.append(told(f"{name}, {where}, blow of {size:g} {unit}", runs, good, alone))
+        return found_rows
+
+    return rows
 
 
 def tilt(x):
@@ -215,8 +440,57 @@ def rate(found, of):
     return f"{found} of {of} ({100 * r.lower:.0f} to {100 * r.upper:.0f} %)"
 
 
+def trotted(run, rest, xs):
+    """Whether it is upright and as high as it was, has come most of its way, and has lifted each foot."""
+    x = run.xs[-1]
+    if run.lost or not np.all(np.isfinite(x)) or np.any(np.max(run.heights, axis=0) < LIFTED):
+        return False
+    way = (x[4] - rest[4]) / (xs[len(run.xs) - 1, 4] - xs[0, 4])
+    return tilt(x) <= TILTED and abs(x[6] - rest[6]) <= LOWER and way >= ON_THE_WAY
+
+
+class Played:
+    """Inputs us (N, nu) as they are."""
+
+    def __init__(self, us):
+        self.us = us
+
+    def __call__(self, x, t):
+        return self.us[min(round(t / TICK), len(self.us) - 1)]
+
+
+def told(task, found, good, alone):
+    """A row of the page."""
+    taken, missed = np.concatenate([r.taken for r in found]), sum(r.missed for r in found)
+    followed = sum(FOLLOWED in s for r in found for s in r.statuses)
+    row = (
+        f"| {task} | {rate(good, len(found))} | {rate(alone, len(found))} | {percentiles(taken)} | "
+        f"{missed} of {len(taken)} | {100 * followed / len(taken):.1f} % |"
+    )
+    print(row, flush=True)
+    return row
+
+
+def trot(seed, count):
+    """Rows of the robots that trot."""
+    rows = []
+    for name, robot in ROBOTS.items():
+        plant, (mpc, (xs, us)), rest = Plant(robot), trotting(robot), rest_of(robot, FINE)
+        for speed in SOME:
+            found, alone = [], 0
+            for i in range(count):
+                tick = int(np.random.default_rng([seed, i, 3]).integers(50, 75))
+                blow = tick, blow_of(1000 * seed + i, speed, plant.mass)
+                mpc.start(xs[0])
+                found.append(drive(plant, mpc, rest, round(TROTS / TICK), blow))
+                alone += trotted(drive(plant, Played(us), rest, round(TROTS / TICK), blow), rest, xs)
+            good = sum(trotted(r, rest, xs) for r in found)
+            rows.append(told(f"{name} trots, blow of {speed:g} m/s", found, good, alone))
+    return rows
+
+
 def stand(seed, count):
-    """(rows, held) of the robots under blows."""
+    """Rows of the robots that stand."""
     rows = []
     for name, robot in ROBOTS.items():
         plant, (mpc, plan) = Plant(robot), standing(robot)
@@ -228,15 +502,8 @@ def stand(seed, count):
                 mpc.start(plan[0][0])
                 found.append(drive(plant, mpc, rest, ticks, blow))
                 alone += recovered(drive(plant, Idle(len(plan[1][0])), rest, ticks, blow), rest)
-            taken, missed = np.concatenate([r.taken for r in found]), sum(r.missed for r in found)
-            followed = sum(FOLLOWED in s for r in found for s in r.statuses)
             up = sum(recovered(r, rest) for r in found)
-            rows.append(
-                f"| {name} stands, blow of {speed:g} m/s ({plant.mass * speed:.3g} N s) | {rate(up, count)} | "
-                f"{rate(alone, count)} | {percentiles(taken)} | {missed} of {len(taken)} | "
-                f"{100 * followed / len(taken):.1f} % |"
-            )
-            print(rows[-1], flush=True)
+            rows.append(told(f"{name} stands, blow of {speed:g} m/s ({plant.mass * speed:.3g} N s)", found, up, alone))
     return rows
 
 
@@ -249,7 +516,13 @@ Written by `python tests/benchmarks/mpc_contact.py --markdown docs/mpc_realtime.
 | Task | Recovered (95 % Wilson) | PD alone | Latency [ms]: median, 95 %, worst | Missed ticks | Followed further |
 |---|---|---|---|---|---|
 """
-TASKS: dict[str, Callable] = {"stand": stand}
+TASKS: dict[str, Callable] = {
+    "stand": stand,
+    "trot": trot,
+    "push": pushes("box pushed", box_push, STRUCK, "m/s"),
+    "aside": pushes("box pushed, struck from any side", lambda: box_push(np.pi), ASIDE, "m/s"),
+    "spin": pushes("spinner turned", spin, TURNED, "rad/s"),
+}
 
 
 def main():
