@@ -58,6 +58,10 @@ class Analytic:
         smooth = analytic_of(steps.model)
         if isinstance(smooth, Refusal):
             return smooth
+        if not parameters and not steps.some_touch and not steps.model.num_constraints:
+            values, known = smooth(steps)
+            if np.count_nonzero(known) == len(known):  # as a rule; of one step in half the time of what follows
+                return Jacobians(values, {})
         impulsive = steps.touching | (steps.model.num_constraints > 0)
         free = np.flatnonzero(~impulsive)
         if len(free) == len(steps) and not parameters:

@@ -167,13 +167,14 @@ def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
     model, vector = steps.model, steps.vector
     _check_derivatives(model, chosen.values)
     nx, end, names = model.nx, model.nx + model.nu, vector.names
-    found, rows = [], zip(steps.x_next, chosen.values, chosen.methods, chosen.reasons, strict=True)
-    for x_next, jacobian, used, reason in rows:
-        A, B, C = frozen(jacobian[:, :nx]), frozen(jacobian[:, nx:end]), frozen(jacobian[:, end:])
+    x_next, values = frozen(steps.x_next), frozen(chosen.values)  # what is taken of them is read-only too
+    found, rows = [], zip(x_next, values, chosen.methods, chosen.reasons, strict=True)
+    for end_state, jacobian, used, reason in rows:
+        A, B, C = jacobian[:, :nx], jacobian[:, nx:end], jacobian[:, end:]
         sources = (used,) * len(names) if used in OF_ONE_KIND else vector.sources
         if used == IMPLICIT.name and vector.step_entry is not None:
             sources = (*sources[: vector.step_entry], used, *sources[vector.step_entry + 1 :])
-        found.append(StepDerivatives(frozen(x_next), A, B, C, names, sources, used, reason))
+        found.append(StepDerivatives(end_state, A, B, C, names, sources, used, reason))
     return found
 
 
