@@ -166,3 +166,15 @@ def test_the_ball_bounces_into_its_target(capsys):
     text = capsys.readouterr().out
     assert text.startswith("converged")
     assert "on the ground from 0.60 to 0.62 s" in text  # once
+
+
+@pytest.mark.slow
+def test_the_hopper_flies_and_stands_half_a_metre_on():
+    module = example("hop_from_standing")
+    solution = dd.solve(module.problem(), **module.solve_options)
+    assert solution.success, solution.message
+    end, flies = solution.replay.xs[-1], [not contacts for contacts in solution.replay.contacts]
+    assert end[0] == pytest.approx(module.WAY, abs=1e-6)
+    assert np.abs(end[4:]).max() < 1e-6
+    assert flies[60]
+    assert not flies[-1]

@@ -28,8 +28,10 @@ LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
 ENOUGH = 1e-3  # of the merit: less than that is no gain
 RELENT = 25.0
 INNER = 20  # steps between two looks at the multipliers
-CLOSED = 1e-3  # [sqrt(J)], and in the units of bounds and goals: what a stage leaves is for the true plant to close
-STALLED, PATIENCE = 0.7, 3  # of what was open: so often in a row no more than that was closed
+CLOSED = (
+    1e-3  # [m/s or rad/s], and in the units of bounds and goals: what a stage leaves is for the true plant to close
+)
+STALLED, PATIENCE = 0.7, 6  # of what was open: so often in a row no more than that was closed
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +73,14 @@ class RelaxedSearch:
         self.started = False
 
     def _scales(self) -> tuple[Array, Array]:
-        """What a force of 1 along each undriven direction and each input changes in a step, in sqrt(J)."""
+        """What a force of 1 along each undriven direction and each input changes in a step, as a speed."""
         x0, model, plant = self.problem.x0, self.problem.model, self.plant
         v = x0[None, model.nq :]
         poses, _ = plant.place(x0[None, : model.nq])
         mass = plant.tree.moving(poses, v).mass[0] + np.diag(plant.tree.reflected)
         inverse = np.linalg.inv(mass)
-        of_rest = np.sqrt(np.einsum("ir,ij,jr->r", self.undriven, inverse, self.undriven))
-        of_inputs = np.sqrt(np.einsum("ir,ij,jr->r", plant.actuation, inverse, plant.actuation))
+        of_rest = np.einsum("ir,ij,jr->r", self.undriven, inverse, self.undriven)
+        of_inputs = np.einsum("ir,ij,jr->r", plant.actuation, inverse, plant.actuation)
         return self.h * of_rest, self.h * of_inputs
 
     def run(

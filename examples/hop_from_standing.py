@@ -1,0 +1,47 @@
+"""A hopper that stands hops half a metre on and lands, from a guess that stays on the ground.
+
+The guess is a straight line to the goal, which no force makes. The first stages look for a motion by inverse dynamics,
+with contact at a distance, of a shorter reach in each; the last one is on the true plant, and is what is told.
+
+    drake-diff run examples/hop_from_standing.py    writes artifacts/hop_from_standing
+    python examples/hop_from_standing.py            prints the stages, and when the foot is in the air
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+import drake_diff as dd
+
+MODEL = Path(__file__).parent.parent / "models" / "hopper.sdf"
+TIME_STEP, NUM_STEPS, WAY, CLEARANCE = 0.01, 100, 0.5, 0.05
+HEIGHT, LEG = 0.5, 0.45 + 12 / 2e4  # [m] the foot is pressed 0.6 mm into the ground, which carries 12 N
+
+solve_options = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 100}
+
+
+def problem() -> dd.Problem:
+    """After 1 s it is to stand 0.5 m further on; at 0.6 s there are 5 cm under its foot. Least effort."""
+    goal = {"x": WAY, "z": HEIGHT, "x_v": 0.0, "z_v": 0.0, "swing_v": 0.0, "leg_v": 0.0}
+    return dd.Problem(
+        dd.load_model(MODEL, time_step=TIME_STEP),
+        x0={"z": HEIGHT, "leg": LEG},
+        x_goal=goal,
+        waypoints={60: {"z": HEIGHT + CLEARANCE, "leg": LEG}},
+        num_steps=NUM_STEPS,
+        running_cost=dd.QuadraticCost(R=1e-3 * np.eye(2), u_ref=[0, 10]),
+    )
+
+
+def main() -> None:
+    solution = dd.solve(problem(), **solve_options)
+    for stage in solution.options["continuation"]:
+        reach = "" if stage["distance"] is None else f" {1000 * stage['distance']:.1f} mm"
+        print(f"  stage {stage['number']}  {stage['kind'] + reach:18s}  {stage['status']}, {stage['iterations']} steps")
+    print(f"{solution.status.value}: {solution.message}")
+    flight = [k * TIME_STEP for k, contacts in enumerate(solution.replay.contacts) if not contacts]
+    print(f"in the air from {flight[0]:.2f} s to {flight[-1]:.2f} s; at the end x = {solution.replay.xs[-1][0]:.6f} m")
+
+
+if __name__ == "__main__":
+    main()
