@@ -4,7 +4,7 @@
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drake_diff._base.statistics import success_rate
@@ -12,13 +12,13 @@ from drake_diff.artifact import elsewhere
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 
-COLUMNS = "h/2", "h/4", "continuous", "mujoco"
+PLANTS = "h/2", "h/4", "continuous", "mujoco"
 HOLDS, FAILS, NOT_MEASURED = "holds", "does not hold", "not measured"
 
 
 @dataclass(frozen=True)
 class Where:
-    """What became of a plan in each of COLUMNS, the sentence of it all, and the processor's time that it took [s]."""
+    """What became of a plan in each of PLANTS, the sentence of it all, and the processor's time that it took [s]."""
 
     found: dict[str, str]
     sentence: str
@@ -26,21 +26,21 @@ class Where:
 
 
 def where_else(problem: Problem, solution: Solution) -> Where:
-    """Follow the solution of `problem`, and say what became of it in each column."""
+    """Follow the solution of `problem`, and say what became of it in each plant."""
     assert solution.problem is problem
     begun = time.process_time()
     told = elsewhere(solution).elsewhere
     assert told is not None
-    rows = dict(zip(COLUMNS, (*told["steps"][1:], *told["continuous time"], *told["mujoco"]), strict=True))
+    rows = dict(zip(PLANTS, (*told["steps"][1:], *told["continuous time"], *told["mujoco"]), strict=True))
     found = {name: HOLDS if row.holds else FAILS if row.measured else NOT_MEASURED for name, row in rows.items()}
     return Where(found, told.sentence, time.process_time() - begun)
 
 
-def counts(wheres: Sequence[Where]) -> list[str]:
-    """Of each column "n of m", of the plans that could be followed there, with the 95 % Wilson interval."""
+def counts(found: Sequence[Mapping[str, str]]) -> list[str]:
+    """For each plant "n of m", of the plans that could be followed there, with the 95 % Wilson interval."""
     told = []
-    for name in COLUMNS:
-        measured = [where.found[name] for where in wheres if where.found[name] != NOT_MEASURED]
+    for name in PLANTS:
+        measured = [one[name] for one in found if one[name] != NOT_MEASURED]
         if measured:
             rate = success_rate(measured.count(HOLDS), len(measured))
             share = f"{100 * rate.lower:.0f} to {100 * rate.upper:.0f} %"

@@ -4,8 +4,10 @@
     python tests/benchmarks/contact_plans.py --tasks solo12_jump,solo12_trot --crocoddyl /path/to/its/python
 
 The referee is Drake alone: it builds the plant, sends it the plan's inputs, and measures what the task asks. A plan
-that solve calls verified and the referee does not find is false. Times are processor seconds of one thread: of the
-whole solve with its verification, of an iteration of its search, and of Drake's own simulation of the motion.
+that solve calls verified and the referee does not find is false. Verified plans are followed by their own feedback in
+steps of h/2 and h/4, in continuous time and in MuJoCo with matched contact, and those that hold there are counted.
+Times are processor seconds of one thread: of the whole solve with its verification, of an iteration of its search, and
+of Drake's own simulation of the motion.
 """
 
 import argparse
@@ -28,6 +30,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 
 import numpy as np  # noqa: E402
+from contact_elsewhere import HOLDS, PLANTS, counts, where_else  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 
 MODULES = ("legged_tasks", "manipulation_tasks")
@@ -119,6 +122,8 @@ def one(name, seed, start, crocoddyl):
     row["false"] = row["verified"] and bool(wrong)
     if len(ticks) > 1:
         row["iteration_s"] = (ticks[-1] - ticks[0]) / (len(ticks) - 1)
+    if row["verified"]:
+        row["elsewhere"] = vars(where_else(task.problem, solution))
     if crocoddyl and task.schedule is not None:
         row["crocoddyl"] = beside(crocoddyl, task)
     return row
@@ -151,7 +156,12 @@ def told_of(rows):
     seconds = [f"{middle(key):.2f} s" for key in ("guess_s", "cpu_s", "search_s")]
     found = [f"{numbers[0]} of {count}", f"{numbers[1]} of {count}", str(numbers[2])]
     rest = [f"{middle('iterations'):.0f}", f"{1e3 * middle('simulation_s'):.1f} ms", f"{ratio:.1f}", other]
-    return "| " + " | ".join([rows[0]["task"], *found, *seconds, *rest]) + " |"
+    return "| " + " | ".join([rows[0]["task"], *found, *seconds, *rest, *held(rows)]) + " |"
+
+
+def held(rows):
+    """In how many of the plants that could be had the verified plans hold."""
+    return counts([row["elsewhere"]["found"] for row in rows if "elsewhere" in row])
 
 
 COLUMNS = (
@@ -166,6 +176,7 @@ COLUMNS = (
     "Drake",
     "Iteration / Drake",
     "Crocoddyl",
+    *PLANTS,
 )
 HEAD = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|"
 
@@ -195,10 +206,15 @@ def main():
                 )
             if len(open_rows[row["task"]]) == arguments.starts:
                 print(told_of(open_rows[row["task"]]), flush=True)
+            elsewhere = row.get("elsewhere")
+            if arguments.why and elsewhere and set(elsewhere["found"].values()) != {HOLDS}:
+                print(f"  {row['task']} {row['start']}: {elsewhere['sentence']}", flush=True)
     if arguments.json:
         Path(arguments.json).write_text(json.dumps(rows, indent=1))
     totals = [sum(row[key] for row in rows) for key in ("solved", "verified", "false")]
+    everywhere = ", ".join(f"{plant} {count}" for plant, count in zip(PLANTS, held(rows), strict=True))
     print(f"\n{len(rows)} starts: the referee finds {totals[0]}, {totals[1]} verified, {totals[2]} false")
+    print(f"of the verified ones hold in {everywhere}")
 
 
 if __name__ == "__main__":
