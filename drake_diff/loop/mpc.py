@@ -68,7 +68,7 @@ class MPC:
         problem: With a given x0 and no free horizon.
         horizon: How many steps are planned; fewer where the problem ends before and has no goal.
         plan: A Solution of the problem by any method, or (xs (N+1, nx), us (N, nu)), to start from; where None, the
-            problem is solved.
+            problem is solved. States and inputs need not be a motion, nor touch what is to be touched.
         iterations: How many steps a call takes.
         budget: [s] that a call may take; None waits for every answer.
         replan_every: After how many steps there is a new plan.
