@@ -24,7 +24,7 @@ from drake_diff.certificates.judgement import POWER, VERDICTS, Flags, Scales, we
 DIRECTIONS = 6
 MISS, QUANTILE = 1e-4, 0.17209  # where the distribution of chi^2 with 6 degrees of freedom is MISS
 LEAST = 1.5  # the sum of squares of a column of z: six normal numbers have 6
-WIDTHS = tuple(10.0 ** (-k / 2) for k in (9, 10, 11))  # 3e-5, 1e-5, 3e-6
+WIDTHS = tuple(10.0 ** (-k / 2) for k in (9, 10, 11, 12))  # 3e-5 ... 1e-6: friction turns within 1e-4 m/s
 WIDE = 8e-3, 4e-3  # of all columns at once, to both sides: what is flat there, but for jumps, is stairs
 FLAT, ALIKE = 1e-2, 0.2  # of the change: see WIDE
 SEEDED = 11
@@ -98,8 +98,9 @@ class FirstLook:
         # The smallest steps decide: where they say something else it is rounding, or there is something at the point.
         if not np.all(told[-1] | (bounds[-1] <= hidden)):
             return "along random directions slopes are others over smaller steps"
-        corner = self._corners()
-        if not np.all((corner <= allowed) | (corner <= hidden)):
+        corners = self._corners()
+        told = corners <= np.maximum(allowed, hidden)
+        if not np.all(told[-1] & (corners <= allowed).any(axis=0) | (corners <= hidden).all(axis=0)):
             return "slopes ahead and behind do not approach each other"
         if np.any(self._stairs()):
             return "a row is flat here, and changes farther away"
@@ -130,11 +131,16 @@ class FirstLook:
         return np.asarray(np.sqrt((gaps**2).sum(axis=-2) / QUANTILE))
 
     def _corners(self) -> Array:
-        """(m,) the same of what is left of the gap between both sides at no width, where it shrinks as h + h^3."""
-        h = np.array(WIDTHS)
-        terms = np.stack([np.ones_like(h), h, h**3])  # at each width
-        bend = (self.ahead - self.behind) / 2
-        return self._bound(np.tensordot(np.linalg.solve(terms, [1.0, 0.0, 0.0]), bend, axes=1))
+        """(s - 2, m) the same of what is left of the gap between both sides at no width, where it shrinks as h + h^3.
+
+        Of three neighbouring widths each.
+        """
+        bend, found = (self.ahead - self.behind) / 2, []
+        for first in range(len(WIDTHS) - 2):
+            h = np.array(WIDTHS[first : first + 3])
+            terms = np.stack([np.ones_like(h), h, h**3])
+            found.append(np.tensordot(np.linalg.solve(terms, [1.0, 0.0, 0.0]), bend[first : first + 3], axes=1))
+        return self._bound(np.array(found))
 
     def of(self, derivative: Array) -> "FirstLook":
         """The same of another derivative that is zero in the same columns."""
