@@ -78,7 +78,8 @@ def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, 
         value, gradient = gradient_of(loss, xs[-1])
         return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us)
     try:
-        value, (by_xs, by_us) = traced_gradient(loss, (xs, us))
+        with np.errstate(all="ignore"):  # what is not finite is refused below, whole
+            value, (by_xs, by_us) = traced_gradient(loss, (xs, us))
     except Exception:  # it does what is not known there, or is wrong itself, which shows here
         return _by_autodiff(loss, xs, us)
     if not (np.isfinite(value) and np.all(np.isfinite(by_xs)) and np.all(np.isfinite(by_us))):
