@@ -21,6 +21,7 @@ from drake_diff.derivatives.analytic import analytic_of, build_analytic, certifi
 from drake_diff.derivatives.joint_impulses import NEAR_RIGID, JointImpulses
 from drake_diff.derivatives.polish import polished_step
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
+from drake_diff.mechanics.tree import OwnDynamics
 from drake_diff.model.parameters import applied, select
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
@@ -284,7 +285,7 @@ def test_an_inertia_that_pinocchio_does_not_take_is_had_by_our_own_dynamics(name
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(robot_file(name), time_step=0.002)
-    assert is_own(model)
+    assert isinstance(analytic_of(model).dynamics, OwnDynamics)
     x = state_in_range(model, np.random.default_rng(0))
     assert same_where_autodiff_works(model, x, np.zeros(0))
     equal(model, x[None], np.zeros((1, 0)))
@@ -300,7 +301,8 @@ def test_auto_serves_wherever_autodiff_does_and_every_step_is_had_to_rounding():
     assert served.count(True) >= 30
 
 
-def test_without_pinocchio_our_own_dynamics_serve(load, without_pinocchio):
+def test_without_pinocchio_our_own_dynamics_serve(load, without_pinocchio, monkeypatch):
+    monkeypatch.setattr(compiled, "has_numba", lambda: False)
     model = load("double_pendulum.urdf")
     xs, us = np.array([[0.4, -0.9, 1.3, -0.6]] * 2), np.array([[0.25, -0.15]] * 2)
     equal(model, xs, us)
@@ -308,17 +310,20 @@ def test_without_pinocchio_our_own_dynamics_serve(load, without_pinocchio):
     assert dd.differentiate_step(model, xs[0], us[0]).method == "implicit"  # of one state in less time
 
 
-@each_row("name", ["solo12.urdf", "go2.urdf", "bolt.urdf"])
-def test_our_own_dynamics_are_pinocchios(name, without_pinocchio):
+@each_row("name, has_numba", [("solo12.urdf", False), ("solo12.urdf", True), ("go2.urdf", True), ("bolt.urdf", False)])
+def test_our_own_dynamics_are_pinocchios(name, has_numba, without_pinocchio, monkeypatch):
     """In flight and on their feet, at their stops too, as AutoDiffXd has them; a wrong inertia is found out."""
+    if not has_numba:
+        monkeypatch.setattr(compiled, "has_numba", lambda: False)
     model, random = example_robot(name, 0.01, feet=True), np.random.default_rng(4)
     xs = np.array([state_in_contact(model, random), state_in_range(model, random)])
     xs[1, :4] *= 1.1  # of any norm
     xs[1, model.nq - 1] = model.position_limits[0][-1] + 1e-3
     equal(model, xs, 0.1 * random.standard_normal((2, model.nu)))
     smooth = analytic_of(model)
+    assert (smooth.dynamics.compiled is not None) == (has_numba and compiled.has_numba())
     wrong = replace(smooth.dynamics.tree, inertia=1.001 * smooth.dynamics.tree.inertia)
-    doctored = replace(smooth, dynamics=replace(smooth.dynamics, tree=wrong))
+    doctored = replace(smooth, dynamics=replace(smooth.dynamics, tree=wrong, compiled=None))
     assert "of the forces in Drake's equation" in certified(model, doctored).reason
 
 

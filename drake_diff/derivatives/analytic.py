@@ -125,9 +125,10 @@ def analytic_of(model: Model) -> SmoothStep | Refusal:
 
 
 def is_own(model: Model) -> bool:
-    """Whether the model's smooth step is by our own dynamics, which take longer than Pinocchio's for a single state."""
+    """Whether the model's smooth step is by our own dynamics in NumPy, which take longer than others for one state."""
     smooth = analytic_of(model)
-    return isinstance(smooth, SmoothStep) and isinstance(smooth.dynamics, OwnDynamics)
+    own = smooth.dynamics if isinstance(smooth, SmoothStep) else None
+    return isinstance(own, OwnDynamics) and own.compiled is None
 
 
 def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:

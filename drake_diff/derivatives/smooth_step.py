@@ -23,6 +23,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.implicit import Form, form_of
 from drake_diff.derivatives.steps import Steps
 from drake_diff.exceptions import MissingDependencyError, ModelError
+from drake_diff.mechanics.compiled_tree import compiled_tree
 from drake_diff.mechanics.coordinates import Coordinates, native_positions, turn, turn_change, turn_derivatives, turning
 from drake_diff.mechanics.description import Description, describe_tree
 from drake_diff.mechanics.tree import OwnDynamics, tree_of
@@ -234,4 +235,5 @@ def _dynamics(model: Model, description: Description, added: Array) -> tuple[Dyn
         tree = tree_of(model, free=True)
         if isinstance(tree, Refusal):
             raise ModelError(f"{error}; our own equations: {tree}") from error
-        return OwnDynamics(tree, model, armature), Coordinates((), tuple((0, j) for j in range(model.nv)))
+        own = OwnDynamics(tree, model, armature, compiled_tree(description))
+        return own, Coordinates((), tuple((0, j) for j in range(model.nv)))

@@ -31,6 +31,7 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from drake_diff._base.arrays import Array, Indices, cross, skew
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
+from drake_diff.mechanics.compiled_tree import CompiledTree
 from drake_diff.mechanics.description import RigidLink, read_links, springs_of, without_welds
 from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
@@ -241,12 +242,19 @@ class OwnDynamics:
     tree: TreeDynamics
     model: Model
     armature: Array
+    compiled: CompiledTree | None = None
 
     def accelerate(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
         """da/dq, da/dv, da/dforce (each (N, n, n)) and a (N, n) under generalized forces (N, n).
 
         q (N, nq), whose quaternions may be of any norm; its derivative is by small motion.
         """
+        if self.compiled is not None:
+            at_rest = self.compiled(q, v, np.zeros_like(v))
+            inverse = np.asarray(np.linalg.inv(at_rest.mass + np.diag(self.armature)), dtype=float)
+            a = _times(inverse, force - at_rest.tau)
+            moved = self.compiled(q, v, a)
+            return -inverse @ moved.by_q, -inverse @ moved.by_v, inverse, a
         moving, a, inverse = self._solved(q, v, force)
         _, by_q, by_v = moving.derivatives(a)
         return -inverse @ by_q, -inverse @ by_v, inverse, a
