@@ -2,7 +2,7 @@
 
     pip install -e '.[test]'
     python tests/benchmarks/fast_source.py [--robots PATTERN] [--steps 0.005,0.02,0.05] [--seed 0] [--count 4]
-                                           [--mimic reduce] [--out FILE.json] [--markdown FILE.md]
+                                           [--mimic reduce] [--out FILE.json] [--markdown FILE.md] [--planted]
 
 Arms are welded to the world and everything else flies, as `load_model(file, actuators="all")` reads it. What flies is
 put on the ground as well, `load_model(..., meshes="spheres", contact="ground", ground=0.8)`, its lowest point 1 mm in.
@@ -11,6 +11,11 @@ the limits, and such that none alone changes its joint's speed by more than 0.3.
 linearized by its own equation ("analytic") by "auto". One such step of each robot is compared with AutoDiffXd, or with
 differences of the step solved to rounding where Drake refuses that, in parts of the largest entry. What is in --out
 already is not run again.
+
+With --planted, errors are planted instead in a contact of each robot on the ground, one after the other: its normal
+tilted by 0.01 rad, its depth, how its point moves and how its depth changes 1 % off, how its normal turns off by
+0.1 rad/m, and its two bodies swapped. What changes the Jacobian by more than 1e-6 of its largest entry is to
+be refused by the certificate.
 """
 
 import argparse
@@ -21,6 +26,7 @@ import sys
 import time
 import warnings
 from collections import Counter
+from dataclasses import replace
 from importlib.metadata import files
 from pathlib import Path
 
@@ -28,10 +34,12 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
 
 import numpy as np  # noqa: E402
-from pydrake.geometry import Role  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
+from drake_diff._base import compiled  # noqa: E402
 from drake_diff._base.statistics import success_rate  # noqa: E402
+from drake_diff.derivatives.contact.pairs import Touches  # noqa: E402
+from drake_diff.derivatives.contact.touching import AllPairs  # noqa: E402
 from drake_diff.derivatives.implicit import form_of  # noqa: E402
 from drake_diff.derivatives.polish import polished_steps  # noqa: E402
 from drake_diff.derivatives.sources import choose  # noqa: E402
@@ -43,6 +51,7 @@ from drake_diff.model.step import set_state  # noqa: E402
 ARMS = ("ur*", "panda*", "z1*", "kinova*", "xarm*", "so1*", "allegro*", "finger*", "double_pendulum*", "TwoDofs*")
 ARMS += ("talos_left_arm*",)
 STEPS, SPEED, KICK, DEPTH = 10, 0.2, 0.3, 1e-3
+MATTERS = 1e-6  # of the largest entry
 WIDTHS = (3e-7, 1e-5, 1e-4)  # SceneGraph's iterations leave noise: the width that comes nearest counts
 EXACT, BY_DIFFERENCES = 1e-8, 1e-5  # what two derivatives of one step may differ by, in parts of the largest entry
 
@@ -63,13 +72,23 @@ def load(file, time_step, feet, mimic):
     return dd.load_model(file, time_step=time_step, actuators="all", mimic=mimic, **options)
 
 
-def lowest(model, x):
-    """The height of the lowest point of a shape that has an end."""
-    set_state(model.double, x)
-    query = model.plant.get_geometry_query_input_port().Eval(model.double.context)
-    shapes = query.inspector().GetAllGeometryIds(Role.kProximity)
-    boxes = [query.ComputeAabbInWorld(shape) for shape in shapes]
-    return min((box.lower()[2] for box in boxes if box is not None), default=0.0)
+def lowered(model, x, height):
+    """`x` with its free body, whose height is in x[height], as low as leaves it DEPTH in the ground."""
+    x = x.copy()
+
+    def touches(z):
+        x[height] = z
+        set_state(model.double, x)
+        return model.double.overlaps()
+
+    free, inside = x[height] + 3.0, x[height] - 3.0
+    assert touches(inside), f"{model.name} does not meet the ground"
+    assert not touches(free), f"{model.name} touches in the air"
+    while free - inside > 1e-7:
+        middle = (free + inside) / 2
+        free, inside = (free, middle) if touches(middle) else (middle, inside)
+    x[height] = free - DEPTH
+    return x
 
 
 def state(model, feet, random):
@@ -80,8 +99,7 @@ def state(model, feet, random):
     for index in model.plant.GetFloatingBaseBodies():
         start = model.plant.get_body(index).floating_positions_start()
         x[start : start + 4], x[start + 6] = [1, 0, 0, 0], 1.0
-        if feet:
-            x[start + 6] -= lowest(model, x) + DEPTH
+        x = lowered(model, x, start + 6) if feet and model.contract.contact.collision_pairs else x
     return x
 
 
@@ -111,6 +129,7 @@ def differences(model, point, width):
 def case(name, file, time_step, feet, mimic, seed, count):
     """What came of one robot at one time step."""
     begin, methods, whys, gap, whose = time.process_time(), Counter(), Counter(), None, ""
+    touching = 0
     model, random = load(file, time_step, feet, mimic), np.random.default_rng(seed)
     for _ in range(count):
         x = state(model, feet, random)
@@ -119,15 +138,18 @@ def case(name, file, time_step, feet, mimic, seed, count):
         us = random.uniform(-1, 1, (STEPS, model.nu)) * np.minimum(form_of(model).limit, KICK * inertia / time_step)
         steps = take_steps(model, select(model, ()), x, us)
         found = choose(steps, "auto")
+        touching += int(np.count_nonzero(steps.touching))
         methods.update(found.methods)
         whys.update(r for m, r in zip(found.methods, found.reasons, strict=True) if m != "analytic")
         known = [k for k, method in enumerate(found.methods) if method == "analytic"]
+        known = [k for k in known if steps.touching[k]] or known
         if gap is None and known:
             k = known[-1]
             gap, whose = parity(model, steps.xs[k], us[k])
     why = whys.most_common(1)[0][0] if whys else ""
     return {
         "nv": model.nv,
+        "touching": touching,
         "methods": methods,
         "why": why,
         "gap": gap,
@@ -136,12 +158,75 @@ def case(name, file, time_step, feet, mimic, seed, count):
     }
 
 
+def tilted(touch):
+    """Its normals by 0.01 rad, about a direction across them."""
+    across = np.cross(touch.normal, np.eye(3)[np.argmin(np.abs(touch.normal), axis=1)])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    return replace(touch, normal=np.cos(0.01) * touch.normal + np.sin(0.01) * across)
+
+
+def off(rows, factor):
+    def change(touch):
+        found = touch.change.copy()
+        found[:, rows] *= factor
+        return replace(touch, change=found)
+
+    return change
+
+
+def turned(touch):
+    found, n = touch.change.copy(), touch.normal
+    found[:, 3:6, :3] += 0.1 * (np.eye(3) - n[:, :, None] * n[:, None, :])
+    return replace(touch, change=found)
+
+
+ERRORS = {
+    "normal": tilted,
+    "depth": lambda touch: replace(touch, phi=1.01 * touch.phi),
+    "motion of the point": off(slice(3), 1.01),
+    "turn of the normal": turned,
+    "change of the depth": off(slice(6, 7), 1.01),
+    "bodies swapped": off(slice(7), -1.0),
+}
+
+
+OF_STATE = ("normal", "depth")  # which Drake's equation notices
+
+
+def planted(file, time_step, mimic, seed):
+    """Whether each error was refused; None where it changes nothing, and an empty answer where nothing touches."""
+    compiled.has_numba = lambda: False  # the errors are planted in the form in NumPy, which the same trial judges
+    model, random, right = load(file, time_step, True, mimic), np.random.default_rng(seed), Touches.at
+    x, u, found = state(model, True, random)[None], np.zeros((1, model.nu)), {}
+    touches = take_steps(model, select(model, ()), x[0], u).touching[0]
+    A, B, methods = dd.linearize(model, x, u)
+    if not touches or methods != ("analytic",):
+        return {}
+    trials = (model.whole if model.coupling is not None else model).cache("impulse trials", dict, of_structure=True)
+    for name, error in ERRORS.items():
+        trials.clear()
+        touching = AllPairs.touching
+        Touches.at = lambda touch, part, error=error: right(error(touch), part)
+        if name in OF_STATE:
+            Touches.at, AllPairs.touching = right, lambda *a, error=error, touching=touching: error(touching(*a))
+        try:
+            wrong = np.concatenate(dd.linearize(model, x, u, "analytic")[:2], axis=2)
+            gap = np.abs(wrong - np.concatenate([A, B], axis=2)).max() / np.abs(A).max()
+            found[name] = False if gap > MATTERS else None
+        except GradientError:
+            found[name] = True
+        finally:
+            Touches.at, AllPairs.touching = right, touching
+    return found
+
+
 def row(result):
     """One line of what came of it."""
     if "refused" in result:
         return f"refused: {result['refused']}"
     total, methods = sum(result["methods"].values()), result["methods"]
     text = ", ".join(f"{n} of {total} {method}" for method, n in sorted(methods.items()))
+    text += f", {result['touching']} in contact"
     gap = "" if result["gap"] is None else f", {result['gap']:.1e} from {result['whose']}"
     return f"{text}{gap}" + (f" ({result['why'][:300]})" if result["why"] else "")
 
@@ -206,8 +291,32 @@ def main():
     parser.add_argument("--mimic")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--markdown", type=Path)
+    parser.add_argument("--planted", action="store_true")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
+    return plant(given) if given.planted else survey(given)
+
+
+def plant(given):
+    """Count what was refused, over robots."""
+    refused, of = Counter(), Counter()
+    for name, file in robots(given.robots):
+        for step in [] if is_arm(name) else map(float, given.steps.split(",")):
+            try:
+                found = planted(file, step, given.mimic, given.seed)
+            except DrakeDiffError as error:
+                print(f"{name}: {type(error).__name__}", flush=True)
+                continue
+            print(f"{name} {1e3 * step:g} ms: {found}", flush=True)
+            of.update(error for error, was in found.items() if was is not None)
+            refused.update(error for error, was in found.items() if was)
+    for error in ERRORS:
+        print(f"{error}: refused {told(refused[error], of[error])}" if of[error] else f"{error}: never mattered")
+    return 0 if refused == of else 1
+
+
+def survey(given):
+    """Count the robots on the fast source."""
     done = json.loads(given.out.read_text()) if given.out and given.out.exists() else []
     results, known = list(done), {(r["robot"], r["step"], r["feet"]) for r in done}
     for name, file in robots(given.robots):
