@@ -185,9 +185,12 @@ def test_a_push_from_a_distance_arrives_and_keeps_momentum(two_spheres):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("time_step", "clearance"), [(0.01, 0.07), (0.02, 0.07), (0.05, None)])
+@pytest.mark.parametrize(("time_step", "clearance"), [(0.005, 0.05), (0.01, 0.05), (0.02, None), (0.05, None)])
 def test_a_hopper_that_stands_gets_half_a_metre_on(time_step, clearance):
-    """The guess stays on the ground: a line to the goal. With a clearance on the way it has to hop."""
+    """The guess stays on the ground: a line to the goal. With a clearance on the way it has to hop.
+
+    At 20 ms it lands too deep for a plan that is verified: at 2 m/s a foot moves 4 cm in a step.
+    """
     model = dd.load_model(MODELS / "hopper.sdf", time_step=time_step)
     x0, goal, count = np.zeros(8), np.full(8, np.nan), round(1 / time_step)
     x0[1], x0[3] = 0.5, 0.45 + 12 / 2e4
