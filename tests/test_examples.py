@@ -178,3 +178,24 @@ def test_the_hopper_flies_and_stands_half_a_metre_on():
     assert np.abs(end[4:]).max() < 1e-6
     assert flies[60]
     assert not flies[-1]
+
+
+@each_row("name, way", [("quadruped_jump", 0.06), ("quadruped_trot", 0.12)])
+def test_the_quadruped_goes_as_its_schedule_says(name, way):
+    """Where a foot is said to stand it is on the ground, where not over it, by Drake's own kinematics."""
+    module = example(name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        problem = module.problem()
+    solution = dd.solve(problem, **module.solve_options)
+    assert solution.success, solution.message
+    model, knot = problem.model, 0
+    context = model.plant.CreateDefaultContext()
+    assert solution.xs[-1][4] == pytest.approx(way, abs=0.03)  # the goal's tolerance
+    for steps, standing in module.schedule.phases:
+        knot += steps
+        model.plant.SetPositions(context, solution.xs[knot - steps // 2, : model.nq])
+        for foot in module.FEET:
+            body = model.plant.GetBodyByName(foot)
+            height = model.plant.EvalBodyPoseInWorld(context, body).translation()[2] - 0.025  # its radius
+            assert (height < 1e-6) == (foot in standing)

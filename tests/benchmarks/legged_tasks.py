@@ -75,11 +75,11 @@ TASKS: Tasks = {f"{robot}_{kind}": partial(make, robot) for robot in LEGGED for 
 
 
 def _task(robot, random, kind, first, last, phases, text, *, way=0.0, pushed=False):
-    h = OF_JUMPS if kind in ("jump", "forward") and robot == "solo12" else TIME_STEP
+    h = OF_JUMPS if kind in ("jump", "forward") else TIME_STEP
     model, facts = legged_model(robot, h), LEGGED[robot]
     nq = model.nq
     x0 = rest(robot, model, np.array(first), random)
-    end = np.array(_posture(robot, last))
+    end = np.array(_posture(robot, h, last))
     end[4:6] = x0[4] + way, x0[5]
     if pushed:
         x0[nq:] = _pushed(robot, model, x0, random)
@@ -114,14 +114,14 @@ def _task(robot, random, kind, first, last, phases, text, *, way=0.0, pushed=Fal
         options={**OPTIONS, "initial_guess": guess},
         asks=tuple(asks),
         schedule=schedule,
-        build=partial(build, robot),
+        build=partial(build, robot, h),
     )
 
 
 @cache
-def _posture(robot, joints):
+def _posture(robot, h, joints):
     """(nq,) as the robot rests with joints at about these."""
-    model = legged_model(robot, TIME_STEP)
+    model = legged_model(robot, h)
     return tuple(rest(robot, model, np.array(joints))[: model.nq])
 
 
@@ -147,8 +147,8 @@ def _pushed(robot, model, x0, random):
 # What a referee measures, by Drake alone.
 
 
-def build(robot, time_step):
-    """(plant, diagram) of the robot on its feet at a time step, 0 for continuous, by Drake's own parser."""
+def build(robot, h, time_step):
+    """(plant, diagram) of the robot on the feet of a task in steps of h, by Drake's own parser; 0 is continuous."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=time_step,
@@ -158,7 +158,7 @@ def build(robot, time_step):
         use_sampled_output_ports=False,
     )
     plant, _ = AddMultibodyPlant(config, builder)
-    Parser(plant).AddModels(str(robot_on_feet(robot)))
+    Parser(plant).AddModels(str(robot_on_feet(robot, h)))
     for i in range(plant.num_joints()):
         joint = plant.get_joint(JointIndex(i))
         if joint.num_velocities() == 1 and not plant.HasJointActuatorNamed(joint.name()):
@@ -173,7 +173,7 @@ def build(robot, time_step):
 @cache
 def _kinematics(robot):
     """A plant and its context in which only places are asked for."""
-    plant, _ = build(robot, TIME_STEP)
+    plant, _ = build(robot, TIME_STEP, TIME_STEP)
     return plant, plant.CreateDefaultContext()
 
 
@@ -203,7 +203,7 @@ def told(task):
     facts, problem = LEGGED[robot], task.problem
     model = problem.model
     return {
-        "file": str(robot_on_feet(robot)),
+        "file": str(robot_on_feet(robot, model.time_step)),
         "feet": facts.feet,
         "base": facts.base,
         "friction": FRICTION,

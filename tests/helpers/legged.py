@@ -16,8 +16,8 @@ from drake_diff.optimize.scheduled.legs import Legs
 
 from .models import robot_file
 
-SINK = 1.25e-3  # [m] of a foot under an even share of the weight: what plans of 10 to 20 ms are found with
-RELAXATION, DISSIPATION, FRICTION = 0.05, 0.5, 0.7  # [s], [s/m]
+SINK, RELAXES = 0.0625, 2.5  # [m/s] times a step: how deep a foot is under an even share of the weight; steps
+DISSIPATION, FRICTION = 0.5, 0.7  # [s/m]
 DRAWN, TURNED = 0.08, 0.05  # of the base's height, how far feet and centre of mass are drawn; [rad]
 SETTLES, SETTLE_STEP = 0.6, 0.002  # [s] of a PD controller that brings a posture to rest
 
@@ -81,9 +81,9 @@ LEGGED = {
 
 
 @cache
-def robot_on_feet(name):
-    """A file of that robot in which its feet are spheres of the stiffness that lets them sink by SINK, and all else
-    is left out that can touch."""
+def robot_on_feet(name, time_step):
+    """A file of that robot in which its feet are spheres, as soft as plans in such steps are found with; all else that
+    can touch is left out."""
     robot = LEGGED[name]
     tree = ElementTree.parse(robot_file(robot.file))
     root = tree.getroot()
@@ -97,9 +97,9 @@ def robot_on_feet(name):
             ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "sphere", radius=str(robot.radius))
             properties = ElementTree.SubElement(collision, "drake:proximity_properties")
             for quantity, value in (
-                ("point_contact_stiffness", robot.weight / len(robot.feet) / SINK),
+                ("point_contact_stiffness", robot.weight / len(robot.feet) / (SINK * time_step)),
                 ("hunt_crossley_dissipation", DISSIPATION),
-                ("relaxation_time", RELAXATION),
+                ("relaxation_time", RELAXES * time_step),
                 ("mu_dynamic", FRICTION),
                 ("mu_static", FRICTION),
             ):
@@ -115,7 +115,7 @@ def legged_model(name, time_step=0.02):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         return dd.load_model(
-            robot_on_feet(name),
+            robot_on_feet(name, time_step),
             time_step=time_step,
             base="free",
             actuators="all",
@@ -131,18 +131,18 @@ def rest(name, model, joints, random=None):
     With a `random` generator the feet are drawn from about where they are, and the centre of mass and the base's turn.
     """
     robot, fine = LEGGED[name], model.at_time_step(SETTLE_STEP)
-    nq, count = model.nq, len(joints)
+    nq, count, sink = model.nq, len(joints), SINK * model.time_step
     x = np.array(model.default_state)
     x[:nq] = 0.0
     x[0], x[nq - count : nq] = 1.0, joints
     legs = Legs(model, robot.feet, x[:nq])
     legs.put(x[:nq])
-    x[6] -= np.mean(legs.points()[:, 2]) + SINK
+    x[6] -= np.mean(legs.points()[:, 2]) + sink
     if random is not None:
         legs.put(x[:nq])
         places, mass, size = legs.points(), np.array(legs.center_of_mass()[0]), DRAWN * x[6]
         places[:, :2] += size * random.uniform(-1, 1, (len(places), 2))
-        places[:, 2] = -SINK
+        places[:, 2] = -sink
         turn = np.zeros(model.nv)
         turn[:3] = TURNED * random.uniform(-1, 1, 3)
         mass += size * random.uniform(-1, 1, 3)

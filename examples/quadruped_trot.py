@@ -1,0 +1,56 @@
+"""A quadruped trots three steps, from a schedule of which foot stands when.
+
+Two feet stand while the other two swing. The schedule makes the first motion, and is a goal too: in the plan and in its
+replays a standing foot touches the ground and does not slip, and a swinging one clears it.
+
+    drake-diff run examples/quadruped_trot.py    writes artifacts/quadruped_trot
+    python examples/quadruped_trot.py            prints how far it goes
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+import drake_diff as dd
+
+MODEL = Path(__file__).parent.parent / "models" / "quadruped.urdf"
+FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
+STANDING = {"trunk_qw": 1.0, "trunk_z": 0.2473}  # the feet sink by half a millimetre
+LEG = {"abduction": 0.0, "hip_pitch": 0.8, "knee": -1.6}
+TIME_STEP, WAY = 0.02, 0.12  # [s], [m] forward
+
+ONE, OTHER = ("FL_foot", "RR_foot"), ("FR_foot", "RL_foot")
+steps = [(5, FEET), (8, ONE), (2, FEET), (8, OTHER), (2, FEET), (8, ONE), (20, FEET)]
+schedule = dd.optimize.ContactSchedule(steps)
+solve_options = {"method": "ilqr", "tolerance": 1e-4}
+
+
+def problem() -> dd.Problem:
+    model = dd.load_model(
+        MODEL, time_step=TIME_STEP, base="free", actuators="all", ground=0.7, contact="ground", near_rigid=0.1
+    )
+    names = model.state_names
+    x0 = np.zeros(model.nx)
+    for name, value in STANDING.items():
+        x0[names.index(name)] = value
+    for leg in ("FL", "FR", "RL", "RR"):
+        for joint, value in LEG.items():
+            x0[names.index(f"{leg}_{joint}_q")] = value
+    end = x0[: model.nq].copy()
+    end[names.index("trunk_x")] += WAY
+    xs, us = schedule.guess(model, x0, end)
+    solve_options["initial_guess"] = (xs, us)
+    goals = [schedule, dd.FrameGoal("trunk", end[4:7], tolerance=0.03), dd.KeepLevel("trunk", knots=-1, tolerance=0.1)]
+    return dd.Problem(model, x0=x0, num_steps=len(us), goals=goals, **schedule.follow(model, (xs, us)))
+
+
+def main() -> None:
+    task = problem()
+    solution = dd.solve(task, **solve_options)
+    print(f"{solution.status.value} after {len(solution.iterations) - 1} iterations: {solution.message}")
+    x = solution.xs[:, task.state_names.index("trunk_x")]
+    print(f"the trunk ends {1e3 * (x[-1] - x[0]):.0f} mm further on")
+
+
+if __name__ == "__main__":
+    main()
