@@ -194,6 +194,7 @@ FIGURES = (
     "impacts.md",
     "continuous_plans.md",
     "tasks_solved.md",
+    "contact_plans.md",
     "mpc_realtime.md",
 )  # pages that a benchmark writes
 
