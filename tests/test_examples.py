@@ -180,6 +180,7 @@ def test_the_hopper_flies_and_stands_half_a_metre_on():
     assert not flies[-1]
 
 
+@pytest.mark.slow
 @each_row("name, way", [("quadruped_jump", 0.06), ("quadruped_trot", 0.12)])
 def test_the_quadruped_goes_as_its_schedule_says(name, way):
     """Where a foot is said to stand it is on the ground, where not over it, by Drake's own kinematics."""
