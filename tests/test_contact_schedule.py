@@ -46,13 +46,14 @@ def test_soles_move_as_differences_say(solo, seed):
     def at(d):
         moved = space.plus(x, np.concatenate([d, np.zeros(nv)]))
         legs.put(moved[:nq], x[nq:])
-        return legs.points(), legs.velocities(x[nq:])[0]
+        return legs.points(), legs.along(np.concatenate([moved[:nq], x[nq:]])[None]).velocities(x[None, nq:])[0]
 
     units = step * np.eye(nv)
     slopes = [[(a - b) / (2 * step) for a, b in zip(at(d), at(-d), strict=True)] for d in units]
     legs.put(x[:nq], x[nq:])
     moves, turns = legs.jacobians()
-    velocities, by_posture = legs.velocities(x[nq:])
+    soles = legs.along(x[None])
+    velocities, by_posture = soles.velocities(x[None, nq:])[0], soles.slopes(x[None, nq:])[0].swapaxes(1, 2)
     assert np.allclose(velocities, moves @ x[nq:], atol=1e-12)
     assert np.allclose(by_posture, np.moveaxis([s[1] for s in slopes], 0, -1), atol=1e-7)  # of differences of 1e-6
     height = np.moveaxis([s[0] for s in slopes], 0, -1)[:, 2]
@@ -133,6 +134,10 @@ def test_rows_of_a_schedule_have_the_derivative_of_differences(solo, standing):
         units = step * np.eye(solo.nx)
         along = np.array([(constraint(x + d, u) - constraint(x - d, u)) / (2 * step) for d in units]).T
         assert np.allclose(found, along, atol=1e-6)
+        states = np.array([posed(solo, 6), x, posed(solo, 7)])  # x among others, which must not mix with it
+        assert np.allclose(constraint.slopes(states, np.zeros((3, solo.nu)))[1, :, : solo.nx], along, atol=1e-6)
+        values = constraint.along(states, np.zeros((3, solo.nu)))
+        assert np.allclose(values, [constraint(state, u) for state in states], rtol=0, atol=1e-14)  # rounding
 
 
 @pytest.mark.parametrize(

@@ -136,11 +136,11 @@ class _Rows:
 
     def values(self, xs: Array, us: Array) -> Array:
         """(size,)"""
-        return self._at("values", xs, us, self.constraint).ravel()
+        return self._at("values", xs, us, self.constraint.along).ravel()
 
     def jacobians(self, xs: Array, us: Array) -> Array:
         """(knots, rows, nx + nu)"""
-        return self._at("jacobians", xs, us, lambda x, u: self.constraint.differentiate(x, u)[1])
+        return self._at("jacobians", xs, us, self.constraint.slopes)
 
     def scale(self, xs: Array, us: Array) -> Array:
         """(size,): one over the largest slope so far of each row, 1 if it has had none."""
@@ -152,6 +152,5 @@ class _Rows:
     def _at(self, what: str, xs: Array, us: Array, evaluate: Callable[[Array, Array], Array]) -> Array:
         key = xs.tobytes() + us.tobytes()
         if self._kept.get(what, (b"", xs))[0] != key:
-            found = [evaluate(xs[k], us[min(k, len(us) - 1)]) for k in self.knots]
-            self._kept[what] = key, np.array(found)
+            self._kept[what] = key, evaluate(xs[self.knots], us[np.minimum(self.knots, len(us) - 1)])
         return self._kept[what][1]

@@ -17,14 +17,13 @@ from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 from drake_diff.optimize.problem.cost import (
-    QuadraticCost,
     differentiate_cost,
     differentiate_final_cost,
     final_cost_hessian,
     running_cost_hessian,
 )
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.timed import cost_at
+from drake_diff.optimize.problem.timed import cost_at, quadratic_along
 
 # Of a state, or of 1: Jacobians are known to 1e-12, so that this leaves 1e-6 of their derivative.
 DIFFERENCE_STEP = 1e-6
@@ -152,11 +151,12 @@ def expand_running_cost(problem: Problem, xs: Array, us: Array, h: float | None 
     h = problem.model.time_step if h is None else h
     (nx, nu), cost = (xs.shape[1], us.shape[1]), problem.total_running_cost
     gradients, hessians = np.zeros((len(us), nx + nu)), np.zeros((len(us), nx + nu, nx + nu))
-    if isinstance(cost, QuadraticCost):
-        x_ref = np.zeros(nx) if cost.x_ref is None else cost.x_ref
-        u_ref = np.zeros(nu) if cost.u_ref is None else cost.u_ref
-        hessians[:] = h * running_cost_hessian(cost, xs[0], us[0])
-        gradients = (np.hstack([xs[:-1], us]) - np.concatenate([x_ref, u_ref])) @ hessians[0]
+    quadratic = quadratic_along(cost, h * np.arange(float(len(us))))
+    if quadratic is not None:
+        x_ref = 0.0 if quadratic.x_ref is None else quadratic.x_ref
+        u_ref = 0.0 if quadratic.u_ref is None else quadratic.u_ref
+        hessians[:] = h * running_cost_hessian(quadratic, xs[0], us[0])
+        gradients = np.hstack([xs[:-1] - x_ref, us - u_ref]) @ hessians[0]
     elif cost is not None:
         for k, u in enumerate(us):
             rate = cost_at(cost, k * h)

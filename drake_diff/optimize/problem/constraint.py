@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, array_with_gaps, frozen
-from drake_diff._base.autodiff import gradient_rows
+from drake_diff._base.autodiff import chain_rows, gradient_rows
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.model.model import Model
 
@@ -42,6 +42,25 @@ class Bounds:
     def __repr__(self) -> str:
         given = {name: value for name, value in vars(self).items() if value is not None}
         return f"Bounds({', '.join(f'{name}={short(value)}' for name, value in given.items())})"
+
+
+class StateFunction:
+    """A function x (nx,) -> (m,) that tells its values and slopes at many states at once."""
+
+    def values(self, xs: Array) -> Array:
+        """(K, m) at states (K, nx)."""
+        raise NotImplementedError
+
+    def slopes(self, xs: Array) -> Array:
+        """(K, m, nx) at states (K, nx)."""
+        raise NotImplementedError
+
+    def __call__(self, x: Any) -> Any:
+        """(m,) at one state, floats or AutoDiffXd."""
+        if x.dtype == float:
+            return self.values(x[None])[0]
+        at = ExtractValue(x.reshape(-1, 1)).T
+        return chain_rows(self.values(at)[0], self.slopes(at)[0], x)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -139,6 +158,22 @@ class Constraint:
         if not (np.all(np.isfinite(plain)) and np.all(np.isfinite(rows))):
             raise GradientError(f"constraint {self.label} or its derivative is not finite at x = {x.tolist()}")
         return plain, rows
+
+    def along(self, xs: Array, us: Array) -> Array:
+        """(K, m) the function's values at xs (K, nx), us (K, nu)."""
+        if isinstance(self.function, StateFunction):
+            return self.function.values(xs)
+        return np.array([self(x, u) for x, u in zip(xs, us, strict=True)])
+
+    def slopes(self, xs: Array, us: Array) -> Array:
+        """(K, m, nx + nu) the function's Jacobians at xs (K, nx), us (K, nu); GradientError as by `differentiate`."""
+        if not isinstance(self.function, StateFunction):
+            return np.array([self.differentiate(x, u)[1] for x, u in zip(xs, us, strict=True)])
+        by_x = self.function.slopes(xs)
+        bad = ~np.all(np.isfinite(by_x), axis=(1, 2))
+        if bad.any():
+            raise GradientError(f"the derivative of constraint {self.label} is not finite at x = {xs[bad][0].tolist()}")
+        return np.concatenate([by_x, np.zeros((*by_x.shape[:2], us.shape[1]))], axis=2)
 
     def excess(self, x: Array, u: Array) -> float:
         """The largest excess over a bound at x (nx,), u (nu,); inf where a value is not a number."""

@@ -25,7 +25,14 @@ from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGo
 from drake_diff.optimize.problem.names import bounds_of, state_of
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
 from drake_diff.optimize.problem.rates import RateLimit
-from drake_diff.optimize.problem.timed import SumOfCosts, TimedCost, TrackingCost, cost_at, running_cost_of
+from drake_diff.optimize.problem.timed import (
+    SumOfCosts,
+    TimedCost,
+    TrackingCost,
+    cost_at,
+    quadratic_along,
+    running_cost_of,
+)
 
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
@@ -415,8 +422,9 @@ class Problem(ShowsItsRepr):
         total = 0.0 if final is None else float(final(xs[-1]))
         if running is not None:
             before = xs[: len(inputs)]
-            if isinstance(running, QuadraticCost):
-                rates = running.along(before, inputs)
+            quadratic = quadratic_along(running, h * np.arange(float(len(inputs))))
+            if quadratic is not None:
+                rates = quadratic.along(before, inputs)
             else:
                 along = enumerate(zip(before, inputs, strict=True))
                 rates = np.array([float(cost_at(running, k * h)(x, u)) for k, (x, u) in along])

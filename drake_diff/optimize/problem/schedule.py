@@ -6,12 +6,11 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
-from pydrake.autodiffutils import ExtractValue
 
 from drake_diff._base.arrays import Array, Indices, finite_array, positive_float
-from drake_diff._base.autodiff import chain_rows
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
+from drake_diff.optimize.problem.constraint import StateFunction
 from drake_diff.optimize.problem.cost import QuadraticCost
 from drake_diff.optimize.problem.goals import USED, Goal, GoalConstraint, name_of
 from drake_diff.optimize.problem.timed import TrackingCost
@@ -19,6 +18,7 @@ from drake_diff.optimize.scheduled.legs import Legs
 from drake_diff.optimize.scheduled.motion import scheduled_motion, swings, touching
 
 MIDDLE = 0.25  # of a swing at either end is left out where its clearance is looked at
+KEPT = 1000  # states of which it is remembered where the feet are
 OF_FRICTION = 0.7  # of the friction that is possible: what a guess uses
 Phases = tuple[tuple[int, tuple[str, ...]], ...]
 # What counts as 1 of what a plan is off its guess: of a quaternion, [m], [rad], [rad/s or m/s] of the base, [rad/s];
@@ -168,51 +168,61 @@ class ContactSchedule(Goal):
 
 
 class _Soles:
-    """What a schedule asks of the points that feet stand on, all of one state at once: the last one's are kept."""
+    """What a schedule asks of the points that feet stand on; what was found of the last KEPT states is kept."""
 
     def __init__(self, legs: Legs):
-        self.legs, self.key = legs, b""
-        self.known = dict[str, Array]()
+        self.legs, self.known = legs, dict[bytes, dict[str, Array]]()
 
-    def of(self, what: str, feet: Sequence[int]) -> Callable[[Any], Any]:
+    def of(self, what: str, feet: Sequence[int]) -> "_OfFeet":
         """x (nx,) -> "heights" (n,) [m] of these feet's points over the ground; or "slides" (2 n,) [m/s] along it."""
         points = np.flatnonzero(np.isin(self.legs.owners, feet))
         rows = points if what == "heights" else np.concatenate([2 * points, 2 * points + 1])
+        return _OfFeet(self, what, rows)
 
-        def function(x: Any) -> Any:
-            if x.dtype == float:
-                return self._at(x, what)[rows]
-            at = ExtractValue(x.reshape(-1, 1)).ravel()
-            return chain_rows(self._at(at, what)[rows], self._at(at, f"{what} by x")[rows], x)
+    def at(self, xs: Array, what: str) -> Array:
+        """(K, ...) of all points at states (K, nx)."""
+        keys = [x.tobytes() for x in xs]
+        if len(self.known) > KEPT:
+            self.known = {}
+        new = {key: x for key, x in zip(keys, xs, strict=True) if what not in self.known.get(key, {})}
+        if new:
+            states = np.array(list(new.values()))
+            found = self._slopes(states) if what.endswith("by x") else self._values(states)
+            for name, values in found.items():
+                for key, value in zip(new, values, strict=True):
+                    self.known.setdefault(key, {})[name] = value
+        return np.array([self.known[key][what] for key in keys])
 
-        return function
+    def _values(self, xs: Array) -> dict[str, Array]:
+        soles = self.legs.along(xs)
+        slides = soles.velocities(xs[:, self.legs.model.nq :])[..., :2].reshape(len(xs), -1)
+        return {"heights": soles.places[..., 2], "slides": slides}
 
-    def _at(self, x: Array, what: str) -> Array:
-        if x.tobytes() != self.key:
-            self.key, self.known = x.tobytes(), {}
-        if what not in self.known:
-            self.legs.put(x[: self.legs.model.nq], x[self.legs.model.nq :])
-            self.known[what] = getattr(self, "_" + what.replace(" ", "_"))(x)
-        return self.known[what]
+    def _slopes(self, xs: Array) -> dict[str, Array]:
+        v, soles, (count, nv) = xs[:, self.legs.model.nq :], self.legs.along(xs), (len(xs), self.legs.model.nv)
+        moves, turned = soles.moves.swapaxes(2, 3), soles.slopes(v).swapaxes(2, 3)
+        tangent = np.array([self.legs.space.derivative_of_minus(x) for x in xs])
+        heights, by_v = moves[:, :, 2], moves[:, :, :2].reshape(count, -1, nv)
+        by_q = turned[:, :, :2].reshape(count, -1, nv)
+        return {
+            "heights by x": heights @ tangent[:, :nv],
+            "slides by x": by_q @ tangent[:, :nv] + by_v @ tangent[:, nv:],
+        }
 
-    def _heights(self, x: Array) -> Array:
-        return self.legs.points()[:, 2]
 
-    def _heights_by_x(self, x: Array) -> Array:
-        by_q = self.legs.jacobians()[0][:, 2]
-        return self._by_x(x, by_q, np.zeros_like(by_q))
+@dataclass(frozen=True, eq=False)
+class _OfFeet(StateFunction):
+    """Some `rows` of what `soles` tell."""
 
-    def _slides(self, x: Array) -> Array:
-        v = x[self.legs.model.nq :]
-        return np.asarray(self.legs.jacobians()[0][:, :2] @ v).ravel()
+    soles: _Soles
+    what: str
+    rows: Indices
 
-    def _slides_by_x(self, x: Array) -> Array:
-        nv = self.legs.model.nv
-        by_q = self.legs.velocities(x[self.legs.model.nq :])[1][:, :2]
-        return self._by_x(x, by_q.reshape(-1, nv), self.legs.jacobians()[0][:, :2].reshape(-1, nv))
+    def values(self, xs: Array) -> Array:
+        return self.soles.at(xs, self.what)[:, self.rows]
 
-    def _by_x(self, x: Array, by_q: Array, by_v: Array) -> Array:
-        return np.asarray(np.hstack([by_q, by_v]) @ self.legs.space.derivative_of_minus(x))
+    def slopes(self, xs: Array) -> Array:
+        return self.soles.at(xs, f"{self.what} by x")[:, self.rows]
 
 
 def _rows(

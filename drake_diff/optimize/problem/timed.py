@@ -142,11 +142,26 @@ class TrackingCost(TimedCost):
         return total
 
     def at(self, time: float) -> QuadraticCost:
-        known, nx = self.known_at(np.array([time]))[0], self.reference[1].shape[1]
+        return self._with(self.known_at(np.array([time]))[0])
+
+    def along(self, times: Array) -> QuadraticCost:
+        """The costs at `times` (K,) [s] as one, whose references are of each of them: (K, nx) and (K, nu)."""
+        return self._with(self.known_at(times))
+
+    def _with(self, known: Array) -> QuadraticCost:
+        nx = self.reference[1].shape[1]
         found = copy.copy(self._form)  # type: ignore[attr-defined]  # whose weights were checked
-        object.__setattr__(found, "x_ref", known[:nx] if self.Q is not None else None)
-        object.__setattr__(found, "u_ref", known[nx:] if self.reference[2] is not None and self.R is not None else None)
+        object.__setattr__(found, "x_ref", known[..., :nx] if self.Q is not None else None)
+        held = self.reference[2] is not None and self.R is not None
+        object.__setattr__(found, "u_ref", known[..., nx:] if held else None)
         return found
+
+
+def quadratic_along(cost: Any, times: Array) -> QuadraticCost | None:
+    """A running cost at `times` (K,) [s] as one QuadraticCost, its references of all or of each; None if it is none."""
+    if isinstance(cost, TrackingCost):
+        return cost.along(times)
+    return cost if isinstance(cost, QuadraticCost) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.geometry import Box, Sphere
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
 
-from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.arrays import Array, Indices, cross
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.model import Model
@@ -67,68 +67,43 @@ class Legs:
         """Put posture q (nq,), at rest or moving with v (nv,), into the twin."""
         set_state(self.twin, np.concatenate([q, np.zeros(self.model.nv) if v is None else v]))
 
+    def along(self, states: Array) -> "Soles":
+        """The soles in K states (K, nx) at once."""
+        nq, rows = self.model.nq, list[tuple[Array, Array]]()
+        for x in states:
+            self.put(x[:nq], x[nq:])
+            rows.append(self._read())
+        return self._of([poses for poses, _ in rows], [moving for _, moving in rows])
+
     def points(self) -> Array:
         """(n, 3) [m] the lowest points in the twin's state."""
-        plant, context, world = self.twin.plant, self.twin.context, self.twin.plant.world_frame()
-        parts = zip(self.frames, self.centres, strict=True)
-        places = np.vstack([plant.CalcPointsPositions(context, frame, centres, world).T for frame, centres in parts])
-        places[:, 2] -= self.radii
-        return places
+        return self._now().places[0]
 
     def jacobians(self) -> tuple[Array, Array]:
         """(n, 3, nv) twice: how the material at the lowest points moves, and how their bodies turn."""
-        plant, context, world = self.twin.plant, self.twin.context, self.twin.plant.world_frame()
-        kind, nv = JacobianWrtVariable.kV, self.model.nv
-        moves, turns = [], []
-        for frame, c in zip(self.frames, self.centres, strict=True):
-            spatial = plant.CalcJacobianSpatialVelocity(context, kind, frame, np.zeros(3), world, world)
-            turn = spatial[:3]
-            here = frame.CalcPoseInWorld(context).rotation().matrix() @ c
-            for arm in here.T:
-                moves.append(spatial[3:] + np.cross(turn, arm, axisa=0, axisb=0).T)
-                turns.append(turn)
-        move, turned = np.array(moves), np.array(turns).reshape(-1, 3, nv)
-        # From a centre to the lowest point of its sphere: turn x (0, 0, -r).
-        move[:, 0] -= self.radii[:, None] * turned[:, 1]
-        move[:, 1] += self.radii[:, None] * turned[:, 0]
-        return move, turned
+        now = self._now()
+        return now.moves[0].swapaxes(1, 2), now.turns[0].swapaxes(1, 2)
 
-    def velocities(self, v: Array) -> tuple[Array, Array]:
-        """(n, 3) [m/s] of the material at the lowest points under v (nv,), and (n, 3, nv) by the twin's posture.
+    def _now(self) -> "Soles":
+        poses, moving = self._read()
+        return self._of([poses], [moving])
 
-        How a column of a Jacobian turns: that of a joint with all joints before it, and none of them with a later one.
-        """
+    def _read(self) -> tuple[Array, Array]:
+        """(feet, 3, 4) the poses of their frames in the twin's state, and (feet, 6, nv) how these turn and move."""
         plant, context, world = self.twin.plant, self.twin.context, self.twin.plant.world_frame()
-        kind, b, nv = JacobianWrtVariable.kV, self.base_v, self.model.nv
-        joints = np.concatenate([np.arange(b), np.arange(b + 6, nv)])
-        found, slopes = [], []
-        for frame, c in zip(self.frames, self.centres, strict=True):
-            spatial = plant.CalcJacobianSpatialVelocity(context, kind, frame, np.zeros(3), world, world)
-            turn, here = spatial[:3], frame.CalcPoseInWorld(context).rotation().matrix() @ c
-            turning = turn[:, joints] * v[joints]  # (3, joints): each joint's part
-            later = turning[:, ::-1].cumsum(axis=1)[:, ::-1]
-            before = (turn[:, b : b + 3] @ v[b : b + 3])[:, None] + turning.cumsum(axis=1) - turning
-            spin = np.zeros((3, nv))
-            spin[:, joints] = np.cross(turn[:, joints], later - turning, axis=0)
-            spin[:, b : b + 3] = np.cross(turn[:, b : b + 3], later[:, :1], axis=0)
-            for arm in here.T:
-                move = spatial[3:] + np.cross(turn, arm, axisa=0, axisb=0).T
-                moving = move[:, joints] * v[joints]
-                after = moving[:, ::-1].cumsum(axis=1)[:, ::-1]
-                slope = np.zeros((3, nv))
-                slope[:, joints] = np.cross(turn[:, joints], after, axis=0) + np.cross(before, move[:, joints], axis=0)
-                slope[:, b : b + 3] = np.cross(turn[:, b : b + 3], after[:, :1], axis=0)
-                slope[:, b : b + 3] += np.cross((turn @ v - later[:, 0])[:, None], move[:, b : b + 3], axis=0)
-                found.append((move @ v, turn @ v))
-                slopes.append((slope, spin))
-        at, by_q = np.array([v for v, _ in found]), np.array([s for s, _ in slopes])
-        turned, spins = np.array([w for _, w in found]), np.array([s for _, s in slopes])
-        radii = self.radii
-        at[:, 0] -= radii * turned[:, 1]  # turn x (0, 0, -r)
-        at[:, 1] += radii * turned[:, 0]
-        by_q[:, 0] -= radii[:, None] * spins[:, 1]
-        by_q[:, 1] += radii[:, None] * spins[:, 0]
-        return at, by_q
+        kind, origin = JacobianWrtVariable.kV, np.zeros(3)
+        poses = [frame.CalcPoseInWorld(context).GetAsMatrix34() for frame in self.frames]
+        moving = [plant.CalcJacobianSpatialVelocity(context, kind, f, origin, world, world) for f in self.frames]
+        return np.array(poses), np.array(moving)
+
+    def _of(self, poses: Sequence[Array], moving: Sequence[Array]) -> "Soles":
+        """The soles in K states, of each what `_read` told."""
+        pose, jacobian = np.array(poses)[:, self.owners], np.array(moving)[:, self.owners].swapaxes(2, 3)
+        arms = (pose[..., :3] @ np.vstack([c.T for c in self.centres])[..., None])[..., 0]
+        turns, centres = jacobian[..., :3], jacobian[..., 3:] + cross(jacobian[..., :3], arms[:, :, None])
+        down = np.zeros((len(self.radii), 3))
+        down[:, 2] = -self.radii
+        return Soles(self.base_v, down, pose[..., 3] + arms + down, turns, centres)
 
     def center_of_mass(self) -> tuple[Array, Array]:
         """(3,) [m] the centre of mass in the twin's state, and (3, nv) how it moves."""
@@ -188,6 +163,51 @@ class Legs:
         """(3, 3) of each point, its body's rotation in the twin's state."""
         found = [frame.CalcPoseInWorld(self.twin.context).rotation().matrix() for frame in self.frames]
         return [found[i] for i in self.owners]
+
+
+@dataclass(frozen=True, eq=False)
+class Soles:
+    """The n lowest points of feet in K states: where they are, and how each degree of freedom turns and moves them."""
+
+    base: int  # where the base's turn, then its place, are among the velocities
+    down: Array  # (n, 3) [m] from the centre of a sphere to its lowest point, 0 of a corner
+    places: Array  # (K, n, 3) [m]
+    turns: Array  # (K, n, nv, 3) of the body
+    centres: Array  # (K, n, nv, 3) of the sphere's centre
+
+    @property
+    def moves(self) -> Array:
+        """(K, n, nv, 3) of the material at the lowest point."""
+        return self.centres + cross(self.turns, self.down[:, None])
+
+    def velocities(self, v: Array) -> Array:
+        """(K, n, 3) [m/s] of the material at the lowest points under v (K, nv)."""
+        return np.asarray((v[:, None, None] @ self.moves)[:, :, 0])
+
+    def slopes(self, v: Array) -> Array:
+        """(K, n, nv, 3) how `velocities` change with the posture.
+
+        How a column of a Jacobian turns: that of a joint with all joints before it, and none of them with a later one.
+        """
+        b, nv = self.base, v.shape[1]
+        joints, base = np.r_[:b, b + 6 : nv], slice(b, b + 3)
+        rates = v[:, None, joints, None]
+        turn, move, base_turn = self.turns[:, :, joints], self.centres[:, :, joints], self.turns[:, :, base]
+        turning, moving = rates * turn, rates * move  # each joint's part
+        later, after = _from_here_on(turning), _from_here_on(moving)
+        spin = (v[:, None, None, base] @ base_turn)[:, :, 0]  # (K, n, 3) of the base
+        before = spin[:, :, None] + turning.cumsum(axis=2) - turning
+        turned, found = np.zeros(self.turns.shape), np.zeros(self.turns.shape)
+        turned[:, :, joints] = cross(turn, later - turning)
+        turned[:, :, base] = cross(base_turn, later[:, :, :1])
+        found[:, :, joints] = cross(turn, after) + cross(before, move)
+        found[:, :, base] = cross(base_turn, after[:, :, :1]) + cross(spin[:, :, None], self.centres[:, :, base])
+        return np.asarray(found + cross(turned, self.down[:, None]))
+
+
+def _from_here_on(parts: Array) -> Array:
+    """(K, n, joints, 3) the sum of a joint's part and those of all later ones."""
+    return parts[:, :, ::-1].cumsum(axis=2)[:, :, ::-1]
 
 
 def _vector(R: Array) -> Array:
