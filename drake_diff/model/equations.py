@@ -39,6 +39,7 @@ class EquationsOfMotion:
         self.actuation = model.actuation
         self.systems = bool(model.inputs.fed)  # whose forces depend on x and u
         self.plain_rates = model.plant.IsVelocityEqualToQDot()
+        self._still = np.zeros(model.nv)
 
     def __call__(self, x: Array, u: Array) -> Array:
         """(nx,) dx/dt at `x` (nx,), `u` (nu,); SimulationError where they are not finite."""
@@ -67,13 +68,15 @@ class EquationsOfMotion:
 
     def _at(self, knot: Array) -> Array:
         """(nx,) dx/dt at one `knot`, without the arrays of many."""
-        model, twin, nx = self.model, self.model.double, self.model.nx
+        twin, nx, nq = self.model.double, self.model.nx, self.model.nq
         if not np.isfinite(knot).all():
             return np.full(nx, np.nan)
-        x, u = knot[:nx], knot[nx:]
+        x = knot[:nx]
         twin.set_state(x)
-        acceleration = self.acceleration(u)[0]
-        return np.concatenate((x[model.nq :] if self.plain_rates else self.q_dot(twin, x), acceleration))
+        found = np.empty(nx)
+        found[:nq] = x[nq:] if self.plain_rates else self.q_dot(twin, x)
+        found[nq:] = self.acceleration(knot[nx:])[0]
+        return found
 
     def autodiff(self, x: Any, u: Any) -> Any:
         """The same with AutoDiffXd in and out."""
@@ -102,7 +105,7 @@ class EquationsOfMotion:
         twin = self.model.double
         if self.systems:
             twin.set_input(u)
-        rest = twin.inverse_dynamics(np.zeros(self.model.nv))
+        rest = twin.inverse_dynamics(self._still)
         mass = twin.mass_matrix()
         return np.linalg.solve(mass, self.actuation @ u - rest), mass
 

@@ -214,9 +214,11 @@ class TVLQR:
             A, B, _ = linearize(model, self.xs, self.us)
         else:
             A, B = np.split(jacobians, [model.nx], axis=2)
+        if self._space.quaternions:
+            points = zip(self.xs[:-1], self.xs[1:], A, B, strict=True)
+            A, B = np.split(np.array([self._space.jacobian(*each) for each in points]), [self._space.size], axis=2)
         gains, cost_to_go = [], [Q if Qf is None else _weight("Qf", Qf, self._space.size)]
-        for point in reversed(list(zip(self.xs[:-1], self.xs[1:], A, B, strict=True))):
-            A_k, B_k = np.hsplit(self._space.jacobian(*point), [self._space.size])
+        for A_k, B_k in zip(A[::-1], B[::-1], strict=True):
             P = cost_to_go[-1]
             BP = B_k.T @ P
             gains.append(np.asarray(np.linalg.solve(R + BP @ B_k, BP @ A_k), dtype=float))

@@ -31,6 +31,7 @@ ACCURATE = 1e-4  # of an interval, in the states' units
 SMALLEST_ERROR = 1e-12  # of an interval: rounding, which no finer mesh makes less
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
+MEASURED = ("_integrated", "_rates", "_held", "_open_loop")  # of a motion, whatever is told about it
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,13 +224,33 @@ class Collocated:
 
     def led_from(self, x: Array, gains: Array | None) -> Array:
         """(10 N + 1, nx) where the dynamics lead from `x` (nx,), with feedback by `gains` (N, nu, nx) if there are."""
-        z = x[None]
-        found = [z]
-        for k in range(len(self.mesh) - 1):
-            path = self._integrate(np.array([k]), z, None if gains is None else gains[k])
-            found.append(path[1:, 0])
-            z = path[-1]
+        found = [x[None]]
+        with np.errstate(all="ignore"):
+            for k in range(len(self.mesh) - 1):
+                found.append(self._led_through(k, found[-1][-1], None if gains is None else gains[k]))
         return np.concatenate(found)
+
+    def _led_through(self, k: int, x: Array, gains: Array | None) -> Array:
+        """(10, nx) where `x` (nx,) at the start of the interval `k` leads in ten steps, as `_integrated` takes them."""
+        nx, interval, moved, held = self.task.dynamics.nx, np.array([k]), self.task.moved, self._held[k]
+        dt, found = self._lengths[k] / SUBSTEPS, np.empty((SUBSTEPS, nx))
+        lower, upper = (self._cut_off(side) for side in (self.task.bounds.u_lower, self.task.bounds.u_upper))
+
+        def rate(x: Array, half: int) -> Array:
+            u = held[half, nx:]
+            if gains is not None:
+                u = np.minimum(np.maximum(u + gains @ (held[half, :nx] - x), lower), upper)
+            return moved(np.concatenate((x, u))[None], interval)[0]
+
+        if self.task.is_map:  # the state is held until the next step
+            found[:-1], found[-1] = x, rate(x, 0)
+            return found
+        for i in range(SUBSTEPS):
+            k1 = rate(x, 2 * i)
+            k2 = rate(x + dt / 2 * k1, 2 * i + 1)
+            k3 = rate(x + dt / 2 * k2, 2 * i + 1)
+            x = found[i] = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + dt * k3, 2 * i + 2))
+        return found
 
     def gains(self, at_end: Array | None = None) -> tuple[Array, Array]:
         """(N, nu, nx) of each interval, by Riccati's recursion with Bryson's weights, as a replay's TVLQR has them.
@@ -254,25 +275,13 @@ class Collocated:
     @cached_property
     def _integrated(self) -> Array:
         """(11, N, nx + 1) where each knot leads within its interval, in ten steps, and what that costs."""
-        every = np.arange(len(self.mesh) - 1)
-        return self._integrate(every, np.column_stack([self.xs[:-1], np.zeros(len(every))]))
-
-    def _integrate(self, k: Indices, z: Array, gains: Array | None = None) -> Array:
-        """(11, S, nx or nx + 1) where `z` at the starts of the intervals `k` (S,) leads in ten steps.
-
-        Its last column is the cost, where it has one more than the states. With `gains` (nu, nx), under feedback about
-        the motion too.
-        """
         nx, task, held = self.task.dynamics.nx, self.task, self._held
-        dt, found, b = self._lengths[k, None] / SUBSTEPS, [z], self.task.bounds
+        k = np.arange(len(self.mesh) - 1)
+        z = np.column_stack([self.xs[:-1], np.zeros(len(k))])
+        dt, found = self._lengths[:, None] / SUBSTEPS, [z]
 
         def rate(z: Array, half: int) -> Array:
-            us, xs = held[k, half, nx:], z[:, :nx]
-            if gains is not None:
-                us = self._cut_off(np.clip(us + (held[k, half, :nx] - xs) @ gains.T, b.u_lower, b.u_upper))
-            knots = np.concatenate((xs, us), axis=1)
-            if z.shape[1] == nx:
-                return task.moved(knots, k)
+            knots = np.concatenate((z[:, :nx], held[:, half, nx:]), axis=1)
             times = self.times(k, np.full(len(k), half / (2 * SUBSTEPS)))
             return np.column_stack([task.moved(knots, k), task.rates(knots, times)])
 
@@ -334,6 +343,12 @@ class Transcribed(Collocated):
     def largest_error(self) -> float:
         """Of an interval and of its part of the cost."""
         return float(np.max(_worst(self)))
+
+    def told(self, **fields: Any) -> "Transcribed":
+        """With other words about the same motion, and what was measured of it."""
+        found = replace(self, **fields)
+        vars(found).update({name: value for name, value in vars(self).items() if name in MEASURED})
+        return found
 
 
 def _finite(values: Array) -> Array:
@@ -440,7 +455,7 @@ class Transcription:
             told = f"error {error:.2g}" if error > tolerance else missing
             if len(mesh) - 1 > most:
                 told = f"{told} still, with {count} intervals: raise max_num_steps"
-                motion = replace(motion, result=replace(motion.result, note=told))
+                motion = motion.told(result=replace(motion.result, note=told))
                 break
             if report is not None:
                 report.say(f"{told} with {count} intervals: refined to {len(mesh) - 1}")
@@ -458,7 +473,7 @@ class Transcription:
             rounds.append((len(mesh) - 1, motion.largest_error))
             near.append(_nearer(motion))
         cleared = tuple((count, float(np.max(each))) for (count, _), each in zip(rounds, near, strict=True))
-        return replace(motion, refinements=tuple(rounds), cleared=cleared if np.any(near[0] > 0) else ())
+        return motion.told(refinements=tuple(rounds), cleared=cleared if np.any(near[0] > 0) else ())
 
     def finer(
         self, motion: Transcribed, exceeded: Sequence[int], most: int, limits: Limits, report: Report | None
@@ -548,7 +563,7 @@ def kept(last: Transcribed, failed: Transcribed) -> Transcribed:
         return replace(last, result=replace(failed.result, z=last.result.z))
     counts = len(failed.mesh) - 1, len(last.mesh) - 1
     note = f"on {counts[0]} intervals no motion was found ({failed.result.message}): that on {counts[1]} is kept"
-    return replace(last, result=replace(last.result, note="; ".join(filter(None, (last.result.note, note)))))
+    return last.told(result=replace(last.result, note="; ".join(filter(None, (last.result.note, note)))))
 
 
 def _worst(motion: Transcribed) -> Array:
