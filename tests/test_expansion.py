@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
 from helpers.plants import craft, tilted
 from helpers.problems import pendulum
 
@@ -43,6 +44,33 @@ def test_of_a_pendulum_by_hand(source):
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
 
 
+def assert_second_differences(model, motion, v, found):
+    size, e = model.nx + model.nu, 1e-4 * np.eye(model.nx + model.nu)
+    for k in range(len(v)):
+        z = np.concatenate([motion.xs[k], motion.us[k]])
+
+        def value(dz, k=k, z=z):
+            return v[k] @ dd.step(model, (z + dz)[: model.nx], (z + dz)[model.nx :])
+
+        for i, j in np.ndindex(size, size):
+            corners = value(e[i] + e[j]) - value(e[i] - e[j]) - value(e[j] - e[i]) + value(-e[i] - e[j])
+            assert found[k, i, j] == pytest.approx(corners / 4e-8, abs=2e-6 * max(1.0, np.abs(found).max()))
+
+
+@pytest.mark.parametrize("file", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "panda"])
+def test_of_hinges_and_slides_by_differences(file):
+    """Second differences of Drake's own steps by 1e-4, as of the body below; no limit acts."""
+    random = np.random.default_rng(2)
+    model = dd.example_model("panda") if file == "panda" else dd.load_model(MODELS / file, time_step=0.02)
+    middle = np.clip(np.mean(np.clip(model.position_limits, -3.0, 3.0), axis=0), -2.0, 2.0)
+    x0 = np.r_[middle + 0.2 * random.standard_normal(model.nq), random.standard_normal(model.nv)]
+    problem = dd.Problem(model, x0=x0, num_steps=1, running_cost=dd.QuadraticCost(R=np.eye(model.nu)))
+    motion, v = motion_of(problem, random.standard_normal((1, model.nu))), random.standard_normal((1, model.nx))
+    smooth = analytic.analytic_of(model)
+    assert smooth.curvature(motion.xs[:-1], motion.us, v) is not None
+    assert_second_differences(model, motion, v, curvature_along(problem, motion, v))
+
+
 def test_of_a_floating_body_with_wheels_by_differences():
     """Second differences of Drake's own steps by 1e-4, of entries up to 1: rounding of 1e-16 leaves 1e-8 of them."""
     model = craft()
@@ -52,16 +80,7 @@ def test_of_a_floating_body_with_wheels_by_differences():
     problem = dd.Problem(model, x0=x0, num_steps=3, running_cost=dd.QuadraticCost(R=np.eye(3)))
     motion, v = motion_of(problem, random.standard_normal((3, 3))), random.standard_normal((3, model.nx))
     found = curvature_along(problem, motion, v)
-    size, e = model.nx + model.nu, 1e-4 * np.eye(model.nx + model.nu)
-    for k in range(3):
-        z = np.concatenate([motion.xs[k], motion.us[k]])
-
-        def value(dz, k=k, z=z):
-            return v[k] @ dd.step(model, (z + dz)[: model.nx], (z + dz)[model.nx :])
-
-        for i, j in np.ndindex(size, size):
-            corners = value(e[i] + e[j]) - value(e[i] - e[j]) - value(e[j] - e[i]) + value(-e[i] - e[j])
-            assert found[k, i, j] == pytest.approx(corners / 4e-8, abs=2e-6 * max(1.0, np.abs(found).max()))
+    assert_second_differences(model, motion, v, found)
     assert np.abs(found[:, : model.nx, model.nx :]).max() > 1e-3  # the inputs' part with the states is seen
 
 

@@ -13,7 +13,7 @@ one then.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,15 @@ class Dynamics(Protocol):
 
     def motions(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array]:
         """(N, nv, 6) of each degree of freedom, (N, nv, 6, 6) of what it carries, and a (N, nv)."""
+        ...
+
+
+@runtime_checkable
+class Bends(Protocol):
+    """Dynamics that know second derivatives."""
+
+    def bend(self, q: Array, v: Array, a: Array, along: Array) -> tuple[Array, Array, Array, Array]:
+        """Those of along' tau (N, nv each) by q q, v q, a q and v v, tau (q, v, a) being inverse dynamics."""
         ...
 
 
@@ -113,6 +122,30 @@ class SmoothStep:
         diagonal[:, :n] += 1.0
         v_next = v + h * a
         return jacobians, np.concatenate([q + h * v_next, v_next], axis=1)
+
+    def curvature(self, xs: Array, us: Array, along: Array) -> Array | None:
+        """(N, nx + nu, nx + nu) the second derivative of along' x' (N, nx each); None of free bodies, or our own trees.
+
+        v' = v + h a, where inverse dynamics give tau(q, v, a) for the forces, which are linear in q, v and u. So with
+        mu = M^-1 w, w'a has the second derivative of -mu' tau(q, v, a) at the a' that the first one has.
+        """
+        if self.coordinates.free or not isinstance(self.dynamics, Bends):
+            return None
+        n, h = self.coordinates.nv, self.time_step
+        q, v = xs[:, :n], xs[:, n:]
+        force, clipped = self.force_of(q, v, us)
+        by_q, by_v, inverse, a = self.dynamics.accelerate(q, v, force)
+        w = h * (along[:, n:] + h * along[:, :n])
+        by_qq, by_vq, by_aq, by_vv = self.dynamics.bend(q, v, a, (inverse @ w[:, :, None])[:, :, 0])
+        parts = by_q - inverse * self.stiffness, by_v - inverse * self.damping, self._by_input(inverse, clipped)
+        through_q, through_v, through_u = (by_aq.swapaxes(1, 2) @ part for part in parts)
+        found = np.zeros((len(xs), 2 * n + us.shape[1], 2 * n + us.shape[1]))
+        found[:, :n, :n] = -(by_qq + by_qq.swapaxes(1, 2)) / 2 - through_q - through_q.swapaxes(1, 2)
+        found[:, :n, n : 2 * n] = -by_vq.swapaxes(1, 2) - through_v
+        found[:, :n, 2 * n :] = -through_u
+        found[:, n:, :n] = found[:, :n, n:].swapaxes(1, 2)
+        found[:, n : 2 * n, n : 2 * n] = -by_vv
+        return found
 
     def at_a_limit(self, steps: Steps) -> NDArray[np.bool_]:
         """(N,) whether a joint limit pushes: Drake's does where phi + 2 h phi' < 0, phi being how far it is."""

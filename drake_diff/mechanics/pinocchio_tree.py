@@ -18,6 +18,9 @@ except ImportError as error:
     ) from error
 
 
+BEND_STEP = 1e-6  # [rad or m], of a joint's position or of 1: exact derivatives leave 1e-6 of theirs
+
+
 @dataclass(frozen=True, eq=False)
 class PinocchioDynamics:
     """Accelerations of a Pinocchio model, whose armature is part of its inertia, in its own coordinates."""
@@ -54,6 +57,31 @@ class PinocchioDynamics:
         found = np.frombuffer(b"".join(rows)).reshape(len(q), 3 * n * n + n)
         by_q, by_v, inverse = (found[:, k * n * n : (k + 1) * n * n].reshape(len(q), n, n) for k in range(3))
         return by_q, by_v, inverse, found[:, 3 * n * n :]
+
+    def bend(self, q: Array, v: Array, a: Array, along: Array) -> tuple[Array, Array, Array, Array]:
+        """Second derivatives of along' tau (N, n each), tau being inverse dynamics: by q q, v q, a q and v v.
+
+        Each (N, n, n); of hinges and slides alone. Those by q are differences of Pinocchio's exact first derivatives.
+        By v v none is needed: with the Christoffel symbols it follows from how the mass matrix changes.
+        """
+        model, data, derivatives = self.model, self.data, pin.computeRNEADerivatives
+        outputs = [memoryview(x).cast("B") for x in (data.dtau_dq, data.dtau_dv, data.M.T)]
+        (count, n), rows = v.shape, []
+        steps = BEND_STEP * np.maximum(1.0, np.abs(q))
+        moved = q[:, None] + np.concatenate([np.zeros((count, 1, n)), steps[:, :, None] * np.eye(n)], axis=1)
+        size = BEND_STEP / np.maximum(np.max(np.abs(along), axis=1), np.finfo(float).tiny)
+        for points, last, v_k, a_k in zip(moved, q + size[:, None] * along, v, a, strict=True):
+            for point in (*points, last):
+                derivatives(model, data, point, v_k, a_k)
+                rows.append(b"".join(outputs))
+        found = np.frombuffer(b"".join(rows)).reshape(count, n + 2, 3, n, n)
+        rates = np.einsum("ki,kjbim->kjbm", along, found[:, : n + 1])
+        slopes = (rates[:, 1:] - rates[:, :1]) / (moved[:, 1:] - moved[:, :1]).diagonal(axis1=1, axis2=2)[
+            ..., None, None
+        ]
+        by_qq, by_vq, by_aq = (slopes[:, :, i].swapaxes(1, 2) for i in range(3))
+        twice = (found[:, -1, 2] - found[:, 0, 2]) / size[:, None, None]
+        return by_qq, by_vq, by_aq, by_aq + by_aq.swapaxes(1, 2) - twice
 
     def motions(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array]:
         """(N, nv, 6) the motion [linear; angular] of each degree of freedom in world, about its origin, at unit speed.

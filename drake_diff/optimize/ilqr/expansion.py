@@ -190,8 +190,9 @@ def curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
     """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None if contact or a limit acts,
     or the motion is in continuous time.
 
-    By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also if
-    Jacobians are not to be had in one call. Raises what `linearize` raises.
+    By the second derivatives of inverse dynamics, or else by differences of the Jacobians along every state: in its
+    inputs alone a smooth step is linear. None also if Jacobians are not to be had in one call. Raises what `linearize`
+    raises.
     """
     model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
     if problem.design.vector.parameters or problem.motion != STEPS:
@@ -199,7 +200,11 @@ def curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
     here = smooth_jacobians(model, xs, us, motion.ends)
     if here is None:
         return None
-    curvature, analytic = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu)), analytic_of(model)
+    analytic = analytic_of(model)
+    exact = None if isinstance(analytic, Refusal) else analytic.curvature(xs, us, v)
+    if exact is not None:
+        return exact
+    curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
     for j in range(model.nx):
         moved = np.array(xs)
         moved[:, j] += DIFFERENCE_STEP * np.maximum(1.0, np.abs(xs[:, j]))
