@@ -18,7 +18,9 @@ except ImportError as error:
     ) from error
 
 
-BEND_STEP = 1e-6  # [rad or m], of a joint's position or of 1: exact derivatives leave 1e-6 of theirs
+BEND_STEP = (
+    3e-8  # [rad or m], of a position or of 1: first derivatives are known to 1e-15, so that 1e-6 of theirs is left
+)
 
 
 @dataclass(frozen=True, eq=False)
