@@ -1,5 +1,6 @@
 """The dynamics' curvature along a motion: of a pendulum by hand, of a free body by differences of Drake's steps."""
 
+import casadi
 import numpy as np
 import pytest
 from helpers.models import MODELS
@@ -40,7 +41,8 @@ def test_of_a_pendulum_by_hand(source):
     expected = np.zeros((30, 3, 3))
     slope = h / (1 + h * b / inertia) * g / length * np.sin(motion.xs[:-1, 0])
     expected[:, 0, 0] = (v[:, 1] + h * v[:, 0]) * slope
-    found = curvature_along(problem, motion, v)
+    found, known = curvature_along(problem, motion, v)
+    assert known.all()
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
 
 
@@ -68,7 +70,7 @@ def test_of_hinges_and_slides_by_differences(file):
     motion, v = motion_of(problem, random.standard_normal((1, model.nu))), random.standard_normal((1, model.nx))
     smooth = analytic.analytic_of(model)
     assert smooth.curvature(motion.xs[:-1], motion.us, v) is not None
-    assert_second_differences(model, motion, v, curvature_along(problem, motion, v))
+    assert_second_differences(model, motion, v, curvature_along(problem, motion, v)[0])
 
 
 def test_of_a_floating_body_with_wheels_by_differences():
@@ -79,9 +81,46 @@ def test_of_a_floating_body_with_wheels_by_differences():
     x0[model.nq :] = random.standard_normal(model.nv)
     problem = dd.Problem(model, x0=x0, num_steps=3, running_cost=dd.QuadraticCost(R=np.eye(3)))
     motion, v = motion_of(problem, random.standard_normal((3, 3))), random.standard_normal((3, model.nx))
-    found = curvature_along(problem, motion, v)
+    found, _ = curvature_along(problem, motion, v)
     assert_second_differences(model, motion, v, found)
     assert np.abs(found[:, : model.nx, model.nx :]).max() > 1e-3  # the inputs' part with the states is seen
+
+
+def cart_poles_by_hand(h, x, u, v):
+    """(5, 5) the second derivative of v' x', by CasADi, of the equations of Kelly, SIAM Review 59(4), 2017, sec. 6."""
+    symbols = casadi.SX.sym("z", 5)
+    angle, turning, force = symbols[1], symbols[3], symbols[4]
+    sin, cos = casadi.sin(angle), casadi.cos(angle)
+    cart = (0.15 * sin * turning**2 + force + 0.3 * 9.81 * cos * sin) / (1 + 0.3 * sin**2)
+    pole = -(0.15 * cos * sin * turning**2 + force * cos + 1.3 * 9.81 * sin) / (0.5 + 0.15 * sin**2)
+    speeds = symbols[2:4] + h * casadi.vertcat(cart, pole)
+    end = casadi.vertcat(symbols[:2] + h * speeds, speeds)
+    return np.array(casadi.Function("H", [symbols], [casadi.hessian(casadi.dot(v, end), symbols)[0]])(np.r_[x, u]))
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_no_step_at_a_joint_limit_has_one(exact, monkeypatch):
+    """The slide's stop is at 2 m, and Drake's pushes from where it would be passed within two steps.
+
+    Differences between a Jacobian with the stop and one without, over 1e-6, would be 6e7 where the truth is 20.
+    """
+    if not exact:
+        monkeypatch.setattr(analytic.SmoothStep, "curvature", lambda *_: None)
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
+    random = np.random.default_rng(3)
+    xs = np.array(
+        [[0.3, 6.0, -2.0, 9.0], [-1.9037, 6.3568, -2.4074, 9.2319], [1.95, 1.0, 1.0, 2.0], [-1.0, 2.0, -1.0, 5.0]]
+    )
+    us, v = random.uniform(-19, 19, (4, 1)), 100 * random.standard_normal((4, 4))
+    us[1] = 20.0
+    ends = np.array([dd.step(model, x, u) for x, u in zip(xs, us, strict=True)])
+    problem = dd.Problem(model, x0=xs[0], num_steps=4, running_cost=dd.QuadraticCost(R=[[1.0]]))
+    after = np.r_[xs[1:], xs[:1]]
+    found, known = curvature_along(problem, Motion(np.r_[xs, xs[:1]], us, ends - after), v)
+    assert known.tolist() == [True, False, False, True]
+    for k, curvature in zip((0, 3), found, strict=True):
+        expected = cart_poles_by_hand(0.04, xs[k], us[k], v[k])
+        np.testing.assert_allclose(curvature, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
 
 
 def test_it_is_refused_where_spheres_touch(two_spheres):

@@ -4,15 +4,19 @@ All in Drake's own coordinates, quaternions included: the discrete step lets a q
 is a state that inputs move, and on the rotations' tangent space the gradient would be wrong by what is left out.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.step import smooth_jacobians
+from drake_diff.derivatives.steps import known_steps
+from drake_diff.model.parameters import select
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
@@ -186,37 +190,49 @@ def _off_bounds(problem: Problem, us: Array) -> Array:
     return np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
 
 
-def curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
-    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None if contact or a limit acts,
-    or the motion is in continuous time.
+def curvature_along(problem: Problem, motion: Motion, v: Array) -> tuple[Array, NDArray[np.bool_]] | None:
+    """(K, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx), and which K of the N steps (N,) have it.
 
-    By the second derivatives of inverse dynamics, or else by differences of the Jacobians along every state: in its
-    inputs alone a smooth step is linear. None also if Jacobians are not to be had in one call. Raises what `linearize`
-    raises.
+    Those at a joint limit have none: what their Jacobians and those of free steps differ by is no second derivative. By
+    the second derivatives of inverse dynamics, or else by differences of the Jacobians along every state: in its inputs
+    alone a smooth step is linear. None where anything touches, a coupler acts, no Jacobians are to be had in one call,
+    or the motion is in continuous time. Raises what `linearize` raises.
     """
     model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
     if problem.design.vector.parameters or problem.motion != STEPS:
         return None  # what is learned has the parameters in it
-    here = smooth_jacobians(model, xs, us, motion.ends)
+    analytic = analytic_of(model)
+    if isinstance(analytic, Refusal):
+        differences = _differences(lambda xs, ends: smooth_jacobians(model, xs, us, ends), xs, motion.ends, v)
+        return None if differences is None else (differences, np.ones(len(us), dtype=bool))
+    steps = known_steps(model, select(model, ()), xs, us, motion.ends)
+    if steps.some_touch or model.num_constraints:
+        return None
+    known = analytic(steps)[1]
+    xs, us, v = xs[known], us[known], v[known]
+    curvature = analytic.curvature(xs, us, v)
+    if curvature is None:  # no step is taken that might not be smooth
+        curvature = _differences(lambda xs, _: analytic.differentiate(xs, us)[0], xs, None, v)
+    return None if curvature is None else (curvature, known)
+
+
+def _differences(
+    jacobians: Callable[[Array, Array | None], Array | None], xs: Array, ends: Array | None, v: Array
+) -> Array | None:
+    """The same of `jacobians` (N, nx, nx + nu) of the states xs (N, nx) and, where they are known, the steps' ends."""
+    here, nx = jacobians(xs, ends), xs.shape[1]
     if here is None:
         return None
-    analytic = analytic_of(model)
-    exact = None if isinstance(analytic, Refusal) else analytic.curvature(xs, us, v)
-    if exact is not None:
-        return exact
-    curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
-    for j in range(model.nx):
+    curvature = np.zeros((len(xs), here.shape[2], here.shape[2]))
+    for j in range(nx):
         moved = np.array(xs)
         moved[:, j] += DIFFERENCE_STEP * np.maximum(1.0, np.abs(xs[:, j]))
-        if isinstance(analytic, Refusal):
-            near = smooth_jacobians(model, moved, us)
-        else:
-            near = analytic.differentiate(moved, us)[0]  # no step is taken that might not be smooth
+        near = jacobians(moved, None)
         if near is None:
             return None
         slopes = (near - here) / (moved - xs)[:, j, None, None]
         curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
-    curvature[:, : model.nx, model.nx :] = curvature[:, model.nx :, : model.nx].swapaxes(1, 2)
+    curvature[:, :nx, nx:] = curvature[:, nx:, :nx].swapaxes(1, 2)
     return (curvature + curvature.swapaxes(1, 2)) / 2
 
 

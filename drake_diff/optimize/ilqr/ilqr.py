@@ -220,8 +220,10 @@ class _Search:
         moved = np.tile(new.c - old.c, (len(new.us), 1))
         self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], moved, new.us - old.us]))
         if self.gains[1] > SLOW * self.gains[0]:
-            M = curvature_along(self.problem, new, model.multipliers())
-            self.curvature.M = self.curvature.M if M is None else M
+            found = curvature_along(self.problem, new, model.multipliers())
+            if found is not None:
+                curvature, known = found
+                self.curvature.M[known] = curvature
         self.expanded = new
         return model
 
