@@ -109,7 +109,7 @@ def _resting(name: str, path: Path, height: float) -> Case:
     return Case(name, model, x, np.zeros(0))
 
 
-def _written(folder: Path, name: str, text: str) -> Path:
+def written(folder: Path, name: str, text: str) -> Path:
     path = folder / name
     path.write_text(text)
     return path
@@ -121,9 +121,9 @@ CASES: dict[str, Callable[[Path], Case]] = {
     "panda": lambda folder: _moving("panda", panda_arm(folder), 0.001, "panda_link0"),
     "solo12": lambda folder: _moving("solo12", robot("solo12.urdf"), 0.001),
     "sphere": lambda folder: _resting("sphere", MODELS / "sphere_on_ground.sdf", 0.1),
-    "box": lambda folder: _resting("box", _written(folder, "box.sdf", box_sdf()), BOX_SIDE / 2 + CORNER),
+    "box": lambda folder: _resting("box", written(folder, "box.sdf", box_sdf()), BOX_SIDE / 2 + CORNER),
 } | {
-    f"chain{n}": lambda folder, n=n: _moving(f"chain{n}", _written(folder, "chain.urdf", chain_urdf(n)), 0.001)
+    f"chain{n}": lambda folder, n=n: _moving(f"chain{n}", written(folder, "chain.urdf", chain_urdf(n)), 0.001)
     for n in CHAINS
 }
 

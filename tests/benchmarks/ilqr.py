@@ -16,9 +16,11 @@ import sys
 import tempfile
 import time
 import warnings
+from importlib.metadata import files
 from pathlib import Path
 
 import numpy as np
+from cases import chain_urdf, written
 from step_derivatives import panda_arm
 
 import drake_diff as dd
@@ -26,25 +28,33 @@ from drake_diff.exceptions import ModelWarning
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.program import Limits
 
-MODELS = Path(__file__).parents[2] / "models"
 REPEATS = 7
 THREADS = (1, 2)
-COST = 1.042  # of the Panda's reach: our tolerance is relative to 1 + cost
+UR5 = next(f for f in files("example-robot-data") or () if f.name == "ur5_robot.urdf")
 
 
 def tasks(folder: Path) -> list[dict]:
-    """State cost q, v, u rates and final weights; hand-over to both sides as JSON."""
+    """State cost q, v, u rates and final weights; hand-over to both sides as JSON. `cost` scales our tolerance."""
     reach = [0.0, -0.78, 0.0, -2.36, 0.0, 1.57, 0.78]
     start = [1.0, 0.2, -0.5, -1.2, 0.4, 2.2, -0.3]
     panda = {"name": "Panda reach", "urdf": str(_undamped(panda_arm(folder), folder)), "time_step": 0.01, "count": 100}
     panda |= {"running": (0.1, 0.01, 1e-3), "final": (1000.0, 10.0, 0.0)}
-    panda |= {"base": "panda_link0", "x0": start + [0.0] * 7, "x_goal": reach + [0.0] * 7}
-    return [panda | {"stop": stop} for stop in (1e-9, 2e-14)]
+    panda |= {"base": "panda_link0", "cost": 1.042, "x0": start + [0.0] * 7, "x_goal": reach + [0.0] * 7}
+    ur5 = panda | {"name": "UR5 reach", "urdf": str(_undamped(Path(UR5.locate()), folder)), "base": None}
+    bent, wanted = [0.0, -0.6, 0.3, -0.2, 0.0, 0.0], [0.5, -1.2, 1.0, -0.8, 0.6, 0.3]
+    ur5 |= {"cost": 1.4806, "x0": bent + [0.0] * 6, "x_goal": wanted + [0.0] * 6}
+    limited = 'type="revolute"><limit lower="0" upper="0" effort="1e6" velocity="1e6"/>'
+    text = chain_urdf(20).replace("<link", '<link name="world"/><link', 1).replace('type="continuous">', limited)
+    chain = panda | {"name": "chain of 20", "urdf": str(_undamped(written(folder, "chain.urdf", text), folder))}
+    bent = (0.2 * np.random.default_rng(0).standard_normal(20)).tolist()
+    chain |= {"base": None, "cost": 0.0221, "x0": bent + [0.0] * 20, "x_goal": [0.0] * 40}
+    return [task | {"stop": stop} for task in (panda, ur5, chain) for stop in (1e-9, 2e-14)]
 
 
 def _undamped(urdf: Path, folder: Path) -> Path:
     """Crocoddyl's free dynamics leaves joint damping, friction and the stops at joint limits out."""
     text = re.sub(r"<dynamics[^>]*/>", "", urdf.read_text())
+    text = re.sub(r"<(visual|collision)>.*?</\1>", "", text, flags=re.DOTALL)  # nothing is to touch
     text = re.sub(r'(lower|upper)="[^"]*"', lambda m: f'{m[1]}="{-100 if m[1] == "lower" else 100}"', text)
     path = folder / f"undamped_{urdf.name}"
     path.write_text(text)
@@ -71,7 +81,7 @@ def ours(task: dict, repeats: int = 0) -> dict:
         bounds=free,
     )
     us = np.zeros((task["count"], model.nu))
-    limits = Limits(max_iterations=500, time_limit=60.0, tolerance=math.sqrt(task["stop"] / (1 + COST)))
+    limits = Limits(max_iterations=500, time_limit=60.0, tolerance=math.sqrt(task["stop"] / (1 + task["cost"])))
     times, cpu = [], []
     for _ in range(1 + repeats):
         start = time.perf_counter(), time.process_time()
