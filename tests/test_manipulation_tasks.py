@@ -1,0 +1,66 @@
+"""The tasks of `benchmarks/manipulation_tasks.py`: what is asked is not there at the start, and the guess touches."""
+
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+
+sys.path.append(str(Path(__file__).parent / "benchmarks"))
+
+from manipulation_tasks import BESIDE, OUT, TASKS
+
+AT = {"spin": "spin_q", "slide": "slide_x", "bx": "bx_x", "by": "by_x"}  # the coordinate of a joint
+
+
+def drawn(name, seed=0):
+    return TASKS[name](np.random.default_rng([seed, zlib.crc32(name.encode()), 0]))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_nothing_asked_is_there_where_nothing_is_done(name):
+    problem = (task := drawn(name)).problem
+    us = np.zeros((problem.num_steps, problem.nu))
+    xs = dd.rollout(problem.model, problem.x0, us).xs
+    assert task.asks
+    for what, measure, allowed in task.asks:
+        assert measure(xs, us) > 5 * allowed, what
+
+
+@pytest.mark.parametrize("name", ["spinner", "ball", "box"])
+def test_an_end_just_inside_its_tolerance_is_taken_and_one_outside_is_refused(name):
+    problem = (task := drawn(name)).problem
+    (goal,) = problem.goals
+    ((_, measure, allowed),) = task.asks
+    for part, taken in ((0.99, True), (1.01, False), (-1.01, False)):
+        x = np.array(problem.x0)
+        for entry, wanted in goal.values.items():
+            x[problem.state_names.index(AT[entry])] = wanted + part * goal.tolerance
+        assert bool(measure(x[None], np.empty((0, problem.nu))) <= allowed) is taken
+
+
+def test_the_guess_takes_the_tip_beside_the_spinner_and_along_with_it():
+    task = drawn("spinner")
+    model, (xs, _) = task.problem.model, task.options["initial_guess"]
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    for x in xs[round(0.4 * (len(xs) - 1)) :]:
+        plant.SetPositionsAndVelocities(context, x)
+        tip = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName("lower")) @ np.array([0.15, 0, 0])
+        spinner = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName("spinner"))
+        # 1e-9 m: rounding of an arccos
+        np.testing.assert_allclose(spinner.inverse() @ tip, [-OUT, -BESIDE, 0], atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["spinner", "ball", "box"])
+def test_a_start_is_solved_and_drake_alone_finds_the_object_there(name):
+    from contact_plans import referee
+
+    task = drawn(name)
+    solution = dd.solve(task.problem, **task.options)
+    assert solution.success, solution.message
+    wrong, _ = referee(task, solution)
+    assert not wrong
