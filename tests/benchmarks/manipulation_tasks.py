@@ -67,7 +67,7 @@ def spinner(random: np.random.Generator, time_step: float = 0.02) -> Task:
 
 
 def beside(x0: np.ndarray, angle: float, count: int, time_step: float) -> np.ndarray:
-    """(N+1, 6) the finger goes to the spinner in the first 40 % of the time, and along with it in the rest, as far as it reaches."""
+    """(N+1, 6) the finger goes to the spinner in 40 % of the time, then along with it as far as it reaches."""
     part = np.linspace(0, 1, count + 1)
     spin = np.interp(part, [0, 0.4, 1], [x0[2], x0[2], angle])
     tip = np.array(PIVOT)[:, None] - OUT * np.array([np.cos(spin), np.sin(spin)])
