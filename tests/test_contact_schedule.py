@@ -10,7 +10,7 @@ from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.scheduled.centroidal import plan_forces
 from drake_diff.optimize.scheduled.legs import Legs
-from drake_diff.optimize.scheduled.motion import swings, touching
+from drake_diff.optimize.scheduled.motion import _slow_phases, _sunk, swings, touching
 
 H, G = 0.02, np.array([0.0, 0.0, -9.81])
 SQUARE = np.array([[0.2, 0.1, 0.0], [0.2, -0.1, 0.0], [-0.2, 0.1, 0.0], [-0.2, -0.1, 0.0]])
@@ -183,3 +183,38 @@ def test_solo_hops_and_lands(solo, standing):
     feet = [solo.plant.GetBodyByName(foot) for foot in SOLO_FEET]
     heights = [solo.plant.EvalBodyPoseInWorld(context, foot).translation()[2] - 0.016 for foot in feet]
     assert min(heights) > 0.02
+
+
+def test_a_phase_is_slow_where_it_lasts_twice_as_long_as_a_fall():
+    carries = np.ones((60, 4), dtype=bool)
+    carries[10:25, 0] = carries[30:48, 1] = False  # 0.3 s and 0.36 s; twice a fall of 0.25 m is 0.32 s
+    assert _slow_phases(carries, 0.02, 0.25, 9.81) == [(30, 48)]
+    assert _slow_phases(carries, 0.02, 0.25, 0.0) == []  # nothing falls
+    carries[30:48] = False
+    assert _slow_phases(carries, 0.02, 0.25, 9.81) == []  # it flies
+
+
+def test_a_sole_sinks_by_its_share_of_the_weight():
+    carries = np.ones((40, 4), dtype=bool)
+    carries[:, 3] = False
+    sunk = _sunk(1e-3, np.tile([0.5, 0.25, 0.25, 0.0], (40, 1)), carries)
+    assert np.allclose(sunk[-1], [1e-3, 0.0, 0.0, 0.0], atol=1e-8)  # 0.7 to the power of 40 is left, 6e-7 of it
+    assert np.all(np.diff(sunk[:, 0]) > 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_solo_lifts_a_foot(solo, seed):
+    x0 = rest("solo12", solo, np.array(LEGGED["solo12"].high), np.random.default_rng(seed))
+    schedule = dd.optimize.ContactSchedule([(25, SOLO_FEET), (25, SOLO_FEET[1:]), (15, SOLO_FEET)])
+    guess = schedule.guess(solo, x0)
+    problem = dd.Problem(solo, x0=x0, num_steps=65, goals=[schedule], **schedule.follow(solo, guess))
+    solution = dd.solve(problem, method="ilqr", initial_guess=guess, tolerance=1e-4, max_iterations=20)
+    assert solution.status.value != "iteration_limit"
+    legs, xs = Legs(solo, SOLO_FEET, x0[: solo.nq]), [x0]
+    for u in solution.us:  # Drake's own steps
+        xs.append(advance(solo.double, xs[-1], u))
+    heights = legs.along(np.array(xs)).places[..., 2]
+    assert heights[37, 0] > 0.01
+    assert np.max(heights[:, 1:]) < 1e-5  # 0 is kept to the tolerance of a search
+    assert np.max(np.abs(xs[-1][solo.nq : solo.nq + 6])) < 0.3

@@ -19,6 +19,9 @@ from drake_diff.optimize.scheduled.legs import Legs
 
 LANDS = 1e-3  # [m] how much deeper than it stands a foot lands: one that misses the ground meets it a step later
 LEVELLED = 6  # steps in which the soles become alike in depth
+# A phase on some feet is slow where it lasts so many times as long as a fall, the square root of height over gravity;
+# how far the centre of mass goes then from its way to the middle of these feet, and a sole in a step to its depth.
+FALLS, INWARD, SINKS = 2.0, 0.5, 0.3
 RUNS_OUT = 0.4  # [s] in which a first spin of the base does
 RISE = 2.0  # the power of a swing's arc: a foot that leaves and lands slowly
 BY_INPUT, BY_FORCE, BY_BASE = 1e3, 1.0, 1e-3  # how willingly inputs, forces and the base's acceleration give way
@@ -62,10 +65,17 @@ def scheduled_motion(
     way = mass_at + s[:, None] * (over - mass_at)
     gravity = np.asarray(model.double.plant.gravity_field().gravity_vector())
     start = mass_at, mass_by @ x0[model.nq :]
+    pull = float(np.linalg.norm(gravity))
+    slow, weight = _slow_phases(carries, h, way[0, 2], pull), legs.mass * pull
+    for a, b in slow:
+        middle = np.mean(places[a : b + 1, carries[a], :2], axis=1)
+        way[a : b + 1, :2] += INWARD * (middle - way[a : b + 1, :2])
     found = plan_forces(legs.mass, gravity, h, start, way, places, carries, friction)
     if not isinstance(found, tuple):
         raise InputError("ContactSchedule", got=str(found), expected="phases in which there are such forces")
     mass, forces = found
+    if slow:
+        places[:, :, 2] -= _sunk(-float(np.mean(places[-1, :, 2])), forces[:, :, 2] / weight, carries)
     places[:, :, 2] += arcs + _lifts(mass[:, 2], on)
     landing = on & ~np.vstack([on[:1], on[:-1]])
     places[landing, 2] -= LANDS
@@ -128,6 +138,24 @@ def _level(heights: Array, count: int) -> Array:
     sink = -float(np.mean(np.maximum(-heights, 0.0)))
     s = smooth(np.clip(np.arange(count) / LEVELLED, 0.0, 1.0))[:, None]
     return np.asarray(heights + s * (sink - heights))
+
+
+def _slow_phases(carries: Mask, h: float, height: float, pull: float) -> list[tuple[int, int]]:
+    """The knots from a to b, inside the motion, between which it stands on the same few points for long."""
+    changes = np.flatnonzero(np.any(carries[1:] != carries[:-1], axis=1)) + 1
+    long = FALLS * np.sqrt(max(height, 0.0) / pull) if pull else np.inf
+    phases = [(int(a), int(b)) for a, b in pairwise(changes)]
+    return [(a, b) for a, b in phases if (b - a) * h >= long and carries[a].any() and not carries[a].all()]
+
+
+def _sunk(depth: float, shares: Array, carries: Mask) -> Array:
+    """(N+1, n) [m] how much deeper than `depth`, that of an even share, soles are for shares (N, n) of the weight."""
+    n = shares.shape[1]
+    sunk = np.zeros((len(shares) + 1, n))
+    for k, carried in enumerate(carries):
+        wanted = depth * (n * shares[k] - 1)
+        sunk[k + 1] = np.where(carried, sunk[k] + SINKS * (wanted - sunk[k]), 0.0)
+    return sunk
 
 
 def _lifts(heights: Array, on: Mask) -> Array:
