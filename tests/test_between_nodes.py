@@ -6,6 +6,7 @@ from helpers.plants import block
 
 import drake_diff as dd
 from drake_diff.optimize.transcription.between import violation_between_nodes
+from drake_diff.optimize.transcription.collocation import collocated
 
 
 def pushed():
@@ -71,3 +72,39 @@ def test_what_is_kept_beside_a_disk_holds_between_the_nodes():
     xs = solution.transcribed.at(np.linspace(0, 1, 4001))[0]
     assert np.min(np.hypot(xs[:, 0] - 0.5, xs[:, 1] - 0.01)) > 0.2 - 1e-3
     assert violation_between_nodes(solution.transcribed).worst <= 1
+
+
+def at_rest(us=None, horizon=1.0, mesh=None):
+    """The plan of x' = u, |u| <= 1, that stays at 0 for 20 intervals."""
+    drift = dd.Dynamics(lambda x, u: [u[0]], nx=1, nu=1, u_lower=[-1], u_upper=[1])
+    problem = dd.Problem(
+        drift, x0=[0], num_steps=20, horizon=horizon, running_cost=dd.QuadraticCost(Q=[[1]], R=[[1]]), x_goal=[0]
+    )
+    mesh, us = np.linspace(0, 1, 21) if mesh is None else mesh, np.zeros((21, 1)) if us is None else us
+    return collocated(problem, "hermite_simpson", np.zeros((21, 1)), us, None, horizon, mesh)
+
+
+def test_a_plan_is_followed_under_feedback_as_in_closed_form():
+    """x' = -3 x decays as exp(-3 t), to 1e-9 by Runge-Kutta steps of 5 ms; at -2 the input's bound is met: -2 + t."""
+    motion, gains = at_rest(), np.full((20, 1, 1), 3.0)
+    times = np.linspace(0, 1, 201)
+    led = motion.led_from(np.array([0.3]), gains)[:, 0]
+    assert led == pytest.approx(0.3 * np.exp(-3 * times), abs=1e-9)
+    assert motion.led_from(np.array([-2.0]), gains)[:, 0] == pytest.approx(-2 + times, abs=1e-12)
+    assert motion.led_from(np.array([0.3]), None)[:, 0] == pytest.approx(0.3, abs=1e-15)
+
+
+def test_the_integration_of_another_motion_is_not_taken_over():
+    """By as little as the last bit of an input, or by its mesh or horizon; that of the very same one is."""
+    motion, other = at_rest(), np.zeros((21, 1))
+    expected = motion.gaps.copy()
+    assert expected == pytest.approx(0, abs=1e-15)
+    other[7] = np.finfo(float).tiny
+    bent = np.linspace(0, 1, 21) ** 1.1
+    for different in (at_rest(other), at_rest(horizon=1.1), at_rest(mesh=bent)):
+        different.measured_as(motion)
+        assert "_integrated" not in vars(different)
+    same = at_rest()
+    same.measured_as(motion)
+    assert "_integrated" in vars(same)
+    assert np.array_equal(same.gaps, expected)

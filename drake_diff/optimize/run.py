@@ -184,6 +184,8 @@ class Run:
             multipliers=motion.result.multipliers,
             certificates=certificates,
         )
+        if self.searched is None and draft.transcribed is not None:  # else it was measured under another cost
+            draft.transcribed.measured_as(motion)
         return self._judge(draft, motion.result)
 
     def sweep(self, guess: Guess, *, given: bool, stages: Stages) -> Solution:

@@ -298,6 +298,21 @@ class Collocated:
                 found.append(z)
         return np.array(found)
 
+    def measured_as(self, other: "Collocated") -> None:
+        """Take over where the knots of `other` lead, which has the same dynamics and cost; nothing of another motion.
+
+        It depends on knots, inputs, mesh, horizon and parameters alone, which have to be the same to the last bit.
+        """
+        ours, theirs = ((m.mesh, m.xs, m.inputs, np.array([m.horizon]), m.task.parameters) for m in (self, other))
+        same = all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
+        if same and self.task.scheme is other.task.scheme and "_integrated" in vars(other):
+            vars(self)["_integrated"] = other._integrated
+
+    @property
+    def inputs(self) -> Array:
+        """(K, nu) the inputs at all nodes."""
+        return self.nodes[:, self.task.dynamics.nx :]
+
     @cached_property
     def _held(self) -> Array:
         """(N, 21, nx + nu) the motion, inputs as the plant applies them, at every half of an interval's ten steps."""
