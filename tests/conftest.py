@@ -17,12 +17,16 @@ for public in dd.__all__:  # a module that is first loaded while a test has patc
     getattr(dd, public)
 
 
+# The quadruped's file has neither motors nor a ground, as most files of robots on legs.
+NEEDED = {"quadruped.urdf": {"base": "free", "actuators": "all", "ground": 0.7, "contact": "ground"}}
+
+
 @pytest.fixture
 def load():
     """Load a model of this repository by its file name."""
 
     def load_by_name(name, *, time_step=0.01, **options):
-        return dd.load_model(MODELS / name, time_step=time_step, **options)
+        return dd.load_model(MODELS / name, time_step=time_step, **(NEEDED.get(name, {}) | options))
 
     return load_by_name
 

@@ -83,7 +83,7 @@ def test_blindness_names_what_stays_apart(two_spheres):
     """The pusher moves towards the ball from 0.3 m and is 0.12 m away at the last knot: h^2 u N (N + 1) / 2 = 0.18."""
     us = np.full((20, 1), 0.18 / (0.02**2 * 20 * 21 / 2))
     problem = push(two_spheres(), gap=0.3, goal=1.0, num_steps=20)
-    xs = np.tile(problem.x0, (21, 1))
+    xs = dd.rollout(problem.model, problem.x0, us).xs
     solution = dd.solve(problem, method="ilqr", initial_guess=(xs, us))
     assert solution.status is Status.NO_GRADIENT
     assert "at knots 0-20 nothing touches (pusher and ball stay 0.12 m apart or more, nearest at knot 20)" in (

@@ -196,6 +196,8 @@ FIGURES = (
     "tasks_solved.md",
     "contact_plans.md",
     "mpc_realtime.md",
+    "derivatives.md",
+    "speed.md",
 )  # pages that a benchmark writes
 
 

@@ -237,7 +237,7 @@ def test_another_status_leaves_the_measures_as_they_were_taken(method):
 
 @each_row("name", ["xs", "us", "problem", "certificates", "cost"])
 def test_what_a_measure_may_depend_on_is_not_told(name):
-    with pytest.raises(InputError, match=f"expected one of iterations, .*, got '{name}'"):
+    with pytest.raises(InputError, match=f"expected one of elsewhere, iterations, .*, got '{name}'"):
         solved("ilqr").told(**{name: None})
 
 

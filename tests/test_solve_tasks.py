@@ -144,10 +144,10 @@ def test_a_plan_at_the_limits_of_its_motor_is_verified(write_urdf, method, limit
 
 def test_a_plan_whose_derivative_is_wrong_exactly_at_the_limit_is_not_verified(write_urdf, monkeypatch):
     """The fault is there at the limit alone, where no difference is taken."""
-    force = SmoothStep._force
+    force = SmoothStep.force_of
     monkeypatch.setattr(
         SmoothStep,
-        "_force",
+        "force_of",
         lambda self, q, v, us: (force(self, q, v, us)[0], np.abs(us) >= self.limit),
     )
     model = write_urdf(limit=2.0, time_step=0.04)
