@@ -18,7 +18,9 @@ for public in dd.__all__:  # a module that is first loaded while a test has patc
 
 
 # The quadruped's file has neither motors nor a ground, as most files of robots on legs.
-NEEDED = {"quadruped.urdf": {"base": "free", "actuators": "all", "ground": 0.7, "contact": "ground"}}
+LEGS, JOINTS = ("FL", "FR", "RL", "RR"), ("abduction", "hip_pitch", "knee")
+MOTORS = {f"{leg}_{joint}": 6.0 for leg in LEGS for joint in JOINTS}  # [N m], the efforts in the file
+NEEDED = {"quadruped.urdf": {"base": "free", "actuators": MOTORS, "ground": 0.7, "contact": "ground"}}
 
 
 @pytest.fixture

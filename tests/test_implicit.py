@@ -25,6 +25,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 import drake_diff as dd
+from drake_diff._base import compiled
 from drake_diff.certificates.certify import certify_inside
 from drake_diff.derivatives import sources
 from drake_diff.derivatives.smooth_step import SmoothStep
@@ -348,7 +349,9 @@ def test_a_box_in_the_air_that_autodiff_refuses_on_a_broad_phase_hit(ground):
     assert refused or ground == "half space"  # which 1.51 refuses and 1.58 does not
 
 
-def test_the_automatic_choice_says_what_it_took_and_why(load, without_pinocchio):
+def test_the_automatic_choice_says_what_it_took_and_why(load, without_pinocchio, monkeypatch):
+    """As after a plain install, without the extra `fast`."""
+    monkeypatch.setattr(compiled, "has_numba", lambda: False)
     model = load("double_pendulum.urdf")
     point = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
     d = dd.differentiate_step(model, *point)
