@@ -43,6 +43,7 @@ SUFFICIENT_DECREASE = 1e-4
 TRIALS = 5  # sizes along one policy; then a shorter policy is asked for
 LONGER = 2.0  # times a step that had been cut back: the first size that is tried after it
 MOST_CUT, LEAST_CUT = 0.1, 0.5  # of a size that was too long: the parabola's minimum is kept between
+LONG, TINY = 1 / 2, 1 / 100  # from a step that long on less regularization will do; below that it takes more
 SHORT, LITTLE = 1 / 32, 1e-2  # several steps cut back to that, each of which gains so little of the cost: it crawls
 # Of the cost: a promise below this is lost in the rounding of the cost's sum.
 ROUNDING = 1e-13
@@ -278,8 +279,12 @@ class _Search:
                 self.ahead = LONGER * size / (1 + self.regularization) if trial else 1.0
                 crawls = size < SHORT and self.gains[1] < LITTLE * abs(merit)
                 self.crawled = self.crawled + (trial > 0) if crawls else 0
-                relaxed = self.regularization / HARDER
-                self.regularization = relaxed if relaxed > SMALLEST_REGULARIZATION else 0.0
+                is_smooth = math.isinf(self.patience)  # else the model may reach too far again: contact jumps
+                if is_smooth or size >= LONG:
+                    relaxed = self.regularization / HARDER
+                    self.regularization = relaxed if relaxed > SMALLEST_REGULARIZATION else 0.0
+                elif size < TINY and trial:
+                    self.regularization = self._tightened()
                 return True
             excess = found - merit - slope * size
             least = -slope * size**2 / (2 * excess) if excess > 0 else 0.0  # 0 where what was found is infinite
