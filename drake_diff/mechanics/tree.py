@@ -21,6 +21,7 @@ vector algebra" (2022). Derivatives by q are by small motion: for a free body by
 Drake places the bodies; the rest is NumPy over all states at once.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +38,19 @@ from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 from drake_diff.model.step import set_state
+
+
+def poses_of(model: Model, bodies: Sequence[Any], q: Array) -> Array:
+    """(N, len(bodies), 3, 4) poses of Drake's bodies at q (N, nq); the double context is left at the last."""
+    plant, context = model.plant, model.double.context
+    own = {body.index(): body for body in bodies}
+    order = {index: i for i, index in enumerate(own)}
+    poses = np.empty((len(q), len(own), 3, 4))
+    for k, positions in enumerate(q):
+        plant.SetPositions(context, positions)
+        for i, body in enumerate(own.values()):
+            poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()
+    return np.take(poses, [order[body.index()] for body in bodies], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,15 +147,7 @@ class TreeDynamics:
 
     def place_all(self, model: Model, q: Array) -> Array:
         """The same at the positions q (N, nq) of all joints."""
-        plant, context = model.plant, model.double.context
-        bodies = {body.index(): body for body in self.bodies}
-        order = {index: i for i, index in enumerate(bodies)}
-        poses = np.empty((len(q), len(bodies), 3, 4))
-        for k, positions in enumerate(q):
-            plant.SetPositions(context, positions)
-            for i, body in enumerate(bodies.values()):
-                poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()
-        return poses[:, [order[body.index()] for body in self.bodies]]
+        return poses_of(model, self.bodies, q)
 
     def __call__(self, poses: Array, q: Array, v: Array, a: Array) -> InverseDynamics:
         """Inverse dynamics at poses (N, n, 3, 4), q, v and a (each (N, nv))."""

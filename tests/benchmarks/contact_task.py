@@ -17,7 +17,7 @@ Ask = tuple[str, Callable[[np.ndarray, np.ndarray], float], float]  # name, (xs,
 
 @dataclass(frozen=True)
 class Task:
-    """`options` are keywords of `dd.solve`; `asks` are what a referee measures besides the goal and the bounds.
+    """`options` are keywords of `dd.solve`; `asks` are all that a referee measures, the goal too, besides input limits.
 
     `schedule` is what Crocoddyl needs to be told, None where it cannot express the task; `build` gives Drake's
     (plant, diagram) at a time step, 0 for continuous, None where the model's own file gives it.

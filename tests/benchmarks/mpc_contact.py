@@ -30,11 +30,11 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np  # noqa: E402
-from helpers.models import MODELS  # noqa: E402
+from helpers.models import MODELS, strike  # noqa: E402
 from helpers.robots import FOOT, example_robot  # noqa: E402
 from pydrake.multibody.parsing import Parser  # noqa: E402
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant  # noqa: E402
-from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable  # noqa: E402
+from pydrake.multibody.tree import BodyIndex  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 from pydrake.systems.framework import DiagramBuilder  # noqa: E402
 
@@ -192,13 +192,7 @@ class Plant:
             self.steps = to
 
     def push(self, impulse):
-        plant, context, world = self.plant, self.context, self.plant.world_frame()
-        at = self.trunk.CalcCenterOfMassInBodyFrame(context)
-        J = plant.CalcJacobianTranslationalVelocity(
-            context, JacobianWrtVariable.kV, self.trunk.body_frame(), at, world, world
-        )
-        change = np.linalg.solve(plant.CalcMassMatrix(context), J.T @ impulse)
-        plant.SetVelocities(context, plant.GetVelocities(context) + change)
+        strike(self.plant, self.context, self.trunk, impulse)
 
 
 @dataclass(eq=False)

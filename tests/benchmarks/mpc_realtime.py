@@ -27,10 +27,9 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np  # noqa: E402
-from helpers.models import MODELS  # noqa: E402
+from helpers.models import MODELS, strike  # noqa: E402
 from pydrake.multibody.parsing import Parser  # noqa: E402
 from pydrake.multibody.plant import MultibodyPlant  # noqa: E402
-from pydrake.multibody.tree import JacobianWrtVariable  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 from task_cases import ARM, HOVER, MOMENT_RATIO, MOST, PANDA, QUADROTOR, ball_distance, flying, places  # noqa: E402
 
@@ -226,14 +225,7 @@ class Plant:
             self.xs.append(self.x)
 
     def push(self, impulse):
-        plant, context = self.plant, self.context
-        world = plant.world_frame()
-        at = self.body.CalcCenterOfMassInBodyFrame(context)
-        J = plant.CalcJacobianTranslationalVelocity(
-            context, JacobianWrtVariable.kV, self.body.body_frame(), at, world, world
-        )
-        dv = np.linalg.solve(plant.CalcMassMatrix(context), J.T @ impulse)
-        plant.SetVelocities(context, plant.GetVelocities(context) + dv)
+        strike(self.plant, self.context, self.body, impulse)
 
 
 @dataclass(frozen=True)

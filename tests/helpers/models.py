@@ -10,7 +10,7 @@ import pytest
 from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
-from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
+from pydrake.multibody.tree import JacobianWrtVariable, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
@@ -136,3 +136,12 @@ def ball_on_ground(folder, *, time_step, stiffness, relaxation_time, friction=0.
     path = folder / f"ball_{zlib.crc32(text.encode())}.sdf"  # a model is built again from its file
     path.write_text(text)
     return dd.load_model(path, time_step=time_step)
+
+
+def strike(plant, context, body, impulse):
+    """An impulse (3,) [N s] at the centre of mass of Drake's `body`: M dv = J' impulse."""
+    world = plant.world_frame()
+    at = body.CalcCenterOfMassInBodyFrame(context)
+    J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, body.body_frame(), at, world, world)
+    change = np.linalg.solve(plant.CalcMassMatrix(context), J.T @ impulse)
+    plant.SetVelocities(context, plant.GetVelocities(context) + change)

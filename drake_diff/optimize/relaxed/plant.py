@@ -29,7 +29,7 @@ from drake_diff.derivatives.contact.pairs import ContactPairs, Touches, read_pai
 from drake_diff.derivatives.implicit import form_of
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
-from drake_diff.mechanics.tree import TreeDynamics, tree_of
+from drake_diff.mechanics.tree import TreeDynamics, poses_of, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 
@@ -89,16 +89,9 @@ class RelaxedPlant:
 
     def place(self, q: Array) -> tuple[Array, Array]:
         """The poses (N, n, 3, 4) of the tree's bodies and (N, bodies, 3, 4) of the pairs' at q (N, nq)."""
-        plant, context = self.model.plant, self.model.double.context
-        own = {body.index(): body for body in (*self.tree.bodies, *self.pairs.bodies)}
-        at = {index: i for i, index in enumerate(own)}
-        poses = np.empty((len(q), len(own), 3, 4))
-        for k, positions in enumerate(q):
-            plant.SetPositions(context, positions)
-            for i, body in enumerate(own.values()):
-                poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()
-        tree, pairs = ([at[body.index()] for body in some] for some in (self.tree.bodies, self.pairs.bodies))
-        return np.take(poses, tree, axis=1), np.take(poses, pairs, axis=1)
+        poses = poses_of(self.model, (*self.tree.bodies, *self.pairs.bodies), q)
+        count = len(self.tree.bodies)
+        return np.ascontiguousarray(poses[:, :count]), np.ascontiguousarray(poses[:, count:])
 
     def forces(self, q: Array, v: Array, v_next: Array, soft: Softness, *, slopes: bool) -> Forces:
         """At q (N, nq), v and v_next (N, nv); without `slopes` the derivatives are empty."""
