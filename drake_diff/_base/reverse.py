@@ -248,7 +248,7 @@ def _sum(a: Any, axis: Any = None, keepdims: bool = False) -> Traced:
             g = np.expand_dims(g, axis)
         return np.broadcast_to(g, shape)
 
-    return _made(np.sum(a.value, axis=axis, keepdims=keepdims), (a, pull))
+    return _made(a.value.sum(axis=axis, keepdims=keepdims), (a, pull))
 
 
 def _mean(a: Any, axis: Any = None, keepdims: bool = False) -> Traced:

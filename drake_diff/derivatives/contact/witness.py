@@ -165,7 +165,7 @@ def _ellipsoid(shape: Shape, normal: Array, flat: float) -> Feature:
 def _mesh(shape: Shape, normal: Array, flat: float) -> Feature:
     found = _feature(normal)
     heights = normal @ shape.vertices.T
-    extent = float(np.ptp(shape.vertices, axis=0).max())
+    extent = float(np.max(np.ptp(shape.vertices, axis=0)))
     for i, row in enumerate(heights):
         top = shape.vertices[row >= row.max() - flat * extent]
         found.point[i] = top.mean(axis=0)
