@@ -2,7 +2,9 @@
 
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -55,6 +57,22 @@ def test_the_guess_takes_the_tip_beside_the_spinner_and_along_with_it():
         spinner = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName("spinner"))
         # 1e-9 m: rounding of an arccos
         np.testing.assert_allclose(spinner.inverse() @ tip, [-OUT, -BESIDE, 0], atol=1e-9)
+
+
+def test_the_referee_refuses_what_is_not_as_asked_and_a_task_that_asks_nothing():
+    from contact_plans import referee
+
+    task = drawn("ball")
+    nothing = SimpleNamespace(us=np.zeros((task.problem.num_steps, task.problem.nu)))
+    ((what, _, _),) = task.asks
+    (wrong,), _ = referee(task, nothing)
+    assert wrong.startswith(what)
+    (wrong,), _ = referee(replace(task, asks=()), nothing)
+    assert "nothing of its goal is measured" in wrong
+    beyond = np.zeros_like(nothing.us)
+    beyond[0] = 1.01 * task.problem.bounds.u_upper
+    wrong, _ = referee(task, SimpleNamespace(us=beyond))
+    assert any("beyond its limit" in one for one in wrong)
 
 
 @pytest.mark.slow
