@@ -105,7 +105,7 @@ class ContactSchedule(Goal):
             alike.setdefault(stands[:, foot].tobytes(), []).append(foot)
         found, most = list[GoalConstraint](), USED * self.slip
         for those in alike.values():
-            name, down = " and ".join(self.feet[i] for i in those), on[:, those[0]]
+            name, down = ", ".join(self.feet[i] for i in those), on[:, those[0]]
             heights, slides = soles.of("heights", those), soles.of("slides", those)
             carries = stands[:, those[0]]
             standing = np.flatnonzero(carries) + 1  # not where it lands: longer steps fly a little longer
@@ -235,7 +235,7 @@ def _rows(
     at = tuple(int(k) for k in knots)
 
     def words(distance: str) -> str:
-        return f"{name} is at most {distance} {off}"
+        return f"{name}: {'each ' if ', ' in name else ''}at most {distance} {off}"
 
     label = f"{name}: {off}"
     yield GoalConstraint(
