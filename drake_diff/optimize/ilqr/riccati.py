@@ -7,12 +7,16 @@ the boxes those of Tassa, Mansard and Todorov, "Control-limited differential dyn
 
 import math
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.compiled import kernel
 
+KERNEL = "drake_diff.optimize.ilqr.riccati_kernel"
+WORTH_COMPILING = 12  # states and inputs: of fewer a search takes less time than Numba takes to load
 BOX_ITERATIONS = 30
 HALVINGS = 0.5 ** np.arange(20)
 LEAST_SCALE = 1e-12  # of the largest diagonal entry: an input of no effect has a ridge too
@@ -75,10 +79,71 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePoli
     """The best policy, `regularization` times its own diagonal added to the inputs' Hessian.
 
     None if that is not positive definite. So the step is about 1 + `regularization` times shorter, whatever the units.
+    """
+    compiled = kernel(KERNEL) if problem.F.shape[2] >= WORTH_COMPILING else None
+    try:
+        if compiled is None:
+            swept = _sweep(problem, regularization)
+        else:
+            swept = _sweep_compiled(compiled, problem, regularization)
+        start, left = _best_start(problem, swept.P[0], swept.s[0], regularization)
+    except np.linalg.LinAlgError:
+        return None
+    d = swept.K[:, :, 0]
+    slope = float(np.sum(swept.gradients * d) + swept.s[0] @ start)
+    along = (swept.hessians @ d[:, :, None])[:, :, 0]
+    curvature = float(np.sum(along * d) + start @ swept.P[0] @ start)
+    gradient = float(np.abs(swept.gradients[swept.free]).max(initial=left))
+    if not math.isfinite(slope + curvature):  # NaN passes for positive definite
+        return None
+    return AffinePolicy(start, d, swept.K[:, :, 1:], swept.s, swept.P, slope, curvature, gradient)
 
-    The recursion is that of [1; dx], so that V = [[c, s'], [s, P]] is all that remains to be paid and
-    K = [feedforward, feedback] all that is done, in the fewest products: NumPy's calls, and memory that is new at every
-    knot, are what a sweep's time goes to.
+
+class _Swept(NamedTuple):
+    """What a sweep leaves."""
+
+    P: Array  # (N+1, n, n) and
+    s: Array  # (N+1, n), what remains to be paid
+    K: Array  # (N, m, n+1) feedforward and feedback
+    free: NDArray[np.bool_]  # (N, m) which inputs no bound holds
+    gradients: Array  # (N, m) and
+    hessians: Array  # (N, m, m), by the inputs
+
+
+def _sweep_compiled(compiled: Any, problem: LinearQuadratic, regularization: float) -> _Swept:
+    """The same as `_sweep`, knot by knot without NumPy's calls."""
+    n, (count, m) = problem.num_states, problem.lower.shape
+    P, s = np.empty((count + 1, n, n)), np.empty((count + 1, n))
+    P[-1], s[-1] = problem.final_hessian, problem.final_gradient
+    found = _Swept(
+        P,
+        s,
+        np.empty((count, m, n + 1)),
+        np.ones((count, m), dtype=bool),
+        np.empty((count, m)),
+        np.empty((count, m, m)),
+    )
+    asked = (problem.F, problem.gaps, problem.gradients, problem.hessians, problem.lower, problem.upper)
+    how = float(regularization), LEAST_SCALE, BOX_ITERATIONS, HALVINGS
+    if not compiled.sweep(*(_plain(part) for part in asked), *how, *found):
+        raise np.linalg.LinAlgError
+    return found
+
+
+def _plain(array: Array) -> Array:
+    """Itself, or a copy that is contiguous and may be written: of others the sweep would be compiled once more."""
+    flags = array.flags
+    return (
+        array if flags.c_contiguous and flags.writeable and array.dtype == float else np.array(array, float, order="C")
+    )
+
+
+def _sweep(problem: LinearQuadratic, regularization: float) -> _Swept:
+    """The recursion; raises LinAlgError where there is no minimum.
+
+    It is that of [1; dx], so that V = [[c, s'], [s, P]] is all that remains to be paid and K = [feedforward, feedback]
+    all that is done, in the fewest products: NumPy's calls, and memory that is new at every knot, are what a sweep's
+    time goes to.
     """
     n, (count, m) = problem.num_states, problem.lower.shape
     w = n + 1
@@ -90,34 +155,23 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePoli
     V[-1, 1:, 1:] = problem.final_hessian
     bounded = np.asarray((np.isfinite(problem.lower) | np.isfinite(problem.upper)).any(axis=1))
     Q_uu, Q_ux, gaps = Q[w:, w:], Q[w:, :w], bool(np.any(problem.gaps))
-    try:
-        for k in range(count - 1, -1, -1):
-            F[1:, 1:] = problem.F[k]
-            if gaps:
-                F[1:, 0] = problem.gaps[k]
-            F.T.dot(V[k + 1].dot(F, out=VF), out=Q)
-            Q[1:, 1:] += problem.hessians[k]
-            Q[0, 1:] += problem.gradients[k]
-            Q[1:, 0] += problem.gradients[k]
-            hessian = _with_ridge(Q_uu, regularization)
-            K_k = _gains(hessian, Q_ux)
-            if bounded[k]:
-                K_k, free[k] = _within(hessian, Q_ux, K_k, problem.lower[k], problem.upper[k])
-            W = Q[:w, :w] + K_k.T.dot(Q_uu.dot(K_k) + Q_ux) + Q_ux.T.dot(K_k)
-            np.add(W, W.T, out=V[k])
-            V[k] *= 0.5
-            K[k], gradients[k], hessians[k] = K_k, Q[w:, 0], Q_uu
-        P, s = V[:, 1:, 1:], V[:, 0, 1:]
-        start, left = _best_start(problem, P[0], s[0], regularization)
-    except np.linalg.LinAlgError:
-        return None
-    d = K[:, :, 0]
-    slope = float(np.sum(gradients * d) + s[0] @ start)
-    curvature = float(np.sum((hessians @ d[:, :, None])[:, :, 0] * d) + start @ P[0] @ start)
-    gradient = float(np.abs(gradients[free]).max(initial=left))
-    if not math.isfinite(slope + curvature):  # NaN passes for positive definite
-        return None
-    return AffinePolicy(start, d, K[:, :, 1:], s, P, slope, curvature, gradient)
+    for k in range(count - 1, -1, -1):
+        F[1:, 1:] = problem.F[k]
+        if gaps:
+            F[1:, 0] = problem.gaps[k]
+        F.T.dot(V[k + 1].dot(F, out=VF), out=Q)
+        Q[1:, 1:] += problem.hessians[k]
+        Q[0, 1:] += problem.gradients[k]
+        Q[1:, 0] += problem.gradients[k]
+        hessian = _with_ridge(Q_uu, regularization)
+        K_k = _gains(hessian, Q_ux)
+        if bounded[k]:
+            K_k, free[k] = _within(hessian, Q_ux, K_k, problem.lower[k], problem.upper[k])
+        W = Q[:w, :w] + K_k.T.dot(Q_uu.dot(K_k) + Q_ux) + Q_ux.T.dot(K_k)
+        np.add(W, W.T, out=V[k])
+        V[k] *= 0.5
+        K[k], gradients[k], hessians[k] = K_k, Q[w:, 0], Q_uu
+    return _Swept(V[:, 1:, 1:], V[:, 0, 1:], K, free, gradients, hessians)
 
 
 def _within(
