@@ -490,6 +490,59 @@ def test_a_step_takes_few_rollouts(file, goal, monkeypatch):
     assert steps[-1].objective < 1e-2 * result.iterations[0].objective
 
 
+@each_row(
+    "limits", [{"x_upper": [np.inf, 1.2]}, {"x_upper": [2, 1.4], "x_lower": [-2, -0.2]}, {"x_lower": [-0.01, -0.01]}]
+)
+@each_row("goal", [(1, 0), (1, 0.5)])
+def test_a_linear_plant_within_limits_takes_one_step_for_each_update_of_the_multipliers(limits, goal, monkeypatch):
+    """Its augmented cost is quadratic but for the bends where bounds begin to push, and a policy knows of them."""
+    updated, update = [], AugmentedLagrangian.update
+
+    def counted(self, *args):
+        updated.append(args)
+        update(self, *args)
+
+    monkeypatch.setattr(AugmentedLagrangian, "update", counted)
+    problem = move(goal=goal, **limits)
+    xs, us = np.zeros((21, 2)), np.zeros((20, 1))
+    result, _, _ = solve_ilqr(problem, xs, us, limits=Limits(100, 60.0, 1e-8), report=None)
+    assert result.outcome is Outcome.SOLVED
+    steps = [row.step for row in result.iterations[1:]]
+    assert min(steps) == 1
+    assert len(steps) <= len(updated) + 1
+
+
+@each_row("seed", range(6))
+def test_limits_cost_few_steps(seed):
+    """Double pendulums below a speed, in a corridor of positions, or both: at most 60 steps, where cut at each bend
+    they took 31 to 156; and what is found is IPOPT's optimum or cheaper, to its 1e-8 of the bounds."""
+    random = np.random.default_rng([8, seed])
+    model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.04)
+    start, end = random.uniform(-0.6, 0.6, 2), random.uniform(-0.8, 0.8, 2)
+    lower, upper = np.full(4, -np.inf), np.full(4, np.inf)
+    if seed % 3 != 1:
+        fastest = np.argmax(np.abs(end - start))
+        upper[2 + fastest] = 1.5 * abs(end - start)[fastest] / (30 * 0.04)
+        lower[2 + fastest] = -upper[2 + fastest]
+    if seed % 3:
+        lower[:2], upper[:2] = np.minimum(start, end) - 0.05, np.maximum(start, end) + 0.05
+    problem = dd.Problem(
+        model,
+        x0=[*start, 0, 0],
+        x_goal=[*end, 0, 0],
+        num_steps=30,
+        running_cost=dd.QuadraticCost(R=np.eye(2)),
+        bounds=dd.Bounds(lower, upper, -25 * np.ones(2), 25 * np.ones(2)),
+    )
+    line = np.linspace(problem.x0, problem.x_goal, 31)
+    result, xs, us = solve_ilqr(problem, line, np.zeros((30, 2)), limits=Limits(100, 60.0, 1e-8), report=None)
+    assert result.outcome is Outcome.SOLVED
+    assert len(result.iterations) <= 61
+    assert np.max(np.maximum(xs - upper, lower - xs)[1:]) < 1e-8
+    shooting = dd.solve(problem, method="shooting", solver="ipopt", initial_guess=(xs, us))
+    assert problem.objective(xs, us) <= shooting.cost * (1 + 1e-6)
+
+
 def test_a_ridge_is_in_the_units_of_what_it_is_added_to():
     """With one input in other units, 1000 times as many of them, the regularized motion is the same."""
     plain, p = [], _around(np.ones(2))

@@ -8,7 +8,7 @@ from helpers.table import each_row
 
 from drake_diff._base.compiled import kernel
 from drake_diff.optimize.ilqr import riccati
-from drake_diff.optimize.ilqr.riccati import LinearQuadratic, slope_along, solve_riccati
+from drake_diff.optimize.ilqr.riccati import LinearQuadratic, follow, slope_along, solve_riccati
 
 
 @pytest.fixture(autouse=True, params=["NumPy", "compiled"])
@@ -138,7 +138,7 @@ def test_what_is_promised_is_what_following_the_policy_costs(gaps, bound, regula
     dx = np.array([0.3, -0.2, 0.5])
     remains = policy.value_gradients[0] @ dx + dx @ policy.value_hessians[0] @ dx / 2
     assert value(p, *followed(p, policy, dx)) - still == pytest.approx(remains, abs=1e-10)
-    slope, curvature = slope_along(p, policy)
+    slope, curvature = slope_along(p, *follow(p, policy))
     assert slope + curvature / 2 == pytest.approx(still, abs=1e-10)
     if not gaps:
         assert -policy.expected == pytest.approx(still, abs=1e-10)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
 from drake_diff.optimize.problem.constraint import Constraint
@@ -17,6 +18,7 @@ from drake_diff.optimize.problem.problem import Problem
 
 FIRST_PENALTIES = (1.0, 1e6)  # the lowest and the highest
 LARGEST_PENALTY, GROWTH = 1e9, 10.0
+Active = tuple[NDArray[np.bool_], NDArray[np.bool_]]  # (m,) which upper bounds push, and which lower ones
 SMALLEST_SLOPE = 1e-8  # of a row: below it nothing says in what unit it is to be weighed
 
 
@@ -42,6 +44,8 @@ class AugmentedLagrangian:
         self.multipliers = np.zeros(len(self.lower))
         self.penalty = FIRST_PENALTIES[0]
         self.any = bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
+        self.is_equality = self.lower == self.upper
+        self.have_bends = bool((np.isfinite(self.lower) | np.isfinite(self.upper))[~self.is_equality].any())
 
     @property
     def forces(self) -> Array:
@@ -77,15 +81,30 @@ class AugmentedLagrangian:
         """What the constraints add to the cost of xs (N+1, nx), us (N, nu)."""
         if not self.any:
             return 0.0
-        return float(np.sum(self._pushes(xs, us) ** 2 - self.multipliers**2)) / (2 * self.penalty)
+        return self._value(*self._forces(self._values(xs, us)))
 
-    def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
+    def active(self, xs: Array, us: Array) -> Active:
+        """Which rows push."""
+        return self._active(*self._forces(self._values(xs, us)))
+
+    def look_ahead(self, xs: Array, us: Array, dxs: Array, dus: Array) -> tuple[Active, float]:
+        """Which rows push, and `value`, at the distance dxs (N+1, nx), dus (N, nu) from xs, us, by the rows' slopes."""
+        zs, moved = np.hstack([dxs, np.vstack([dus, dus[-1:]])]), [dxs.ravel()]
+        for group in self.groups:
+            moved.append(np.einsum("kri,ki->kr", group.jacobians(xs, us), zs[group.knots]).ravel())
+        forces = self._forces(self._values(xs, us) + np.concatenate(moved))
+        return self._active(*forces), self._value(*forces)
+
+    def differentiate(self, xs: Array, us: Array, active: Active | None = None) -> tuple[Array, Array]:
         """(gradients (N+1, nx + nu), Hessians (N+1, nx + nu, nx + nu)) of `value` by each [x_k; u_k].
 
-        Raises GradientError if that of a constraint is lost or not finite.
+        Given other rows than those that push here, of what `value` would be if the given pushed, and they alone. Raises
+        GradientError if that of a constraint is lost or not finite.
         """
-        pushes = self._pushes(xs, us)
-        stiffness = np.where((pushes != 0) | (self.lower == self.upper), self.penalty, 0.0)
+        above, below = self._forces(self._values(xs, us))
+        active = self._active(above, below) if active is None else active
+        pushes = np.where(active[0], above, 0.0) + np.where(active[1], below, 0.0)
+        stiffness = np.where(active[0] | active[1], self.penalty, 0.0)
         (count, nx), n = xs.shape, xs.shape[1] + us.shape[1]
         gradients, hessians = np.zeros((count, n)), np.zeros((count, n, n))
         gradients[:, :nx] = pushes[: xs.size].reshape(xs.shape)
@@ -114,11 +133,22 @@ class AugmentedLagrangian:
         values = self._values(xs, us)
         return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
 
+    def _forces(self, values: Array) -> tuple[Array, Array]:
+        """(m,) each: y + p c of the upper bounds, which push where it is positive, and of the lower ones."""
+        weight = self.penalty * self.scale
+        return self.multipliers + weight * (values - self.upper), self.multipliers + weight * (values - self.lower)
+
+    def _active(self, above: Array, below: Array) -> Active:
+        """An equality pushes always, on one side or the other: it is told as its upper bound."""
+        return (above > 0) | self.is_equality, (below < 0) & ~self.is_equality
+
+    def _value(self, above: Array, below: Array) -> float:
+        pushes = np.maximum(above, 0.0) + np.minimum(below, 0.0)
+        return float(np.sum(pushes**2 - self.multipliers**2)) / (2 * self.penalty)
+
     def _pushes(self, xs: Array, us: Array) -> Array:
         """(m,): y + p c of each bound that pushes, 0 elsewhere."""
-        values, weight = self._values(xs, us), self.penalty * self.scale
-        above = self.multipliers + weight * (values - self.upper)
-        below = self.multipliers + weight * (values - self.lower)
+        above, below = self._forces(self._values(xs, us))
         return np.maximum(above, 0.0) + np.minimum(below, 0.0)
 
 

@@ -18,7 +18,7 @@ from drake_diff.derivatives.step import smooth_jacobians
 from drake_diff.derivatives.steps import known_steps
 from drake_diff.model.parameters import select
 from drake_diff.motion.rollout import STEPS
-from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
+from drake_diff.optimize.ilqr.constraints import Active, AugmentedLagrangian
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 from drake_diff.optimize.problem.cost import (
     differentiate_cost,
@@ -99,6 +99,25 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
         start_upper=np.where(free, bounds.x_upper - xs[0], 0.0),
     )
     return _with_design(problem, motion, found, h) if len(motion.c) else found
+
+
+def with_active(
+    problem: Problem, motion: Motion, model: LinearQuadratic, rows: AugmentedLagrangian, old: Active, new: Active
+) -> LinearQuadratic:
+    """`model` of `motion`, in which the `old` rows push, as if the `new` ones pushed, and they alone."""
+    nx, n = motion.xs.shape[1], model.F.shape[2]
+    kept = np.r_[:nx, nx + len(motion.c) : n]  # where x and u are in [x, c, u]
+    before, after = rows.differentiate(*motion.point, old), rows.differentiate(*motion.point, new)
+    gradient, curvature = after[0] - before[0], after[1] - before[1]
+    gradients, hessians = np.array(model.gradients), np.array(model.hessians)
+    final_gradient, final_hessian = np.array(model.final_gradient), np.array(model.final_hessian)
+    gradients[:, kept] += gradient[:-1]
+    hessians[:, kept[:, None], kept] += curvature[:-1]
+    final_gradient[:nx] += gradient[-1, :nx]
+    final_hessian[:nx, :nx] += curvature[-1, :nx, :nx]
+    return replace(
+        model, gradients=gradients, hessians=hessians, final_gradient=final_gradient, final_hessian=final_hessian
+    )
 
 
 def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: float) -> LinearQuadratic:

@@ -19,9 +19,16 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
-from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
-from drake_diff.optimize.ilqr.expansion import DynamicsCurvature, Motion, curvature_along, expand, jacobians_along
-from drake_diff.optimize.ilqr.riccati import AffinePolicy, LinearQuadratic, slope_along, solve_riccati
+from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, Active, AugmentedLagrangian
+from drake_diff.optimize.ilqr.expansion import (
+    DynamicsCurvature,
+    Motion,
+    curvature_along,
+    expand,
+    jacobians_along,
+    with_active,
+)
+from drake_diff.optimize.ilqr.riccati import AffinePolicy, LinearQuadratic, follow, slope_along, solve_riccati
 from drake_diff.optimize.problem.cost import CostToGo
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import (
@@ -52,6 +59,8 @@ LEFT_OVER = 3e-2
 BESIDE = 1e-14  # of a bound: an input that is no further from it is on it
 # Of what a step gained: where the next one gains more, the search converges slowly, for want of the right curvature.
 SLOW = 1 / 2
+SETTLE = 12  # sweeps for one policy, until it leads to the bounds that it was made for
+PARTS = 0.5 ** np.arange(6)  # of such a sweep's step
 
 _Solve = Callable[[LinearQuadratic, float], AffinePolicy | None]
 
@@ -140,6 +149,30 @@ def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: 
             return False
         found = found or policy is not None
     return found
+
+
+class _Bends:
+    """The model of an augmented cost with the bends where bounds begin to push, as a function of steps (dxs, dus)."""
+
+    def __init__(self, smooth: LinearQuadratic, rows: AugmentedLagrangian, point: tuple[Array, Array]):
+        self.smooth, self.rows, self.point = smooth, rows, point
+        self.still = np.zeros((len(point[0]), smooth.num_states)), np.zeros_like(point[1])
+        self.base = rows.value(*point)
+
+    def __call__(self, step: tuple[Array, Array]) -> tuple[Active, float]:
+        """Which bounds push there, and how the model changes."""
+        active, value = self.rows.look_ahead(*self.point, step[0][:, : self.point[0].shape[1]], step[1])
+        slope, curvature = slope_along(self.smooth, *step)
+        return active, slope + curvature / 2 + value - self.base
+
+    def lower_between(self, old: tuple[Array, Array], new: tuple[Array, Array]) -> tuple[Array, Array]:
+        """The first step on the way back from `new` to `old` that is lower than `old`."""
+        before, found = self(old)[1], new
+        for part in PARTS:
+            found = tuple(a + part * (b - a) for a, b in zip(old, new, strict=True))
+            if self(found)[1] < before:
+                break
+        return found
 
 
 class _Search:
@@ -246,7 +279,7 @@ class _Search:
             return Outcome.ITERATION_LIMIT
         refusals = self.refusals
         while self.regularization <= LARGEST_REGULARIZATION:
-            policies = (solve(one, self.regularization) for one in models)
+            policies = (self._settled(one, solve(one, self.regularization)) for one in models)
             policy = next((p for p in policies if p is not None and p.expected >= 0), None)
             if policy is not None and self._search_along(model, policy):
                 return None
@@ -257,6 +290,38 @@ class _Search:
             self.regularization = self._tightened()
         self.regularization = 0.0
         return Outcome.NO_GRADIENT if self.refusals > refusals else Outcome.INACCURATE
+
+    def _settled(self, model: LinearQuadratic, policy: AffinePolicy | None) -> AffinePolicy | None:
+        """The policy for the bounds that push where it leads, in place of those that push here.
+
+        Where a bound begins to push, or ends, the augmented cost has a bend that no quadratic model has, and a step is
+        cut back at the next of them. Quadratic but for its bends, the cost's model has its minimum where Newton steps,
+        each a sweep, lead: they end at a policy that leads to the very bounds it was made for. Of a rollout alone: what
+        closes gaps goes too far for such a model.
+        """
+        rows, point = self.constraints, self.motion.point
+        if policy is None or not rows.have_bends or not self.motion.is_rollout:
+            return policy
+        here, none = rows.active(*point), np.zeros(len(rows.lower), dtype=bool)
+        smooth = with_active(self.problem, self.motion, model, rows, here, (none, none))
+        bends = _Bends(smooth, rows, point)
+        active, step, best, least = here, bends.still, policy, math.inf
+        for _ in range(SETTLE):
+            led = follow(model, policy)
+            ahead, change = bends(led)
+            if change < least:
+                slope, least = slope_along(model, *led)[0], change
+                best = replace(policy, slope=slope, curvature=2 * (change - slope))
+            if all(map(np.array_equal, ahead, active)):
+                break
+            step = bends.lower_between(step, led)
+            active = bends(step)[0]
+            bent = with_active(self.problem, self.motion, smooth, rows, (none, none), active)
+            next_policy = solve_riccati(bent, self.regularization)
+            if next_policy is None:
+                break
+            policy = next_policy
+        return best
 
     def _tightened(self) -> float:
         return max(HARDER * self.regularization, FIRST_REGULARIZATION)
@@ -269,7 +334,7 @@ class _Search:
         """
         slope, distance = policy.slope, self.motion.distance
         if distance:
-            slope, curvature = slope_along(model, policy)
+            slope, curvature = slope_along(model, *follow(model, policy))
             self.gap_weight = max(self.gap_weight, 2 * (slope + max(curvature, 0) / 2) / distance)
             slope -= self.gap_weight * distance
         merit, size = self._merit(self.motion, self.cost), min(1.0, self.ahead * (1 + self.regularization))

@@ -249,13 +249,20 @@ def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array)
     return d, free
 
 
-def slope_along(problem: LinearQuadratic, policy: AffinePolicy) -> tuple[float, float]:
-    """(slope, curvature) of the cost along the full linear step, which closes the gaps."""
-    dx, slope, curvature = policy.start, 0.0, 0.0
-    for k in range(len(problem.F)):
-        z = np.concatenate([dx, policy.feedforward[k] + policy.feedback[k] @ dx])
-        slope += float(problem.gradients[k] @ z)
-        curvature += float(z @ problem.hessians[k] @ z)
-        dx = problem.F[k] @ z + problem.gaps[k]
-    slope += float(problem.final_gradient @ dx)
-    return slope, curvature + float(dx @ problem.final_hessian @ dx)
+def follow(problem: LinearQuadratic, policy: AffinePolicy) -> tuple[Array, Array]:
+    """(dxs (N+1, n), dus (N, m)) of the full linear step, which closes the gaps."""
+    n, (count, m) = problem.num_states, problem.lower.shape
+    zs, dx = np.empty((count, n + m)), policy.start
+    for z, F, f, d, K in zip(zs, problem.F, problem.gaps, policy.feedforward, policy.feedback, strict=True):
+        z[:n] = dx
+        z[n:] = d + K.dot(dx)
+        dx = F.dot(z) + f
+    return np.vstack([zs[:, :n], dx]), zs[:, n:]
+
+
+def slope_along(problem: LinearQuadratic, dxs: Array, dus: Array) -> tuple[float, float]:
+    """(slope, curvature) of the cost along a step (N+1, n), (N, m)."""
+    zs, dx = np.hstack([dxs[:-1], dus]), dxs[-1]
+    slope = float(np.sum(problem.gradients * zs) + problem.final_gradient @ dx)
+    bent = (problem.hessians @ zs[:, :, None])[:, :, 0]
+    return slope, float(np.sum(bent * zs) + dx @ problem.final_hessian @ dx)
