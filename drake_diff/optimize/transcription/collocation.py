@@ -20,6 +20,7 @@ from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearance
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.problem.rates import RateLimit
 from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome, Report
+from drake_diff.optimize.transcription.lead import Lead
 from drake_diff.optimize.transcription.task import OptimalControl
 
 SLOPED = np.linspace(0, 1, 11)  # where slopes are looked at within an interval, its ends among them
@@ -128,14 +129,14 @@ class Collocated:
     def _slopes(self, values: Array) -> Array:
         """Of `values` (N, S, n) by time, exact for parabolas."""
         by_tau = np.gradient(values, SLOPED, axis=1, edge_order=2)
-        return np.asarray(by_tau / self._lengths[:, None, None])
+        return np.asarray(by_tau / self.lengths[:, None, None])
 
     @cached_property
     def defects(self) -> Array:
         """(N,) how far each interval is from the scheme's equations, in the worst coordinate's unit."""
         xs = self.task.scheme.per_interval(self.nodes[:, : self.task.dynamics.nx])
         rates = self.task.scheme.per_interval(self._rates)
-        defects = self.task.scheme.interval_defects(self._lengths, xs, rates)
+        defects = self.task.scheme.interval_defects(self.lengths, xs, rates)
         return np.asarray(np.max(np.abs(defects), axis=(1, 2)))
 
     @property
@@ -162,7 +163,7 @@ class Collocated:
     def cost_errors(self) -> Array:
         """(N,) the same of the running cost's quadrature, as a part of the whole cost (of 1 where that is less)."""
         scheme = self.task.scheme
-        quadrature = self._lengths * (scheme.per_interval(self._cost_rates) @ scheme.weights)
+        quadrature = self.lengths * (scheme.per_interval(self._cost_rates) @ scheme.weights)
         return _finite(np.abs(self._integrated[-1, :, -1] - quadrature) / max(1.0, abs(self.cost)))
 
     def at(self, times: Any) -> tuple[Array, Array]:
@@ -184,7 +185,8 @@ class Collocated:
         return self.task.rates(self.nodes, self.horizon * self.task.scheme.node_fractions(self.mesh))
 
     @property
-    def _lengths(self) -> Array:
+    def lengths(self) -> Array:
+        """(N,) [s] of the intervals."""
         return self.horizon * np.diff(self.mesh)
 
     def interval_at(self, times: Array) -> Indices:
@@ -198,7 +200,7 @@ class Collocated:
 
     def times(self, k: Indices, tau: Array) -> Array:
         """[s] (S,) of the places `tau` in the intervals `k`."""
-        return np.asarray(self.horizon * self.mesh[k] + tau * self._lengths[k])
+        return np.asarray(self.horizon * self.mesh[k] + tau * self.lengths[k])
 
     def between(self, k: Any, tau: Array) -> tuple[Array, Array]:
         """xs and us in the intervals `k` (S,) at `tau` (S,) of each."""
@@ -207,7 +209,7 @@ class Collocated:
         if self.task.is_map:  # between two steps nothing moves
             return self.xs[k + (tau > 1 - ROUNDED)], np.einsum("sj,sju->su", scheme.at(tau), us)
         moved = np.einsum("sj,sjx->sx", scheme.integrated(tau), scheme.per_interval(self._rates)[k])
-        return self.xs[k] + self._lengths[k, None] * moved, np.einsum("sj,sju->su", scheme.at(tau), us)
+        return self.xs[k] + self.lengths[k, None] * moved, np.einsum("sj,sju->su", scheme.at(tau), us)
 
     @cached_property
     def open_loop(self) -> Array:
@@ -215,7 +217,7 @@ class Collocated:
         return self._open_loop[::SUBSTEPS]
 
     def led(self, control: str) -> Array:
-        """(10 N + 1, nx) the same at every substep, by "open loop", or by "TVLQR" about the motion."""
+        """(10 N + 1, nx) the same at every tenth of an interval, by "open loop", or by "TVLQR" about the motion."""
         return self._open_loop if control == "open loop" else self.led_from(self.xs[0], self.gains()[0])
 
     @cached_property
@@ -224,33 +226,21 @@ class Collocated:
 
     def led_from(self, x: Array, gains: Array | None) -> Array:
         """(10 N + 1, nx) where the dynamics lead from `x` (nx,), with feedback by `gains` (N, nu, nx) if there are."""
-        found = [x[None]]
+        if not self.task.is_map:
+            return self._lead.from_state(x, gains)
+        found, (lower, upper) = [x[None]], self.input_limits
         with np.errstate(all="ignore"):
-            for k in range(len(self.mesh) - 1):
-                found.append(self._led_through(k, found[-1][-1], None if gains is None else gains[k]))
+            for k, planned in enumerate(self._held[:, 0]):
+                x, u = found[-1][-1], planned[self.task.dynamics.nx :]
+                if gains is not None:
+                    u = np.minimum(np.maximum(u + gains[k] @ (planned[: len(x)] - x), lower), upper)
+                after = self.task.moved(np.concatenate((x, u))[None], np.array([k]))
+                found.append(np.vstack([np.tile(x, (SUBSTEPS - 1, 1)), after]))  # the state is held until then
         return np.concatenate(found)
 
-    def _led_through(self, k: int, x: Array, gains: Array | None) -> Array:
-        """(10, nx) where `x` (nx,) at the start of the interval `k` leads in ten steps, as `_integrated` takes them."""
-        nx, interval, moved, held = self.task.dynamics.nx, np.array([k]), self.task.moved, self._held[k]
-        dt, found = self._lengths[k] / SUBSTEPS, np.empty((SUBSTEPS, nx))
-        lower, upper = (self._cut_off(side) for side in (self.task.bounds.u_lower, self.task.bounds.u_upper))
-
-        def rate(x: Array, half: int) -> Array:
-            u = held[half, nx:]
-            if gains is not None:
-                u = np.minimum(np.maximum(u + gains @ (held[half, :nx] - x), lower), upper)
-            return moved(np.concatenate((x, u))[None], interval)[0]
-
-        if self.task.is_map:  # the state is held until the next step
-            found[:-1], found[-1] = x, rate(x, 0)
-            return found
-        for i in range(SUBSTEPS):
-            k1 = rate(x, 2 * i)
-            k2 = rate(x + dt / 2 * k1, 2 * i + 1)
-            k3 = rate(x + dt / 2 * k2, 2 * i + 1)
-            x = found[i] = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + dt * k3, 2 * i + 2))
-        return found
+    @cached_property
+    def _lead(self) -> Lead:
+        return Lead(self, SUBSTEPS)
 
     def gains(self, at_end: Array | None = None) -> tuple[Array, Array]:
         """(N, nu, nx) of each interval, by Riccati's recursion with Bryson's weights, as a replay's TVLQR has them.
@@ -264,7 +254,7 @@ class Collocated:
         by_knot = self.task.linearized(np.hstack([self.xs, self.us])[:-1], np.arange(count))
         P, gains = FINAL_WEIGHT * Q if at_end is None else at_end, np.empty((count, nu, nx))
         for k in range(count - 1, -1, -1):
-            h, A, B = self._lengths[k], by_knot[k][:, :nx], by_knot[k][:, nx:]
+            h, A, B = self.lengths[k], by_knot[k][:, :nx], by_knot[k][:, nx:]
             if not is_map:  # the step by the implicit midpoint rule
                 implicit = np.eye(nx) - h / 2 * A
                 A, B = np.linalg.solve(implicit, np.eye(nx) + h / 2 * A), np.linalg.solve(implicit, h * B)
@@ -278,7 +268,7 @@ class Collocated:
         nx, task, held = self.task.dynamics.nx, self.task, self._held
         k = np.arange(len(self.mesh) - 1)
         z = np.column_stack([self.xs[:-1], np.zeros(len(k))])
-        dt, found = self._lengths[:, None] / SUBSTEPS, [z]
+        dt, found = self.lengths[:, None] / SUBSTEPS, [z]
 
         def rate(z: Array, half: int) -> Array:
             knots = np.concatenate((z[:, :nx], held[:, half, nx:]), axis=1)
@@ -318,15 +308,15 @@ class Collocated:
         """(N, 21, nx + nu) the motion, inputs as the plant applies them, at every half of an interval's ten steps."""
         count, halves = len(self.mesh) - 1, np.arange(2 * SUBSTEPS + 1)
         xs, us = self.between(np.repeat(np.arange(count), len(halves)), np.tile(halves / (2 * SUBSTEPS), count))
-        return np.hstack([xs, self._cut_off(us)]).reshape(count, len(halves), -1)
+        return np.hstack([xs, self.cut_off(us)]).reshape(count, len(halves), -1)
 
     def applied_at(self, times: Array) -> Array:
         """(S, nu) the inputs at `times` (S,) [s] as the plant applies them."""
-        return self._cut_off(self.at(times)[1])
+        return self.cut_off(self.at(times)[1])
 
     def applied(self, k: Indices, tau: Array) -> Array:
         """(S, nu) the inputs in the intervals `k` at `tau` as the plant applies them."""
-        return self._cut_off(self.between(k, tau)[1])
+        return self.cut_off(self.between(k, tau)[1])
 
     def seen(self, c: ClearanceConstraint) -> tuple[Array, Array]:
         """Times (S,) [s] between the knots and states (S, nx): where the dynamics lead, and what `c` looks at besides.
@@ -339,7 +329,12 @@ class Collocated:
         between = ~np.isin(when, knots)
         return np.concatenate([times, when[between]]), np.vstack([xs, where[between]])
 
-    def _cut_off(self, us: Array) -> Array:
+    @property
+    def input_limits(self) -> tuple[Array, Array]:
+        """(nu,) each: the task's bounds within the plant's own limits."""
+        return self.cut_off(self.task.bounds.u_lower), self.cut_off(self.task.bounds.u_upper)
+
+    def cut_off(self, us: Array) -> Array:
         """`us` (S, nu) at the plant's own limits."""
         limits = self.task.dynamics.bounds
         return np.clip(us, limits.u_lower, limits.u_upper)
