@@ -103,6 +103,11 @@ class Twin:
         return tuple(labelled(elements(self.plant)) for elements in (bodies, joints, actuators))
 
     @cached_property
+    def _actuation(self) -> Any:
+        """The plant's own input port where u is its actuation and nothing else, or None."""
+        return self.plant.get_actuation_input_port() if self.inputs.plain else None
+
+    @cached_property
     def _workspace(self) -> Any:
         return MultibodyForces_[self.scalar](self.plant)
 
@@ -190,8 +195,8 @@ class Twin:
 
     def set_input(self, u: Any) -> None:
         """Put the input `u` (nu,), floats or AutoDiffXd, into the context."""
-        if self.inputs.plain:
-            self.plant.get_actuation_input_port().FixValue(self.context, u)
+        if self._actuation is not None:
+            self._actuation.FixValue(self.context, u)
             return
         for number, where in self.inputs.ports:
             self.diagram.get_input_port(number).FixValue(self.root_context, u[where])

@@ -217,12 +217,12 @@ class TVLQR:
         if self._space.quaternions:
             points = zip(self.xs[:-1], self.xs[1:], A, B, strict=True)
             A, B = np.split(np.array([self._space.jacobian(*each) for each in points]), [self._space.size], axis=2)
-        gains, cost_to_go = [], [Q if Qf is None else _weight("Qf", Qf, self._space.size)]
+        gains, cost_to_go = list[Array](), [Q if Qf is None else _weight("Qf", Qf, self._space.size)]
         for A_k, B_k in zip(A[::-1], B[::-1], strict=True):
             P = cost_to_go[-1]
-            BP = B_k.T @ P
-            gains.append(np.asarray(np.linalg.solve(R + BP @ B_k, BP @ A_k), dtype=float))
-            before = Q + A_k.T @ P @ (A_k - B_k @ gains[-1])
+            BP = B_k.T.dot(P)
+            gains.append(np.linalg.solve(R + BP.dot(B_k), BP.dot(A_k)))
+            before = Q + A_k.T.dot(P).dot(A_k - B_k.dot(gains[-1]))
             cost_to_go.append((before + before.T) / 2)
         self.gains, self.cost_to_go = frozen(gains[::-1]), frozen(cost_to_go[::-1])
         self.parameters = frozen(self.gains.ravel())

@@ -317,9 +317,11 @@ def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
             entries, limits = limit.entries(plan.problem.system)
             slew[entries] = np.minimum(slew[entries], limits * period)
 
+    unlimited = bool(np.all(np.isinf(slew)))
+
     def kept(x: Any, t: float) -> Any:
         wanted = np.minimum(np.maximum(policy(x, t), bounds.u_lower), bounds.u_upper)
-        if np.all(np.isinf(slew)):
+        if unlimited:
             return wanted
         last[:] = [wanted if not last else np.clip(wanted, last[0] - slew, last[0] + slew)]
         return last[0]
