@@ -9,6 +9,7 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.certificates.certify import certify_inside
 from drake_diff.certificates.first_look import LookAt
+from drake_diff.certificates.neighbourhood import is_broken
 from drake_diff.certificates.steps import certify_steps, first_looks
 
 RANDOM = np.random.default_rng(3)
@@ -123,3 +124,48 @@ def test_many_steps_agree_as_each_does():
     for x, u, found in zip(xs, us, together, strict=True):
         assert found.verdict == certify_inside(model, x, u).verdict == "agree"
         assert "random directions" in found.told
+
+
+@each_row(
+    "f, broken",
+    [
+        (lambda t: np.sin(t), False),
+        (lambda t: t + np.maximum(t - 1e-3, 0.0), False),  # a contact that begins farther away
+        (lambda t: t + (t > 2e-6), False),  # one jump is no staircase
+        (lambda t: t + np.maximum(t - 4e-8, 0.0), True),  # between the point and the first place on the line
+        (lambda t: t + np.maximum(-t - 3e-7, 0.0), True),  # to one side
+        (lambda t: t + 1e-9 * (t > 0), True),
+        (lambda t: np.floor(t / 1e-5 + 0.5) * 1e-5, True),  # longer stairs than the widths of a nearer look
+        (lambda t: t + 1e-6 * np.floor(t / 1e-5 + 0.5), True),
+    ],
+)
+def test_what_a_nearer_look_does_not_meet_is_sought_along_a_line(f, broken):
+    def changes(x):
+        return np.stack([f(x @ [1.0, 0.5]), x[:, 0] * 3], axis=1) - [f(np.zeros(1))[0], 0.0]
+
+    assert bool(is_broken(changes, 2)) == broken
+
+
+def test_a_nearer_look_meets_what_is_at_the_point_and_not_what_is_beside_it():
+    def doubts(f):
+        found = []
+        for nearer in (False, True):
+            look = LookAt(np.array([[1.0]]), nearer=nearer)
+            found.append(look.taken(f(look.displacements)).doubt() != "")
+        return found
+
+    assert doubts(lambda x: x + np.maximum(x - 5e-6, 0.0)) == [True, False]
+    assert doubts(lambda x: x + np.maximum(x - 1e-7, 0.0)) == [True, True]
+    assert doubts(lambda x: x + 0.02 * np.abs(x)) == [True, True]
+    assert doubts(lambda x: 1.0101 * x) == [True, True]
+    assert doubts(lambda x: np.floor(x / 1e-3 + 0.5) * 1e-3) == [True, True]
+
+
+def test_a_ball_that_has_just_touched_passes_nearer_to_the_point_where_every_entry_agrees():
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
+    x = model.default_state
+    x[:4], x[4:] = [1, 0, 0, 0], [0.75, 0.25, 0.1 - 1.57e-6, -1.65, 0.25, 1.22, -0.3, -0.8, 0]
+    (found,) = certify_steps(model, x[None], np.zeros((1, 0)))
+    assert found.around is None  # no look at every entry was needed
+    assert "beyond which something changes" in found.told
+    assert found.verdict == certify_inside(model, x, np.zeros(0)).verdict == "agree"

@@ -83,8 +83,8 @@ def look_around(
     """
     steps = np.array(STEPS)[:, None, None]
     sides = np.stack([steps * np.eye(n), -steps * np.eye(n)]).reshape(-1, n)
-    direction, lines = _line(n), np.multiply.outer([1.0, -1.0], np.multiply.outer(SPACINGS, np.arange(1, VALUES + 1)))
-    values = f(np.vstack([np.zeros((1, n)), sides, lines.reshape(-1, 1) * direction]))
+    direction = _line(n)
+    values = f(np.vstack([np.zeros((1, n)), sides, _along(n)]))
     centre = values[0]
 
     def apart(some: Array) -> Array:
@@ -94,9 +94,7 @@ def look_around(
     rows = changes.shape[1]
     ahead, behind = changes[: len(sides)].reshape(2, len(STEPS), n, rows).swapaxes(2, 3) / steps
     size = np.abs(centre) if minus is np.subtract else np.ones(rows)
-    along = changes[len(sides) :].reshape(2, len(SPACINGS), VALUES, rows)
-    rounding = LAST_PLACE * (size + np.abs(along).max(axis=2))
-    by_spacing = np.maximum(_scatter(along), rounding)  # (2, spacings, m)
+    along, rounding, by_spacing = _scattered(changes[len(sides) :], size)
     unknown = np.array(np.broadcast_to(unsolved, rows), dtype=float)
     if point is not None:
         unknown = np.maximum(unknown, ROUNDED_POINT * np.nan_to_num(np.abs(ahead[0])) @ np.abs(point))
@@ -104,6 +102,36 @@ def look_around(
     finest = np.maximum(by_spacing[:, 0].max(axis=0), unknown / SAFETY)
     stairs = _stairs(lambda t: apart(f(np.multiply.outer(t, direction))), along, by_spacing, rounding, unknown)
     return Neighbourhood(centre, size, ahead, -behind, scatter, finest, stairs)
+
+
+def is_broken(changes: Many, n: int) -> str:
+    """How a function of displacements (K, n) is no smooth one, by its `changes` from the point (K, m) along one line.
+
+    It is a staircase, or has a corner or a jump within 1e-6 of the point; empty where it is neither.
+    """
+    direction, found = _line(n), changes(_along(n))
+    unsolved = np.zeros(found.shape[1])
+    along, rounding, by_spacing = _scattered(found, unsolved + 1)
+    still = np.maximum(by_spacing[:, 0].min(axis=0), rounding[:, NEAR - 1].max(axis=0))
+    for k in range(NEAR):
+        through = np.concatenate([along[1, k, ::-1], np.zeros((1, len(unsolved))), along[0, k]])
+        if np.any(_scatter(through) > TOLD * still):
+            return "it is broken beside the point"
+    some = _stairs(lambda t: changes(np.multiply.outer(t, direction)), along, by_spacing, rounding, unsolved)
+    return next(iter(some.values()), "")
+
+
+def _along(n: int) -> Array:
+    """(K, n) places along a line to both sides of the point, at each of SPACINGS."""
+    places = np.multiply.outer([1.0, -1.0], np.multiply.outer(SPACINGS, np.arange(1, VALUES + 1)))
+    return np.asarray(places.reshape(-1, 1) * _line(n))
+
+
+def _scattered(changes: Array, size: Array) -> tuple[Array, Array, Array]:
+    """The `changes` along a line (2, spacings, values, m), their rounding and their scatter (2, spacings, m)."""
+    along = changes.reshape(2, len(SPACINGS), VALUES, -1)
+    rounding = LAST_PLACE * (size + np.abs(along).max(axis=2))
+    return along, rounding, np.maximum(_scatter(along), rounding)
 
 
 def _line(n: int) -> Array:

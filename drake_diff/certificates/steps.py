@@ -20,6 +20,7 @@ from drake_diff.certificates.certify import (
     with_room,
 )
 from drake_diff.certificates.first_look import FirstLook, LookAt, certificate_by
+from drake_diff.certificates.neighbourhood import is_broken
 from drake_diff.derivatives.polish import polished_steps
 from drake_diff.derivatives.sources import step_at
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
@@ -82,10 +83,10 @@ class StepLook:
 
 
 def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> list[StepLook]:
-    """Each of the steps from xs (N, nx) under us (N, nu) along a few directions."""
+    """Each of the steps from xs (N, nx) under us (N, nu) along a few directions, as `looks` takes them."""
     vector = select(model, parameters)
     with applied(vector) as model:
-        space, looks = tangent_space(model), []
+        space = tangent_space(model)
         derivatives = derivatives_along(model, xs[0], us, vector=vector, xs=xs)
         steps, plans = [], []
         for x, u, d in zip(xs, us, derivatives, strict=True):
@@ -93,17 +94,64 @@ def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> l
             steps.append(StepAround(model, vector, space, np.concatenate([x, u, vector.values]), scale))
             derivative = space.jacobian(x, d.x_next, d.A, d.B, d.C) * scale
             plans.append(LookAt(derivative, in_steps(model, space, len(scale))))
-        points = [
-            np.array([step.moved(d) for d in plan.displacements]) for step, plan in zip(steps, plans, strict=True)
-        ]
-        try:
-            ends = ends_around(model, vector, xs, us, points)
-        except SimulationError as error:  # of one of them, which its certificate tells
-            ends = [(np.zeros(0), -1.0, str(error))] * len(points)
-        for step, d, plan, (values, left, why) in zip(steps, derivatives, plans, ends, strict=True):
-            look = None if why else plan.taken(values, space.minus)
-            looks.append(StepLook(step, d, look, left, why if look is None else look.doubt()))
-        return looks
+        every = zip(steps, derivatives, looks(steps, plans), strict=True)
+        return [StepLook(step, d, *found) for step, d, found in every]
+
+
+Looked = tuple[FirstLook | None, float, str]  # as in a StepLook
+
+
+def looks(steps: list[StepAround], plans: list[LookAt]) -> list[Looked]:
+    """What the steps, all of one model, do at the `plans`; what Drake's own leave, and the doubt.
+
+    A step in doubt is looked at once more, nearer to the point.
+    """
+    found = _taken(steps, plans)
+    for k, (step, (look, _, doubt)) in enumerate(zip(steps, found, strict=True)):
+        if look is not None and doubt:
+            nearer = _look_nearer(step, look)
+            found[k] = found[k] if nearer[2] else nearer
+    return found
+
+
+def _taken(steps: list[StepAround], plans: list[LookAt]) -> list[Looked]:
+    first, nx = steps[0], steps[0].model.nx
+    xs, us = (np.array([step.point[part] for step in steps]) for part in (slice(nx), slice(nx, nx + first.model.nu)))
+    points = [np.array([step.moved(d) for d in plan.displacements]) for step, plan in zip(steps, plans, strict=True)]
+    try:
+        ends = ends_around(first.model, first.vector, xs, us, points)
+    except SimulationError as error:  # of one of them, which its certificate tells
+        ends = [(np.zeros(0), -1.0, str(error))] * len(points)
+    found = list[Looked]()
+    for plan, (values, left, why) in zip(plans, ends, strict=True):
+        look = None if why else plan.taken(values, first.space.minus)
+        found.append((look, left, why if look is None else look.doubt()))
+    return found
+
+
+def _look_nearer(step: StepAround, look: FirstLook) -> Looked:
+    """`looks` over a tenth of the widths, where a contact that begins or slides a little farther away is not met.
+
+    Stairs that are longer than these are met there neither, nor is a corner by a column of small weight: they are
+    sought along a line, as by a look at every entry.
+    """
+    plan = LookAt(look.derivative, look.second, nearer=True)
+    ((near, left, doubt),) = _taken([step], [plan])
+    if near is None or doubt:
+        return near, left, doubt
+    row, nx, end = step.point[None], step.model.nx, step.model.nx + step.model.nu
+
+    def changes(displacements: Array) -> Array:
+        points = np.array([step.point, *[step.moved(d) for d in displacements]])
+        ((ends, _, why),) = ends_around(step.model, step.vector, row[:, :nx], row[:, nx:end], [points])
+        if why:
+            raise SimulationError(why)
+        return np.array([step.space.minus(each, ends[0]) for each in ends[1:]])
+
+    try:
+        return near, left, is_broken(changes, len(step.scale))
+    except SimulationError as error:
+        return near, left, str(error)
 
 
 def ends_around(
