@@ -33,7 +33,7 @@ import numpy as np  # noqa: E402
 from contact_elsewhere import HOLDS, PLANTS, counts, where_else  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 
-MODULES = ("legged_tasks", "manipulation_tasks")
+MODULES = ("legged_tasks", "manipulation_tasks", "arm_tasks")
 REPEATS = 3  # of a simulation, the quickest of which counts
 AGAIN = 1e-6  # what the referee's own motion may be off the plan's in a step: another order of sums
 

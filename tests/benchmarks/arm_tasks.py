@@ -1,0 +1,161 @@
+"""Tasks of `contact_plans.py` with an arm: a ball is thrown into a target, and a ball that flies is caught.
+
+The guess of a throw is a curve of the cup to where it lets go, and the ball's parabola from there; of a catch, the
+ball's parabola, the cup's way to it, and a stop. The arm follows by inverse kinematics, the cup upright.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from contact_task import Task, Tasks
+from manipulation_tasks import softer
+
+import drake_diff as dd
+
+ARM = Path(__file__).parent / "arm_cup.sdf"
+LINK, REACH, GRAVITY = 0.35, 0.67, 9.81  # [m] of both links; of what a guess asks the arm; [m/s^2]
+SEAT = 0.04 + 0.035 * np.sqrt(2) - 0.1 * GRAVITY / 500  # [m] from the wrist up to the middle of a ball at rest in it
+OPTIONS = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 150, "tolerance": 1e-2}
+AT_TARGET, AT_REST = 0.05, 0.05  # [m], [m/s]
+TARGET_BEYOND = 0.8  # [m] no ball in the cup is further from the shoulder
+THROWN, CAUGHT = (1000, 1), (3000, 2.5)  # stiffness [N/m] of cup and ball, and in how many steps they relax
+MUCH = np.repeat([0.5, 0.2, 1e3, 5.0, 2.0, 1e3], [3, 2, 1, 3, 2, 1])  # of a state: what is far from the guess
+EFFORT = 20.0  # [N m]
+LAST = 5  # knots in which a ball that is caught lies still
+
+
+def arm_at(wrist: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+    """(N, 3) the angles that put the wrist at (N, 2) places x and z, the nearest in reach, with the cup turned so."""
+    far = np.linalg.norm(wrist, axis=1)
+    wrist = wrist * np.minimum(1, REACH / far)[:, None]
+    elbow = np.arccos(np.clip(np.sum(wrist**2, axis=1) / (2 * LINK**2) - 1, -1, 1))
+    shoulder = np.arctan2(wrist[:, 1], wrist[:, 0]) - elbow / 2
+    return np.column_stack([shoulder, elbow, pitch - shoulder - elbow])
+
+
+def seat(pitch: np.ndarray) -> np.ndarray:
+    """(..., 2) from the wrist to the middle of a ball in the cup."""
+    return SEAT * np.stack([-np.sin(pitch), np.cos(pitch)], axis=-1)
+
+
+def motion_of(
+    wrist: np.ndarray, pitch: np.ndarray, ball: np.ndarray, v0: np.ndarray, time_step: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(xs, us) of a wrist at (N+1, 2) places, a cup at (N+1,) angles and a ball at (N+1, 2) places; nothing drives it."""
+    q = np.column_stack([arm_at(wrist, pitch), ball, np.zeros(len(ball))])
+    v = np.vstack([v0, np.diff(q, axis=0) / time_step])
+    return np.hstack([q, v]), np.zeros((len(q) - 1, 3))
+
+
+def near(guess: tuple[np.ndarray, np.ndarray], time_step: float) -> dict:
+    """The cost of a Problem that stays near a guess."""
+    xs, _ = guess
+    table = time_step * np.arange(len(xs)), xs
+    return {"running_cost": dd.optimize.TrackingCost(table, Q=np.diag(MUCH**-2.0), R=np.eye(3) / EFFORT**2)}
+
+
+def flight(place: np.ndarray, velocity: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """(N, 2) places of a ball that flies."""
+    return place + velocity * t[:, None] - [0, GRAVITY / 2] * t[:, None] ** 2
+
+
+def smooth(s: np.ndarray) -> np.ndarray:
+    """0 until 0, 1 from 1 on, without a corner."""
+    s = np.clip(s, 0, 1)
+    return s**2 * (3 - 2 * s)
+
+
+def curve(t: np.ndarray, end: float, places: tuple, speeds: tuple) -> np.ndarray:
+    """(N, 2) the cubic between two places with given speeds in the time 0 to end; before and after it stands there."""
+    s = np.clip(t / end, 0, 1)[:, None]
+    first, last = (np.asarray(place) for place in places)
+    out, back = (end * np.asarray(speed) for speed in speeds)
+    return (
+        first * (1 + 2 * s) * (1 - s) ** 2 + out * s * (1 - s) ** 2 + last * s**2 * (3 - 2 * s) + back * s**2 * (s - 1)
+    )
+
+
+def throw(random: np.random.Generator, time_step: float = 0.005) -> Task:
+    """A ball that lies in the cup is thrown so that it comes to a target beyond the arm's reach."""
+    model = softer(ARM, time_step, THROWN[0], THROWN[1])
+    start = np.array([random.uniform(0.25, 0.35), random.uniform(-0.3, -0.2)])
+    target = np.array([random.uniform(1.0, 1.5), random.uniform(-0.2, 0.2)])
+    swing, fly, stop = 0.35, 0.45, 0.15  # [s]
+    count = round((swing + fly) / time_step)
+    t = np.arange(count + 1) * time_step
+    velocity = (target - start) / fly + [0, GRAVITY * fly / 2]
+    release = start + 0.4 * swing * velocity
+    release *= min(1.0, 0.9 * REACH / np.linalg.norm(release))
+    velocity = (target - release) / fly + [0, GRAVITY * fly / 2]
+    along = -np.arctan2(velocity[0], velocity[1])  # in the end the cup is open to where the ball goes
+    pitch = along * smooth(t / swing)
+    held = curve(t, swing, (start + [0, SEAT], release), (np.zeros(2), velocity))
+    last = release - seat(along)
+    after = curve(t - swing, stop, (last, last + 0.3 * stop * velocity), (velocity, np.zeros(2)))
+    carried = (t <= swing)[:, None]
+    wrist = np.where(carried, held - seat(pitch), after)
+    ball = np.where(carried, held, flight(release, velocity, t - swing))
+    guess = motion_of(wrist, pitch, ball, np.zeros(6), time_step)
+    goal = dict(zip(("ball_x", "ball_z"), target.tolist(), strict=True))
+    problem = dd.Problem(
+        model,
+        x0=guess[0][0],
+        num_steps=count,
+        goals=dd.JointGoal(goal, tolerance=AT_TARGET),
+        **near(guess, time_step),
+    )
+    asks = (
+        ("ball from its target [m]", partial(ball_off, target), AT_TARGET),
+        ("target within the arm's reach [m]", lambda xs, us: TARGET_BEYOND - float(np.linalg.norm(target)), 0),
+    )
+    text = f"the ball at ({target[0]:.2f}, {target[1]:.2f}) m"
+    return Task("throw", problem, text, {**OPTIONS, "initial_guess": guess}, asks)
+
+
+def catch(random: np.random.Generator, time_step: float = 0.005) -> Task:
+    """A cup goes to where a ball comes down, and brings it to rest in it."""
+    model = softer(ARM, time_step, CAUGHT[0], CAUGHT[1])
+    start = np.array([random.uniform(0.3, 0.5), random.uniform(-0.2, 0.1)])
+    place = np.array([random.uniform(1.1, 1.5), random.uniform(0.3, 0.5)])
+    meet = np.array([random.uniform(0.45, 0.55), random.uniform(0.2, 0.3)])
+    fly, stop, rest = 0.5, 0.3, 0.3  # [s]
+    count = round((fly + stop + rest) / time_step)
+    t = np.arange(count + 1) * time_step
+    velocity = (meet - place) / fly + [0, GRAVITY * fly / 2]
+    there = velocity - [0, GRAVITY * fly]
+    against = -np.arctan2(-there[0], -there[1])  # the cup is open to where the ball comes from
+    pitch = against * (1 - smooth((t - fly) / stop)) * smooth(t / fly)
+    end = meet + there * stop / 3
+    first = meet - seat(against)
+    before = curve(t, fly, (start, first), (np.zeros(2), there))
+    held = curve(t - fly, stop, (meet, end), (there, np.zeros(2)))
+    free = (t <= fly)[:, None]
+    wrist = np.where(free, before, held - seat(pitch))
+    ball = np.where(free, flight(place, velocity, t), held)
+    guess = motion_of(wrist, pitch, ball, np.array([0, 0, 0, *velocity, 0]), time_step)
+    goal = dict(zip(("ball_x", "ball_z"), end.tolist(), strict=True))
+    problem = dd.Problem(
+        model,
+        x0=guess[0][0],
+        num_steps=count,
+        goals=[
+            dd.JointGoal(goal, tolerance=AT_TARGET),
+            dd.JointGoal({"ball_x_v": 0, "ball_z_v": 0}, tolerance=AT_REST, knots=range(count + 1 - LAST, count + 1)),
+        ],
+        **near(guess, time_step),
+    )
+    asks = (
+        ("ball from its place [m]", partial(ball_off, end), AT_TARGET),
+        ("ball moves [m/s]", lambda xs, us: float(np.max(np.abs(xs[-LAST:, 9:11]))), AT_REST),
+    )
+    text = f"the ball at rest at ({end[0]:.2f}, {end[1]:.2f}) m"
+    return Task("catch", problem, text, {**OPTIONS, "initial_guess": guess}, asks)
+
+
+def ball_off(place: np.ndarray, xs: np.ndarray, us: np.ndarray) -> float:
+    """How far the ball is from a place in the end."""
+    return float(np.max(np.abs(xs[-1, 3:5] - place)))
+
+
+TASKS: Tasks = {"throw": throw, "catch": catch}
