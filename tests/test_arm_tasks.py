@@ -1,0 +1,104 @@
+"""The tasks of `benchmarks/arm_tasks.py`: what is asked is not there at the start, and the referee refuses misses."""
+
+import sys
+import zlib
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+
+sys.path.append(str(Path(__file__).parent / "benchmarks"))
+
+from arm_tasks import LAST, TASKS, motion_of, seat
+
+BALL, BALL_V = slice(3, 5), slice(9, 11)  # in the state of arm_cup.sdf
+
+
+def drawn(name, start=0):
+    return TASKS[name](np.random.default_rng([0, zlib.crc32(name.encode()), start]))
+
+
+@pytest.mark.parametrize("name", ["throw", "catch"])
+def test_nothing_asked_is_there_where_nothing_is_done(name):
+    problem = (task := drawn(name)).problem
+    us = np.zeros((problem.num_steps, problem.nu))
+    xs = dd.rollout(problem.model, problem.x0, us).xs
+    assert task.asks
+    for what, measure, allowed in task.asks:
+        assert measure(xs, us) > 2 * allowed, what
+
+
+@pytest.mark.parametrize("name", ["throw", "catch"])
+def test_an_end_just_inside_its_tolerance_is_taken_and_one_outside_is_refused(name):
+    task = drawn(name)
+    xs, us = (np.array(part) for part in task.options["initial_guess"])
+    (_, place_off, allowed), *rest = task.asks
+    xs[-1, BALL] = list(task.problem.goals[0].values.values())  # sorted by name: x, z
+    for part, taken in ((0.99, True), (1.01, False), (-1.01, False)):
+        moved = xs.copy()
+        moved[-1, BALL] += part * allowed
+        assert bool(place_off(moved, us) <= allowed) is taken
+    for _, speed, slow in rest:
+        for knot, taken in ((-LAST, False), (-LAST - 1, True)):
+            moved = xs.copy()
+            moved[-LAST:, BALL_V] = 0
+            moved[knot, BALL_V] = 1.01 * slow
+            assert bool(speed(moved, us) <= slow) is taken
+
+
+def test_the_target_of_a_throw_is_beyond_the_cup():
+    for start in range(20):
+        assert np.linalg.norm(list(drawn("throw", start).problem.goals[0].values.values())) > 0.9
+
+
+def test_a_ball_in_its_seat_lies_still_where_motors_hold_the_arm():
+    problem = drawn("throw").problem
+    model, x = problem.model, problem.x0
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    plant.SetPositionsAndVelocities(context, x)
+    held = -plant.CalcGravityGeneralizedForces(context)[:3]
+    pose = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName("cup"))
+    reach = pose.translation()[0]
+    upper = 0.35 * np.cos(x[0])
+    held += 0.1 * 9.81 * np.array([reach, reach - upper, 0.0])
+    after = dd.rollout(model, x, np.tile(held, (10, 1))).xs[-1]
+    np.testing.assert_allclose(after[BALL], x[BALL], atol=1e-6)  # [m] friction's creep, and the arm's slow fall
+
+
+def test_the_guess_has_the_ball_in_the_cup():
+    pitch = np.array([0.0, -0.4])
+    wrist = np.array([[0.4, 0.1], [0.3, -0.2]])
+    xs, _ = motion_of(wrist, pitch, wrist + seat(pitch), np.zeros(6), 0.005)
+    model = drawn("throw").problem.model
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    for x in xs:
+        plant.SetPositionsAndVelocities(context, x)
+        ball = plant.CalcPointsPositions(
+            context, plant.GetFrameByName("ball"), np.zeros(3), plant.GetFrameByName("cup")
+        ).ravel()
+        # 0.04 m to the plates, sqrt(2) radii from there, sunk by its weight of 0.981 N at 500 N/m
+        np.testing.assert_allclose(ball, [0, 0, 0.04 + 0.035 * np.sqrt(2) - 0.981 / 500], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["throw", "catch"])
+def test_the_referee_refuses_an_arm_that_does_nothing(name):
+    from contact_plans import referee
+
+    task = drawn(name)
+    wrong, _ = referee(task, SimpleNamespace(us=np.zeros((task.problem.num_steps, 3))))
+    assert wrong
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["throw", "catch"])
+def test_a_start_is_solved_and_drake_alone_finds_the_ball_there(name):
+    from contact_plans import referee
+
+    task = drawn(name)
+    solution = dd.solve(task.problem, **task.options)
+    assert solution.success, solution.message
+    wrong, _ = referee(task, solution)
+    assert not wrong
