@@ -1,4 +1,4 @@
-"""One task with contact, as `contact_plans.py` runs it: `legged_tasks.py`, `manipulation_tasks.py` and `arm_tasks.py` build them.
+"""One task with contact, as `contact_plans.py` runs it; its MODULES, such as `legged_tasks.py`, build them.
 
 Each of these modules has `TASKS`, a name -> a function of a random generator that gives a Task: the start is drawn,
 and the guess is none or a naive one.
