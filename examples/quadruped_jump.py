@@ -10,14 +10,11 @@ schedule is a goal too: the plan and its replays are held to it.
 
 from pathlib import Path
 
-import numpy as np
-
 import drake_diff as dd
 
 MODEL = Path(__file__).parent.parent / "models" / "quadruped.urdf"
 FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
-STANDING = {"trunk_qw": 1.0, "trunk_z": 0.2473}  # the feet sink by half a millimetre
-LEG = {"abduction": 0.0, "hip_pitch": 0.8, "knee": -1.6}
+BENT = {"hip_pitch": 0.8, "knee": -1.6}  # [rad]
 TIME_STEP, WAY = 0.01, 0.06  # [s], [m] forward
 
 schedule = dd.optimize.ContactSchedule([(40, FEET), (16, ()), (50, FEET)])
@@ -28,15 +25,10 @@ def problem() -> dd.Problem:
     model = dd.load_model(
         MODEL, time_step=TIME_STEP, base="free", actuators="all", ground=0.7, contact="ground", near_rigid=0.1
     )
-    names = model.state_names
-    x0 = np.zeros(model.nx)
-    for name, value in STANDING.items():
-        x0[names.index(name)] = value
-    for leg in ("FL", "FR", "RL", "RR"):
-        for joint, value in LEG.items():
-            x0[names.index(f"{leg}_{joint}_q")] = value
+    legs = ("FL", "FR", "RL", "RR")
+    x0 = schedule.standing(model, {f"{leg}_{joint}": value for leg in legs for joint, value in BENT.items()})
     end = x0[: model.nq].copy()
-    end[names.index("trunk_x")] += WAY
+    end[model.state_names.index("trunk_x")] += WAY
     xs, us = schedule.guess(model, x0, end)
     solve_options["initial_guess"] = (xs, us)
     goals = [schedule, dd.FrameGoal("trunk", end[4:7], tolerance=0.03), dd.KeepLevel("trunk", knots=-1, tolerance=0.1)]

@@ -381,6 +381,8 @@ def load_model(
     meshes: str = "skip",
     relaxation_time: float | None = None,
     near_rigid: float | None = None,
+    stiffness: float | None = None,
+    dissipation: float | None = None,
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
@@ -417,6 +419,10 @@ def load_model(
         relaxation_time: [s] in sap contact, of shapes for which the file gives none; Drake's own default is 0.1 s.
         near_rigid: Drake's near-rigid threshold of sap contact, its own default 1. It softens light bodies' contact
             where steps are long, so that they sink deeper; a smaller one keeps to the stiffness of the shapes.
+        stiffness: [N/m] of point contact, of shapes for which the file gives none, a ground that is added too; Drake's
+            own default is 1e6. Where two shapes touch it is k1 k2 / (k1 + k2): half of it, where both have it.
+        dissipation: [s/m] Hunt and Crossley's, of similar and lagged contact, of shapes for which the file gives none;
+            Drake's own default is 50.
 
     Returns:
         The Model. What was left out of the file (such as meshes in formats that Drake cannot use) and what was added
@@ -452,7 +458,7 @@ def load_model(
     )
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config, builder)
-    _set_contact_law(plant, scene_graph, near_rigid, relaxation_time)
+    _set_contact_law(plant, scene_graph, near_rigid, relaxation_time, stiffness, dissipation)
     options: dict[str, Any] = {
         "time_step": time_step,
         "contact_model": contact_model,
@@ -471,6 +477,8 @@ def load_model(
         "meshes": meshes,
         "relaxation_time": relaxation_time,
         "near_rigid": near_rigid,
+        "stiffness": stiffness,
+        "dissipation": dissipation,
     }
     fixed = options["fix_joints"] if mimic is None else ()  # else the followers are free of each other later
     read = read_into(plant, source, options["packages"], meshes, fixed)
@@ -510,14 +518,24 @@ def load_model(
 
 
 def _set_contact_law(
-    plant: MultibodyPlant, scene_graph: SceneGraph, near_rigid: float | None, relaxation_time: float | None
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    near_rigid: float | None,
+    relaxation_time: float | None,
+    stiffness: float | None,
+    dissipation: float | None,
 ) -> None:
     if near_rigid is not None:
         plant.set_sap_near_rigid_threshold(positive_float("near_rigid", near_rigid))
-    if relaxation_time is not None:
-        defaults = SceneGraphConfig()
-        defaults.default_proximity_properties.relaxation_time = positive_float("relaxation_time [s]", relaxation_time)
-        scene_graph.set_config(defaults)
+    config = SceneGraphConfig()  # with Drake's own defaults
+    for name, unit, value in (
+        ("relaxation_time", "s", relaxation_time),
+        ("point_stiffness", "N/m", stiffness),
+        ("hunt_crossley_dissipation", "s/m", dissipation),
+    ):
+        if value is not None:
+            setattr(config.default_proximity_properties, name, positive_float(f"{name} [{unit}]", value))
+    scene_graph.set_config(config)
 
 
 def _changed_shapes(

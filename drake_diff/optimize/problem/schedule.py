@@ -1,7 +1,7 @@
 """Which foot stands when: a goal that a plan keeps, and the guess that it begins with."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
@@ -13,9 +13,11 @@ from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import StateFunction
 from drake_diff.optimize.problem.cost import QuadraticCost
 from drake_diff.optimize.problem.goals import USED, Goal, GoalConstraint, name_of
+from drake_diff.optimize.problem.names import coordinates
 from drake_diff.optimize.problem.timed import TrackingCost
 from drake_diff.optimize.scheduled.legs import Legs
 from drake_diff.optimize.scheduled.motion import scheduled_motion, swings, touching
+from drake_diff.optimize.scheduled.standing import standing, with_soft_feet
 
 MIDDLE = 0.25  # of a swing at either end is left out where its clearance is looked at
 KEPT = 1000  # states of which it is remembered where the feet are
@@ -117,6 +119,64 @@ class ContactSchedule(Goal):
             found += _rows(slides, still, name, "of slip where it stands", self.slip, lower=-most, upper=most)
         return tuple(found)
 
+    def with_soft_feet(self, model: Model) -> Model:
+        """The model with contact that is as soft for its time step as plans need, where its file gives none.
+
+        An even share of the weight presses a foot by 0.0625 m/s times the step; the contact relaxes in 2.5 steps. A
+        stiff foot that a search moves by a tenth of a millimetre leaves the ground, which no derivative foretells.
+
+        Args:
+            model: A model from a file, with a ground.
+
+        Returns:
+            `model.changed(...)` with another `stiffness`, `dissipation`, `relaxation_time` and `near_rigid`.
+
+        Raises:
+            ModelError: It was made from a diagram.
+
+        Example:
+            >>> model = dd.load_model("models/quadruped.urdf", time_step=0.02, ground=True, actuators="all")
+            >>> schedule = dd.optimize.ContactSchedule([(50, ["FL_foot", "FR_foot", "RL_foot", "RR_foot"])])
+            >>> schedule.with_soft_feet(model).options["relaxation_time"]
+            0.05
+        """
+        return with_soft_feet(model, len(self.feet))
+
+    def standing(self, model: Model, joints: Any) -> Array:
+        """The state in which it stands at rest on all feet, its joints where they are said to be.
+
+        The base is rolled, pitched and raised until a step of the model changes nothing.
+
+        Args:
+            model: The model, with a ground at z = 0.
+            joints: The position [rad or m] of joints by their names; others are where the file puts them.
+
+        Returns:
+            (nx,) the state.
+
+        Raises:
+            InputError: It does not rest so, a foot is off the ground, or a motor is too weak to hold it.
+            UnknownNameError: The model has no such foot or joint.
+
+        Example:
+            >>> legs = "FL", "FR", "RL", "RR"
+            >>> model = dd.load_model("models/quadruped.urdf", time_step=0.02, ground=True, actuators="all")
+            >>> schedule = dd.optimize.ContactSchedule([(50, [f"{leg}_foot" for leg in legs])])
+            >>> bent = {f"{leg}_hip_pitch": 0.8 for leg in legs} | {f"{leg}_knee": -1.6 for leg in legs}
+            >>> x0 = schedule.standing(schedule.with_soft_feet(model), bent)
+            >>> round(float(x0[model.state_names.index("trunk_z")]), 3)
+            0.247
+        """
+        posture = np.array(model.default_state[: model.nq])
+        if not isinstance(joints, Mapping):
+            raise InputError("ContactSchedule.standing: joints", got=repr(joints)[:80], expected="positions by name")
+        for at, value in coordinates(model, "ContactSchedule.standing", joints).items():
+            if at >= model.nq:
+                got = model.state_names[at]
+                raise InputError("ContactSchedule.standing: joints", got=got, expected="positions, not velocities")
+            posture[at] = float(finite_array(f"ContactSchedule.standing {model.state_names[at]}", value, ()))
+        return standing(Legs(model, self.feet, posture), posture)[0]
+
     def guess(self, model: Model, x0: Any, end: Any = None, *, swing: float = 0.04) -> tuple[Array, Array]:
         """A motion by the schedule: forces at the standing feet bring the centre of mass to where it is to be.
 
@@ -134,13 +194,27 @@ class ContactSchedule(Goal):
             States xs (N+1, nx) and inputs us (N, nu).
 
         Raises:
-            InputError: No forces of the feet within friction make such a motion.
+            InputError: No forces of the feet within friction make such a motion, or feet that stand are in the air.
         """
         x0 = np.array(finite_array("x0", x0, (model.nx,)))
         last = x0[: model.nq] if end is None else np.array(finite_array("end", end, (model.nq,)))
         legs = Legs(model, self.feet, x0[: model.nq])
+        self._check_touching(legs, x0)
         height, friction = positive_float("swing [m]", swing), OF_FRICTION * legs.friction()
         return scheduled_motion(model, legs, x0, last, self.stands, height, friction)
+
+    def _check_touching(self, legs: Legs, x0: Array) -> None:
+        """InputError where the first state leaves feet in the air that are to stand in the first step."""
+        legs.put(x0[: legs.model.nq])
+        over = np.array([np.min(legs.points()[legs.owners == i, 2]) for i in range(len(self.feet))])
+        standing = np.flatnonzero(self.stands[0])
+        if not len(standing):
+            return
+        worst = standing[np.argmax(over[standing])]
+        if over[worst] > self.touch or np.min(over[standing]) >= 0:
+            got = f"{self.feet[worst]} {1e3 * over[worst]:.2g} mm over the ground"
+            expected = "feet that press into it where they stand: see ContactSchedule.standing"
+            raise InputError("ContactSchedule: x0", got=got, expected=expected)
 
     def follow(self, model: Model, guess: tuple[Array, Array]) -> dict[str, Any]:
         """The `running_cost` and `final_cost` of a Problem that stays near a guess and ends at rest where it ends.

@@ -1,0 +1,152 @@
+"""Where a schedule lets a robot stand, by closed form and by Drake alone; and plans of robots as their files say."""
+
+import numpy as np
+import pytest
+from helpers.models import MODELS, robot_file
+from pydrake.systems.analysis import Simulator
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.optimize.scheduled.legs import Legs
+from drake_diff.optimize.scheduled.standing import standing
+
+pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+LEGS = "FL", "FR", "RL", "RR"
+FEET = tuple(f"{leg}_foot" for leg in LEGS)
+BENT = {f"{leg}_hip_pitch": 0.8 for leg in LEGS} | {f"{leg}_knee": -1.6 for leg in LEGS}
+STAND = dd.optimize.ContactSchedule([(10, FEET)])
+OPTIONS = {"base": "free", "actuators": "all", "ground": 0.7, "contact": "ground"}
+G, OF_GROUND = 9.81, 1e6  # [m/s^2], [N/m] Drake's own stiffness
+
+
+def quadruped(path=MODELS / "quadruped.urdf", **changes):
+    return dd.load_model(path, **({"time_step": 0.02, "near_rigid": 0.1} | OPTIONS | changes))
+
+
+def with_stiffness(tmp_path, value):
+    """The quadruped, the stiffness of whose feet is `value` or none."""
+    text = (MODELS / "quadruped.urdf").read_text()
+    line = '<drake:point_contact_stiffness value="12000"/>'
+    assert line in text
+    path = tmp_path / "quadruped.urdf"
+    path.write_text(text.replace(line, line.replace("12000", f"{value}") if value else ""))
+    return path
+
+
+@pytest.mark.parametrize(("stiffness", "time_step"), [(3000, 0.02), (12000, 0.02), (12000, 0.005), (60000, 0.01)])
+def test_springs_under_the_feet_carry_the_weight_by_the_lever_rule(tmp_path, stiffness, time_step):
+    model = quadruped(with_stiffness(tmp_path, stiffness), time_step=time_step)
+    x = STAND.standing(model, BENT)
+    legs = Legs(model, FEET, x[: model.nq])
+    legs.put(x[: model.nq])
+    points, center = legs.points(), legs.center_of_mass()[0]
+    forces = stiffness * OF_GROUND / (stiffness + OF_GROUND) * -points[:, 2]
+    assert np.sum(forces) == pytest.approx(legs.mass * G, rel=1e-6)  # by a velocity of 1e-7 m/s after the step
+    # Sideways forces of the feet are 0 in all and act within some tenths of a millimetre of one height.
+    moment = forces @ (points - center)[:, :2]
+    assert np.max(np.abs(moment)) < 1e-3 * legs.mass * G * 0.2
+    for name, angle in BENT.items():
+        assert x[model.state_names.index(f"{name}_q")] == angle
+
+
+def test_drake_alone_keeps_it_where_it_stands():
+    model = quadruped()
+    posture = np.array(model.default_state[: model.nq])
+    posture[[model.state_names.index(f"{name}_q") for name in BENT]] = list(BENT.values())
+    x, u = standing(Legs(model, FEET, posture), posture)
+    simulator = Simulator(model.diagram)
+    context = model.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    model.plant.SetPositionsAndVelocities(context, x)
+    model.plant.get_actuation_input_port().FixValue(context, u)
+    simulator.AdvanceTo(10 * model.time_step)
+    # 1e-7 is left after a step; inputs alone let it fall, e-fold in some 0.1 s.
+    assert np.max(np.abs(model.plant.GetPositionsAndVelocities(context) - x)) < 1e-5
+
+
+def test_a_softened_foot_sinks_by_a_sixteenth_of_a_metre_per_second_times_the_step(tmp_path):
+    for h in (0.005, 0.02):
+        model = STAND.with_soft_feet(quadruped(with_stiffness(tmp_path, None), time_step=h, near_rigid=None))
+        x = STAND.standing(model, BENT)
+        legs = Legs(model, FEET, x[: model.nq])
+        legs.put(x[: model.nq])
+        assert -np.mean(legs.points()[:, 2]) == pytest.approx(0.0625 * h, rel=1e-6)
+    own = STAND.with_soft_feet(quadruped())
+    stiffnesses = {g.stiffness for g in own.contract.geometries if g.body in FEET}
+    assert stiffnesses == {12000.0}  # what the file says stays
+
+
+def test_the_law_of_contact_is_that_of_the_option(tmp_path):
+    model = quadruped(with_stiffness(tmp_path, None), stiffness=5000.0, dissipation=2.0)
+    assert {g.stiffness for g in model.contract.geometries} == {5000.0}
+    for wrong in ({"stiffness": 0}, {"dissipation": -1.0}):
+        with pytest.raises(InputError, match="above 0"):
+            quadruped(**wrong)
+
+
+def test_what_cannot_stand_is_refused_with_the_reason():
+    model = quadruped()
+    with pytest.raises(InputError, match=r"foot .* mm over the ground"):
+        STAND.standing(model, BENT | {"FL_knee": -2.4})
+    back = {f"{leg}_hip_pitch": 1.5 for leg in LEGS} | {f"{leg}_knee": -1.0 for leg in LEGS}
+    with pytest.raises(InputError, match=r"after a step|over the ground"):  # the centre of mass is not over its feet
+        STAND.standing(model, back)
+    with pytest.raises(UnknownNameError, match="elbow"):
+        STAND.standing(model, {"elbow": 0.0})
+    with pytest.raises(InputError, match="not velocities"):
+        STAND.standing(model, {"FL_knee_w": 0.0})
+    with pytest.raises(InputError, match="positions by name"):
+        STAND.standing(model, [0.0])
+    weak = quadruped(actuators=dict.fromkeys((*BENT, *(f"{leg}_abduction" for leg in LEGS)), 0.05))
+    with pytest.raises(InputError, match=r"more than 0\.05"):
+        STAND.standing(weak, BENT)
+    with pytest.raises(ModelError, match="diagram"):
+        STAND.with_soft_feet(dd.model_from_diagram(model.diagram))
+
+
+def test_feet_in_the_air_are_refused_where_they_are_to_stand():
+    model = quadruped()
+    x0 = STAND.standing(model, BENT)
+    for higher in (0.002, 0.1):
+        above = x0.copy()
+        above[model.state_names.index("trunk_z")] += higher
+        with pytest.raises(InputError, match=r"ContactSchedule: x0.* mm over the ground"):
+            STAND.guess(model, above)
+    fall = dd.optimize.ContactSchedule([(4, ()), (30, FEET)])
+    assert len(fall.guess(model, x0)[1]) == 34
+
+
+# The robots are as their files give them, none of which has a stiffness; nothing was chosen by them.
+STRANGERS = {
+    "a1": ("a1.urdf", FEET, ("hip", "thigh", "calf"), "base"),
+    "go1": ("go1.urdf", FEET, ("hip", "thigh", "calf"), "base"),
+    "b1": ("b1.urdf", FEET, ("hip", "thigh", "calf"), "base"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STRANGERS)
+def test_a_strangers_quadruped_trots(name):
+    file, feet, parts, base = STRANGERS[name]
+    one, other = (feet[0], feet[3]), (feet[1], feet[2])
+    steps = [(5, feet), (8, one), (2, feet), (8, other), (2, feet), (8, one), (20, feet)]
+    schedule = dd.optimize.ContactSchedule(steps)
+    model = schedule.with_soft_feet(dd.load_model(robot_file(file), time_step=0.02, meshes="spheres", **OPTIONS))
+    angles = dict(zip(parts, (0.0, 0.8, -1.6), strict=True))
+    x0 = schedule.standing(model, {f"{leg}_{part}_joint": angles[part] for leg in LEGS for part in parts})
+    end = x0[: model.nq].copy()
+    end[4] += 0.5 * x0[6]
+    guess = schedule.guess(model, x0, end)
+    goals = [schedule, dd.FrameGoal(base, end[4:7], tolerance=0.05)]
+    problem = dd.Problem(model, x0=x0, num_steps=len(guess[1]), goals=goals, **schedule.follow(model, guess))
+    solution = dd.solve(problem, method="ilqr", tolerance=1e-4, initial_guess=guess)
+    assert solution.success, solution.message
+    context = model.plant.CreateDefaultContext()
+
+    def heights(knot):
+        model.plant.SetPositions(context, solution.xs[knot, : model.nq])
+        bodies = [model.plant.GetBodyByName(foot) for foot in feet]
+        return np.array([model.plant.EvalBodyPoseInWorld(context, body).translation()[2] for body in bodies])
+
+    for knot, swinging in ((9, other), (19, one), (29, other)):
+        lifted = heights(knot) - heights(0)
+        assert [bool(value > 5e-3) for value in lifted] == [foot in swinging for foot in feet]  # its clearance, asked
