@@ -124,8 +124,10 @@ def _normal(info: Any) -> Array:
 
 
 def body_of(model: Model, geometry: Any) -> Any:
-    """The body that carries a geometry."""
-    return model.plant.GetBodyFromFrameId(model.double.inspector.GetFrameId(geometry))
+    """The body that carries a geometry, which stays on it: it is asked for at every contact of every step."""
+    if geometry not in model.carriers:
+        model.carriers[geometry] = model.plant.GetBodyFromFrameId(model.double.inspector.GetFrameId(geometry))
+    return model.carriers[geometry]
 
 
 def _pair(model: Model, a: Any, b: Any) -> Pair:

@@ -266,6 +266,11 @@ class Model(ShowsItsRepr):
         return ", ".join(found + ["the diagram drives actuators"] * bool(self.inputs.fed_actuators))
 
     @cached_property
+    def carriers(self) -> dict[Any, Any]:
+        """The bodies that carry geometries, by these, as `contact.body_of` finds them."""
+        return {}
+
+    @cached_property
     def double(self) -> Twin:
         """The plant that everything is measured on.
 

@@ -119,6 +119,27 @@ class Plan:
         except (SimulationError, ModelError, ValueError):
             return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
 
+    @cached_property
+    def halved_gains(self) -> Array:
+        """(2 N, nu, nt) of TVLQR about the plan in half of its steps."""
+        xs, us = self.sample(2)
+        with applied(select(self.model_at(2), self.vector.to_dict())) as model:
+            return regulator(self, model, xs, us).gains
+
+    def gains(self, parts: int) -> Array | None:
+        """(m N, nu, nt) of TVLQR in the m-th `parts` of each step, those of halves in between; None where they are own.
+
+        A motion in continuous time has gains that are smooth in time, of which finer steps have next to the same. Where
+        things touch they may be others altogether.
+        """
+        if not self.continuous or parts == 1:
+            return None
+        known = self.halved_gains
+        at = np.minimum(np.arange(parts * self.problem.num_steps) * 2 / parts, len(known) - 1)
+        first = np.minimum(at.astype(int), len(known) - 2)
+        ahead = (at - first)[:, None, None]
+        return np.asarray((1 - ahead) * known[first] + ahead * known[first + 1])
+
     def model_at(self, parts: int) -> Model:
         """The model at the m-th part of an interval."""
         model, h = self.problem.model, self.time_step / parts
@@ -298,18 +319,23 @@ def _replay_in(
         return [_missing(plan, variant, control, str(error)) for control in controls]
 
 
-def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
-    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds and limits of its rate.
-
-    The latter make it remember its last input: it is for one rollout.
-    """
-    bounds = plan.problem.bounds
+def regulator(plan: Plan, model: Model, xs: Array, us: Array) -> TVLQR:
+    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan."""
     Q, R, final = regulator_weights(plan, us)
     part = model.time_step / plan.time_step  # a running cost is summed over more steps where they are finer
     jacobians = None
     if plan.problem.motion == CONTINUOUS:
         jacobians = intervals_of(model, select(model, ()), CONTINUOUS).jacobians(xs, us)
-    policy = TVLQR(model, xs, us, part * Q, part * R, final, jacobians=jacobians)
+    return TVLQR(model, xs, us, part * Q, part * R, final, jacobians=jacobians)
+
+
+def track(plan: Plan, model: Model, xs: Array, us: Array, gains: Array | None = None) -> Policy:
+    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds and limits of its rate.
+
+    The latter make it remember its last input: it is for one rollout. The `gains` (N, nu, nt) may be known.
+    """
+    bounds = plan.problem.bounds
+    policy = regulator(plan, model, xs, us) if gains is None else about(model, xs, us, gains)
     slew, last = np.full(model.nu, np.inf), list[Array]()
     period = model.time_step if plan.continuous else plan.time_step  # a held input jumps at the plan's own knots
     for limit in plan.problem.rate_limits:
@@ -327,6 +353,17 @@ def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
         return last[0]
 
     return kept
+
+
+def about(model: Model, xs: Array, us: Array, gains: Array) -> Policy:
+    """The law of `TVLQR` about xs (N+1, nx) and us (N, nu) by `gains` (N, nu, nt)."""
+    space, h = tangent_space(model), model.time_step
+
+    def law(x: Array, t: float) -> Array:
+        k = min(round(t / h), len(us) - 1)
+        return np.asarray(us[k] - gains[k] @ space.minus(x, xs[k]))
+
+    return law
 
 
 def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
@@ -351,7 +388,7 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
         elif control == "open loop":
             motion = _rolled(plan.problem, model, xs[0], us, len(us))
         else:
-            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us), len(us))
+            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us, plan.gains(parts)), len(us))
     except (SimulationError, ModelError, GradientError, ValueError) as error:
         return _missing(plan, variant, control, str(error))
     bounds = plan.problem.bounds
