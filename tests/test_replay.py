@@ -1,9 +1,11 @@
 """Replays of a plan: closed forms for what they measure, and plans that must not pass."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
 from helpers.plants import block as rail_block
 from helpers.table import each_row
 
@@ -271,3 +273,52 @@ def test_the_open_loop_motion_is_taken_once(write_urdf):
     """The replay at the plan's own step is the plan's open-loop motion."""
     plan = plan_of(block(write_urdf, x_goal=[1, 0]), np.full((COUNT, 1), 2.0))
     assert by_name(replays(plan), f"in steps of {H:g} s", "open loop").motion is plan.open_loop
+
+
+def cart_pole_swing_up():
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
+    bounds = dd.Bounds(x_lower=[-2, *[-np.inf] * 3], x_upper=[2, *[np.inf] * 3], u_lower=[-20], u_upper=[20])
+    problem = dd.Problem(
+        model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=50, running_cost=EFFORT, bounds=bounds
+    )
+    return dd.solve(problem, method="collocation")
+
+
+def test_gains_of_half_steps_keep_a_smooth_plan_in_finer_ones_as_well_as_their_own():
+    """In steps of 5 ms each regulator brings the cart-pole up; in such of 20 ms they are the same one."""
+    plan = cart_pole_swing_up().plan
+    ends = {}
+    for parts in (2, 8):
+        model, (xs, us) = plan.model_at(parts), plan.sample(parts)
+        for known in (None, plan.gains(parts)):
+            motion = dd.rollout(model, xs[0], policy=track(plan, model, xs, us, known), num_steps=len(us))
+            ends[parts, known is None] = np.abs(plan.problem.goal_error(motion.xs[-1])) / plan.scale
+    assert np.allclose(ends[2, True], ends[2, False], rtol=1e-9)
+    assert np.max(ends[8, True]) < 0.01  # of 3 % allowed
+    assert np.max(ends[8, False]) < 0.01
+
+
+def test_a_smooth_plan_that_is_wrong_is_refused_whatever_its_gains():
+    """Under feedback about states that go elsewhere from the middle on, and under inputs that are cut off."""
+    plan = cart_pole_swing_up().plan
+    assert not list(broken_variants(plan, replays(plan)))
+
+    def elsewhere(parts):
+        xs, us = plan.sample(parts)
+        moved = xs.copy()
+        moved[len(xs) // 2 :, 0] += 0.2 * plan.scale[0]
+        return moved, us
+
+    def weak(parts):
+        xs, us = plan.sample(parts)
+        return xs, np.clip(us, -5.0, 5.0)
+
+    found = replays(dataclasses.replace(plan, sample=elsewhere))
+    assert not any(r.holds for r in found if r.control == "TVLQR")
+    bounds = dataclasses.replace(plan.problem.bounds, u_lower=np.array([-5.0]), u_upper=np.array([5.0]))
+    cut = dataclasses.replace(plan, problem=dataclasses.replace(plan.problem, bounds=bounds), sample=weak)
+    assert list(broken_variants(cut, replays(cut)))
+
+
+def test_where_things_may_touch_each_replay_has_gains_of_its_own(write_urdf):
+    assert plan_of(block(write_urdf, x_goal=[0.1, 0]), np.ones((COUNT, 1))).gains(8) is None
