@@ -19,6 +19,8 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.rollout import STEPS
+from drake_diff.motion.smooth_roll import SmoothRoll, smooth_roll_of
 from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, Active, AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import (
     DynamicsCurvature,
@@ -28,7 +30,14 @@ from drake_diff.optimize.ilqr.expansion import (
     jacobians_along,
     with_active,
 )
-from drake_diff.optimize.ilqr.riccati import AffinePolicy, LinearQuadratic, follow, slope_along, solve_riccati
+from drake_diff.optimize.ilqr.riccati import (
+    WORTH_COMPILING,
+    AffinePolicy,
+    LinearQuadratic,
+    follow,
+    slope_along,
+    solve_riccati,
+)
 from drake_diff.optimize.problem.cost import CostToGo
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import (
@@ -59,6 +68,7 @@ LEFT_OVER = 3e-2
 BESIDE = 1e-14  # of a bound: an input that is no further from it is on it
 # Of what a step gained: where the next one gains more, the search converges slowly, for want of the right curvature.
 SLOW = 1 / 2
+SAME_MOTION = 1e-9  # of the largest state: what rounding of two forms of a step may come to under feedback
 SETTLE = 12  # sweeps for one policy, until it leads to the bounds that it was made for
 PARTS = 0.5 ** np.arange(6)  # of such a sweep's step
 
@@ -151,6 +161,13 @@ def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: 
     return found
 
 
+def _smooth_roll(problem: Problem) -> SmoothRoll | None:
+    """What motions of the problem are tried by; None where that is Drake's step itself."""
+    if not problem.has_model or problem.motion != STEPS or problem.design.vector.parameters or problem.design.count:
+        return None
+    return smooth_roll_of(problem.model) if problem.nx + problem.nu >= WORTH_COMPILING else None
+
+
 class _Bends:
     """The model of an augmented cost with the bends where bounds begin to push, as a function of steps (dxs, dus)."""
 
@@ -193,6 +210,8 @@ class _Search:
         self.start, self.design = time.monotonic(), problem.design
         begin = self.design.start if values is None else self.design.of_values(values)
         self.motion = self._take_in(xs, us, np.clip(begin, *self.design.limits))
+        self.guess, self.tried_by = self.motion, _smooth_roll(problem)
+        self.policy: AffinePolicy | None = None  # that of the last step
         self.expanded, self.curvature = self.motion, DynamicsCurvature()
         self.cost = self._objective(self.motion)
         self.constraints.start(*self.motion.point, self.cost, float(np.sum(self.motion.gaps**2)))
@@ -211,6 +230,27 @@ class _Search:
         return f"; {count} trial motion{'s' * (count > 1)} backed off from: {self.refusal}" if count else ""
 
     def run(self, interrupted: threading.Event) -> Outcome:
+        """Search; where motions are tried by the compiled form of the step, what is found is rolled out by Drake's own.
+
+        Where that leads elsewhere, the search goes on from there with Drake's own step alone.
+        """
+        outcome = self._search(interrupted)
+        if self.tried_by is None or self.policy is None:
+            return outcome
+        self.tried_by = None
+        try:
+            motion = self._roll(self.policy, 0.0)
+        except SimulationError:
+            motion = self.guess
+        same = np.abs(motion.xs - self.motion.xs).max() <= SAME_MOTION * max(1.0, float(np.abs(motion.xs).max()))
+        self.motion, self.cost = motion, self._objective(motion)
+        self.rows[-1] = replace(self.rows[-1], objective=self.cost, primal_infeasibility=self._infeasibility())
+        if same:
+            return outcome
+        self.jacobians = None
+        return self._search(interrupted)
+
+    def _search(self, interrupted: threading.Event) -> Outcome:
         """Minimize once; if there are constraints, again and again for better multipliers."""
         final = not self.constraints.any
         while True:
@@ -373,7 +413,7 @@ class _Search:
         except (GradientError, SimulationError) as error:
             self.refusals, self.refusal = self.refusals + 1, str(error)
             return math.inf
-        self.motion, self.cost, self.jacobians = motion, cost, jacobians
+        self.motion, self.cost, self.jacobians, self.policy = motion, cost, jacobians, policy
         self.gains = self.gains[1], merit - found
         self.rows.append(Iteration(len(self.rows), cost, self._infeasibility(), policy.gradient, size))
         if self.report:
@@ -390,6 +430,11 @@ class _Search:
         wanted = old.us + size * policy.feedforward
         if len(c):
             wanted = wanted + policy.feedback[:, :, nx:] @ (c - old.c)
+        if self.tried_by is not None:
+            bounds = *self.inner, self.problem.bounds.u_lower, self.problem.bounds.u_upper
+            found = self.tried_by(xs[0], old.xs, gaps, wanted, policy.feedback, bounds)
+            if found is not None:  # else a joint is at its limit, or something is not finite: Drake's step says it
+                return Motion(*found, gaps, c)
         with self.problem.intervals(self.design.at(c)) as intervals:
             for k, feedback in enumerate(policy.feedback[:, :, :nx]):
                 us[k] = self._inside(wanted[k] + feedback.dot(xs[k] - old.xs[k]))

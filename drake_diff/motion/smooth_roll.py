@@ -1,0 +1,87 @@
+"""A smooth plant moved under feedback by its own equation, compiled: what a search tries motions with.
+
+It is of trees of hinges and slides that cannot touch anything, and of steps in which no joint is at its limit. Each
+step is Drake's but for rounding, of which the certificate of the model's smooth derivative sees three; what is told of
+a search in the end is rolled out by Drake itself.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, own_array
+from drake_diff._base.compiled import kernel
+from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.analytic import analytic_of
+from drake_diff.derivatives.smooth_step import SmoothStep
+from drake_diff.exceptions import ModelError
+from drake_diff.mechanics.compiled_tree import compiled_tree
+from drake_diff.mechanics.description import describe_tree
+from drake_diff.model.model import Model
+
+KERNEL = "drake_diff.mechanics.roll_kernel"
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothRoll:
+    """What does not change from motion to motion."""
+
+    smooth: SmoothStep
+    tree: tuple[Array, ...]  # the tables of a `tree_kernel.Tree`
+    forces: tuple[Any, ...]  # those of `roll_kernel.Forces`
+
+    def __call__(
+        self, x0: Array, old: Array, gaps: Array, wanted: Array, gains: Array, bounds: tuple[Array, ...]
+    ) -> tuple[Array, Array] | None:
+        """(xs (N+1, nx), us (N, nu)), us = wanted + gains (xs - old) within bounds, each step less its gap (N, nx).
+
+        `gains` (N, nu, nx), `bounds` those of `roll_kernel.Bounds`. None where a joint comes to its limit, or anything
+        is not finite.
+        """
+        compiled, (count, nu), nx = kernel(KERNEL), wanted.shape, len(x0)
+        xs, us = np.empty((count + 1, nx)), np.empty((count, nu))
+        xs[0] = x0
+        told = [np.array(part, float, order="C") for part in (old, gaps, wanted, gains)]
+        compiled_bounds = compiled.Bounds(*(np.array(part, float, order="C") for part in bounds))
+        tables = compiled.Tree(*self.tree), compiled.Forces(*self.forces)
+        if not compiled.roll(*tables, compiled_bounds, *told, xs, us) or not np.isfinite(xs).all():
+            return None
+        ends, n = xs[1:] + gaps, nx // 2
+        ahead = xs[:-1, :n] + 2 * self.smooth.time_step * ends[:, n:]
+        lower, upper = self.smooth.limits
+        return None if ((ahead <= lower) | (ahead >= upper)).any() else (xs, us)
+
+
+def smooth_roll_of(model: Model) -> SmoothRoll | None:
+    """None where the plant is another, its steps are not certified, or Numba is not installed."""
+    if model.has_other_parameters:
+        return None
+    return model.cache("smooth roll", lambda: _make(model))
+
+
+def _make(model: Model) -> SmoothRoll | None:
+    if model.contract.contact.collision_pairs or model.num_constraints or model.coupling is not None:
+        return None
+    smooth = analytic_of(model)
+    if isinstance(smooth, Refusal) or smooth.coordinates.free or smooth.form.pd:
+        return None
+    if model.nq != model.nv or not np.array_equal(smooth.positions, np.arange(model.nv)):
+        return None
+    try:
+        description = describe_tree(model)
+    except ModelError:
+        return None
+    tree = compiled_tree(description)
+    if tree is None:
+        return None
+    arrays = (
+        smooth.dynamics.armature,
+        smooth.stiffness,
+        smooth.damping,
+        smooth.rest,
+        smooth.form.actuation,
+        smooth.limit,
+    )
+    forces = (float(model.time_step), *(own_array(np.asarray(part, dtype=float)) for part in arrays))
+    return SmoothRoll(smooth, tree.tables, forces)
