@@ -86,6 +86,6 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
 def _is_finite(numbers: Any) -> bool:
     """Of an array (n,) of floats; AutoDiffXd are taken as they are.
 
-    The sum of squares is a seventh of the time; it may be beyond all numbers though none of them is.
+    Their norm takes a fraction of the time of looking at each, and this one is finite as long as they are.
     """
-    return numbers.dtype != float or math.isfinite(numbers.dot(numbers)) or bool(np.isfinite(numbers).all())
+    return numbers.dtype != float or math.isfinite(math.hypot(*numbers.tolist()))

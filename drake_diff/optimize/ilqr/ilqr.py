@@ -319,8 +319,9 @@ class _Search:
             return Outcome.ITERATION_LIMIT
         refusals = self.refusals
         while self.regularization <= LARGEST_REGULARIZATION:
-            policies = (self._settled(one, solve(one, self.regularization)) for one in models)
-            policy = next((p for p in policies if p is not None and p.expected >= 0), None)
+            with np.errstate(all="ignore"):  # a policy that leads to infinity promises nothing
+                policies = (self._settled(one, solve(one, self.regularization)) for one in models)
+                policy = next((p for p in policies if p is not None and p.expected >= 0), None)
             if policy is not None and self._search_along(model, policy):
                 return None
             if is_reached(ROUNDING * scale):
