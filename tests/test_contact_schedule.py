@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from helpers.legged import LEGGED, SOLO_FEET, legged_model, rest
+from helpers.legged import LEGGED, SOLO_FEET, legged_model, rest, robot_on_feet
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.model.parameters import select
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
+from drake_diff.optimize.replay import Plan, broken_variants, held, replays
 from drake_diff.optimize.scheduled.centroidal import plan_forces
 from drake_diff.optimize.scheduled.legs import Legs
 from drake_diff.optimize.scheduled.motion import _slow_phases, _sunk, swings, touching
@@ -202,15 +204,22 @@ def test_a_sole_sinks_by_its_share_of_the_weight():
     assert np.all(np.diff(sunk[:, 0]) > 0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_solo_lifts_a_foot(solo, seed):
-    x0 = rest("solo12", solo, np.array(LEGGED["solo12"].high), np.random.default_rng(seed))
+@pytest.fixture(scope="module", params=range(2))
+def lifted(solo, request):
+    """A foot lifted for half a second, solved: its problem, the steps of its schedule, and the solution."""
+    x0 = rest("solo12", solo, np.array(LEGGED["solo12"].high), np.random.default_rng(request.param))
     schedule = dd.optimize.ContactSchedule([(25, SOLO_FEET), (25, SOLO_FEET[1:]), (15, SOLO_FEET)])
     guess = schedule.guess(solo, x0)
-    problem = dd.Problem(solo, x0=x0, num_steps=65, goals=[schedule], **schedule.follow(solo, guess))
-    solution = dd.solve(problem, method="ilqr", initial_guess=guess, tolerance=1e-4, max_iterations=20)
-    assert solution.status.value != "iteration_limit"
+    place = dd.FrameGoal("base_link", position=guess[0][-1][4:7], tolerance=0.05)
+    problem = dd.Problem(solo, x0=x0, num_steps=65, goals=[schedule, place], **schedule.follow(solo, guess))
+    return problem, dd.solve(problem, method="ilqr", initial_guess=guess, tolerance=1e-4, max_iterations=20)
+
+
+@pytest.mark.slow
+def test_solo_lifts_a_foot(solo, lifted):
+    problem, solution = lifted
+    assert solution.success, solution.message
+    x0 = np.asarray(problem.x0)
     legs, xs = Legs(solo, SOLO_FEET, x0[: solo.nq]), [x0]
     for u in solution.us:  # Drake's own steps
         xs.append(advance(solo.double, xs[-1], u))
@@ -218,3 +227,43 @@ def test_solo_lifts_a_foot(solo, seed):
     assert heights[37, 0] > 0.01
     assert np.max(heights[:, 1:]) < 1e-5  # 0 is kept to the tolerance of a search
     assert np.max(np.abs(xs[-1][solo.nq : solo.nq + 6])) < 0.3
+
+
+@pytest.mark.slow
+def test_the_other_law_of_contact_decides_in_steps_that_are_fine_enough_for_it(solo, lifted):
+    """Lagged contact in steps of 20 ms throws the landed foot up; in 2.5 ms the same feedback holds it."""
+    _, solution = lifted
+    whole, fine = "with lagged contact", "with lagged contact in steps of 0.0025 s"
+    assert not any(r.holds for r in solution.replays if r.variant == whole)
+    assert [r.control for r in solution.replays if r.variant == fine and r.holds] == ["TVLQR"]
+    assert f"{whole}, where steps are longer, not: " in solution.message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lifted", [0], indirect=True)
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+def test_a_lift_that_is_not_what_was_asked_is_refused(solo, lifted):
+    problem, solution = lifted
+    x0, us = np.asarray(problem.x0), np.asarray(solution.us)
+    base = solution.xs[-1][4:7]
+    kept = next(goal for goal in problem.goals if isinstance(goal, dd.optimize.ContactSchedule))
+    slippery = dd.load_model(
+        robot_on_feet("solo12", 0.02), time_step=0.02, base="free", actuators="all", ground=0.03, near_rigid=0.1
+    )
+    strength = np.full(solo.nu, 0.6 * np.max(np.abs(us)))  # a standing robot's knees need more than that
+    limits = dd.Bounds(u_lower=-strength, u_upper=strength)
+    other = dd.optimize.ContactSchedule([(25, SOLO_FEET), (25, SOLO_FEET[:3]), (15, SOLO_FEET)])
+    there = dd.FrameGoal("base_link", base, tolerance=0.05)
+    further = dd.FrameGoal("base_link", base + np.array([0.1, 0, 0]), tolerance=0.05)
+    planted = {
+        "another foot is to be lifted": (solo, us, [other], None),
+        "the base is to end 0.1 m further": (solo, us, [kept, further], None),
+        "feet slip": (slippery, us, [kept, there], None),
+        "motors are too weak": (solo, np.clip(us, -strength, strength), [kept, there], limits),
+    }
+    for name, (model, inputs, goals, bounds) in planted.items():
+        asked = dd.Problem(model, x0=x0, num_steps=65, goals=goals, bounds=bounds, final_cost=lambda x: x[0])
+        plan = Plan(asked, select(model, ()), 0.02, held(np.asarray(solution.xs), inputs), continuous=False)
+        found = replays(plan)
+        assert list(broken_variants(plan, found)), f"{name}: {found}"
+        assert not any(r.holds for r in found if "lagged" in r.variant), f"{name}: {found}"

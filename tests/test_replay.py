@@ -184,6 +184,27 @@ BALL = """<sdf version="1.9"><model name="ball"><link name="ball"><inertial><mas
 </model></sdf>""".replace("<sdf ", '<sdf xmlns:drake="drake" ')
 
 
+def test_a_plan_that_lives_from_one_law_of_contact_is_refused_in_the_other_in_fine_steps_too(tmp_path):
+    """A ball that is to lie still after its fall: sap's relaxation time stops it, an undamped spring throws it back."""
+    path = tmp_path / "ball.sdf"
+    damped = """10000</drake:point_contact_stiffness><drake:relaxation_time>0.1</drake:relaxation_time>
+    <drake:hunt_crossley_dissipation>0</drake:hunt_crossley_dissipation>"""
+    path.write_text(BALL.replace("100</drake:point_contact_stiffness>", damped))
+    model = dd.load_model(path, time_step=0.002, ground=0.5, near_rigid=1e-3)
+    fall = dd.Problem(model, x0=[0.15, 0], num_steps=100, x_goal=[0.1, math.nan], optimize="initial_state")
+    us = np.zeros((100, 0))
+    xs = dd.rollout(model, [0.15, 0], num_steps=100).xs
+    plan = Plan(fall, select(model, ()), 0.002, held(xs, us), continuous=False)
+    found = replays(plan)
+    other = ["with lagged contact", "with lagged contact in steps of 0.00025 s"]
+    assert [(r.variant, r.holds) for r in found[-2:]] == [(name, False) for name in other]
+    assert all(r.holds for r in found[:-2])
+    refused = list(broken_variants(plan, found))
+    assert len(refused) == 1
+    assert refused[0].startswith(f"replayed {other[1]} it does not hold: open loop, z_x ends")
+    assert found[-1].motion.xs[-1, 0] > 0.11  # 0.1 s to the ground, 0.03 s on its spring, and on the way up
+
+
 def test_a_replay_prints_what_failed_and_not_its_arrays(write_urdf):
     plan = plan_of(block(write_urdf, x_goal=[0.9, math.nan]), np.full((COUNT, 1), 2.0))
     found = by_name(replays(plan), f"in steps of {H:g} s", "open loop")

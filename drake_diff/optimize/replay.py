@@ -5,6 +5,10 @@ of the plant holds if the inputs, open loop or with TVLQR feedback about the pla
 an unstable motion diverges open loop however right it is, and feedback through contact can do harm. A discrete plan has
 to hold at h, h/2 and h/8; a collocated one, whose interval need not be a step that the simulator can take, at two
 successive ones of h, h/2, ... h/64. Under feedback less is allowed, since the end then depends on its weights too.
+The other approximation of contact is followed by the gains of the plan's own steps, those that a robot would be driven
+by: where a foot has just landed lagged contact has derivatives of fifty times the plan's, and its own gains throw the
+foot up. A step that is right for one law may be too long for another, whose foot then goes through the ground. So a
+plan that does not hold in the other law at h is tried in it at h/8, and that decides, whatever it says.
 A plan in continuous time, whose law of contact is one, has to hold in another integration of that law: its equations
 are Drake's terms and the contact written out, and share nothing with those that the plan was made by.
 """
@@ -120,6 +124,12 @@ class Plan:
             return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
 
     @cached_property
+    def own_gains(self) -> Array:
+        """(N, nu, nt) of TVLQR about the plan in its own steps."""
+        with applied(select(self.model_at(1), self.vector.to_dict())) as model:
+            return regulator(self, model, *self.sample(1)).gains
+
+    @cached_property
     def halved_gains(self) -> Array:
         """(2 N, nu, nt) of TVLQR about the plan in half of its steps."""
         xs, us = self.sample(2)
@@ -175,7 +185,12 @@ def replays(plan: Plan) -> tuple[Replay, ...]:
         contact = model.contract.contact
         if contact.collision_pairs and not plan.continuous:
             other = OTHER_APPROXIMATION[contact.approximation]
-            found += _replay_in(plan, f"with {other} contact", lambda: model.with_contact(other), 1)
+            name = f"with {other} contact"
+            tried = _replay_in(plan, name, lambda: model.with_contact(other), 1)
+            found += tried
+            if not _holds(tried):
+                name = f"{name} in steps of {plan.time_step / FINE:.4g} s"
+                found += _replay_in(plan, name, lambda: plan.model_at(FINE).with_contact(other), FINE)
     return tuple(found)
 
 
@@ -198,8 +213,8 @@ def deciding(plan: Plan, found: Sequence[Replay]) -> list[str]:
     """The variants in which the plan has to hold."""
     variants = list(dict.fromkeys(r.variant for r in found))
     if plan.continuous:
-        variants = variants[-2:] if len(variants) > 1 else []  # the two finest; one alone says nothing
-    return variants
+        return variants[-2:] if len(variants) > 1 else []  # the two finest; one alone says nothing
+    return [v for v in variants if not any(other.startswith(f"{v} in steps of ") for other in variants)]
 
 
 def broken_variants(plan: Plan, found: Sequence[Replay]) -> Iterator[str]:
@@ -221,15 +236,21 @@ def told_of_controls(plan: Plan, found: Sequence[Replay]) -> str:
     good = [c for c in controls if all(r.holds for r in found if r.control == c and r.variant in decides)]
     if not good:
         held = (r for r in found if r.holds and r.variant in decides)
-        return "on the plant, " + ", ".join(f"{r.variant} {_words(r.control)}" for r in held) + "; nowhere under both"
+        where = ", ".join(f"{r.variant} {_words(r.control)}" for r in held)
+        longer = next((r for r in found if not (r.holds or r.variant in decides)), None)
+        return f"on the plant, {where}; nowhere under both" + (_in_longer_steps(longer) if longer else "")
     told = "on the plant " + " and ".join(map(_words, good)) + (f" {decides[0]} or less" if plan.continuous else "")
     for control in controls:
         failed = [r for r in found if r.control == control and not r.holds]
         if control not in good:
             told += f", not {_words(control)}: {failed[0].variant}, {failed[0].failures[0]}"
-        elif failed:  # a collocated plan in steps that are too coarse for it
-            told += f"; {_words(control)} {failed[0].variant}, which are longer, not: {failed[0].failures[0]}"
+        elif failed:  # in steps that are too coarse for a collocated plan, or for the other law of contact
+            told += _in_longer_steps(failed[0])
     return told
+
+
+def _in_longer_steps(r: Replay) -> str:
+    return f"; {_words(r.control)} {r.variant}, where steps are longer, not: {r.failures[0]}"
 
 
 def told_of_goals(plan: Plan, found: Sequence[Replay]) -> str:
@@ -381,6 +402,8 @@ def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
 
 
 def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:
+    approximation = model.contract.contact.approximation
+    law_is_another = approximation != plan.problem.model.contract.contact.approximation
     try:
         xs, us = plan.sample(parts)
         if known is not None:
@@ -388,13 +411,12 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
         elif control == "open loop":
             motion = _rolled(plan.problem, model, xs[0], us, len(us))
         else:
-            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us, plan.gains(parts)), len(us))
+            gains = np.repeat(plan.own_gains, parts, axis=0) if law_is_another else plan.gains(parts)
+            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us, gains), len(us))
     except (SimulationError, ModelError, GradientError, ValueError) as error:
         return _missing(plan, variant, control, str(error))
     bounds = plan.problem.bounds
     beyond = np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper)[1:]
-    approximation = model.contract.contact.approximation
-    law_is_another = approximation != plan.problem.model.contract.contact.approximation
     return Replay(
         variant=variant,
         control=control,

@@ -23,6 +23,7 @@ TIME_STEP, OF_JUMPS = 0.02, 0.01  # [s]; where a robot flies at 1 m/s a foot mov
 PUSH, SPIN = 0.35, 0.5  # [m/s], [rad/s] the largest velocity of a push of Solo12; of others by their height
 HEIGHTS = {"solo12": 0.23, "go2": 0.31, "anymal": 0.45}  # [m] of the base, standing
 AT_PLACE, AT_REST, LEVEL, SPINS = 0.05, 0.3, 0.1, 1.0  # [m], [m/s], [rad], [rad/s] of the base at the end
+SWING = 0.15  # of that height, how high a foot is lifted
 IN_AIR = 0.01  # [m] every foot that is to be in the air, in the middle of its way
 OPTIONS = {"method": "ilqr", "tolerance": 1e-4, "max_iterations": 100}
 
@@ -75,7 +76,8 @@ TASKS: Tasks = {f"{robot}_{kind}": partial(make, robot) for robot in LEGGED for 
 
 
 def _task(robot, random, kind, first, last, phases, text, *, way=0.0, pushed=False):
-    h = OF_JUMPS if kind in ("jump", "forward") else TIME_STEP
+    quick = kind in ("jump", "forward") or (robot, kind) == ("anymal", "trot")
+    h = OF_JUMPS if quick else TIME_STEP
     model, facts = legged_model(robot, h), LEGGED[robot]
     nq = model.nq
     x0 = rest(robot, model, np.array(first), random)
@@ -85,7 +87,7 @@ def _task(robot, random, kind, first, last, phases, text, *, way=0.0, pushed=Fal
         x0[nq:] = _pushed(robot, model, x0, random)
     steps = [(round(seconds / h), [facts.feet[i] for i in feet]) for seconds, feet in phases]
     schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet)
-    guess = schedule.guess(model, x0, end, swing=0.15 * HEIGHTS[robot])
+    guess = schedule.guess(model, x0, end, swing=SWING * HEIGHTS[robot])
     goals = [
         schedule,
         dd.FrameGoal(facts.base, position=end[4:7], tolerance=AT_PLACE),
@@ -212,6 +214,6 @@ def told(task):
         "end": np.asarray(task.options["initial_guess"][0][-1]).tolist(),
         "time_step": model.time_step,
         "phases": task.schedule.phases,
-        "swing": 0.15 * HEIGHTS[robot],
+        "swing": SWING * HEIGHTS[robot],
         "at_place": AT_PLACE,
     }

@@ -16,7 +16,8 @@ from drake_diff.optimize.scheduled.legs import Legs
 
 from .models import robot_file
 
-SINK, RELAXES = 0.0625, 2.5  # [m/s] times a step: how deep a foot is under an even share of the weight; steps
+# How deep a foot is under an even share of the weight, of its radius times a step in seconds; steps.
+SINK, RELAXES = 3.9, 2.5
 DISSIPATION, FRICTION = 0.5, 0.7  # [s/m]
 DRAWN, TURNED = 0.08, 0.05  # of the base's height, how far feet and centre of mass are drawn; [rad]
 SETTLES, SETTLE_STEP = 0.6, 0.002  # [s] of a PD controller that brings a posture to rest
@@ -37,6 +38,11 @@ class Legged:
     weight: float
     gains: tuple[float, float]
     base: str = "base_link"
+
+    @property
+    def sinks(self):
+        """[m/s] times a step: how deep a foot is where the robot stands."""
+        return SINK * self.radius
 
 
 def _legs(hip, knee, *, hind=1, count=4):
@@ -97,7 +103,7 @@ def robot_on_feet(name, time_step):
             ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "sphere", radius=str(robot.radius))
             properties = ElementTree.SubElement(collision, "drake:proximity_properties")
             for quantity, value in (
-                ("point_contact_stiffness", robot.weight / len(robot.feet) / (SINK * time_step)),
+                ("point_contact_stiffness", robot.weight / len(robot.feet) / (robot.sinks * time_step)),
                 ("hunt_crossley_dissipation", DISSIPATION),
                 ("relaxation_time", RELAXES * time_step),
                 ("mu_dynamic", FRICTION),
@@ -131,7 +137,7 @@ def rest(name, model, joints, random=None):
     With a `random` generator the feet are drawn from about where they are, and the centre of mass and the base's turn.
     """
     robot, fine = LEGGED[name], model.at_time_step(SETTLE_STEP)
-    nq, count, sink = model.nq, len(joints), SINK * model.time_step
+    nq, count, sink = model.nq, len(joints), robot.sinks * model.time_step
     x = np.array(model.default_state)
     x[:nq] = 0.0
     x[0], x[nq - count : nq] = 1.0, joints
