@@ -13,6 +13,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_diff._base.arrays import Array, positive_float
 from drake_diff.exceptions import InputError, ModelError
+from drake_diff.model.half_space import from_half_space
 from drake_diff.model.model import Model
 from drake_diff.model.twin import Twin
 
@@ -183,7 +184,7 @@ def _pairs(plant: Any, context: Any) -> list[tuple[Any, tuple[Any, Any]]]:
     inspector, found = query.inspector(), []
     for ids in sorted(inspector.GetCollisionCandidates(), key=lambda pair: [int(i.get_value()) for i in pair]):
         try:
-            pair = query.ComputeSignedDistancePairClosestPoints(*ids)
+            pair = from_half_space(query, ids) or query.ComputeSignedDistancePairClosestPoints(*ids)
         except RuntimeError as error:
             why = "soft contact needs the distance of every pair, and Drake cannot compute one"
             raise ModelError(f"{why}: {error}") from error
