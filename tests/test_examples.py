@@ -181,6 +181,21 @@ def test_the_hopper_flies_and_stands_half_a_metre_on():
 
 
 @pytest.mark.slow
+def test_two_fingers_hold_the_box_up_by_its_sides():
+    """At the end nothing is under it, and what carries it are two forces at its sides, within their friction cones."""
+    module = example("grasp_and_lift")
+    solution = dd.solve(module.problem(), **module.solve_options)
+    assert solution.success, solution.message
+    for found in solution.replay.contacts[-5:]:
+        assert sorted(name for c in found for name in (c.body_a, c.body_b)) == ["box", "box", "left", "right"]
+        for contact in found:
+            across = abs(contact.normal[0])
+            assert across > 0.99
+            assert np.linalg.norm(contact.force[1:]) < 0.85 * abs(contact.force[0])  # 0.8, and what it leans
+    assert solution.replay.xs[-1][1] == pytest.approx(module.HEIGHT, abs=0.01)  # the goal's tolerance
+
+
+@pytest.mark.slow
 @each_row("name, way", [("quadruped_jump", 0.06), ("quadruped_trot", 0.12)])
 def test_the_quadruped_goes_as_its_schedule_says(name, way):
     """Where a foot is said to stand it is on the ground, where not over it, by Drake's own kinematics."""

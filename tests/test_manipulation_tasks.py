@@ -75,8 +75,38 @@ def test_the_referee_refuses_what_is_not_as_asked_and_a_task_that_asks_nothing()
     assert any("beyond its limit" in one for one in wrong)
 
 
+def test_a_box_that_is_dropped_leans_or_is_carried_from_below_is_refused():
+    """Of a motion whose end is as asked; 2 of the 10 knots of the last 0.2 s are spoilt."""
+    task = drawn("grasp")
+    us = np.zeros((task.problem.num_steps, 4))
+    asked = np.array(task.problem.goals[0].goal.values["z"])
+
+    def missed(**spoilt):
+        xs = np.tile(task.problem.x0, (len(us) + 1, 1))
+        xs[50:, 1] = xs[50:, 4] = xs[50:, 6] = asked
+        for name, (knots, value) in spoilt.items():
+            xs[knots, task.problem.state_names.index(name)] = value
+        return [number for number, (_, measure, allowed) in enumerate(task.asks) if not measure(xs, us) <= allowed]
+
+    assert missed() == []
+    assert missed(z_x=(slice(-5, -3), asked - 0.011)) == [0]
+    assert missed(turn_q=(-1, 0.051)) == [1]
+    assert missed(left_z_x=(slice(60, 62), asked - 0.12)) == [2]  # below its side: the tip carries the box
+
+
+def test_the_guess_closes_both_fingers_on_the_box_and_goes_up_with_it():
+    task = drawn("grasp")
+    xs, _ = task.options["initial_guess"]
+    there = xs[round(0.4 * (len(xs) - 1)) :]
+    # 0.07 m: half of the box and a fingertip; rounding of sums of three numbers below 1
+    np.testing.assert_allclose(there[:, 0] - there[:, 3], 0.07, atol=1e-15)
+    np.testing.assert_allclose(there[:, 5] - there[:, 0], 0.07, atol=1e-15)
+    np.testing.assert_array_equal(there[:, 1], there[:, 4])
+    np.testing.assert_array_equal(there[:, 1], there[:, 6])
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["spinner", "ball", "box"])
+@pytest.mark.parametrize("name", ["spinner", "ball", "box", "grasp"])
 def test_a_start_is_solved_and_drake_alone_finds_the_object_there(name):
     from contact_plans import referee
 

@@ -1,9 +1,10 @@
-"""Tasks of `contact_plans.py` in which something is pushed, and a hop: from a random start.
+"""Tasks of `contact_plans.py` in which something is pushed, grasped or tipped, and a hop: from a random start.
 
 A goal is a place with a tolerance: 5 mm for a ball and a box, 0.05 rad for a spinner. Speed at the end costs and is not
 asked. Contact is softer than the models' own: of that, the force of a step that begins to touch jumps so far that it
 stops what it hits at once, and the least cost lies at the jump. The guess is a line to the goal, and the spinner's a
-finger that goes to the end of the spinner and along with it.
+finger that goes to the end of the spinner and along with it; two fingers go to a box's sides and up with it. These are
+geared, and their effort is told from that of a grip: a finger that comes slowly and presses on has few jumps ahead.
 """
 
 import re
@@ -19,9 +20,17 @@ import drake_diff as dd
 MODELS = Path(dd.__file__).parent / "models"
 OPTIONS = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 150}
 AT_PLACE, AT_ANGLE = 0.005, 0.05  # [m], [rad]
+AT_HEIGHT, HELD = 0.01, 0.2  # [m], for so long at the end [s]
 AT_GOAL = 1e-3  # of a hop's goal, in the units of states
 ROUGHLY = 1e-2  # of a solve: where a push begins or lets go the cost has a corner, and the last 0.01 % take long
+MORE_ROUGHLY = 3e-2  # of a grasp: the last 0.1 %
 DISSIPATION = 5  # [s/m]
+WEIGHT, CARRIED, GRIP = 9.81 * 0.203, 9.81 * 0.101, 2.5  # [N] of a box, of a finger and its slide; of a finger on a box
+BOX, TIP, GIVES = (
+    (0.05, 0.1),
+    0.02,
+    2000,
+)  # [m] half of the tall box, of a fingertip; [N/m] of two corners on the ground
 LINK, PIVOT, BESIDE, OUT = 0.15, (0.25, 0.2), 0.04, 0.07  # [m] of the finger and the spinner, between axes; from pivot
 
 
@@ -76,8 +85,7 @@ def beside(x0: np.ndarray, angle: float, count: int, time_step: float) -> np.nda
     there = np.array([np.arctan2(tip[1], tip[0]) - elbow / 2, elbow]).T
     way = np.minimum(part / 0.4, 1)[:, None]
     q = np.column_stack([(1 - way) * x0[:2] + way * there, spin])
-    v = np.vstack([np.zeros(3), np.diff(q, axis=0) / time_step])
-    return np.hstack([q, v])
+    return with_speeds(q, time_step)
 
 
 def ball(random: np.random.Generator, time_step: float = 0.02) -> Task:
@@ -134,4 +142,59 @@ def monoped(random: np.random.Generator, time_step: float = 0.01) -> Task:
     return Task("monoped", problem, f"{way:.2f} m on, at rest", {**OPTIONS, "tolerance": 1e-6}, asks)
 
 
-TASKS: Tasks = {"spinner": spinner, "ball": ball, "box": box, "monoped": monoped}
+def grasp(random: np.random.Generator, time_step: float = 0.02) -> Task:
+    """Two fingers that start apart from a box grip it by its sides and hold it up, which friction alone does."""
+    model = dd.load_model(MODELS / "two_fingers.sdf", time_step=time_step)
+    count, (half, tall) = round(2 / time_step), BOX
+    x0 = np.zeros(14)
+    x0[:2] = random.uniform(-0.03, 0.03), tall - WEIGHT / GIVES
+    for entry, side in ((3, -1), (5, 1)):
+        x0[entry] = x0[0] + side * (half + TIP + random.uniform(0.02, 0.1))
+        x0[entry + 1] = tall + random.uniform(-0.02, 0.03)
+    height = x0[1] + random.uniform(0.05, 0.1)
+    held = dd.optimize.Dwell(dd.JointGoal({"z": height}, tolerance=AT_HEIGHT), HELD)
+    problem = dd.Problem(
+        model,
+        x0=x0,
+        num_steps=count,
+        goals=[held, dd.JointGoal({"turn": 0}, tolerance=AT_ANGLE)],
+        running_cost=dd.QuadraticCost(
+            Q=np.diag([0.0, 0, 1, *np.zeros(11)]), R=0.01 * np.eye(4), u_ref=[GRIP, CARRIED, -GRIP, CARRIED]
+        ),
+        final_cost=dd.QuadraticCost(Q=np.diag([0] * 7 + [0.1] * 7)),
+    )
+    options = {**OPTIONS, "tolerance": MORE_ROUGHLY, "initial_guess": gripped(x0, height, count, time_step)}
+    rest = range(count - round(HELD / time_step), count + 1)
+    asks = (
+        ("box from its height [m]", lambda xs, us: max(off({1: height}, xs, us, k) for k in rest), AT_HEIGHT),
+        ("box from upright [rad]", partial(off, {2: 0.0}), AT_ANGLE),
+        ("fingertips from the middles of its sides, up or down [m]", beyond_faces, tall - TIP),
+    )
+    return Task("grasp", problem, f"the box at {height:.2f} m, held by its sides", options, asks)
+
+
+def beyond_faces(xs: np.ndarray, us: np.ndarray) -> float:
+    """[m] how far a fingertip ever is from the middle of a box's side along it, once the box is up."""
+    up = xs[xs[:, 1] > BOX[1] + AT_HEIGHT]
+    c, s = np.cos(up[:, 2]), np.sin(up[:, 2])
+    along = [(up[:, i] - up[:, 0]) * s + (up[:, i + 1] - up[:, 1]) * c for i in (3, 5)]
+    return float(np.max(np.abs(along), initial=0.0))
+
+
+def gripped(x0: np.ndarray, height: float, count: int, time_step: float) -> tuple[np.ndarray, np.ndarray]:
+    """(N+1, 14), (N, 4) the fingers go to the sides of the box in 40 % of the time, then up with it, and stay."""
+    part = np.linspace(0, 1, count + 1)
+    z = np.interp(part, [0, 0.4, 0.9, 1], [x0[1], x0[1], height, height])
+    way, columns = np.minimum(part / 0.4, 1), [np.full(count + 1, x0[0]), z, np.zeros(count + 1)]
+    for entry, side in ((3, -1), (5, 1)):
+        columns.append((1 - way) * x0[entry] + way * (x0[0] + side * (BOX[0] + TIP)))
+        columns.append((1 - way) * x0[entry + 1] + way * z)
+    return with_speeds(np.column_stack(columns), time_step), np.tile([GRIP, CARRIED, -GRIP, CARRIED], (count, 1))
+
+
+def with_speeds(q: np.ndarray, time_step: float) -> np.ndarray:
+    """(N+1, nx) of a motion that begins at rest."""
+    return np.hstack([q, np.vstack([np.zeros(q.shape[1]), np.diff(q, axis=0) / time_step])])
+
+
+TASKS: Tasks = {"grasp": grasp, "spinner": spinner, "ball": ball, "box": box, "monoped": monoped}
