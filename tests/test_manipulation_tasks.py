@@ -16,6 +16,7 @@ sys.path.append(str(Path(__file__).parent / "benchmarks"))
 from manipulation_tasks import BESIDE, OUT, TASKS
 
 AT = {"spin": "spin_q", "slide": "slide_x", "bx": "bx_x", "by": "by_x"}  # the coordinate of a joint
+KEPT = {"grasp": 2}  # of what is asked, at the end: it is there at first, and to be kept
 
 
 def drawn(name, seed=0):
@@ -28,7 +29,7 @@ def test_nothing_asked_is_there_where_nothing_is_done(name):
     us = np.zeros((problem.num_steps, problem.nu))
     xs = dd.rollout(problem.model, problem.x0, us).xs
     assert task.asks
-    for what, measure, allowed in task.asks:
+    for what, measure, allowed in task.asks[: len(task.asks) - KEPT.get(name, 0)]:
         assert measure(xs, us) > 5 * allowed, what
 
 
