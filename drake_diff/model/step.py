@@ -86,6 +86,6 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
 def _is_finite(numbers: Any) -> bool:
     """Of an array (n,) of floats; AutoDiffXd are taken as they are.
 
-    Their norm takes a fraction of the time of looking at each, and this one is finite as long as they are.
+    Their norm takes a fraction of the time of looking at each; a norm that no float holds is infinite.
     """
     return numbers.dtype != float or math.isfinite(math.hypot(*numbers.tolist()))
