@@ -292,7 +292,7 @@ class _Search:
         model = expand(self.problem, new, self.jacobians, self.constraints)
         moved = np.tile(new.c - old.c, (len(new.us), 1))
         self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], moved, new.us - old.us]))
-        if self.gains[1] > SLOW * self.gains[0]:
+        if new.is_rollout and self.gains[1] > SLOW * self.gains[0]:  # steps with gaps are short for these
             found = curvature_along(self.problem, new, model.multipliers())
             if found is not None:
                 curvature, known = found
