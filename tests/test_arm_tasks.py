@@ -12,16 +12,17 @@ import drake_diff as dd
 
 sys.path.append(str(Path(__file__).parent / "benchmarks"))
 
-from arm_tasks import LAST, TASKS, motion_of, seat
+from arm_tasks import HALF, LAST, TASKS, TIP, motion_of, seat
 
 BALL, BALL_V = slice(3, 5), slice(9, 11)  # in the state of arm_cup.sdf
+BOX = slice(6, 8)  # in that of the UR5 and the box
 
 
 def drawn(name, start=0):
     return TASKS[name](np.random.default_rng([0, zlib.crc32(name.encode()), start]))
 
 
-@pytest.mark.parametrize("name", ["throw", "catch"])
+@pytest.mark.parametrize("name", TASKS)
 def test_nothing_asked_is_there_where_nothing_is_done(name):
     problem = (task := drawn(name)).problem
     us = np.zeros((problem.num_steps, problem.nu))
@@ -47,6 +48,34 @@ def test_an_end_just_inside_its_tolerance_is_taken_and_one_outside_is_refused(na
             moved[-LAST:, BALL_V] = 0
             moved[knot, BALL_V] = 1.01 * slow
             assert bool(speed(moved, us) <= slow) is taken
+
+
+def test_a_box_just_inside_its_tolerance_is_taken_and_one_outside_is_refused():
+    task = drawn("push")
+    xs, us = (np.array(part) for part in task.options["initial_guess"])
+    ((_, place_off, allowed),) = task.asks
+    for part, taken in ((0.99, True), (1.01, False), (-1.01, False)):
+        xs[-1, BOX] = np.array(list(task.problem.goals[0].values.values())) + part * allowed
+        assert bool(place_off(xs, us) <= allowed) is taken
+
+
+def test_the_guess_takes_the_arms_tip_along_with_the_box_and_leaves_it_where_it_is_wanted():
+    task = drawn("push")
+    model, (xs, _) = task.problem.model, task.options["initial_guess"]
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    tip, box = plant.GetFrameByName("tip"), plant.GetFrameByName("box")
+    apart = []
+    for x in xs:
+        plant.SetPositionsAndVelocities(context, x)
+        place = plant.CalcPointsPositions(context, tip, np.zeros(3), plant.world_frame()).ravel()
+        assert abs(place[2] - 0.05) < 1e-6  # [m] the middle of the box; SNOPT meets its constraints to 1e-6
+        apart.append(np.linalg.norm(place[:2] - x[BOX]))
+        assert np.isclose(box.CalcPoseInWorld(context).translation()[2], 0.05)
+    pushed = np.count_nonzero(np.abs(np.array(apart) - HALF - TIP) < 1e-5)
+    assert pushed > 0.15 * len(xs)
+    assert min(apart) > HALF + TIP - 1e-5
+    # what it glides on is of the steps' own damping, but for 1 mm
+    np.testing.assert_allclose(xs[-1, BOX], list(task.problem.goals[0].values.values()), atol=1e-3)
 
 
 def test_the_target_of_a_throw_is_beyond_the_cup():
@@ -83,18 +112,18 @@ def test_the_guess_has_the_ball_in_the_cup():
         np.testing.assert_allclose(ball, [0, 0, 0.04 + 0.035 * np.sqrt(2) - 0.981 / 500], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["throw", "catch"])
+@pytest.mark.parametrize("name", TASKS)
 def test_the_referee_refuses_an_arm_that_does_nothing(name):
     from contact_plans import referee
 
     task = drawn(name)
-    wrong, _ = referee(task, SimpleNamespace(us=np.zeros((task.problem.num_steps, 3))))
+    wrong, _ = referee(task, SimpleNamespace(us=np.zeros((task.problem.num_steps, task.problem.nu))))
     assert wrong
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["throw", "catch"])
-def test_a_start_is_solved_and_drake_alone_finds_the_ball_there(name):
+@pytest.mark.parametrize("name", TASKS)
+def test_a_start_is_solved_and_drake_alone_finds_what_moves_there(name):
     from contact_plans import referee
 
     task = drawn(name)

@@ -1,20 +1,28 @@
-"""Tasks of `contact_plans.py` with an arm: a ball is thrown into a target, and a ball that flies is caught.
+"""Tasks of `contact_plans.py` with an arm: a ball is thrown into a target, one that flies is caught, a box is pushed.
 
 The guess of a throw is a curve of the cup to where it lets go, and the ball's parabola from there; of a catch, the
 ball's parabola, the cup's way to it, and a stop. Where they part or meet the cup is open along the ball's way. The arm
 follows by inverse kinematics. The cost is that of staying near the guess. A throw is searched from places alone, with
 relaxed contact first; a catch from the guess's states and the inputs of inverse dynamics, as contact that begins at
 2 m/s and more is stiffer than what is relaxed.
+
+A UR5 of example-robot-data pushes a box on a table to a place. A file of directives puts the arm, a tip on its flange
+and the box together. The guess takes the tip straight behind the box and along the line to the place, by inverse
+kinematics, and then back: a tip that slows down with the box would barely touch it for long.
 """
 
+import tempfile
 from functools import partial
+from importlib.metadata import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from contact_task import Task, Tasks
 from manipulation_tasks import softer
+from pydrake.multibody.inverse_kinematics import InverseKinematics
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from pydrake.solvers import Solve
 
 import drake_diff as dd
 
@@ -25,8 +33,14 @@ OPTIONS = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 150, "
 AT_TARGET, AT_REST = 0.05, 0.05  # [m], [m/s]
 THROWN, CAUGHT = (1000, 1), (3000, 2.5)  # stiffness [N/m] of cup and ball, and in how many steps they relax
 MUCH = np.repeat([0.5, 0.2, 1e3, 5.0, 2.0, 1e3], [3, 2, 1, 3, 2, 1])  # of a state: what is far from the guess
+MUCH_OF_PUSH = np.repeat([0.3, 0.1, 0.3, 1.0, 0.5, 3.0], [6, 2, 1, 6, 2, 1])
 EFFORT = 20.0  # [N m]
-ALONG = 0.7  # of its speed has the cup where it meets a ball: with all of it they would barely touch, and let go again
+UR5 = [f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
+ELBOW_UP = (0.2, -1.2, 1.8, -2.1, -1.57, 0)  # [rad] where its inverse kinematics begin
+SPEED, BACK, AWAY = 0.3, 0.4, 0.04  # [m/s] where a push ends, and [s] and [m] in which the tip then goes back
+SLOWS = 4.0  # [1/s] damping of the box by its mass
+HALF, TIP, AT_PLACE = 0.1, 0.03, 0.005  # [m] of the box and the tip; of the box's goal
+ALONG = 0.7  # of a ball's speed, which the cup has where they meet: with all of it they would barely touch
 LAST = 5  # knots in which a ball that is caught lies still
 
 
@@ -53,28 +67,35 @@ def motion_of(
     return np.hstack([q, v]), np.zeros((len(q) - 1, 3))
 
 
-def efforts(model: dd.Model, xs: np.ndarray) -> np.ndarray:
-    """(N, 3) the torques within their limits that move the arm along xs with what else moves the ball, a load on it."""
-    plant, nq = model.plant, model.nq
-    context, (cup, ball) = plant.CreateDefaultContext(), (plant.GetFrameByName(name) for name in ("cup", "ball"))
-    world, limits = plant.world_frame(), plant.GetEffortUpperLimits()
-    us = np.empty((len(xs) - 1, 3))
+def efforts(model: dd.Model, xs: np.ndarray, hand: str, load: str) -> np.ndarray:
+    """(N, nu) torques within the limits that move an arm along xs, with what else its hand moves as a load on it.
+
+    The arm's joints come first in the state, and then two that move the load along x, and along z or y.
+    """
+    plant, nq, n = model.plant, model.nq, model.nu
+    context, world = plant.CreateDefaultContext(), plant.world_frame()
+    of_hand, of_load = plant.GetFrameByName(hand), plant.GetFrameByName(load)
+    other = 2 if hand == "cup" else 1
+    us = np.empty((len(xs) - 1, n))
     for k, acceleration in enumerate(np.diff(xs[:, nq:], axis=0) / model.time_step):
         plant.SetPositionsAndVelocities(context, xs[k])
         forces = MultibodyForces(plant)
         plant.CalcForceElementsContribution(context, forces)
         tau = plant.CalcInverseDynamics(context, acceleration, forces)
-        at = plant.CalcPointsPositions(context, ball, np.zeros(3), cup)
-        J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, cup, at, world, world)
-        us[k] = np.clip(tau[:3] + J[:, :3].T @ [tau[3], 0, tau[4]], -limits, limits)
+        at = plant.CalcPointsPositions(context, of_load, np.zeros(3), of_hand)
+        J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, of_hand, at, world, world)
+        pushes = np.zeros(3)
+        pushes[[0, other]] = tau[n : n + 2]
+        limits = plant.GetEffortUpperLimits()
+        us[k] = np.clip(tau[:n] + J[:, :n].T @ pushes, -limits, limits)
     return us
 
 
-def near(guess: tuple[np.ndarray, np.ndarray], time_step: float) -> dict[str, Any]:
+def near(guess: tuple[np.ndarray, np.ndarray], time_step: float, much: np.ndarray) -> dict[str, Any]:
     """The cost of a Problem that stays near a guess."""
     xs, us = guess
     table = time_step * np.arange(len(xs)), xs, np.vstack([us, us[-1:]])
-    return {"running_cost": dd.optimize.TrackingCost(table, Q=np.diag(MUCH**-2.0), R=np.eye(3) / EFFORT**2)}
+    return {"running_cost": dd.optimize.TrackingCost(table, Q=np.diag(much**-2.0), R=np.eye(us.shape[1]) / EFFORT**2)}
 
 
 def flight(place: np.ndarray, velocity: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -125,7 +146,7 @@ def throw(random: np.random.Generator, time_step: float = 0.005) -> Task:
         x0=guess[0][0],
         num_steps=count,
         goals=dd.JointGoal(goal, tolerance=AT_TARGET),
-        **near(guess, time_step),
+        **near(guess, time_step, MUCH),
     )
     asks = (("ball from its target [m]", partial(ball_off, target), AT_TARGET),)
     text = f"the ball at ({target[0]:.2f}, {target[1]:.2f}) m"
@@ -154,7 +175,7 @@ def catch(random: np.random.Generator, time_step: float = 0.005) -> Task:
     wrist = np.where(free, before, held - seat(pitch))
     ball = np.where(free, flight(place, velocity, t), held)
     xs, _ = motion_of(wrist, pitch, ball, np.array([0, 0, 0, *velocity, 0]), time_step)
-    guess = xs, efforts(model, xs)
+    guess = xs, efforts(model, xs, "cup", "ball")
     goal = dict(zip(("ball_x", "ball_z"), end.tolist(), strict=True))
     problem = dd.Problem(
         model,
@@ -164,7 +185,7 @@ def catch(random: np.random.Generator, time_step: float = 0.005) -> Task:
             dd.JointGoal(goal, tolerance=AT_TARGET),
             dd.JointGoal({"ball_x_v": 0, "ball_z_v": 0}, tolerance=AT_REST, knots=range(count + 1 - LAST, count + 1)),
         ],
-        **near(guess, time_step),
+        **near(guess, time_step, MUCH),
     )
     asks = (
         ("ball from its place [m]", partial(ball_off, end), AT_TARGET),
@@ -174,9 +195,80 @@ def catch(random: np.random.Generator, time_step: float = 0.005) -> Task:
     return Task("catch", problem, text, {**OPTIONS, "continuation": None, "initial_guess": guess}, asks)
 
 
+def scene(time_step: float) -> dd.Model:
+    """The UR5 with a tip on its flange, and the box: of the arm's own shapes only the tip touches the box."""
+    (arm,) = (file.locate() for file in files("example-robot-data") or () if str(file).endswith("/ur5_robot.urdf"))
+    here = Path(__file__).parent
+    text = f"""directives:
+- add_model: {{name: arm, file: "file://{arm}"}}
+- add_model: {{name: tip, file: "file://{here / "fingertip.sdf"}"}}
+- add_weld: {{parent: "arm::tool0", child: "tip::tip", X_PC: {{translation: [0, 0, 0.05]}}}}
+- add_model: {{name: box, file: "file://{here / "table_box.sdf"}"}}
+- add_collision_filter_group: {{name: box, members: ["box::box"]}}
+- add_collision_filter_group:
+    name: flange
+    members: ["arm::ee_link"]
+    ignored_collision_filter_groups: [box]
+"""
+    path = Path(tempfile.mkdtemp()) / "push.dmd.yaml"
+    path.write_text(text)
+    return dd.load_model(path, time_step=time_step, actuators=UR5)
+
+
+def tip_at(model: dd.Model, places: np.ndarray) -> np.ndarray:
+    """(N, 6) the UR5's angles with its tip at (N, 3) places, pointing down, each near the one before."""
+    plant, found = model.plant, np.empty((len(places), 6))
+    tip, world, last = plant.GetFrameByName("tip"), plant.world_frame(), np.zeros(model.nq)
+    last[:6] = ELBOW_UP
+    for k, place in enumerate(places):
+        search = InverseKinematics(plant)
+        search.AddPositionConstraint(tip, np.zeros(3), world, place, place)
+        search.AddAngleBetweenVectorsConstraint(tip, [0, 0, 1], world, [0, 0, -1], 0, 0.01)
+        search.prog().AddBoundingBoxConstraint(last[6:], last[6:], search.q()[6:])
+        search.prog().AddQuadraticErrorCost(np.eye(6), last[:6], search.q()[:6])
+        search.prog().SetInitialGuess(search.q(), last)
+        result = Solve(search.prog())
+        assert result.is_success(), place
+        last = result.GetSolution(search.q())
+        found[k] = last[:6]
+    return found
+
+
+def push(random: np.random.Generator, time_step: float = 0.02) -> Task:
+    """The tip of an arm that starts apart from a box pushes it to a place on the table."""
+    model, count = scene(time_step), round(1.5 / time_step)
+    start = np.array([random.uniform(0.4, 0.5), random.uniform(-0.1, 0.1)])
+    along, way, gap = random.uniform(-0.4, 0.4), random.uniform(0.1, 0.2), random.uniform(0.03, 0.08)
+    line, turned = np.array([np.cos(along), np.sin(along)]), along + random.uniform(-0.1, 0.1)
+    place = start + way * line
+    pushed = gap + way - SPEED / SLOWS * (1 - np.exp(-SLOWS * BACK))  # then the box glides on
+    t = np.arange(count + 1) * time_step
+    until = t[-1] - BACK
+    pushing = (t <= until)[:, None]
+    forth = curve(t, until, ([0.0], [pushed]), ([0.0], [SPEED]))
+    back = curve(t - until, BACK, ([pushed], [pushed - AWAY]), ([SPEED], [0.0]))
+    glide = pushed + SPEED / SLOWS * (1 - np.exp(-SLOWS * np.maximum(0, t - until)))[:, None]
+    tip = start - (HALF + TIP + gap) * line + np.where(pushing, forth, back) * line
+    box = start + np.maximum(0, np.where(pushing, forth, glide) - gap) * line
+    arm = tip_at(model, np.column_stack([tip, np.full(count + 1, 0.05)]))
+    q = np.column_stack([arm, box, np.full(count + 1, turned)])
+    xs = np.hstack([q, np.vstack([np.zeros(9), np.diff(q, axis=0) / time_step])])
+    guess = xs, efforts(model, xs, "tip", "box")
+    problem = dd.Problem(
+        model,
+        x0=xs[0],
+        num_steps=count,
+        goals=dd.JointGoal(dict(zip(("bx", "by"), place.tolist(), strict=True)), tolerance=AT_PLACE),
+        **near(guess, time_step, MUCH_OF_PUSH),
+    )
+    asks = (("box from its place [m]", lambda xs, us: float(np.max(np.abs(xs[-1, 6:8] - place))), AT_PLACE),)
+    text = f"the box at ({place[0]:.2f}, {place[1]:.2f}) m"
+    return Task("push", problem, text, {**OPTIONS, "continuation": None, "initial_guess": guess}, asks)
+
+
 def ball_off(place: np.ndarray, xs: np.ndarray, us: np.ndarray) -> float:
     """How far the ball is from a place in the end."""
     return float(np.max(np.abs(xs[-1, 3:5] - place)))
 
 
-TASKS: Tasks = {"throw": throw, "catch": catch}
+TASKS: Tasks = {"throw": throw, "catch": catch, "push": push}
