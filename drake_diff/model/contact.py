@@ -85,18 +85,28 @@ def active_modes(model: Model) -> dict[Pair, str]:
 
 def contacts_of_the_step(model: Model) -> tuple[ContactPoint, ...]:
     """The contacts of the step that `step.advance` took last on the double twin."""
-    found = []
-    for a, b, force, info in contact_forces(model.double):
-        body_a, body_b, normal = body_of(model, a), body_of(model, b), _normal(info)
-        if model.plant.IsAnchored(body_a):  # the force is the one on what can move
-            body_a, body_b, normal, force = body_b, body_a, -normal, -force
-        if hasattr(info, "contact_surface"):
-            point, depth, slip_speed = info.contact_surface().centroid(), 0.0, 0.0
-        else:
-            point, depth, slip_speed = info.contact_point(), info.point_pair().depth, info.slip_speed()
-        where, sizes = (frozen(point), frozen(normal), frozen(force)), (float(depth), float(slip_speed))
-        found.append(ContactPoint(body_a.name(), body_b.name(), *where, *sizes))
+    found, results = [], model.double.plant.get_contact_results_output_port().Eval(model.double.context)
+    for i in range(results.num_point_pair_contacts()):
+        info = results.point_pair_contact_info(i)
+        pair = info.point_pair()
+        where, ids = (info.contact_point(), pair.nhat_BA_W, -info.contact_force()), (pair.id_A, pair.id_B)
+        found.append(_contact_point(model, *ids, *where, pair.depth, info.slip_speed()))
+    for i in range(results.num_hydroelastic_contacts()):
+        info = results.hydroelastic_contact_info(i)
+        surface, force = info.contact_surface(), info.F_Ac_W().translational()
+        where, ids = (surface.centroid(), _normal(info), force), (surface.id_M(), surface.id_N())
+        found.append(_contact_point(model, *ids, *where, 0.0, 0.0))
     return tuple(found)
+
+
+def _contact_point(
+    model: Model, a: Any, b: Any, point: Any, normal: Any, force: Any, depth: float, slip_speed: float
+) -> ContactPoint:
+    """Of the geometries a and b, by the force on a; told is the one on what can move."""
+    (name_a, anchored), (name_b, _) = _carrier(model, a), _carrier(model, b)
+    if anchored:
+        name_a, name_b, normal, force = name_b, name_a, -normal, -force
+    return ContactPoint(name_a, name_b, frozen(point), frozen(normal), frozen(force), float(depth), float(slip_speed))
 
 
 def contact_forces(twin: Twin) -> Iterator[tuple[Any, Any, Any, Any]]:
@@ -124,9 +134,15 @@ def _normal(info: Any) -> Array:
 
 
 def body_of(model: Model, geometry: Any) -> Any:
-    """The body that carries a geometry, which stays on it: it is asked for at every contact of every step."""
+    """The body that carries a geometry."""
+    return model.plant.GetBodyFromFrameId(model.double.inspector.GetFrameId(geometry))
+
+
+def _carrier(model: Model, geometry: Any) -> tuple[str, bool]:
+    """The name of that body, and whether it is fixed to the world: they stay, and each contact of each step asks."""
     if geometry not in model.carriers:
-        model.carriers[geometry] = model.plant.GetBodyFromFrameId(model.double.inspector.GetFrameId(geometry))
+        body = body_of(model, geometry)
+        model.carriers[geometry] = body.name(), model.plant.IsAnchored(body)
     return model.carriers[geometry]
 
 

@@ -266,8 +266,8 @@ class Model(ShowsItsRepr):
         return ", ".join(found + ["the diagram drives actuators"] * bool(self.inputs.fed_actuators))
 
     @cached_property
-    def carriers(self) -> dict[Any, Any]:
-        """The bodies that carry geometries, by these, as `contact.body_of` finds them."""
+    def carriers(self) -> dict[Any, tuple[str, bool]]:
+        """By geometry the name of the body that carries it and whether that is fixed, as far as they were asked for."""
         return {}
 
     @cached_property

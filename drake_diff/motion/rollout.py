@@ -237,10 +237,10 @@ class Meter:
         self.applied: list[Array] = []  # (nv,) by body forces and the diagram's systems
         self.pushes: list[tuple[Array, Array]] = []  # of contact and of joint limits, (nv,) each
         lower, upper = model.position_limits
-        # Of each joint with limits its places in q and v, and the limits.
-        self.limited = [
-            (i, j, lower[i], upper[i]) for i, j in _single(model) if np.isfinite(lower[i]) or np.isfinite(upper[i])
-        ]
+        # Of the joints with limits their places in q and v, and the limits.
+        limited = [(i, j) for i, j in _single(model) if np.isfinite(lower[i]) or np.isfinite(upper[i])]
+        self.limited = np.array(limited, dtype=np.intp).reshape(-1, 2).T
+        self.limits = lower[self.limited[0]], upper[self.limited[0]]
         self.contacts: list[tuple[ContactPoint, ...]] = []
 
     def measure_state(self, x: Array) -> None:
@@ -272,16 +272,15 @@ class Meter:
 
     def _limit_force(self, x: Array, x_next: Array, contact: Array) -> Array:
         """(nv,) what joints near a limit needed for the step beyond all other forces: the limit alone gives it."""
-        if not self.limited:
+        (i, j), (lower, upper) = self.limited, self.limits
+        if not len(i):
             return self.still
         nq, h, found = self.model.nq, self.model.time_step, np.zeros(self.model.nv)
         v, after = x[nq:], x_next[nq:]
-        near = []
-        for i, j, lower, upper in self.limited:  # Drake's limits act from two steps before on
-            reach = 2 * h * max(abs(v[j]), abs(after[j]))
-            if not lower <= min(x[i], x_next[i]) - reach or not max(x[i], x_next[i]) + reach <= upper:
-                near.append(j)
-        if near:
+        reach = 2 * h * np.maximum(np.abs(v[j]), np.abs(after[j]))  # Drake's limits act from two steps before on
+        inside = (lower <= np.minimum(x[i], x_next[i]) - reach) & (np.maximum(x[i], x_next[i]) + reach <= upper)
+        near = j[~inside]
+        if len(near):
             needed = self.model.double.inverse_dynamics((after - v) / h) + self.damping * (after - v)
             driven = self.actuation @ self.efforts[-1]
             if self.model.inputs.fed_actuators:  # which inverse dynamics has, too
