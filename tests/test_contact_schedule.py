@@ -197,11 +197,13 @@ def test_a_phase_is_slow_where_it_lasts_twice_as_long_as_a_fall():
 
 
 def test_a_sole_sinks_by_its_share_of_the_weight():
-    carries = np.ones((40, 4), dtype=bool)
-    carries[:, 3] = False
-    sunk = _sunk(1e-3, np.tile([0.5, 0.25, 0.25, 0.0], (40, 1)), carries)
-    assert np.allclose(sunk[-1], [1e-3, 0.0, 0.0, 0.0], atol=1e-8)  # 0.7 to the power of 40 is left, 6e-7 of it
+    landing = np.zeros((41, 4), dtype=bool)
+    sunk = _sunk(1e-3, np.tile([0.5, 0.25, 0.25, 0.0], (40, 1)), landing)
+    assert np.allclose(sunk[-1], [1e-3, 0.0, 0.0, -1e-3], atol=1e-8)  # 0.7 to the power of 40 is left, 6e-7 of it
     assert np.all(np.diff(sunk[:, 0]) > 0)
+    landing[40, 3] = True
+    landed = _sunk(1e-3, np.tile([0.5, 0.25, 0.25, 0.0], (40, 1)), landing)
+    assert np.allclose(landed[-1] - sunk[-1], [0.0, 0.0, 0.0, LANDS], atol=1e-15)
 
 
 @pytest.fixture(scope="module", params=range(2))

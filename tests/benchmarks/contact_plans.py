@@ -2,8 +2,10 @@
 
     python tests/benchmarks/contact_plans.py --seed 0 --starts 5 --jobs 2
     python tests/benchmarks/contact_plans.py --tasks solo12_jump,solo12_trot --crocoddyl /path/to/its/python
+    python tests/benchmarks/contact_plans.py --tasks go2_stand,go2_trot --time-step 0.05 --starts 2
 
-The referee is Drake alone: it builds the plant, sends it the plan's inputs, and measures what the task asks. A plan
+The referee is Drake alone: it builds the plant, sends it the plan's inputs, and measures what the task asks. Where a
+robot falls by rounding alone unless it is balanced, each step of the plan is compared with Drake's own instead. A plan
 that solve calls verified and the referee does not find is false. Verified plans are followed by their own feedback in
 steps of h/2 and h/4, in continuous time and in MuJoCo with matched contact, and those that hold there are counted.
 Times are processor seconds of one thread: of the whole solve with its verification, of an iteration of its search, and
@@ -13,6 +15,7 @@ of Drake's own simulation of the motion.
 import argparse
 import contextlib
 import importlib
+import inspect
 import json
 import logging
 import os
@@ -33,7 +36,7 @@ import numpy as np  # noqa: E402
 from contact_elsewhere import HOLDS, PLANTS, counts, where_else  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 
-MODULES = ("legged_tasks", "manipulation_tasks", "arm_tasks")
+MODULES = ("legged_tasks", "biped_tasks", "manipulation_tasks", "arm_tasks")
 REPEATS = 3  # of a simulation, the quickest of which counts
 AGAIN = 1e-6  # what the referee's own motion may be off the plan's in a step: another order of sums
 
@@ -66,6 +69,12 @@ def simulated(plant, diagram, x0, us, h):
     return xs, best
 
 
+def off_by_step(plant, diagram, xs, us, h):
+    """How far, of 1 or of its own size, a state of the plan is from where Drake's step from the one before it leads."""
+    ends = [simulated(plant, diagram, x, u[None], h)[0][1] for x, u in zip(xs[:-1], us, strict=True)]
+    return float(np.max(np.abs(np.array(ends) - xs[1:]) / np.maximum(np.abs(xs[1:]), 1.0)))
+
+
 def referee(task, solution):
     """(what is not as asked, seconds of Drake's simulation) of a plan, by Drake alone."""
     model = task.problem.model
@@ -76,6 +85,13 @@ def referee(task, solution):
     us = np.asarray(solution.us)
     xs, seconds = simulated(plant, diagram, np.asarray(task.problem.x0), us, model.time_step)
     found = [] if task.asks else ["the task has no asks: nothing of its goal is measured"]
+    if task.falls:
+        xs = np.asarray(solution.xs)
+        off = off_by_step(plant, diagram, xs, us, model.time_step)
+        if not off <= AGAIN:
+            found.append(f"a step of the plan is {off:.3g} from Drake's")
+        if not np.array_equal(xs[0], task.problem.x0):
+            found.append("the plan does not start where the task does")
     for name, measure, allowed in task.asks:
         miss = measure(xs, us)
         if not miss <= allowed:
@@ -87,8 +103,13 @@ def referee(task, solution):
     return found, seconds
 
 
-def one(name, seed, start, crocoddyl):
-    """A row of the table: one task from one start."""
+def takes_step(make):
+    """Whether a task is told of any time step; the others have that of their models."""
+    return "h" in inspect.signature(make).parameters
+
+
+def one(name, seed, start, crocoddyl, time_step):
+    """A row of the table: one task from one start, in steps of the task's own where `time_step` is 0."""
     warnings.simplefilter("ignore")
     logging.getLogger("drake").setLevel(logging.ERROR)
     import drake_diff as dd
@@ -97,7 +118,7 @@ def one(name, seed, start, crocoddyl):
     row = {"task": name, "start": start, "solved": False, "verified": False, "false": False}
     begun = time.process_time()
     try:
-        task = every_task()[name](random)
+        task = every_task()[name](random, **({"h": time_step} if time_step else {}))
     except dd.exceptions.DrakeDiffError as error:
         return row | {"message": f"no guess: {error}", "guess_s": time.process_time() - begun}
     row["guess_s"] = time.process_time() - begun
@@ -186,18 +207,26 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--starts", type=int, default=5)
     parser.add_argument("--tasks", default="", help="names or their beginnings, with commas; all where empty")
+    parser.add_argument("--time-step", type=float, default=0.0, help="[s] of robots on legs; each task's own where 0")
     parser.add_argument("--jobs", type=int, default=1, help="processes, each with one start at a time")
     parser.add_argument("--crocoddyl", default="", help="a Python that has Crocoddyl")
     parser.add_argument("--json", default="", help="where all rows are written")
     parser.add_argument("--why", action="store_true", help="tells of each start that is not verified why")
     arguments = parser.parse_args()
     begin = tuple(filter(None, arguments.tasks.split(",")))
-    names = [name for name in every_task() if not begin or name.startswith(begin)]
-    asked = [(name, arguments.seed, start, arguments.crocoddyl) for name in names for start in range(arguments.starts)]
-    print(f"seed {arguments.seed}, {arguments.starts} starts, Drake steps of the tasks' own length\n{HEAD}", flush=True)
+    h = arguments.time_step
+    names = [
+        name for name, make in every_task().items() if name.startswith(begin or "") and (not h or takes_step(make))
+    ]
+    if not names:
+        parser.error(f"no task of that name{' that is told of any time step' * (h > 0)}: {', '.join(every_task())}")
+    seed, crocoddyl = arguments.seed, arguments.crocoddyl
+    asked = [(name, seed, start, crocoddyl, h) for name in names for start in range(arguments.starts)]
+    steps = f"steps of {1e3 * h:g} ms" if h else "Drake steps of the tasks' own length"
+    print(f"seed {seed}, {arguments.starts} starts, {steps}\n{HEAD}", flush=True)
     rows, open_rows = [], {}
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(one, *zip(*asked, strict=True)) if asked else ():
+        for row in pool.map(one, *zip(*asked, strict=True)):
             rows.append(row)
             open_rows.setdefault(row["task"], []).append(row)
             if arguments.why and not (row["verified"] and row["solved"]):

@@ -20,7 +20,8 @@ class Task:
     """`options` are keywords of `dd.solve`; `asks` are all that a referee measures, the goal too, besides input limits.
 
     `schedule` is what Crocoddyl needs to be told, None where it cannot express the task; `build` gives Drake's
-    (plant, diagram) at a time step, 0 for continuous, None where the model's own file gives it.
+    (plant, diagram) at a time step, 0 for continuous, None where the model's own file gives it. What `falls` goes
+    another way from a change of 1e-12, as a biped does on one foot: its plan is measured step by step.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Task:
     asks: tuple[Ask, ...] = ()
     schedule: Any = None
     build: Callable[[float], Any] | None = None
+    falls: bool = False
 
 
 Tasks = dict[str, Callable[[np.random.Generator], Task]]

@@ -14,14 +14,14 @@ from pydrake.geometry import HalfSpace, ProximityProperties
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
-from pydrake.multibody.tree import JacobianWrtVariable, JointIndex
+from pydrake.multibody.tree import JacobianWrtVariable, JointActuatorIndex, JointIndex
 from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
 
 TIME_STEP, OF_JUMPS = 0.02, 0.01  # [s]; where a robot flies at 1 m/s a foot moves by a third of its size in 10 ms
 PUSH, SPIN = 0.35, 0.5  # [m/s], [rad/s] the largest velocity of a push of Solo12; of others by their height
-HEIGHTS = {"solo12": 0.23, "go2": 0.31, "anymal": 0.45}  # [m] of the base, standing
+HEIGHTS = {"solo12": 0.23, "go2": 0.31, "anymal": 0.45, "cheetah": 0.27}  # [m] of the base, standing
 AT_PLACE, AT_REST, LEVEL, SPINS = 0.05, 0.3, 0.1, 1.0  # [m], [m/s], [rad], [rad/s] of the base at the end
 SWING = 0.15  # of that height, how high a foot is lifted
 IN_AIR = 0.01  # [m] every foot that is to be in the air, in the middle of its way
@@ -30,54 +30,54 @@ OPTIONS = {"method": "ilqr", "tolerance": 1e-4, "max_iterations": 100}
 Phases = Sequence[tuple[float, Sequence[str]]]  # [s], and the feet that stand
 
 
-def stand_up(robot, random):
+def stand_up(robot, random, h=TIME_STEP):
     high, low = LEGGED[robot].high, LEGGED[robot].low
-    return _task(robot, random, "stand", low, high, [(0.6, ALL)], "stands up from a crouch")
+    return _task(robot, random, h, "stand", low, high, [(0.6, ALL)], "stands up from a crouch")
 
 
-def lower(robot, random):
+def lower(robot, random, h=TIME_STEP):
     high, low = LEGGED[robot].high, LEGGED[robot].low
-    return _task(robot, random, "lower", high, low, [(0.6, ALL)], "lowers its body")
+    return _task(robot, random, h, "lower", high, low, [(0.6, ALL)], "lowers its body")
 
 
-def lift(robot, random):
+def lift(robot, random, h=TIME_STEP):
     high = LEGGED[robot].high
     phases = [(0.5, ALL), (0.5, (1, 2, 3)), (0.3, ALL)]
-    return _task(robot, random, "lift", high, high, phases, "shifts its weight and lifts a foot for half a second")
+    return _task(robot, random, h, "lift", high, high, phases, "shifts its weight and lifts a foot for half a second")
 
 
-def jump(robot, random):
+def jump(robot, random, h=OF_JUMPS):
     high = LEGGED[robot].high
-    return _task(robot, random, "jump", high, high, [(0.4, ALL), (0.16, ()), (0.5, ALL)], "jumps and lands")
+    return _task(robot, random, h, "jump", high, high, [(0.4, ALL), (0.16, ()), (0.5, ALL)], "jumps and lands")
 
 
-def forward(robot, random):
+def forward(robot, random, h=OF_JUMPS):
     high = LEGGED[robot].high
     phases = [(0.4, ALL), (0.16, ()), (0.5, ALL)]
     way = 0.5 * HEIGHTS[robot]
-    return _task(robot, random, "forward", high, high, phases, f"jumps {way:.2f} m forward and lands", way=way)
+    return _task(robot, random, h, "forward", high, high, phases, f"jumps {way:.2f} m forward and lands", way=way)
 
 
-def trot(robot, random):
+def trot(robot, random, h=None):
+    h = h or (OF_JUMPS if robot == "anymal" else TIME_STEP)
     high, way = LEGGED[robot].high, 0.6 * HEIGHTS[robot]
     one, other = (0, 3), (1, 2)
     phases = [(0.1, ALL), (0.16, one), (0.04, ALL), (0.16, other), (0.04, ALL), (0.16, one), (0.4, ALL)]
-    return _task(robot, random, "trot", high, high, phases, f"trots three steps, {way:.2f} m forward", way=way)
+    return _task(robot, random, h, "trot", high, high, phases, f"trots three steps, {way:.2f} m forward", way=way)
 
 
-def push(robot, random):
+def push(robot, random, h=TIME_STEP):
     high = LEGGED[robot].high
-    return _task(robot, random, "push", high, high, [(1.0, ALL)], "comes to rest after a push", pushed=True)
+    return _task(robot, random, h, "push", high, high, [(1.0, ALL)], "comes to rest after a push", pushed=True)
 
 
 ALL = (0, 1, 2, 3)
 KINDS = {"stand": stand_up, "lower": lower, "lift": lift, "jump": jump, "forward": forward, "trot": trot, "push": push}
-TASKS: Tasks = {f"{robot}_{kind}": partial(make, robot) for robot in LEGGED for kind, make in KINDS.items()}
+ROBOTS = [robot for robot, facts in LEGGED.items() if facts.is_installed and not facts.is_flat]
+TASKS: Tasks = {f"{robot}_{kind}": partial(make, robot) for robot in ROBOTS for kind, make in KINDS.items()}
 
 
-def _task(robot, random, kind, first, last, phases, text, *, way=0.0, pushed=False):
-    quick = kind in ("jump", "forward") or (robot, kind) == ("anymal", "trot")
-    h = OF_JUMPS if quick else TIME_STEP
+def _task(robot, random, h, kind, first, last, phases, text, *, way=0.0, pushed=False):
     model, facts = legged_model(robot, h), LEGGED[robot]
     nq = model.nq
     x0 = rest(robot, model, np.array(first), random)
@@ -98,9 +98,9 @@ def _task(robot, random, kind, first, last, phases, text, *, way=0.0, pushed=Fal
     problem = dd.Problem(model, x0=x0, num_steps=schedule.num_steps, goals=goals, **follow)
     plant = _kinematics(robot)
     asks = [
-        ("base from its place [m]", partial(_off_place, end[4:7]), AT_PLACE),
-        ("base from level [rad]", _tilt, LEVEL),
-        ("speed of the base [m/s]", partial(_speed, nq), AT_REST),
+        ("base from its place [m]", partial(off_place, end[4:7]), AT_PLACE),
+        ("base from level [rad]", tilt, LEVEL),
+        ("speed of the base [m/s]", partial(speed, nq), AT_REST),
     ]
     knot = 0
     for count, standing in steps:
@@ -161,9 +161,10 @@ def build(robot, h, time_step):
     )
     plant, _ = AddMultibodyPlant(config, builder)
     Parser(plant).AddModels(str(robot_on_feet(robot, h)))
+    driven = {plant.get_joint_actuator(JointActuatorIndex(i)).joint().name() for i in range(plant.num_actuators())}
     for i in range(plant.num_joints()):
         joint = plant.get_joint(JointIndex(i))
-        if joint.num_velocities() == 1 and not plant.HasJointActuatorNamed(joint.name()):
+        if joint.num_velocities() == 1 and joint.name() not in driven:
             plant.AddJointActuator(joint.name(), joint)
     ground = ProximityProperties()
     ground.AddProperty("material", "coulomb_friction", CoulombFriction(FRICTION, FRICTION))
@@ -179,16 +180,16 @@ def _kinematics(robot):
     return plant, plant.CreateDefaultContext()
 
 
-def _off_place(place, xs, us):
+def off_place(place, xs, us):
     return float(np.linalg.norm(xs[-1, 4:7] - place))
 
 
-def _tilt(xs, us):
+def tilt(xs, us):
     _, x, y, _ = xs[-1, :4] / np.linalg.norm(xs[-1, :4])
     return float(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
 
 
-def _speed(nq, xs, us):
+def speed(nq, xs, us):
     return float(np.linalg.norm(xs[-1, nq + 3 : nq + 6]))
 
 

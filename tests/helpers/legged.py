@@ -1,10 +1,12 @@
-"""Robots of example-robot-data that stand on spheres: their feet, as soft as their weight asks for."""
+"""Robots, most of them of example-robot-data, that stand on spheres: their feet, as soft as their weight asks for."""
 
+import re
 import tempfile
 import warnings
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +40,25 @@ class Legged:
     weight: float
     gains: tuple[float, float]
     base: str = "base_link"
+    package: str = "example-robot-data"
+    soles: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),)  # [m] centres of spheres in a foot's own frame
+    drawn: float = DRAWN
+    held: str = ""  # how the names of joints begin that stay where they are
+
+    @property
+    def is_flat(self):
+        return len(self.soles) > 1
+
+    @property
+    def is_installed(self):
+        try:
+            self.path()
+        except PackageNotFoundError:
+            return False
+        return True
+
+    def path(self):
+        return robot_file(self.file, self.package)
 
     @property
     def sinks(self):
@@ -53,6 +74,7 @@ def _legs(hip, knee, *, hind=1, count=4):
 SOLO_FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 GO2_FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
 ANYMAL_FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
+CHEETAH_FEET = ("toe_fr", "toe_fl", "toe_hr", "toe_hl")
 LEGGED = {
     "solo12": Legged(
         file="solo12.urdf",
@@ -83,6 +105,29 @@ LEGGED = {
         gains=(300.0, 8.0),
         base="base",
     ),
+    "cheetah": Legged(
+        file="mini_cheetah/mini_cheetah.urdf",
+        feet=CHEETAH_FEET,
+        radius=0.015,
+        high=_legs(-0.8, 1.6),
+        low=_legs(-1.2, 2.4),
+        weight=86.8,
+        gains=(40.0, 1.0),
+        base="body",
+        package="pybullet",  # no other package of an index has it
+    ),
+    "talos": Legged(  # soles of 20 x 12 cm, as its maker has them
+        file="talos_reduced.urdf",
+        feet=("leg_left_6_link", "leg_right_6_link"),
+        radius=0.016,
+        soles=tuple((x, y, -0.091) for x in (-0.1, 0.1) for y in (-0.06, 0.06)),
+        high=(0.0, 0.0, -0.45, 0.9, -0.45, 0.0) * 2,
+        low=(0.0, 0.0, -0.65, 1.3, -0.65, 0.0) * 2,
+        weight=885.0,
+        gains=(4000.0, 40.0),
+        drawn=0.02,
+        held="torso|arm|gripper|head",
+    ),
 }
 
 
@@ -91,20 +136,27 @@ def robot_on_feet(name, time_step):
     """A file of that robot in which its feet are spheres, as soft as plans in such steps are found with; all else that
     can touch is left out."""
     robot = LEGGED[name]
-    tree = ElementTree.parse(robot_file(robot.file))
+    tree = ElementTree.parse(robot.path())
     root = tree.getroot()
     root.set("xmlns:drake", "http://drake.mit.edu")
+    for joint in root.findall("joint"):
+        if robot.held and re.match(robot.held, joint.get("name")):
+            joint.set("type", "fixed")
     for link in root.findall("link"):
         for kind in ("collision", "visual"):
             for old in link.findall(kind):
                 link.remove(old)
-        if link.get("name") in robot.feet:
+        for centre in robot.soles if link.get("name") in robot.feet else ():
             collision = ElementTree.SubElement(link, "collision")
+            ElementTree.SubElement(collision, "origin", xyz=" ".join(map(str, centre)))
             ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "sphere", radius=str(robot.radius))
             properties = ElementTree.SubElement(collision, "drake:proximity_properties")
             for quantity, value in (
-                ("point_contact_stiffness", robot.weight / len(robot.feet) / (robot.sinks * time_step)),
-                ("hunt_crossley_dissipation", DISSIPATION),
+                (
+                    "point_contact_stiffness",
+                    robot.weight / (len(robot.feet) * len(robot.soles)) / (robot.sinks * time_step),
+                ),
+                ("hunt_crossley_dissipation", RELAXES / robot.sinks if robot.is_flat else DISSIPATION),
                 ("relaxation_time", RELAXES * time_step),
                 ("mu_dynamic", FRICTION),
                 ("mu_static", FRICTION),
@@ -135,6 +187,7 @@ def rest(name, model, joints, random=None):
     """(nx,) a state at rest, the joints held at about `joints` by a PD controller.
 
     With a `random` generator the feet are drawn from about where they are, and the centre of mass and the base's turn.
+    The centre of mass of a robot on flat feet is brought, or drawn about, over the middle of them.
     """
     robot, fine = LEGGED[name], model.at_time_step(SETTLE_STEP)
     nq, count, sink = model.nq, len(joints), robot.sinks * model.time_step
@@ -144,19 +197,35 @@ def rest(name, model, joints, random=None):
     legs = Legs(model, robot.feet, x[:nq])
     legs.put(x[:nq])
     x[6] -= np.mean(legs.points()[:, 2]) + sink
+    legs.put(x[:nq])
+    places, mass, size = legs.points(), np.array(legs.center_of_mass()[0]), robot.drawn * x[6]
+    if robot.is_flat:
+        mass[:2] = np.mean(places[:, :2], axis=0)
+    turn = np.zeros(model.nv)
     if random is not None:
-        legs.put(x[:nq])
-        places, mass, size = legs.points(), np.array(legs.center_of_mass()[0]), DRAWN * x[6]
-        places[:, :2] += size * random.uniform(-1, 1, (len(places), 2))
-        places[:, 2] = -sink
-        turn = np.zeros(model.nv)
+        places[:, :2] += size * random.uniform(-1, 1, (len(robot.feet), 2))[legs.owners]
         turn[:3] = TURNED * random.uniform(-1, 1, 3)
         mass += size * random.uniform(-1, 1, 3)
+    if random is not None or robot.is_flat:
+        places[:, 2] = -sink
         x[:nq] = legs.posture(x[:nq], legs.moved(x[:nq], turn), mass, places, np.zeros(len(places), dtype=bool))
     kp, kd = robot.gains
     drive, held = model.actuation[-count:], x[nq - count : nq].copy()
+    still = _that_hold(legs, x[:nq], count) if robot.is_flat else 0.0
     for _ in range(round(SETTLES / SETTLE_STEP)):
-        torque = kp * (held - x[nq - count : nq]) - kd * x[-count:]
+        torque = still + kp * (held - x[nq - count : nq]) - kd * x[-count:]
         x = np.array(advance(fine.double, x, np.linalg.solve(drive, torque)))
     x[nq:] = 0.0
     return x
+
+
+def _that_hold(legs, q, count):
+    """(count,) torques of the joints that hold posture q (nq,), by the least forces at the soles."""
+    legs.put(q)
+    needed, by_force = (
+        legs.twin.inverse_dynamics(np.zeros(legs.model.nv)),
+        legs.jacobians()[0].reshape(-1, legs.model.nv).T,
+    )
+    base = slice(legs.base_v, legs.base_v + 6)
+    forces = np.linalg.lstsq(by_force[base], needed[base], rcond=None)[0]
+    return (needed - by_force @ forces)[-count:]

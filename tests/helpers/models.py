@@ -20,9 +20,9 @@ ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "models"
 
 
-def robot_file(name):
-    """Where example-robot-data has it."""
-    return next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
+def robot_file(name, package="example-robot-data"):
+    """Where that package has it."""
+    return next(f.locate() for f in files(package) if str(f).endswith("/" + name))
 
 
 def contact_properties(stiffness, dissipation=0.0, friction=0.0, relaxation_time=None):

@@ -111,9 +111,12 @@ class AugmentedLagrangian:
         hessians[:, np.arange(nx), np.arange(nx)] = stiffness[: xs.size].reshape(xs.shape)
         for group, rows in zip(self.groups, self.slices, strict=True):
             jacobians = self.scale[rows].reshape(group.shape)[:, :, None] * group.jacobians(xs, us)
-            gradients[group.knots] += np.einsum("kr,kri->ki", pushes[rows].reshape(group.shape), jacobians)
-            stiff = stiffness[rows].reshape(group.shape)[:, :, None] * jacobians
-            hessians[group.knots] += np.einsum("kri,krj->kij", stiff, jacobians)
+            gradients[group.knots] += (pushes[rows].reshape(group.shape)[:, None] @ jacobians)[:, 0]
+            stiff = stiffness[rows].reshape(group.shape)
+            for k, those, by_z in zip(group.knots, stiff, jacobians, strict=True):
+                pushing = by_z[those > 0]
+                if len(pushing):
+                    hessians[k] += self.penalty * pushing.T.dot(pushing)
         return gradients, hessians
 
     def update(self, xs: Array, us: Array) -> None:

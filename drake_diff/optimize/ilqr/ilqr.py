@@ -307,7 +307,8 @@ class _Search:
         left_over = self.limits.tolerance**2 * scale
         if not final:
             left_over = max(left_over, LEFT_OVER * self.constraints.unrest(*self.motion.point))
-        models = replace(model, hessians=model.hessians + self.curvature.M), model
+        curved = (replace(model, hessians=model.hessians + self.curvature.M),) if self.curvature.M.any() else ()
+        models = (*curved, model)
         solve = cache(solve_riccati)  # no policy is sought twice
 
         def is_reached(limit: float) -> bool:

@@ -15,7 +15,7 @@ from drake_diff.optimize.problem.cost import QuadraticCost
 from drake_diff.optimize.problem.goals import USED, Goal, GoalConstraint, name_of
 from drake_diff.optimize.problem.names import coordinates
 from drake_diff.optimize.problem.timed import TrackingCost
-from drake_diff.optimize.scheduled.legs import Legs
+from drake_diff.optimize.scheduled.legs import Legs, Soles
 from drake_diff.optimize.scheduled.motion import scheduled_motion, swings, touching
 from drake_diff.optimize.scheduled.standing import standing, with_soft_feet
 
@@ -246,6 +246,7 @@ class _Soles:
 
     def __init__(self, legs: Legs):
         self.legs, self.known = legs, dict[bytes, dict[str, Array]]()
+        self.read = dict[bytes, tuple[Array, Array]]()  # of the plant, which is slow to ask
 
     def of(self, what: str, feet: Sequence[int]) -> "_OfFeet":
         """x (nx,) -> "heights" (n,) [m] of these feet's points over the ground; or "slides" (2 n,) [m/s] along it."""
@@ -257,23 +258,26 @@ class _Soles:
         """(K, ...) of all points at states (K, nx)."""
         keys = [x.tobytes() for x in xs]
         if len(self.known) > KEPT:
-            self.known = {}
+            self.known, self.read = {}, {}
         new = {key: x for key, x in zip(keys, xs, strict=True) if what not in self.known.get(key, {})}
         if new:
             states = np.array(list(new.values()))
-            found = self._slopes(states) if what.endswith("by x") else self._values(states)
+            for key, x in new.items():
+                if key not in self.read:
+                    self.read[key] = self.legs.read(x)
+            soles = self.legs.soles([self.read[key] for key in new])
+            found = self._slopes(states, soles) if what.endswith("by x") else self._values(states, soles)
             for name, values in found.items():
                 for key, value in zip(new, values, strict=True):
                     self.known.setdefault(key, {})[name] = value
         return np.array([self.known[key][what] for key in keys])
 
-    def _values(self, xs: Array) -> dict[str, Array]:
-        soles = self.legs.along(xs)
+    def _values(self, xs: Array, soles: Soles) -> dict[str, Array]:
         slides = soles.velocities(xs[:, self.legs.model.nq :])[..., :2].reshape(len(xs), -1)
         return {"heights": soles.places[..., 2], "slides": slides}
 
-    def _slopes(self, xs: Array) -> dict[str, Array]:
-        v, soles, (count, nv) = xs[:, self.legs.model.nq :], self.legs.along(xs), (len(xs), self.legs.model.nv)
+    def _slopes(self, xs: Array, soles: Soles) -> dict[str, Array]:
+        v, (count, nv) = xs[:, self.legs.model.nq :], (len(xs), self.legs.model.nv)
         moves, turned = soles.moves.swapaxes(2, 3), soles.slopes(v).swapaxes(2, 3)
         tangent = np.array([self.legs.space.derivative_of_minus(x) for x in xs])
         heights, by_v = moves[:, :, 2], moves[:, :, :2].reshape(count, -1, nv)

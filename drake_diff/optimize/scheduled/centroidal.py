@@ -6,6 +6,8 @@ moment about the centre of mass is small, so that the robot keeps its turn. That
 about the way of the program before, and there are a few of them.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
@@ -20,6 +22,7 @@ ALIKE, CHANGE, MOMENT, NEAR = (
     100.0,
     0.1,
 )  # weights, of forces in weights of the robot and lengths in its size
+EASES = 0.2  # [s] in which a point is unloaded before a slow phase without it
 STEP = 0.02  # [s] of which these weights are; they are rates, so that they say the same in steps of another length
 SHARES = 0.5, 0.2, 0.02  # of an even share of the weight: what a standing point carries at least; the first that can be
 
@@ -33,6 +36,7 @@ def plan_forces(
     places: Array,
     stands: NDArray[np.bool_],
     friction: float,
+    slow: Sequence[tuple[int, int]] = (),
 ) -> tuple[Array, Array] | Refusal:
     """Positions (N+1, 3) [m] of the centre of mass, and forces (N, n, 3) [N]; or why there are none.
 
@@ -45,8 +49,11 @@ def plan_forces(
         places: (N+1, n, 3) [m] of the points.
         stands: (N, n) whether a point carries in a step.
         friction: The largest sideways force, as a part of the upright one.
+        slow: First steps of phases, and of those after them, into and out of which points are unloaded bit by bit.
     """
     size = max(float(np.max(np.ptp(places[0], axis=0))) / 2, 1e-3)
+
+    eased, unloaded = _eased(stands, slow, round(EASES / time_step))
 
     def rounds(least: float) -> tuple[Array, Array] | Refusal:
         found: tuple[Array, Array] | Refusal = (np.array(way), np.zeros(0))
@@ -55,7 +62,8 @@ def plan_forces(
                 break
             program = _Program(mass, gravity, time_step, size, stands)
             program.follow(start, way)
-            program.share(friction, least)
+            program.share(friction, least * eased)
+            program.ease(unloaded)
             program.keep_turn(places, found[0])
             found = program.solve()
         return found
@@ -104,7 +112,7 @@ class _Program:
         near = np.sqrt(NEAR * self.part) / self.size * np.eye(at.size)
         program.Add2NormSquaredCost(near, near @ way.ravel(), at.ravel())
 
-    def share(self, friction: float, least: float) -> None:
+    def share(self, friction: float, least: Array) -> None:
         """Forces within friction, upwards, alike among the points, and alike from step to step."""
         program, steps = self.program, {(int(k), int(i)): j for j, (k, i) in enumerate(self.carries)}
         sides = np.array([[1, 0, -friction], [-1, 0, -friction], [0, 1, -friction], [0, -1, -friction]])
@@ -113,11 +121,18 @@ class _Program:
         for (k, i), j in steps.items():
             force, share = self.forces[j], 1 / len(self.of_step[k])
             program.AddLinearConstraint(sides, np.full(4, -np.inf), np.zeros(4), force)
-            program.AddBoundingBoxConstraint(least * share, np.inf, force[2])
+            program.AddBoundingBoxConstraint(least[k, i] * share, np.inf, force[2])
             program.Add2NormSquaredCost(alike, alike @ (share * up), force)
             before = steps.get((k - 1, i))
             if before is not None:
                 program.Add2NormSquaredCost(change, np.zeros(3), np.concatenate([force, self.forces[before]]))
+
+    def ease(self, unloaded: NDArray[np.bool_]) -> None:
+        """Forces that come from nothing, or go to it, where that is so of a point (N, n)."""
+        change = np.sqrt(CHANGE / self.part) * np.eye(3)
+        for j, (k, i) in enumerate(self.carries):
+            if unloaded[k, i]:
+                self.program.Add2NormSquaredCost(change, np.zeros(3), self.forces[j])
 
     def keep_turn(self, places: Array, way: Array) -> None:
         """No moment about the way (N+1, 3) of the centre of mass, as nearly as may be."""
@@ -136,6 +151,20 @@ class _Program:
         forces = np.zeros((*self.stands.shape, 3))
         forces[self.stands] = self.weight * np.asarray(result.GetSolution(self.forces))[: len(self.carries)]
         return np.asarray(result.GetSolution(self.at)), forces
+
+
+def _eased(stands: NDArray[np.bool_], slow: Sequence[tuple[int, int]], steps: int) -> tuple[Array, NDArray[np.bool_]]:
+    """(N, n) parts of the least share; and whether a step is a point's last before a slow phase, or its first after."""
+    part, last = np.ones(stands.shape), np.zeros(stands.shape, dtype=bool)
+    for a, b in slow:
+        leaves, lands = stands[a - 1] & ~stands[a], stands[b] & ~stands[b - 1]
+        last[a - 1, leaves] = last[b, lands] = True
+        for i in range(steps):
+            if a - 1 - i >= 0:
+                part[a - 1 - i, leaves] = np.minimum(part[a - 1 - i, leaves], i / steps)
+            if b + i < len(stands):
+                part[b + i, lands] = np.minimum(part[b + i, lands], i / steps)
+    return part, last
 
 
 def _cross(arm: Array) -> Array:

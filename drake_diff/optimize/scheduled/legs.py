@@ -69,11 +69,17 @@ class Legs:
 
     def along(self, states: Array) -> "Soles":
         """The soles in K states (K, nx) at once."""
-        nq, rows = self.model.nq, list[tuple[Array, Array]]()
-        for x in states:
-            self.put(x[:nq], x[nq:])
-            rows.append(self._read())
-        return self._of([poses for poses, _ in rows], [moving for _, moving in rows])
+        return self.soles([self.read(x) for x in states])
+
+    def read(self, x: Array) -> tuple[Array, Array]:
+        """What `soles` needs of a state x (nx,)."""
+        nq = self.model.nq
+        self.put(x[:nq], x[nq:])
+        return self._read()
+
+    def soles(self, read: Sequence[tuple[Array, Array]]) -> "Soles":
+        """The soles in K states, of each what `read` told."""
+        return self._of([poses for poses, _ in read], [moving for _, moving in read])
 
     def points(self) -> Array:
         """(n, 3) [m] the lowest points in the twin's state."""

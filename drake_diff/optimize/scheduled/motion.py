@@ -21,7 +21,7 @@ LANDS = 1e-3  # [m] how much deeper than it stands a foot lands: one that misses
 LEVELLED = 6  # steps in which the soles become alike in depth
 # A phase on some feet is slow where it lasts so many times as long as a fall, the square root of height over gravity;
 # how far the centre of mass goes then from its way to the middle of these feet, and a sole in a step to its depth.
-FALLS, INWARD, SINKS = 2.0, 0.5, 0.3
+FALLS, INWARD, SINKS = 2.0, 0.75, 0.3
 RUNS_OUT = 0.4  # [s] in which a first spin of the base does
 RISE = 2.0  # the power of a swing's arc: a foot that leaves and lands slowly
 BY_INPUT, BY_FORCE, BY_BASE = 1e3, 1.0, 1e-3  # how willingly inputs, forces and the base's acceleration give way
@@ -70,15 +70,16 @@ def scheduled_motion(
     for a, b in slow:
         middle = np.mean(places[a : b + 1, carries[a], :2], axis=1)
         way[a : b + 1, :2] += INWARD * (middle - way[a : b + 1, :2])
-    found = plan_forces(legs.mass, gravity, h, start, way, places, carries, friction)
+    found = plan_forces(legs.mass, gravity, h, start, way, places, carries, friction, slow)
     if not isinstance(found, tuple):
         raise InputError("ContactSchedule", got=str(found), expected="phases in which there are such forces")
     mass, forces = found
-    if slow:
-        places[:, :, 2] -= _sunk(-float(np.mean(places[-1, :, 2])), forces[:, :, 2] / weight, carries)
-    places[:, :, 2] += arcs + _lifts(mass[:, 2], on)
     landing = on & ~np.vstack([on[:1], on[:-1]])
-    places[landing, 2] -= LANDS
+    if slow or len(legs.owners) > len(legs.feet):
+        places[:, :, 2] -= _sunk(-float(np.mean(places[-1, :, 2])), forces[:, :, 2] / weight, landing)
+    else:
+        places[landing, 2] -= LANDS
+    places[:, :, 2] += arcs + _lifts(mass[:, 2], on)
     ways, qs = s[:, None] * legs.apart(end, first) + _run_out(legs, x0[model.nq :], h, len(on)), [first]
     for k in range(1, len(on)):
         wish = legs.moved(first, ways[k])
@@ -148,13 +149,15 @@ def _slow_phases(carries: Mask, h: float, height: float, pull: float) -> list[tu
     return [(a, b) for a, b in phases if (b - a) * h >= long and carries[a].any() and not carries[a].all()]
 
 
-def _sunk(depth: float, shares: Array, carries: Mask) -> Array:
-    """(N+1, n) [m] how much deeper than `depth`, that of an even share, soles are for shares (N, n) of the weight."""
-    n = shares.shape[1]
-    sunk = np.zeros((len(shares) + 1, n))
-    for k, carried in enumerate(carries):
-        wanted = depth * (n * shares[k] - 1)
-        sunk[k + 1] = np.where(carried, sunk[k] + SINKS * (wanted - sunk[k]), 0.0)
+def _sunk(depth: float, shares: Array, landing: Mask) -> Array:
+    """(N+1, n) [m] how much deeper than `depth`, that of an even share, soles are for shares (N, n) of the weight.
+
+    One that carries nothing comes up to the ground; where it lands it is a little deeper.
+    """
+    wanted = depth * (shares.shape[1] * shares - 1)
+    sunk = np.zeros(landing.shape)
+    for k, goal in enumerate(wanted):
+        sunk[k + 1] = sunk[k] + SINKS * (goal - sunk[k]) + LANDS * landing[k + 1]
     return sunk
 
 
