@@ -12,7 +12,7 @@ from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.replay import Plan, broken_variants, held, replays
 from drake_diff.optimize.scheduled.centroidal import plan_forces
 from drake_diff.optimize.scheduled.legs import Legs
-from drake_diff.optimize.scheduled.motion import _slow_phases, _sunk, swings, touching
+from drake_diff.optimize.scheduled.motion import LANDS, _slow_phases, _sunk, swings, touching
 
 H, G = 0.02, np.array([0.0, 0.0, -9.81])
 SQUARE = np.array([[0.2, 0.1, 0.0], [0.2, -0.1, 0.0], [-0.2, 0.1, 0.0], [-0.2, -0.1, 0.0]])

@@ -14,9 +14,8 @@ from legged_tasks import AT_PLACE, AT_REST, IN_AIR, LEVEL, OPTIONS, SPINS, TIME_
 import drake_diff as dd
 
 ROBOT, LEFT, RIGHT, BOTH = "talos", 0, 1, (0, 1)
-STRIDE, SWING = 0.15, 0.06  # [m]
+STRIDE, SWING = 0.1, 0.05  # [m]
 LANDED, STANDS = 0.03, 0.005  # [m] a foot from where it is to be at last; of one that carries, over the ground
-TOUCH = 0.01  # [m] of a corner in a replay: a hundredth of the robot's height, as 5 mm are of a quadruped's
 
 
 def step(random, h=TIME_STEP):
@@ -40,7 +39,7 @@ def _task(random, h, kind, first, phases, text, *, way=0.0):
     shift = np.mean(begun, axis=(0, 1))[:2] - np.mean(_soles(end), axis=(0, 1))[:2]
     end[4:6] += shift + np.array([way, 0.0])
     steps = [(round(seconds / h), [facts.feet[i] for i in feet]) for seconds, feet in phases]
-    schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet, touch=TOUCH)
+    schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet)
     guess = schedule.guess(model, x0, end, swing=SWING)
     goals = [
         schedule,

@@ -44,6 +44,7 @@ class Legged:
     soles: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),)  # [m] centres of spheres in a foot's own frame
     drawn: float = DRAWN
     held: str = ""  # how the names of joints begin that stay where they are
+    rotor: tuple[float, float] = (0.0, 1.0)  # [kg m^2] of each motor, and its gear ratio
 
     @property
     def is_flat(self):
@@ -127,6 +128,7 @@ LEGGED = {
         gains=(4000.0, 40.0),
         drawn=0.02,
         held="torso|arm|gripper|head",
+        rotor=(1e-5, 100.0),  # as talos.srdf has it
     ),
 }
 
@@ -142,6 +144,9 @@ def robot_on_feet(name, time_step):
     for joint in root.findall("joint"):
         if robot.held and re.match(robot.held, joint.get("name")):
             joint.set("type", "fixed")
+    for actuator in root.iter("actuator") if robot.rotor[0] else ():
+        for quantity, value in zip(("rotor_inertia", "gear_ratio"), robot.rotor, strict=True):
+            ElementTree.SubElement(actuator, f"drake:{quantity}", value=str(value))
     for link in root.findall("link"):
         for kind in ("collision", "visual"):
             for old in link.findall(kind):
