@@ -95,6 +95,32 @@ def test_a_box_that_is_dropped_leans_or_is_carried_from_below_is_refused():
     assert missed(left_z_x=(slice(60, 62), asked - 0.12)) == [2]  # below its side: the tip carries the box
 
 
+def test_a_box_that_still_rocks_is_not_flipped():
+    """As it lies at the end, but for 2 of the 10 knots of the last 0.2 s."""
+    task = drawn("flip")
+    us = np.zeros((task.problem.num_steps, 2))
+    xs = np.tile(task.problem.x0, (len(us) + 1, 1))
+    xs[-20:, 2] = np.pi / 2
+    ((_, measure, allowed),) = task.asks
+    assert measure(xs, us) <= allowed
+    xs[-5:-3, 2] -= 0.051
+    assert measure(xs, us) > allowed
+
+
+def test_the_guess_turns_the_box_about_its_far_edge_and_the_finger_with_it():
+    task = drawn("flip")
+    xs, _ = task.options["initial_guess"]
+    x0 = task.problem.x0
+    turn = xs[:, 2]
+    edge = xs[:, :2] + np.column_stack(
+        [0.05 * np.cos(turn) - 0.05 * np.sin(turn), -0.05 * np.sin(turn) - 0.05 * np.cos(turn)]
+    )
+    # 1e-15: rounding of sums of numbers below 1
+    np.testing.assert_allclose(edge, np.tile(x0[:2] + np.array([0.05, -0.05]), (len(xs), 1)), atol=1e-15)
+    there = xs[round(0.4 * (len(xs) - 1)) :]
+    np.testing.assert_allclose(np.linalg.norm(there[:, 3:5] - there[:, :2], axis=1), np.hypot(0.07, 0.03), atol=1e-15)
+
+
 def test_the_guess_closes_both_fingers_on_the_box_and_goes_up_with_it():
     task = drawn("grasp")
     xs, _ = task.options["initial_guess"]

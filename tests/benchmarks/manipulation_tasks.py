@@ -24,8 +24,10 @@ AT_HEIGHT, HELD = 0.01, 0.2  # [m], for so long at the end [s]
 AT_GOAL = 1e-3  # of a hop's goal, in the units of states
 ROUGHLY = 1e-2  # of a solve: where a push begins or lets go the cost has a corner, and the last 0.01 % take long
 MORE_ROUGHLY = 3e-2  # of a grasp: the last 0.1 %
+TIPPED_ROUGHLY = 0.1  # of a box that tips and lands: the last 1 %
 DISSIPATION = 5  # [s/m]
 WEIGHT, CARRIED, GRIP = 9.81 * 0.203, 9.81 * 0.101, 2.5  # [N] of a box, of a finger and its slide; of a finger on a box
+CUBE, HIGH, PUSH, PRESS = 0.05, 0.03, 1.0, 0.5  # [m] half of the low box, where it is pushed, above its middle; [N]
 BOX, TIP, GIVES = (
     (0.05, 0.1),
     0.02,
@@ -192,9 +194,50 @@ def gripped(x0: np.ndarray, height: float, count: int, time_step: float) -> tupl
     return with_speeds(np.column_stack(columns), time_step), np.tile([GRIP, CARRIED, -GRIP, CARRIED], (count, 1))
 
 
+def flip(random: np.random.Generator, time_step: float = 0.02) -> Task:
+    """A finger that starts apart from a box tips it over its far edge, by a quarter of a turn, and it lies still."""
+    model = dd.load_model(MODELS / "finger_box.sdf", time_step=time_step)
+    count = round(2 / time_step)
+    x0 = np.zeros(10)
+    x0[:2] = random.uniform(-0.03, 0.03), CUBE - WEIGHT / GIVES
+    x0[3:5] = x0[0] - CUBE - TIP - random.uniform(0.03, 0.12), random.uniform(0.04, 0.1)
+    problem = dd.Problem(
+        model,
+        x0=x0,
+        num_steps=count,
+        goals=[dd.optimize.Dwell(dd.JointGoal({"turn": np.pi / 2}, tolerance=AT_ANGLE), HELD)],
+        running_cost=dd.QuadraticCost(
+            Q=np.diag([0] * 5 + [0.1] * 3 + [0] * 2), R=0.01 * np.eye(2), u_ref=[PUSH, CARRIED - PRESS]
+        ),
+        final_cost=dd.QuadraticCost(Q=np.diag([0] * 5 + [0.1] * 5)),
+    )
+    guess = tipped(x0, count, time_step), np.tile([PUSH, CARRIED - PRESS], (count, 1))
+    rest = range(count - round(HELD / time_step), count + 1)
+    asks = (
+        ("box from a quarter turn [rad]", lambda xs, us: max(off({2: np.pi / 2}, xs, us, k) for k in rest), AT_ANGLE),
+    )
+    options = {**OPTIONS, "tolerance": TIPPED_ROUGHLY, "initial_guess": guess}
+    return Task("flip", problem, "the box on its side", options, asks)
+
+
+def tipped(x0: np.ndarray, count: int, time_step: float) -> np.ndarray:
+    """(N+1, 10) the finger goes to the box's side in 40 % of the time, and the box turns with it about its edge."""
+    part = np.linspace(0, 1, count + 1)
+    turn = np.interp(part, [0, 0.4, 0.8, 1], [0, 0, np.pi / 2, np.pi / 2])
+    c, s = np.cos(turn), np.sin(turn)
+
+    def turned(x: float, z: float) -> np.ndarray:
+        return np.column_stack([x * c + z * s, z * c - x * s])
+
+    box = x0[:2] + np.array([CUBE, -CUBE]) + turned(-CUBE, CUBE)
+    way = np.minimum(part / 0.4, 1)[:, None]
+    tip = (1 - way) * x0[3:5] + way * (box + turned(-CUBE - TIP, HIGH))
+    return with_speeds(np.column_stack([box, turn, tip]), time_step)
+
+
 def with_speeds(q: np.ndarray, time_step: float) -> np.ndarray:
     """(N+1, nx) of a motion that begins at rest."""
     return np.hstack([q, np.vstack([np.zeros(q.shape[1]), np.diff(q, axis=0) / time_step])])
 
 
-TASKS: Tasks = {"grasp": grasp, "spinner": spinner, "ball": ball, "box": box, "monoped": monoped}
+TASKS: Tasks = {"grasp": grasp, "flip": flip, "spinner": spinner, "ball": ball, "box": box, "monoped": monoped}
