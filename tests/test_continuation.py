@@ -9,9 +9,10 @@ from helpers.problems import FREE, push
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, ModelError
 from drake_diff.optimize.continuation import default_schedule
-from drake_diff.optimize.ilqr.through_contact import restore_goal
+from drake_diff.optimize.ilqr import through_contact
+from drake_diff.optimize.ilqr.through_contact import restore_goal, where_it_jumps
 from drake_diff.optimize.solution import Status
 
 
@@ -137,6 +138,18 @@ def test_only_ilqr_takes_a_continuation(two_spheres, load):
     pendulum = load("pendulum.urdf")
     with pytest.raises(InputError, match="may collide"):
         dd.solve(dd.Problem(pendulum, x0=[0, 0], num_steps=5, x_goal=[1, 0]), continuation="auto")
+
+
+def test_where_drake_knows_no_distance_the_message_says_so(two_spheres, monkeypatch):
+    def none(twin):
+        raise ModelError("of two such shapes")
+
+    problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
+    at = np.tile(problem.x0, (2, 1))
+    at[:, 1] = at[:, 0] + 0.2  # the spheres just touch
+    assert "just touching at knot 0" in where_it_jumps(problem, at)
+    monkeypatch.setattr(through_contact, "distances", none)
+    assert where_it_jumps(problem, at) == ", and where bodies just touch is not known: of two such shapes"
 
 
 def test_restoration_leaves_a_goal_that_nothing_moves(two_spheres):

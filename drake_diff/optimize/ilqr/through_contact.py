@@ -53,7 +53,11 @@ def where_it_jumps(problem: Problem, xs: Array) -> str:
     """Where along xs (N+1, nx) two bodies are just touching, and what that means; empty if none are."""
     for k, x in enumerate(xs[:-1]):
         set_state(problem.model.double, x)
-        for (a, b), distance in distances(problem.model.double).items():
+        try:
+            found = distances(problem.model.double)
+        except ModelError as error:  # Drake knows no distance of some pair
+            return f", and where bodies just touch is not known: {error}"
+        for (a, b), distance in found.items():
             if abs(distance) < JUST_TOUCHING:
                 return (
                     f", with {a} and {b} just touching at knot {k}: the step jumps there, and a minimum at a jump "
