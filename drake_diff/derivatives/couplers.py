@@ -112,8 +112,11 @@ def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
 
 
 def _probe(model: Model, context: Any, random: np.random.Generator) -> tuple[Array, Array, Array, Array]:
-    """q, v', A (v' - v*) and A of one step from rest."""
-    plant, h = model.plant, model.time_step
+    """q, v', A (v' - v*) and A of one step from rest, where all other forces are held, so that v* = 0.
+
+    Else a robot falls, and beside its momentum the impulse of a light finger is a matter of rounding.
+    """
+    plant = model.plant
     lower, upper = (
         np.clip(side, -1.0, 1.0) for side in (plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
     )
@@ -122,12 +125,13 @@ def _probe(model: Model, context: Any, random: np.random.Generator) -> tuple[Arr
     q[position] = (lower + random.uniform(0.3, 0.7, len(q)) * (upper - lower))[position]
     plant.SetPositions(context, q)
     plant.SetVelocities(context, np.zeros(model.nv))
-    v_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())[model.nq :]
     forces = MultibodyForces(plant)
     plant.CalcForceElementsContribution(context, forces)
-    bias = plant.CalcInverseDynamics(context, np.zeros(model.nv), forces)
-    A = plant.CalcMassMatrix(context) + h * np.diag(model.double.damping())
-    return q, v_next, A @ v_next + h * bias, A
+    held = plant.CalcInverseDynamics(context, np.zeros(model.nv), forces)
+    plant.get_applied_generalized_force_input_port().FixValue(context, held)
+    v_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())[model.nq :]
+    A = plant.CalcMassMatrix(context) + model.time_step * np.diag(model.double.damping())
+    return q, v_next, A @ v_next, A
 
 
 def _single(model: Model) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
