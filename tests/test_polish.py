@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.models import Plant, add_slide, contact_properties
+from helpers.models import Plant, add_slide, contact_properties, robot_file
 from helpers.plants import block, constrained, limited_pendulum, pair, springs_and_motors
 from helpers.robots import FOOT, ROBOTS, example_robot, state_in_contact, state_in_range
 from helpers.table import each_row
@@ -191,6 +191,19 @@ def test_two_blocks_whose_rails_are_coupled(u):
     assert polished(model, [*q, *v], [u])[2:] == pytest.approx(exact, rel=1e-12)
     found = couplers_of(model)
     np.testing.assert_allclose(found.direction, [[1, -2]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("time_step", [0.005, 0.05])
+def test_couplers_of_light_fingers_of_a_robot_that_falls(time_step):
+    """Its momentum of falling is 1e7 times the impulses of its fingers: 12 are 1 or -1 times their leaders."""
+    model = dd.load_model(robot_file("talos_full_v2.urdf"), time_step=time_step)
+    found = couplers_of(model)
+    assert not isinstance(found, Refusal), found
+    assert found.direction.shape == (12, model.nv)
+    ratios = np.sort(np.abs(found.direction), axis=1)
+    np.testing.assert_allclose(ratios[:, -2:], 1.0, rtol=1e-9)
+    assert not ratios[:, :-2].any()
+    np.testing.assert_allclose(found.offset, 0.0, atol=1e-9)
 
 
 def test_a_hand_whose_fingers_are_coupled_and_controlled():

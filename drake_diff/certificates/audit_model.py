@@ -12,10 +12,12 @@ from pydrake.multibody.plant import DiscreteContactApproximation
 
 from drake_diff.certificates.finding import Finding, Severity
 from drake_diff.certificates.place import Place
+from drake_diff.exceptions import ModelError
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.model import Model
 from drake_diff.model.plant import FLOATING, PROXIMITY, actuators, bodies, joints, labelled
 from drake_diff.model.repairs import can_be_driven
+from drake_diff.model.separable import inseparable_pairs, links_of
 from drake_diff.model.step import set_state
 
 Found = Iterator[Finding]
@@ -176,6 +178,24 @@ def _lost_shapes(place: Place) -> Found:
         message = f"{much}, so that they pass through things"
         mends: dict[str, Any] = {"meshes": "spheres"} if _has_usable_meshes(model) else {"contact": False}
         yield Finding("warning", "collision_gone", _listed(lost), message, remedy, mends)
+
+
+def _never_apart(place: Place) -> Found:
+    model, scene_graph = place.model, place.model.double.scene_graph
+    if scene_graph is None or not model.contract.contact.collision_pairs:
+        return
+    try:
+        pairs = inseparable_pairs(model.plant, model.diagram)
+    except ModelError:
+        return  # as no step of it can be taken then, which is a finding of its own
+    if pairs:
+        message = (
+            f"they overlap wherever the joints are (pairs of shapes: {len(pairs)}), and push each other apart in every "
+            "step; of deep overlaps Drake's point of contact jumps, and has no derivative"
+        )
+        remedy = 'load_model(..., contact="separable") lets these pairs alone pass through each other'
+        subject = links_of(model.plant, scene_graph, pairs)
+        yield Finding("warning", "never_apart", subject, message, remedy, {"contact": "separable"})
 
 
 def _has_usable_meshes(model: Model) -> bool:
@@ -346,6 +366,7 @@ FILE_CHECKS: tuple[Callable[[Place], Found], ...] = (
     _switched_off,
     _massless,
     _lost_shapes,
+    _never_apart,
     _falls,
     _invented_inertia,
     _unread_compliance,

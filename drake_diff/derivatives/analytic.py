@@ -4,7 +4,8 @@ The equation of a model's smooth steps (`smooth_step`) is certified when it is f
 of its steps with contact (`contact.jacobian`) at the first of them that are met.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +35,11 @@ SAME_JACOBIAN = 1e-9
 # Differences of a step solved to rounding: friction turns within 1e-4 m/s, but where SceneGraph iterates to the point
 # of contact, it leaves up to 1e-8 of noise, and may jump on one side.
 SAME_DIFFERENCES, SAME_WHERE_ITERATED, DIFFERENCES = 1e-5, 3e-4, (3e-7, 1e-5, 1e-4)
+SAME_WHERE_STOPPED = 3e-4  # two ends as far apart as 1e-6 of the momentum, where friction turns within 1e-4 m/s
 SAME_STEP = 1e-12  # of the largest entry of x' (or 1): the same positions, summed in another order
 CERTIFIED_STATES, STATES_TRIED = 3, 60
 FAR = 4.0  # [m or rad]
+Led = Callable[[int, Array], Array | None]  # the Jacobian of a step, by its own equation, were x' its end
 DIFFERS, STEP_DIFFERENCES = "its Jacobian with impulses differs from", "the differences of the step solved to rounding"
 
 
@@ -249,6 +252,12 @@ def _certified_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> _WithI
     found = _WithImpulses(values, known, {}, refused)
     trials: dict[str, _Trial] = model.cache("impulse trials", dict, of_structure=True)
     own = form.pairs.kinds(placed, len(steps)) if touch else [{JOINT_LIMITS}] * len(steps)
+
+    def led(k: int, x_next: Array) -> Array | None:
+        one = steps.part(np.array([k])) if len(steps) > 1 else steps
+        jacobians, known, *_ = contact_jacobians(form, smooth, replace(one, x_next=x_next[None]), material, change)
+        return jacobians[0] if known[0] else None
+
     for k in np.flatnonzero(found.known):
         of_step = [trials.setdefault(kind, _Trial()) for kind in sorted(own[k])]
         if all(trial.is_settled for trial in of_step):
@@ -258,6 +267,7 @@ def _certified_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> _WithI
             int(k),
             found.values[k],
             [trial for trial in of_step if trial.left and not trial.refusal],
+            led,
             iterated=any(map(is_iterated, own[k])),
         )
         why, note = (
@@ -270,15 +280,17 @@ def _certified_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> _WithI
     return found
 
 
-def _certify(steps: Steps, k: int, jacobian: Array, trials: list[_Trial], *, iterated: bool) -> None:
+def _certify(
+    steps: Steps, k: int, jacobian: Array, trials: list[_Trial], led: Led | None = None, *, iterated: bool
+) -> None:
     """Compare a step's Jacobian for the trials that are still open."""
     if trials:
-        refusal, note = _other_jacobian(steps, k, jacobian, iterated=iterated)
+        refusal, note = _other_jacobian(steps, k, jacobian, led, iterated=iterated)
         for trial in trials:
             trial.refusal, trial.note, trial.left = refusal, note, trial.left - 1
 
 
-def _other_jacobian(steps: Steps, k: int, jacobian: Array, *, iterated: bool) -> tuple[str, str]:
+def _other_jacobian(steps: Steps, k: int, jacobian: Array, led: Led | None, *, iterated: bool) -> tuple[str, str]:
     """How a step's Jacobian with impulses differs from AutoDiffXd's, empty where it does not; and a note if not its.
 
     Where Drake takes no AutoDiffXd step, as beside shapes that it does not differentiate, it is compared with
@@ -290,26 +302,38 @@ def _other_jacobian(steps: Steps, k: int, jacobian: Array, *, iterated: bool) ->
     try:
         exact = advance(model.autodiff, variables[: model.nx], variables[model.nx :])
     except (SimulationError, ModelError):
-        return _unlike_differences(steps, k, jacobian, iterated=iterated)
+        return _unlike_differences(steps, k, jacobian, led, iterated=iterated)
     gap = _gap(jacobian, gradient_rows(exact, model.nx + model.nu))
     return ("", "") if gap <= SAME_JACOBIAN else (f"{DIFFERS} AutoDiffXd's by {gap:.2g} of its largest entry", "")
 
 
-def _unlike_differences(steps: Steps, k: int, jacobian: Array, *, iterated: bool) -> tuple[str, str]:
+def _unlike_differences(steps: Steps, k: int, jacobian: Array, led: Led | None, *, iterated: bool) -> tuple[str, str]:
     """As `_other_jacobian`, of differences over the size that comes nearest.
 
-    Where Drake's points of contact are `iterated`, that is of each column apart, and may be the difference to one side.
+    They are of the step solved to rounding. Where impulses turn quickly, Drake's solver stops far enough beside for
+    the Jacobian to differ: then `led`, the same equation's at the solution, is compared, and may be as far from it as
+    SAME_WHERE_STOPPED. Where Drake's points of contact are `iterated`, that is of each column apart, and may be the
+    difference to one side.
     """
-    gaps = []
+    gaps, solved = [], None
     for size in DIFFERENCES:
         sides = _differences(steps, k, size)
         if isinstance(sides, Refusal):
             return f"neither AutoDiffXd nor differences are had to certify it by: {sides}", ""
-        central = (sides[0] + sides[1]) / 2
+        forward, backward, here = sides
+        central = (forward + backward) / 2
         if _gap(jacobian, central) <= SAME_DIFFERENCES:
             return "", f"with impulses equal to {STEP_DIFFERENCES}, as AutoDiffXd takes no such step"
+        if led is not None and solved is None:
+            solved = led(k, here)
+        if (
+            solved is not None
+            and _gap(jacobian, solved) <= SAME_WHERE_STOPPED
+            and _gap(solved, central) <= SAME_DIFFERENCES
+        ):
+            return "", f"with impulses equal to {STEP_DIFFERENCES}, but for where Drake's solver stops"
         mine = jacobian[:, : central.shape[1]]
-        gaps += [np.abs(mine - of).max(axis=0) / np.abs(mine).max() for of in (*sides, central)]
+        gaps += [np.abs(mine - of).max(axis=0) / np.abs(mine).max() for of in (forward, backward, central)]
     gap = float(np.max(np.min(gaps, axis=0)))
     if iterated and gap <= SAME_WHERE_ITERATED:
         return (
@@ -325,8 +349,8 @@ def _gap(jacobian: Array, other: Array) -> float:
     return gap if np.isfinite(gap) else np.inf
 
 
-def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array] | Refusal:
-    """(nx, nx + nu) forward and backward differences over `width` of the step solved to rounding."""
+def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array, Array] | Refusal:
+    """(nx, nx + nu) forward and backward differences over `width` of the step solved to rounding, and its end (nx,)."""
     model, count = steps.model, steps.model.nx + steps.model.nu
     point = np.concatenate([steps.xs[k], steps.us[k]])
     size = width * np.maximum(1.0, np.abs(point))
@@ -338,4 +362,5 @@ def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array] | Re
     return (
         np.asarray(((found.x_next[:count] - here) / size[:, None]).T),
         np.asarray(((here - found.x_next[count:-1]) / size[:, None]).T),
+        here,
     )

@@ -47,6 +47,7 @@ from drake_diff.model.repairs import (
     touch_the_world_alone,
     weld_link,
 )
+from drake_diff.model.separable import touch_what_can_separate
 from drake_diff.model.twin import AddedForce, Twin
 
 T = TypeVar("T")
@@ -412,7 +413,9 @@ def load_model(
         packages: The folder of each package:// that the file names, by the name of the package. Without it that is the
             nearest folder of that name above the file. Nothing is ever downloaded.
         contact: False takes every collision shape away. "ground" lets what moves touch only what is fixed to the world,
-            such as a ground: a robot's own shapes pass through each other.
+            such as a ground: a robot's own shapes pass through each other. "separable" lets only those shapes pass
+            through each other that overlap wherever the joints are, in the default and 100 random postures, as the
+            covers of joints do; `Model.notes` names them.
         mimic: What becomes of joints that follow others, as a gripper's second finger does, and which Drake holds
             together by constraints: "reduce" takes the followers out of the state, whose equations are then those of
             the independent coordinates; "fix" welds followers and leaders where they are. None keeps all in the state,
@@ -502,6 +505,8 @@ def load_model(
     coupling = coupling_of(plant, mimics)
     add_body_forces(builder, plant, body_forces)
     diagram = builder.Build()
+    if contact == "separable":
+        notes += touch_what_can_separate(plant, scene_graph, diagram)
 
     def rebuild(**changes: Any) -> Model:
         for option in changes.keys() - options.keys():

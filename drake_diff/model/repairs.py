@@ -285,8 +285,8 @@ def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
 
 def check_contact(value: Any) -> None:
     """InputError where the argument `contact` is none."""
-    if not (isinstance(value, bool) or value == "ground"):
-        raise InputError("contact", got=repr(value), expected='True, False or "ground"')
+    if not (isinstance(value, bool) or value in ("ground", "separable")):
+        raise InputError("contact", got=repr(value), expected='True, False, "ground" or "separable"')
 
 
 def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:

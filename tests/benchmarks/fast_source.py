@@ -2,7 +2,8 @@
 
     pip install -e '.[test]'
     python tests/benchmarks/fast_source.py [--robots PATTERN] [--steps 0.005,0.02,0.05] [--seed 0] [--count 4]
-                                           [--mimic reduce] [--out FILE.json] [--markdown FILE.md] [--planted]
+                                           [--mimic reduce] [--contact separable] [--out FILE.json] [--markdown FILE.md]
+                                           [--planted]
 
 Arms are welded to the world and everything else flies, as `load_model(file, actuators="all")` reads it. What flies is
 put on the ground as well, `load_model(..., meshes="spheres", contact="ground", ground=0.8)`, its lowest point 1 mm in.
@@ -10,7 +11,7 @@ From --count random states near the default one, speeds N(0, 0.2), each takes te
 the limits, and such that none alone changes its joint's speed by more than 0.3. A robot counts where every step was
 linearized by its own equation ("analytic") by "auto". One such step of each robot is compared with AutoDiffXd, or with
 differences of the step solved to rounding where Drake refuses that, in parts of the largest entry. What is in --out
-already is not run again.
+already is not run again. With `--contact separable` shapes that overlap in every posture pass through each other.
 
 With --planted, errors are planted instead in a contact of each robot on the ground, one after the other: its normal
 tilted by 0.01 rad, its depth, how its point moves and how its depth changes 1 % off, how its normal turns off by
@@ -58,16 +59,18 @@ EXACT, BY_DIFFERENCES = 1e-8, 1e-5  # what two derivatives of one step may diffe
 
 def robots(pattern):
     """The files by name."""
-    found = {str(f): Path(f.locate()) for f in files("example-robot-data") if str(f).endswith(".urdf")}
-    return sorted({p.name: p for p in found.values() if fnmatch.fnmatch(p.name, pattern)}.items())
+    found = [Path(f.locate()) for f in files("example-robot-data") if str(f).endswith(".urdf")]
+    often = Counter(p.name for p in found)
+    named = {p.name if often[p.name] == 1 else f"{p.parent.parent.name}/{p.name}": p for p in found}
+    return sorted((name, p) for name, p in named.items() if fnmatch.fnmatch(p.name, pattern))
 
 
 def is_arm(name):
     return any(fnmatch.fnmatch(name, arm) for arm in ARMS)
 
 
-def load(file, time_step, feet, mimic):
-    options = {"base": "weld"} if is_arm(file.name) else {}
+def load(file, time_step, feet, mimic, contact=True):
+    options = {"contact": contact} | ({"base": "weld"} if is_arm(file.name) else {})
     options |= {"ground": 0.8, "contact": "ground", "meshes": "spheres"} if feet else {}
     return dd.load_model(file, time_step=time_step, actuators="all", mimic=mimic, **options)
 
@@ -126,11 +129,11 @@ def differences(model, point, width):
     return ((ends[: len(point)] - ends[len(point) :]) / (2 * size[:, None])).T
 
 
-def case(name, file, time_step, feet, mimic, seed, count):
+def case(file, time_step, feet, mimic, contact, seed, count):
     """What came of one robot at one time step."""
     begin, methods, whys, gap, whose = time.process_time(), Counter(), Counter(), None, ""
     touching = 0
-    model, random = load(file, time_step, feet, mimic), np.random.default_rng(seed)
+    model, random = load(file, time_step, feet, mimic, contact), np.random.default_rng(seed)
     for _ in range(count):
         x = state(model, feet, random)
         set_state(model.double, x)
@@ -289,6 +292,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=4)
     parser.add_argument("--mimic")
+    parser.add_argument("--contact", choices=("separable",))
     parser.add_argument("--out", type=Path)
     parser.add_argument("--markdown", type=Path)
     parser.add_argument("--planted", action="store_true")
@@ -301,7 +305,7 @@ def plant(given):
     """Count what was refused, over robots."""
     refused, of = Counter(), Counter()
     for name, file in robots(given.robots):
-        for step in [] if is_arm(name) else map(float, given.steps.split(",")):
+        for step in [] if is_arm(file.name) else map(float, given.steps.split(",")):
             try:
                 found = planted(file, step, given.mimic, given.seed)
             except DrakeDiffError as error:
@@ -321,11 +325,11 @@ def survey(given):
     results, known = list(done), {(r["robot"], r["step"], r["feet"]) for r in done}
     for name, file in robots(given.robots):
         for step in map(float, given.steps.split(",")):
-            for feet in (False,) if is_arm(name) else (False, True):
+            for feet in (False,) if is_arm(file.name) else (False, True):
                 if (name, step, feet) in known:
                     continue
                 try:
-                    found = case(name, file, step, feet, given.mimic, given.seed, given.count)
+                    found = case(file, step, feet, given.mimic, given.contact or True, given.seed, given.count)
                 except DrakeDiffError as error:
                     found = {"refused": " ".join(f"{type(error).__name__}: {error}".split())[:300]}
                 results.append({"robot": name, "step": step, "feet": feet, **found})
