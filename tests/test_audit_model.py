@@ -416,6 +416,14 @@ TRAPS += [
         r"gravity\): the file switches it off",
         {"gravity": [0.0, 0.0, 0.0]},
     ),
+    (
+        "never_apart",
+        "warning",
+        sdf(""),
+        {},
+        r"a - b\): they overlap wherever the joints are",
+        {"contact": "separable"},
+    ),
 ]
 
 
@@ -489,4 +497,4 @@ def test_the_models_of_this_repository_have_none(load, name):
 
 
 def test_every_check_of_files_is_part_of_the_audit():
-    assert len(FILE_CHECKS) == 12
+    assert len(FILE_CHECKS) == 13

@@ -20,6 +20,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified, is_own
 from drake_diff.derivatives.joint_impulses import NEAR_RIGID, JointImpulses
 from drake_diff.derivatives.polish import polished_step
+from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.mechanics.tree import OwnDynamics
 from drake_diff.model.parameters import applied, select
@@ -90,6 +91,38 @@ def test_real_robots(tmp_path, name):
     model, random = robot(name, tmp_path), np.random.default_rng(5)
     xs = np.array([free_state(model, random) for _ in range(3)])
     equal(model, xs, 0.3 * random.standard_normal((3, model.nu)))
+
+
+@each_row("name", ["ur5_robot.urdf", "panda.urdf", "xarm7.urdf", "finger_edu.urdf"])
+def test_a_single_smooth_step_of_a_fixed_robot(name, monkeypatch):
+    """It is had without the calls for many steps, and is AutoDiffXd's; frozen, and its end is Drake's own."""
+    model, random = example_robot(name, 0.005), np.random.default_rng(5)
+    analytic_of(model)
+    monkeypatch.setattr(SmoothStep, "__call__", None)
+    for _ in range(3):
+        x, u = free_state(model, random), 0.3 * random.standard_normal(model.nu)
+        d, other = (dd.differentiate_step(model, x, u, method=by) for by in ("auto", "autodiff"))
+        assert (d.method, other.method, d.C.shape) == ("analytic", "autodiff", (model.nx, 0))
+        for mine, its in ((d.A, other.A), (d.B, other.B)):
+            np.testing.assert_allclose(mine, its, rtol=0, atol=1e-9 * np.abs(other.A).max())
+            assert not mine.flags.writeable
+        assert np.array_equal(d.x_next, dd.step(model, x, u))
+        assert not d.x_next.flags.writeable
+
+
+def test_one_smooth_step_is_known_only_where_it_leads_where_it_is_said_to():
+    model = springs_and_motors(limit=3.0)
+    smooth, (x, u) = analytic_of(model), (np.array(POINT[0]), np.array([0.4, -0.3, 2.0]))
+    x_next = dd.step(model, x, u)
+    A, B, _ = equal(model, x[None], u[None])
+    np.testing.assert_allclose(smooth.one(x, u, x_next), np.hstack([A[0], B[0]]), rtol=0, atol=1e-12)
+    for i in range(model.nx):
+        assert smooth.one(x, u, x_next + 1e-8 * np.eye(model.nx)[i]) is None
+    assert smooth.one(x, u, x_next * np.nan) is None
+    assert smooth.one(x, np.array([0.4, 3.1, 2.0]), dd.step(model, x, [0.4, 3.1, 2.0])) is None  # clipped
+    free = floating(None, 0)
+    x = random_state(free, np.random.default_rng(0))
+    assert analytic_of(free).one(x, np.zeros(1), dd.step(free, x, [0.0])) is None  # a free body
 
 
 @pytest.mark.parametrize("seed", range(3))

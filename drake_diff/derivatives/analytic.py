@@ -127,6 +127,14 @@ def analytic_of(model: Model) -> SmoothStep | Refusal:
     return model.cache("analytic", make, of_structure=True)  # parameters of contact alone may be applied
 
 
+def one_smooth_step(model: Model, steps: Steps) -> Array | None:
+    """(nx, nx + nu) of one step in which nothing touches; None where it takes more than `SmoothStep.one` to know it."""
+    if model.coupling is not None or model.num_constraints or is_own(model):
+        return None
+    smooth = analytic_of(model)
+    return None if isinstance(smooth, Refusal) else smooth.one(steps.xs[0], steps.us[0], steps.x_next[0])
+
+
 def is_own(model: Model) -> bool:
     """Whether the model's smooth step is by our own dynamics in NumPy, which take longer than others for one state."""
     smooth = analytic_of(model)

@@ -9,15 +9,17 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives.analytic import analytic_of
+from drake_diff.derivatives.analytic import analytic_of, one_smooth_step
 from drake_diff.derivatives.implicit import takes_many
-from drake_diff.derivatives.sources import ANALYTIC, IMPLICIT, OF_ONE_KIND, Chosen, check_method, choose
+from drake_diff.derivatives.sources import ANALYTIC, CERTIFIED, IMPLICIT, OF_ONE_KIND, Chosen, check_method, choose
 from drake_diff.derivatives.steps import Steps, known_steps, take_step, take_steps
 from drake_diff.exceptions import GradientError, ShapeError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.model.step import check_point
 
+# By these methods a smooth step has the analytic derivative, and why.
+OF_ONE_SMOOTH_STEP = {"auto": CERTIFIED, "analytic": "asked for"}
 # Lagged contact reaches 4e4 where it is right; Drake's singular poses give 1e15 and more.
 MAGNITUDE_BOUND = 1e8
 
@@ -143,6 +145,16 @@ def linearize(
 def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, method: str) -> StepDerivatives:
     """`differentiate_step` on a model that the vector is applied to; sizes are the caller's business."""
     steps = take_step(model, vector, x, u)
+    reason = OF_ONE_SMOOTH_STEP.get(method)
+    if reason is not None and not vector.parameters and not steps.some_touch:
+        jacobian = one_smooth_step(model, steps)
+        if jacobian is not None:
+            _check_derivatives(model, jacobian[None])
+            jacobian.setflags(write=False)
+            x_next = steps.x_next[0]
+            x_next.setflags(write=False)
+            A, B, C = jacobian[:, : model.nx], jacobian[:, model.nx :], jacobian[:, len(x) + len(u) :]
+            return StepDerivatives(x_next, A, B, C, (), (), ANALYTIC.name, reason)
     return _derivatives_of(steps, choose(steps, method, single=True))[0]
 
 

@@ -31,6 +31,7 @@ class PinocchioDynamics:
     data: Any
     derivatives: Any  # pin.computeABADerivatives
     outputs: list[memoryview]  # where in data it leaves da/dq, da/dv, da/dforce and a: four joined are one copy
+    views: tuple[Array, Array, Array, Array]  # the same as arrays, overwritten by each call
     joint_of: Indices  # (nv,) of each degree of freedom, less 1
 
     @classmethod
@@ -39,9 +40,10 @@ class PinocchioDynamics:
         model, _ = build(links, gravity)
         data = model.createData()
         model.armature = armature
-        outputs = [memoryview(x).cast("B") for x in (data.ddq_dq, data.ddq_dv, data.Minv, data.ddq)]
+        views = data.ddq_dq, data.ddq_dv, data.Minv, data.ddq
+        outputs = [memoryview(x).cast("B") for x in views]
         joint_of = np.repeat(np.arange(model.njoints - 1), list(model.nvs)[1:])
-        return cls(model, data, pin.computeABADerivatives, outputs, joint_of)
+        return cls(model, data, pin.computeABADerivatives, outputs, views, joint_of)
 
     @property
     def armature(self) -> Array:
@@ -59,6 +61,11 @@ class PinocchioDynamics:
         found = np.frombuffer(b"".join(rows)).reshape(len(q), 3 * n * n + n)
         by_q, by_v, inverse = (found[:, k * n * n : (k + 1) * n * n].reshape(len(q), n, n) for k in range(3))
         return by_q, by_v, inverse, found[:, 3 * n * n :]
+
+    def accelerate_one(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
+        """As `accelerate`, of one state (nq,) and (nv,); until the next call."""
+        self.derivatives(self.model, self.data, q, v, force)
+        return self.views
 
     def bend(self, q: Array, v: Array, a: Array, along: Array) -> tuple[Array, Array, Array, Array]:
         """Second derivatives of along' tau (N, n each), tau being inverse dynamics: by q q, v q, a q and v v.

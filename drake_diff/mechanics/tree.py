@@ -265,6 +265,11 @@ class OwnDynamics:
         _, by_q, by_v = moving.derivatives(a)
         return -inverse @ by_q, -inverse @ by_v, inverse, a
 
+    def accelerate_one(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
+        """As `accelerate`, of one state (nq,) and (nv,)."""
+        by_q, by_v, inverse, a = self.accelerate(q[None], v[None], force[None])
+        return by_q[0], by_v[0], inverse[0], a[0]
+
     def motions(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array]:
         """(N, n, 6) the motion [linear; angular] of each degree of freedom in world, about its origin, at unit speed.
 
