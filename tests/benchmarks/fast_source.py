@@ -2,8 +2,8 @@
 
     pip install -e '.[test]'
     python tests/benchmarks/fast_source.py [--robots PATTERN] [--steps 0.005,0.02,0.05] [--seed 0] [--count 4]
-                                           [--mimic reduce] [--contact separable] [--out FILE.json] [--markdown FILE.md]
-                                           [--planted]
+                                           [--mimic reduce] [--contact separable] [--tilt 0.01] [--out FILE.json]
+                                           [--markdown FILE.md] [--planted]
 
 Arms are welded to the world and everything else flies, as `load_model(file, actuators="all")` reads it. What flies is
 put on the ground as well, `load_model(..., meshes="spheres", contact="ground", ground=0.8)`, its lowest point 1 mm in.
@@ -12,6 +12,8 @@ the limits, and such that none alone changes its joint's speed by more than 0.3.
 linearized by its own equation ("analytic") by "auto". One such step of each robot is compared with AutoDiffXd, or with
 differences of the step solved to rounding where Drake refuses that, in parts of the largest entry. What is in --out
 already is not run again. With `--contact separable` shapes that overlap in every posture pass through each other.
+Free bodies are exactly upright, in which boxes and wheels lie flat on the ground, where Drake's point of contact jumps;
+with `--tilt` they are turned by so many rad, about a random axis.
 
 With --planted, errors are planted instead in a contact of each robot on the ground, one after the other: its normal
 tilted by 0.01 rad, its depth, how its point moves and how its depth changes 1 % off, how its normal turns off by
@@ -94,14 +96,15 @@ def lowered(model, x, height):
     return x
 
 
-def state(model, feet, random):
-    """(nx,) near the default state, within the limits; free bodies upright at 1 m, or on the ground."""
+def state(model, feet, random, tilt=0.0):
+    """(nx,) near the default state, within the limits; free bodies upright, or tilted, at 1 m, or on the ground."""
     x, (lower, upper) = model.default_state.copy(), model.position_limits
     x[: model.nq] = np.clip(x[: model.nq] + 0.1 * random.standard_normal(model.nq), lower, upper)
     x[model.nq :] = SPEED * random.standard_normal(model.nv)
     for index in model.plant.GetFloatingBaseBodies():
         start = model.plant.get_body(index).floating_positions_start()
-        x[start : start + 4], x[start + 6] = [1, 0, 0, 0], 1.0
+        turn = np.append(1.0, tilt / 2 * random.standard_normal(3) if tilt else np.zeros(3))
+        x[start : start + 4], x[start + 6] = turn / np.linalg.norm(turn), 1.0
         x = lowered(model, x, start + 6) if feet and model.contract.contact.collision_pairs else x
     return x
 
@@ -129,13 +132,14 @@ def differences(model, point, width):
     return ((ends[: len(point)] - ends[len(point) :]) / (2 * size[:, None])).T
 
 
-def case(file, time_step, feet, mimic, contact, seed, count):
+def case(file, time_step, feet, given):
     """What came of one robot at one time step."""
     begin, methods, whys, gap, whose = time.process_time(), Counter(), Counter(), None, ""
     touching = 0
-    model, random = load(file, time_step, feet, mimic, contact), np.random.default_rng(seed)
-    for _ in range(count):
-        x = state(model, feet, random)
+    model = load(file, time_step, feet, given.mimic, given.contact or True)
+    random = np.random.default_rng(given.seed)
+    for _ in range(given.count):
+        x = state(model, feet, random, given.tilt)
         set_state(model.double, x)
         inertia = np.diag(model.double.mass_matrix())[np.argmax(np.abs(model.actuation), axis=0) if model.nu else []]
         us = random.uniform(-1, 1, (STEPS, model.nu)) * np.minimum(form_of(model).limit, KICK * inertia / time_step)
@@ -293,6 +297,7 @@ def main():
     parser.add_argument("--count", type=int, default=4)
     parser.add_argument("--mimic")
     parser.add_argument("--contact", choices=("separable",))
+    parser.add_argument("--tilt", type=float, default=0.0)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--markdown", type=Path)
     parser.add_argument("--planted", action="store_true")
@@ -329,7 +334,7 @@ def survey(given):
                 if (name, step, feet) in known:
                     continue
                 try:
-                    found = case(file, step, feet, given.mimic, given.contact or True, given.seed, given.count)
+                    found = case(file, step, feet, given)
                 except DrakeDiffError as error:
                     found = {"refused": " ".join(f"{type(error).__name__}: {error}".split())[:300]}
                 results.append({"robot": name, "step": step, "feet": feet, **found})
