@@ -142,7 +142,9 @@ class Plan:
         A motion in continuous time has gains that are smooth in time, of which finer steps have next to the same. Where
         things touch they may be others altogether.
         """
-        if not self.continuous or parts == 1:
+        if parts == 1:
+            return self.own_gains
+        if not self.continuous:
             return None
         known = self.halved_gains
         at = np.minimum(np.arange(parts * self.problem.num_steps) * 2 / parts, len(known) - 1)

@@ -18,8 +18,9 @@ from drake_diff.optimize.scheduled.legs import Legs
 
 from .models import robot_file
 
-# How deep a foot is under an even share of the weight, of its radius times a step in seconds; steps.
-SINK, RELAXES = 3.9, 2.5
+# How deep a foot is under an even share of the weight: of its radius times a step in seconds. One of a radius above
+# SMALL [m] is at most as deep as one of that, or DEEPEST [m] in short steps. And how many steps it relaxes in.
+SINK, SMALL, DEEPEST, RELAXES = 3.9, 0.016, 1.25e-3, 2.5
 DISSIPATION, FRICTION = 0.5, 0.7  # [s/m]
 DRAWN, TURNED = 0.08, 0.05  # of the base's height, how far feet and centre of mass are drawn; [rad]
 SETTLES, SETTLE_STEP = 0.6, 0.002  # [s] of a PD controller that brings a posture to rest
@@ -61,10 +62,9 @@ class Legged:
     def path(self):
         return robot_file(self.file, self.package)
 
-    @property
-    def sinks(self):
-        """[m/s] times a step: how deep a foot is where the robot stands."""
-        return SINK * self.radius
+    def depth(self, time_step):
+        """[m] of a foot where the robot stands."""
+        return min(SINK * self.radius * time_step, max(DEEPEST, SINK * SMALL * time_step))
 
 
 def _legs(hip, knee, *, hind=1, count=4):
@@ -159,9 +159,12 @@ def robot_on_feet(name, time_step):
             for quantity, value in (
                 (
                     "point_contact_stiffness",
-                    robot.weight / (len(robot.feet) * len(robot.soles)) / (robot.sinks * time_step),
+                    robot.weight / (len(robot.feet) * len(robot.soles)) / robot.depth(time_step),
                 ),
-                ("hunt_crossley_dissipation", RELAXES / robot.sinks if robot.is_flat else DISSIPATION),
+                (
+                    "hunt_crossley_dissipation",
+                    RELAXES * time_step / robot.depth(time_step) if robot.is_flat else DISSIPATION,
+                ),
                 ("relaxation_time", RELAXES * time_step),
                 ("mu_dynamic", FRICTION),
                 ("mu_static", FRICTION),
@@ -195,7 +198,7 @@ def rest(name, model, joints, random=None):
     The centre of mass of a robot on flat feet is brought, or drawn about, over the middle of them.
     """
     robot, fine = LEGGED[name], model.at_time_step(SETTLE_STEP)
-    nq, count, sink = model.nq, len(joints), robot.sinks * model.time_step
+    nq, count, sink = model.nq, len(joints), robot.depth(model.time_step)
     x = np.array(model.default_state)
     x[:nq] = 0.0
     x[0], x[nq - count : nq] = 1.0, joints
