@@ -163,12 +163,18 @@ def floating(joint_type, seed):
 
 
 def in_the_air(model, x):
-    """Free bodies a metre up, and what slides three metres off whatever it could touch."""
+    """Free bodies a metre up, and what slides metres off whatever it could touch."""
     if model.state_names[0].endswith("_qw"):
         x[6] = 1.0
-    apart = {"two_spheres": "slide_x", "box_push": "bx_x", "hopper": "z_x"}
-    if model.name in apart:
-        x[model.state_names.index(apart[model.name])] = 3.0
+    apart = {
+        "two_spheres": {"slide_x": 3.0},
+        "box_push": {"bx_x": 3.0},
+        "hopper": {"z_x": 3.0},
+        "finger_box": {"z_x": 3.0, "finger_z_x": 1.0},
+        "two_fingers": {"z_x": 3.0, "left_z_x": 1.0, "right_z_x": 2.0},
+    }
+    for name, place in apart.get(model.name, {}).items():
+        x[model.state_names.index(name)] = place
     return x
 
 
