@@ -3,6 +3,7 @@ from . import comparison as comparison
 from . import engines as engines
 from . import exceptions as exceptions
 from . import export as export
+from . import identification as identification
 from . import logs as logs
 from . import loop as loop
 from . import model as model
@@ -22,6 +23,7 @@ from .comparison.recordings import Recording as Recording
 from .comparison.side_by_side import compare as compare
 from .derivatives.step import differentiate_step as differentiate_step
 from .derivatives.step import linearize as linearize
+from .identification.identify import identify as identify
 from .model import quantities as quantities
 from .model.contact import contact_modes as contact_modes
 from .model.example import example_model as example_model

@@ -103,7 +103,7 @@ Motion = tuple[Array, Array, Array]  # times (n,) [s], xs (n, nx), us (n - 1, nu
 SUFFIXES = "a .csv file, an .mcap file or the directory of a ROS 2 bag"
 
 
-def read_recording(path: str | Path, model: Model, *, name: str | None = None) -> Recording:
+def read_recording(path: str | Path, model: Model, *, name: str | None = None, gaps: bool = False) -> Recording:
     """Read a motion of `model` from a CSV file, an MCAP file or the directory of a ROS 2 bag.
 
     A CSV file has a header row and a row per sample. Its columns, in any order, are `time`, `model.state_names` and
@@ -118,6 +118,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None) -
         path: the file or directory.
         model: the model whose motion it is.
         name: a name for the engine, in place of the file's.
+        gaps: whether a CSV file may lack columns of states, or have empty cells in them: what was not measured is NaN.
 
     Returns:
         A `Recording`, for `dd.compare(model, recordings=[...])`.
@@ -141,7 +142,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None) -
         raise InputError("recording", got=f"{path}, which is not there", expected=SUFFIXES)
     facts: Mapping[str, str] = {}
     if path.suffix == ".csv":
-        motion = _read_csv(path, model)
+        motion = _read_csv(path, model, gaps)
     elif path.is_dir() or (path.suffix == ".mcap" and is_ros2(path)):
         motion, facts = read_ros2(path, model)
     elif path.suffix == ".mcap":
@@ -152,7 +153,8 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None) -
     name, version = name or facts.get("engine", path.stem), facts.get("version", "(version unknown)")
     times, xs, us = (frozen(part) for part in motion)
     recording = Recording(name, version, times, xs, us, facts)
-    check_recording(recording, model)
+    if not gaps:
+        check_recording(recording, model)
     return recording
 
 
@@ -170,13 +172,13 @@ def _told(path: Path) -> dict[str, str]:
     return {key: value if isinstance(value, str) else json.dumps(value) for key, value in told.items()}
 
 
-def _read_csv(path: Path, model: Model) -> Motion:
+def _read_csv(path: Path, model: Model, gaps: bool) -> Motion:
     with path.open(newline="", encoding="utf-8-sig") as file:
         rows = [(line, row) for line, row in enumerate(csv.reader(file), start=1) if row]
     if not rows:
         raise InputError(str(path), got="an empty file", expected="a header row and samples")
     wanted = ("time", *model.state_names, *model.input_names)
-    places = _columns(path, model, rows[0][1], wanted)
+    places = _columns(path, model, rows[0][1], wanted, model.state_names if gaps else ())
     table = np.zeros((len(rows) - 1, len(wanted)))
     for k, (line, row) in enumerate(rows[1:]):
         if len(row) != len(rows[0][1]):
@@ -184,6 +186,9 @@ def _read_csv(path: Path, model: Model) -> Motion:
         for j, (column, place) in enumerate(zip(wanted, places, strict=True)):
             if k == len(table) - 1 and j > model.nx and not row[place].strip():
                 continue  # no step begins at the last sample
+            if place < 0 or (gaps and 0 < j <= model.nx and not row[place].strip()):
+                table[k, j] = np.nan
+                continue
             table[k, j] = _number(f"{path} line {line}, column {column}", row[place])
     if np.any(np.diff(table[:, 0]) <= 0):
         k = int(np.flatnonzero(np.diff(table[:, 0]) <= 0)[0]) + 1
@@ -202,8 +207,8 @@ def _number(subject: str, text: str) -> float:
     return value
 
 
-def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str]) -> list[int]:
-    """Where each wanted column stands."""
+def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str], spared: Sequence[str]) -> list[int]:
+    """Where each wanted column stands; -1 of those that may be missing and are."""
     by_joint = {}
     for label, joint in labelled(joints(model.plant)).items():
         q, v = model.places(joint)
@@ -217,9 +222,9 @@ def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str])
         if names.count(column) > 1:
             raise InputError(f"{path} line 1, column {column}", got="twice", expected="once")
     for column in wanted:
-        if column not in names:
+        if column not in names and column not in spared:
             raise InputError(f"{path} line 1, column {column}", got=f"none, of {', '.join(header)}", expected="one")
-    return [names.index(column) for column in wanted]
+    return [names.index(column) if column in names else -1 for column in wanted]
 
 
 def _read_mcap(path: Path, model: Model) -> tuple[Motion, Mapping[str, str]]:

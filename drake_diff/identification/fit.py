@@ -1,0 +1,320 @@
+"""Weighted least squares over pieces of motion, each from a first state of its own, by multiple shooting.
+
+A piece is cut into segments. The state at the start of each is an unknown as well, and the gaps between segments are
+closed together with the least squares (Bock's generalized Gauss-Newton method): a step is linearized along the measured
+motion, however unstable it is, and where the gaps are closed it is one motion over the whole piece. With the linearized
+gaps a segment's state follows from the piece's first state and from z, which leaves
+
+    min | r - J (d_first, dz) |^2 + | (z + dz - z_file) / width |^2
+
+whose d_first of each piece are taken out by a QR factorization of their own. The second term only decides where the
+data say nothing: it is one standard deviation where a quantity is three times its own size away from the file's.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import SimulationError
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.flow import ContinuousMotion
+from drake_diff.identification.measured import LEAST, Piece
+from drake_diff.identification.unknowns import BIAS, Unknowns
+from drake_diff.model.model import Model
+
+SEGMENT = 0.15  # [s] the length of a segment, or
+SEGMENT_SAMPLES = 5  # so many samples, whichever is longer
+GROWTH = 1e6  # of a small motion within a piece, beyond which its end says nothing of its start: it is cut in two
+LARGEST = 1.0  # the largest change of an unknown in one step, in widths / FAR
+SETTLED = 1e-5  # of |r|^2, in units of the noise: what a last step may still gain
+CLOSED = 1e-3  # of the noise: how far gaps may stand open at the end
+HALVINGS = 8
+NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
+
+
+@dataclass(eq=False)
+class Segments:
+    """All segments of all pieces side by side, in the order of time."""
+
+    pieces: list[Piece]
+    of_piece: NDArray[np.intp]  # (K,)
+    first: NDArray[np.intp]  # (K,) the sample that each starts at
+    hs: Array  # (K, M), padded with steps of length 0
+    us: Array  # (K, M, nu)
+    counts: NDArray[np.intp]  # (K,) steps of each
+    samples: list[NDArray[np.intp]]  # of each segment, the samples of its piece that belong to it
+    at: list[NDArray[np.intp]]  # and after how many steps they are
+
+
+def cut_segments(law: ContinuousMotion, pieces: Sequence[Piece], nu: int) -> Segments:
+    """The last sample of a piece belongs to its last segment, any other to the segment that it starts or is within."""
+    of_piece, first, hs, us, samples, at = [], [], [], [], [], []
+    for p, piece in enumerate(pieces):
+        n = len(piece.times)
+        bounds = [0]
+        while bounds[-1] < n - 1:
+            k = bounds[-1]
+            late = int(np.searchsorted(piece.times, piece.times[k] + SEGMENT * (1 - 1e-9)))
+            bounds.append(min(max(late, k + SEGMENT_SAMPLES), n - 1))
+        if len(bounds) > 2 and bounds[-1] - bounds[-2] < SEGMENT_SAMPLES:
+            bounds.pop(-2)
+        for a, b in pairwise(bounds):
+            lengths = [law.cut(float(piece.times[k + 1] - piece.times[k])) for k in range(a, b)]
+            of_piece.append(p)
+            first.append(a)
+            hs.append(np.concatenate(lengths))
+            us.append(np.repeat(piece.us[a:b], [len(each) for each in lengths], axis=0))
+            last = b + 1 if b == n - 1 else b
+            samples.append(np.arange(a, last))
+            at.append(np.concatenate([[0], np.cumsum([len(each) for each in lengths])])[: last - a])
+    counts = np.array([len(each) for each in hs], dtype=np.intp)
+    all_h, all_u = np.zeros((len(hs), counts.max())), np.zeros((len(hs), counts.max(), nu))
+    for k, (h, u) in enumerate(zip(hs, us, strict=True)):
+        all_h[k, : len(h)], all_u[k, : len(u)] = h, u
+        all_u[k, len(u) :] = u[-1]
+    ids = np.array(of_piece, dtype=np.intp), np.array(first, dtype=np.intp)
+    return Segments(list(pieces), *ids, all_h, all_u, counts, samples, [np.asarray(a, dtype=np.intp) for a in at])
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """The least squares at a point, in z alone: min | b - R dz |^2 + rest, and what first states follow from dz."""
+
+    R: Array  # (np, np)
+    b: Array  # (np,)
+    rest: float
+    own: list[tuple[Array, Array, Array]]  # of each piece: R_ss (2 nv, 2 nv), R_sz (2 nv, np), b_s (2 nv,)
+    nodes: list[tuple[Array, Array]]  # of each segment: D (2 nv, 2 nv + np) and e (2 nv,): its start moves by D d + e
+    residuals: list[Array]  # of each piece (n, 2 nv), gaps linearized, in units of the noise; NaN where unmeasured
+    gap: float  # in units of the noise
+
+
+class Fit:
+    """Unknowns and states of one set of pieces."""
+
+    def __init__(
+        self,
+        model: Model,
+        law: ContinuousMotion,
+        chart: Chart,
+        unknowns: Unknowns,
+        pieces: Sequence[Piece],
+        noise: Array,
+        *,
+        fixed: bool = False,
+    ):
+        self.fixed = fixed  # whether the unknowns stay, and only first states are sought
+        self.model, self.law, self.chart, self.unknowns, self.noise = model, law, chart, unknowns, noise
+        self.segments = cut_segments(law, pieces, model.nu)
+        self.gap_scale = np.empty(chart.size)
+        nv, period = model.nv, max(float(np.median(np.diff(pieces[0].times))), 1e-3)
+        from_positions = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0) / (5 * period)
+        self.gap_scale[:nv] = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0)
+        self.gap_scale[nv:] = np.where(np.isfinite(noise[nv:]), noise[nv:], from_positions)
+
+    @property
+    def count(self) -> int:
+        """How many numbers were measured."""
+        return int(sum(np.isfinite(self._measured(p)).sum() for p in range(len(self.segments.pieces))))
+
+    def _measured(self, p: int) -> Array:
+        piece = self.segments.pieces[p]
+        return np.where(np.isfinite(self.noise), self.chart.minus(piece.ys, piece.ys), np.nan)
+
+    def residuals_of(self, z: Array, xs: Array, starts: Array) -> tuple[list[Array], Array]:
+        """Of each segment (samples, 2 nv) in units of the noise; and the gaps (K, 2 nv), 0 where a piece ends."""
+        s, found = self.segments, []
+        shift = self._shift(self.unknowns.values(z))
+        for k, piece in enumerate(s.pieces[p] for p in s.of_piece):
+            e = self.chart.minus(piece.ys[s.samples[k]], xs[k, s.at[k]]) - shift
+            found.append(e / self.noise)
+        gaps = np.zeros((len(s.first), self.chart.size))
+        inner = np.flatnonzero(s.of_piece[:-1] == s.of_piece[1:])
+        if len(inner):
+            gaps[inner] = self.chart.minus(xs[inner, s.counts[inner]], starts[inner + 1])
+        return found, gaps
+
+    def _shift(self, values: Array) -> Array:
+        shift = np.zeros(self.chart.size)
+        for column, entry in self._bias_columns():
+            shift[entry] += values[column]
+        return shift
+
+    def _bias_columns(self) -> list[tuple[int, int]]:
+        """(column of z, entry of a small motion) of each bias."""
+        found = []
+        singles = dict(self.chart.coordinates.single)
+        names = (*self.model.position_names, *self.model.velocity_names)
+        for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
+            if one.quantity == BIAS:
+                i = names.index(one.label)
+                entry = singles[i] if i < self.model.nq else self.model.nv + i - self.model.nq
+                found.append((s.start, entry))
+        return found
+
+    def objective(self, z: Array, starts: Array) -> tuple[float, float]:
+        """(|r|^2 with the pull to the file's values, the size of the gaps); infinite where there is no such motion."""
+        values = self.unknowns.values(z)
+        if not self.law.is_possible(values):
+            return np.inf, np.inf
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                xs = self.law.run(values, starts, self.segments.hs, self.segments.us)
+        except (SimulationError, np.linalg.LinAlgError):
+            return np.inf, np.inf
+        residuals, gaps = self.residuals_of(z, xs, starts)
+        total = sum(float(np.nansum(r**2)) for r in residuals)
+        if not np.all(np.isfinite(xs)):
+            return np.inf, np.inf
+        return total + self._pull(z), float(np.linalg.norm(gaps / self.gap_scale))
+
+    def _pull(self, z: Array) -> float:
+        return float(np.sum(((z - self.unknowns.z_start) / self.unknowns.widths) ** 2))
+
+    def reduce(self, z: Array, starts: Array) -> Reduced:
+        """Linearize, close the gaps to first order, and take the first states out."""
+        s, nt, nz = self.segments, self.chart.size, len(z)
+        xs = self.law.run(self.unknowns.values(z), starts, s.hs, s.us)
+        residuals, gaps = self.residuals_of(z, xs, starts)
+        A, C = self.law.slopes(z, xs, s.hs, s.us)
+        K, M, nx = A.shape[:3]
+        along = np.zeros((K, M + 1, nx, nt + nz))
+        along[:, 0, :, :nt] = self.chart.from_motion(starts)
+        for m in range(M):
+            along[:, m + 1] = A[:, m] @ along[:, m]
+            along[:, m + 1, :, nt:] += C[:, m]
+        own, rows_z, nodes, by_piece, rest = [], [np.zeros((0, nz + 1))], [], [], 0.0
+        for p, piece in enumerate(s.pieces):
+            D, e = np.eye(nt, nt + nz), np.zeros(nt)
+            rows, found = [], np.full((len(piece.times), nt), np.nan)
+            for k in np.flatnonzero(s.of_piece == p):
+                nodes.append((D, e))
+                at = xs[k, s.at[k]]
+                moved = self.chart.to_motion(at) @ along[k, s.at[k]]
+                J = moved[..., :nt] @ D
+                J[..., nt:] += moved[..., nt:]
+                r = residuals[k] - (moved[..., :nt] @ e) / self.noise
+                for column, entry in self._bias_columns():
+                    J[:, entry, nt + column] += 1.0
+                J /= self.noise[:, None]
+                seen = np.isfinite(r)
+                rows.append(np.column_stack([J[seen], r[seen]]))
+                found[s.samples[k]] = r
+                end = self.chart.to_motion(xs[k, s.counts[k]]) @ along[k, s.counts[k]]
+                e = end[:, :nt] @ e + gaps[k]
+                D = end[:, :nt] @ D
+                D[:, nt:] += end[:, nt:]
+            by_piece.append(found)
+            ridge = np.zeros((nt, nt + nz + 1))
+            ridge[:, :nt] = NO_PRIOR * np.eye(nt)
+            R = _triangle(np.vstack([*rows, ridge]))
+            own.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
+            rows_z.append(R[nt : nt + nz, nt:])
+            rest += float(R[nt + nz, -1] ** 2)
+        R = _triangle(np.vstack(rows_z))
+        gap = float(np.linalg.norm(gaps / self.gap_scale))
+        rest += float(R[nz, -1] ** 2)
+        return Reduced(R[:nz, :nz], R[:nz, -1], rest, own, nodes, by_piece, gap)
+
+    def step_of(self, z: Array, found: Reduced) -> Array:
+        """dz (np,) of the linearized problem, within bounds and not far."""
+        if self.fixed:
+            return np.zeros_like(z)
+        widths = self.unknowns.widths
+        norms = np.linalg.norm(found.R, axis=0)
+        scale = np.where(np.isfinite(widths), widths, 1 / np.where(norms > 0, norms, 1.0))
+        pull = np.where(np.isfinite(widths), scale / widths, 0.0)
+        offset = np.where(np.isfinite(widths), (self.unknowns.z_start - z) / widths, 0.0)
+        matrix = np.vstack([found.R * scale, np.diag(pull)])
+        right = np.concatenate([found.b, offset])
+        lower, upper = self.unknowns.bounds
+        far = np.where(np.isfinite(widths), LARGEST / 3 * widths, np.inf)
+        low, high = np.maximum(lower - z, -far) / scale, np.minimum(upper - z, far) / scale
+        low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
+        step = np.linalg.lstsq(matrix, right, rcond=1e-13)[0]
+        if np.any(step < low) or np.any(step > high):
+            high = np.where(high > low, high, low + 1e-12)
+            step = np.clip(lsq_linear(matrix, right, bounds=(low, high), method="bvls").x, low, high)
+        return np.asarray(step * scale)
+
+    def moved(self, starts: Array, found: Reduced, dz: Array, part: float) -> Array:
+        """The starts of the segments a part of the way along the step dz."""
+        after, first = starts.copy(), {}
+        for p, (R, R_z, b) in enumerate(found.own):
+            first[p] = np.linalg.lstsq(R, b - R_z @ dz, rcond=1e-14)[0]
+        for k, (D, e) in enumerate(found.nodes):
+            d = D @ np.concatenate([first[int(self.segments.of_piece[k])], dz]) + e
+            after[k] = self.chart.plus(starts[k], part * d)
+        return after
+
+    def solve(self, z: Array, starts: Array, most: int) -> "Solved":
+        """From z and the starts of the segments; at most so many steps."""
+        merit, converged, steps, why = 0.0, False, 0, "it took too many steps"
+        found = self.reduce(z, starts)
+        for steps in range(most + 1):
+            dz = self.step_of(z, found)
+            now = sum(float(np.nansum(r**2)) for r in found.residuals) + self._pull(z)
+            then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(z + dz)
+            if now - then <= SETTLED * (1 + SETTLED * now) and found.gap <= CLOSED:
+                converged, why = True, ""
+                break
+            if steps == most:
+                break
+            here, open_ = self.objective(z, starts)
+            if open_ > 0:
+                merit = max(merit, 2 * max(then - here, 0.0) / open_ + 1.0)
+            for halving in range(HALVINGS + 1):
+                part = 0.5**halving
+                ahead = self.moved(starts, found, dz, part)
+                value, gap = self.objective(z + part * dz, ahead)
+                expected = part * (here - then + merit * open_)
+                if value + merit * gap <= here + merit * open_ - 1e-4 * expected + 1e-9 * (1 + abs(here)):
+                    break
+            else:
+                why = "no part of a step made the motion nearer to what was measured"
+                break
+            z, starts = z + part * dz, ahead
+            found = self.reduce(z, starts)
+        return Solved(z, starts, found, converged, steps, why)
+
+
+def _triangle(matrix: Array) -> Array:
+    """(n, n) R with R' R = matrix' matrix, of a matrix (m, n)."""
+    n = matrix.shape[1]
+    found: Array = np.asarray(np.linalg.qr(matrix, mode="r"))
+    return np.vstack([found, np.zeros((max(0, n - len(found)), n))])
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Where the least squares ended."""
+
+    z: Array
+    starts: Array
+    reduced: Reduced
+    converged: bool
+    steps: int
+    why: str
+
+
+def growth_cuts(fit: Fit, z: Array, starts: Array) -> list[Piece]:
+    """The pieces, cut where a small motion of their start has grown by GROWTH."""
+    s, nt = fit.segments, fit.chart.size
+    found = fit.reduce(z, starts)
+    pieces: list[Piece] = []
+    scale = fit.gap_scale
+    for p, piece in enumerate(s.pieces):
+        begin, base = 0, np.eye(nt)
+        for k in np.flatnonzero(s.of_piece == p):
+            D = found.nodes[k][0][:, :nt]
+            grown = np.linalg.norm((D @ np.linalg.pinv(base)) * scale / scale[:, None], 2)
+            if grown > GROWTH and s.first[k] - begin >= LEAST and len(piece.times) - s.first[k] > LEAST:
+                pieces.append(piece.part(begin, int(s.first[k])))
+                begin, base = int(s.first[k]), D
+        pieces.append(piece.part(begin, len(piece.times) - 1))
+    return pieces

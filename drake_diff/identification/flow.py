@@ -1,0 +1,108 @@
+"""The motion of a tree in continuous time over many segments at once, and its derivatives.
+
+Fixed steps of the classical method of Runge and Kutta, of order 4, over which inputs are held; the derivatives are
+those of the method's own steps. A step of length 0 changes nothing: with such steps segments of different length stand
+side by side.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.tree import Numbers, Tree
+from drake_diff.identification.unknowns import Unknowns, by_complex_step, set_numbers
+from drake_diff.model.model import Model
+
+CHUNK = 512  # steps that are differentiated in one call
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousMotion:
+    """dq/dt = N(q) v, dv/dt = a of a tree whose numbers are set by unknowns."""
+
+    model: Model
+    tree: Tree
+    chart: Chart
+    unknowns: Unknowns
+    longest: float  # [s] the longest step
+
+    @property
+    def words(self) -> str:
+        return f"continuous time, by Runge-Kutta steps of at most {1e3 * self.longest:.3g} ms"
+
+    def cut(self, period: float) -> tuple[float, ...]:
+        """Lengths of the steps [s] over a time between samples [s]."""
+        count = max(1, int(np.ceil(period / self.longest - 1e-9)))
+        return (period / count,) * count
+
+    def is_possible(self, values: Array) -> bool:
+        """Whether there are bodies with these values."""
+        return self.unknowns.consistent(values, self.tree)
+
+    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
+        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
+        numbers = set_numbers(self.model, self.tree, self.unknowns, values)
+        xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
+        xs[:, 0] = starts
+        for m in range(hs.shape[1]):
+            h, u = hs[:, m, None], us[:, m]
+            k1 = self._rates(numbers, xs[:, m], u)
+            k2 = self._rates(numbers, xs[:, m] + h / 2 * k1, u)
+            k3 = self._rates(numbers, xs[:, m] + h / 2 * k2, u)
+            k4 = self._rates(numbers, xs[:, m] + h * k3, u)
+            xs[:, m + 1] = xs[:, m] + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return xs
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
+        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        model, tree, unknowns = self.model, self.tree, self.unknowns
+
+        def flat(z: Array) -> Array:
+            return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
+
+        numbers, by = set_numbers(model, tree, unknowns, unknowns.values(z)), by_complex_step(flat, z)
+        K, M = hs.shape
+        x, h, u = xs[:, :-1].reshape(K * M, -1), hs.reshape(-1), us.reshape(K * M, -1)
+        nx = x.shape[1]
+        found = np.empty((K * M, nx, nx + by.shape[1]))
+        for k in range(0, K * M, CHUNK):
+            part = slice(k, k + CHUNK)
+            found[part] = self._step_slopes(numbers, by, x[part], h[part], u[part])
+        found = found.reshape(K, M, nx, -1)
+        return found[..., :nx], found[..., nx:]
+
+    def _step_slopes(self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array) -> Array:
+        nx, h = x.shape[1], h[:, None, None]
+        start = np.zeros((*x.shape, nx + by.shape[1]))
+        start[:, :, :nx] = np.eye(nx)
+        total, change = np.zeros_like(start), start
+        at, slope = x, np.zeros_like(x)
+        for weight, ahead in ((1, 0.0), (2, 0.5), (2, 0.5), (1, 1.0)):
+            at = x + ahead * h[..., 0] * slope
+            moved = start + ahead * h * change if ahead else start
+            slope, by_x, by_z = self._rate_slopes(numbers, by, at, u)
+            change = by_x @ moved
+            change[:, :, nx:] += by_z
+            total += weight * change
+        return np.asarray(start + h / 6 * total)
+
+    def _rates(self, numbers: Numbers, x: Array, u: Array) -> Array:
+        q, v = x[:, : self.model.nq], x[:, self.model.nq :]
+        a = self.tree.accelerate(numbers, q, v, u)
+        if not self.chart.coordinates.free:
+            return np.concatenate([v, a], axis=1)
+        return np.concatenate([(self.chart.coordinates.rate(q) @ v[..., None])[..., 0], a], axis=1)
+
+    def _rate_slopes(self, numbers: Numbers, by: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        nq, chart = self.model.nq, self.chart.coordinates
+        q, v = x[:, :nq], x[:, nq:]
+        found = self.tree.slopes(numbers, q, v, u, by)
+        N, W = chart.rate(q), chart.motion(q)
+        by_x = np.zeros((*x.shape, x.shape[1]))
+        by_x[:, :nq, :nq], by_x[:, :nq, nq:] = chart.rate_by_position(v), N
+        by_x[:, nq:, :nq], by_x[:, nq:, nq:] = found.by_q @ W, found.by_v
+        by_z = np.zeros((*x.shape, by.shape[1]))
+        by_z[:, nq:] = found.by_numbers
+        return np.concatenate([(N @ v[..., None])[..., 0], found.a], axis=1), by_x, by_z

@@ -1,0 +1,316 @@
+"""Which parameters of a model are wrong, and by how much, from recordings of its motion."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from drake_diff._base.arrays import Array, frozen, positive_int
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.refusal import Refusal
+from drake_diff.comparison.recordings import Recording
+from drake_diff.exceptions import ModelError
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.fit import Fit, Solved, growth_cuts
+from drake_diff.identification.flow import ContinuousMotion
+from drake_diff.identification.judge import (
+    FALSE_ALARM,
+    SCATTER,
+    Known,
+    colour_of,
+    freedom_of,
+    intervals_of,
+    known_of,
+    noise_of,
+    unidentifiable,
+)
+from drake_diff.identification.measured import (
+    Piece,
+    given_noise,
+    guess_states,
+    noise_by_differences,
+    read_pieces,
+)
+from drake_diff.identification.tree import tree_for_identification
+from drake_diff.identification.unknowns import Unknowns, choose_unknowns
+from drake_diff.mechanics.description import coordinates_of
+from drake_diff.model.model import Model
+from drake_diff.model.tangent import tangent_space
+
+LONGEST, SHORTEST = 0.01, 1e-4  # [s] of the steps of Runge and Kutta
+STEP_ERROR = 5e-3  # of the noise: what a step of half the length may change over a segment
+ROUNDS = 5  # of estimating the noise
+SAME_NOISE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Identification(ShowsItsRepr):
+    """What recordings say of a model's parameters; `dd.identify` makes one."""
+
+    values: Mapping[str, Any]  # by name, as the model's parameters take them; a number or an array
+    start: Mapping[str, Any]  # the model's own
+    intervals: Mapping[str, Array]  # (2,) or (k, 2): lower and upper, with 95 % of the probability
+    units: Mapping[str, str]
+    unidentifiable: tuple[str, ...]  # combinations that the recordings leave open, in words
+    explained: bool  # whether what is left looks like noise, and held-out samples are predicted
+    reason: str  # why
+    sentence: str
+    noise: Mapping[str, float]  # the standard deviation of each measured entry, given or from the residuals
+    error_before: float  # of the held-out samples (of all, where none are), in standard deviations of the noise
+    error_after: float
+    residuals: tuple[Array, ...]  # of each fitted piece (n, 2 nv), in standard deviations; NaN where unmeasured
+    columns: tuple[str, ...]  # (np,) a name for each entry of the values
+    covariance: Array  # (np, np) of the values; infinite where nothing is known
+    score: float  # -2 log of the likelihood, up to a constant of the data
+    count: int  # how many numbers were measured
+    converged: bool
+    steps: int
+    motion: str  # which motion was fitted
+
+    def __repr__(self) -> str:
+        return self.sentence
+
+
+def identify(
+    model: Model,
+    recordings: Recording | str | Path | Sequence[Recording | str | Path],
+    parameters: Sequence[str] | str = "all",
+    *,
+    noise: Mapping[str, float] | None = None,
+    held_out: float | str = 0.2,
+    max_iterations: int = 60,
+) -> Identification:
+    """Estimate parameters of a model from recordings of its motion, with intervals.
+
+    Args:
+        model: The model; its own values are where the search begins.
+        recordings: One or more of `dd.Recording`, or files as `dd.comparison.read_recording` takes them. States that
+            were not measured are NaN, or columns that a file lacks; positions alone are enough. Inputs are held from
+            each sample to the next. Samples may be any time apart.
+        parameters: Names as by `dd.list_parameters`, and beside them JOINT.coulomb_friction, INPUT.strength and
+            STATE.bias; or "all": masses, centres of mass, inertias, dampings, spring stiffnesses and rotor inertias.
+        noise: The standard deviation of the noise of states, by name. What is not given is estimated.
+        held_out: Which part of each recording, its end, is not fitted but predicted; or the name of a recording.
+        max_iterations: How many steps of Gauss and Newton the fit may take.
+
+    Returns:
+        `.values`, `.intervals` (95 %), `.unidentifiable`, `.explained` with its `.reason`, and a `.sentence`.
+
+    Raises:
+        InputError, UnknownNameError, ShapeError, NonFiniteError: A recording is not one of this model, or a name is
+            none of its parameters.
+        ModelError: The model has no motion that can be fitted here; says why.
+
+    Source:
+        Multiple shooting: Bock, "Recent advances in parameter identification techniques for ODE" (1983).
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.001)
+        >>> motion = dd.rollout(model, [1.0, 0.0], np.zeros((1500, 1)), parameters={"hinge.damping": 0.2})
+        >>> measured = motion.xs[::10] + 1e-3 * np.random.default_rng(0).standard_normal((151, 2))
+        >>> log = dd.Recording("lab", "1", 0.01 * np.arange(151), measured, np.zeros((150, 1)))
+        >>> print(round(dd.identify(model, log, ["hinge.damping"]).values["hinge.damping"], 2))
+        0.2
+    """
+    positive_int("max_iterations", max_iterations)
+    tree = tree_for_identification(model)
+    if isinstance(tree, Refusal):
+        raise ModelError(f"{model.name}: {tree}: its motion cannot be fitted in continuous time")
+    chart, unknowns = Chart(coordinates_of(model)), choose_unknowns(model, tree, parameters)
+    pieces = read_pieces(model, recordings, held_out)
+    stated = given_noise(model, chart, noise)
+    scatter = noise_by_differences(chart, pieces)
+    problem = _Problem(model, chart, unknowns, pieces, stated, scatter)
+    fit, solved = problem.solve(ContinuousMotion(model, tree, chart, unknowns, LONGEST), max_iterations)
+    return problem.judged(fit, solved)
+
+
+@dataclass(eq=False)
+class _Problem:
+    model: Model
+    chart: Chart
+    unknowns: Unknowns
+    pieces: list[Piece]
+    stated: Array  # (2 nv,) the noise as it was given, NaN where it was not
+    scatter: Array  # (2 nv,) that of neighbouring samples
+
+    def fit(self, law: ContinuousMotion, pieces: Sequence[Piece], noise: Array, *, fixed: bool = False) -> Fit:
+        return Fit(self.model, law, self.chart, self.unknowns, pieces, noise, fixed=fixed)
+
+    def guess(self, fit: Fit) -> Array:
+        s = fit.segments
+        found = [guess_states(self.model, self.chart, p, s.first[s.of_piece == i]) for i, p in enumerate(s.pieces)]
+        return np.concatenate(found)
+
+    @property
+    def first_noise(self) -> Array:
+        return np.where(np.isfinite(self.stated), self.stated, self.scatter)
+
+    @property
+    def fitted(self) -> list[Piece]:
+        return [piece for piece in self.pieces if not piece.held_out]
+
+    def solve(self, law: ContinuousMotion, most: int) -> tuple[Fit, Solved]:
+        """With steps so short that half of them give the same motion over the segments, at the start and at the end."""
+        z, noise = self.unknowns.z_start, self.first_noise
+        fit = self.fit(law, self.fitted, noise)
+        starts = self.guess(fit)
+        while not self._follows(fit, z, starts):
+            fit = self._shorter(fit, fit.segments.pieces, noise)
+        pieces = growth_cuts(fit, z, starts)
+        fit = self.fit(fit.law, pieces, noise)
+        starts = self.guess(fit)
+        while True:
+            fit, solved = self._weighted(fit, z, starts, most)
+            if self._follows(fit, solved.z, solved.starts):
+                return fit, solved
+            z, starts = solved.z, solved.starts
+            fit = self._shorter(fit, pieces, fit.noise)
+
+    def _follows(self, fit: Fit, z: Array, starts: Array) -> bool:
+        """Whether steps of half the length lead to the same ends of all segments."""
+        ends = []
+        for longest in (fit.law.longest, fit.law.longest / 2):
+            other = self.fit(replace(fit.law, longest=longest), fit.segments.pieces, fit.noise)
+            with np.errstate(over="ignore", invalid="ignore"):
+                xs = other.law.run(self.unknowns.values(z), starts, other.segments.hs, other.segments.us)
+            ends.append(xs[np.arange(len(xs)), other.segments.counts])
+        gap = self.chart.minus(*ends) / fit.gap_scale
+        return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= STEP_ERROR)
+
+    def _shorter(self, fit: Fit, pieces: Sequence[Piece], noise: Array) -> Fit:
+        longest = fit.law.longest / 2
+        if longest < SHORTEST:
+            raise ModelError(
+                f"{self.model.name}: its motion is too stiff: steps of {1e3 * fit.law.longest:.2g} ms do not follow it"
+            )
+        return self.fit(replace(fit.law, longest=longest), pieces, noise)
+
+    def _weighted(self, fit: Fit, z: Array, starts: Array, most: int) -> tuple[Fit, Solved]:
+        """Least squares, weighted anew until the residuals have the noise that they are weighted by."""
+        for _ in range(ROUNDS):
+            solved = fit.solve(z, starts, most)
+            z, starts = solved.z, solved.starts
+            found = np.where(np.isfinite(self.stated), self.stated, np.fmax(noise_of(fit, solved), 1e-3 * self.scatter))
+            seen = np.isfinite(found)
+            if np.max(np.abs(found[seen] / fit.noise[seen] - 1)) < SAME_NOISE:
+                return fit, solved
+            fit = self.fit(fit.law, fit.segments.pieces, found)
+        return fit, fit.solve(z, starts, most)
+
+    def judged(self, fit: Fit, solved: Solved) -> Identification:
+        unknowns, z = self.unknowns, solved.z
+        count, taken = freedom_of(fit, solved)
+        known = known_of(unknowns, z, solved.reduced.R)
+        intervals = intervals_of(unknowns, z, known.covariance, count - taken)
+        values, by_z = unknowns.values(z), unknowns.by_z(z)
+        before, after, why_not = self._predicted(fit, solved, known, count - taken)
+        reason = self._reason(fit, solved, why_not)
+        lost = ~np.isfinite(np.diag(known.covariance))
+        covariance = by_z @ np.where(np.isfinite(known.covariance), known.covariance, 0.0) @ by_z.T
+        hidden = np.any(by_z[:, lost] != 0, axis=1)
+        covariance[hidden, hidden] = np.inf
+        names, open_ = tangent_space(self.model).names, unidentifiable(unknowns, z, known)
+        chi2 = sum(float(np.nansum(r**2)) for r in solved.reduced.residuals)
+        every = np.concatenate(solved.reduced.residuals)
+        with np.errstate(divide="ignore"):
+            logs = np.isfinite(every).sum(axis=0) * np.log(np.where(np.isfinite(fit.noise), fit.noise, 1.0))
+        result = Identification(
+            values=unknowns.named(values),
+            start=unknowns.named(unknowns.start),
+            intervals={
+                one.name: frozen(intervals[s][0] if len(one.start) == 1 else intervals[s])
+                for one, s in zip(unknowns.each, unknowns.slices, strict=True)
+            },
+            units={one.name: one.unit for one in unknowns.each},
+            unidentifiable=open_,
+            explained=not reason,
+            reason=reason or "what is left is like noise, and what was held out is predicted",
+            sentence="",
+            noise={n: float(s) for n, s in zip(names, fit.noise, strict=True) if np.isfinite(s)},
+            error_before=before,
+            error_after=after,
+            residuals=tuple(frozen(r) for r in solved.reduced.residuals),
+            columns=unknowns.columns,
+            covariance=frozen(covariance),
+            score=chi2 + 2 * float(np.sum(logs)),
+            count=count,
+            converged=solved.converged,
+            steps=solved.steps,
+            motion=fit.law.words,
+        )
+        object.__setattr__(result, "sentence", _sentence(result, intervals, unknowns, values))
+        return result
+
+    def _predicted(self, fit: Fit, solved: Solved, known: Known, freedom: float) -> tuple[float, float, str]:
+        """(the error with the model's own values, with those found, why that is too much: empty where it is not)."""
+        held = [piece for piece in self.pieces if piece.held_out]
+        pieces = held or list(fit.segments.pieces)
+        own = Fit(self.model, fit.law, self.chart, self.unknowns, pieces, fit.noise, fixed=True)
+        found = []
+        for z in (self.unknowns.z_start, solved.z):
+            fixed = own.solve(z, self.guess(own), 20)
+            count, taken = freedom_of(own, fixed)
+            total = sum(float(np.nansum(r**2)) for r in fixed.reduced.residuals)
+            found.append(float(np.sqrt(total / max(count - taken, 1))))
+        if not held:
+            return found[0], found[1], ""
+        finite = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
+        extra = float(np.trace(fixed.reduced.R @ finite @ fixed.reduced.R.T))
+        allowed = float(stats.f.ppf(0.999, max(count - taken, 1), max(freedom, 1))) * (
+            1 + extra / max(count - taken, 1)
+        )
+        if fixed.converged and found[1] ** 2 <= allowed:
+            return found[0], found[1], ""
+        return found[0], found[1], f"samples that were held out are missed by {found[1]:.3g} times the noise"
+
+    def _reason(self, fit: Fit, solved: Solved, why_not: str) -> str:
+        """Why the model does not explain the recordings; empty where it does."""
+        if not solved.converged:
+            return f"the fit did not converge: {solved.why}"
+        names = tangent_space(self.model).names
+        every = np.concatenate(solved.reduced.residuals)
+        numbers = np.isfinite(every).sum(axis=0)
+        size = noise_of(fit, solved)
+        for j, name in enumerate(names):
+            if np.isfinite(self.stated[j]) and numbers[j]:
+                ratio = float(size[j] / self.stated[j])
+                if ratio**2 > stats.chi2.ppf(0.9999, numbers[j]) / numbers[j]:
+                    return f"what is left of {name} is {ratio:.3g} times the noise that was given"
+            elif numbers[j] and size[j] > SCATTER * self.scatter[j]:
+                return f"what is left of {name} is {size[j] / self.scatter[j]:.3g} times the scatter of its samples"
+        name, p = colour_of(solved.reduced.residuals, names)
+        if p < FALSE_ALARM:
+            return f"what is left of {name} is not noise: it hangs together over time (probability {p:.1g})"
+        return why_not
+
+
+def _sentence(e: Identification, intervals: Array, unknowns: Unknowns, values: Array) -> str:
+    changed, kept, vague = [], 0, 0
+    for j, name in enumerate(unknowns.columns):
+        low, high = intervals[j]
+        was, now, unit = unknowns.start[j], values[j], unknowns.units[j]
+        if not (np.isfinite(low) and np.isfinite(high)):
+            vague += 1
+        elif low <= was <= high:
+            kept += 1
+        else:
+            by = f", {100 * (now / was - 1):+.3g} %" if was else ""
+            size = abs(now - was) / max(high - low, 1e-300)
+            changed.append((size, f"{name} is {now:.4g} {unit} ({low:.4g} to {high:.4g}), not {was:.4g}{by}"))
+    changed.sort(key=lambda pair: -pair[0])
+    told = [text for _, text in changed[:4]]
+    if len(changed) > 4:
+        told.append(f"{len(changed) - 4} more differ")
+    if not changed:
+        told.append("no parameter differs from the model's by more than its interval")
+    if kept and changed:
+        told.append(f"{kept} {'stays' if kept == 1 else 'stay'} within the interval")
+    if vague:
+        told.append(f"{vague} cannot be known from these recordings")
+    verdict = "Explained" if e.explained else "Not explained"
+    error = f"the error falls from {e.error_before:.3g} to {e.error_after:.3g} times the noise"
+    return f"{verdict}: {'; '.join(told)}; {error}; {e.reason}."

@@ -1,0 +1,179 @@
+"""What the data determine, and whether the model explains them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from drake_diff._base.arrays import Array
+from drake_diff.identification.fit import NO_PRIOR, Fit, Solved
+from drake_diff.identification.unknowns import FAR, MASS, Unknowns
+
+CONFIDENCE = 0.95
+UNSEEN = 1.0  # a change by so many times its own size that the data leave open at one sigma is not determined
+NOTHING = 1e-8  # of a unit's effect: rounding
+PART = 0.03  # of the largest change in a combination: what is not told
+FALSE_ALARM = 0.004  # of all tests of residuals together, where the model is right
+LAGS = 10
+SCATTER = 1.6  # times the scatter of neighbouring samples: residuals beyond it are no noise
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What the data say of the unknowns: the covariance of z, data alone, and combinations that they leave open."""
+
+    covariance: Array  # (np, np) of z; infinite entries on the diagonal where nothing is known
+    open: tuple[Array, ...]  # directions (np,) of z, each normed to 1 in the quantities' own sizes
+
+
+def known_of(unknowns: Unknowns, z: Array, R: Array) -> Known:
+    """By the singular values of the Jacobian R (np, np) in units of the noise, first states taken out."""
+    norms = np.linalg.norm(R, axis=0)
+    sizes = unknowns.widths / FAR
+    # Of what has no size, 10 times what the data could tell of it alone: only beside others can it stay open.
+    scale = np.where(np.isfinite(sizes), sizes, 10 / np.where(norms > 0, norms, 1.0))
+    _, s, V = np.linalg.svd(R * scale)
+    least = NOTHING * max(float(np.max(s, initial=0.0)), 1.0)
+    with np.errstate(divide="ignore"):
+        spread = np.where(s > least, 1 / s, np.inf)
+    finite = np.isfinite(spread)
+    covariance = (V[finite].T * spread[finite] ** 2) @ V[finite] * np.outer(scale, scale)
+    lost = np.any(np.abs(V[~finite]) > 1e-5, axis=0) if np.any(~finite) else np.zeros(len(z), dtype=bool)
+    covariance[lost, :] = covariance[:, lost] = 0.0
+    covariance[lost, lost] = np.inf
+    weak = V[spread > UNSEEN]
+    return Known(covariance, tuple(direction * scale for direction in _sparse(weak)))
+
+
+def _sparse(directions: Array) -> list[Array]:
+    """The same space by directions of few entries each: elimination with the largest entry as pivot."""
+    rows, found = np.array(directions), []
+    for k in range(len(rows)):
+        _, column = np.unravel_index(np.argmax(np.abs(rows[k:])), rows[k:].shape)
+        best = k + int(np.argmax(np.abs(rows[k:, column])))
+        rows[[k, best]] = rows[[best, k]]
+        rows[k] /= rows[k, column]
+        for other in range(len(rows)):
+            if other != k:
+                rows[other] -= rows[other, column] * rows[k]
+    for row in rows:
+        found.append(row / np.max(np.abs(row)))
+    return found
+
+
+def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float) -> Array:
+    """(np, 2) with 95 % in each; a mass's is about its logarithm, and none goes below what is possible."""
+    t = float(stats.t.ppf((1 + CONFIDENCE) / 2, max(freedom, 1.0)))
+    values, by_z = unknowns.values(z), unknowns.by_z(z)
+    found = np.empty((len(z), 2))
+    finite = np.where(np.isfinite(np.diag(covariance)), 1.0, 0.0)
+    safe = np.where(np.isfinite(covariance), covariance, 0.0)
+    spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", by_z, safe, by_z), 0.0))
+    spread[(np.abs(by_z) @ (1 - finite)) > 0] = np.inf
+    for one, s in zip(unknowns.each, unknowns.slices, strict=True):
+        if one.quantity == MASS:
+            wide = t * spread[s] / values[s]
+            with np.errstate(over="ignore"):
+                found[s] = np.column_stack([values[s] * np.exp(-wide), values[s] * np.exp(wide)])
+        else:
+            found[s] = np.column_stack([values[s] - t * spread[s], values[s] + t * spread[s]])
+            found[s] = np.maximum(found[s], one.lower)
+    return found
+
+
+def unidentifiable(unknowns: Unknowns, z: Array, known: Known) -> tuple[str, ...]:
+    """In words, the combinations that the data leave open."""
+    by_z, values = unknowns.by_z(z), unknowns.values(z)
+    found = []
+    for direction in known.open:
+        change = by_z @ direction
+        found.append(_words(unknowns, values, change))
+    return tuple(dict.fromkeys(found))
+
+
+def _words(unknowns: Unknowns, values: Array, change: Array) -> str:
+    sizes = np.concatenate(
+        [np.full(len(one.start), one.size or 1.0) for one in unknowns.each]
+    )  # of an inertia, a third of its trace
+    parts = np.abs(change) / sizes
+    told = [int(j) for j in np.argsort(-parts, kind="stable") if parts[j] > PART * np.max(parts)]
+    names = [unknowns.columns[j] for j in told]
+    quantities = {unknowns.each[i].name for i in _owners(unknowns, told)}
+    if len(quantities) == 1:
+        (name,) = quantities
+        if len(told) == 1:
+            return f"{names[0]}: a change of it leaves the motion as it is"
+        return f"{name}: a change of {_listed(names)} together leaves the motion as it is"
+    relative = change[told] / np.where(values[told] != 0, values[told], np.inf)
+    if len(told) == 2 and np.all(relative != 0):
+        ratio = relative[0] / relative[1]
+        if abs(ratio + 1) < 0.02:
+            return f"{names[0]} and {names[1]}: only their product is seen"
+        if abs(ratio - 1) < 0.02:
+            return f"{names[0]} and {names[1]}: only their quotient is seen"
+    # Told as what a tenth of the first one's size does.
+    factor = 0.1 / parts[told[0]]
+    if change[told[0]] < 0:
+        factor = -factor
+    each = [
+        f"{name} by {factor * change[j]:+.3g} {unknowns.units[j]}" for name, j in zip(names[:6], told, strict=False)
+    ]
+    more = f" and {len(told) - 6} more" if len(told) > 6 else ""
+    return f"a change of {' with '.join(each)}{more} leaves the motion as it is"
+
+
+def _owners(unknowns: Unknowns, columns: Sequence[int]) -> set[int]:
+    return {i for i, s in enumerate(unknowns.slices) for j in columns if s.start <= j < s.stop}
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def freedom_of(fit: Fit, solved: Solved) -> tuple[int, float]:
+    """(how many numbers were measured, how many of them the unknowns and first states take up)."""
+    taken = sum(float(np.sum(np.abs(np.diag(R)) > 10 * NO_PRIOR)) for R, _, _ in solved.reduced.own)
+    if not fit.fixed and len(solved.z):
+        widths = fit.unknowns.widths
+        norms = np.linalg.norm(solved.reduced.R, axis=0)
+        scale = np.where(np.isfinite(widths), widths, 1e6 / np.where(norms > 0, norms, 1.0))
+        s = np.linalg.svd(solved.reduced.R * scale, compute_uv=False)
+        taken += float(np.sum(s**2 / (1 + s**2)))
+    return sum(int(np.isfinite(r).sum()) for r in solved.reduced.residuals), taken
+
+
+def noise_of(fit: Fit, solved: Solved) -> Array:
+    """(2 nv,) the noise that the residuals show."""
+    count, taken = freedom_of(fit, solved)
+    free = max(count - taken, 1.0) / count
+    every = np.concatenate(solved.reduced.residuals)
+    numbers = np.isfinite(every).sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(fit.noise * np.sqrt(np.nansum(every**2, axis=0) / (numbers * free)))
+
+
+def colour_of(residuals: Sequence[Array], names: Sequence[str]) -> tuple[str, float]:
+    """(the entry whose residuals are least like white noise, the probability of that in white noise of all entries).
+
+    The test of Ljung and Box (1978), each piece by itself: Q = n (n + 2) sum over lags of rho_k^2 / (n - k).
+    """
+    worst, least, tests = "", 1.0, 0
+    for j, name in enumerate(names):
+        total, freedom = 0.0, 0
+        for piece in residuals:
+            r = piece[np.isfinite(piece[:, j]), j]
+            n, lags = len(r), min(LAGS, len(r) // 5)
+            if lags < 2 or not np.any(r):
+                continue
+            r = r - np.mean(r)
+            size = float(r @ r)
+            rho = np.array([r[k:] @ r[:-k] / size for k in range(1, lags + 1)])
+            total += n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
+            freedom += lags
+        if freedom:
+            tests += 1
+            p = float(stats.chi2.sf(total, freedom))
+            if p < least:
+                worst, least = name, p
+    return worst, min(1.0, least * tests)

@@ -1,0 +1,177 @@
+"""What was measured, in pieces that each have a first state of their own: samples, noise, and a guess of states."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import comb
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff._base.arrays import Array, array_with_gaps, finite_array
+from drake_diff.comparison.recordings import Recording, read_recording
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.identification.chart import Chart
+from drake_diff.model.model import Model
+from drake_diff.model.tangent import tangent_space
+
+LEAST = 8  # samples of a piece
+WINDOW = 9  # samples that a cubic is laid through, at least
+WINDOW_TIME = 0.05  # [s] and over this time at least
+NO_NOISE = 1e-9  # of a column's range: what is recorded without noise is still rounded
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A stretch of a recording."""
+
+    name: str
+    times: Array  # (n,) [s]
+    ys: Array  # (n, nx) measured states; NaN where nothing was
+    us: Array  # (n-1, nu) held from each sample to the next
+    held_out: bool
+
+    def part(self, first: int, last: int) -> "Piece":
+        """From one sample to another, both included."""
+        span = slice(first, last + 1)
+        return Piece(self.name, self.times[span], self.ys[span], self.us[first:last], self.held_out)
+
+
+def read_pieces(
+    model: Model, recordings: Recording | str | Path | Sequence[Recording | str | Path], held_out: float | str
+) -> list[Piece]:
+    """Each recording's first part to fit, and its last to be held out: a part of the samples, or a recording by name.
+
+    Raises InputError, ShapeError or NonFiniteError, naming recording and entry.
+    """
+    given = [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
+    if not given:
+        raise InputError("recordings", got="none", expected="one or more of dd.Recording, or their files")
+    each = [r if isinstance(r, Recording) else read_recording(r, model, gaps=True) for r in given]
+    names = [r.name for r in each]
+    if isinstance(held_out, str):
+        if held_out not in names:
+            raise UnknownNameError("recording to be held out", got=held_out, known=names)
+        if set(names) == {held_out}:
+            raise InputError("held_out", got=held_out, expected="another recording to fit")
+    elif not 0 <= held_out <= 0.8:
+        raise InputError("held_out", got=held_out, expected="from 0 to 0.8 of the samples, or a recording's name")
+    pieces = []
+    for r in each:
+        whole = _checked(r, model)
+        if isinstance(held_out, str):
+            pieces.append(Piece(whole.name, whole.times, whole.ys, whole.us, r.name == held_out))
+            continue
+        last, count = len(whole.times) - 1, round(held_out * len(whole.times))
+        count = count if LEAST <= count <= last - LEAST else 0
+        pieces.append(whole.part(0, last - count))
+        if count:
+            rest = whole.part(last - count, last)
+            pieces.append(Piece(rest.name, rest.times, rest.ys, rest.us, True))
+    return pieces
+
+
+def _checked(recording: Recording, model: Model) -> Piece:
+    subject = f"recording {recording.name}"
+    times = finite_array(f"{subject}: times", recording.times, ("n",))
+    if len(times) < LEAST:
+        raise InputError(f"{subject}: samples", got=len(times), expected=f"{LEAST} or more")
+    if np.any(np.diff(times) <= 0):
+        k = int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1
+        raise InputError(f"{subject}: time of sample {k}", got=f"{times[k]} s", expected="later than the one before")
+    ys = np.array(array_with_gaps(f"{subject}: xs", recording.xs, (len(times), model.nx)))
+    us = finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
+    if np.any(np.isinf(ys)):
+        k, j = (int(i) for i in np.argwhere(np.isinf(ys))[0])
+        raise InputError(f"{subject}: {model.state_names[j]} at sample {k}", got=ys[k, j], expected="a number or NaN")
+    for start in tangent_space(model).quaternions:
+        turn = ys[:, start : start + 4]
+        turn[np.isnan(turn).any(axis=1)] = np.nan
+        norms = np.linalg.norm(turn, axis=1)
+        if np.any(np.abs(norms - 1) > 0.1):
+            k = int(np.argmax(np.abs(norms - 1) > 0.1))
+            raise InputError(f"{subject}: norm of {model.state_names[start]}... at {k}", got=norms[k], expected="1")
+        turn /= norms[:, None]
+        seen = np.flatnonzero(np.isfinite(norms))
+        signs = np.sign(np.sum(turn[seen[1:]] * turn[seen[:-1]], axis=1))
+        turn[seen[1:]] *= np.cumprod(np.where(signs == 0, 1, signs))[:, None]
+    if not np.any(np.isfinite(ys[:, : model.nq])):
+        raise InputError(f"{subject}: xs", got="no position", expected="some measured positions")
+    return Piece(recording.name, times - times[0], ys, us, held_out=False)
+
+
+def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None) -> Array:
+    """(2 nv,) what the user says of the noise of each entry; NaN where nothing.
+
+    Names are those of states; a free body's turn is called base_rx, base_ry, base_rz.
+    """
+    names = tangent_space(model).names
+    found = np.full(chart.size, np.nan)
+    for name, value in (noise or {}).items():
+        if name not in names:
+            raise UnknownNameError("noise of", got=name, known=names)
+        if isinstance(value, bool) or not np.isfinite(value) or value <= 0:
+            raise InputError(f"noise of {name}", got=value, expected="a standard deviation above 0")
+        found[names.index(name)] = value
+    return found
+
+
+def noise_by_differences(chart: Chart, pieces: Sequence[Piece]) -> Array:
+    """(2 nv,) an upper estimate of the noise of each entry: of differences of order 1 to 8, the one that says least.
+
+    White noise s makes the difference of order d vary by s sqrt(binomial(2 d, d)); what moves adds to that.
+    """
+    least = np.full(chart.size, np.inf)
+    reach = np.zeros(chart.size)
+    increments = [chart.minus(piece.ys[1:], piece.ys[:-1]) for piece in pieces]
+    for j in range(chart.size):
+        for order in range(1, 9):
+            parts = [np.diff(each[:, j], n=order - 1) for each in increments]
+            known = np.concatenate([part[np.isfinite(part)] for part in parts])
+            if len(known) >= 6:
+                least[j] = min(least[j], float(np.sqrt(np.mean(known**2) / comb(2 * order, order))))
+        travelled = np.concatenate([each[:, j] for each in increments])
+        reach[j] = np.nansum(np.abs(travelled)) if np.any(np.isfinite(travelled)) else 0.0
+    seen = np.any([np.isfinite(each).any(axis=0) for each in increments], axis=0)
+    least = np.where(np.isfinite(least), least, 1.0)  # where samples are too few to say
+    return np.where(seen, np.maximum(least, NO_NOISE * np.maximum(reach, 1e-3)), np.nan)
+
+
+def guess_states(model: Model, chart: Chart, piece: Piece, at: NDArray[np.intp]) -> Array:
+    """(len(at), nx) states at some samples: cubics through the samples around each.
+
+    A velocity that was not measured is the slope of its position; a position that was not measured is the model's own.
+    """
+    nq, default = model.nq, model.default_state
+    found = np.empty((len(at), model.nx))
+    for row, k in enumerate(at):
+        t = piece.times - piece.times[k]
+        q, q_dot, v = default[:nq].copy(), np.zeros(nq), np.full(model.nv, np.nan)
+        for i in range(nq):
+            fitted = _cubic(t, piece.ys[:, i])
+            if fitted is not None:
+                q[i], q_dot[i] = fitted
+        for i, _ in chart.coordinates.free:
+            q[i : i + 4] /= np.linalg.norm(q[i : i + 4])
+        for i in range(model.nv):
+            fitted = _cubic(t, piece.ys[:, nq + i])
+            if fitted is not None:
+                v[i] = fitted[0]
+        slope = chart.coordinates.motion(q) @ q_dot
+        found[row] = np.concatenate([q, np.where(np.isnan(v), slope, v)])
+    return found
+
+
+def _cubic(t: Array, y: Array) -> Any:
+    """(value, slope) at t = 0 of a cubic through the samples around; None where there are none."""
+    known = np.flatnonzero(np.isfinite(y))
+    if len(known) < 2:
+        return None
+    order = known[np.argsort(np.abs(t[known]), kind="stable")]
+    within = int(np.sum(np.abs(t[order]) <= WINDOW_TIME))
+    used = order[: max(WINDOW, within)]
+    degree = min(3, len(used) - 1)
+    size = float(np.max(np.abs(t[used]))) or 1.0
+    fitted = np.linalg.lstsq(np.vander(t[used] / size, degree + 1, increasing=True), y[used], rcond=None)[0]
+    return fitted[0], fitted[1] / size

@@ -1,0 +1,306 @@
+"""What is estimated: named quantities, the coordinates z in which they move, and the numbers of the tree that they set.
+
+A mass moves by its logarithm, an inertia by the log-Cholesky coordinates of its second moment about the centre of mass
+and the centre of mass by itself: with all three free these are the log-Cholesky coordinates of the pseudo-inertia
+(Rucker and Wensing, "Smooth parameterization of rigid-body inertia", 2022), so that every z is a body that can be.
+Damping, stiffness, friction and rotor inertia enter the equations of motion linearly and may be 0: they move by
+themselves, and are kept at 0 or above.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.identification.tree import Numbers, Tree, moved_by, ten_numbers
+from drake_diff.mechanics.description import names_of
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import (
+    from_log_cholesky,
+    list_parameters,
+    room_of_inertia,
+    second_moment,
+    to_log_cholesky,
+)
+from drake_diff.model.plant import actuators, bodies, joints, labelled
+
+MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
+COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
+OF_TREE = (
+    MASS, CENTER, INERTIA, "damping", "offset", "spring_stiffness", "spring_rest_angle", "spring_rest_length",
+    "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH,
+)  # fmt: skip
+OF_ALL = (MASS, CENTER, INERTIA, "damping", "spring_stiffness", "rotor_inertia")
+FAR = 3.0  # how many times its own size a quantity may be wrong by before what the data say is doubted, at one sigma
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown:
+    """One quantity: the model's value (k,), its unit, and the size [unit] of a change that counts as 100 %."""
+
+    name: str
+    unit: str
+    start: Array
+    lower: float
+    size: float  # 0 where the model says nothing of it, such as a damping of 0
+
+    @property
+    def label(self) -> str:
+        return self.name.rsplit(".", 1)[0]
+
+    @property
+    def quantity(self) -> str:
+        return self.name.rsplit(".", 1)[1]
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """A name for each entry."""
+        return (self.name,) if len(self.start) == 1 else tuple(f"{self.name}[{i}]" for i in range(len(self.start)))
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """All of them, one after the other."""
+
+    each: tuple[Unknown, ...]
+
+    @property
+    def slices(self) -> tuple[slice, ...]:
+        ends = np.cumsum([0, *(len(one.start) for one in self.each)])
+        return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return tuple(name for one in self.each for name in one.columns)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(one.unit for one in self.each for _ in one.start)
+
+    @property
+    def start(self) -> Array:
+        """(np,) the model's values."""
+        return np.concatenate([one.start for one in self.each]) if self.each else np.zeros(0)
+
+    @property
+    def sizes(self) -> Array:
+        """(np,) what counts as 100 % of each entry; 0 where nothing says it."""
+        return np.concatenate([np.full(len(one.start), one.size) for one in self.each]) if self.each else np.zeros(0)
+
+    @property
+    def z_start(self) -> Array:
+        z = self.start.copy()
+        for one, s in zip(self.each, self.slices, strict=True):
+            if one.quantity == MASS:
+                z[s] = np.log(one.start)
+            elif one.quantity == INERTIA:
+                z[s] = to_log_cholesky(one.start)
+                z[s][3:] /= _spread(one)
+        return z
+
+    @property
+    def widths(self) -> Array:
+        """(np,) in z, how far the data may move it before they must say more than the file; infinite without a size."""
+        widths = np.empty(len(self.start))
+        for one, s in zip(self.each, self.slices, strict=True):
+            relative = one.quantity in (MASS, INERTIA)
+            widths[s] = 1.0 if relative else one.size or np.inf
+        return FAR * widths
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper z (np,)."""
+        lower = np.full(len(self.start), -np.inf)
+        for one, s in zip(self.each, self.slices, strict=True):
+            if one.quantity not in (MASS, INERTIA):
+                lower[s] = one.lower
+        return lower, np.full(len(self.start), np.inf)
+
+    def values(self, z: Any) -> Any:
+        """(np,) of z (np,), complex or float."""
+        values = np.array(z)
+        for one, s in zip(self.each, self.slices, strict=True):
+            if one.quantity == MASS:
+                values[s] = np.exp(z[s])
+            elif one.quantity == INERTIA:
+                own = np.array(z[s])
+                own[3:] = own[3:] * _spread(one)
+                values[s] = from_log_cholesky(own)
+        return values
+
+    def by_z(self, z: Array) -> Array:
+        """(np, np) the derivative of the values."""
+        return by_complex_step(self.values, z)
+
+    def named(self, values: Array) -> dict[str, Any]:
+        """By name; a number where it is one."""
+        return {
+            one.name: float(values[s][0]) if len(one.start) == 1 else frozen(values[s])
+            for one, s in zip(self.each, self.slices, strict=True)
+        }
+
+    def consistent(self, values: Array, tree: Tree | None) -> bool:
+        """Whether some distribution of mass has every body's numbers: a centre of mass alone may leave it.
+
+        Points and rods have no room to begin with, and are not looked at.
+        """
+        if tree is None:
+            return True
+        given = self.named(values)
+        for one in self.each:
+            if one.quantity == CENTER and f"{one.label}.{INERTIA}" not in given:
+                if room_of_inertia(np.asarray(_central(tree, one.label, {})[2])) <= 0:
+                    continue
+                _, _, inertia = _central(tree, one.label, given)
+                if room_of_inertia(np.asarray(inertia, dtype=float)) < 0:
+                    return False
+        return True
+
+
+def by_complex_step(function: Any, z: Array) -> Array:
+    """(m, n) the derivative of an analytic function of z (n,), to rounding."""
+    tiny, columns = 1e-30, []
+    for j in range(len(z)):
+        moved = np.array(z, dtype=complex)
+        moved[j] += 1j * tiny
+        columns.append(np.imag(function(moved)) / tiny)
+    return np.array(columns).T if columns else np.zeros((len(function(z)), 0))
+
+
+def _spread(one: Unknown) -> float:
+    """[m sqrt(kg)] the size of the entries beside the diagonal of the Cholesky factor."""
+    return float(np.sqrt(max(np.trace(second_moment(one.start)) / 3, 1e-300)))
+
+
+def choose_unknowns(model: Model, tree: Tree | None, names: Sequence[str] | str) -> Unknowns:
+    """The quantities called `names`; "all" are all inertias, dampings, spring stiffnesses and rotor inertias.
+
+    Raises UnknownNameError, which lists those that exist, or InputError where one cannot be estimated.
+    """
+    known = {p.name: (p.unit, p.value, p.lower) for p in list_parameters(model)}
+    if tree is not None:
+        known |= _extra(model)
+    if isinstance(names, str) and names == "all":
+        names = [name for name in known if name.rsplit(".", 1)[1] in OF_ALL]
+        names = [name for name in names if _why_not(model, tree, name, known[name][1]) is None]
+    elif isinstance(names, str):
+        names = [names]
+    found = []
+    for name in names:
+        if name not in known:
+            raise UnknownNameError("parameter", got=name, known=known)
+        unit, value, lower = known[name]
+        why = _why_not(model, tree, name, value)
+        if why is not None:
+            raise InputError(name, got=why, expected="a quantity that can be estimated here")
+        found.append(Unknown(name, unit, np.array(value, dtype=float), lower, _size(model, name, value)))
+    if len({one.name for one in found}) < len(found) or not found:
+        raise InputError("parameters", got=", ".join(names) or "none", expected="one or more names, each once")
+    return Unknowns(tuple(found))
+
+
+def _extra(model: Model) -> dict[str, tuple[str, Array, float]]:
+    """What Drake's plant has no number for."""
+    found = {}
+    for label, joint in labelled(joints(model.plant)).items():
+        if joint.num_velocities() == 1:
+            unit = "N" if joint.type_name() == "prismatic" else "N m"
+            found[f"{label}.{COULOMB}"] = (unit, np.zeros(1), 0.0)
+    for name in model.input_names:
+        found[f"{name}.{STRENGTH}"] = ("1", np.ones(1), -np.inf)
+    for name in (*model.position_names, *model.velocity_names):
+        found[f"{name}.{BIAS}"] = ("", np.zeros(1), -np.inf)
+    return found
+
+
+def _why_not(model: Model, tree: Tree | None, name: str, value: Array) -> str | None:
+    label, quantity = name.rsplit(".", 1)
+    if quantity == "time_step":
+        return "the model's time step, of which a fit makes no sense"
+    if tree is not None and quantity not in (*OF_TREE, BIAS):
+        return 'a quantity of contact or control, of which motion in continuous time knows nothing; see motion="steps"'
+    if tree is not None and quantity in (MASS, CENTER, INERTIA) and not tree.bodies[label].mass > 0:
+        return "a body without mass"
+    if quantity == INERTIA and room_of_inertia(value) <= 0:
+        return "the inertia of a point or a rod"
+    if tree is not None and quantity in (MASS, CENTER, INERTIA) and tree.placed[label][0] < 0:
+        return "a body that is fixed to the world"
+    return None
+
+
+def _size(model: Model, name: str, value: Array) -> float:
+    """What counts as a change by 100 %: of a centre of mass the radius of gyration, or how far off it is."""
+    label, quantity = name.rsplit(".", 1)
+    if quantity == CENTER:
+        body = labelled(bodies(model.plant))[label]
+        moments = body.default_spatial_inertia().get_unit_inertia().get_moments()
+        return max(float(np.sqrt(np.sum(moments) / 2)), float(np.linalg.norm(value)), 1e-3)
+    if quantity == INERTIA:
+        return float(np.sum(value[:3]) / 3)
+    if quantity == "offset":
+        return max(float(np.linalg.norm(value)), 0.1)
+    if quantity in ("spring_rest_angle", "spring_rest_length"):
+        return 1.0
+    return float(np.linalg.norm(value))
+
+
+def _central(tree: Tree, label: str, given: dict[str, Any]) -> tuple[Any, Any, Any]:
+    """Mass, centre of mass and inertia (6,) about it of a body, as Drake's parameters set them one after the other."""
+    link = tree.bodies[label]
+    mass, center = given.get(f"{label}.{MASS}", link.mass), given.get(f"{label}.{CENTER}", link.center_of_mass)
+    own = np.array([link.inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
+    if f"{label}.{INERTIA}" in given:
+        return mass, center, given[f"{label}.{INERTIA}"]
+    unit = ten_numbers(1.0, link.center_of_mass, own / link.mass)[4:]  # about the body's origin, which stays
+    shift = ten_numbers(1.0, center, np.zeros(6))[4:]
+    return mass, center, mass * (unit - shift)
+
+
+def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Numbers:
+    """The tree's numbers where the unknowns have `values` (np,), complex or float."""
+    given: dict[str, Any] = {}
+    for one, s in zip(unknowns.each, unknowns.slices, strict=True):
+        given[one.name] = values[s][0] if len(one.start) == 1 else values[s]
+    kind = np.result_type(np.asarray(values).dtype, float)
+    own = {name: np.array(getattr(tree.numbers, name), dtype=kind) for name in Numbers.__dataclass_fields__}
+    _set_bodies(tree, given, own["inertial"])
+    by_joint = {link.joint: link for link in tree.bodies.values() if link.kind != "weld"}
+    at = {link.joint.joint: i for i, link in enumerate(tree.links)}
+    for name, value in given.items():
+        label, quantity = name.rsplit(".", 1)
+        if quantity in ("damping", COULOMB):
+            own["damping" if quantity == "damping" else "coulomb"][by_joint[label].v_start] = value
+        elif quantity == "spring_stiffness":
+            own["stiffness"][by_joint[label].v_start] = value
+        elif quantity in ("spring_rest_angle", "spring_rest_length"):
+            own["rest"][by_joint[label].v_start] = value
+        elif quantity == "offset":
+            pose = tree.placed[by_joint[label].parent][1]
+            own["offset"][at[label]] = pose.rotation().matrix() @ value + pose.translation()
+        elif quantity == "gravity":
+            own["gravity"][:] = value
+        elif quantity == STRENGTH:
+            own["strength"][model.input_names.index(label)] = value
+    if any(name.rsplit(".", 1)[1] in ("gear_ratio", "rotor_inertia") for name in given):
+        _set_rotors(model, by_joint, given, own["reflected"])
+    return Numbers(**own)
+
+
+def _set_bodies(tree: Tree, given: dict[str, Any], inertial: Any) -> None:
+    for label in dict.fromkeys(n.rsplit(".", 1)[0] for n in given if n.rsplit(".", 1)[1] in (MASS, CENTER, INERTIA)):
+        place, pose = tree.placed[label]
+        before = ten_numbers(*_central(tree, label, {}))
+        inertial[place] += moved_by(pose) @ (ten_numbers(*_central(tree, label, given)) - before)
+
+
+def _set_rotors(model: Model, by_joint: dict[str, Any], given: dict[str, Any], reflected: Any) -> None:
+    reflected[:] = 0.0
+    joint_names = names_of(model.plant)[1]
+    for label, actuator in labelled(actuators(model.plant)).items():
+        rotor = given.get(f"{label}.rotor_inertia", actuator.default_rotor_inertia())
+        ratio = given.get(f"{label}.gear_ratio", actuator.default_gear_ratio())
+        reflected[by_joint[joint_names[actuator.joint().index()]].v_start] += rotor * ratio**2

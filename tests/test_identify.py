@@ -1,0 +1,232 @@
+"""Parameters from recordings: closed forms first, then motions integrated by SciPy, which knows nothing of Drake."""
+
+import numpy as np
+import pytest
+from helpers.robots import example_robot, state_in_range
+from helpers.table import each_row
+from scipy import stats
+from scipy.integrate import solve_ivp
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.flow import ContinuousMotion
+from drake_diff.identification.judge import colour_of
+from drake_diff.identification.tree import tree_for_identification
+from drake_diff.identification.unknowns import choose_unknowns, set_numbers
+from drake_diff.mechanics.description import coordinates_of
+from drake_diff.model.step import set_state
+
+MASS, LEVER, GRAVITY = 1.0, 0.5, 9.81  # of models/pendulum.urdf
+
+
+def swing(*, damping=0.1, friction=0.0, times=None, start=(1.0, 0.0), noise=1e-3, seed=0, velocities=False):
+    """A recording of the pendulum by its equation of motion."""
+
+    def rates(t, y):
+        moment = -MASS * GRAVITY * LEVER * np.sin(y[0]) - damping * y[1] - friction * np.tanh(y[1] / 1e-3)
+        return [y[1], moment / (MASS * LEVER**2)]
+
+    times = np.linspace(0, 2, 201) if times is None else times
+    found = solve_ivp(rates, (0, times[-1]), start, rtol=1e-9, atol=1e-11, t_eval=times, method="LSODA")
+    xs = found.y.T + noise * np.random.default_rng(seed).standard_normal((len(times), 2))
+    if not velocities:
+        xs[:, 1] = np.nan
+    return dd.Recording("lab", "1", times, xs, np.zeros((len(times) - 1, 1)))
+
+
+@pytest.fixture
+def pendulum(load):
+    return load("pendulum.urdf")
+
+
+def test_what_enters_linearly_is_the_linear_least_squares_solution(write_urdf):
+    """x = x0 + v0 t + s (F / 2 m) t^2 is linear in x0, v0 and the strength s: the textbook's value and t interval."""
+    model, n, force = write_urdf(mass=2.0), 40, 3.0
+    t = 0.05 * np.arange(n)
+    x = 0.2 - 0.1 * t + 1.2 * force / 4 * t**2 + 0.01 * np.random.default_rng(1).standard_normal(n)
+    log = dd.Recording("rail", "1", t, np.column_stack([x, np.full(n, np.nan)]), np.full((n - 1, 1), force))
+    e = dd.identify(model, log, [f"{model.input_names[0]}.strength"], held_out=0)
+    X = np.column_stack([np.ones(n), t, force / 4 * t**2])
+    wanted, left, *_ = np.linalg.lstsq(X, x)
+    noise = np.sqrt(left[0] / (n - 3))
+    half = stats.t.ppf(0.975, n - 3) * noise * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
+    (name,) = e.values
+    # The fit pulls to 1 with a width of 3, which moves it by (half / 3)^2 of what it moves at all: 1e-5.
+    assert e.values[name] == pytest.approx(wanted[2], rel=1e-5)
+    np.testing.assert_allclose(e.intervals[name], wanted[2] + np.array([-half, half]), rtol=1e-3)
+    assert e.noise[model.position_names[0]] == pytest.approx(noise, rel=1e-3)
+    assert e.explained
+
+
+def test_the_damping_of_a_pendulum_is_found_from_positions_alone(pendulum):
+    e = dd.identify(pendulum, swing(damping=0.15), ["hinge.damping"])
+    low, high = e.intervals["hinge.damping"]
+    assert low < 0.15 < high < low + 0.002
+    assert e.explained, e.reason
+    assert e.unidentifiable == ()
+    assert e.noise["hinge_q"] == pytest.approx(1e-3, rel=0.2)
+    assert e.error_after < 1.3 < e.error_before
+    assert "hinge.damping is 0.1" in e.sentence
+    assert "+5" in e.sentence
+
+
+def test_samples_may_be_any_time_apart_and_missing(pendulum):
+    times = np.sort(np.random.default_rng(3).uniform(0, 2, 250))
+    times[0] = 0
+    log = swing(damping=0.15, times=times)
+    log.xs[40:60] = np.nan
+    e = dd.identify(pendulum, log, ["hinge.damping"])
+    low, high = e.intervals["hinge.damping"]
+    assert low < 0.15 < high < low + 0.003
+    assert e.explained, e.reason
+
+
+def test_several_recordings_are_fitted_at_once_and_one_is_predicted(pendulum):
+    logs = [swing(damping=0.15, start=(a, 0), seed=k) for k, a in enumerate((0.5, 1.0, 2.5))]
+    named = [dd.Recording(f"log{k}", "1", r.times, r.xs, r.us) for k, r in enumerate(logs)]
+    e = dd.identify(pendulum, named, ["hinge.damping"], held_out="log2")
+    assert len(e.residuals) == 2
+    assert e.explained, e.reason
+    low, high = e.intervals["hinge.damping"]
+    assert low < 0.15 < high < low + 0.001
+
+
+def test_a_motion_with_dry_friction_is_not_explained_by_damping_and_is_by_friction(pendulum):
+    log = swing(damping=0.1, friction=0.08, noise=1e-4)
+    without = dd.identify(pendulum, log, ["hinge.damping"])
+    assert not without.explained
+    assert without.sentence.startswith("Not explained")
+    e = dd.identify(pendulum, log, ["hinge.damping", "hinge.coulomb_friction"])
+    assert e.explained, e.reason
+    # 1 % of it: the friction here turns over 0.02 rad/s, that of the recording over 0.001.
+    assert e.values["hinge.coulomb_friction"] == pytest.approx(0.08, rel=0.01)
+
+
+def test_what_is_seen_only_together_is_named(pendulum):
+    e = dd.identify(pendulum, swing(), ["hinge.damping", "pole.mass"])
+    assert e.unidentifiable == ("hinge.damping and pole.mass: only their quotient is seen",)
+    assert e.intervals["pole.mass"][1] == np.inf
+    assert e.values["hinge.damping"] / e.values["pole.mass"] == pytest.approx(0.1, rel=0.01)
+
+
+def test_a_parameter_that_does_nothing_is_named(pendulum):
+    e = dd.identify(pendulum, swing(), ["pole.center_of_mass"])
+    assert e.unidentifiable == ("pole.center_of_mass[1]: a change of it leaves the motion as it is",)
+
+
+def test_a_stated_noise_that_is_too_small_is_not_explained(pendulum):
+    assert dd.identify(pendulum, swing(), ["hinge.damping"], noise={"hinge_q": 1e-3}).explained
+    e = dd.identify(pendulum, swing(), ["hinge.damping"], noise={"hinge_q": 5e-4})
+    assert not e.explained
+    assert "times the noise that was given" in e.reason
+
+
+def test_residuals_that_hang_together_are_told_from_white_ones():
+    random = np.random.default_rng(0)
+    white = [random.standard_normal((400, 1)) for _ in range(2)]
+    assert colour_of(white, ["a"])[1] > 0.01
+    wave = [r + np.sin(np.arange(400) / 9)[:, None] for r in white]
+    assert colour_of(wave, ["a"])[1] < 1e-6
+
+
+def test_a_chaotic_motion_is_fitted(load):
+    """A double pendulum that swings over: small changes of its start grow tenfold in half a second."""
+    model = load("double_pendulum.urdf", time_step=0.001)
+    truth = {"lower.mass": 0.6, "elbow.damping": 0.03}
+    tree = tree_for_identification(model)
+    unknowns = choose_unknowns(model, tree, list(truth))
+    numbers = set_numbers(model, tree, unknowns, np.array(list(truth.values())))
+
+    def rates(t, x):
+        return np.concatenate([x[2:], tree.accelerate(numbers, x[None, :2], x[None, 2:], np.zeros((1, model.nu)))[0]])
+
+    times = np.linspace(0, 3, 301)
+    found = solve_ivp(rates, (0, 3), [2.5, 1.5, 0.0, 0.0], rtol=1e-10, atol=1e-10, t_eval=times)
+    xs = found.y.T + np.random.default_rng(0).standard_normal((301, 4)) * [1e-3, 1e-3, 0, 0]
+    xs[:, 2:] = np.nan
+    e = dd.identify(model, dd.Recording("lab", "1", times, xs, np.zeros((300, model.nu))), list(truth))
+    assert e.explained, e.reason
+    for name, value in truth.items():
+        low, high = e.intervals[name]
+        assert low - (high - low) < value < high + (high - low), name
+        assert high - low < 0.1 * value
+
+
+@each_row("name", ["ur5_robot.urdf", "solo12.urdf"])
+def test_accelerations_are_drakes_and_steps_have_the_slopes_of_differences(name):
+    model, random = example_robot(name), np.random.default_rng(0)
+    tree = tree_for_identification(model)
+    x, u = state_in_range(model, random), random.uniform(-1, 1, model.nu)
+    set_state(model.double, x)
+    wanted = np.linalg.solve(
+        model.double.mass_matrix(), model.actuation @ u - model.double.inverse_dynamics(np.zeros(model.nv))
+    )
+    nq = model.nq
+    found = tree.accelerate(tree.numbers, x[None, :nq], x[None, nq:], u[None])[0]
+    np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
+    numbers = tree.numbers
+    by = np.eye(len(numbers.flat))
+    slopes = tree.slopes(numbers, x[None, :nq], x[None, nq:], u[None], by)
+    direction = random.uniform(-1, 1, len(by)) * np.maximum(np.abs(numbers.flat), 1e-3)
+
+    def moved(size):
+        flat = numbers.flat + size * direction
+        parts = {name: flat[numbers.places(name)] for name in type(numbers).__dataclass_fields__}
+        return tree.accelerate(type(numbers)(**parts), x[None, :nq], x[None, nq:], u[None])[0]
+
+    difference = (moved(1e-5) - moved(-1e-5)) / 2e-5
+    # Differences over 1e-5 of light links are good to 1e-6 of the largest.
+    np.testing.assert_allclose(slopes.by_numbers[0] @ direction, difference, atol=1e-6 * np.abs(difference).max())
+
+
+def test_steps_have_the_slopes_of_differences_by_unknowns(load):
+    model = load("double_pendulum.urdf")
+    tree = tree_for_identification(model)
+    names = ["upper.mass", "lower.mass", "lower.center_of_mass", "elbow.offset", "elbow.damping", "model.gravity"]
+    unknowns = choose_unknowns(model, tree, [*names, "elbow.coulomb_friction", "elbow_motor.strength"][:-1])
+    law = ContinuousMotion(model, tree, Chart(coordinates_of(model)), unknowns, 0.01)
+    z = unknowns.z_start + 0.05
+    start, hs = np.array([[0.4, -0.3, 1.0, -2.0]]), np.array([[0.01]])
+    us = np.full((1, 1, model.nu), 0.3)
+    _, by_z = law.slopes(z, law.run(unknowns.values(z), start, hs, us), hs, us)
+    for j in range(len(z)):
+        e = 1e-6 * np.eye(len(z))[j]
+        ends = [law.run(unknowns.values(z + sign * e), start, hs, us)[0, -1] for sign in (1, -1)]
+        np.testing.assert_allclose(by_z[0, 0, :, j], (ends[0] - ends[1]) / 2e-6, atol=1e-8, err_msg=names[0])
+
+
+def test_a_file_may_lack_columns_and_cells(pendulum, tmp_path):
+    log = swing(damping=0.15)
+    rows = [f"{t},{x[0]},0" for t, x in zip(log.times, log.xs, strict=True)]
+    rows[7] = f"{log.times[7]},,0"
+    path = tmp_path / "swing.csv"
+    path.write_text("\n".join([f"time,hinge_q,{pendulum.input_names[0]}", *rows]))
+    e = dd.identify(pendulum, path, ["hinge.damping"])
+    assert e.explained, e.reason
+    with pytest.raises(InputError, match="column hinge_w"):
+        dd.comparison.read_recording(path, pendulum)
+
+
+def refused(model, log, *arguments, **more):
+    with pytest.raises((InputError, ModelError, ShapeError, UnknownNameError)) as error:
+        dd.identify(model, log, *arguments, **more)
+    return str(error.value)
+
+
+def test_what_makes_no_sense_is_refused(pendulum, load):
+    log = swing()
+    assert "pole.mass" in refused(pendulum, log, ["pole.maas"])
+    assert "each once" in refused(pendulum, log, ["pole.mass", "pole.mass"])
+    assert "point or a rod" in refused(pendulum, log, ["pole.inertia"])
+    assert "time step" in refused(pendulum, log, ["model.time_step"])
+    assert "hinge_q" in refused(pendulum, log, ["pole.mass"], noise={"hinge": 1.0})
+    assert "0 to 0.8" in refused(pendulum, log, ["pole.mass"], held_out=0.9)
+    assert "lab" in refused(pendulum, log, ["pole.mass"], held_out="other")
+    assert "xs" in refused(load("double_pendulum.urdf"), log, ["upper.mass"])
+    late = dd.Recording("lab", "1", log.times[::-1], log.xs, log.us)
+    assert "later than the one before" in refused(pendulum, late, ["pole.mass"])
+    nothing = dd.Recording("lab", "1", log.times, np.full_like(log.xs, np.nan), log.us)
+    assert "no position" in refused(pendulum, nothing, ["pole.mass"])
+    short = dd.Recording("lab", "1", log.times[:4], log.xs[:4], log.us[:3])
+    assert "8 or more" in refused(pendulum, short, ["pole.mass"])
