@@ -99,8 +99,8 @@ def test_a_motion_with_dry_friction_is_not_explained_by_damping_and_is_by_fricti
     assert without.sentence.startswith("Not explained")
     e = dd.identify(pendulum, log, ["hinge.damping", "hinge.coulomb_friction"])
     assert e.explained, e.reason
-    # 1 % of it: the friction here turns over 0.02 rad/s, that of the recording over 0.001.
-    assert e.values["hinge.coulomb_friction"] == pytest.approx(0.08, rel=0.01)
+    # Its standard error is 0.5 %; and friction turns over 0.02 rad/s here, over 0.001 in the recording.
+    assert e.values["hinge.coulomb_friction"] == pytest.approx(0.08, rel=0.02)
 
 
 def test_what_is_seen_only_together_is_named(pendulum):
