@@ -91,7 +91,6 @@ class Reduced:
     own: list[tuple[Array, Array, Array]]  # of each piece: R_ss (2 nv, 2 nv), R_sz (2 nv, np), b_s (2 nv,)
     nodes: list[tuple[Array, Array]]  # of each segment: D (2 nv, 2 nv + np) and e (2 nv,): its start moves by D d + e
     residuals: list[Array]  # of each piece (n, 2 nv), gaps linearized, in units of the noise; NaN where unmeasured
-    gap: float  # in units of the noise
 
 
 class Fit:
@@ -126,18 +125,28 @@ class Fit:
         piece = self.segments.pieces[p]
         return np.where(np.isfinite(self.noise), self.chart.minus(piece.ys, piece.ys), np.nan)
 
-    def residuals_of(self, z: Array, xs: Array, starts: Array) -> tuple[list[Array], Array]:
-        """Of each segment (samples, 2 nv) in units of the noise; and the gaps (K, 2 nv), 0 where a piece ends."""
-        s, found = self.segments, []
-        shift = self._shift(self.unknowns.values(z))
+    def at(self, z: Array, starts: Array) -> "Point | None":
+        """The motion there; None where there is none."""
+        values, s = self.unknowns.values(z), self.segments
+        if not self.law.is_possible(values):
+            return None
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                xs = self.law.run(values, starts, s.hs, s.us)
+        except (SimulationError, np.linalg.LinAlgError):
+            return None
+        if not np.all(np.isfinite(xs)):
+            return None
+        residuals, shift = [], self._shift(values)
         for k, piece in enumerate(s.pieces[p] for p in s.of_piece):
             e = self.chart.minus(piece.ys[s.samples[k]], xs[k, s.at[k]]) - shift
-            found.append(e / self.noise)
+            residuals.append(e / self.noise)
         gaps = np.zeros((len(s.first), self.chart.size))
         inner = np.flatnonzero(s.of_piece[:-1] == s.of_piece[1:])
         if len(inner):
             gaps[inner] = self.chart.minus(xs[inner, s.counts[inner]], starts[inner + 1])
-        return found, gaps
+        value = sum(float(np.nansum(r**2)) for r in residuals) + self._pull(z)
+        return Point(z, starts, xs, residuals, gaps, value, float(np.linalg.norm(gaps / self.gap_scale)))
 
     def _shift(self, values: Array) -> Array:
         shift = np.zeros(self.chart.size)
@@ -157,30 +166,13 @@ class Fit:
                 found.append((s.start, entry))
         return found
 
-    def objective(self, z: Array, starts: Array) -> tuple[float, float]:
-        """(|r|^2 with the pull to the file's values, the size of the gaps); infinite where there is no such motion."""
-        values = self.unknowns.values(z)
-        if not self.law.is_possible(values):
-            return np.inf, np.inf
-        try:
-            with np.errstate(over="ignore", invalid="ignore"):
-                xs = self.law.run(values, starts, self.segments.hs, self.segments.us)
-        except (SimulationError, np.linalg.LinAlgError):
-            return np.inf, np.inf
-        residuals, gaps = self.residuals_of(z, xs, starts)
-        total = sum(float(np.nansum(r**2)) for r in residuals)
-        if not np.all(np.isfinite(xs)):
-            return np.inf, np.inf
-        return total + self._pull(z), float(np.linalg.norm(gaps / self.gap_scale))
-
     def _pull(self, z: Array) -> float:
         return float(np.sum(((z - self.unknowns.z_start) / self.unknowns.widths) ** 2))
 
-    def reduce(self, z: Array, starts: Array) -> Reduced:
+    def reduce(self, point: "Point") -> Reduced:
         """Linearize, close the gaps to first order, and take the first states out."""
+        z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
         s, nt, nz = self.segments, self.chart.size, len(z)
-        xs = self.law.run(self.unknowns.values(z), starts, s.hs, s.us)
-        residuals, gaps = self.residuals_of(z, xs, starts)
         A, C = self.law.slopes(z, xs, s.hs, s.us)
         K, M, nx = A.shape[:3]
         along = np.zeros((K, M + 1, nx, nt + nz))
@@ -217,9 +209,8 @@ class Fit:
             rows_z.append(R[nt : nt + nz, nt:])
             rest += float(R[nt + nz, -1] ** 2)
         R = _triangle(np.vstack(rows_z))
-        gap = float(np.linalg.norm(gaps / self.gap_scale))
         rest += float(R[nz, -1] ** 2)
-        return Reduced(R[:nz, :nz], R[:nz, -1], rest, own, nodes, by_piece, gap)
+        return Reduced(R[:nz, :nz], R[:nz, -1], rest, own, nodes, by_piece)
 
     def step_of(self, z: Array, found: Reduced) -> Array:
         """dz (np,) of the linearized problem, within bounds and not far."""
@@ -253,34 +244,47 @@ class Fit:
         return after
 
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
-        """From z and the starts of the segments; at most so many steps."""
-        merit, converged, steps, why = 0.0, False, 0, "it took too many steps"
-        found = self.reduce(z, starts)
+        """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
+        merit, here = 0.0, self.at(z, starts)
+        if here is None:
+            raise SimulationError(
+                "the model has no motion from the states that were measured: its steps are not finite"
+            )
         for steps in range(most + 1):
-            dz = self.step_of(z, found)
-            now = sum(float(np.nansum(r**2)) for r in found.residuals) + self._pull(z)
-            then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(z + dz)
-            if now - then <= SETTLED * (1 + SETTLED * now) and found.gap <= CLOSED:
-                converged, why = True, ""
-                break
+            found = self.reduce(here)
+            dz = self.step_of(here.z, found)
+            now = sum(float(np.nansum(r**2)) for r in found.residuals) + self._pull(here.z)
+            then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(here.z + dz)
+            if now - then <= SETTLED * (1 + SETTLED * now) and here.gap <= CLOSED:
+                return Solved(here.z, here.starts, found, True, steps, "")
             if steps == most:
                 break
-            here, open_ = self.objective(z, starts)
-            if open_ > 0:
-                merit = max(merit, 2 * max(then - here, 0.0) / open_ + 1.0)
-            for halving in range(HALVINGS + 1):
-                part = 0.5**halving
-                ahead = self.moved(starts, found, dz, part)
-                value, gap = self.objective(z + part * dz, ahead)
-                expected = part * (here - then + merit * open_)
-                if value + merit * gap <= here + merit * open_ - 1e-4 * expected + 1e-9 * (1 + abs(here)):
+            if here.gap > 0:
+                merit = max(merit, 2 * max(then - here.value, 0.0) / here.gap + 1.0)
+            gain = here.value - then + merit * here.gap
+            for part in (0.5**k for k in range(HALVINGS + 1)):
+                ahead = self.at(here.z + part * dz, self.moved(here.starts, found, dz, part))
+                allowed = here.value + merit * here.gap - 1e-4 * part * gain + 1e-9 * (1 + abs(here.value))
+                if ahead is not None and ahead.value + merit * ahead.gap <= allowed:
                     break
             else:
                 why = "no part of a step made the motion nearer to what was measured"
-                break
-            z, starts = z + part * dz, ahead
-            found = self.reduce(z, starts)
-        return Solved(z, starts, found, converged, steps, why)
+                return Solved(here.z, here.starts, found, False, steps, why)
+            here = ahead
+        return Solved(here.z, here.starts, found, False, most, "it took too many steps")
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A motion of all segments from their starts."""
+
+    z: Array
+    starts: Array
+    xs: Array  # (K, M+1, nx)
+    residuals: list[Array]  # of each segment (samples, 2 nv) in units of the noise
+    gaps: Array  # (K, 2 nv), 0 where a piece ends
+    value: float  # |r|^2 with the pull to the file's values
+    gap: float  # the size of the gaps
 
 
 def _triangle(matrix: Array) -> Array:
@@ -305,7 +309,10 @@ class Solved:
 def growth_cuts(fit: Fit, z: Array, starts: Array) -> list[Piece]:
     """The pieces, cut where a small motion of their start has grown by GROWTH."""
     s, nt = fit.segments, fit.chart.size
-    found = fit.reduce(z, starts)
+    point = fit.at(z, starts)
+    if point is None:
+        return list(s.pieces)
+    found = fit.reduce(point)
     pieces: list[Piece] = []
     scale = fit.gap_scale
     for p, piece in enumerate(s.pieces):

@@ -5,6 +5,7 @@ those of the method's own steps. A step of length 0 changes nothing: with such s
 side by side.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,15 +44,15 @@ class ContinuousMotion:
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
-        numbers = set_numbers(self.model, self.tree, self.unknowns, values)
+        accelerate = self.tree.acceleration(set_numbers(self.model, self.tree, self.unknowns, values))
         xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
         xs[:, 0] = starts
         for m in range(hs.shape[1]):
             h, u = hs[:, m, None], us[:, m]
-            k1 = self._rates(numbers, xs[:, m], u)
-            k2 = self._rates(numbers, xs[:, m] + h / 2 * k1, u)
-            k3 = self._rates(numbers, xs[:, m] + h / 2 * k2, u)
-            k4 = self._rates(numbers, xs[:, m] + h * k3, u)
+            k1 = self._rates(accelerate, xs[:, m], u)
+            k2 = self._rates(accelerate, xs[:, m] + h / 2 * k1, u)
+            k3 = self._rates(accelerate, xs[:, m] + h / 2 * k2, u)
+            k4 = self._rates(accelerate, xs[:, m] + h * k3, u)
             xs[:, m + 1] = xs[:, m] + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         return xs
 
@@ -88,9 +89,9 @@ class ContinuousMotion:
             total += weight * change
         return np.asarray(start + h / 6 * total)
 
-    def _rates(self, numbers: Numbers, x: Array, u: Array) -> Array:
+    def _rates(self, accelerate: Callable[[Array, Array, Array], Array], x: Array, u: Array) -> Array:
         q, v = x[:, : self.model.nq], x[:, self.model.nq :]
-        a = self.tree.accelerate(numbers, q, v, u)
+        a = accelerate(q, v, u)
         if not self.chart.coordinates.free:
             return np.concatenate([v, a], axis=1)
         return np.concatenate([(self.chart.coordinates.rate(q) @ v[..., None])[..., 0], a], axis=1)

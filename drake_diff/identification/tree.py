@@ -11,16 +11,18 @@ A shift of a joint on its parent is the motion of a slide without mass that is p
 its column is that of a coordinate in the derivative of `mechanics.tree`, whose notation is used here.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_diff._base.arrays import Array, Indices, cross, skew
+from drake_diff._base.arrays import Array, Indices, cross, own_array, skew
+from drake_diff._base.compiled import kernel
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import ModelError
+from drake_diff.mechanics.compiled_tree import KERNEL, CompiledTree
 from drake_diff.mechanics.coordinates import rotation
 from drake_diff.mechanics.description import Link, RigidLink, read_links, springs_of, without_welds
 from drake_diff.mechanics.tree import Moving, TreeDynamics, tree_of
@@ -82,6 +84,7 @@ class Tree:
     actuation: Array  # (n, nu), of all joints
     limits: Array  # (nu,) what Drake cuts each input at
     placed: Mapping[str, tuple[int, Any]]  # by body: the link it belongs to, and the pose of the body in its frame
+    moved_by: Mapping[str, Array]  # (10, 10) by body: its ten numbers in the frame of its link
     bodies: Mapping[str, Link]
     numbers: Numbers  # the model's own
 
@@ -91,11 +94,70 @@ class Tree:
         return np.array([link.free for link in self.links], dtype=bool)
 
     def accelerate(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Array:
-        """a (N, n) at q (N, nq), v (N, n) under u (N, nu)."""
-        q, v = self._all(q, v)
-        moving, force, mass = self._moved(numbers, q, v, u)
-        bias = moving.forces(np.zeros_like(v))[0]
-        return np.asarray(np.linalg.solve(self._own(mass), self._along(force - bias)[..., None])[..., 0])
+        """a (N, nv) at q (N, nq), v (N, nv) under u (N, nu)."""
+        return self.acceleration(numbers)(q, v, u)
+
+    def acceleration(self, numbers: Numbers) -> Callable[[Array, Array, Array], Array]:
+        """`accelerate` with these numbers, for many calls: compiled where Numba is installed."""
+        compiled = self._compiled(numbers)
+
+        def of(q: Array, v: Array, u: Array) -> Array:
+            q, v = self._all(q, v)
+            if compiled is None:
+                moving, force, mass = self._moved(numbers, q, v, u)
+                bias = moving.forces(np.zeros_like(v))[0]
+            else:
+                moved, force = compiled(q, v, np.zeros_like(v)), self._force(numbers, q, v, u)
+                bias, mass = moved.tau, moved.mass + np.diag(numbers.reflected)
+            return np.asarray(np.linalg.solve(self._own(mass), self._along(force - bias)[..., None])[..., 0])
+
+        return of
+
+    def _compiled(self, numbers: Numbers) -> CompiledTree | None:
+        """Each link is its joint's frame with what it carries by welds; None where Numba is not installed."""
+        module = kernel(KERNEL)
+        if module is None:
+            return None
+        kinds = {"revolute": module.HINGE, "prismatic": module.SLIDE, "quaternion_floating": module.FREE}
+        parents, first, size, joint_of = [], [], [], []
+        for link in self.links:
+            before = joint_of[link.parent] if link.parent >= 0 else -1
+            for start in (3, 0) if link.free else (0,):
+                parents.append(before)
+                first.append(link.joint.v_start + start)
+                size.append(3 if link.free else 1)
+                before = len(parents) - 1
+            joint_of.append(before)
+        frames = np.array([link.on_parent.GetAsMatrix34() for link in self.links]).reshape(-1, 3, 4)
+        frames[:, :, 3] = numbers.offset
+        identity = np.broadcast_to(np.eye(3, 4), frames.shape)
+        mass = numbers.inertial[:, 0]
+        center = numbers.inertial[:, 1:4] / np.where(mass != 0, mass, 1.0)[:, None]
+        inertia = np.empty((len(mass), 3, 3))
+        for k, (i, j) in enumerate(_INERTIA):
+            inertia[:, i, j] = inertia[:, j, i] = numbers.inertial[:, 4 + k]
+        hat = skew(center)
+        inertia += mass[:, None, None] * (hat @ hat)  # about the centre of mass
+        tables = (
+            [link.parent for link in self.links],
+            [kinds[link.joint.kind] for link in self.links],
+            joint_of,
+            [link.joint.q_start for link in self.links],
+            [link.joint.v_start for link in self.links],
+            np.array([link.axis for link in self.links], dtype=float).reshape(-1, 3),
+            frames,
+            identity,
+            mass,
+            center,
+            inertia,
+            parents,
+            first,
+            size,
+            numbers.gravity,
+        )
+        whole = [own_array(np.array(t, dtype=np.int64) if isinstance(t, list) else t) for t in tables]
+        names = {link.joint.body: i for i, link in enumerate(self.links)}
+        return CompiledTree(tuple(whole), names, len(self.dynamics.mass))
 
     def slopes(self, numbers: Numbers, q: Array, v: Array, u: Array, by: Array) -> Slopes:
         """The same with derivatives; `by` (count, np) is how the numbers change with each parameter."""
@@ -139,11 +201,14 @@ class Tree:
     def _moved(self, numbers: Numbers, q: Array, v: Array, u: Array) -> tuple[Moving, Array, Array]:
         """The tree in motion, the force (N, n) that does not come from its links, and M (N, n, n)."""
         moving = self._with(numbers).moving(self.place(numbers, q), v)
+        return moving, self._force(numbers, q, v, u), moving.mass + np.diag(numbers.reflected)
+
+    def _force(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Array:
+        """(N, n) what does not come from links."""
         effort = np.clip(u, -self.limits, self.limits) * numbers.strength
         stretched = np.where(numbers.stiffness != 0, q[:, self.dynamics.positions] - numbers.rest, 0.0)
         force = effort @ self.actuation.T - numbers.stiffness * stretched - numbers.damping * v
-        force -= numbers.coulomb * np.tanh(v / SLIP_SPEED)
-        return moving, force, moving.mass + np.diag(numbers.reflected)
+        return np.asarray(force - numbers.coulomb * np.tanh(v / SLIP_SPEED))
 
     def _passes(self, u: Array) -> Array:
         """(N, nu) 1 where an input is within its limits, beyond which it changes nothing."""
@@ -281,7 +346,7 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         place, pose = placed[link.body]
         if place >= 0:
             own = ten_numbers(link.mass, link.center_of_mass, link.inertia[tuple(np.transpose(_INERTIA))])
-            inertial[place] += moved_by(pose) @ own
+            inertial[place] += _moved_by(pose) @ own
     numbers = Numbers(
         inertial=inertial,
         offset=np.array([link.on_parent.translation() for link in links]).reshape(-1, 3),
@@ -297,8 +362,9 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
     own = replace(dynamics, axis=axis, origin=np.zeros((n, 3)))
     first = np.array([link.joint.v_start for link in links], dtype=np.intp)
     bodies = {link.body: link for link in every}
+    moves = {body: _moved_by(pose) for body, (_, pose) in placed.items()}
     actuation = model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T).T
-    return Tree(links, own, first, np.asarray(actuation), np.asarray(limits), placed, bodies, numbers)
+    return Tree(links, own, first, np.asarray(actuation), np.asarray(limits), placed, moves, bodies, numbers)
 
 
 def ten_numbers(mass: Any, center: Any, inertia: Any) -> Any:
@@ -308,7 +374,7 @@ def ten_numbers(mass: Any, center: Any, inertia: Any) -> Any:
     return np.array([mass, *(mass * c for c in center), *(i + mass * s for i, s in zip(inertia, about, strict=True))])
 
 
-def moved_by(pose: Any) -> Array:
+def _moved_by(pose: Any) -> Array:
     """(10, 10) the ten numbers of a body in a frame in which its own has this pose, by those in its own."""
     R, p = pose.rotation().matrix(), np.array(pose.translation())
     columns = []

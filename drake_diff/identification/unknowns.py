@@ -16,7 +16,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.identification.tree import Numbers, Tree, moved_by, ten_numbers
+from drake_diff.identification.tree import Numbers, Tree, ten_numbers
 from drake_diff.mechanics.description import names_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import (
@@ -292,9 +292,8 @@ def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Nu
 
 def _set_bodies(tree: Tree, given: dict[str, Any], inertial: Any) -> None:
     for label in dict.fromkeys(n.rsplit(".", 1)[0] for n in given if n.rsplit(".", 1)[1] in (MASS, CENTER, INERTIA)):
-        place, pose = tree.placed[label]
         before = ten_numbers(*_central(tree, label, {}))
-        inertial[place] += moved_by(pose) @ (ten_numbers(*_central(tree, label, given)) - before)
+        inertial[tree.placed[label][0]] += tree.moved_by[label] @ (ten_numbers(*_central(tree, label, given)) - before)
 
 
 def _set_rotors(model: Model, by_joint: dict[str, Any], given: dict[str, Any], reflected: Any) -> None:
