@@ -1,7 +1,7 @@
 """The motion of a tree in continuous time over many segments at once, and its derivatives.
 
-Fixed steps of the classical method of Runge and Kutta, of order 4, over which inputs are held; the derivatives are
-those of the method's own steps. A step of length 0 changes nothing: with such steps segments of different length stand
+Fixed steps of order 8 by the method of Dormand and Prince (Hairer, Norsett and Wanner, "Solving Ordinary Differential
+Equations I", 1993, II.5), over which inputs are held; the derivatives are those of the method's own steps. A step of length 0 changes nothing: with such steps segments of different length stand
 side by side.
 """
 
@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import DOP853
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.chart import Chart
@@ -16,7 +17,8 @@ from drake_diff.identification.tree import Numbers, Tree
 from drake_diff.identification.unknowns import Unknowns, by_complex_step, set_numbers
 from drake_diff.model.model import Model
 
-CHUNK = 512  # steps that are differentiated in one call
+CHUNK = 128  # steps that are differentiated in one call
+STAGES, WEIGHTS = [np.array(row[:i]) for i, row in enumerate(DOP853.A)], np.array(DOP853.B)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +33,7 @@ class ContinuousMotion:
 
     @property
     def words(self) -> str:
-        return f"continuous time, by Runge-Kutta steps of at most {1e3 * self.longest:.3g} ms"
+        return f"continuous time, by steps of order 8 of at most {1e3 * self.longest:.3g} ms"
 
     def cut(self, period: float) -> tuple[float, ...]:
         """Lengths of the steps [s] over a time between samples [s]."""
@@ -48,12 +50,11 @@ class ContinuousMotion:
         xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
         xs[:, 0] = starts
         for m in range(hs.shape[1]):
-            h, u = hs[:, m, None], us[:, m]
-            k1 = self._rates(accelerate, xs[:, m], u)
-            k2 = self._rates(accelerate, xs[:, m] + h / 2 * k1, u)
-            k3 = self._rates(accelerate, xs[:, m] + h / 2 * k2, u)
-            k4 = self._rates(accelerate, xs[:, m] + h * k3, u)
-            xs[:, m + 1] = xs[:, m] + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            h, u, x = hs[:, m, None], us[:, m], xs[:, m]
+            slopes = np.empty((len(WEIGHTS), *x.shape))
+            for i, weights in enumerate(STAGES):
+                slopes[i] = self._rates(accelerate, x + h * np.tensordot(weights, slopes[:i], 1), u)
+            xs[:, m + 1] = x + h * np.tensordot(WEIGHTS, slopes, 1)
         return xs
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
@@ -78,16 +79,14 @@ class ContinuousMotion:
         nx, h = x.shape[1], h[:, None, None]
         start = np.zeros((*x.shape, nx + by.shape[1]))
         start[:, :, :nx] = np.eye(nx)
-        total, change = np.zeros_like(start), start
-        at, slope = x, np.zeros_like(x)
-        for weight, ahead in ((1, 0.0), (2, 0.5), (2, 0.5), (1, 1.0)):
-            at = x + ahead * h[..., 0] * slope
-            moved = start + ahead * h * change if ahead else start
-            slope, by_x, by_z = self._rate_slopes(numbers, by, at, u)
-            change = by_x @ moved
-            change[:, :, nx:] += by_z
-            total += weight * change
-        return np.asarray(start + h / 6 * total)
+        rates, changes = np.empty((len(WEIGHTS), *x.shape)), np.empty((len(WEIGHTS), *start.shape))
+        for i, weights in enumerate(STAGES):
+            at = x + h[..., 0] * np.tensordot(weights, rates[:i], 1)
+            moved = start + h * np.tensordot(weights, changes[:i], 1)
+            rates[i], by_x, by_z = self._rate_slopes(numbers, by, at, u)
+            np.matmul(by_x, moved, out=changes[i])
+            changes[i, :, :, nx:] += by_z
+        return np.asarray(start + h * np.tensordot(WEIGHTS, changes, 1))
 
     def _rates(self, accelerate: Callable[[Array, Array, Array], Array], x: Array, u: Array) -> Array:
         q, v = x[:, : self.model.nq], x[:, self.model.nq :]

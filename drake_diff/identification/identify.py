@@ -40,8 +40,8 @@ from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 
-LONGEST, SHORTEST = 0.01, 1e-4  # [s] of the steps of Runge and Kutta
-STEP_ERROR = 1e-2  # of the noise: what a step of half the length may change over a segment
+LONGEST, SHORTEST = 0.02, 1e-4  # [s] of the steps of Runge and Kutta
+STEP_ERROR = 1e-3  # of the noise: what a step of half the length may change over a segment
 ROUNDS = 5  # of estimating the noise
 SAME_NOISE = 0.01
 
