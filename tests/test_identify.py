@@ -196,6 +196,39 @@ def test_steps_have_the_slopes_of_differences_by_unknowns(load):
         np.testing.assert_allclose(by_z[0, 0, :, j], (ends[0] - ends[1]) / 2e-6, atol=1e-8, err_msg=names[0])
 
 
+def test_the_models_own_steps_are_fitted_where_they_are_asked_for_and_are_only_as_good_as_they_are_short(load):
+    """Euler's steps of 10 ms put their error into the damping: the interval misses, and the residuals say so."""
+    log = swing(damping=0.15)
+    long = dd.identify(load("pendulum.urdf", time_step=0.01), log, ["hinge.damping"], motion="steps")
+    assert not long.explained
+    assert long.intervals["hinge.damping"][0] > 0.15
+    short = dd.identify(load("pendulum.urdf", time_step=0.001), log, ["hinge.damping"], motion="steps")
+    assert short.explained, short.reason
+    low, high = short.intervals["hinge.damping"]
+    assert low < 0.15 < high
+    assert short.motion == "the model's own steps of 1 ms"
+
+
+def test_steps_fit_between_samples(load):
+    """100 Hz and steps of 3 ms: three of 10/3 ms lie between samples."""
+    e = dd.identify(load("pendulum.urdf", time_step=0.003), swing(damping=0.15), ["hinge.damping"], motion="steps")
+    assert e.motion == "the model's own steps of 3.333 ms"
+
+
+@pytest.mark.slow
+def test_a_model_with_controllers_is_fitted_by_its_own_steps():
+    model = example_robot("finger_edu.urdf", time_step=0.002, gains=(2.0, 0.1))
+    x0 = state_in_range(model, np.random.default_rng(0))
+    motion = dd.rollout(model, x0, np.zeros((75, model.nu)))
+    xs = motion.xs[::5] + 1e-4 * np.random.default_rng(1).standard_normal((16, model.nx))
+    log = dd.Recording("lab", "1", 0.01 * np.arange(16), xs, np.zeros((15, model.nu)))
+    damping = next(p.name for p in dd.list_parameters(model) if p.name.endswith(".kd"))
+    e = dd.identify(model, log, [damping], held_out=0)
+    assert e.motion == "the model's own steps of 2 ms, as actuators have PD controllers in the plant"
+    low, high = e.intervals[damping]
+    assert low < 0.1 < high, e
+
+
 def test_a_file_may_lack_columns_and_cells(pendulum, tmp_path):
     log = swing(damping=0.15)
     rows = [f"{t},{x[0]},0" for t, x in zip(log.times, log.xs, strict=True)]
@@ -228,5 +261,8 @@ def test_what_makes_no_sense_is_refused(pendulum, load):
     assert "later than the one before" in refused(pendulum, late, ["pole.mass"])
     nothing = dd.Recording("lab", "1", log.times, np.full_like(log.xs, np.nan), log.us)
     assert "no position" in refused(pendulum, nothing, ["pole.mass"])
+    assert "motion" in refused(pendulum, log, ["pole.mass"], motion="discrete")
+    uneven = dd.Recording("lab", "1", log.times**1.1, log.xs, log.us)
+    assert "the same" in refused(pendulum, uneven, ["pole.mass"], motion="steps")
     short = dd.Recording("lab", "1", log.times[:4], log.xs[:4], log.us[:3])
     assert "8 or more" in refused(pendulum, short, ["pole.mass"])

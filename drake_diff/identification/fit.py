@@ -14,6 +14,7 @@ data say nothing: it is one standard deviation where a quantity is three times i
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,19 +23,51 @@ from scipy.optimize import lsq_linear
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.measured import LEAST, Piece
 from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
 
-SEGMENT = 0.15  # [s] the length of a segment, or
-SEGMENT_SAMPLES = 5  # so many samples, whichever is longer
+SEGMENT_SAMPLES = 5  # of a segment at least
 GROWTH = 1e6  # of a small motion within a piece, beyond which its end says nothing of its start: it is cut in two
 LARGEST = 1.0  # the largest change of an unknown in one step, in widths / FAR
 SETTLED = 1e-5  # of |r|^2, in units of the noise: what a last step may still gain
 CLOSED = 1e-3  # of the noise: how far gaps may stand open at the end
 HALVINGS = 8
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
+
+
+class Law(Protocol):
+    """How a model moves, many segments at once."""
+
+    @property
+    def words(self) -> str:
+        """Which motion this is."""
+        ...
+
+    @property
+    def segment(self) -> float:
+        """[s] how long a segment is."""
+        ...
+
+    def cut(self, period: float) -> tuple[float, ...]:
+        """Lengths of the steps [s] over a time between samples [s]."""
+        ...
+
+    def shorter(self) -> "Law | None":
+        """The same by steps of half the length; None where the steps are the model's own."""
+        ...
+
+    def is_possible(self, values: Array) -> bool:
+        """Whether there are bodies with these values."""
+        ...
+
+    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
+        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
+        ...
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
+        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        ...
 
 
 @dataclass(eq=False)
@@ -51,7 +84,7 @@ class Segments:
     at: list[NDArray[np.intp]]  # and after how many steps they are
 
 
-def cut_segments(law: ContinuousMotion, pieces: Sequence[Piece], nu: int) -> Segments:
+def cut_segments(law: Law, pieces: Sequence[Piece], nu: int) -> Segments:
     """The last sample of a piece belongs to its last segment, any other to the segment that it starts or is within."""
     of_piece, first, hs, us, samples, at = [], [], [], [], [], []
     for p, piece in enumerate(pieces):
@@ -59,7 +92,7 @@ def cut_segments(law: ContinuousMotion, pieces: Sequence[Piece], nu: int) -> Seg
         bounds = [0]
         while bounds[-1] < n - 1:
             k = bounds[-1]
-            late = int(np.searchsorted(piece.times, piece.times[k] + SEGMENT * (1 - 1e-9)))
+            late = int(np.searchsorted(piece.times, piece.times[k] + law.segment * (1 - 1e-9)))
             bounds.append(min(max(late, k + SEGMENT_SAMPLES), n - 1))
         if len(bounds) > 2 and bounds[-1] - bounds[-2] < SEGMENT_SAMPLES:
             bounds.pop(-2)
@@ -99,7 +132,7 @@ class Fit:
     def __init__(
         self,
         model: Model,
-        law: ContinuousMotion,
+        law: Law,
         chart: Chart,
         unknowns: Unknowns,
         pieces: Sequence[Piece],
@@ -263,7 +296,9 @@ class Fit:
                 merit = max(merit, 2 * max(then - here.value, 0.0) / here.gap + 1.0)
             gain = here.value - then + merit * here.gap
             for part in (0.5**k for k in range(HALVINGS + 1)):
-                ahead = self.at(here.z + part * dz, self.moved(here.starts, found, dz, part))
+                ahead = self.at(
+                    np.clip(here.z + part * dz, *self.unknowns.bounds), self.moved(here.starts, found, dz, part)
+                )
                 allowed = here.value + merit * here.gap - 1e-4 * part * gain + 1e-9 * (1 + abs(here.value))
                 if ahead is not None and ahead.value + merit * ahead.gap <= allowed:
                     break

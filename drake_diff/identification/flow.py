@@ -1,12 +1,12 @@
 """The motion of a tree in continuous time over many segments at once, and its derivatives.
 
 Fixed steps of order 8 by the method of Dormand and Prince (Hairer, Norsett and Wanner, "Solving Ordinary Differential
-Equations I", 1993, II.5), over which inputs are held; the derivatives are those of the method's own steps. A step of length 0 changes nothing: with such steps segments of different length stand
-side by side.
+Equations I", 1993, II.5), over which inputs are held; the derivatives are those of the method's own steps. A step of
+length 0 changes nothing: with such steps segments of different length stand side by side.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.integrate import DOP853
@@ -30,6 +30,7 @@ class ContinuousMotion:
     chart: Chart
     unknowns: Unknowns
     longest: float  # [s] the longest step
+    segment: float = 0.15  # [s]
 
     @property
     def words(self) -> str:
@@ -39,6 +40,10 @@ class ContinuousMotion:
         """Lengths of the steps [s] over a time between samples [s]."""
         count = max(1, int(np.ceil(period / self.longest - 1e-9)))
         return (period / count,) * count
+
+    def shorter(self) -> "ContinuousMotion":
+        """By steps of half the length."""
+        return replace(self, longest=self.longest / 2)
 
     def is_possible(self, values: Array) -> bool:
         """Whether there are bodies with these values."""

@@ -1,7 +1,7 @@
 """Which parameters of a model are wrong, and by how much, from recordings of its motion."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,9 @@ from drake_diff._base.arrays import Array, frozen, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
-from drake_diff.exceptions import ModelError
+from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.fit import Fit, Solved, growth_cuts
+from drake_diff.identification.fit import Fit, Law, Solved, growth_cuts
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.judge import (
     FALSE_ALARM,
@@ -34,12 +34,15 @@ from drake_diff.identification.measured import (
     noise_by_differences,
     read_pieces,
 )
+from drake_diff.identification.steps import discrete_motion
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
+from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
+MOTIONS = ("auto", "continuous", "steps")
 LONGEST, SHORTEST = 0.02, 1e-4  # [s] of the steps of Runge and Kutta
 STEP_ERROR = 1e-3  # of the noise: what a step of half the length may change over a segment
 ROUNDS = 5  # of estimating the noise
@@ -81,6 +84,7 @@ def identify(
     *,
     noise: Mapping[str, float] | None = None,
     held_out: float | str = 0.2,
+    motion: str = "auto",
     max_iterations: int = 60,
 ) -> Identification:
     """Estimate parameters of a model from recordings of its motion, with intervals.
@@ -94,6 +98,11 @@ def identify(
             STATE.bias; or "all": masses, centres of mass, inertias, dampings, spring stiffnesses and rotor inertias.
         noise: The standard deviation of the noise of states, by name. What is not given is estimated.
         held_out: Which part of each recording, its end, is not fitted but predicted; or the name of a recording.
+        motion: Which motion is fitted:
+
+            - "continuous": the model's equations of motion in continuous time, without contact, limits and controllers;
+            - "steps": the model's own discrete steps with all that acts in them, contact parameters included;
+            - "auto": continuous, but steps where bodies touch, a joint is beyond its limit, or the model has no other.
         max_iterations: How many steps of Gauss and Newton the fit may take.
 
     Returns:
@@ -116,16 +125,43 @@ def identify(
         0.2
     """
     positive_int("max_iterations", max_iterations)
+    if motion not in MOTIONS:
+        raise UnknownNameError("motion", got=motion, known=MOTIONS)
+    chart, pieces = Chart(coordinates_of(model)), read_pieces(model, recordings, held_out)
     tree = tree_for_identification(model)
-    if isinstance(tree, Refusal):
-        raise ModelError(f"{model.name}: {tree}: its motion cannot be fitted in continuous time")
-    chart, unknowns = Chart(coordinates_of(model)), choose_unknowns(model, tree, parameters)
-    pieces = read_pieces(model, recordings, held_out)
+    why = str(tree) if isinstance(tree, Refusal) else _what_acts(model, chart, pieces)
+    if motion == "continuous" and isinstance(tree, Refusal):
+        raise ModelError(f"{model.name} has no motion in continuous time here: {why}")
+    continuous = motion == "continuous" or (motion == "auto" and not why)
+    own_tree = tree if continuous and not isinstance(tree, Refusal) else None
+    unknowns = choose_unknowns(model, own_tree, parameters)
     stated = given_noise(model, chart, noise)
     scatter = noise_by_differences(chart, pieces)
     problem = _Problem(model, chart, unknowns, pieces, stated, scatter)
-    fit, solved = problem.solve(ContinuousMotion(model, tree, chart, unknowns, LONGEST), max_iterations)
-    return problem.judged(fit, solved)
+    law: Law = (
+        discrete_motion(model, unknowns, pieces)
+        if own_tree is None
+        else ContinuousMotion(model, own_tree, chart, unknowns, LONGEST)
+    )
+    fit, solved = problem.solve(law, max_iterations)
+    return problem.judged(fit, solved, why if motion == "auto" else "")
+
+
+def _what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
+    """What acts in the recordings that motion in continuous time leaves out; empty where nothing does."""
+    lower, upper = model.position_limits
+    for piece in pieces:
+        q = piece.ys[:, : model.nq]
+        with np.errstate(invalid="ignore"):
+            beyond = np.any((q < lower) | (q > upper), axis=0)
+        if np.any(beyond):
+            return f"{model.position_names[int(np.argmax(beyond))]} is beyond its limit"
+        if model.contract.contact.collision_pairs:
+            for x in guess_states(model, chart, piece, np.arange(len(piece.times))):
+                set_state(model.double, x)
+                if model.double.overlaps():
+                    return "bodies touch"
+    return ""
 
 
 @dataclass(eq=False)
@@ -137,7 +173,7 @@ class _Problem:
     stated: Array  # (2 nv,) the noise as it was given, NaN where it was not
     scatter: Array  # (2 nv,) that of neighbouring samples
 
-    def fit(self, law: ContinuousMotion, pieces: Sequence[Piece], noise: Array, *, fixed: bool = False) -> Fit:
+    def fit(self, law: Law, pieces: Sequence[Piece], noise: Array, *, fixed: bool = False) -> Fit:
         return Fit(self.model, law, self.chart, self.unknowns, pieces, noise, fixed=fixed)
 
     def guess(self, fit: Fit) -> Array:
@@ -153,7 +189,7 @@ class _Problem:
     def fitted(self) -> list[Piece]:
         return [piece for piece in self.pieces if not piece.held_out]
 
-    def solve(self, law: ContinuousMotion, most: int) -> tuple[Fit, Solved]:
+    def solve(self, law: Law, most: int) -> tuple[Fit, Solved]:
         """With steps so short that half of them give the same motion over the segments, at the start and at the end."""
         z, noise = self.unknowns.z_start, self.first_noise
         fit = self.fit(law, self.fitted, noise)
@@ -171,23 +207,24 @@ class _Problem:
             fit = self._shorter(fit, pieces, fit.noise)
 
     def _follows(self, fit: Fit, z: Array, starts: Array) -> bool:
-        """Whether steps of half the length lead to the same ends of all segments."""
+        """Whether steps of half the length lead to the same ends of all segments; the model's own steps need not."""
+        shorter = fit.law.shorter()
+        if shorter is None:
+            return True
         ends = []
-        for longest in (fit.law.longest, fit.law.longest / 2):
-            other = self.fit(replace(fit.law, longest=longest), fit.segments.pieces, fit.noise)
+        for law in (fit.law, shorter):
+            other = self.fit(law, fit.segments.pieces, fit.noise)
             with np.errstate(over="ignore", invalid="ignore"):
-                xs = other.law.run(self.unknowns.values(z), starts, other.segments.hs, other.segments.us)
+                xs = law.run(self.unknowns.values(z), starts, other.segments.hs, other.segments.us)
             ends.append(xs[np.arange(len(xs)), other.segments.counts])
         gap = self.chart.minus(*ends) / fit.gap_scale
         return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= STEP_ERROR)
 
     def _shorter(self, fit: Fit, pieces: Sequence[Piece], noise: Array) -> Fit:
-        longest = fit.law.longest / 2
-        if longest < SHORTEST:
-            raise ModelError(
-                f"{self.model.name}: its motion is too stiff: steps of {1e3 * fit.law.longest:.2g} ms do not follow it"
-            )
-        return self.fit(replace(fit.law, longest=longest), pieces, noise)
+        law = fit.law.shorter()
+        if law is None or np.max(fit.segments.hs) < SHORTEST:
+            raise ModelError(f"{self.model.name}: its motion is too stiff: {fit.law.words} does not follow it")
+        return self.fit(law, pieces, noise)
 
     def _weighted(self, fit: Fit, z: Array, starts: Array, most: int) -> tuple[Fit, Solved]:
         """Least squares, weighted anew until the residuals have the noise that they are weighted by."""
@@ -201,7 +238,7 @@ class _Problem:
             fit = self.fit(fit.law, fit.segments.pieces, found)
         return fit, fit.solve(z, starts, most)
 
-    def judged(self, fit: Fit, solved: Solved) -> Identification:
+    def judged(self, fit: Fit, solved: Solved, why_steps: str) -> Identification:
         unknowns, z = self.unknowns, solved.z
         count, taken = freedom_of(fit, solved)
         known = known_of(unknowns, z, solved.reduced.R)
@@ -240,7 +277,7 @@ class _Problem:
             count=count,
             converged=solved.converged,
             steps=solved.steps,
-            motion=fit.law.words,
+            motion=fit.law.words + (f", as {why_steps}" if why_steps else ""),
         )
         object.__setattr__(result, "sentence", _sentence(result, intervals, unknowns, values))
         return result

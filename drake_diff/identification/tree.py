@@ -119,7 +119,10 @@ class Tree:
         if module is None:
             return None
         kinds = {"revolute": module.HINGE, "prismatic": module.SLIDE, "quaternion_floating": module.FREE}
-        parents, first, size, joint_of = [], [], [], []
+        parents: list[int] = []
+        first: list[int] = []
+        size: list[int] = []
+        joint_of: list[int] = []
         for link in self.links:
             before = joint_of[link.parent] if link.parent >= 0 else -1
             for start in (3, 0) if link.free else (0,):

@@ -182,8 +182,8 @@ def choose_unknowns(model: Model, tree: Tree | None, names: Sequence[str] | str)
     Raises UnknownNameError, which lists those that exist, or InputError where one cannot be estimated.
     """
     known = {p.name: (p.unit, p.value, p.lower) for p in list_parameters(model)}
-    if tree is not None:
-        known |= _extra(model)
+    extra = _extra(model)
+    known |= {name: extra[name] for name in extra if tree is not None or name.endswith(f".{BIAS}")}
     if isinstance(names, str) and names == "all":
         names = [name for name in known if name.rsplit(".", 1)[1] in OF_ALL]
         names = [name for name in names if _why_not(model, tree, name, known[name][1]) is None]
@@ -223,7 +223,7 @@ def _why_not(model: Model, tree: Tree | None, name: str, value: Array) -> str | 
         return "the model's time step, of which a fit makes no sense"
     if tree is not None and quantity not in (*OF_TREE, BIAS):
         return 'a quantity of contact or control, of which motion in continuous time knows nothing; see motion="steps"'
-    if tree is not None and quantity in (MASS, CENTER, INERTIA) and not tree.bodies[label].mass > 0:
+    if quantity in (MASS, CENTER, INERTIA) and not labelled(bodies(model.plant))[label].default_mass() > 0:
         return "a body without mass"
     if quantity == INERTIA and room_of_inertia(value) <= 0:
         return "the inertia of a point or a rod"
