@@ -198,6 +198,7 @@ FIGURES = (
     "mpc_realtime.md",
     "derivatives.md",
     "speed.md",
+    "identification.md",
 )  # pages that a benchmark writes
 
 
