@@ -107,6 +107,7 @@ def test_what_is_seen_only_together_is_named(pendulum):
     e = dd.identify(pendulum, swing(), ["hinge.damping", "pole.mass"])
     assert e.unidentifiable == ("hinge.damping and pole.mass: only their quotient is seen",)
     assert e.intervals["pole.mass"][1] == np.inf
+    assert "2 cannot be known from these recordings (hinge.damping and pole.mass" in e.sentence
     assert e.values["hinge.damping"] / e.values["pole.mass"] == pytest.approx(0.1, rel=0.01)
 
 

@@ -347,7 +347,9 @@ def _sentence(e: Identification, intervals: Array, unknowns: Unknowns, values: A
     if kept and changed:
         told.append(f"{kept} {'stays' if kept == 1 else 'stay'} within the interval")
     if vague:
-        told.append(f"{vague} cannot be known from these recordings")
+        more = f", and {len(e.unidentifiable) - 1} more such" if len(e.unidentifiable) > 1 else ""
+        first = f" ({e.unidentifiable[0]}{more})" if e.unidentifiable else ""
+        told.append(f"{vague} cannot be known from these recordings{first}")
     verdict = "Explained" if e.explained else "Not explained"
     error = f"the error falls from {e.error_before:.3g} to {e.error_after:.3g} times the noise"
     return f"{verdict}: {'; '.join(told)}; {error}; {e.reason}."
