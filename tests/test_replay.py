@@ -11,7 +11,16 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.model.parameters import select
-from drake_diff.optimize.replay import FEEDBACK_TOLERANCE, STATE_TOLERANCE, Plan, broken_variants, held, replays, track
+from drake_diff.optimize.replay import (
+    FEEDBACK_TOLERANCE,
+    STATE_TOLERANCE,
+    Plan,
+    broken_variants,
+    held,
+    replays,
+    told_of_controls,
+    track,
+)
 from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -203,6 +212,22 @@ def test_a_plan_that_lives_from_one_law_of_contact_is_refused_in_the_other_in_fi
     assert len(refused) == 1
     assert refused[0].startswith(f"replayed {other[1]} it does not hold: open loop, z_x ends")
     assert found[-1].motion.xs[-1, 0] > 0.11  # 0.1 s to the ground, 0.03 s on its spring, and on the way up
+
+
+def test_where_the_other_law_fails_at_the_plans_own_step_the_message_says_so(write_urdf):
+    problem = block(write_urdf, final_cost=lambda x: x[0])
+    plan = plan_of(problem, np.zeros((COUNT, 1)))
+    own, other = f"in steps of {H:g} s", "with lagged contact"
+    known = by_name(replays(plan), own, "open loop")
+    finer, why = f"{other} in steps of {H / 8:g} s", "the foot is thrown up"
+    rows = ((own, ()), (other, (why,)), (finer, ()))
+    found = [dataclasses.replace(known, variant=name, failures=failures) for name, failures in rows]
+    assert list(broken_variants(plan, found)) == []
+    assert (
+        told_of_controls(plan, found)
+        == f"on the plant open loop; open loop {other}, where steps are longer, not: {why}"
+    )
+    assert next(broken_variants(plan, found[:2])).startswith(f"replayed {other} it does not hold: open loop, {why}")
 
 
 def test_a_replay_prints_what_failed_and_not_its_arrays(write_urdf):
