@@ -196,6 +196,23 @@ def test_two_fingers_hold_the_box_up_by_its_sides():
 
 
 @pytest.mark.slow
+def test_the_ball_flies_out_of_the_cup_into_its_target():
+    """After the cup it touches nothing and flies a parabola, in Drake's steps z = z_0 + v t - g t (t + h) / 2."""
+    module = example("throw_into_target")
+    solution = dd.solve(module.problem(), **module.solve_options)
+    assert solution.success, solution.message
+    xs, h = solution.replay.xs, module.TIME_STEP
+    assert np.linalg.norm(xs[-1][3:5] - module.TARGET) < 0.05 * np.sqrt(2)  # 5 cm in x and in z
+    flies = 1 + max(k for k, contacts in enumerate(solution.replay.contacts) if contacts)
+    assert 0 < flies < len(xs) - 40
+    t = h * np.arange(len(xs) - flies)
+    place, velocity = xs[flies][3:5], xs[flies][9:11]
+    parabola = place + np.outer(t, velocity) - np.outer(t * (t + h) / 2, [0, module.GRAVITY])
+    assert np.allclose(xs[flies:, 3:5], parabola, atol=1e-9)
+    assert np.linalg.norm(place - module.TARGET) > 0.5  # beyond the arm's reach from where it lets go
+
+
+@pytest.mark.slow
 @each_row("name, way", [("quadruped_jump", 0.06), ("quadruped_trot", 0.12)])
 def test_the_quadruped_goes_as_its_schedule_says(name, way):
     """Where a foot is said to stand it is on the ground, where not over it, by Drake's own kinematics."""

@@ -26,7 +26,7 @@ from pydrake.solvers import Solve
 
 import drake_diff as dd
 
-ARM = Path(__file__).parent / "arm_cup.sdf"
+ARM = Path(dd.__file__).parent / "models" / "arm_cup.sdf"
 LINK, REACH, GRAVITY = 0.35, 0.67, 9.81  # [m] of both links; of what a guess asks the arm; [m/s^2]
 SEAT = 0.04 + 0.035 * np.sqrt(2) - 0.1 * GRAVITY / 500  # [m] from the wrist up to the middle of a ball at rest in it
 OPTIONS = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 150, "tolerance": 1e-2}
