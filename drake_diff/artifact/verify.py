@@ -27,6 +27,7 @@ from drake_diff.artifact.trace import CONFIGURATION, Trace, read_trace
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, MissingDependencyError, ModelError
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.certification import CertificationRecord, certify_model
+from drake_diff.record.comparison import ComparisonRecord
 from drake_diff.record.parts import FileEvidence
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.provenance import provenance_of
@@ -211,7 +212,11 @@ def _run_again(found: Verification, record: SealedRecord) -> Verification:
     except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
         # what a forger put together need not fit in any way
         return _judged(found, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
-    return replace(found, unchecked=(f"every number: {NOT_RERUN[record.kind]}",))
+    told = [f"every number: {NOT_RERUN[record.kind]}"]
+    for e in record.engines if isinstance(record, ComparisonRecord) else ():
+        if e.function is not None:
+            told.append(f"{e.engine}: a user's function ({e.function.name}), whose code the record does not hold")
+    return replace(found, unchecked=tuple(told))
 
 
 def _without_its_functions(found: Verification, record: SealedRecord, error: Exception) -> Verification:

@@ -15,9 +15,10 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.comparison.recordings import Recording
-from drake_diff.engines.contract_line import SAME_NUMBER, ContractLine
+from drake_diff.engines.contract_line import NOT_TOLD, SAME_NUMBER, ContractLine
 from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
+from drake_diff.engines.equations import ClosedForm
 from drake_diff.engines.interface import Engine, EngineContract, Precision
 from drake_diff.exceptions import InputError, NotOfferedError
 from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration, exponential_turn
@@ -85,7 +86,7 @@ def attribute(
     masses, no_mass = _offered((one, two), "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
     biases, no_bias = _offered((one, two), "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
     a, b = (
-        Terms(M, bias, *forces(engine.contract, u), engine.contract.time_step)
+        Terms(M, *_forces_of(engine, M, bias, x, u), engine.contract.time_step)
         for M, bias, engine in zip(masses, biases, (one, two), strict=True)
     )
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
@@ -146,6 +147,11 @@ def _offered(
     known = next((value for value in found if value is not None), otherwise)
     missing = [f"{name} of {e.name}" for e, value in zip(engines, found, strict=True) if value is None]
     return [known if value is None else value for value in found], missing
+
+
+def _forces_of(engine: Engine, M: Array, bias: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    """Bias, B u and the joints' damping, (nv,) each; of a closed form what `M` makes of its accelerations."""
+    return engine.terms(M, x, u) if isinstance(engine, ClosedForm) else (bias, *forces(engine.contract, u))
 
 
 def forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
@@ -215,7 +221,6 @@ def _size(difference: Array) -> float:
     return float(np.abs(difference).max(initial=0.0))
 
 
-NOT_TOLD = "the recording does not say"
 CLOSES = 0.01  # of the gap may be left by a change that explains it
 PRECISIONS: dict[str, Precision] = {"float64": "float64", "float32": "float32"}
 

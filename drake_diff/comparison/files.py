@@ -114,6 +114,9 @@ def _engine(e: Compared) -> records.EngineEvidence:
             )
             for j, gap, law in zip(e.jacobians, e.jacobian_gaps, e.laws, strict=True)
         ],
+        function=None if e.function is None else records.FunctionEvidence(
+            name=e.function.name, sha256=e.function.sha256, parameters=dict(e.function.parameters)
+        ),
         rollout_jacobian=None if e.rollout_jacobian is None else _rows(e.rollout_jacobian),
     )  # fmt: skip
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import preformatted
-from drake_diff.comparison.attribution import NOT_TOLD, Attribution
-from drake_diff.engines.contract_line import LAWS, ContractLine, is_another_model
+from drake_diff.comparison.attribution import Attribution
+from drake_diff.engines.contract_line import LAWS, UNKNOWN, ContractLine, is_another_model
+from drake_diff.engines.equations import UserFunction
 from drake_diff.engines.interface import Precision
 from drake_diff.engines.motion import AGREES, BROKE_OFF, EngineMotion, JacobianAt
 from drake_diff.model.model import Model
@@ -29,9 +30,19 @@ OF_CONTACT = (
 # By term of a step: the lines of a contract that can explain it.
 TELLS: Mapping[str, tuple[str, ...]] = {
     "inertia": ("mass", "center of mass", "inertia", "frames", "armature", "joint types", "joint order and names"),
-    "bias": ("gravity", "springs", "mass", "center of mass", "inertia", "frames", "joint order and names"),
-    "actuation": ("actuator mapping", "effort limits"),
-    "damping": ("damping", "integrator"),
+    "bias": (
+        "forces at rest",
+        "velocity products",
+        "gravity",
+        "springs",
+        "mass",
+        "center of mass",
+        "inertia",
+        "frames",
+        "joint order and names",
+    ),
+    "actuation": ("actuator mapping", "effort limits", "forces of the inputs"),
+    "damping": ("damping", "damping forces", "integrator"),
     "time step": ("time step",),
     "integrator": ("integrator",),
     "contact law": ("contact law", *OF_CONTACT, "solver tolerance"),
@@ -76,6 +87,7 @@ class Compared:
     rollout_gap: float | None = None  # relative to the reference's largest entry; None where one of the two broke off
     seconds_per_step: float | None = None
     seconds_per_jacobian: float | None = None
+    function: UserFunction | None = None  # what is known of a user's own equations
 
     @property
     def different(self) -> tuple[ContractLine, ...]:
@@ -104,7 +116,7 @@ class Compared:
 
     def tells(self, term: str) -> tuple[ContractLine, ...]:
         """The lines that are different and explain a term."""
-        known = [line for line in self.different if line.reason != NOT_TOLD]
+        known = [line for line in self.different if line.reason not in UNKNOWN]
         return tuple(line for line in known if line.quantity in TELLS.get(term, ()))
 
     @property
@@ -145,7 +157,7 @@ class Compared:
         """What it is beside Drake, and why."""
         within = f"{len(self.step_gaps)} steps within {_largest(self.step_gaps)} of Drake's"
         if self.verdict == "same":
-            unused = [line.quantity for line in self.different if line.reason != NOT_TOLD]
+            unused = [line.quantity for line in self.different if line.reason not in UNKNOWN]
             but = f"; its contract also differs in {_list(unused)}, which played no part here" if unused else ""
             jacobians = f", Jacobians within {_largest(self.jacobian_gaps)} of their largest entry"
             return f"the same simulation: each of {within}{jacobians if self.jacobians else ''}{but}"
@@ -269,7 +281,7 @@ class Comparison:
 
 def _breaks(line: ContractLine, touched: bool) -> bool:
     """Whether a line that is different makes another model, where contact is at work or not."""
-    return line.reason != NOT_TOLD and is_another_model(line, touched)
+    return line.reason not in UNKNOWN and is_another_model(line, touched)
 
 
 def first_above(gaps: Array, precision: Precision) -> int | None:

@@ -18,10 +18,11 @@ from drake_diff.engines.contact_match import contact_lines
 from drake_diff.engines.contract_line import MUST_HAVE, Match
 from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
+from drake_diff.engines.equations import ClosedForm
 from drake_diff.engines.interface import Engine
 from drake_diff.engines.load import ELSEWHERE, ENGINES, load_spec
 from drake_diff.engines.motion import EngineMotion, JacobianAt, jacobian_at, measured, move, rollout_jacobian, seconds
-from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
+from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.sampling import sample_states
@@ -48,9 +49,9 @@ def compare(
 
     Args:
         model: the model; Drake with its settings is the reference.
-        engines: names for `load_engine`, "drake:similar" or "drake:lagged:implicit" for Drake with other settings, or
-            `Engine` objects. Without it: every engine there is that has all of the model's contacts, and Drake's other
-            contact approximations where something can touch.
+        engines: names for `load_engine`, "drake:similar" or "drake:lagged:implicit" for Drake with other settings,
+            `Engine` objects, or your own equations as an `engines.ClosedForm`. Without it: every engine there is that
+            has all of the model's contacts, and Drake's other contact approximations where something can touch.
         recordings: motions recorded elsewhere, from `read_recording`. Each recorded step is compared with as many
             steps of Drake as lie between its samples; a recording has no Jacobians.
         x0: start (nx,); without it the first recording's, or else a random state that touches nothing.
@@ -90,7 +91,7 @@ def compare(
     refused: list[Refused] = []
     for wanted in default_engines(model) if engines is None else engines:
         try:
-            engine = load_spec(wanted, model) if isinstance(wanted, str) else wanted
+            engine = load_spec(wanted, model) if isinstance(wanted, str) else _of(wanted, reference)
             if engines is None:
                 _check_contact(reference, engine)
             loaded.append(engine)
@@ -112,6 +113,17 @@ def default_engines(model: Model) -> tuple[str, ...]:
     own = model.contract.contact
     others = [a for a in ("sap", "similar", "lagged") if own.collision_pairs and a != own.approximation]
     return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
+
+
+def _of(engine: Engine, reference: DrakeEngine) -> Engine:
+    """InputError for a closed form of other coordinates than the reference's."""
+    if isinstance(engine, ClosedForm):
+        ours, theirs = reference.contract, engine.contract
+        for what in ("joints", "inputs"):
+            a, b = ([getattr(x, "name", x) for x in getattr(contract, what)] for contract in (ours, theirs))
+            if a != b:
+                raise InputError(f"{engine.name}: {what}", got=", ".join(b), expected=f"this model's, {', '.join(a)}")
+    return engine
 
 
 def _check_contact(reference: Engine, engine: Engine) -> None:
@@ -163,6 +175,7 @@ class _Panel:
             jacobian_gaps=frozen([_gap(a.jacobian, b.jacobian) for a, b in both]), rollout_jacobian=has,
             rollout_gap=rollout_gap, seconds_per_step=seconds(lambda: engine.step(self.x0, self.us[0])),
             seconds_per_jacobian=seconds(lambda: engine.differentiate_step(self.x0, self.us[0])),
+            function=engine.function if isinstance(engine, ClosedForm) else None,
         )  # fmt: skip
 
     def recorded(self, recording: Recording) -> Compared:

@@ -26,7 +26,7 @@ Limits = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class ClosedForm(ABC):
+class HandForm(ABC):
     """Joints of one degree of freedom, unless said otherwise; q (nv,), v (nv,), u (nu,)."""
 
     gravity: float = 9.81  # [m/s^2], downwards
@@ -106,7 +106,7 @@ class ClosedForm(ABC):
 
 
 @dataclass(frozen=True)
-class Slider(ClosedForm):
+class Slider(HandForm):
     """A body on one slide; `inertia` is that about its centre, about every axis, for the contract."""
 
     mass: float = 1.0
@@ -127,7 +127,7 @@ class Slider(ClosedForm):
 
 
 @dataclass(frozen=True)
-class Projectile(ClosedForm):
+class Projectile(HandForm):
     """A free ball: q = (quaternion, position), v = (angular, linear velocity)."""
 
     joint_names: tuple[str, ...] = ("ball",)
@@ -180,7 +180,7 @@ class MassSpringDamper(Slider):
 
 
 @dataclass(frozen=True)
-class Pendulum(ClosedForm):
+class Pendulum(HandForm):
     """A point mass below a hinge about +y: m l^2 a = u - m g l sin q - b v'."""
 
     joint_names: tuple[str, ...] = ("hinge",)
@@ -207,7 +207,7 @@ class Pendulum(ClosedForm):
 
 
 @dataclass(frozen=True)
-class DoublePendulum(ClosedForm):
+class DoublePendulum(HandForm):
     """Two uniform thin rods below hinges about +y; the second angle is relative to the first."""
 
     joint_names: tuple[str, ...] = ("shoulder", "elbow")
@@ -262,7 +262,7 @@ class DoublePendulum(ClosedForm):
 
 
 @dataclass(frozen=True)
-class CartPole(ClosedForm):
+class CartPole(HandForm):
     """Kelly's: a cart on a rail along x, a point bob on a massless pole from a hinge about -y; the cart is pushed."""
 
     joint_names: tuple[str, ...] = ("slide", "hinge")
@@ -299,7 +299,7 @@ class CartPole(ClosedForm):
 
 
 # The hand calculation of the file of that name in models/.
-BY_MODEL: dict[str, ClosedForm] = {
+BY_MODEL: dict[str, HandForm] = {
     "projectile": Projectile(), "mass_spring_damper": MassSpringDamper(), "pendulum": Pendulum(),
     "double_pendulum": DoublePendulum(), "cart_pole": CartPole(),
 }  # fmt: skip
@@ -376,7 +376,7 @@ class NumpyEngine(EulerEngine):
 
     name, version, status, method = "numpy", np.__version__, "ok", "by hand"
 
-    def __init__(self, model: Model | ClosedForm, *, time_step: float | None = None):
+    def __init__(self, model: Model | HandForm, *, time_step: float | None = None):
         if isinstance(model, Model):
             if model.name not in BY_MODEL:
                 known = ", ".join(sorted(BY_MODEL))

@@ -21,6 +21,11 @@ LAWS = (
 )  # fmt: skip
 
 
+# Of a quantity that is different because nobody says what it is, which neither breaks nor explains anything.
+NOT_TOLD, FUNCTION_DOES_NOT_SAY = "the recording does not say", "a user's function does not say"
+UNKNOWN = (NOT_TOLD, FUNCTION_DOES_NOT_SAY)
+
+
 @dataclass(frozen=True, repr=False)
 class ContractLine:
     """One thing that two engines must share, and whether they do.
@@ -69,7 +74,8 @@ class Match:
     def different(self, quantity: str, what: str) -> ContractLine:
         """With the reason of the engine that has one."""
         reason = self.one.reasons.get(quantity) or self.two.reasons.get(quantity) or ""
-        return ContractLine(quantity, "different", f"{what}; {reason}" if reason else what, reason)
+        told = reason if reason in UNKNOWN else "; ".join(part for part in (what, reason) if part)
+        return ContractLine(quantity, "different", told, reason)
 
     def text(self, quantity: str, a: str, b: str) -> ContractLine:
         return ContractLine(quantity, "equal", a) if a == b else self.different(quantity, self.both(a, b))

@@ -8,7 +8,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.engines.contact_match import contact_lines
-from drake_diff.engines.contract_line import NOTHING, SAME_NUMBER, ContractLine, Match, values_told
+from drake_diff.engines.contract_line import NOTHING, SAME_NUMBER, UNKNOWN, ContractLine, Match, values_told
+from drake_diff.engines.equations import ClosedForm, part_lines
 from drake_diff.engines.interface import Engine, EngineContract
 from drake_diff.exceptions import NotOfferedError
 from drake_diff.mechanics.description import JointContract
@@ -95,8 +96,11 @@ class _Match(Match):
         wrong = {name: line for name, line in lines.items() if line.verdict == "different"}
         if not wrong:
             return ContractLine(quantity, "equal", "of " + ", ".join(lines))
+        first = next(iter(wrong.values()))
+        if first.reason in UNKNOWN:
+            return first
         detail = "; ".join(f"{name}: {line.detail}" for name, line in wrong.items())
-        return ContractLine(quantity, "different", detail, next(iter(wrong.values())).reason)
+        return ContractLine(quantity, "different", detail, first.reason)
 
     def actuation(self) -> ContractLine:
         quantity, inputs = "actuator mapping", self.one.inputs
@@ -119,14 +123,16 @@ class _Match(Match):
             return ContractLine("effort limits", "equal", "no inputs")
         return self.numbers("effort limits", self.one.effort_limits, self.two.effort_limits)
 
-    def dynamics(self) -> tuple[ContractLine, ContractLine]:
-        """M and bias at random states, each engine asked in Drake's coordinates."""
+    def dynamics(self) -> tuple[ContractLine, ...]:
+        """M and bias at random states in Drake's coordinates; of a closed form the parts of its forces."""
         kinds = [j.kind for j in self.one.joints]
         if kinds != [j.kind for j in self.two.joints]:
             why = "not comparable: the joints are of other types"
             return ContractLine("M(q)", "different", why), ContractLine("bias(q, v)", "different", why)
         random, (a, b) = np.random.default_rng(0), self.engines
         states = [_random_state(kinds, random) for _ in range(RANDOM_STATES)]
+        if isinstance(a, ClosedForm) or isinstance(b, ClosedForm):
+            return part_lines(self, states)
         return (
             self.term("M(q)", [(q,) for q, _ in states], a.mass_matrix, b.mass_matrix),
             self.term("bias(q, v)", states, a.bias, b.bias),

@@ -35,10 +35,10 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
 
     Args:
         name: "numpy", "drake", "mujoco", "mjx", "pinocchio", "casadi", "newton", "pybullet" or "sapien".
-        model: the `Model`; "numpy" also takes a closed form of `engines.closed_form`.
+        model: the `Model`; "numpy" also takes a form of `engines.closed_form`.
         **options: "drake" takes `contact` ("sap", "similar", "lagged") and `method` (of `differentiate_step`);
             "mujoco" and "mjx" take `path`, an MJCF file of your own; "mujoco" takes `time_step` [s], another than the
-            model's; a closed form needs it.
+            model's; such a form needs it.
 
     Returns:
         An `Engine`: step, Jacobians, energy, mass matrix and contract of the model in that simulator.

@@ -42,6 +42,14 @@ class JacobianEvidence(Part):
     certificate: Certified | None
 
 
+class FunctionEvidence(Part):
+    """A user's own equations: their code is not in the record, and cannot be run again from it."""
+
+    name: str
+    sha256: str | None  # of the source; null where Python could not show it
+    parameters: dict[str, float]
+
+
 class EngineEvidence(Part):
     """One engine beside the reference."""
 
@@ -64,6 +72,7 @@ class EngineEvidence(Part):
     rollout_jacobian: list[Numbers] | None
     rollout_gap: float | None
     gradient: Literal["its own step's", "not its own step's", "undecided", "none"]
+    function: FunctionEvidence | None = None
 
 
 class StateEvidence(Part):
@@ -114,5 +123,9 @@ class ComparisonRecord(SealedRecord):
 
     def facts(self) -> dict[str, str]:
         """The verdict on each engine but the reference."""
-        told = {e.engine: e.verdict for e in self.engines[1:]}
+        told: dict[str, str] = {e.engine: e.verdict for e in self.engines[1:]}
+        for e in self.engines:
+            if e.function is not None:
+                source = f"source sha256 {e.function.sha256}" if e.function.sha256 else "its source was not to be had"
+                told[e.engine] += f"; a user's function {e.function.name}, {source}, which this record does not hold"
         return told | {e.engine: "not compared" for e in self.refused} | super().facts()

@@ -1,0 +1,424 @@
+"""A user's own equations of motion as an engine, and each part of their forces beside that of another engine."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from itertools import permutations, product
+from math import factorial
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff._base.arrays import Array, finite_array
+from drake_diff.engines.common import Arguments
+from drake_diff.engines.contract_line import FUNCTION_DOES_NOT_SAY, SAME_NUMBER, ContractLine, Match
+from drake_diff.engines.drake import DrakeEngine
+from drake_diff.engines.interface import DRAKES_STEP, Engine, EngineContract, StepJacobian, float_rows
+from drake_diff.exceptions import InputError, NotOfferedError, SimulationError, UnknownNameError
+from drake_diff.mechanics.coordinates import euler_step
+from drake_diff.mechanics.description import JointContract, coordinates_of
+from drake_diff.model.model import Model
+from drake_diff.model.sampling import sample_states
+
+EXPLICIT, RK4 = "semi-implicit Euler, joint damping explicit, q' = q + h N(q) v'", "Runge-Kutta of order 4"
+INTEGRATORS: Mapping[str, str] = {"drake": DRAKES_STEP, "semi-implicit Euler": EXPLICIT, "RK4": RK4}
+# What a function of accelerations says nothing of, by quantity of the match: its forces are compared in place of them.
+NOT_SAID = (
+    "frames", "mass", "center of mass", "inertia", "damping", "armature", "springs", "position limits", "gravity",
+    "actuator mapping",
+)  # fmt: skip
+UNSAID = float("nan")
+PARTS = ("forces at rest", "velocity products", "damping forces", "forces of the inputs")
+ALONE = 1e-6  # of a part: what a factor must leave of it to be the whole difference
+MOST_JOINTS = 5  # whose order, signs and zeros are tried
+# What rounding in M(q) a makes of a force, by the condition number of M.
+ROUNDING = 1e-14
+
+
+@dataclass(frozen=True)
+class UserFunction:
+    """What a record can hold of a function: its name, the hash of its source, and the parameters it was given."""
+
+    name: str
+    sha256: str | None  # of the source, None where Python cannot show it
+    parameters: Mapping[str, float]
+
+
+class Parts(NamedTuple):
+    """Generalized forces (nv,) of one engine at one state: those named in PARTS."""
+
+    rest: Array
+    products: Array
+    damping: Array
+    inputs: Array
+
+
+class ClosedForm(Arguments):
+    """Your own equations of motion in NumPy as an engine: they stand beside Drake in `dd.compare`.
+
+    The function gives accelerations. `compare` takes it apart at random states into forces at rest (gravity, springs),
+    velocity products, damping and forces of the inputs, and compares each with Drake's by joint, taking Drake's M(q):
+    a wrong inertia therefore shows in every part. A part that differs makes it another model, and the detail names
+    the joint and, where there is one, the factor. Contact and joint limits are no parts of it.
+
+    The inputs are cut at the model's effort limits before the function sees them. In a record the function is known
+    by its name and the hash of its source alone; what it uses from outside is not in that hash.
+
+    Args:
+        model: the model whose coordinates and time step it has.
+        acceleration: (q (nq,), v (nv,), u (nu,)) -> dv/dt (nv,), or with `parameters` (q, v, u, parameters). SI units.
+            A free body has Drake's coordinates: quaternion w x y z and position; angular and linear velocity in world.
+        name: what it is called in results.
+        parameters: numbers by name that the function takes, for the record.
+        joints: the order of the joints in the function's q and v; without it the model's.
+        inputs: the order of its inputs; without it the model's.
+        integrator: "drake" (semi-implicit Euler, with what is linear and odd in v taken at the next velocity, as Drake
+            takes joint damping), "semi-implicit Euler" (v' = v + h a) or "RK4".
+        contact: where the function has contact of its own, its law in words. A step of it in contact is then
+            the same as Drake's, or unexplained: nothing is known of its friction and stiffness.
+
+    Raises:
+        UnknownNameError, InputError: a name that the model does not have, a joint left out, a function that fails,
+            or that does not give the same twice.
+        ShapeError, NonFiniteError: the function gives another shape, or NaN or infinity, at a state of the model.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> mine = dd.engines.ClosedForm(
+        ...     model,
+        ...     lambda q, v, u, p: (u - 0.1 * v - p["mass"] * 9.81 * 0.5 * np.sin(q)) / (p["mass"] * 0.5**2),
+        ...     name="my pendulum", parameters={"mass": 1.0},
+        ... )
+        >>> print(dd.compare(model, [mine], num_steps=20).engines[1].verdict)
+        same
+    """
+
+    status, version = "ok", "equations"
+
+    def __init__(
+        self,
+        model: Model,
+        acceleration: Callable[..., ArrayLike],
+        *,
+        name: str = "closed form",
+        parameters: Mapping[str, float] | None = None,
+        joints: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+        integrator: str = "drake",
+        contact: str | None = None,
+    ):
+        if not callable(acceleration):
+            raise InputError("acceleration", got=repr(acceleration)[:80], expected="a function of q, v and u")
+        if not isinstance(name, str) or not name:
+            raise InputError("name", got=repr(name), expected="a name")
+        if integrator not in INTEGRATORS:
+            raise UnknownNameError("integrator", got=integrator, known=INTEGRATORS)
+        self.name, self.integrator, self.contact, self._acceleration = name, integrator, contact, acceleration
+        numbers = {} if parameters is None else parameters
+        given = {str(key): float(finite_array(f"parameters[{key!r}]", x, ())) for key, x in numbers.items()}
+        self._extra = () if parameters is None else (MappingProxyType(given),)
+        self.function = UserFunction(_name_of(acceleration), _source_hash(acceleration), given)
+        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
+        self.coordinates, self.time_step = coordinates_of(model), model.time_step
+        self._drakes = DrakeEngine(model).contract
+        own = [joint.name for joint in self._drakes.joints]
+        entries = [(i, j, 7, 6) for i, j in self.coordinates.free] + [(i, j, 1, 1) for i, j in self.coordinates.single]
+        places = dict(zip(own, sorted(entries, key=lambda place: place[1]), strict=True))
+        self.joints = _order("joints", joints, own)
+        of_q = [range(i, i + n) for i, _, n, _ in (places[joint] for joint in self.joints)]
+        of_v = [range(j, j + n) for _, j, _, n in (places[joint] for joint in self.joints)]
+        self._of_q, self._of_v = (np.array([k for r in found for k in r], dtype=int) for found in (of_q, of_v))
+        names = list(model.input_names)
+        self._of_u = np.array([names.index(x) for x in _order("inputs", inputs, names)], dtype=int)
+        self._limits = np.array(self._drakes.effort_limits)
+        self._try(model)
+
+    def _try(self, model: Model) -> None:
+        """The function at a state, twice: what is wrong with it is said before anything runs."""
+        sample = sample_states(model, 1)[0]
+        q, v = sample.x[: self.nq], sample.x[self.nq :]
+        try:
+            first, second = self.acceleration(q, v, sample.u), self.acceleration(q, v, sample.u)
+        except SimulationError as error:
+            raise InputError("acceleration", got=str(error), expected="a function of q, v and u") from error
+        if not np.array_equal(first, second):
+            raise InputError(
+                "acceleration", got=f"{first} and then {second} for the same arguments",
+                expected="a function of its arguments alone",
+            )  # fmt: skip
+
+    def acceleration(self, q: ArrayLike, v: ArrayLike, u: ArrayLike) -> Array:
+        """(nv,) dv/dt in Drake's order.
+
+        Args:
+            q: (nq,) positions.
+            v: (nv,) velocities.
+            u: (nu,) inputs, which are cut at their limits.
+
+        Returns:
+            (nv,) the accelerations.
+
+        Raises:
+            ShapeError, NonFiniteError: an argument, or what the function gives, has another shape or is not finite.
+            SimulationError: the function fails there.
+        """
+        q, v = self._motion(q, v)
+        u = np.clip(finite_array("u", u, (self.nu,)), -self._limits, self._limits)
+        try:
+            given = self._acceleration(q[self._of_q], v[self._of_v], u[self._of_u], *self._extra)
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+            raise SimulationError(f"{self.name} fails at q = {q}, v = {v}: {type(error).__name__}: {error}") from error
+        found = np.empty(self.nv)
+        found[self._of_v] = finite_array(f"{self.name}: acceleration at q = {q}, v = {v}", given, (self.nv,))
+        return found
+
+    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
+        """The state (nx,) one time step after `x` (nx,) under `u` (nu,)."""
+        x, u = self._point(x, u)
+        q, v, h = x[: self.nq], x[self.nq :], self.time_step
+        try:
+            if self.integrator == "RK4":
+                x_next = self._runge_kutta(x, u)
+            else:
+                a = self.acceleration(q, v, u)
+                if self.integrator == "drake":  # (1 - h dodd/dv) a = f, which is (M + h D) a = M f
+                    a = np.asarray(np.linalg.solve(np.eye(self.nv) - h * self._damping_by_velocity(q), a), dtype=float)
+                x_next = euler_step(self.coordinates, h, x, a)
+        except (InputError, np.linalg.LinAlgError) as error:
+            raise SimulationError(str(error)) from error
+        if not np.all(np.isfinite(x_next)):
+            raise SimulationError(f"the step leads to {x_next}, which is not finite, from x = {x}, u = {u}")
+        return x_next
+
+    def _runge_kutta(self, x: Array, u: Array) -> Array:
+        h = self.time_step
+
+        def rate(x: Array) -> Array:
+            q, v = x[: self.nq], x[self.nq :]
+            return np.concatenate([self.coordinates.rate(q) @ v, self.acceleration(q, v, u)])
+
+        a = rate(x)
+        b = rate(x + h / 2 * a)
+        c = rate(x + h / 2 * b)
+        return np.asarray(x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c)))
+
+    def _damping_by_velocity(self, q: Array) -> Array:
+        """(nv, nv): the odd part of the acceleration at unit velocities, in which velocity products, even, are not."""
+        u = np.zeros(self.nu)
+        columns = [(self.acceleration(q, e, u) - self.acceleration(q, -e, u)) / 2 for e in np.eye(self.nv)]
+        return np.array(columns).reshape(self.nv, self.nv).T
+
+    def parts(self, M: Array, q: Array, v: Array, u: Array) -> Parts:
+        """The forces that `M` (nv, nv) makes of the accelerations."""
+        still, no_u = np.zeros(self.nv), np.zeros(self.nu)
+        rest, ahead, back = (self.acceleration(q, w, no_u) for w in (still, v, -v))
+        found = (rest, (ahead + back) / 2 - rest, (ahead - back) / 2, self.acceleration(q, v, u) - ahead)
+        return Parts(*(M @ a for a in found))
+
+    def terms(self, M: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Bias, B u and joint damping, (nv,) each, that make these accelerations of `M` (nv, nv)."""
+        q, v = x[: self.nq], x[self.nq :]
+        damping = -np.diag(M @ self._damping_by_velocity(q))
+        inputs = self.parts(M, q, v, u).inputs
+        return inputs - damping * v - M @ self.acceleration(q, v, u), inputs, damping
+
+    def seen_as(self, order: Array, signs: Array, shift: Array) -> _Turned:
+        """The same function, with its joints of one degree of freedom in another order, turned or shifted."""
+        return _Turned(self, order, signs, shift)
+
+    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
+        """NotOfferedError: differences of its steps are taken where a Jacobian is compared."""
+        raise NotOfferedError(f"{self.name}: equations of motion without derivatives")
+
+    def energy(self, x: ArrayLike) -> float:
+        """NotOfferedError."""
+        raise NotOfferedError(f"{self.name}: accelerations say nothing of energy")
+
+    def contact_depth(self, x: ArrayLike) -> float:
+        """NotOfferedError."""
+        raise NotOfferedError(f"{self.name}: accelerations say nothing of overlap")
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """NotOfferedError."""
+        raise NotOfferedError(f"{self.name}: accelerations say nothing of M(q) alone")
+
+    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """NotOfferedError."""
+        raise NotOfferedError(f"{self.name}: accelerations say nothing of forces alone")
+
+    @property
+    def contract(self) -> EngineContract:
+        """The model's coordinates, limits of inputs and time step; of the rest a function says nothing."""
+        unsaid: dict[str, Any] = {
+            "axis": (UNSAID,) * 3, "anchor": (UNSAID,) * 3, "center_of_mass": (UNSAID,) * 3, "inertia": (UNSAID,) * 6,
+            **dict.fromkeys(("mass", "damping", "armature", "stiffness", "rest"), UNSAID),
+        }  # fmt: skip
+        joints = tuple(JointContract(name=joint.name, kind=joint.kind, **unsaid) for joint in self._drakes.joints)
+        touching = dict.fromkeys(("contact pairs", "contact law", "solver tolerance"), FUNCTION_DOES_NOT_SAY)
+        none = {
+            "contact pairs": "the equations have no contact", "contact law": "the equations have no contact",
+            "solver tolerance": "nothing is solved iteratively",
+        }  # fmt: skip
+        return EngineContract(
+            engine=self.name, joints=joints, native_order=self.joints, inputs=self._drakes.inputs,
+            actuation=float_rows(np.full((self.nv, self.nu), UNSAID)), effort_limits=self._drakes.effort_limits,
+            time_step=self.time_step, integrator=INTEGRATORS[self.integrator], gravity=(UNSAID,) * 3,
+            contact_law=self.contact or "none",
+            reasons={
+                **dict.fromkeys(NOT_SAID, FUNCTION_DOES_NOT_SAY),
+                "limit law": "the equations have no joint limits",
+                **(touching if self.contact else none),
+            },
+        )  # fmt: skip
+
+
+class _Turned:
+    """A function seen in other coordinates of its single joints: q_function = signs * q[order] + shift."""
+
+    def __init__(self, engine: ClosedForm, order: Array, signs: Array, shift: Array):
+        self.engine, self.order, self.signs, self.shift = engine, order, signs, shift
+        self.q, self.v = (np.array([x[k] for x in engine.coordinates.single], dtype=int) for k in (0, 1))
+
+    def parts(self, M: Array, q: Array, v: Array, u: Array) -> Parts:
+        q_seen, v_seen = np.array(q), np.array(v)
+        q_seen[self.q] = self.signs * q[self.q][self.order] + self.shift
+        v_seen[self.v] = self.signs * v[self.v][self.order]
+        parts = self.engine.parts(np.eye(len(v)), q_seen, v_seen, u)
+        found = []
+        for a in parts:
+            back = np.array(a)
+            back[self.v[self.order]] = self.signs * a[self.v]
+            found.append(M @ back)
+        return Parts(*found)
+
+
+def part_lines(match: Match, states: Sequence[tuple[Array, Array]]) -> tuple[ContractLine, ...]:
+    """A line per part of the forces, at `states` (q, v); of two closed forms, and of one without M(q), none."""
+    theirs: Engine | ClosedForm
+    mine, theirs = match.engines if isinstance(match.engines[0], ClosedForm) else match.engines[::-1]
+    if not isinstance(mine, ClosedForm):
+        raise TypeError("expected a closed form")
+    random, contract = np.random.default_rng(1), theirs.contract
+    limit = np.minimum(np.array(contract.effort_limits), 1.0)
+    us = [limit * random.uniform(-1, 1, len(limit)) for _ in states]
+    try:
+        masses = [theirs.mass_matrix(q) for q, _ in states]
+        wanted = [_parts_of(theirs, *state, u) for state, u in zip(states, us, strict=True)]
+        given = [mine.parts(M, *s, u) for M, s, u in zip(masses, states, us, strict=True)]
+    except (InputError, NotOfferedError, SimulationError) as error:
+        return tuple(ContractLine(part, "different", f"not comparable: {error}") for part in PARTS)
+    tolerance = max(SAME_NUMBER[match.precision], ROUNDING * max(float(np.linalg.cond(M)) for M in masses))
+    names = [j.name for j in contract.joints for _ in range(6 if j.kind == "quaternion_floating" else 1)]
+    scale = np.array([max(float(np.abs(part).max(initial=0.0)) for part in parts) for parts in wanted])
+    lines = []
+    for i, quantity in enumerate(PARTS):
+        a, b = (np.array([parts[i] for parts in found]) for found in (wanted, given))
+        off = np.abs(b - a) > tolerance * np.maximum(scale, np.abs(b).max(axis=1, initial=0.0))[:, None]
+        wrong = [f"of {names[j]}, {_told(a[:, j], b[:, j])}" for j in np.flatnonzero(off.any(axis=0))]
+        told = f"of {', '.join(dict.fromkeys(names))}, at {len(states)} random states"
+        lines.append(ContractLine(quantity, "different" if wrong else "equal", "; ".join(wrong) or told))
+    if all(line.verdict == "equal" for line in lines):
+        return tuple(lines)
+    remark = _as_if(mine, (masses, states, us), (wanted, tolerance * scale))
+    if not remark and lines[-1].verdict == "different" and len(_wrong(lines)) > 1:
+        remark = "a wrong inertia looks like this, as the forces are taken with M(q) of the other engine"
+    last = _wrong(lines)[-1]
+    lines[last] = replace(lines[last], detail="; ".join(part for part in (lines[last].detail, remark) if part))
+    return tuple(lines)
+
+
+def _wrong(lines: Sequence[ContractLine]) -> list[int]:
+    """The places of those that are different."""
+    return [i for i, line in enumerate(lines) if line.verdict == "different"]
+
+
+def _parts_of(engine: Engine, q: Array, v: Array, u: Array) -> Parts:
+    """Of an engine with terms of its own; NotOfferedError for one without."""
+    contract = engine.contract
+    rest, limit = -engine.bias(q, np.zeros(len(v))), np.array(contract.effort_limits)
+    damping = [[0.0] * 6 if j.kind == "quaternion_floating" else [j.damping] for j in contract.joints]
+    D = np.array([number for joint in damping for number in joint])
+    actuation = np.array(contract.actuation, dtype=float).reshape(len(v), len(u))
+    return Parts(rest, -engine.bias(q, v) - rest, -D * v, actuation @ np.clip(u, -limit, limit))
+
+
+def _told(wanted: Array, given: Array) -> str:
+    """How one joint's force over the states differs from what it is to be."""
+    size, apart = float(wanted @ wanted), float(np.abs(given - wanted).max())
+    at_most = f"off by up to {apart:.4g} of {np.abs(wanted).max():.4g}"
+    if not size:
+        return f"{at_most}: it is to be 0"
+    factor = float(given @ wanted) / size
+    if np.abs(given - factor * wanted).max() > ALONE * max(float(np.abs(given).max()), ALONE * np.abs(wanted).max()):
+        return at_most
+    if abs(factor) < ALONE:
+        return f"{at_most}: it is missing"
+    if abs(factor + 1) < ALONE:
+        return f"{at_most}: its sign is the other one"
+    return f"{at_most}: {factor:.6g} times what it is to be"
+
+
+def _as_if(
+    mine: ClosedForm, at: tuple[list[Array], Sequence[tuple[Array, Array]], list[Array]],
+    wanted: tuple[list[Parts], Array],
+) -> str:  # fmt: skip
+    """The one change of the function's coordinates that makes it right; "" where there is none."""
+    n, (parts, allowed) = len(mine.coordinates.single), wanted
+    if not 1 <= n <= MOST_JOINTS:
+        return ""
+    names = [j.name for j in mine.contract.joints if j.kind != "quaternion_floating"]
+    hinges = [j.kind == "revolute" for j in mine.contract.joints if j.kind != "quaternion_floating"]
+    same, one, zero = np.arange(n), np.ones(n), np.zeros(n)
+    tried = []
+    for order in list(permutations(range(n)))[1 : factorial(n)]:
+        told = ", ".join(names[i] for i in order)
+        tried.append((f"as if the function had its joints in the order ({told})", (np.array(order), one, zero)))
+    for signs in list(product((1.0, -1.0), repeat=n))[1:]:
+        told = ", ".join(name for name, sign in zip(names, signs, strict=True) if sign < 0)
+        tried.append((f"as if the function counted {told} the other way", (same, np.array(signs), zero)))
+    for half in list(product((0.0, np.pi), repeat=n))[1:]:
+        if all(hinge or not x for hinge, x in zip(hinges, half, strict=True)):
+            told = ", ".join(name for name, x in zip(names, half, strict=True) if x)
+            tried.append((f"as if the function counted {told} from half a turn away", (same, one, np.array(half))))
+    for told, view in tried:
+        seen = mine.seen_as(*view)
+        try:
+            for M, state, u, wanted_parts, most in zip(*at, parts, allowed, strict=True):
+                given = seen.parts(M, *state, u)
+                if not all(np.abs(a - b).max() <= most for a, b in zip(given, wanted_parts, strict=True)):
+                    break
+            else:
+                return told
+        except (InputError, SimulationError):
+            continue
+    return ""
+
+
+def _order(subject: str, given: Sequence[str] | None, own: Sequence[str]) -> tuple[str, ...]:
+    """`given`, which must have each of `own` once."""
+    if given is None:
+        return tuple(own)
+    for name in given:
+        if name not in own:
+            raise UnknownNameError(subject, got=name, known=own)
+    if sorted(given) != sorted(own):
+        raise InputError(subject, got=", ".join(given), expected=f"each of {', '.join(own)} once")
+    return tuple(given)
+
+
+def _name_of(function: Any) -> str:
+    return str(getattr(function, "__qualname__", type(function).__qualname__))
+
+
+def _source_hash(function: Any) -> str | None:
+    """Of the function's source; of an object that is called, of its class."""
+    shown = function if inspect.isroutine(function) else type(function)
+    try:
+        return sha256(inspect.getsource(shown).encode()).hexdigest()
+    except (OSError, TypeError):
+        return None
