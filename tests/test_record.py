@@ -23,7 +23,7 @@ from drake_diff import artifact
 from drake_diff.artifact import measure
 from drake_diff.artifact.sections import describe_problem, rebuild_problem
 from drake_diff.exceptions import ArtifactError
-from drake_diff.record.parts import Metric
+from drake_diff.record.parts import DataBoundary, Metric
 from drake_diff.record.provenance import named_files
 from drake_diff.record.read import KINDS
 from drake_diff.record.sealed import SCHEMA_VERSION, canonical, own_sha256
@@ -70,6 +70,9 @@ def records_of(model):
         fields["reason"] = st.text(min_size=1, max_size=12)
     if model is EvidenceRecord:
         fields |= {"schema_version": st.just(SCHEMA_VERSION), "verdict": st.just("fail")}
+        fields |= {"evaluations": st.just([]), "panel": st.none()}  # they rest on metrics and replays
+    if model is DataBoundary:
+        fields["held_out"] = st.just([])
     if model is FollowedEvidence:
         return st.builds(model, **fields | {"holds": st.just(False), "measured": st.just(False)})
     return st.builds(model, **fields)

@@ -82,7 +82,8 @@ def test_metrics_that_are_defined_otherwise_are_not_compared(runs, tmp_path):
     cost = record.metrics[0].model_copy(update={"unit": "J"})
     packages = {**record.provenance.packages, "drake": "0.1"}
     provenance = record.provenance.model_copy(update={"packages": packages})
-    record.model_copy(update={"metrics": [cost, *record.metrics[1:-1]], "provenance": provenance}).write(directory)
+    changes = {"metrics": [cost, *record.metrics[1:-1]], "evaluations": [], "provenance": provenance}
+    record.model_copy(update=changes).write(directory)
     found = compare_runs(runs / "a", directory)
     assert not found.comparable
     assert found.refused[0] == "cost: its unit differs: '1' and 'J'"

@@ -185,6 +185,8 @@ def lying(section, change):
     def record_of(measurement, folder):
         fields = honest(measurement, folder).model_dump()
         change(fields[section])
+        if section in ("metrics", "replays"):  # whoever lies about them leaves out what says otherwise
+            fields |= {"evaluations": [], "panel": None}
         return EvidenceRecord.model_validate(fields)
 
     return record_of
@@ -251,6 +253,7 @@ def test_a_run_that_stopped_far_from_its_goal_cannot_say_that_it_converged(solut
     def forged(measurement, folder):
         fields = honest(measurement, folder).model_dump()
         fields["metrics"] = [m for m in fields["metrics"] if m["verdict"] != "fail"]
+        fields["evaluations"] = []
         fields["replays"] = [{**r, "holds": True, "failures": []} for r in fields["replays"]]
         fields["failures"] = []
         fields["events"] = [e for e in fields["events"] if e["kind"] != "failure"]
@@ -321,7 +324,8 @@ def test_another_version_of_drake_is_a_reason_for_doubt_not_a_lie(run, copy):
     record = dd.load_record(copy)
     older = record.provenance.model_copy(update={"packages": {**record.provenance.packages, "drake": "1.40.0"}})
     metric = record.metrics[0].model_copy(update={"value": 1.0})
-    record.model_copy(update={"provenance": older, "metrics": [metric, *record.metrics[1:]]}).write(copy)
+    changes = {"provenance": older, "metrics": [metric, *record.metrics[1:]], "evaluations": []}
+    record.model_copy(update=changes).write(copy)
     found = dd.verify(copy)
     assert (found.verdict, found.complaints) == ("undecided", ())
     assert found.undecided[0].startswith("recorded with drake 1.40.0, run again with")

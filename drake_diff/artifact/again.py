@@ -26,7 +26,7 @@ from drake_diff.record.solve import EvidenceRecord
 # What a record says of itself and of where it was made: nothing can make it again.
 GIVEN = ("name", "provenance", "wall_clock")
 # What the search tells of itself: it rests on the search, and not on the plan that it found alone.
-SEARCHED = ("events", "failures", "gradient", "inputs", "sentence", "solver", "verdict")
+SEARCHED = ("data", "events", "failures", "gradient", "inputs", "sentence", "solver", "verdict")
 SEARCH_TOPICS = ("/solver/", "/gradient/", "/events", "/replays")
 # What a constraint that is a user's function decides, beside the search.
 CONSTRAINED = ("metrics[constraint violation]", "problem.constraints", "problem.couplings")
@@ -159,7 +159,7 @@ def _without_the_search(told: Solution, record: EvidenceRecord, unrepeated: tupl
     missing = [*SEARCHED]
     missing += [f"replays[{i}].{key}" for i in range(len(record.replays) if constraints else 0) for key in JUDGED]
     if costs:
-        missing += ["metrics[cost]", *(f"problem.{name}" for name in COSTS)]
+        missing += ["metrics[cost]", "evaluations[cost]", *(f"problem.{name}" for name in COSTS)]
     if constraints:
         missing += CONSTRAINED
     files = {name: data for name, data in again.files.items() if name not in (PLAN, REPLAY, REPORT)}

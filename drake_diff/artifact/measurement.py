@@ -13,6 +13,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
+from drake_diff.artifact.second_measurement import evaluation_failures, evaluations
 from drake_diff.artifact.sections import units_of
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
@@ -26,7 +27,7 @@ from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
-from drake_diff.record.parts import Event, Failure, Label, Metric
+from drake_diff.record.parts import Evaluation, Event, Failure, Label, Metric
 from drake_diff.record.solve import ElsewhereEvidence, FollowedEvidence, ReplayEvidence
 
 AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
@@ -82,6 +83,7 @@ class Measurement(ShowsItsRepr):
         replays: The plan in every variant of the plant.
         metrics: Every measure of the plan and of its replay; those with a tolerance decide.
         invariants: What physics keeps along the replay.
+        evaluations: The metrics that have a second measurement, beside it.
         failures: Why the run is no success; none for a success.
         events: What happened, in order: the solver, contacts, inputs at their limits, failures.
 
@@ -108,6 +110,7 @@ class Measurement(ShowsItsRepr):
     thinnest: str
     metrics: tuple[Metric, ...]
     invariants: tuple[Metric, ...]
+    evaluations: tuple[Evaluation, ...]
     failures: tuple[Failure, ...]
     events: tuple[Event, ...]
 
@@ -166,7 +169,8 @@ def measure(solution: Solution) -> Measurement:
         metrics += _metrics_of_the_replay(solution, motion, states, positions)
         invariants += _invariants(solution.vector, motion, _unit(positions), ON_THE_PLANT[problem.motion])
         limit, thinnest = thinnest_geometry(problem.model)
-    failures = tuple(_failures(solution, metrics))
+    beside = evaluations(solution, motion, metrics)
+    failures = (*_failures(solution, metrics), *evaluation_failures(beside, metrics))
     return Measurement(
         solution=solution,
         positions=positions,
@@ -182,6 +186,7 @@ def measure(solution: Solution) -> Measurement:
         thinnest=thinnest,
         metrics=tuple(metrics),
         invariants=tuple(invariants),
+        evaluations=beside,
         failures=failures,
         events=tuple(_events(solution, motion, failures)),
     )

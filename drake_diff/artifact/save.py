@@ -10,7 +10,7 @@ from typing import Any, overload
 from drake_diff.artifact.measurement import Measurement, elsewhere_evidence, failure_of, measure, replay_evidence
 from drake_diff.artifact.phased import begin_phases, phases_record, save_phases
 from drake_diff.artifact.rerun import PLAN, TRACE, write_plan
-from drake_diff.artifact.sections import asked, found
+from drake_diff.artifact.sections import asked, found, panel_of
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
@@ -118,8 +118,10 @@ def record_of(m: Measurement, folder: Path) -> EvidenceRecord:
         sentence=m.solution.message,
         metrics=m.metrics,
         invariants=m.invariants,
+        evaluations=m.evaluations,
         events=m.events,
         replays=[replay_evidence(r) for r in m.replays],
+        panel=panel_of(m.solution),
         elsewhere=elsewhere_evidence(m.solution.elsewhere),
         failures=m.failures,
         **asked(m.solution.problem, m.solution),

@@ -4,6 +4,8 @@ A problem is written as plain numbers and names, and comes back from them: all o
 """
 
 import math
+from collections.abc import Iterator, Mapping
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -28,19 +30,24 @@ from drake_diff.optimize.problem.rates import InputRate, Jerk
 from drake_diff.optimize.problem.rigid import RIGID_QUANTITIES, RigidQuantity, rigid_quantity
 from drake_diff.optimize.problem.terminal import TerminalSet
 from drake_diff.optimize.problem.timed import SumOfCosts, TrackingCost
+from drake_diff.optimize.replay import deciding
 from drake_diff.optimize.solution import Solution
-from drake_diff.record.parts import ModelInput, Quantity
+from drake_diff.record.embodiment import NO_BODY, embodiment_of
+from drake_diff.record.parts import DataBoundary, DataUse, ModelInput, Quantity
 from drake_diff.record.provenance import gradient_evidence, model_input
+from drake_diff.record.sealed import canonical
 from drake_diff.record.solve import (
     ActionInterface,
     Claim,
     Command,
+    EvaluationPanel,
     EvidenceRecord,
     GradientColumn,
     GradientEvidence,
     Inputs,
     Observation,
     ObservedVariable,
+    PanelCase,
     ParameterEvidence,
     Solver,
 )
@@ -117,6 +124,7 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
         f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
         f"keeps bounds{goals} and constraints at every knot; optimized: {', '.join(problem.optimize)}"
     )
+    model = ModelInput(file=None, options=None) if problem.moved is None else model_input(problem.moved)
     return {
         "claim": Claim(statement=statement, limitations=LIMITATIONS),
         "inputs": Inputs(
@@ -127,11 +135,69 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
         ),
         "problem": describe_problem(problem),
         "contract": {} if problem.moved is None else problem.moved.contract.to_dict(),
+        "embodiment": NO_BODY if problem.moved is None else embodiment_of(problem.moved.contract),
+        "data": _data(problem, options, model),
         "units": UNITS | ({"couplings": COUPLED} if problem.couplings else {}),
         "observation": _observation(problem, time_step),
         "action": _action(problem, time_step, options.get("time_limit")),
-        "model": ModelInput(file=None, options=None) if problem.moved is None else model_input(problem.moved),
+        "model": model,
     }
+
+
+def _data(problem: Problem, options: Mapping[str, Any], model: ModelInput) -> DataBoundary:
+    """What a search saw, and what its plan is judged on: there are no recordings, and so nothing is held out."""
+    guess = DataUse(
+        name="initial guess",
+        what=str(options.get("initial_guess", "not known yet")),
+        sha256=options.get("initial_guess_sha256"),
+    )
+    seed = DataUse(name="seed", what=f"of random starts: {options['seed']}" if "seed" in options else "none is known")
+    plant = DataUse(name="model", what=f"the equations of {problem.name}")
+    if model.file is not None:
+        plant = DataUse(name="model", what=model.file.path, sha256=model.file.sha256)
+    given = [*_given_data(problem)]
+    statement = (
+        f"{'it has seen what is listed, and' if given else 'no recording was used:'} nothing was fitted to data, and "
+        "no data are held out. The plan was made on the model, and is judged on the same one in the panel's cases"
+    )
+    return DataBoundary(statement=statement, seen=[plant, guess, seed, *given], judged_on=[plant])
+
+
+def _given_data(problem: Problem) -> Iterator[DataUse]:
+    """Motions that the problem's costs follow, and functions of the user, which may know any data."""
+    for name in COSTS:
+        cost = getattr(problem, name)
+        for i, part in enumerate(cost.costs if isinstance(cost, SumOfCosts) else (cost,)):
+            if isinstance(part, TrackingCost):
+                told = b"".join(np.asarray(v, dtype=float).tobytes() for v in part.reference if v is not None)
+                what = f"a motion of {len(part.reference[0])} times that {name.replace('_', ' ')} follows"
+                yield DataUse(name=f"{name} {i}", what=what, sha256=sha256(told).hexdigest())
+            elif isinstance(_cost(part), str):
+                yield DataUse(name=f"{name} {i}", what=f"{_cost(part)}, a function: what it knows is not recorded")
+    for c in problem.constraints:
+        if _quantity(c.function) is None:
+            yield DataUse(name=f"constraint {c.label}", what="a function: what it knows is not recorded")
+
+
+def panel_of(solution: Solution) -> EvaluationPanel:
+    """Under what a solution is judged: every replay, and which of them its verdict rests on."""
+    problem, found = solution.problem, solution.replays
+    decides = deciding(solution.plan, found) if problem.has_model else []
+    cases = [
+        PanelCase(
+            variant=r.variant,
+            control=r.control,
+            time_step_s=r.time_step,
+            contact_approximation=r.approximation,
+            decides=r.variant in decides,
+        )
+        for r in found
+    ]
+    statement = "the plan's own start, model and inputs in each case; a variant that decides holds under one control"
+    if not problem.has_model:
+        statement = "the given equations alone, at and between the knots: there is no plant to replay it on"
+    told = EvaluationPanel(statement=statement, cases=cases, perturbations=[], latencies_s=[0.0])
+    return told.model_copy(update={"sha256": sha256(canonical(told.model_dump(mode="json")).encode()).hexdigest()})
 
 
 def _search(solution: Solution) -> dict[str, Any] | None:

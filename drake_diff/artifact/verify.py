@@ -445,4 +445,7 @@ def _other_versions(record: SealedRecord) -> tuple[str, ...]:
     if isinstance(record, EvidenceRecord) and record.elsewhere is not None:
         used += record.elsewhere.engines
     names = [n for n in used if was.get(n) != now.get(n)]
-    return tuple(f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names)
+    told = [f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names]
+    if record.schema_version != SCHEMA_VERSION:
+        told.append(f"recorded by schema {record.schema_version}, whose fields are not those of {SCHEMA_VERSION}")
+    return tuple(told)

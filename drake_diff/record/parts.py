@@ -151,3 +151,88 @@ class ModelInput(Part):
     file: FileEvidence | None
     named: list[FileEvidence] = Field(default_factory=list)
     options: FiniteTable | None
+
+
+class DataUse(Part):
+    """Data that a run used: what it is, and the hash of its bytes, null where it has none of its own."""
+
+    name: str
+    what: str
+    sha256: str | None = None
+
+
+class DataBoundary(Part):
+    """Which data a run saw while it searched, and on which it was judged; `statement` says it in words.
+
+    `held_out` are the names of what it was judged on and did not see. What has the name or the bytes of data that was
+    seen is not held out: a record that says so is refused.
+    """
+
+    statement: str
+    seen: list[DataUse]
+    judged_on: list[DataUse]
+    held_out: list[str] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _holds_out_only_what_was_not_seen(self) -> "DataBoundary":
+        names, hashes = {use.name for use in self.seen}, {use.sha256 for use in self.seen if use.sha256}
+        new = [use.name for use in self.judged_on if use.name not in names and use.sha256 not in hashes]
+        wrong = [name for name in self.held_out if name not in new]
+        if wrong:
+            raise ValueError(f"held out: {', '.join(wrong)}, which the run saw, or was not judged on")
+        return self
+
+
+class Drive(Part):
+    """An actuator: its joint, what it is commanded, and what it can do; null is no limit, and no gain."""
+
+    actuator: str
+    joint: str
+    command: str
+    unit: str
+    effort_limit: float | None
+    gear_ratio: float
+    rotor_inertia: float
+    kp: float | None
+    kd: float | None
+
+
+class Embodiment(Part):
+    """The robot: its base, which joints are driven and how, which only move, what is fixed, sensed and can touch.
+
+    `other_inputs` are those that are no actuator, such as the thrust on a body. Units are those of the contract.
+    """
+
+    robot: str
+    base: str
+    driven: list[Drive]
+    other_inputs: list[str]
+    passive: list[str]
+    fixed: list[str]
+    sensed: str
+    touching: list[str]
+
+
+class Evaluation(Part):
+    """A metric measured a second time in another way; `how` says which.
+
+    "differ" is a failure of the evaluator, whatever the motion is: the two values are further apart than `tolerance`,
+    one alone is a finite number, or their units are not the same. "not measured" has the reason.
+    """
+
+    name: str  # the metric's
+    how: str
+    unit: str
+    value: float | None
+    tolerance: float
+    verdict: Literal["agree", "differ", "not measured"]
+    reason: str | None = None
+
+    def of(self, metric: Metric) -> str:
+        """What the verdict has to be beside `metric`."""
+        if self.reason is not None:
+            return "not measured"
+        same = set(self.unit.split(" or ")) == set(metric.unit.split(" or "))
+        if self.value is None or metric.value is None:
+            return "agree" if same and self.value is metric.value else "differ"
+        return "agree" if same and abs(self.value - metric.value) <= self.tolerance else "differ"

@@ -20,7 +20,14 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.record.parts import FileEvidence, ModelInput, Part, Provenance
 from drake_diff.record.provenance import file_evidence
 
-SCHEMA_VERSION = "2.1.0"  # a new major one where a field goes or changes its meaning, a minor one where one is added
+# A new major one where a field goes or changes its meaning, a minor one where one is added.
+SCHEMA_VERSION = "2.2.0"
+# How others are read, word for word in every published schema.
+READING = (
+    f"This is version {SCHEMA_VERSION}. An earlier minor version of the same major one is read with what it lacks "
+    "empty or null, which says that it was not recorded. A later minor version is read without the fields that are not "
+    "known here. Another major version is refused by name."
+)
 SCHEMAS = Path(__file__).parent.parent / "schema"
 MOST_NAMES = 5  # of files, in a printed record
 APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run
@@ -72,7 +79,8 @@ class SealedRecord(ShowsItsRepr, Part):
     @classmethod
     def generated_schema(cls) -> bytes:
         """The JSON Schema as pydantic makes it from the class; a test holds it equal to the published one."""
-        return (json.dumps(cls.model_json_schema(), sort_keys=True, indent=2) + "\n").encode()
+        schema = {**cls.model_json_schema(), "$comment": READING}
+        return (json.dumps(schema, sort_keys=True, indent=2) + "\n").encode()
 
     @classmethod
     def read(cls, directory: str | Path) -> Self:

@@ -4,8 +4,21 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from drake_diff.record.parts import Certified, Event, Failure, FiniteTable, Metric, Part, Quantity
+from drake_diff.record.parts import (
+    Certified,
+    DataBoundary,
+    Embodiment,
+    Evaluation,
+    Event,
+    Failure,
+    FiniteTable,
+    Metric,
+    Part,
+    Quantity,
+)
 from drake_diff.record.sealed import SealedRecord
+
+METRIC_WRONG = "metric_wrong"  # the code of a failure: a metric is not what it is by a second measurement
 
 
 class Claim(Part):
@@ -170,6 +183,29 @@ class ElsewhereEvidence(Part):
     rows: list[FollowedEvidence]
 
 
+class PanelCase(Part):
+    """One plant in which the plan was judged, and under which control; `decides` where the verdict rests on it."""
+
+    variant: str
+    control: str
+    time_step_s: float
+    contact_approximation: str
+    decides: bool
+
+
+class EvaluationPanel(Part):
+    """Under what the plan was judged: plants, perturbations, latencies; runs of one `sha256` were judged alike.
+
+    The hash is that of the panel's canonical JSON with `sha256` empty.
+    """
+
+    statement: str
+    cases: list[PanelCase]
+    perturbations: list[str]
+    latencies_s: list[float]
+    sha256: str = ""
+
+
 class EvidenceRecord(SealedRecord):
     """Everything a stranger needs to judge one solve; the motion is in plan.npz and trace.mcap.
 
@@ -183,11 +219,15 @@ class EvidenceRecord(SealedRecord):
     inputs: Inputs
     problem: FiniteTable
     contract: FiniteTable
+    embodiment: Embodiment | None = None  # null in records of before 2.2
+    data: DataBoundary | None = None  # the same
+    panel: EvaluationPanel | None = None  # the same, and before anything was judged
     units: dict[str, str]  # of the numbers in `problem` and `contract`, by their key
     solver: Solver | None = None
     parameters: list[ParameterEvidence] = Field(default_factory=list)
     metrics: list[Metric] = Field(default_factory=list)
     invariants: list[Metric] = Field(default_factory=list)
+    evaluations: list[Evaluation] = Field(default_factory=list)
     gradient: GradientEvidence | None = None
     observation: Observation
     action: ActionInterface
@@ -205,6 +245,26 @@ class EvidenceRecord(SealedRecord):
                 broken.append(f"solver status {self.solver.status if self.solver else 'missing'}")
             if broken:
                 raise ValueError(f'a verdict "pass" with {", ".join(broken)}')
+        return self
+
+    @model_validator(mode="after")
+    def _says_where_its_evaluation_fails(self) -> "EvidenceRecord":
+        metrics = {metric.name: metric for metric in self.metrics}
+        for e in self.evaluations:
+            if e.name not in metrics or e.verdict != e.of(metrics[e.name]):
+                raise ValueError(f'evaluation of {e.name}: "{e.verdict}" is not what the two values say')
+            labelled = any(f.label == "evaluation_error" and f.code == METRIC_WRONG for f in self.failures)
+            if e.verdict == "differ" and not labelled:
+                raise ValueError(f"{e.name} differs from its second measurement: expected an evaluation_error")
+        return self
+
+    @model_validator(mode="after")
+    def _was_judged_on_its_panel(self) -> "EvidenceRecord":
+        judged = [(r.variant, r.control, r.time_step_s, r.contact_approximation) for r in self.replays]
+        cases = self.panel.cases if self.panel is not None else []
+        told = [(c.variant, c.control, c.time_step_s, c.contact_approximation) for c in cases]
+        if self.panel is not None and told != judged:
+            raise ValueError(f"panel: expected the {len(judged)} replays, got {len(told)} others")
         return self
 
     def as_row(self) -> dict[str, str]:
