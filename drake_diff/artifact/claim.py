@@ -6,6 +6,7 @@ from typing import Any
 from drake_diff.artifact.differences import shown
 from drake_diff.artifact.sections import COSTS, LIMITS
 from drake_diff.record.certification import CertificationRecord
+from drake_diff.record.identification import IdentificationRecord
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.sealed import SealedRecord
 from drake_diff.record.solve import EvidenceRecord
@@ -29,6 +30,8 @@ def claims_of(record: SealedRecord) -> tuple[str, ...]:
         parameters = ", ".join(record.parameters) or "no parameter"
         asked = f"{len(record.states)} states of seed {record.seed}, by {record.method}, with {parameters}"
         lines.append(f"certificates at {asked}")
+    elif isinstance(record, IdentificationRecord):
+        lines += _of_an_identification(record)
     return tuple(lines)
 
 
@@ -44,6 +47,16 @@ def _of_phases(record: PhasesRecord) -> Iterator[str]:
         yield f"in all {listed(record.horizon_s)} s"
     search = ", ".join(f"{k} {shown(v)}" for k, v in sorted((record.search or {}).items()) if v is not None)
     yield f"by solve with {search or 'arguments that are not recorded'}"
+
+
+def _of_an_identification(record: IdentificationRecord) -> Iterator[str]:
+    asked = record.inputs
+    yield f"parameters {asked.parameters if isinstance(asked.parameters, str) else listed(asked.parameters)}"
+    yield f"noise {shown(asked.noise) if asked.noise else 'estimated'}, held out {shown(asked.held_out)}"
+    yield f"motion {asked.motion}, in at most {asked.max_iterations} steps"
+    for r in record.recordings:
+        file = "given as arrays" if r.file is None else f"{r.file} ({(r.sha256 or '')[:12]})"
+        yield f"recording {r.name}, {r.samples} samples, {file}"
 
 
 def _of_a_solve(record: EvidenceRecord) -> Iterator[str]:

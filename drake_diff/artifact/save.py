@@ -5,12 +5,13 @@ record.json is complete last, so that a run that is killed leaves a record that 
 
 import json
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 from drake_diff.artifact.measurement import Measurement, elsewhere_evidence, failure_of, measure, replay_evidence
 from drake_diff.artifact.phased import begin_phases, phases_record, save_phases
 from drake_diff.artifact.rerun import PLAN, TRACE, write_plan
 from drake_diff.artifact.sections import asked, found, panel_of
+from drake_diff.exceptions import InputError
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
@@ -20,6 +21,10 @@ from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.provenance import provenance_of, written_now
 from drake_diff.record.sealed import WallClock, canonical, reproducible
 from drake_diff.record.solve import EvidenceRecord
+
+if TYPE_CHECKING:
+    from drake_diff.identification.identify import Identification
+    from drake_diff.record.identification import IdentificationRecord
 
 REPLAY, REPORT = "replay.html", "report.html"
 FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record and its schema
@@ -42,7 +47,11 @@ def begin(directory: str | Path, problem: Problem | PhasedProblem) -> None:
 def save(solution: Solution, directory: str | Path) -> EvidenceRecord: ...
 @overload
 def save(solution: PhasedSolution, directory: str | Path) -> PhasesRecord: ...
-def save(solution: Solution | PhasedSolution, directory: str | Path) -> EvidenceRecord | PhasesRecord:
+@overload
+def save(solution: "Identification", directory: str | Path) -> "IdentificationRecord": ...
+def save(
+    solution: "Solution | PhasedSolution | Identification", directory: str | Path
+) -> "EvidenceRecord | PhasesRecord | IdentificationRecord":
     """Measure a solution and write its directory: record, plan, trace, replay and report.
 
     Each file is written aside and moved into place, record.json last, so that at any moment the record is complete
@@ -51,6 +60,8 @@ def save(solution: Solution | PhasedSolution, directory: str | Path) -> Evidence
     Args:
         solution: A result of `solve`, of any status. Of one in phases, phases.json says how they are linked, and each
             phase has a directory phase_0, phase_1, ... of its own with all these files; there is no page of the whole.
+            Or a result of `identify`: identification.json, the recordings, the model file, trace.mcap and report.html
+            are written, and "pass" says that the values found explain the recordings.
         directory: Where to write record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html.
             It is made where there is none; files of these names are replaced. Plain dynamics have nothing to draw
             in 3D, and so no replay.html.
@@ -61,6 +72,8 @@ def save(solution: Solution | PhasedSolution, directory: str | Path) -> Evidence
 
     Raises:
         OSError: A file cannot be written.
+        InputError: It is none of these.
+        ArtifactError: The file of a recording has changed since `identify` read it.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -73,12 +86,23 @@ def save(solution: Solution | PhasedSolution, directory: str | Path) -> Evidence
     folder = Path(directory)
     if isinstance(solution, PhasedSolution):
         return save_phases(solution, folder, save, FILES)
+    if not isinstance(solution, Solution):
+        return _save_other(solution, folder)
     begin(folder, solution.problem)
     write_plan(folder / PLAN, solution)  # what is measured next may take long
     measurement = measure(solution)
     record = record_of(measurement, folder)
     write_files(folder, measurement, record)
     return record.write(folder)
+
+
+def _save_other(result: Any, folder: Path) -> "IdentificationRecord":
+    from drake_diff.artifact.identified import save_identification  # what saves a solve need not load it
+    from drake_diff.identification.identify import Identification
+
+    if not isinstance(result, Identification):
+        raise InputError("solution", got=type(result).__name__, expected="a result of solve or of identify")
+    return save_identification(result, folder)
 
 
 def write_files(folder: Path, measurement: Measurement, record: EvidenceRecord) -> None:

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -28,6 +29,7 @@ from drake_diff.exceptions import ArtifactError, DrakeDiffError, MissingDependen
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.certification import CertificationRecord, certify_model
 from drake_diff.record.comparison import ComparisonRecord
+from drake_diff.record.identification import IdentificationRecord
 from drake_diff.record.parts import FileEvidence
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.provenance import provenance_of
@@ -46,6 +48,10 @@ UNCHECKED = (
 GIVEN = "problem, model and inputs.search: they are what was asked; a record that asks for less can be just as true"
 GIVEN_IN_PHASES = "in each phase's record problem and model, and here links and search: they are what was asked"
 WITHIN_PHASES = "the record does not say what solve was called with"  # of a phase: that of all says it
+OF_RECORDINGS = (
+    "inputs, model and the recordings: they are what was asked, and whether a robot moved so is for who recorded it; "
+    "recordings[...].sha256 is the hash of the file that was read"
+)
 OF_FUNCTIONS = (
     "all that rests on the functions: only the plan's first and last state and its bounds were compared with the "
     "metrics, and the plan with the trace"
@@ -205,6 +211,8 @@ def _run_again(found: Verification, record: SealedRecord) -> Verification:
             return _certify_again(found, record)
         if isinstance(record, PhasesRecord):
             return _phases_again(found, record)
+        if isinstance(record, IdentificationRecord):
+            return _identify_again(found, record)
     except (ModelError, MissingDependencyError) as error:
         return _without_its_functions(found, record, error)
     except ArtifactError as error:
@@ -420,6 +428,37 @@ def _certify_again(found: Verification, record: CertificationRecord) -> Verifica
     return _judged(replace(found, unchecked=unchecked, rounded=rounded, checked=fields.count), problems, [])
 
 
+def _identify_again(found: Verification, record: IdentificationRecord) -> Verification:
+    """The fit once more from the recordings in the directory, and all that was written of it."""
+    from drake_diff.artifact.identified import MADE, identified_again, write_made
+
+    made, identification = identified_again(found.directory, record)
+    again = made.model_copy(update={"contract": contract_as(made.contract, record.contract)})
+    fields = Compared(record.FILE)
+    compare_fields(fields, record.model_dump(mode="json"), again.model_dump(mode="json"))
+    compared = [fields]
+    with TemporaryDirectory() as folder:
+        write_made(Path(folder), identification, again)
+        for name in MADE:
+            one = Compared(name)
+            if name not in record.files:
+                one.differ("the file", "none", "written with every identification")
+            elif name == TRACE:
+                new, kept = ((place / name).read_bytes() for place in (Path(folder), found.directory))
+                compare_traces(one, kept, new, alike=(record.FILE,))
+            else:
+                compare_text(one, (found.directory / name).read_bytes(), (Path(folder) / name).read_bytes())
+            compared.append(one)
+    differing = [d for one in compared for d in one.differing]
+    problems = [*_odd_schema(record), *(str(d) for d in differing if not d.allowed)]
+    kept_files = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
+    carried = "" if record.model.file is None else record.model.file.path
+    unchecked = (*UNCHECKED, OF_RECORDINGS, *_others(record, (carried, *kept_files, *MADE)))
+    rounded = tuple(str(d) for d in differing if d.allowed)
+    checked = sum(one.count for one in compared)
+    return _judged(replace(found, unchecked=unchecked, rounded=rounded, checked=checked), problems, [])
+
+
 def _odd_trace(trace: Trace, plan: dict[str, Any], record: EvidenceRecord) -> Iterator[str]:
     """What in the trace is not what record.json and plan.npz have."""
     if trace.attachments.get(record.FILE) != reproducible(record.model_dump(mode="json")).encode():
@@ -444,6 +483,8 @@ def _other_versions(record: SealedRecord) -> tuple[str, ...]:
     used = ["drake", "drake-diff", "numpy", "casadi"]
     if isinstance(record, EvidenceRecord) and record.elsewhere is not None:
         used += record.elsewhere.engines
+    if isinstance(record, IdentificationRecord):
+        used.append("numba")  # by which the motions are computed, where it is there
     names = [n for n in used if was.get(n) != now.get(n)]
     told = [f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names]
     if record.schema_version != SCHEMA_VERSION:

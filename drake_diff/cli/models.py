@@ -1,4 +1,4 @@
-"""Commands on a model file: audit, certify, compare, export-model."""
+"""Commands on a model file: audit, certify, compare, identify, export-model."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,8 +11,10 @@ from drake_diff.cli.text import (
     judged,
     names_in,
     names_option,
+    numbers_in,
     out_option,
     plain,
+    progress_line,
     show,
     table,
     takes_model,
@@ -25,7 +27,7 @@ FINDINGS = {"error": "bold red", "warning": "bold yellow", "info": "bold dim"}
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to `app`."""
-    for command in (audit, certify, compare):
+    for command in (audit, certify, compare, identify):
         app.command()(takes_model(command))
     app.command("export-model")(takes_model(export))
 
@@ -143,6 +145,59 @@ def compare(
         show(plain(r.engine, "bold dim"), plain(f"not compared: {r.reason}", "dim"))
     show(judged(record.verdict), record.sentence)
     show(f"wrote {directory / PAGE}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def identify(
+    model: Any,
+    file: Path,
+    recording: Annotated[
+        list[Path], typer.Option(help="A recorded motion: CSV, MCAP or a ROS 2 bag. Can be given again.")
+    ],
+    parameters: Annotated[str | None, names_option("Parameters to estimate", "all")] = None,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(metavar="STATE=DEVIATION", help="Standard deviation of a state's noise. Can be given again."),
+    ] = None,
+    held_out: Annotated[
+        str,
+        typer.Option(metavar="PART|NAME", help="The part at the end of each recording, or a recording, to predict."),
+    ] = "0.2",
+    motion: Annotated[str, typer.Option(help="auto, continuous or steps")] = "auto",
+    out: Annotated[Path | None, out_option("artifacts/identify_<model>")] = None,
+) -> None:
+    """Estimate parameters of MODEL from recordings: which differ, by how much, how sure, and what stays open.
+
+    Writes identification.json, the recordings, trace.mcap and report.html. Exit status 0 only if the values found
+    explain the recordings.
+    """
+    from drake_diff.artifact.save import save
+    from drake_diff.identification.identify import identify as estimate
+
+    directory = out or Path("artifacts") / f"identify_{file.stem}"
+    names: Any = "all" if parameters is None else names_in(parameters)
+    given = numbers_in("--noise", noise or (), "STATE=DEVIATION")
+    try:
+        part: float | str = float(held_out)
+    except ValueError:
+        part = held_out
+    with progress_line("fitting"):
+        found = estimate(model, list(recording), names, noise=given or None, held_out=part, motion=motion)
+    record: Any = save(found, directory)
+    show(judged(record.verdict), record.sentence)
+    rows = table("parameter", "before", "found", "95 % from", "to", "unit", "", left=1)
+    for e in record.estimates:
+        known = e.lower is not None and e.upper is not None
+        differs = known and not e.lower <= e.before <= e.upper
+        told = plain("not known", "dim") if not known else plain("differs", "yellow") if differs else plain("")
+        rows.add_row(
+            plain(e.name), plain(e.before), plain(e.value), plain(e.lower), plain(e.upper), plain(e.unit), told
+        )
+    show(rows)
+    for line in record.unidentifiable:
+        show(plain("left open", "bold dim"), line)
+    show(f"fitted {record.motion}, {record.steps} steps")
+    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 

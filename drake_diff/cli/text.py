@@ -6,7 +6,7 @@ What a record or a model says may be a stranger's text: it is printed without ma
 import functools
 import inspect
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -146,6 +146,12 @@ def _split(option: str, words: str, expected: str) -> tuple[str, str]:
     if not (name and sign and value):
         raise InputError(option, got=repr(words), expected=expected)
     return name.strip(), value.strip()
+
+
+def numbers_in(option: str, words: Iterable[str], expected: str) -> dict[str, float]:
+    """Numbers by name, of "NAME=NUMBER" each."""
+    pairs = (_split(option, word, expected) for word in words)
+    return {name: _number(option, value, expected) for name, value in pairs}
 
 
 def _number(option: str, words: str, expected: str) -> float:

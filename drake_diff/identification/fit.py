@@ -181,6 +181,16 @@ class Fit:
         value = sum(float(np.nansum(r**2)) for r in residuals) + self._pull(z)
         return Point(z, starts, xs, residuals, gaps, value, float(np.linalg.norm(gaps / self.gap_scale)))
 
+    def states(self, solved: "Solved") -> list[Array]:
+        """(n, nx) of each piece: the motion at its samples."""
+        s = self.segments
+        with np.errstate(over="ignore", invalid="ignore"):
+            xs = self.law.run(self.unknowns.values(solved.z), solved.starts, s.hs, s.us)
+        found = [np.empty((len(piece.times), self.model.nx)) for piece in s.pieces]
+        for k, p in enumerate(s.of_piece):
+            found[p][s.samples[k]] = xs[k, s.at[k]]
+        return found
+
     def _shift(self, values: Array) -> Array:
         shift = np.zeros(self.chart.size)
         for column, entry in self._bias_columns():

@@ -1,7 +1,7 @@
 """Which parameters of a model are wrong, and by how much, from recordings of its motion."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from drake_diff.identification.measured import (
     given_noise,
     guess_states,
     noise_by_differences,
+    read_given,
     read_pieces,
 )
 from drake_diff.identification.steps import discrete_motion
@@ -47,6 +48,31 @@ LONGEST, SHORTEST = 0.02, 1e-4  # [s] of the steps of Runge and Kutta
 STEP_ERROR = 1e-3  # of the noise: what a step of half the length may change over a segment
 ROUNDS = 5  # of estimating the noise
 SAME_NOISE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What `identify` was called with."""
+
+    model: Model
+    recordings: tuple[Recording, ...]
+    files: tuple[tuple[Path, str] | None, ...]  # of each, the file that it was read from and its hash
+    parameters: tuple[str, ...] | str
+    noise: Mapping[str, float]
+    held_out: float | str
+    motion: str
+    max_iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A stretch of a recording beside the model's motion."""
+
+    piece: Piece
+    xs: Array  # (n, nx) with the values that were found
+    xs_before: (
+        Array | None
+    )  # with the model's own, from a first state that fits best; None where that was not looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +98,8 @@ class Identification(ShowsItsRepr):
     converged: bool
     steps: int
     motion: str  # which motion was fitted
+    motions: tuple[Followed, ...]  # of what was fitted, then of what was held out
+    asked: Asked | None = None  # what was asked: `dd.save` writes it, and `dd.verify` asks it again
 
     def __repr__(self) -> str:
         return self.sentence
@@ -127,7 +155,8 @@ def identify(
     positive_int("max_iterations", max_iterations)
     if motion not in MOTIONS:
         raise UnknownNameError("motion", got=motion, known=MOTIONS)
-    chart, pieces = Chart(coordinates_of(model)), read_pieces(model, recordings, held_out)
+    given, files = read_given(model, recordings)
+    chart, pieces = Chart(coordinates_of(model)), read_pieces(model, given, held_out)
     tree = tree_for_identification(model)
     why = str(tree) if isinstance(tree, Refusal) else _what_acts(model, chart, pieces)
     if motion == "continuous" and isinstance(tree, Refusal):
@@ -144,7 +173,9 @@ def identify(
         else ContinuousMotion(model, own_tree, chart, unknowns, LONGEST)
     )
     fit, solved = problem.solve(law, max_iterations)
-    return problem.judged(fit, solved, why if motion == "auto" else "")
+    found = problem.judged(fit, solved, why if motion == "auto" else "")
+    names = parameters if isinstance(parameters, str) else tuple(parameters)
+    return replace(found, asked=Asked(model, given, files, names, dict(noise or {}), held_out, motion, max_iterations))
 
 
 def _what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
@@ -244,7 +275,7 @@ class _Problem:
         known = known_of(unknowns, z, solved.reduced.R)
         intervals = intervals_of(unknowns, z, known.covariance, count - taken)
         values, by_z = unknowns.values(z), unknowns.by_z(z)
-        before, after, why_not = self._predicted(fit, solved, known, count - taken)
+        before, after, why_not, motions = self._predicted(fit, solved, known, count - taken)
         reason = self._reason(fit, solved, why_not)
         lost = ~np.isfinite(np.diag(known.covariance))
         covariance = by_z @ np.where(np.isfinite(known.covariance), known.covariance, 0.0) @ by_z.T
@@ -278,31 +309,38 @@ class _Problem:
             converged=solved.converged,
             steps=solved.steps,
             motion=fit.law.words + (f", as {why_steps}" if why_steps else ""),
+            motions=tuple(motions),
         )
         object.__setattr__(result, "sentence", _sentence(result, intervals, unknowns, values))
         return result
 
-    def _predicted(self, fit: Fit, solved: Solved, known: Known, freedom: float) -> tuple[float, float, str]:
-        """(the error with the model's own values, with those found, why that is too much: empty where it is not)."""
+    def _predicted(
+        self, fit: Fit, solved: Solved, known: Known, freedom: float
+    ) -> tuple[float, float, str, list[Followed]]:
+        """(error with the model's own values, with those found, why that is too much: empty where not; the motions)."""
         held = [piece for piece in self.pieces if piece.held_out]
         pieces = held or list(fit.segments.pieces)
         own = Fit(self.model, fit.law, self.chart, self.unknowns, pieces, fit.noise, fixed=True)
-        found = []
+        found, moved = [], []
         for z in (self.unknowns.z_start, solved.z):
             fixed = own.solve(z, self.guess(own), 20)
+            moved.append([frozen(xs) for xs in own.states(fixed)])
             count, taken = freedom_of(own, fixed)
             total = sum(float(np.nansum(r**2)) for r in fixed.reduced.residuals)
             found.append(float(np.sqrt(total / max(count - taken, 1))))
+        fitted = [frozen(xs) for xs in fit.states(solved)]
         if not held:
-            return found[0], found[1], ""
+            return found[0], found[1], "", [*map(Followed, pieces, fitted, moved[0])]
+        motions = [Followed(p, xs, None) for p, xs in zip(fit.segments.pieces, fitted, strict=True)]
+        motions += map(Followed, held, moved[1], moved[0])
         finite = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
         extra = float(np.trace(fixed.reduced.R @ finite @ fixed.reduced.R.T))
         allowed = float(stats.f.ppf(0.999, max(count - taken, 1), max(freedom, 1))) * (
             1 + extra / max(count - taken, 1)
         )
         if fixed.converged and found[1] ** 2 <= allowed:
-            return found[0], found[1], ""
-        return found[0], found[1], f"samples that were held out are missed by {found[1]:.3g} times the noise"
+            return found[0], found[1], "", motions
+        return found[0], found[1], f"samples that were held out are missed by {found[1]:.3g} times the noise", motions
 
     def _reason(self, fit: Fit, solved: Solved, why_not: str) -> str:
         """Why the model does not explain the recordings; empty where it does."""

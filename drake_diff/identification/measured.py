@@ -1,7 +1,8 @@
 """What was measured, in pieces that each have a first state of their own: samples, noise, and a guess of states."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from hashlib import sha256
 from math import comb
 from pathlib import Path
 from typing import Any
@@ -31,11 +32,12 @@ class Piece:
     ys: Array  # (n, nx) measured states; NaN where nothing was
     us: Array  # (n-1, nu) held from each sample to the next
     held_out: bool
+    recording: int = 0  # which one it is of
 
     def part(self, first: int, last: int) -> "Piece":
         """From one sample to another, both included."""
         span = slice(first, last + 1)
-        return Piece(self.name, self.times[span], self.ys[span], self.us[first:last], self.held_out)
+        return replace(self, times=self.times[span], ys=self.ys[span], us=self.us[first:last])
 
 
 def read_pieces(
@@ -58,18 +60,37 @@ def read_pieces(
     elif not 0 <= held_out <= 0.8:
         raise InputError("held_out", got=held_out, expected="from 0 to 0.8 of the samples, or a recording's name")
     pieces = []
-    for r in each:
-        whole = _checked(r, model)
+    for i, r in enumerate(each):
+        whole = replace(_checked(r, model), recording=i)
         if isinstance(held_out, str):
-            pieces.append(Piece(whole.name, whole.times, whole.ys, whole.us, r.name == held_out))
+            pieces.append(replace(whole, held_out=r.name == held_out))
             continue
         last, count = len(whole.times) - 1, round(held_out * len(whole.times))
         count = count if LEAST <= count <= last - LEAST else 0
         pieces.append(whole.part(0, last - count))
         if count:
-            rest = whole.part(last - count, last)
-            pieces.append(Piece(rest.name, rest.times, rest.ys, rest.us, True))
+            pieces.append(replace(whole.part(last - count, last), held_out=True))
     return pieces
+
+
+def read_given(
+    model: Model, recordings: Recording | str | Path | Sequence[Recording | str | Path]
+) -> tuple[tuple[Recording, ...], tuple[tuple[Path, str] | None, ...]]:
+    """Every recording, and the file that it was read from with its hash, where there is one."""
+    given = [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
+    found, files = [], []
+    for one in given:
+        files.append(None if isinstance(one, Recording) or not Path(one).exists() else (Path(one), hash_of(Path(one))))
+        found.append(one if isinstance(one, Recording) else read_recording(one, model, gaps=True))
+    return tuple(found), tuple(files)
+
+
+def hash_of(path: Path) -> str:
+    """The hash of a file; of a directory, that of the names and hashes of its files."""
+    if path.is_file():
+        return sha256(path.read_bytes()).hexdigest()
+    names = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
+    return sha256("".join(f"{hash_of(path / name)} {name}\n" for name in names).encode()).hexdigest()
 
 
 def _checked(recording: Recording, model: Model) -> Piece:

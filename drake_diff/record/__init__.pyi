@@ -1,6 +1,7 @@
 from .certification import CertificationRecord as CertificationRecord
 from .certification import certify_model as certify_model
 from .comparison import ComparisonRecord as ComparisonRecord
+from .identification import IdentificationRecord as IdentificationRecord
 from .phases import PhasesRecord as PhasesRecord
 from .robustness import RobustnessRecord as RobustnessRecord
 from .rollout import RolloutRecord as RolloutRecord

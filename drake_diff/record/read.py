@@ -5,6 +5,7 @@ from pathlib import Path
 from drake_diff.exceptions import ArtifactError
 from drake_diff.record.certification import CertificationRecord
 from drake_diff.record.comparison import ComparisonRecord
+from drake_diff.record.identification import IdentificationRecord
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.robustness import RobustnessRecord
 from drake_diff.record.rollout import RolloutRecord
@@ -18,6 +19,7 @@ KINDS: tuple[type[SealedRecord], ...] = (
     CertificationRecord,
     PhasesRecord,
     RolloutRecord,
+    IdentificationRecord,
 )
 
 
@@ -27,17 +29,18 @@ def kind_of(directory: str | Path) -> type[SealedRecord] | None:
 
 
 def load_record(directory: str | Path) -> SealedRecord:
-    """Read the record in a directory that a solve, a comparison, trials, a certification or `save_rollout` wrote.
+    """Read the record in a directory that a solve, a comparison, trials, a certification, an identification or
+    `save_rollout` wrote.
 
     It is read, not verified: see `verify`.
 
     Args:
         directory: The directory that holds record.json, phases.json, comparison.json, robustness.json,
-            certification.json or rollout.json.
+            certification.json, rollout.json or identification.json.
 
     Returns:
-        An `EvidenceRecord`, `PhasesRecord`, `ComparisonRecord`, `RobustnessRecord`, `CertificationRecord` or
-        `RolloutRecord`.
+        An `EvidenceRecord`, `PhasesRecord`, `ComparisonRecord`, `RobustnessRecord`, `CertificationRecord`,
+        `RolloutRecord` or `IdentificationRecord`.
 
     Raises:
         ArtifactError: There is no such record, or it does not follow its schema.
