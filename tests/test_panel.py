@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,8 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff._base.statistics import success_rate
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
-from drake_diff.panels.panel_file import expand, load_panel
+from drake_diff.panels.panel_file import canonical, expand, load_panel
+from drake_diff.panels.ranking import ranked
 from drake_diff.panels.workers import row_of
 
 FUNCTIONS = """
@@ -473,3 +475,62 @@ def test_without_ray_its_extra_is_named(write, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'drake-diff\[cluster\]'"):
         dd.panels.run_panel(write(), out=tmp_path / "out", engine="ray")
+
+
+def test_every_trial_has_a_record_that_is_the_same_for_any_number_of_workers(write, tmp_path):
+    path = write("fails")
+    found = [dd.panels.run_panel(path, out=tmp_path / f"out_{n}", workers=n) for n in (1, 2)]
+    one, two = ({p.name: p.read_bytes() for p in (f.directory / "trials").iterdir()} for f in found)
+    assert one == two
+    assert set(one) == {f"{row['id']}.json" for row in found[0].rows}
+    told = {record["id"]: record for record in map(json.loads, one.values())}
+    for row in found[0].rows:
+        record = told[row["id"]]
+        assert record["inputs"]["seed"] == row["seed"]
+        assert record["cell"] == {"method": "a", "level": row["level"]}
+        assert record["verdict"] == ("fail" if row["level"] == 2 else "not judged")
+        assert ("error" in record["result"]) == (row["level"] == 2)
+        assert record["panel"]["evaluate"] == "trials.py:fails"
+        content = {key: value for key, value in record.items() if key != "sha256"}
+        assert record["sha256"] == sha256(canonical(content)).hexdigest()
+
+
+def cell(name, successes, trials, cost=None, errors=0):
+    rate = success_rate(successes, trials)
+    return {
+        "cell": {"method": name},
+        "trials": trials,
+        "errors": errors,
+        "success": {"count": successes, "rate": rate.value, "low": rate.lower, "high": rate.upper},
+        "numbers": {} if cost is None else {"cost": {"mean": cost}},
+    }
+
+
+def test_the_ranking_is_by_what_is_sure_and_says_what_cannot_be_told_apart():
+    """2 of 2 is less sure than 95 of 100 (Wilson: at least 0.34 against 0.89), and is not told apart from it."""
+    cells = [cell("few", 2, 2), cell("dear", 95, 100, 3.0), cell("bad", 10, 100), cell("cheap", 95, 100, 1.0)]
+    by, rows = ranked({"cells": cells})
+    assert by.startswith("the lower end")
+    assert [row["cell"]["method"] for row in rows] == ["cheap", "dear", "few", "bad"]
+    assert [row["place"] for row in rows] == [1, 2, 3, 4]
+    assert [row["apart"] for row in rows] == [False, False, False, True]
+    for each in cells:
+        del each["success"]
+    cells[3]["errors"] = 1
+    by, rows = ranked({"cells": cells})
+    assert by.startswith("the fewest errors")
+    assert [(row["cell"]["method"], row["place"]) for row in rows] == [
+        ("dear", 1),
+        ("few", 2),
+        ("bad", 2),
+        ("cheap", 4),
+    ]
+    assert {row["apart"] for row in rows} == {None}
+
+
+def test_names_on_the_page_of_a_panel_are_text(write, tmp_path):
+    path = write("fails", methods='["<script>alert(1)</script>"]')
+    dd.panels.run_panel(path, out=tmp_path / "out", workers=1)
+    page = (tmp_path / "out" / "panel.html").read_text()
+    assert "<script>alert(1)" not in page
+    assert "method=&lt;script&gt;alert(1)" in page

@@ -87,7 +87,7 @@ def panel(
     ] = None,
     out: Annotated[Path | None, out_option("artifacts/<file>")] = None,
 ) -> None:
-    """Evaluate every trial of FILE in parallel, and write table.csv and summary.json.
+    """Evaluate every trial of FILE in parallel, and write table.csv, summary.json, panel.html and trials/.
 
     Finished trials are kept: after Ctrl-C (exit status 130) or a kill the same command goes on.
     Exit status 1 if a trial ended in an error; its row says which.
@@ -118,7 +118,7 @@ def panel(
         rows.add_row(*(plain(word) for word in words))
     show(rows)
     show(f"{found.summary['trials']} trials, {found.errors} errors")
-    show(f"wrote {directory}: table.csv, summary.json, trials.jsonl")
+    show(f"wrote {directory}: table.csv, summary.json, trials.jsonl, a record of each trial in trials, panel.html")
     raise typer.Exit(1 if found.errors else 0)
 
 

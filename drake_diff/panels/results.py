@@ -22,9 +22,10 @@ from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import success_rate
 from drake_diff.exceptions import ArtifactError
 from drake_diff.panels.panel_file import PanelTrial, canonical, cell_name
+from drake_diff.panels.ranking import write_ranking
 from drake_diff.panels.workers import Row
 
-JOURNAL, TABLE, SUMMARY = "trials.jsonl", "table.csv", "summary.json"
+JOURNAL, TABLE, SUMMARY, TRIALS, PAGE = "trials.jsonl", "table.csv", "summary.json", "trials", "panel.html"
 SHOWN_CELLS = 8  # in a repr
 
 
@@ -142,7 +143,10 @@ class PanelTable(ShowsItsRepr):
 def write_table(
     directory: Path, trials: Sequence[PanelTrial], found: Mapping[str, Row], made: Mapping[str, Any]
 ) -> PanelTable:
-    """Write `table.csv` and `summary.json` of all `trials` into `directory`; `made` says what the panel is."""
+    """Write `table.csv`, `summary.json`, a record of each trial and the ranking of all `trials` into `directory`.
+
+    `made` says what the panel is.
+    """
     cells: dict[bytes, list[PanelTrial]] = {}
     for trial in trials:
         cells.setdefault(canonical(trial.cell), []).append(trial)
@@ -159,7 +163,32 @@ def write_table(
     write_whole(directory / TABLE, _csv(rows, {name for row in found.values() for name in row}))
     text = json.dumps(summary, indent=1, allow_nan=False, ensure_ascii=False)
     write_whole(directory / SUMMARY, text.encode() + b"\n")
+    (directory / TRIALS).mkdir(exist_ok=True)
+    for trial in trials:
+        write_whole(directory / TRIALS / f"{trial.id}.json", trial_record(trial, found[trial.id], made))
+    write_ranking(directory / PAGE, summary)
     return PanelTable(directory, rows, summary)
+
+
+def trial_record(trial: PanelTrial, row: Row, made: Mapping[str, Any]) -> bytes:
+    """The record of one trial as JSON: what it was given, what came out, of which panel, with which versions.
+
+    It is the same, byte for byte, whichever engine and worker evaluated it; `sha256` is of all else in it.
+    """
+    failed = "error" in row or row.get("success") is False
+    judged = isinstance(row.get("success"), bool)
+    told = {
+        "kind": "trial",
+        "id": trial.id,
+        "cell": trial.cell,
+        "inputs": trial.fields,
+        "result": row,
+        "verdict": "fail" if failed else "pass" if judged else "not judged",
+        "panel": dict(made),
+    }
+    return (
+        json.dumps({**told, "sha256": sha256(canonical(told)).hexdigest()}, sort_keys=True, indent=1).encode() + b"\n"
+    )
 
 
 def _csv(rows: Sequence[Row], answered: set[str]) -> bytes:
