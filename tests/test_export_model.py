@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import warnings
 from dataclasses import replace
 
@@ -115,6 +116,31 @@ def test_shapes_come_back_where_they_were(load, tmp_path, form):
         assert max(depths) > 0
         if form == "sdf" and name == "sphere_on_ground.sdf":
             assert theirs.contract.contacts[0].friction == 0.5
+
+
+@each_row(
+    "form, element, named",
+    [
+        (form, element, named)
+        for form in ("urdf", "sdf")
+        for element, named in (
+            ("mu_dynamic", "friction"), ("point_contact_stiffness", "stiffness"),
+            ("hunt_crossley_dissipation", "dissipation"), ("damping", "damping"), ("lower", "position limits"),
+            ("mass", "mass"),
+        )
+    ],
+)  # fmt: skip
+def test_friction_softness_limits_and_damping_come_back_and_one_that_is_off_is_named(load, form, element, named):
+    model = load("hopper.sdf")
+    text = written(form, describe(model), model.time_step)
+    assert complaints(form, model, text) == []
+
+    def more(found):
+        return f"{found[1]}{0.8 * float(found[2]) + 0.01!r}"
+
+    wrong, count = re.subn(rf'(<(?:drake:)?{element}(?: value=")?>?|{element}=")(-?[0-9.e+-]+)', more, text)
+    assert count
+    assert any(f", {named}: " in told for told in complaints(form, model, wrong)), (form, element)
 
 
 def test_mujoco_s_own_urdf_reader_has_the_same_mass_matrix(tmp_path):

@@ -63,6 +63,35 @@ def test_frames_inputs_and_diagnostics_are_the_trace_s(run, bag):
         assert float({v.key: v.value for v in m.status[0].values}["energy_total [J]"]) == energy
 
 
+def test_contacts_and_events_are_the_trace_s(load, tmp_path):
+    """Of a hopper that stands on its foot."""
+    from drake_diff.artifact import measure
+    from drake_diff.artifact.trace import write_trace
+
+    model = load("hopper.sdf", time_step=0.005)
+    x0 = model.default_state
+    problem = dd.Problem(model, x0=x0, num_steps=3, final_cost=lambda x: x[0] ** 2)
+    motion = dd.rollout(model, x0, np.zeros((3, model.nu)))
+    solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
+    write_trace(tmp_path / "trace.mcap", measure(solution), {})
+    export_ros2(tmp_path, tmp_path / "bag")
+    log = dd.logs.read_mcap(tmp_path / "trace.mcap").messages
+    found = messages(tmp_path / "bag", "/contacts")
+    assert len(found) == len(log["/contacts"]) == 3
+    for (time, ours), (at, theirs) in zip(log["/contacts"], found, strict=True):
+        assert at == time
+        assert [x.name for x in theirs.status] == [f"{a} on {b}" for a, b in zip(ours.body_a, ours.body_b, strict=True)]
+        for i, status in enumerate(theirs.status):
+            values = {v.key: float(v.value) for v in status.values}
+            units = {"depth": "m", "slip_speed": "m/s", "px": "m", "nz": "1", "fx": "N", "fz": "N"}
+            for name, unit in units.items():
+                assert values[f"{name} [{unit}]"] == getattr(ours, name)[i]
+    assert max(ours.fz[0] for _, ours in log["/contacts"]) > 0
+    events = messages(tmp_path / "bag", "/events")
+    assert [m.msg for _, m in events] == [e.message for _, e in log["/events"]]
+    assert [m.level for _, m in events] == [40 if e.kind == "failure" else 20 for _, e in log["/events"]]
+
+
 def test_rosbags_reads_the_whole_bag_with_its_metadata(bag):
     from rosbags.rosbag2 import Reader
 
@@ -73,15 +102,17 @@ def test_rosbags_reads_the_whole_bag_with_its_metadata(bag):
             "/tf": ("tf2_msgs/msg/TFMessage", 11),
             "/input": ("std_msgs/msg/Float64MultiArray", 10),
             "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", 11),
+            "/contacts": ("diagnostic_msgs/msg/DiagnosticArray", 0),
+            "/events": ("rcl_interfaces/msg/Log", 2),
         }
-        assert len(list(reader.messages())) == 54
+        assert len(list(reader.messages())) == 56
 
 
 def test_metadata_are_those_of_a_version_that_humble_reads(bag):
     from ruamel.yaml import YAML
 
     found = YAML(typ="safe").load(bag / "metadata.yaml")["rosbag2_bagfile_information"]
-    assert (found["version"], found["storage_identifier"], found["message_count"]) == (8, "mcap", 54)
+    assert (found["version"], found["storage_identifier"], found["message_count"]) == (8, "mcap", 56)
     assert found["relative_file_paths"] == ["bag.mcap"]
     assert found["duration"]["nanoseconds"] == 200_000_000
     formats = {t["topic_metadata"]["serialization_format"] for t in found["topics_with_message_count"]}

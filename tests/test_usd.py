@@ -1,5 +1,7 @@
 """The exported USD, read by Newton: another engine than the one that wrote it, float32 as USD's schemas are."""
 
+import re
+
 import numpy as np
 import pytest
 from helpers.contracts import arms
@@ -73,3 +75,73 @@ def test_what_usd_cannot_say_is_told_and_not_written(load, tmp_path):
     export_model(load("projectile.sdf"), tmp_path / "ball", target="isaaclab", states=2)
     assert (tmp_path / "ball" / "model.usda").read_text().startswith("#usda 1.0")
     assert "`model.usda` is the same model" in (tmp_path / "ball" / "README.md").read_text()
+
+
+def test_friction_ground_stiffness_limits_and_springs_are_read_by_usd_core(load):
+    """By UsdPhysics' own getters, from the file alone."""
+    from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
+
+    from drake_diff.export.usd import usd
+
+    def opened(name):
+        stage = Usd.Stage.CreateInMemory()
+        stage.GetRootLayer().ImportFromString(usd(describe(load(name))))
+        return stage
+
+    stage = opened("sphere_on_ground.sdf")
+    (plane,) = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Plane))
+    for prim in (plane, *(prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Sphere))):
+        assert prim.HasAPI(UsdPhysics.CollisionAPI)
+        material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
+        assert UsdPhysics.MaterialAPI(material).GetDynamicFrictionAttr().Get() == 0.5
+        assert UsdPhysics.MaterialAPI(material).GetRestitutionAttr().Get() == 0.0
+    assert UsdGeom.Plane(plane).GetAxisAttr().Get() == "Z"
+    world = UsdGeom.XformCache().GetLocalToWorldTransform(plane)
+    np.testing.assert_allclose(world.TransformDir((0, 0, 1)), [0, 0, 1], atol=1e-12)
+    sprung = opened("mass_spring_damper.sdf")  # a stage, which prims do not keep alive
+    slide = UsdPhysics.DriveAPI.Get(sprung.GetPrimAtPath("/robot/joints/slide"), "linear")
+    assert (slide.GetStiffnessAttr().Get(), slide.GetTargetPositionAttr().Get()) == pytest.approx((50, 0.1), rel=1e-6)
+
+
+DROPPED = {
+    "friction": ("sphere_on_ground.sdf", r"physics:dynamicFriction = 0.5"),
+    "stiffness of contact": ("sphere_on_ground.sdf", r"custom float physxMaterial:compliantContactStiffness = \d+"),
+    "the ground": ("sphere_on_ground.sdf", r'def Plane "collision_0"'),
+    "a spring": ("mass_spring_damper.sdf", r"drive:linear:physics:stiffness = 50"),
+    "damping": ("mass_spring_damper.sdf", r"drive:linear:physics:damping = 1.5"),
+    "a mass": ("mass_spring_damper.sdf", r"physics:mass = 2"),
+    "a limit": (None, r"physics:(lower|upper)Limit = "),
+}
+
+
+@pytest.mark.parametrize("what", DROPPED)
+def test_whatever_is_dropped_from_the_file_is_found(load, tmp_path, what):
+    from drake_diff.export.usd import complaints, usd
+
+    name, dropped = DROPPED[what]
+    description = describe(load(name) if name else arms(tmp_path))
+    text = usd(description)
+    assert complaints(description, text) == []
+    without, count = re.subn(dropped, lambda found: found[0].replace("hysics", "hysicist").replace("Plane", "Cone")
+                             .replace("hysx", "hysicx").replace("collision_0", "shown"), text)  # fmt: skip
+    assert count
+    assert complaints(description, without)
+
+
+def test_what_is_lost_is_told_by_name(load):
+    from drake_diff.export.usd import lost
+
+    assert any("dissipation" in told for told in lost(describe(load("sphere_on_ground.sdf"))))
+    assert lost(describe(load("cart_pole.urdf"))) == ("effort limits of force",)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["two_fingers.sdf", "hopper.sdf", "quadruped.urdf"])
+def test_newton_finds_friction_and_every_moving_body(load, tmp_path, name):
+    """Where bodies are welded to the world, too: its importer takes no joint of two that do not move."""
+    description = describe(load(name))
+    _, builder = newton_of(load(name), tmp_path)
+    frictions = {g.material["friction"] for g in description.geometries}
+    assert len(frictions) == 1
+    np.testing.assert_allclose(builder.shape_material_mu, frictions.pop(), rtol=1e-6)
+    assert {label.split("/")[-1] for label in builder.body_label} >= {x.body for x in description.moving}

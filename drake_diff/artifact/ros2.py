@@ -11,6 +11,7 @@ from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyEr
 from drake_diff.logs.mcap_file import read_mcap
 
 TRACE = "trace.mcap"
+INFO, ERROR = 20, 40  # of rcl_interfaces/Log
 BAG_VERSION = 8  # of metadata.yaml: the one that Humble and everything newer reads
 Convert = Callable[[dict[str, Any], int, Any, dict[str, Any]], Any]  # ROS types, time [ns], message, channel metadata
 
@@ -90,6 +91,29 @@ def _diagnostics(types: dict[str, Any], time: int, message: Any, metadata: dict[
     return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(types, time), status=[status])
 
 
+def _contacts(types: dict[str, Any], time: int, message: Any, metadata: dict[str, Any]) -> Any:
+    """diagnostic_msgs/DiagnosticArray: a status for each contact, body a on body b; numbers as in `_diagnostics`."""
+    units, pair = metadata["units"], types["diagnostic_msgs/msg/KeyValue"]
+    names = [field.name for field in message.DESCRIPTOR.fields if field.name not in ("body_a", "body_b")]
+    found = [
+        types["diagnostic_msgs/msg/DiagnosticStatus"](
+            level=0, name=f"{a} on {b}", message="contact", hardware_id="",
+            values=[pair(f"{name} [{units[name]}]", repr(getattr(message, name)[i])) for name in names],
+        )
+        for i, (a, b) in enumerate(zip(message.body_a, message.body_b, strict=True))
+    ]  # fmt: skip
+    return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(types, time), status=found)
+
+
+def _event(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
+    """rcl_interfaces/Log: a failure is an error, anything else information; its kind is the name."""
+    told = message.kind if not message.failure_label else f"{message.kind}: {message.failure_label}"
+    return types["rcl_interfaces/msg/Log"](
+        stamp=_header(types, time).stamp, level=ERROR if message.kind == "failure" else INFO, name=told,
+        msg=message.message, file="", function=message.code, line=0,
+    )  # fmt: skip
+
+
 def _header(types: dict[str, Any], time: int, frame: str = "") -> Any:
     return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(time, 1_000_000_000)), frame)
 
@@ -99,5 +123,7 @@ CONVERTED: dict[str, tuple[str, Convert]] = {
     "/planned/joint_states": ("sensor_msgs/msg/JointState", _joint_state),
     "/tf": ("tf2_msgs/msg/TFMessage", _transforms),
     "/input": ("std_msgs/msg/Float64MultiArray", _input),
+    "/contacts": ("diagnostic_msgs/msg/DiagnosticArray", _contacts),
+    "/events": ("rcl_interfaces/msg/Log", _event),
     "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", _diagnostics),
 }

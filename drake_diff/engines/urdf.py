@@ -1,8 +1,9 @@
 """Drake's plant as URDF, numbers to the last digit: for readers of URDF, and in the form that Bullet takes.
 
 For readers of URDF each link's frame stands at its joint and parallel to the world where q = 0: no joint is turned
-against its parent, so nothing goes through roll, pitch and yaw but geometry. URDF has no springs and no friction;
-neither is written. Bullet gets each link in the frame of its joint, with its inertia by the principal axes.
+against its parent, so nothing goes through roll, pitch and yaw but geometry.
+URDF has no springs; friction and softness of contact are written in the elements that Drake reads.
+Bullet gets each link in the frame of its joint, with its inertia by the principal axes.
 """
 
 from collections.abc import Sequence
@@ -18,6 +19,11 @@ from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import rotation
 from drake_diff.mechanics.description import Description, Geometry, Link, RigidLink
 
+# Drake's own elements, in URDF and SDF, of what a side of a contact is made.
+PROXIMITY = {
+    "friction": ("mu_dynamic", "mu_static"), "stiffness": ("point_contact_stiffness",),
+    "dissipation": ("hunt_crossley_dissipation",), "relaxation_time": ("relaxation_time",),
+}  # fmt: skip
 KINDS = {"weld": "fixed", "prismatic": "prismatic", "quaternion_floating": "floating"}
 SHAPES = ("Sphere", "Box", "Cylinder")  # URDF's own; Bullet has capsules too
 
@@ -30,7 +36,11 @@ def urdf(description: Description) -> str:
     root, elements = _tree(description, "world", description.links)
     zero = AtZero(description)
     for geometry in (g for g in description.geometries if shape_of(g)[0] in SHAPES):
-        _add_collision(elements[geometry.body], geometry, zero.in_frame(geometry.body) @ geometry.pose)
+        collision = _add_collision(elements[geometry.body], geometry, zero.in_frame(geometry.body) @ geometry.pose)
+        material = SubElement(collision, "drake:proximity_properties")
+        for quantity, value in geometry.material.items():
+            for name in PROXIMITY[quantity]:
+                SubElement(material, f"drake:{name}", value=row(value))
     armature = {x.joint: x.armature for x in description.moving}
     for name, joint in zip(description.inputs, description.actuated, strict=True):
         transmission = SubElement(root, "transmission", name=name)
@@ -162,13 +172,14 @@ def _add_inertial(body: Element, mass: float, center: RigidTransform, inertia: A
     SubElement(inertial, "inertia", {name: row(inertia[place]) for name, place in places.items()})
 
 
-def _add_collision(body: Element, geometry: Geometry, X: RigidTransform) -> None:
+def _add_collision(body: Element, geometry: Geometry, X: RigidTransform) -> Element:
     kind, sizes = shape_of(geometry)
     collision = SubElement(body, "collision", name=geometry.name)
     _place(collision, X)
     element = SubElement(SubElement(collision, "geometry"), kind.lower())
     for name, values in sizes.items():
         element.set(name, row(values))
+    return collision
 
 
 def _place(element: Element, X: RigidTransform) -> None:

@@ -21,13 +21,17 @@ from drake_diff.engines.load import load_engine
 from drake_diff.engines.mujoco.mjcf import mjcf
 from drake_diff.engines.urdf import urdf
 from drake_diff.exceptions import DrakeDiffError, ModelWarning
-from drake_diff.export.sdf import sdf
+from drake_diff.export.sdf import collision_name, sdf
 from drake_diff.mechanics.description import Description
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.tangent import tangent_space
 
-# What Drake does not read in these formats, or they cannot say: contract.json has it, as the README tells.
-IN_THE_CONTRACT = ("contact pairs", "friction", "stiffness", "dissipation")
+# What Drake does not read in a format, or it cannot say: contract.json has it, as the README tells.
+IN_THE_CONTRACT = {
+    "urdf": ("contact pairs",),
+    "sdf": ("contact pairs",),
+    "mjcf": ("contact pairs", "friction", "stiffness", "dissipation"),
+}
 SUFFIX = {"urdf": ".urdf", "sdf": ".sdf", "mjcf": ".xml"}
 H = 0.01  # [s]
 # Of rounding in numbers of size 1 to 100; the Jacobian's second derivatives magnify it.
@@ -88,17 +92,36 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore", ModelWarning)  # of what is other engines' alone
                         # Drake reads gravity of no format.
-                        engine = _Unlimited(load_model(path, time_step=model.time_step, gravity=gravity))
+                        found_there = load_model(
+                            path, time_step=model.time_step, gravity=gravity,
+                            contact_approximation=model.contract.contact.approximation,
+                        )  # fmt: skip
+                        engine = _Unlimited(found_there)
+                        found += _other_materials(form, reference.description, engine.description)
                 lines = match_contracts(_Named(model, form), engine)
             except DrakeDiffError as error:
                 found.append(f"{reader} cannot read it: {error}")
             else:
                 wrong = [line for line in lines if line.verdict == "different" and line.quantity not in LAWS]
                 if reader == "drake":
-                    wrong = [line for line in wrong if line.quantity not in IN_THE_CONTRACT]
+                    wrong = [line for line in wrong if line.quantity not in IN_THE_CONTRACT[form]]
                 else:  # shapes that MJCF is not written for are left out, with their pairs
                     wrong = [line for line in wrong if not line.reason]
                 found += [f"read by {reader}, {line.quantity}: {line.detail}" for line in wrong]
+    return found
+
+
+def _other_materials(form: str, own: Description, read: Description) -> list[str]:
+    """Friction and softness of shapes that came back otherwise, whether or not they can touch something there."""
+    found = []
+    for g in own.geometries if form != "mjcf" else ():
+        name = collision_name(g.name) if form == "sdf" else g.name
+        theirs = [x.material for x in read.geometries if x.name.rsplit("#", 1)[0].endswith(name)]
+        if theirs:  # else it is left out, and told
+            for quantity, value in g.material.items():
+                other = theirs[0].get(quantity)
+                if other is None or abs(other - value) > STEP_TOLERANCE * abs(value):
+                    found.append(f"read by drake, {quantity}: {g.name}: {other} where {value:g} was meant")
     return found
 
 

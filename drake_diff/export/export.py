@@ -70,7 +70,7 @@ OF_TARGET: Mapping[str, str] = {
   2 a b / (a + b) in Drake; the file has a number where all pairs have the same""",
     "isaaclab": """
 - `UrdfConverterCfg`: fix_base where the model hangs on the world, merge_fixed_joints False, joint_drive target type
-  none. Neither URDF nor the USD has friction and contact stiffness
+  none. Isaac's importer of URDF reads no friction; the USD has it, and stiffness of contact as PhysX's own attribute
 - environment parity: sim.dt = {h}, decimation = 1, render_interval = 1, gravity {gravity}, no action scale or clip
 - actuators: ImplicitActuatorCfg with stiffness 0, damping and armature of `contract.json`, effort limits as there
 - solver: TGS, 32 position and 1 velocity iterations, or say which; no contact offset, no bounce (restitution 0),
@@ -136,13 +136,21 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     made_usd, about_usd = {}, ""
     if target == "isaaclab":
         try:
-            from drake_diff.export.usd import usd
+            from drake_diff.export import usd
 
-            made_usd, about_usd = {"model.usda": usd(description)}, "`model.usda` is the same model in USD, in float32."
+            made_usd, about_usd = (
+                {"model.usda": usd.usd(description)},
+                "`model.usda` is the same model in USD, in float32.",
+            )
+            about_usd += f" It does not say: {'; '.join(usd.lost(description)) or 'nothing that is missed'}."
+            if wrong := usd.complaints(description, made_usd["model.usda"]):
+                raise CertificateError(
+                    f"nothing is exported: the USD, read again, is another model: {'; '.join(wrong)}"
+                )
         except (MissingDependencyError, ModelError) as error:
             about_usd = f"No USD is written: {error}. UrdfConverter makes one."
     names = {g.name: collision_name(g.name) if form == "sdf" else g.name for g in description.geometries}
-    left_out = [own for own, name in names.items() if name not in text]
+    left_out = [own for own, name in names.items() if f'"{name}"' not in text]
     contract = DrakeEngine(model).contract
     made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
     facts: dict[str, Any] = {**vars(contract), "h": repr(contract.time_step), "gravity": list(contract.gravity)}
@@ -154,7 +162,10 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     )  # fmt: skip
     files = {
         f"model{SUFFIX[form]}": text,
-        "contract.json": json.dumps(_plain({**asdict(contract), "initial_states": made}), indent=1) + "\n",
+        "contract.json": json.dumps(
+            _plain({**asdict(contract), "not_in_the_file": left_out, "initial_states": made}), indent=1
+        )
+        + "\n",
         "initial_states.csv": _table(["state", "kind", *model.state_names], ([s.kind, *s.x] for s in samples)),
         "inputs.csv": _table(["state", *model.input_names], (s.u for s in samples)),
         "README.md": readme,

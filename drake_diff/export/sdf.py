@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 
 from drake_diff.engines.common import row, shape_of, xml_text
 from drake_diff.engines.interface import UNLIMITED
-from drake_diff.engines.urdf import AtZero
+from drake_diff.engines.urdf import PROXIMITY, AtZero
 from drake_diff.mechanics.description import Description, Geometry, Link
 
 KINDS = {"weld": "fixed", "prismatic": "prismatic", "revolute": "revolute"}
@@ -20,7 +20,8 @@ GROUND = "fixed_to_the_world"  # the model of the world's own geometry
 def sdf(description: Description, time_step: float) -> str:
     """The SDF text. Geometries that are no sphere, box, cylinder, capsule, ellipsoid or half space are left out.
 
-    Friction is written where all pairs have the same: SDF has one of each geometry, and engines combine them otherwise.
+    Friction and softness of contact are written for each geometry as Drake reads them, and friction as others do
+    where all pairs have the same: these combine that of two geometries otherwise.
     """
     root = Element("sdf", {"version": "1.9", "xmlns:drake": "http://drake.mit.edu"})
     world = SubElement(root, "world", name="from_drake")
@@ -97,3 +98,7 @@ def _add_geometry(link: Element, geometry: Geometry, X: RigidTransform, friction
     if friction is not None:
         ode = SubElement(SubElement(SubElement(collision, "surface"), "friction"), "ode")
         SubElement(ode, "mu").text = SubElement(ode, "mu2").text = row(friction)
+    material = SubElement(collision, "drake:proximity_properties")
+    for quantity, value in geometry.material.items():
+        for name in PROXIMITY[quantity]:
+            SubElement(material, f"drake:{name}").text = row(value)

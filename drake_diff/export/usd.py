@@ -1,9 +1,10 @@
 """Drake's plant as USD with UsdPhysics, in the float32 that its schemas have; the frames are those of `urdf`.
 
 Angles of joints are in degrees there, and so are limits and damping. Joint damping is a drive to velocity 0, which
-PhysX takes implicitly; the armature is PhysX's own attribute.
+PhysX takes implicitly; armature and stiffness of contact are PhysX's own attributes.
 """
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,25 +16,24 @@ from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.description import Description, Geometry, Link
 
 try:
-    from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
+    from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 except ImportError as error:
     raise MissingDependencyError("USD needs usd-core: pip install 'drake-diff[usd]'") from error
 
-ROOT, GROUND = "/robot", "/fixed_to_the_world"
+ROOT, GROUND, MATERIALS = "/robot", "/fixed_to_the_world", "/materials"
+SINGLE = 1e-6  # of USD's float32
+SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
 
 
 def usd(description: Description) -> str:
-    """The text of a .usda file. Shapes that are no sphere, box, cylinder or capsule are left out, and friction is.
+    """The text of a .usda file, with friction of each shape, and the pairs that may touch; `lost` is what it lacks.
 
     ModelError where a link has no mass or moment of inertia, which USD takes for one to be computed from its shapes,
     and where a name is none of USD's.
     """
-    for link in description.links:
-        if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
-            raise ModelError(f"link {link.body}: USD cannot hold a mass or moment of inertia of 0")
-        for name in (link.body, link.joint):
-            if not Tf.IsValidIdentifier(name):
-                raise ModelError(f"{name!r} is not a valid name in USD")
+    anchored = _anchored(description)
+    moving = [link for link in description.links if link.body not in anchored]
+    _refuse(moving)
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -46,13 +46,89 @@ def usd(description: Description) -> str:
     UsdPhysics.ArticulationRootAPI.Apply(root)
     zero = AtZero(description)
     for link in description.links:
-        _add_link(stage, link, zero)
-    for link in description.links:
+        form = UsdGeom.Xform.Define(stage, f"{ROOT}/{link.body}")
+        _place(form, zero.frames[link.body])
+        if link.body not in anchored:
+            _add_inertia(form.GetPrim(), link, zero)
+    for link in moving:
         if link.kind != "quaternion_floating":
-            _add_joint(stage, link, zero)
+            _add_joint(stage, link, zero, anchored)
+    prims = {}
     for i, geometry in enumerate(description.geometries):
-        _add_geometry(stage, i, geometry, zero.in_frame(geometry.body) @ geometry.pose)
+        if shape_of(geometry)[0] in SHAPES:
+            prims[geometry.name] = _add_geometry(stage, i, geometry, zero.in_frame(geometry.body) @ geometry.pose)
+            _add_material(stage, i, geometry, prims[geometry.name])
+    _filter_pairs(description, prims)
     return str(stage.GetRootLayer().ExportToString())
+
+
+def _refuse(moving: Sequence[Link]) -> None:
+    """ModelError for what USD cannot hold."""
+    for link in moving:
+        if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
+            raise ModelError(f"link {link.body}: USD cannot hold a mass or moment of inertia of 0")
+        for name in (link.body, link.joint):
+            if not Tf.IsValidIdentifier(name):
+                raise ModelError(f"{name!r} is not a valid name in USD")
+
+
+def lost(description: Description) -> tuple[str, ...]:
+    """What of contact and actuators the file cannot say, by name."""
+    kinds = {g.name: shape_of(g)[0] or type(g.shape).__name__ for g in description.geometries}
+    found = [f"the shape of {name} ({kind})" for name, kind in kinds.items() if kind not in SHAPES]
+    sides = {g.name: g.material for g in description.geometries}
+    for pair in description.pairs:
+        a, b = (sides[name].get("friction") for name in pair.names)
+        if a != b:
+            found.append(
+                f"friction of {' with '.join(pair.names)}: {pair.friction} here, PhysX takes the average of {a} and {b}"
+            )
+    if any(pair.dissipation or pair.relaxation_time for pair in description.pairs):
+        found.append("dissipation of contacts")
+    limited = [x for x, e in zip(description.inputs, description.effort_limits, strict=True) if np.isfinite(e)]
+    return (*found, *(["effort limits of " + ", ".join(limited)] if limited else []))
+
+
+def complaints(description: Description, text: str) -> list[str]:
+    """What of bodies, joints and contact the .usda file `text`, read again, does not say."""
+    stage, found, anchored = Usd.Stage.CreateInMemory(), [], _anchored(description)
+    stage.GetRootLayer().ImportFromString(text)
+
+    def check(subject: str, path: str, wanted: Mapping[str, float]) -> None:
+        for name, value in wanted.items():
+            read = stage.GetPrimAtPath(path).GetAttribute(name).Get() if stage.GetPrimAtPath(path) else None
+            if read is None or not np.isclose(float(read), value, rtol=SINGLE, atol=SINGLE):
+                found.append(f"{name} of {subject}: {read} where {value} was meant")
+
+    scene, size = "/physicsScene", float(np.linalg.norm(description.gravity))
+    check("the world", scene, {"physics:gravityMagnitude": size})
+    for link in (link for link in description.links if link.body not in anchored):
+        check(f"link {link.body}", f"{ROOT}/{link.body}", {"physics:mass": link.mass})
+        kind = {"revolute": "angular", "prismatic": "linear"}.get(link.kind)
+        if kind:
+            unit = 180 / np.pi if kind == "angular" else 1.0
+            wanted = {
+                f"drive:{kind}:physics:damping": link.damping / unit,
+                f"drive:{kind}:physics:stiffness": link.stiffness / unit,
+                f"drive:{kind}:physics:targetPosition": link.rest * unit,
+                "physxJoint:armature": link.armature,
+            }
+            limits = {"physics:lowerLimit": link.lower * unit, "physics:upperLimit": link.upper * unit}
+            wanted |= {name: value for name, value in limits.items() if np.isfinite(value)}
+            check(f"joint {link.joint}", f"{ROOT}/joints/{link.joint}", wanted)
+    for i, geometry in enumerate(description.geometries):
+        if shape_of(geometry)[0] not in SHAPES:
+            continue
+        parent = GROUND if geometry.body == "world" else f"{ROOT}/{geometry.body}"
+        prim = stage.GetPrimAtPath(f"{parent}/collision_{i}")
+        if not prim or not prim.HasAPI(UsdPhysics.CollisionAPI):
+            found.append(f"the shape of {geometry.name}: it collides with nothing")
+            continue
+        bound = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0]
+        names = {"friction": "physics:dynamicFriction", "stiffness": "physxMaterial:compliantContactStiffness"}
+        wanted = {names[name]: value for name, value in geometry.material.items() if name in names}
+        check(f"geometry {geometry.name}", str(bound.GetPath()) if bound else "/none", wanted)
+    return found
 
 
 def _vector(values: Any) -> Any:
@@ -69,26 +145,34 @@ def _place(shape: Any, X: RigidTransform) -> None:
     shape.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, *xyz))
 
 
-def _add_link(stage: Any, link: Link, zero: AtZero) -> None:
-    form = UsdGeom.Xform.Define(stage, f"{ROOT}/{link.body}")
-    _place(form, zero.frames[link.body])
-    UsdPhysics.RigidBodyAPI.Apply(form.GetPrim())
+def _anchored(description: Description) -> set[str]:
+    """The world and the bodies that are welded to it: in USD, shapes that do not move, without mass or joint."""
+    found = {"world"}
+    for link in description.links:
+        if link.kind == "weld" and link.parent in found:
+            found.add(link.body)
+    return found
+
+
+def _add_inertia(prim: Any, link: Link, zero: AtZero) -> None:
+    UsdPhysics.RigidBodyAPI.Apply(prim)
     center, inertia = zero.inertia(link)
     moments, turn = principal(inertia)
-    mass = UsdPhysics.MassAPI.Apply(form.GetPrim())
+    mass = UsdPhysics.MassAPI.Apply(prim)
     mass.CreateMassAttr(link.mass)
     mass.CreateCenterOfMassAttr(_vector(center))
     mass.CreateDiagonalInertiaAttr(_vector(moments))
     mass.CreatePrincipalAxesAttr(_quaternion(turn))
 
 
-def _add_joint(stage: Any, link: Link, zero: AtZero) -> None:
+def _add_joint(stage: Any, link: Link, zero: AtZero, anchored: set[str]) -> None:
     name = {"weld": "FixedJoint", "revolute": "RevoluteJoint", "prismatic": "PrismaticJoint"}[link.kind]
     joint = getattr(UsdPhysics, name).Define(stage, f"{ROOT}/joints/{link.joint}")
-    if link.parent != "world":
+    if link.parent not in anchored:
         joint.CreateBody0Rel().SetTargets([f"{ROOT}/{link.parent}"])
     joint.CreateBody1Rel().SetTargets([f"{ROOT}/{link.body}"])
-    joint.CreateLocalPos0Attr(_vector(zero.in_parent(link).translation()))
+    place = zero.frames[link.body] if link.parent in anchored else zero.in_parent(link)
+    joint.CreateLocalPos0Attr(_vector(place.translation()))
     joint.CreateLocalPos1Attr(_vector([0, 0, 0]))
     if link.kind == "weld":
         return
@@ -109,7 +193,7 @@ def _add_joint(stage: Any, link: Link, zero: AtZero) -> None:
     joint.GetPrim().CreateAttribute("physxJoint:armature", Sdf.ValueTypeNames.Float).Set(float(link.armature))
 
 
-def _add_geometry(stage: Any, number: int, geometry: Geometry, X: RigidTransform) -> None:
+def _add_geometry(stage: Any, number: int, geometry: Geometry, X: RigidTransform) -> Any:
     kind, sizes = shape_of(geometry)
     parent = GROUND if geometry.body == "world" else f"{ROOT}/{geometry.body}"
     path = f"{parent}/collision_{number}"
@@ -123,8 +207,41 @@ def _add_geometry(stage: Any, number: int, geometry: Geometry, X: RigidTransform
         form = UsdGeom.Cube.Define(stage, path)
         form.CreateSizeAttr(1.0)
     else:
-        return
+        form = UsdGeom.Plane.Define(stage, path)
+        form.CreateAxisAttr("Z")
     _place(form, X)
     if kind == "Box":
         form.AddScaleOp().Set(_vector(sizes["size"]))
     UsdPhysics.CollisionAPI.Apply(form.GetPrim())
+    return form.GetPrim()
+
+
+def _add_material(stage: Any, number: int, geometry: Geometry, prim: Any) -> None:
+    """Restitution 0; friction is averaged, which of two that are the same is Drake's."""
+    material = UsdShade.Material.Define(stage, f"{MATERIALS}/material_{number}")
+    physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    physics.CreateRestitutionAttr(0.0)
+    if "friction" in geometry.material:
+        physics.CreateStaticFrictionAttr(geometry.material["friction"])
+        physics.CreateDynamicFrictionAttr(geometry.material["friction"])
+    material.GetPrim().AddAppliedSchema("PhysxMaterialAPI")
+    own: dict[str, tuple[Any, Any]] = {"frictionCombineMode": (Sdf.ValueTypeNames.Token, "average")}
+    if "stiffness" in geometry.material:
+        own["compliantContactStiffness"] = (Sdf.ValueTypeNames.Float, geometry.material["stiffness"])
+    for name, (kind, value) in own.items():
+        material.GetPrim().CreateAttribute(f"physxMaterial:{name}", kind).Set(value)
+    binding = UsdShade.MaterialBindingAPI.Apply(prim)
+    binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
+
+
+def _filter_pairs(description: Description, prims: Mapping[str, Any]) -> None:
+    """Pairs that Drake does not let touch do not touch."""
+    touching = {frozenset(pair.names) for pair in description.pairs}
+    body = {g.name: g.body for g in description.geometries}
+    for i, one in enumerate(prims):
+        apart = [
+            two for two in list(prims)[i + 1 :] if body[one] != body[two] and frozenset((one, two)) not in touching
+        ]
+        if apart:
+            filtered = UsdPhysics.FilteredPairsAPI.Apply(prims[one])
+            filtered.CreateFilteredPairsRel().SetTargets([prims[two].GetPath() for two in apart])

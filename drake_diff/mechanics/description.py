@@ -4,8 +4,8 @@
 formulas that go joint by joint; `joint_contracts` gives the same in one frame, to compare engines by.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,6 +22,7 @@ from drake_diff.model.plant import actuators, bodies, instances, joints, labelle
 
 MOVING = ("revolute", "prismatic", "quaternion_floating")
 SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
+MATERIAL = ("friction", "stiffness", "dissipation", "relaxation_time")  # of one side of a contact
 T = TypeVar("T")
 Part = tuple[float, Array, Array]  # mass [kg], centre of mass (3,) [m], inertia (3, 3) about it [kg m^2]
 
@@ -111,6 +112,7 @@ class Geometry:
     body: str
     pose: RigidTransform
     shape: Any
+    material: Mapping[str, float] = field(default_factory=dict)  # what the model gives of MATERIAL
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +291,9 @@ def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometr
         body = body_names[model.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).index()]
         names[geometry] = f"{inspector.GetName(geometry)}#{i}"
         pose, shape = inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry)
-        found.append(Geometry(names[geometry], body, pose, shape))
+        given = {name: proximity_property(inspector, geometry, name) for name in MATERIAL}
+        material = {name: float(value) for name, value in given.items() if value is not None and np.isfinite(value)}
+        found.append(Geometry(names[geometry], body, pose, shape, material))
     pairs = []
     for ids in sorted(inspector.GetCollisionCandidates(), key=lambda ids: (names[ids[0]], names[ids[1]])):
         pairs.append(_pair(inspector, ids, (names[ids[0]], names[ids[1]])))
@@ -298,8 +302,7 @@ def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometr
 
 def _pair(inspector: Any, ids: Sequence[Any], names: tuple[str, str]) -> PairContract:
     """What Drake makes of two sides: see `derivatives.contact.material`."""
-    quantities = ("friction", "stiffness", "dissipation", "relaxation_time")
-    read = {name: [proximity_property(inspector, i, name) for i in ids] for name in quantities}
+    read = {name: [proximity_property(inspector, i, name) for i in ids] for name in MATERIAL}
     known = {name: (float(a), float(b)) for name, (a, b) in read.items() if a is not None and b is not None}
     friction, stiffness = (_harmonic(known[name]) if name in known else None for name in ("friction", "stiffness"))
     dissipation = None
@@ -361,7 +364,7 @@ def rigid_links(description: Description) -> RigidLinks:
     links, on, anchored = without_welds(description.links)
     starts = [i for i, link in enumerate(links) if link.parent < 0]
     known = tuple(
-        (on[g.body][0], Geometry(g.name, g.body, on[g.body][1] @ g.pose, g.shape))
+        (on[g.body][0], Geometry(g.name, g.body, on[g.body][1] @ g.pose, g.shape, g.material))
         for g in description.geometries
         if type(g.shape).__name__ in SHAPES
     )
