@@ -122,6 +122,18 @@ class XmlText:
         """Put XML text in the place of an element."""
         self._replace(element.start, element.end, text.encode())
 
+    def before(self, element: Element, text: str) -> None:
+        """Put XML text in front of an element."""
+        self._replace(element.start, element.start, text.encode())
+
+    def append(self, element: Element, text: str) -> None:
+        """Put XML text behind all that is inside an element."""
+        if self.data[element.inside - 2 : element.inside] == b"/>":
+            self.fill(element, text)
+            return
+        close = self._tags.rindex(b"</", element.inside, element.end)
+        self._replace(close, close, text.encode())
+
     def rename(self, element: Element, tag: str) -> None:
         """Give an element another tag."""
         old = element.tag.encode()

@@ -1,0 +1,287 @@
+"""The model file with the values that were found: the user's own text, changed only where a value differs.
+
+A comment at each changed element says what it was, what it is, with which interval and from which recordings.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.files import write_whole
+from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
+from drake_diff.identification.identify import Asked, Identification
+from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, INERTIA, MASS, STRENGTH
+from drake_diff.model.model import Model, load_model
+from drake_diff.model.parameters import applied, list_parameters, select
+from drake_diff.model.xml_text import Element, XmlText
+
+BODY = (MASS, CENTER, INERTIA)
+SPRING = {
+    "spring_stiffness": "spring_stiffness",
+    "spring_rest_angle": "spring_reference",
+    "spring_rest_length": "spring_reference",
+}
+ROTOR = ("rotor_inertia", "gear_ratio")
+IN_URDF, IN_SDF = (*BODY, "damping", "offset", *ROTOR), (*BODY, "damping", *SPRING, *ROTOR)
+SAME = 1e-9  # of a parameter's largest entry: what printing, and moving an inertia to its centre of mass, may change
+ROUNDING = 1e-13  # of m c^2: what is left of an inertia of 0 that was moved from the body's origin
+NO_ROOM = {
+    COULOMB: "Drake has no dry friction of joints",
+    STRENGTH: "no file says how strong an input is",
+    BIAS: "it is a property of the recording",
+    "gravity": "it is an option of load_model",
+}
+
+
+def write_model(identification: Identification, path: str | Path) -> Path:
+    """Write the model's file with the values that were found, and say at each changed element what was changed and why.
+
+    The text of the file stays as it is elsewhere. The new file is loaded, and each parameter of it compared with what
+    was found, before it stays.
+
+    Args:
+        identification: What `identify` returned, of a model from one URDF or SDF file. Where it is not explained, the
+            file says so at its top.
+        path: The file to write, of the same kind. It must not exist yet, and it names meshes as the old one does.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: The path is taken or of another kind, or a value is one that no file of this kind can have.
+        ModelError: The model is not from one URDF or SDF file, or the new file does not have the values.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.001)
+        >>> motion = dd.rollout(model, [1.0, 0.0], np.zeros((500, 1)), parameters={"hinge.damping": 0.2})
+        >>> log = dd.Recording("lab", "1", 0.01 * np.arange(51), motion.xs[::10], np.zeros((50, 1)))
+        >>> found = dd.identify(model, log, ["hinge.damping"], motion="steps")
+        >>> path = dd.identification.write_model(found, pathlib.Path(tempfile.mkdtemp()) / "right.urdf")
+        >>> dd.list_parameters(dd.load_model(path, time_step=0.001))[0]
+        hinge.damping = 0.2 N m s/rad, at least 0; derivative by autodiff
+    """
+    asked, path = identification.asked, Path(path)
+    if asked is None:
+        raise InputError("identification", got="one without what was asked", expected="what dd.identify returned")
+    source = asked.model.source
+    if source is None or source.suffix not in (".urdf", ".sdf"):
+        got = "a diagram" if source is None else source.name
+        raise ModelError(f"{asked.model.name} is from {got}: a corrected model is written of one URDF or SDF file")
+    if path.suffix != source.suffix:
+        raise InputError("path", got=str(path), expected=f"a {source.suffix} file, as the model's own")
+    if path.exists() or not path.parent.is_dir():
+        raise InputError("path", got=str(path), expected="a file that does not exist, in a folder that does")
+    text = _Corrected(identification, asked, source).text()
+    write_whole(path, text.encode())
+    try:
+        _check(identification, asked.model, path)
+    except DrakeDiffError as error:
+        path.unlink()
+        raise ModelError(f"no corrected model is written: {error}") from error
+    return path
+
+
+class _Corrected:
+    """The text of a file, and the changes to it."""
+
+    def __init__(self, e: Identification, asked: Asked, source: Path):
+        self.e, self.model, self.is_sdf = e, asked.model, source.suffix == ".sdf"
+        self.xml = XmlText(source.read_bytes())
+        self.data = ", ".join(
+            r.name if file is None else f"{file[0].name} (SHA-256 {file[1][:12]})"
+            for r, file in zip(asked.recordings, asked.files, strict=True)
+        )
+        self.changed = {n: v for n, v in e.values.items() if not np.array_equal(v, e.start[n])}
+        for name in self.changed:
+            quantity = name.rsplit(".", 1)[1]
+            if quantity not in (IN_SDF if self.is_sdf else IN_URDF):
+                kind = "SDF" if self.is_sdf else "URDF"
+                why = NO_ROOM.get(quantity, f"{kind} has no place for it that Drake reads and drake_diff writes")
+                raise InputError(name, got=why, expected=f"a quantity of a {kind} file; identify without it")
+
+    def text(self) -> str:
+        by_label: dict[str, dict[str, Any]] = {}
+        for name, value in self.changed.items():
+            label, quantity = name.rsplit(".", 1)
+            by_label.setdefault(label, {})[quantity] = value
+        for label, values in by_label.items():
+            body = [quantity for quantity in values if quantity in BODY]
+            if body:
+                self._write_body(label, body)
+            joint = {q: v for q, v in values.items() if q == "damping" or q in SPRING}
+            if joint:
+                self._write_dynamics(label, joint)
+            rotor = {q: v for q, v in values.items() if q in ROTOR}
+            if rotor:
+                self._write_rotor(label, rotor)
+            if "offset" in values:
+                self._write_offset(label, values["offset"])
+        top = _comment(f"{self.e.sentence} By drake_diff from {self.data}; {self.e.motion}.")
+        self.xml.before(self.xml.root, top + "\n")
+        return str(self.xml)
+
+    def _element(self, label: str, *tags: str) -> Element:
+        # A joint that has no type is a mention of one, in a transmission.
+        named = [one for one in self.xml.root.iter(*tags) if one.get("name") == label]
+        found = [one for one in named if one.tag != "joint" or one.get("type")]
+        if len(found) != 1:
+            where = f"the file has {len(found)} elements {' or '.join(tags)} of this name"
+            raise InputError(label, got=where, expected="one, in the model's own file and not in one that it includes")
+        return found[0]
+
+    def _told(self, label: str, quantities: Sequence[str]) -> str:
+        parts = []
+        for name in (f"{label}.{quantity}" for quantity in quantities):
+            was, now, limits = (
+                np.atleast_1d(self.e.start[name]),
+                np.atleast_1d(self.e.values[name]),
+                np.reshape(self.e.intervals[name], (-1, 2)),
+            )
+            for i, (low, high) in enumerate(limits):
+                entry, unit = (name if len(now) == 1 else f"{name}[{i}]"), self.e.units[name]
+                known = np.isfinite(low) and np.isfinite(high)
+                sure = (
+                    f"95 % interval {low:.5g} to {high:.5g}" if known else "by itself not known from these recordings"
+                )
+                parts.append(f"{entry} was {was[i]:.6g} {unit}, is {now[i]:.6g} ({sure})")
+        return _comment(f"drake_diff: {'; '.join(parts)}; from {self.data}") + "\n"
+
+    def _write_body(self, label: str, quantities: Sequence[str]) -> None:
+        inertial = self._element(label, "link").find("inertial")
+        if inertial is None:
+            raise InputError(f"{label}.mass", got="a link without inertial", expected="one with it, to be changed")
+        mass, center, inertia = _inertia(self.model, self.e, label)
+        names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        entries = {name: inertia["xyz".index(name[1]), "xyz".index(name[2])] for name in names}
+        if self.is_sdf:
+            rows = "".join(f"<{name}>{_number(value)}</{name}>" for name, value in entries.items())
+            inside = f"<pose>{_row(center)} 0 0 0</pose><mass>{_number(mass)}</mass><inertia>{rows}</inertia>"
+        else:
+            rows = " ".join(f'{name}="{_number(value)}"' for name, value in entries.items())
+            inside = f'<origin xyz="{_row(center)}" rpy="0 0 0"/><mass value="{_number(mass)}"/><inertia {rows}/>'
+        self.xml.replace(inertial, f"{self._told(label, quantities)}<inertial>{inside}</inertial>")
+
+    def _write_dynamics(self, label: str, values: dict[str, Any]) -> None:
+        joint, told = self._element(label, "joint"), self._told(label, list(values))
+        tags = {SPRING.get(quantity, quantity): _number(float(value)) for quantity, value in values.items()}
+        if not self.is_sdf:
+            dynamics = joint.find("dynamics")
+            if dynamics is None:
+                self.xml.append(joint, f'{told}<dynamics damping="{tags["damping"]}"/>')
+                return
+            self.xml.before(dynamics, told)
+            self.xml.set(dynamics, "damping", tags["damping"])
+            return
+        axis = joint.find("axis")
+        if axis is None:
+            raise InputError(f"{label}.damping", got="a joint without axis", expected="one with it, to be changed")
+        dynamics = axis.find("dynamics")
+        if dynamics is None:
+            inside = "".join(f"<{tag}>{value}</{tag}>" for tag, value in tags.items())
+            self.xml.append(axis, f"{told}<dynamics>{inside}</dynamics>")
+            return
+        self.xml.before(dynamics, told)
+        self._set_children(dynamics, tags)
+
+    def _set_children(self, element: Element, tags: dict[str, str]) -> None:
+        missing = []
+        for tag, value in tags.items():
+            own = element.find(tag)
+            if own is None:
+                missing.append(f"<{tag}>{value}</{tag}>")
+            else:
+                self.xml.replace(own, f"<{tag}>{value}</{tag}>")
+        if missing:
+            self.xml.append(element, "".join(missing))
+
+    def _write_rotor(self, label: str, values: dict[str, Any]) -> None:
+        told, tags = self._told(label, list(values)), {f"drake:{q}": _number(float(v)) for q, v in values.items()}
+        if not self.xml.root.get("xmlns:drake"):
+            self.xml.set(self.xml.root, "xmlns:drake", "http://drake.mit.edu")
+        if self.is_sdf:
+            joint = self._element(label, "joint")
+            self.xml.before(joint, told)
+            self._set_children(joint, tags)
+            return
+        found = [a for t in self.xml.root.iter("transmission") for a in t.findall("actuator") if a.get("name") == label]
+        if len(found) != 1:
+            got = f"{len(found)} transmissions in the file that have this actuator"
+            raise InputError(f"{label}.{next(iter(values))}", got=got, expected="one, to be changed")
+        self.xml.before(found[0], told)
+        missing = []
+        for tag, value in tags.items():
+            own = found[0].find(tag)
+            if own is None:
+                missing.append(f'<{tag} value="{value}"/>')
+            else:
+                self.xml.set(own, "value", value)
+        if missing:
+            self.xml.append(found[0], "".join(missing))
+
+    def _write_offset(self, label: str, value: Array) -> None:
+        joint = self._element(label, "joint")
+        origin, told = joint.find("origin"), self._told(label, ["offset"])
+        if origin is None:
+            self.xml.append(joint, f'{told}<origin xyz="{_row(value)}"/>')
+            return
+        self.xml.before(origin, told)
+        self.xml.set(origin, "xyz", _row(value))
+
+
+def _own(model: Model, e: Identification) -> dict[str, Any]:
+    """The values that are parameters of the model."""
+    known = {p.name for p in list_parameters(model)}
+    return {name: value for name, value in e.values.items() if name in known}
+
+
+def _inertia(model: Model, e: Identification, label: str) -> tuple[float, Array, Array]:
+    """Mass, centre of mass (3,) and inertia (3, 3) about it, in the body's frame, as the plant has them there."""
+    with applied(select(model, _own(model, e))):
+        spatial = model.double.body(label).CalcSpatialInertiaInBodyFrame(model.double.context)
+    mass, center = float(spatial.get_mass()), np.asarray(spatial.get_com(), dtype=float)
+    inertia = np.array(spatial.Shift(center).CalcRotationalInertia().CopyToFullMatrix3())
+    inertia[np.abs(inertia) < ROUNDING * mass * float(center @ center)] = 0.0
+    return mass, center, inertia
+
+
+def _check(e: Identification, model: Model, path: Path) -> None:
+    """ModelError where the file, loaded as the model was, has another parameter than the model with what was found."""
+    options: dict[str, Any] = dict(model.options or {})
+    new = {p.name: p.value for p in list_parameters(load_model(path, **options))}
+    with applied(select(model, _own(model, e))):
+        for p in list_parameters(model):
+            label, quantity = p.name.rsplit(".", 1)
+            wanted = np.atleast_1d(_own(model, e).get(p.name, p.value))
+            size = float(np.max(np.abs(wanted)))
+            if quantity in (MASS, CENTER, INERTIA):
+                body = model.double.body(label).CalcSpatialInertiaInBodyFrame(model.double.context)
+                if not body.get_mass() > 0:
+                    continue
+                center = np.asarray(body.get_com())
+                if quantity == INERTIA:
+                    central = body.Shift(center).CalcRotationalInertia()
+                    wanted = np.concatenate([central.get_moments(), central.get_products()])
+                    size = float(np.max(np.abs(wanted))) + 1e-3 * body.get_mass() * float(center @ center)
+            if p.name not in new:
+                raise UnknownNameError(f"{path.name}: parameter", got=p.name, known=new)
+            if not np.allclose(new[p.name], wanted, rtol=0, atol=SAME * size):
+                raise InputError(f"{path.name}: {p.name}", got=new[p.name], expected=f"{wanted}, which was found")
+
+
+def _comment(words: str) -> str:
+    """Text as an XML comment: in one line, and without what would end it."""
+    plain = "".join(c if c.isprintable() else " " for c in words)
+    return f"<!-- {re.sub('-(?=-)', '- ', plain).rstrip('-')} -->"
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _row(values: Array) -> str:
+    return " ".join(_number(value) for value in values)

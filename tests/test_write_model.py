@@ -1,0 +1,207 @@
+"""The corrected model file: every parameter of it is what was found, and what no file can have is refused by name."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.table import each_row
+from scipy.integrate import solve_ivp
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelError
+from drake_diff.identification import Identification, write_model
+from drake_diff.identification.identify import Asked
+
+ARM = """<?xml version="1.0"?>
+<!-- an arm -- of one link -->
+<robot name="arm">
+  <link name="arm"><inertial><origin xyz="0.1 0 -0.2" rpy="0.3 0 0"/><mass value="2"/>
+    <inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0.001" ixz="0" iyz="0"/></inertial></link>
+  <joint name="shoulder" type="continuous"><parent link="world"/><child link="arm"/>
+    <origin xyz="0 0 1" rpy="0 0 0.5"/><axis xyz="0 1 0"/></joint>
+  <transmission name="t"><type>transmission_interface/SimpleTransmission</type>
+    <joint name="shoulder"><hardwareInterface>EffortJointInterface</hardwareInterface></joint>
+    <actuator name="motor"/></transmission>
+</robot>
+"""
+
+
+def saying(model, values, *, file=None, explained=True):
+    """An identification of `model` that found `values`, each 10 % sure; how it was found does not matter here."""
+    own = {p.name: p for p in dd.list_parameters(model)}
+    start = {name: own[name].value if name in own else np.ones(1) for name in values}
+    start = {name: float(value[0]) if len(value) == 1 else value for name, value in start.items()}
+    intervals = {}
+    for name, value in values.items():
+        value = np.atleast_1d(value)
+        half = 0.1 * np.abs(value) + 1e-3
+        found = np.column_stack([value - half, value + half])
+        intervals[name] = found[0] if len(value) == 1 else found
+    recording = dd.Recording("lab", "1", np.arange(9.0), np.zeros((9, model.nx)), np.zeros((8, model.nu)))
+    count = sum(np.size(value) for value in values.values())
+    return Identification(
+        values=values, start=start, intervals=intervals, units={n: own[n].unit if n in own else "1" for n in values},
+        unidentifiable=(), explained=explained, reason="", sentence="Explained: so -- it is -->.", noise={},
+        error_before=2.0, error_after=1.0, residuals=(), columns=(), covariance=np.eye(count), score=0.0, count=9,
+        converged=True, steps=1, motion="continuous time", motions=(),
+        asked=Asked(model, (recording,), (file,), tuple(values), {}, 0.2, "auto", 60),
+    )  # fmt: skip
+
+
+def same(model, path, values):
+    """All parameters of the new file are the old ones', but for those that were found."""
+    old = {p.name: p.value for p in dd.list_parameters(model)}
+    new = {p.name: p.value for p in dd.list_parameters(dd.load_model(path, **model.options))}
+    assert set(old) == set(new)
+    for name, value in old.items():
+        # Printed to the last digit; an inertia is moved to the centre of mass and back, of 1 kg m^2 or less here.
+        np.testing.assert_allclose(new[name], np.atleast_1d(values.get(name, value)), rtol=1e-12, atol=1e-14)
+
+
+@pytest.fixture
+def arm(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM)
+    return dd.load_model(path, time_step=0.01)
+
+
+INERTIA = np.array([0.05, 0.06, 0.03, 0.002, -0.001, 0.003])
+
+
+def test_a_urdf_file_takes_everything_that_it_has_a_place_for(arm, tmp_path):
+    values = {
+        "arm.mass": 3.0,
+        "arm.center_of_mass": np.array([0.02, 0.01, -0.3]),
+        "arm.inertia": INERTIA,
+        "shoulder.damping": 0.7,
+        "shoulder.offset": np.array([0.0, 0.1, 1.1]),
+        "motor.rotor_inertia": 1e-4,
+        "motor.gear_ratio": 30.0,
+    }
+    path = write_model(saying(arm, values), tmp_path / "right.urdf")
+    same(arm, path, values)
+    text = path.read_text()
+    assert "arm.mass was 2 kg, is 3 (95 % interval 2.699 to 3.301)" in text
+    assert "from lab" in text
+    assert "<!-- an arm -- of one link -->" in text  # what was not changed stays, however odd
+    assert "--" not in re.sub("<!--|-->", "", text.replace("<!-- an arm -- of one link -->", ""))
+    # The turn of the joint's frame is the file's.
+    turned = dd.load_model(path, **arm.options).plant.GetJointByName("shoulder").frame_on_parent()
+    assert turned.GetFixedPoseInBodyFrame().rotation().ToRollPitchYaw().yaw_angle() == pytest.approx(0.5)
+
+
+def test_an_sdf_file_takes_springs_too(load, tmp_path):
+    model = load("mass_spring_damper.sdf")
+    values = {"block.mass": 2.5, "slide.damping": 1.0, "slide.spring_stiffness": 60.0, "slide.spring_rest_length": 0.2}
+    # A mass alone carries the unit inertia with it, as in Drake.
+    path = write_model(saying(model, values), tmp_path / "right.sdf")
+    (inertia,) = [p.value for p in dd.list_parameters(model) if p.name == "block.inertia"]
+    same(model, path, {**values, "block.inertia": inertia * 1.25})
+
+
+@each_row("seed", range(12))
+def test_random_bodies_come_out_as_they_were_found(arm, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    spread = rng.normal(size=(3, 3)) * 0.1
+    second = spread @ spread.T + 1e-3 * np.eye(3)
+    inertia = np.trace(second) * np.eye(3) - second
+    values = {
+        "arm.mass": float(rng.uniform(0.1, 10)),
+        "arm.center_of_mass": rng.normal(size=3) * 0.3,
+        "arm.inertia": np.array([inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]),
+    }
+    # A centre of mass alone may leave what a body can have.
+    kept = (
+        values if seed % 2 else {"arm.mass": values["arm.mass"]} if seed % 4 else {"arm.inertia": values["arm.inertia"]}
+    )
+    path = write_model(saying(arm, kept), tmp_path / f"{seed}.urdf")
+    wanted = dict(kept)
+    if "arm.inertia" not in kept and "arm.mass" in kept:
+        (own,) = [p.value for p in dd.list_parameters(arm) if p.name == "arm.inertia"]
+        wanted["arm.inertia"] = own * kept["arm.mass"] / 2
+    same(arm, path, wanted)
+
+
+def test_a_body_that_cannot_be_is_not_written(arm, tmp_path):
+    found = saying(arm, {"arm.center_of_mass": np.array([3.0, 0.0, 0.0])})
+    with pytest.raises(ModelError, match="no corrected model is written"):
+        write_model(found, tmp_path / "right.urdf")
+    assert not (tmp_path / "right.urdf").exists()
+
+
+def test_a_recording_makes_a_file_that_has_what_was_found(load, tmp_path):
+    model = load("pendulum.urdf")
+    times = 0.01 * np.arange(101)
+    moment = lambda t, y: [y[1], (-9.81 * 0.5 * np.sin(y[0]) - 0.15 * y[1]) / 0.25]  # noqa: E731
+    q = solve_ivp(moment, (0, 1), (1.0, 0.0), rtol=1e-9, atol=1e-11, t_eval=times).y[0]
+    xs = np.column_stack([q + 1e-3 * np.random.default_rng(0).standard_normal(101), np.full(101, np.nan)])
+    found = dd.identify(model, dd.Recording("lab", "1", times, xs, np.zeros((100, 1))), ["hinge.damping"])
+    path = write_model(found, tmp_path / "right.urdf")
+    same(model, path, found.values)
+    assert "Explained" in path.read_text()
+
+
+@each_row(
+    "name, words",
+    [
+        ("shoulder.coulomb_friction", "no dry friction"),
+        ("motor.strength", "how strong an input is"),
+        ("shoulder_q.bias", "property of the recording"),
+        ("gravity.gravity", "option of load_model"),
+        ("arm.friction", "URDF has no place for it"),
+    ],
+)
+def test_what_a_file_cannot_carry_is_named(arm, tmp_path, name, words):
+    with pytest.raises(InputError, match=words) as refused:
+        write_model(saying(arm, {name: 2.0}), tmp_path / "right.urdf")
+    assert name in str(refused.value)
+    assert not (tmp_path / "right.urdf").exists()
+
+
+def test_an_offset_in_sdf_is_refused(load, tmp_path):
+    model = load("sliding_block.sdf")
+    with pytest.raises(InputError, match="SDF has no place for it"):
+        write_model(saying(model, {"slide.offset": np.array([0.0, 0.0, 1.0])}), tmp_path / "right.sdf")
+
+
+def test_other_kinds_of_files_are_refused(arm, load, tmp_path):
+    acrobot = load("acrobot.xml")
+    with pytest.raises(ModelError, match="one URDF or SDF file"):
+        write_model(saying(acrobot, {"elbow.damping": 1.0}), tmp_path / "right.xml")
+    found = saying(arm, {"arm.mass": 3.0})
+    with pytest.raises(InputError, match=r"a \.urdf file"):
+        write_model(found, tmp_path / "right.sdf")
+    with pytest.raises(InputError, match="does not exist"):
+        write_model(found, arm.source)
+    with pytest.raises(InputError, match=r"what dd\.identify returned"):
+        write_model(replace(found, asked=None), tmp_path / "right.urdf")
+
+
+def test_a_name_that_the_file_has_twice_is_refused(tmp_path):
+    path = tmp_path / "two.sdf"
+    link = '<link name="a"><inertial><mass>1</mass></inertial></link>'
+    models = "".join(f'<model name="{name}">{link}</model>' for name in ("one", "two"))
+    path.write_text(f'<sdf version="1.9"><world name="w">{models}</world></sdf>')
+    model = dd.load_model(path, time_step=0.01)
+    with pytest.raises(InputError, match="elements link of this name"):
+        write_model(saying(model, {"one::a.mass": 2.0}), tmp_path / "right.sdf")
+
+
+def test_parameters_without_a_change_leave_the_text(arm, tmp_path):
+    path = write_model(saying(arm, {"arm.mass": 2.0}), tmp_path / "right.urdf")
+    lines = path.read_text().splitlines()
+    assert [line for line in lines if not line.startswith("<!-- Explained")] == ARM.splitlines()
+
+
+def test_names_cannot_end_the_comment(arm, tmp_path):
+    odd = tmp_path / "x--><evil a='--'/>.csv"
+    found = saying(arm, {"arm.mass": 3.0}, file=(odd, "0" * 64))
+    text = write_model(found, tmp_path / "right.urdf").read_text()
+    assert "--><evil" not in text
+    same(arm, tmp_path / "right.urdf", {**found.values, "arm.inertia": _scaled(arm)})
+
+
+def _scaled(arm):
+    (own,) = [p.value for p in dd.list_parameters(arm) if p.name == "arm.inertia"]
+    return own * 1.5
