@@ -29,7 +29,11 @@ from drake_diff.model.parameters import applied
 STAGES = (0.15, 0.3, np.inf)  # [s] how long segments are
 CALM = 3  # samples on each side of a start without an impact
 STILL = 0.1  # of the longest way of a segment: what moves less says little of impacts
-LOG_SCALE, LENGTH_SCALE, CENTER_SCALE = 0.3, 1e-3, 0.02  # of a positive number; [m, rad] of a bias; of a radius of gyration
+LOG_SCALE, LENGTH_SCALE, CENTER_SCALE = (
+    0.3,
+    1e-3,
+    0.02,
+)  # of a positive number; [m, rad] of a bias; of a radius of gyration
 WIDTH = 0.15  # of a secant, in these scales
 SAMPLES = 3  # every so many samples are compared: neighbours say the same
 LOST = 100.0  # times the scale: the residual of a motion that Drake cannot step
@@ -59,6 +63,7 @@ class _Segment:
     piece: int
     first: int
     last: int  # the last sample
+    still: bool  # the end of a recording: where things lie says how large they are
 
 
 class _Search:
@@ -79,18 +84,24 @@ class _Search:
         scales, logs = [], []
         for one in self.unknowns.each:
             if one.quantity in (INERTIA, STRENGTH):
-                raise InputError(one.name, got="a quantity of smooth motion", expected="one of contact; see dd.identify")
+                raise InputError(
+                    one.name, got="a quantity of smooth motion", expected="one of contact; see dd.identify"
+                )
             by_log = one.quantity not in (BIAS, CENTER)
             if by_log and not np.all(one.start > 0):
                 raise InputError(one.name, got=one.start, expected="a value above 0 to begin from")
             size = LOG_SCALE if by_log else LENGTH_SCALE if one.quantity == BIAS else CENTER_SCALE * one.size
+            if one.quantity == "radius":
+                size = LENGTH_SCALE / one.size
             scales += [size] * len(one.start)
             logs += [by_log] * len(one.start)
         return np.array(scales), np.array(logs)
 
     def values(self, w: Array) -> Array:
         start = self.unknowns.start
-        return np.asarray(np.where(self.by_log, start * np.exp(np.where(self.by_log, self.scale * w, 0)), start + self.scale * w))
+        return np.asarray(
+            np.where(self.by_log, start * np.exp(np.where(self.by_log, self.scale * w, 0)), start + self.scale * w)
+        )
 
     def segments(self, length: float) -> list[_Segment]:
         """From the first sample of each recording, and from calm samples where what follows moves."""
@@ -102,12 +113,13 @@ class _Search:
             ways = np.array([np.linalg.norm(piece.ys[min(k + count, last)] - piece.ys[k]) for k in range(last)])
             k = 0
             while k < last:
-                found.append(_Segment(p, k, min(k + count, last)))
+                found.append(_Segment(p, k, min(k + count, last), still=False))
                 ahead = np.arange(k + max(5, count // 2), min(k + count + 1, last - 4))
                 ahead = ahead[ways[ahead] > STILL * np.max(ways)] if len(ahead) else ahead
                 if not len(ahead) or np.isinf(length):
                     break
                 k = int(ahead[np.argmin(rough[ahead])])
+            found.append(_Segment(p, max(0, last - max(5, round(STAGES[0] / period))), last, still=True))
         return found
 
     def _rough(self, piece: Piece) -> Array:
@@ -142,8 +154,20 @@ class _Search:
                 found.append(e)
         return found
 
-    def weights(self, errors: Sequence[Array]) -> Array:
-        """(samples, nv) the scale of errors so many samples after a start: the upper quartile, never falling."""
+    def weights(self, w: Array, segments: Sequence[_Segment]) -> list[Array]:
+        """Of each segment (samples, nv): the scale that its errors have at w, those of ends by themselves."""
+        errors = self.errors(w, segments)
+        moving, ends = (
+            [e for e, s in zip(errors, segments, strict=True) if s.still is still] for still in (False, True)
+        )
+        # Where things lie, what all recordings share is the model's fault: the scale is what they differ by.
+        shared = np.nanmedian([np.nanmedian(e, axis=0) for e in ends], axis=0)
+        several = len(ends) > 2
+        scales = {False: self._scale(moving), True: self._scale([e - shared for e in ends] if several else ends)}
+        return [scales[s.still][: s.last - s.first] for s in segments]
+
+    def _scale(self, errors: Sequence[Array]) -> Array:
+        """(samples, nv) of errors so many samples after a start: the upper quartile, never falling."""
         longest = max(len(e) for e in errors)
         found = np.full((longest, self.model.nv), np.nan)
         for k in range(longest):
@@ -152,25 +176,24 @@ class _Search:
         found = np.fmax.accumulate(found, axis=0)
         return np.maximum(found, 1e-3 * np.max(found, axis=0)) + 1e-9
 
-    def residual(self, w: Array, segments: Sequence[_Segment], weights: Array) -> list[Array]:
+    def residual(self, w: Array, segments: Sequence[_Segment], weights: Sequence[Array]) -> list[Array]:
         found = []
-        for e in self.errors(w, segments):
-            r = (e / weights[: len(e)])[SAMPLES - 1 :: SAMPLES]
+        for e, scale in zip(self.errors(w, segments), weights, strict=True):
+            r = (e / scale)[SAMPLES - 1 :: SAMPLES]
             found.append(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
         return found
 
-    def slopes(self, w: Array, segments: Sequence[_Segment], weights: Array) -> Array:
-        columns = []
-        for j in range(len(w)):
-            d = np.zeros(len(w))
-            d[j] = WIDTH
-            ahead, behind = (np.concatenate([r.ravel() for r in self.residual(w + s * d, segments, weights)]) for s in (1, -1))
-            columns.append((ahead - behind) / (2 * WIDTH))
+    def slopes(self, w: Array, segments: Sequence[_Segment], weights: Sequence[Array]) -> Array:
+        def flat(w: Array) -> Array:
+            return np.concatenate([r.ravel() for r in self.residual(w, segments, weights)])
+
+        here = flat(w)
+        columns = [(flat(w + WIDTH * d) - here) / WIDTH for d in np.eye(len(w))]
         return np.stack(columns, axis=1)
 
 
 def identify_contact(
-    model: Model, recordings: Sequence[Recording], parameters: Sequence[str], *, max_iterations: int = 12
+    model: Model, recordings: Sequence[Recording], parameters: Sequence[str], *, max_iterations: int = 8
 ) -> ContactIdentification:
     """Estimate friction, stiffness, dissipation, radii and centres of mass from motions through impacts.
 
@@ -203,15 +226,15 @@ def identify_contact(
     w = np.zeros(len(search.scale))
     for length in STAGES:
         segments = search.segments(length)
-        weights = search.weights(search.errors(w, segments))
+        weights = search.weights(w, segments)
 
-        def flat(w: Array, segments: list[_Segment] = segments, weights: Array = weights) -> Array:
+        def flat(w: Array, segments: list[_Segment] = segments, weights: list[Array] = weights) -> Array:
             return np.concatenate([r.ravel() for r in search.residual(w, segments, weights)])
 
-        def slopes(w: Array, segments: list[_Segment] = segments, weights: Array = weights) -> Array:
+        def slopes(w: Array, segments: list[_Segment] = segments, weights: list[Array] = weights) -> Array:
             return search.slopes(w, segments, weights)
 
-        solved = least_squares(flat, w, jac=slopes, loss="soft_l1", max_nfev=max_iterations, xtol=1e-4, ftol=1e-5)
+        solved = least_squares(flat, w, jac=slopes, loss="soft_l1", max_nfev=max_iterations, xtol=1e-3, ftol=1e-4)
         w = np.asarray(solved.x)
     taken = search.taken
     costs = [float(np.mean(2 * (np.sqrt(1 + flat(at) ** 2) - 1))) for at in (np.zeros(len(w)), w)]
@@ -235,21 +258,21 @@ def identify_contact(
     )
 
 
-def _between(search: _Search, w: Array, segments: Sequence[_Segment], weights: Array) -> Array:
+def _between(search: _Search, w: Array, segments: Sequence[_Segment], weights: Sequence[Array]) -> Array:
     """(np,) half widths of 95 % intervals of w: each recording counts as one observation, however it hangs together."""
     residuals, J = search.residual(w, segments, weights), search.slopes(w, segments, weights)
-    scores, begin, bread = [], 0, np.zeros((len(w), len(w)))
-    for r in residuals:
+    scores, begin, bread = np.zeros((len(search.pieces), len(w))), 0, np.zeros((len(w), len(w)))
+    for r, segment in zip(residuals, segments, strict=True):
         rows = J[begin : begin + r.size]
         begin += r.size
         rho = 1 / np.sqrt(1 + r.ravel() ** 2)
-        scores.append(rows.T @ (rho * r.ravel()))
+        scores[segment.piece] += rows.T @ (rho * r.ravel())
         bread += (rows.T * rho) @ rows
     count = len(scores)
     if count < 2:
         return np.full(len(w), np.inf)
     inverse = np.linalg.pinv(bread)
-    meat = np.array(scores).T @ np.array(scores) * count / max(count - 1, 1)
+    meat = scores.T @ scores * count / max(count - 1, 1)
     lost = np.diag(bread) <= 0
     spread = np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), 0.0))
     return np.asarray(np.where(lost, np.inf, spread * float(stats.t.ppf(0.975, count - 1))))

@@ -1,0 +1,130 @@
+"""The tosses of cube_tosses.py by MuJoCo's sysid toolbox, with as many simulated steps as Drake's fit took.
+
+Eight corner spheres, whole tosses from their first states, positions of the centre and of two sites, and the
+toolbox's own optimizer, its unknowns scaled by the Jacobian.
+"""
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+
+RATE, WIDTH, MASS, INERTIA, INSET = 148.0, 0.1048, 0.37, 0.00081, 0.0024
+STEPS = 2  # between two samples: 3.4 ms
+AT = WIDTH / 2 - INSET
+
+
+def model_text() -> str:
+    """MuJoCo's defaults for solref, and the friction that was published."""
+    corners = "".join(
+        f'<geom name="corner{i}" type="sphere" size="{INSET}" pos="{a * AT} {b * AT} {c * AT}" priority="1"/>'
+        for i, (a, b, c) in enumerate(product((-1, 1), repeat=3))
+    )
+    return (
+        f'<mujoco><option timestep="{1 / RATE / STEPS}" cone="elliptic"/><default><geom friction="0.15 0 0"/></default>'
+        '<worldbody><geom name="board" type="plane" size="0 0 1"/><body name="cube"><freejoint/>'
+        f'<inertial pos="0 0 0" mass="{MASS}" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>{corners}'
+        '<site name="center"/><site name="x" pos="0.05 0 0"/><site name="y" pos="0 0.05 0"/></body></worldbody><sensor>'
+        '<framepos name="center" objtype="site" objname="center"/><framepos name="x" objtype="site" objname="x"/>'
+        '<framepos name="y" objtype="site" objname="y"/></sensor></mujoco>'
+    )
+
+
+def _turned(quaternions: Array, vector: Array) -> Array:
+    import mujoco
+
+    found = np.empty((len(quaternions), 3))
+    for k, q in enumerate(quaternions):
+        mujoco.mju_rotVecQuat(found[k], vector, q)
+    return found
+
+
+def _state(x: Array) -> tuple[Array, Array]:
+    """(qpos, qvel) of Drake's state: the angular velocity goes to the body's frame."""
+    w = _turned((x[:4] * [1, -1, -1, -1])[None], x[7:10])[0]
+    return np.concatenate([x[4:7], x[:4]]), np.concatenate([x[10:13], w])
+
+
+def _parameters(sysid: Any) -> Any:
+    def corners(spec: Any, change: Any) -> None:
+        for i in range(8):
+            change(spec.geom(f"corner{i}"))
+
+    def set_radius(s: Any, p: Any) -> None:
+        corners(s, lambda g: setattr(g, "size", [p.value[0], 0, 0]))
+
+    def set_friction(s: Any, p: Any) -> None:
+        corners(s, lambda g: setattr(g, "friction", [p.value[0], 0, 0]))
+
+    def set_law(s: Any, p: Any) -> None:
+        corners(s, lambda g: setattr(g, "solref", [p.value[0], p.value[1]]))
+
+    def set_ground(s: Any, p: Any) -> None:
+        s.geom("board").pos = [0, 0, p.value[0]]
+
+    def set_center(s: Any, p: Any) -> None:
+        s.body("cube").ipos = p.value
+
+    found = sysid.ParameterDict()
+    found.add(sysid.Parameter("radius", INSET, 0.0005, 0.01, modifier=set_radius))
+    found.add(sysid.Parameter("friction", 0.15, 0.01, 1.0, modifier=set_friction))
+    found.add(sysid.Parameter("solref", [0.02, 1.0], [0.0075, 0.05], [0.1, 3.0], modifier=set_law))
+    found.add(sysid.Parameter("ground", 0.0, -0.01, 0.01, modifier=set_ground))
+    found.add(sysid.Parameter("center", [0.0] * 3, [-0.01] * 3, [0.01] * 3, modifier=set_center))
+    return found
+
+
+def fit_by_sysid(fitted: list[Array], held: list[Array], steps: int) -> list[str]:
+    """Lines with what it found, and its errors on tosses that were held out."""
+    import mujoco
+    from mujoco import sysid
+
+    spec = mujoco.MjSpec.from_string(model_text())
+    model = spec.compile()
+    starts, controls, sensors = [], [], []
+    for xs in fitted:
+        starts.append(sysid.create_initial_state(model, *_state(xs[0])))
+        t, fine = np.arange(len(xs)) / RATE, np.arange((len(xs) - 1) * STEPS + 1) / RATE / STEPS
+        sites = [xs[:, 4:7] + _turned(xs[:, :4], v) for v in (np.zeros(3), np.eye(3)[0] * 0.05, np.eye(3)[1] * 0.05)]
+        every = np.concatenate(sites, axis=1)
+        every = np.stack([np.interp(fine, t, column) for column in every.T], axis=1)
+        controls.append(sysid.TimeSeries(fine, np.zeros((len(fine), 0))))
+        sensors.append(sysid.TimeSeries.from_names(fine, every, model))
+    names = [f"toss {i}" for i in range(len(fitted))]
+    sequences = sysid.ModelSequences("cube", spec, names, starts, controls, sensors)
+    residual = sysid.build_residual_fn(models_sequences=[sequences], n_threads=1)
+    parameters, taken = _parameters(sysid), [0]
+    each = sum(len(xs) - 1 for xs in fitted) * STEPS
+
+    def counted(x: Array, p: Any) -> Any:
+        taken[0] += each * (x.shape[1] if np.ndim(x) == 2 else 1)
+        return residual(x, p)
+
+    most = max(1, steps // (each * (parameters.size + 2)))
+    best, _ = sysid.optimize(
+        initial_params=parameters, residual_fn=counted, optimizer="mujoco", verbose=False, max_iters=most, x_scale="jac"
+    )
+    lines = [f"MuJoCo sysid: {taken[0]} simulated steps, {most} iterations"]
+    for name, parameter in best.items():
+        lines.append(f"  {name}: {np.round(parameter.value, 6).tolist()}")
+    for tag, p in (("MuJoCo, by hand", parameters), ("MuJoCo, identified by its sysid", best)):
+        by = sysid.apply_param_modifiers(p, spec)
+        e = np.array([_error(by, xs) for xs in held])
+        lines.append(
+            f"{tag}: mean {np.mean(e):.1f} %, median {np.median(e):.1f} %, below 10 %: {np.sum(e < 10)} of {len(e)}"
+        )
+    return lines
+
+
+def _error(model: Any, xs: Array) -> float:
+    import mujoco
+
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel = _state(xs[0])
+    found = [data.qpos[:3].copy()]
+    for _ in range(len(xs) - 1):
+        mujoco.mj_step(model, data, STEPS)
+        found.append(data.qpos[:3].copy())
+    return float(np.mean(np.linalg.norm(np.array(found) - xs[:, 4:7], axis=1)) / WIDTH * 100)

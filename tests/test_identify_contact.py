@@ -1,0 +1,91 @@
+"""Contact parameters from motions through impacts: a closed form, then tosses of known truth by other steps."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError
+from drake_diff.identification import identify_contact
+
+TOSSES = Path(__file__).parent / "benchmarks" / "cube_tosses.py"
+
+
+def throws(model, truth, *, steps=1, height=0.0):
+    """Four spinning throws of the ball, 200 Hz, by so many steps between samples, above a ground at a height."""
+    fine, found = model.at_time_step(0.005 / steps), []
+    for k in range(4):
+        x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.12 + 0.01 * k, 4.0 - k, 6.0 * k - 12, 0.5, 0.4 + 0.1 * k, 0.2, -0.3])
+        xs = dd.rollout(fine, x0, np.zeros((60 * steps, 0)), parameters=truth).xs[::steps].copy()
+        xs[:, 6] += height
+        found.append(dd.Recording(f"throw {k}", "1", 0.005 * np.arange(61), xs, np.zeros((60, 0))))
+    return found
+
+
+@pytest.fixture
+def ball(load):
+    return load("sphere_on_ground.sdf", time_step=0.005)
+
+
+def test_friction_of_a_ball_that_slides_is_that_of_the_closed_form(load):
+    ball = load("sphere_on_ground.sdf", time_step=0.001)
+    friction, gravity, radius, depth = 0.25, 9.81, 0.1, 9.81 / 1e4
+    times = 0.005 * np.arange(41)
+    recordings = []
+    for k, v in enumerate((1.8, 2.0, 2.2)):  # [m/s] all slide for 2 v / (7 mu g) > 0.2 s
+        xs = np.zeros((41, 13))
+        turn = 0.5 * 2.5 * friction * gravity / radius * times**2
+        xs[:, 0], xs[:, 2] = np.cos(turn / 2), np.sin(turn / 2)
+        xs[:, 4], xs[:, 6] = v * times - friction * gravity * times**2 / 2, radius - depth
+        xs[:, 8], xs[:, 10] = 2.5 * friction * gravity / radius * times, v - friction * gravity * times
+        recordings.append(dd.Recording(f"slide {k}", "1", times, xs, np.zeros((40, 0))))
+    found = identify_contact(ball, recordings, ["ball.friction"])
+    own = float(found.values["ball.friction"])
+    # Of a pair Drake takes 2 a b / (a + b), the ground having 0.5. Its steps lead mu g h t / 2 beyond mu g t^2 / 2:
+    # h / t, for 1 ms 2 % at 0.05 s.
+    assert 2 * own * 0.5 / (own + 0.5) == pytest.approx(friction, rel=0.02)
+
+
+def test_the_truth_of_the_same_steps_is_found(ball):
+    truth = {"ball.friction": 0.25, "ball.radius": 0.103}
+    found = identify_contact(ball, throws(ball, truth, height=0.002), ["ball.friction", "ball.radius", "ball_z.bias"])
+    # No noise and the same steps: what is left is where least squares stop.
+    assert found.values["ball.friction"] == pytest.approx(0.25, rel=5e-3)
+    gap = float(found.values["ball.radius"]) - float(found.values["ball_z.bias"])
+    assert gap == pytest.approx(0.101, abs=2e-4)  # a ball's height shows the difference alone
+    assert found.cost_after < 0.05 * found.cost_before
+
+
+def test_bad_input_is_refused_by_name(ball):
+    recording = throws(ball, {})[0]
+    xs = recording.xs.copy()
+    xs[3, 8] = np.nan
+    gap = dd.Recording("gap", "1", recording.times, xs, recording.us)
+    with pytest.raises(InputError, match="every position and velocity"):
+        identify_contact(ball, [gap], ["ball.friction"])
+    with pytest.raises(InputError, match=r"ball\.inertia"):
+        identify_contact(ball, [recording], ["ball.inertia"])
+
+
+@pytest.mark.slow
+def test_a_cubes_half_width_and_friction_are_found_from_tosses_by_finer_steps():
+    spec = importlib.util.spec_from_file_location("cube_tosses", TOSSES)
+    tosses = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tosses)
+    model, fine = tosses.model_of(1), tosses.model_of(4)
+    truth = {"cube.radius": 0.0034, "cube.friction": 0.11, "cube.stiffness": 3e4, "cube.relaxation_time": 0.008}
+    rng, recordings = np.random.default_rng(0), []
+    for k in range(8):
+        turn = rng.standard_normal(4)
+        x0 = np.concatenate([turn / np.linalg.norm(turn), [0, 0, 0.16], rng.uniform(-3, 3, 3), [1.0, 0.3, -0.2]])
+        xs = dd.rollout(fine, x0, np.zeros((400, 0)), parameters=truth).xs[::4].copy()
+        xs[:, 6] -= 0.001  # the ground is 1 mm lower
+        recordings.append(tosses.recording(f"toss {k}", xs))
+    names = ["cube.radius", "cube_z.bias", "cube.friction", "cube.stiffness", "cube.relaxation_time"]
+    found = identify_contact(model, recordings, names)
+    # Steps four times as long land up to 7 ms early or late: 1 % of the half width and a tenth of the friction.
+    assert float(found.values["cube.radius"]) == pytest.approx(0.0034, abs=5e-4)
+    assert float(found.values["cube_z.bias"]) == pytest.approx(-0.001, abs=5e-4)
+    assert float(found.values["cube.friction"]) == pytest.approx(0.11, rel=0.1)
