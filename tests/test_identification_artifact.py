@@ -227,6 +227,15 @@ def test_a_recording_that_changed_since_is_not_saved(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_recording_in_the_directory_itself_is_not_written_over(copy):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
+    kept = copy / "recordings" / "0" / "lab.csv"
+    found = dd.identify(model, kept, ["hinge.damping"], max_iterations=1)
+    with pytest.raises(InputError, match="in the directory to be written"):
+        dd.save(found, copy)
+    assert dd.verify(copy).holds
+
+
 def test_what_is_no_result_is_not_saved(tmp_path):
     with pytest.raises(InputError, match="a result of solve or of identify"):
         dd.save(io.BytesIO(), tmp_path)

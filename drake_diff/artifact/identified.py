@@ -48,6 +48,9 @@ def save_identification(identification: Identification, directory: str | Path) -
     for recording, given in zip(asked.recordings, asked.files, strict=True):
         if given is not None and (not given[0].exists() or hash_of(given[0]) != given[1]):
             raise ArtifactError(f"recording {recording.name}: {given[0]} has changed since it was read")
+        if given is not None and given[0].resolve().is_relative_to((folder / RECORDINGS).resolve()):
+            got = f"{given[0]}, which is in the directory to be written"
+            raise InputError(f"recording {recording.name}", got=got, expected="one elsewhere")
         if given is not None and (size := _size(given[0])) > LARGEST:
             expected = f"at most {LARGEST} bytes, as it is kept in the directory"
             raise InputError(f"recording {recording.name}", got=f"{size} bytes", expected=expected)

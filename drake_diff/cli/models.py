@@ -196,7 +196,7 @@ def identify(
     show(rows)
     for line in record.unidentifiable:
         show(plain("left open", "bold dim"), line)
-    show(f"fitted {record.motion}, {record.steps} steps")
+    show(f"fitted: {record.motion}")
     show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)
 
