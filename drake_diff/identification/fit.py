@@ -106,7 +106,8 @@ def cut_segments(law: Law, pieces: Sequence[Piece], nu: int) -> Segments:
             samples.append(np.arange(a, last))
             at.append(np.concatenate([[0], np.cumsum([len(each) for each in lengths])])[: last - a])
     counts = np.array([len(each) for each in hs], dtype=np.intp)
-    all_h, all_u = np.zeros((len(hs), counts.max())), np.zeros((len(hs), counts.max(), nu))
+    longest = max(len(each) for each in hs)
+    all_h, all_u = np.zeros((len(hs), longest)), np.zeros((len(hs), longest, nu))
     for k, (h, u) in enumerate(zip(hs, us, strict=True)):
         all_h[k, : len(h)], all_u[k, : len(u)] = h, u
         all_u[k, len(u) :] = u[-1]
