@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.pendulum import swing
 from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
 from scipy import stats
@@ -16,23 +17,6 @@ from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.step import set_state
-
-MASS, LEVER, GRAVITY = 1.0, 0.5, 9.81  # of models/pendulum.urdf
-
-
-def swing(*, damping=0.1, friction=0.0, times=None, start=(1.0, 0.0), noise=1e-3, seed=0, velocities=False):
-    """A recording of the pendulum by its equation of motion."""
-
-    def rates(t, y):
-        moment = -MASS * GRAVITY * LEVER * np.sin(y[0]) - damping * y[1] - friction * np.tanh(y[1] / 1e-3)
-        return [y[1], moment / (MASS * LEVER**2)]
-
-    times = np.linspace(0, 2, 201) if times is None else times
-    found = solve_ivp(rates, (0, times[-1]), start, rtol=1e-9, atol=1e-11, t_eval=times, method="LSODA")
-    xs = found.y.T + noise * np.random.default_rng(seed).standard_normal((len(times), 2))
-    if not velocities:
-        xs[:, 1] = np.nan
-    return dd.Recording("lab", "1", times, xs, np.zeros((len(times) - 1, 1)))
 
 
 @pytest.fixture

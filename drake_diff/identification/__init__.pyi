@@ -1,3 +1,5 @@
+from .explain import Explanation as Explanation
+from .explain import explain as explain
 from .identify import Identification as Identification
 from .identify import identify as identify
 from .impacts import ContactIdentification as ContactIdentification

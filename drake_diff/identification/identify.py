@@ -25,6 +25,7 @@ from drake_diff.identification.judge import (
     intervals_of,
     known_of,
     noise_of,
+    score_of,
     unidentifiable,
 )
 from drake_diff.identification.measured import (
@@ -158,7 +159,7 @@ def identify(
     given, files = read_given(model, recordings)
     chart, pieces = Chart(coordinates_of(model)), read_pieces(model, given, held_out)
     tree = tree_for_identification(model)
-    why = str(tree) if isinstance(tree, Refusal) else _what_acts(model, chart, pieces)
+    why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces)
     if motion == "continuous" and isinstance(tree, Refusal):
         raise ModelError(f"{model.name} has no motion in continuous time here: {why}")
     continuous = motion == "continuous" or (motion == "auto" and not why)
@@ -166,7 +167,7 @@ def identify(
     unknowns = choose_unknowns(model, own_tree, parameters)
     stated = given_noise(model, chart, noise)
     scatter = noise_by_differences(chart, pieces)
-    problem = _Problem(model, chart, unknowns, pieces, stated, scatter)
+    problem = Problem(model, chart, unknowns, pieces, stated, scatter)
     law: Law = (
         discrete_motion(model, unknowns, pieces)
         if own_tree is None
@@ -178,7 +179,7 @@ def identify(
     return replace(found, asked=Asked(model, given, files, names, dict(noise or {}), held_out, motion, max_iterations))
 
 
-def _what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
+def what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
     """What acts in the recordings that motion in continuous time leaves out; empty where nothing does."""
     lower, upper = model.position_limits
     for piece in pieces:
@@ -196,7 +197,9 @@ def _what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
 
 
 @dataclass(eq=False)
-class _Problem:
+class Problem:
+    """Recordings, what is sought in them, and the noise that weights them."""
+
     model: Model
     chart: Chart
     unknowns: Unknowns
@@ -220,24 +223,29 @@ class _Problem:
     def fitted(self) -> list[Piece]:
         return [piece for piece in self.pieces if not piece.held_out]
 
-    def solve(self, law: Law, most: int) -> tuple[Fit, Solved]:
-        """With steps so short that half of them give the same motion over the segments, at the start and at the end."""
+    def prepared(self, law: Law) -> tuple[Fit, Array]:
+        """By steps that follow the motion, over pieces that are short enough; and a guess of the starts of segments."""
         z, noise = self.unknowns.z_start, self.first_noise
         fit = self.fit(law, self.fitted, noise)
         starts = self.guess(fit)
-        while not self._follows(fit, z, starts):
-            fit = self._shorter(fit, fit.segments.pieces, noise)
-        pieces = growth_cuts(fit, z, starts)
-        fit = self.fit(fit.law, pieces, noise)
-        starts = self.guess(fit)
+        while not self.follows(fit, z, starts):
+            fit = self.shortened(fit, fit.segments.pieces, noise)
+        fit = self.fit(fit.law, growth_cuts(fit, z, starts), noise)
+        return fit, self.guess(fit)
+
+    def solve(self, law: Law, most: int) -> tuple[Fit, Solved]:
+        """With steps so short that half of them give the same motion over the segments, at the start and at the end."""
+        z = self.unknowns.z_start
+        fit, starts = self.prepared(law)
+        pieces = fit.segments.pieces
         while True:
-            fit, solved = self._weighted(fit, z, starts, most)
-            if self._follows(fit, solved.z, solved.starts):
+            fit, solved = self.weighted(fit, z, starts, most)
+            if self.follows(fit, solved.z, solved.starts):
                 return fit, solved
             z, starts = solved.z, solved.starts
-            fit = self._shorter(fit, pieces, fit.noise)
+            fit = self.shortened(fit, pieces, fit.noise)
 
-    def _follows(self, fit: Fit, z: Array, starts: Array) -> bool:
+    def follows(self, fit: Fit, z: Array, starts: Array) -> bool:
         """Whether steps of half the length lead to the same ends of all segments; the model's own steps need not."""
         shorter = fit.law.shorter()
         if shorter is None:
@@ -251,13 +259,13 @@ class _Problem:
         gap = self.chart.minus(*ends) / fit.gap_scale
         return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= STEP_ERROR)
 
-    def _shorter(self, fit: Fit, pieces: Sequence[Piece], noise: Array) -> Fit:
+    def shortened(self, fit: Fit, pieces: Sequence[Piece], noise: Array) -> Fit:
         law = fit.law.shorter()
         if law is None or np.max(fit.segments.hs) < SHORTEST:
             raise ModelError(f"{self.model.name}: its motion is too stiff: {fit.law.words} does not follow it")
         return self.fit(law, pieces, noise)
 
-    def _weighted(self, fit: Fit, z: Array, starts: Array, most: int) -> tuple[Fit, Solved]:
+    def weighted(self, fit: Fit, z: Array, starts: Array, most: int) -> tuple[Fit, Solved]:
         """Least squares, weighted anew until the residuals have the noise that they are weighted by."""
         for _ in range(ROUNDS):
             solved = fit.solve(z, starts, most)
@@ -276,16 +284,12 @@ class _Problem:
         intervals = intervals_of(unknowns, z, known.covariance, count - taken)
         values, by_z = unknowns.values(z), unknowns.by_z(z)
         before, after, why_not, motions = self._predicted(fit, solved, known, count - taken)
-        reason = self._reason(fit, solved, why_not)
+        reason = self.doubt(fit, solved, why_not)
         lost = ~np.isfinite(np.diag(known.covariance))
         covariance = by_z @ np.where(np.isfinite(known.covariance), known.covariance, 0.0) @ by_z.T
         hidden = np.any(by_z[:, lost] != 0, axis=1)
         covariance[hidden, hidden] = np.inf
         names, open_ = tangent_space(self.model).names, unidentifiable(unknowns, z, known)
-        chi2 = sum(float(np.nansum(r**2)) for r in solved.reduced.residuals)
-        every = np.concatenate(solved.reduced.residuals)
-        with np.errstate(divide="ignore"):
-            logs = np.isfinite(every).sum(axis=0) * np.log(np.where(np.isfinite(fit.noise), fit.noise, 1.0))
         result = Identification(
             values=unknowns.named(values),
             start=unknowns.named(unknowns.start),
@@ -304,7 +308,7 @@ class _Problem:
             residuals=tuple(frozen(r) for r in solved.reduced.residuals),
             columns=unknowns.columns,
             covariance=frozen(covariance),
-            score=chi2 + 2 * float(np.sum(logs)),
+            score=score_of(fit, solved),
             count=count,
             converged=solved.converged,
             steps=solved.steps,
@@ -342,7 +346,7 @@ class _Problem:
             return found[0], found[1], "", motions
         return found[0], found[1], f"samples that were held out are missed by {found[1]:.3g} times the noise", motions
 
-    def _reason(self, fit: Fit, solved: Solved, why_not: str) -> str:
+    def doubt(self, fit: Fit, solved: Solved, why_not: str) -> str:
         """Why the model does not explain the recordings; empty where it does."""
         if not solved.converged:
             return f"the fit did not converge: {solved.why}"

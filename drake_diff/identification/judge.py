@@ -153,6 +153,13 @@ def noise_of(fit: Fit, solved: Solved) -> Array:
         return np.asarray(fit.noise * np.sqrt(np.nansum(every**2, axis=0) / (numbers * free)))
 
 
+def score_of(fit: Fit, solved: Solved) -> float:
+    """-2 log of the likelihood, up to a constant of the data."""
+    every = np.concatenate(solved.reduced.residuals)
+    logs = np.isfinite(every).sum(axis=0) * np.log(np.where(np.isfinite(fit.noise), fit.noise, 1.0))
+    return float(np.nansum(every**2)) + 2 * float(np.sum(logs))
+
+
 def colour_of(residuals: Sequence[Array], names: Sequence[str]) -> tuple[str, float]:
     """(the entry whose residuals are least like white noise, the probability of that in white noise of all entries).
 

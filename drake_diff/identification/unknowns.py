@@ -182,10 +182,10 @@ def choose_unknowns(model: Model, tree: Tree | None, names: Sequence[str] | str)
     Raises UnknownNameError, which lists those that exist, or InputError where one cannot be estimated.
     """
     known = {p.name: (p.unit, p.value, p.lower) for p in list_parameters(model)}
-    extra = _extra(model)
-    known |= {name: extra[name] for name in extra if tree is not None or name.endswith(f".{BIAS}")}
+    own = list(known)
+    known = {n: e for n, e in _extra(model).items() if tree is not None or n.endswith(f".{BIAS}")} | known
     if isinstance(names, str) and names == "all":
-        names = [name for name in known if name.rsplit(".", 1)[1] in OF_ALL]
+        names = [name for name in own if name.rsplit(".", 1)[1] in OF_ALL]
         names = [name for name in names if _why_not(model, tree, name, known[name][1]) is None]
     elif isinstance(names, str):
         names = [names]
@@ -210,6 +210,11 @@ def _extra(model: Model) -> dict[str, tuple[str, Array, float]]:
         if joint.num_velocities() == 1:
             unit = "N" if joint.type_name() == "prismatic" else "N m"
             found[f"{label}.{COULOMB}"] = (unit, np.zeros(1), 0.0)
+            found[f"{label}.spring_stiffness"] = (
+                f"{unit}/{'m' if unit == 'N' else 'rad'}",
+                np.zeros(1),
+                0.0,
+            )  # rest: 0
     for name in model.input_names:
         found[f"{name}.{STRENGTH}"] = ("1", np.ones(1), -np.inf)
     for name in (*model.position_names, *model.velocity_names):
@@ -303,3 +308,13 @@ def _set_rotors(model: Model, by_joint: dict[str, Any], given: dict[str, Any], r
         rotor = given.get(f"{label}.rotor_inertia", actuator.default_rotor_inertia())
         ratio = given.get(f"{label}.gear_ratio", actuator.default_gear_ratio())
         reflected[by_joint[joint_names[actuator.joint().index()]].v_start] += rotor * ratio**2
+
+
+def possible_changes(model: Model, tree: Tree) -> list[str]:
+    """Names of everything in which the motion of a tree may differ from the model's."""
+    known = {p.name: p.value for p in list_parameters(model)} | {n: e[1] for n, e in _extra(model).items()}
+    return [
+        name
+        for name, value in known.items()
+        if name.rsplit(".", 1)[1] != "gear_ratio" and _why_not(model, tree, name, value) is None
+    ]

@@ -75,8 +75,8 @@ def scale(root, name, factor):
         element.set(key, repr(float(float(element.get(key)) * factor)))
 
 
-def by_mujoco(root, joints, q0, torques, friction):
-    """(SAMPLES + 1, 2 n) positions and velocities of `joints`, from rest."""
+def by_mujoco(root, joints, q0, torques, friction, period=PERIOD, gravity=(0, 0, -9.81)):
+    """(N + 1, 2 n) positions and velocities of `joints`, from rest, under N torques that act for a period each."""
     root = copy.deepcopy(root)
     if all(link.get("name") != "world" for link in root.iter("link")):
         root.insert(0, ET.Element("link", name="world"))
@@ -85,13 +85,13 @@ def by_mujoco(root, joints, q0, torques, friction):
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT) | int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in joints]
     q, v = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
-    model.dof_frictionloss[v] = friction
+    model.dof_frictionloss[v], model.opt.gravity[:] = friction, gravity
     data = mujoco.MjData(model)
     data.qpos[q] = q0
     found = [np.concatenate([data.qpos[q], data.qvel[v]])]
     for torque in torques:
         data.qfrc_applied[v] = torque
-        for _ in range(round(PERIOD / STEP)):
+        for _ in range(round(period / STEP)):
             mujoco.mj_step(model, data)
         found.append(np.concatenate([data.qpos[q], data.qvel[v]]))
     return np.array(found)

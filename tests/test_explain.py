@@ -1,0 +1,125 @@
+"""What is wrong in a model, by name: recordings of equations of motion that SciPy integrates."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers.pendulum import GRAVITY, LEVER, MASS, swing
+from helpers.robots import example_robot
+from scipy.integrate import solve_ivp
+
+import drake_diff as dd
+from drake_diff.exceptions import ModelError, UnknownNameError
+
+
+@pytest.fixture
+def pendulum(load):
+    return load("pendulum.urdf")
+
+
+def driven(*, mass=MASS, damping=0.1, gravity=GRAVITY, bias=0.0, strength=1.0, delay=0.0, limit=np.inf, seed=0):
+    """The pendulum under torques held for 10 ms, so that mass, damping, gravity and strength are told apart."""
+    times = np.linspace(0, 2, 201)
+    us = 3 * np.sin(2 * np.pi * 0.9 * times[:-1]) + 2 * np.sin(2 * np.pi * 2.3 * times[:-1] + 1)
+
+    def rates(t, y):
+        torque = strength * np.clip(us[int(np.clip((t - delay) / 0.01, 0, 199))], -limit, limit)
+        moment = torque - mass * gravity * LEVER * np.sin(y[0]) - damping * y[1]
+        return [y[1], moment / (mass * LEVER**2)]
+
+    xs = [np.array([1.0, 0.0])]
+    for k in range(200):  # a piece for each input
+        cuts = np.unique([times[k], np.clip(times[k] + delay % 0.01, times[k], times[k + 1]), times[k + 1]])
+        x = xs[-1]
+        for a, b in pairwise(cuts):
+            if b - a > 1e-9:
+                middle = (a + b) / 2
+                x = solve_ivp(lambda t, y, m=middle: rates(m, y), (a, b), x, rtol=1e-9, atol=1e-11).y[:, -1]
+        xs.append(x)
+    measured = np.array(xs) + [bias, 0] + 1e-3 * np.random.default_rng(seed).standard_normal((201, 2))
+    measured[:, 1] = np.nan
+    return dd.Recording("lab", "1", times, measured, us[:, None])
+
+
+def among(w, name):
+    return name in w.names or (name,) in w.alternatives
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "truth"),
+    [
+        ({"damping": 0.3}, "hinge.damping", 0.3),
+        ({"mass": 1.2}, "pole.mass", 1.2),
+        ({"bias": 0.05}, "hinge_q.bias", 0.05),
+        ({"strength": 0.8}, "motor.strength", 0.8),
+    ],
+)
+def test_a_single_change_of_a_pendulum_is_named(pendulum, changes, name, truth):
+    w = dd.explain(pendulum, driven(**changes))
+    assert w.explained
+    assert among(w, name), w
+    assert name in w.sentence
+    low, high = w.intervals[name]
+    assert low < truth < high, w
+
+
+def test_gravity_is_named(pendulum):
+    w = dd.explain(pendulum, driven(gravity=9.0))
+    assert among(w, "model.gravity"), w
+    assert w.values["model.gravity"][2] == pytest.approx(-9.0, abs=0.05)
+
+
+def test_what_cannot_be_told_apart_is_named_together(pendulum):
+    """A pendulum that nothing drives shows only the quotient of damping and mass."""
+    w = dd.explain(pendulum, swing(damping=0.15))
+    assert {w.names, *w.alternatives} >= {("hinge.damping",), ("pole.mass",)}
+    assert w.sentence.endswith("the recording cannot tell.")
+    assert w.values["hinge.damping"] == pytest.approx(0.15, rel=0.02)
+
+
+def test_dry_friction_is_named(pendulum):
+    w = dd.explain(pendulum, swing(friction=0.08, noise=1e-4))
+    assert w.names == ("hinge.coulomb_friction",)
+    assert w.alternatives == ()
+    assert w.values["hinge.coulomb_friction"] == pytest.approx(0.08, rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_delay_and_a_limit_of_inputs_are_named(pendulum):
+    w = dd.explain(pendulum, driven(delay=0.015))
+    assert w.names == ("model.input_delay",), w
+    assert w.intervals["model.input_delay"][0] < 0.015 < w.intervals["model.input_delay"][1]
+    w = dd.explain(pendulum, driven(limit=2.5))
+    assert w.names == ("motor.limit",), w
+    assert w.values["motor.limit"] == pytest.approx(2.5, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_of_a_right_model_nothing_is_said(pendulum, seed):
+    for log in (swing(seed=seed), driven(seed=seed)):
+        w = dd.explain(pendulum, log)
+        assert w.names == ()
+        assert w.explained
+        assert w.sentence == "Nothing: the model explains it."
+
+
+def test_a_law_that_no_parameter_has_is_not_explained(pendulum):
+    """A wall that stops the measured angle."""
+    log = swing(noise=1e-4)
+    pushed = log.xs.copy()
+    pushed[:, 0] = np.maximum(pushed[:, 0], -0.6)
+    w = dd.explain(pendulum, dd.Recording("lab", "1", log.times, pushed, log.us))
+    assert w.names == ()
+    assert not w.explained
+    assert w.sentence.startswith("Not explained")
+
+
+def test_what_makes_no_sense_is_refused(pendulum):
+    with pytest.raises(UnknownNameError):
+        dd.explain(pendulum, swing(), noise={"hinge": 1.0})
+    with pytest.raises(UnknownNameError):
+        dd.explain(pendulum, swing(), motion="steps")
+    model = example_robot("finger_edu.urdf", gains=(2.0, 0.1))
+    xs = np.tile(model.default_state, (20, 1))
+    with pytest.raises(ModelError, match="controllers"):
+        dd.explain(model, dd.Recording("lab", "1", 0.01 * np.arange(20), xs, np.zeros((19, model.nu))))
