@@ -291,8 +291,7 @@ class _Search:
         found: list[_Tried] = []
         done: set[tuple[str, ...]] = set()
         for gain, members, step in ranked:
-            behind = 0.0 if any(one.explains for one in found) else BEHIND * ranked[0][0]
-            if gain <= 0 or len(done) == FITTED or gain < ranked[0][0] - max(LEAST_BEHIND, behind):
+            if gain <= 0 or len(done) == FITTED or gain < ranked[0][0] - max(LEAST_BEHIND, BEHIND * ranked[0][0]):
                 break
             names = tuple(self.plain(promise.names[i]) for i in members)
             if names in done or len(set(names)) < len(names) or sum(map(self.is_of_inputs, names)) > 1:
