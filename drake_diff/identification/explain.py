@@ -100,13 +100,13 @@ def explain(
         BIC: Schwarz, "Estimating the dimension of a model" (1978).
 
     Example:
-        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.001)
-        >>> motion = dd.rollout(model, [1.0, 0.0], np.zeros((1500, 1)), parameters={"model.gravity": [0, 0, -9.0]})
-        >>> measured = motion.xs[::10] + 1e-3 * np.random.default_rng(0).standard_normal((151, 2))
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.0001)
+        >>> motion = dd.rollout(model, [1.0, 0.0], np.zeros((15000, 1)), parameters={"hinge.damping": 0.2})
+        >>> measured = motion.xs[::100] + 1e-3 * np.random.default_rng(0).standard_normal((151, 2))
         >>> log = dd.Recording("lab", "1", 0.01 * np.arange(151), measured, np.zeros((150, 1)))
         >>> w = dd.explain(model, log)
-        >>> print("model.gravity" in w.names or ("model.gravity",) in w.alternatives)
-        True
+        >>> sorted([w.names, *w.alternatives])
+        [('hinge.damping',), ('pole.mass',)]
     """
     if motion not in MOTIONS:
         raise UnknownNameError("motion", got=motion, known=MOTIONS)
