@@ -95,6 +95,7 @@ def test_a_success_and_an_interrupt_have_nothing_to_try():
     assert "to try" not in dd.solve(problem).message
 
 
+@pytest.mark.slow
 def test_what_is_named_is_taken():
     """Each method that a refusal names for a problem is not refused for it."""
     problems = [swing_up(), swing_up(horizon=(0.5, 2.0)), swing_up(trajectory_cost=lambda xs, us: 0.0 * xs[-1][0])]

@@ -277,6 +277,7 @@ def test_a_block_in_least_time_by_discrete_steps(method, solver, steps, tmp_path
     assert any("time_step" in column for column in solution.certificates[-1].columns)
 
 
+@pytest.mark.slow
 @each_row("method, segments", [("ilqr", 1), ("shooting", 1), ("shooting", 3)])
 def test_a_time_that_is_weighed_against_effort(method, segments, tmp_path):
     """w T + c 12 m^2 d^2 / T^3 is least at T = (36 c m^2 d^2 / w)^(1/4); of N steps c = 1 / (1 - 1/N^2)."""

@@ -234,6 +234,7 @@ def test_a_forged_run_in_continuous_time_is_refused(thrown_run, tmp_path, forge)
     assert dd.verify(folder).verdict == "broken"
 
 
+@pytest.mark.slow
 def test_a_derivative_that_another_integration_does_not_have_is_no_plans(monkeypatch):
     """2 % off at every width, which nothing explains; and slopes that do not settle, as where a body tumbles."""
     model = ball_on_rails(gravity=9.81, time_step=0.02)

@@ -88,6 +88,7 @@ def test_slopes_that_do_not_settle_do_not_exist():
     assert Slopes(0, 1.0, (-4.6, 0.9, -8.1)).kind == "none"
 
 
+@pytest.mark.slow
 def test_a_wrong_gradient_and_a_wrong_verdict_are_counted(monkeypatch):
     one = case(0, 0)
     found = impacts.judge(one, None, costs=False)

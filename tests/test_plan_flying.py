@@ -37,6 +37,7 @@ def test_thrusters_push_and_turn_a_body_in_every_direction(box):
     assert np.sum(wrenches, axis=0) == pytest.approx([0, 0, 0, 2, 2, 2], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_box_is_lifted_out_of_the_ground_and_flown(box, tmp_path):
     found = load_robot(box, 0)
     assert "thrusters" in " ".join(found.repairs)

@@ -214,7 +214,7 @@ def test_without_contact_nothing_touches(write):
         ({"packages": "arm"}, InputError, "packages: expected the folder of each package"),
         ({"ground": False}, InputError, "ground"),
         ({"ground": 0.5, "contact": False}, InputError, "ground: expected contact"),
-        ({"contact": "no"}, InputError, "contact: expected True, False or \"ground\", got 'no'"),
+        ({"contact": "no"}, InputError, 'contact: expected True, False, "ground" or "separable", got \'no\''),
     ],
 )
 def test_bad_repairs_are_named(write, options, error, words):

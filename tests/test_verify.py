@@ -199,6 +199,7 @@ def set_value(index, key, value):
     return change
 
 
+@pytest.mark.slow
 @each_row(
     "section, change, words",
     [
