@@ -103,6 +103,21 @@ def test_what_cannot_stand_is_refused_with_the_reason():
         STAND.with_soft_feet(dd.model_from_diagram(model.diagram))
 
 
+def test_a_trunk_that_carries_too_is_refused(tmp_path):
+    """A ball about the trunk reaches the ground: 0.02 mm into it, at 500 N/mm, it carries 10 N."""
+    text = (MODELS / "quadruped.urdf").read_text()
+    path, depth = tmp_path / "quadruped.urdf", 2e-5
+    high = STAND.standing(quadruped(), BENT)[6]
+    for radius, touches in ((high - 0.01, False), (high + depth, True)):
+        ball = f'<collision><geometry><sphere radius="{radius}"/></geometry></collision></link>'
+        path.write_text(text.replace("</link>", ball, 1))
+        if touches:
+            with pytest.raises(InputError, match=r"trunk touches too"):
+                STAND.standing(quadruped(path), BENT)
+        else:
+            assert STAND.standing(quadruped(path), BENT)[6] == pytest.approx(high, abs=1e-9)
+
+
 def test_feet_in_the_air_are_refused_where_they_are_to_stand():
     model = quadruped()
     x0 = STAND.standing(model, BENT)

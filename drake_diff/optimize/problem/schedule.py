@@ -155,7 +155,7 @@ class ContactSchedule(Goal):
             (nx,) the state.
 
         Raises:
-            InputError: It does not rest so, a foot is off the ground, or a motor is too weak to hold it.
+            InputError: It does not rest so, a foot is off the ground, more than feet touch, or a motor is too weak.
             UnknownNameError: The model has no such foot or joint.
 
         Example:
@@ -206,8 +206,7 @@ class ContactSchedule(Goal):
     def _check_touching(self, legs: Legs, x0: Array) -> None:
         """InputError where the first state leaves feet in the air that are to stand in the first step."""
         legs.put(x0[: legs.model.nq])
-        over = np.array([np.min(legs.points()[legs.owners == i, 2]) for i in range(len(self.feet))])
-        standing = np.flatnonzero(self.stands[0])
+        over, standing = legs.heights(), np.flatnonzero(self.stands[0])
         if not len(standing):
             return
         worst = standing[np.argmax(over[standing])]

@@ -85,6 +85,11 @@ class Legs:
         """(n, 3) [m] the lowest points in the twin's state."""
         return self._now().places[0]
 
+    def heights(self) -> Array:
+        """(feet,) [m] of the lowest point of each foot in the twin's state."""
+        heights = self.points()[:, 2]
+        return np.array([np.min(heights[self.owners == i]) for i in range(len(self.feet))])
+
     def jacobians(self) -> tuple[Array, Array]:
         """(n, 3, nv) twice: how the material at the lowest points moves, and how their bodies turn."""
         now = self._now()

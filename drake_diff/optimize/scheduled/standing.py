@@ -5,6 +5,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.derivatives.step import linearize
 from drake_diff.exceptions import InputError
+from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.model import Model
 from drake_diff.model.step import advance
 from drake_diff.optimize.scheduled.legs import Legs
@@ -36,7 +37,7 @@ def standing(legs: Legs, posture: Array) -> tuple[Array, Array]:
     The base is rolled, pitched and raised: by Gauss and Newton over these three and the inputs.
 
     Raises:
-        InputError: No such state is found, a foot is in the air in it, or a motor is too weak for it.
+        InputError: No such state is found, a foot is in the air, something else touches, or a motor is too weak.
     """
     model, base = legs.model, legs.base_v
     freed, free = [base, base + 1, base + 5], 2 * model.nv
@@ -99,7 +100,7 @@ def _check(legs: Legs, x: Array, u: Array, off: float) -> None:
             limit = abs(entry.upper if value > 0 else entry.lower)
             raise InputError(what, got=f"more than {limit:.3g} of {entry.name}", expected="what its motors can hold")
     legs.put(x[: model.nq])
-    over = [float(np.min(legs.points()[legs.owners == i, 2])) for i in range(len(legs.feet))]
+    over = legs.heights()
     highest = int(np.argmax(over))
     if over[highest] > 0:
         got = f"{legs.feet[highest]} {1e3 * over[highest]:.2g} mm over the ground"
@@ -107,3 +108,9 @@ def _check(legs: Legs, x: Array, u: Array, off: float) -> None:
     if off >= AT_REST:
         expected = "a posture that rests on its feet, the centre of mass over them"
         raise InputError(what, got=f"{off:.2g} rad/s or m/s after a step", expected=expected)
+    plant = model.plant
+    rigid = {str(b.name()) for foot in legs.feet for b in plant.GetBodiesWeldedTo(plant.GetBodyByName(foot))}
+    advance(model.double, x, u)
+    others = sorted({contact.body_a for contact in contacts_of_the_step(model)} - rigid)
+    if others:
+        raise InputError(what, got=f"{others[0]} touches too", expected="a posture that its feet alone carry")
