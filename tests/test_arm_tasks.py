@@ -1,12 +1,12 @@
 """The tasks of `benchmarks/arm_tasks.py`: what is asked is not there at the start, and the referee refuses misses."""
 
 import sys
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.contact_tasks import assert_solved_and_found, drawn_task
 
 import drake_diff as dd
 
@@ -18,13 +18,9 @@ BALL, BALL_V = slice(3, 5), slice(9, 11)  # in the state of arm_cup.sdf
 BOX = slice(6, 8)  # in that of the UR5 and the box
 
 
-def drawn(name, start=0):
-    return TASKS[name](np.random.default_rng([0, zlib.crc32(name.encode()), start]))
-
-
 @pytest.mark.parametrize("name", TASKS)
 def test_nothing_asked_is_there_where_nothing_is_done(name):
-    problem = (task := drawn(name)).problem
+    problem = (task := drawn_task(TASKS, name)).problem
     us = np.zeros((problem.num_steps, problem.nu))
     xs = dd.rollout(problem.model, problem.x0, us).xs
     assert task.asks
@@ -34,7 +30,7 @@ def test_nothing_asked_is_there_where_nothing_is_done(name):
 
 @pytest.mark.parametrize("name", ["throw", "catch"])
 def test_an_end_just_inside_its_tolerance_is_taken_and_one_outside_is_refused(name):
-    task = drawn(name)
+    task = drawn_task(TASKS, name)
     xs, us = (np.array(part) for part in task.options["initial_guess"])
     (_, place_off, allowed), *rest = task.asks
     xs[-1, BALL] = list(task.problem.goals[0].values.values())  # sorted by name: x, z
@@ -51,7 +47,7 @@ def test_an_end_just_inside_its_tolerance_is_taken_and_one_outside_is_refused(na
 
 
 def test_a_box_just_inside_its_tolerance_is_taken_and_one_outside_is_refused():
-    task = drawn("push")
+    task = drawn_task(TASKS, "push")
     xs, us = (np.array(part) for part in task.options["initial_guess"])
     ((_, place_off, allowed),) = task.asks
     for part, taken in ((0.99, True), (1.01, False), (-1.01, False)):
@@ -60,7 +56,7 @@ def test_a_box_just_inside_its_tolerance_is_taken_and_one_outside_is_refused():
 
 
 def test_the_guess_takes_the_arms_tip_along_with_the_box_and_leaves_it_where_it_is_wanted():
-    task = drawn("push")
+    task = drawn_task(TASKS, "push")
     model, (xs, _) = task.problem.model, task.options["initial_guess"]
     plant, context = model.plant, model.plant.CreateDefaultContext()
     tip, box = plant.GetFrameByName("tip"), plant.GetFrameByName("box")
@@ -80,11 +76,11 @@ def test_the_guess_takes_the_arms_tip_along_with_the_box_and_leaves_it_where_it_
 
 def test_the_target_of_a_throw_is_beyond_the_cup():
     for start in range(20):
-        assert np.linalg.norm(list(drawn("throw", start).problem.goals[0].values.values())) > 0.9
+        assert np.linalg.norm(list(drawn_task(TASKS, "throw", start).problem.goals[0].values.values())) > 0.9
 
 
 def test_a_ball_in_its_seat_lies_still_where_motors_hold_the_arm():
-    problem = drawn("throw").problem
+    problem = drawn_task(TASKS, "throw").problem
     model, x = problem.model, problem.x0
     plant, context = model.plant, model.plant.CreateDefaultContext()
     plant.SetPositionsAndVelocities(context, x)
@@ -101,7 +97,7 @@ def test_the_guess_has_the_ball_in_the_cup():
     pitch = np.array([0.0, -0.4])
     wrist = np.array([[0.4, 0.1], [0.3, -0.2]])
     xs, _ = motion_of(wrist, pitch, wrist + seat(pitch), np.zeros(6), 0.005)
-    model = drawn("throw").problem.model
+    model = drawn_task(TASKS, "throw").problem.model
     plant, context = model.plant, model.plant.CreateDefaultContext()
     for x in xs:
         plant.SetPositionsAndVelocities(context, x)
@@ -116,7 +112,7 @@ def test_the_guess_has_the_ball_in_the_cup():
 def test_the_referee_refuses_an_arm_that_does_nothing(name):
     from contact_plans import referee
 
-    task = drawn(name)
+    task = drawn_task(TASKS, name)
     wrong, _ = referee(task, SimpleNamespace(us=np.zeros((task.problem.num_steps, task.problem.nu))))
     assert wrong
 
@@ -124,10 +120,4 @@ def test_the_referee_refuses_an_arm_that_does_nothing(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_a_start_is_solved_and_drake_alone_finds_what_moves_there(name):
-    from contact_plans import referee
-
-    task = drawn(name)
-    solution = dd.solve(task.problem, **task.options)
-    assert solution.success, solution.message
-    wrong, _ = referee(task, solution)
-    assert not wrong
+    assert_solved_and_found(drawn_task(TASKS, name))

@@ -1,13 +1,13 @@
 """The tasks of `benchmarks/manipulation_tasks.py`: what is asked is not there at the start, and the guess touches."""
 
 import sys
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.contact_tasks import assert_solved_and_found, drawn_task
 
 import drake_diff as dd
 
@@ -19,13 +19,9 @@ AT = {"spin": "spin_q", "slide": "slide_x", "bx": "bx_x", "by": "by_x"}  # the c
 KEPT = {"grasp": 2}  # of what is asked, at the end: it is there at first, and to be kept
 
 
-def drawn(name, seed=0):
-    return TASKS[name](np.random.default_rng([seed, zlib.crc32(name.encode()), 0]))
-
-
 @pytest.mark.parametrize("name", TASKS)
 def test_nothing_asked_is_there_where_nothing_is_done(name):
-    problem = (task := drawn(name)).problem
+    problem = (task := drawn_task(TASKS, name)).problem
     us = np.zeros((problem.num_steps, problem.nu))
     xs = dd.rollout(problem.model, problem.x0, us).xs
     assert task.asks
@@ -35,7 +31,7 @@ def test_nothing_asked_is_there_where_nothing_is_done(name):
 
 @pytest.mark.parametrize("name", ["spinner", "ball", "box"])
 def test_an_end_just_inside_its_tolerance_is_taken_and_one_outside_is_refused(name):
-    problem = (task := drawn(name)).problem
+    problem = (task := drawn_task(TASKS, name)).problem
     (goal,) = problem.goals
     ((_, measure, allowed),) = task.asks
     for part, taken in ((0.99, True), (1.01, False), (-1.01, False)):
@@ -46,7 +42,7 @@ def test_an_end_just_inside_its_tolerance_is_taken_and_one_outside_is_refused(na
 
 
 def test_the_guess_takes_the_tip_beside_the_spinner_and_along_with_it():
-    task = drawn("spinner")
+    task = drawn_task(TASKS, "spinner")
     model, (xs, _) = task.problem.model, task.options["initial_guess"]
     plant, context = model.plant, model.plant.CreateDefaultContext()
     there = xs[round(0.4 * (len(xs) - 1)) :]
@@ -63,7 +59,7 @@ def test_the_guess_takes_the_tip_beside_the_spinner_and_along_with_it():
 def test_the_referee_refuses_what_is_not_as_asked_and_a_task_that_asks_nothing():
     from contact_plans import referee
 
-    task = drawn("ball")
+    task = drawn_task(TASKS, "ball")
     nothing = SimpleNamespace(us=np.zeros((task.problem.num_steps, task.problem.nu)))
     ((what, _, _),) = task.asks
     (wrong,), _ = referee(task, nothing)
@@ -78,7 +74,7 @@ def test_the_referee_refuses_what_is_not_as_asked_and_a_task_that_asks_nothing()
 
 def test_a_box_that_is_dropped_leans_or_is_carried_from_below_is_refused():
     """Of a motion whose end is as asked; 2 of the 10 knots of the last 0.2 s are spoilt."""
-    task = drawn("grasp")
+    task = drawn_task(TASKS, "grasp")
     us = np.zeros((task.problem.num_steps, 4))
     asked = np.array(task.problem.goals[0].goal.values["z"])
 
@@ -97,7 +93,7 @@ def test_a_box_that_is_dropped_leans_or_is_carried_from_below_is_refused():
 
 def test_a_box_that_still_rocks_is_not_flipped():
     """As it lies at the end, but for 2 of the 10 knots of the last 0.2 s."""
-    task = drawn("flip")
+    task = drawn_task(TASKS, "flip")
     us = np.zeros((task.problem.num_steps, 2))
     xs = np.tile(task.problem.x0, (len(us) + 1, 1))
     xs[-20:, 2] = np.pi / 2
@@ -108,7 +104,7 @@ def test_a_box_that_still_rocks_is_not_flipped():
 
 
 def test_the_guess_turns_the_box_about_its_far_edge_and_the_finger_with_it():
-    task = drawn("flip")
+    task = drawn_task(TASKS, "flip")
     xs, _ = task.options["initial_guess"]
     x0 = task.problem.x0
     turn = xs[:, 2]
@@ -122,7 +118,7 @@ def test_the_guess_turns_the_box_about_its_far_edge_and_the_finger_with_it():
 
 
 def test_the_guess_closes_both_fingers_on_the_box_and_goes_up_with_it():
-    task = drawn("grasp")
+    task = drawn_task(TASKS, "grasp")
     xs, _ = task.options["initial_guess"]
     there = xs[round(0.4 * (len(xs) - 1)) :]
     # 0.07 m: half of the box and a fingertip; rounding of sums of three numbers below 1
@@ -135,10 +131,4 @@ def test_the_guess_closes_both_fingers_on_the_box_and_goes_up_with_it():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["spinner", "ball", "box", "grasp"])
 def test_a_start_is_solved_and_drake_alone_finds_the_object_there(name):
-    from contact_plans import referee
-
-    task = drawn(name)
-    solution = dd.solve(task.problem, **task.options)
-    assert solution.success, solution.message
-    wrong, _ = referee(task, solution)
-    assert not wrong
+    assert_solved_and_found(drawn_task(TASKS, name))

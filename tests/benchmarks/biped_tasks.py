@@ -9,9 +9,7 @@ from functools import cache, partial
 import numpy as np
 from contact_task import Task, Tasks
 from helpers.legged import LEGGED, legged_model, rest
-from legged_tasks import AT_PLACE, AT_REST, IN_AIR, LEVEL, OPTIONS, SPINS, TIME_STEP, build, off_place, speed, tilt
-
-import drake_diff as dd
+from legged_tasks import IN_AIR, OPTIONS, TIME_STEP, build, scheduled_problem
 
 ROBOT, LEFT, RIGHT, BOTH = "talos", 0, 1, (0, 1)
 STRIDE, SWING = 0.1, 0.05  # [m]
@@ -39,21 +37,7 @@ def _task(random, h, kind, first, phases, text, *, way=0.0):
     shift = np.mean(begun, axis=(0, 1))[:2] - np.mean(_soles(end), axis=(0, 1))[:2]
     end[4:6] += shift + np.array([way, 0.0])
     steps = [(round(seconds / h), [facts.feet[i] for i in feet]) for seconds, feet in phases]
-    schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet)
-    guess = schedule.guess(model, x0, end, swing=SWING)
-    goals = [
-        schedule,
-        dd.FrameGoal(facts.base, position=end[4:7], tolerance=AT_PLACE),
-        dd.FrameVelocityGoal(facts.base, tolerance=AT_REST, angular_velocity=(0.0, 0.0, 0.0), angular_tolerance=SPINS),
-        dd.KeepLevel(facts.base, tolerance=LEVEL, knots=-1),
-    ]
-    follow = schedule.follow(model, guess)
-    problem = dd.Problem(model, x0=x0, num_steps=schedule.num_steps, goals=goals, **follow)
-    asks = [
-        ("base from its place [m]", partial(off_place, end[4:7]), AT_PLACE),
-        ("base from level [rad]", tilt, LEVEL),
-        ("speed of the base [m/s]", partial(speed, model.nq), AT_REST),
-    ]
+    problem, _, guess, asks = scheduled_problem(model, facts, x0, end, steps, SWING)
     if way:
         ends = np.mean(_soles(end), axis=1)
         asks += [(f"{facts.feet[i]} from where it lands [m]", partial(_off_foot, i, ends[i]), LANDED) for i in BOTH]

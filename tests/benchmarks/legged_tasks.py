@@ -86,22 +86,8 @@ def _task(robot, random, h, kind, first, last, phases, text, *, way=0.0, pushed=
     if pushed:
         x0[nq:] = _pushed(robot, model, x0, random)
     steps = [(round(seconds / h), [facts.feet[i] for i in feet]) for seconds, feet in phases]
-    schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet)
-    guess = schedule.guess(model, x0, end, swing=SWING * HEIGHTS[robot])
-    goals = [
-        schedule,
-        dd.FrameGoal(facts.base, position=end[4:7], tolerance=AT_PLACE),
-        dd.FrameVelocityGoal(facts.base, tolerance=AT_REST, angular_velocity=(0.0, 0.0, 0.0), angular_tolerance=SPINS),
-        dd.KeepLevel(facts.base, tolerance=LEVEL, knots=-1),
-    ]
-    follow = schedule.follow(model, guess)
-    problem = dd.Problem(model, x0=x0, num_steps=schedule.num_steps, goals=goals, **follow)
+    problem, schedule, guess, asks = scheduled_problem(model, facts, x0, end, steps, SWING * HEIGHTS[robot])
     plant = _kinematics(robot)
-    asks = [
-        ("base from its place [m]", partial(off_place, end[4:7]), AT_PLACE),
-        ("base from level [rad]", tilt, LEVEL),
-        ("speed of the base [m/s]", partial(speed, nq), AT_REST),
-    ]
     knot = 0
     for count, standing in steps:
         middle, swinging = knot + count // 2, [foot for foot in facts.feet if foot not in standing]
@@ -118,6 +104,25 @@ def _task(robot, random, h, kind, first, last, phases, text, *, way=0.0, pushed=
         schedule=schedule,
         build=partial(build, robot, h),
     )
+
+
+def scheduled_problem(model, facts, x0, end, steps, swing):
+    """(problem, schedule, guess, what a referee measures of the base) of a robot that comes to rest at `end`."""
+    schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet)
+    guess = schedule.guess(model, x0, end, swing=swing)
+    goals = [
+        schedule,
+        dd.FrameGoal(facts.base, position=end[4:7], tolerance=AT_PLACE),
+        dd.FrameVelocityGoal(facts.base, tolerance=AT_REST, angular_velocity=(0.0, 0.0, 0.0), angular_tolerance=SPINS),
+        dd.KeepLevel(facts.base, tolerance=LEVEL, knots=-1),
+    ]
+    follow = schedule.follow(model, guess)
+    asks = [
+        ("base from its place [m]", partial(off_place, end[4:7]), AT_PLACE),
+        ("base from level [rad]", tilt, LEVEL),
+        ("speed of the base [m/s]", partial(speed, model.nq), AT_REST),
+    ]
+    return dd.Problem(model, x0=x0, num_steps=schedule.num_steps, goals=goals, **follow), schedule, guess, asks
 
 
 @cache
