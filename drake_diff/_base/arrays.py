@@ -1,6 +1,7 @@
 """Arrays and numbers that come from users, checked once; cross products of many vectors at once."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import accumulate, pairwise
 from math import hypot, isfinite
 from typing import Any
 
@@ -97,6 +98,11 @@ _SKEW = np.zeros((3, 9))  # w -> skew(w), flattened
 for _row, _column, _entry, _sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
     _SKEW[_entry, 3 * _row + _column] = _sign
     _SKEW[_entry, 3 * _column + _row] = -_sign
+
+
+def slices_of(lengths: Iterable[int]) -> tuple[slice, ...]:
+    """Where parts of these lengths stand, one after the other."""
+    return tuple(slice(a, b) for a, b in pairwise(accumulate(lengths, initial=0)))
 
 
 def skew(w: Array) -> Array:

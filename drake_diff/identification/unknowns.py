@@ -9,12 +9,11 @@ themselves, and are kept at 0 or above.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.arrays import Array, frozen, slices_of
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.identification.tree import Numbers, Tree, ten_numbers
 from drake_diff.mechanics.description import names_of
@@ -70,8 +69,7 @@ class Unknowns:
 
     @property
     def slices(self) -> tuple[slice, ...]:
-        ends = np.cumsum([0, *(len(one.start) for one in self.each)])
-        return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
+        return slices_of(len(one.start) for one in self.each)
 
     @property
     def columns(self) -> tuple[str, ...]:

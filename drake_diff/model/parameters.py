@@ -21,14 +21,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 
-from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.arrays import Array, finite_array, frozen, slices_of
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameter_kinds import AUTODIFF, CONTACT_KINDS, MECHANISM_KINDS, Kind
@@ -118,8 +117,7 @@ class ParameterVector:
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Where each parameter stands in the vector."""
-        ends = np.cumsum([0, *(len(p.value) for p in self.parameters)])
-        return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
+        return slices_of(len(p.value) for p in self.parameters)
 
     @cached_property
     def differenced(self) -> NDArray[np.int64]:

@@ -7,12 +7,11 @@ p J'J of the rows that push is kept (Gauss-Newton), which no constraint can make
 """
 
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, slices_of
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.problem import Problem
 
@@ -38,8 +37,7 @@ class AugmentedLagrangian:
         self.groups = [_Rows(problem, constraint) for constraint in problem.kept]
         self.lower = np.concatenate([lower.ravel(), *(g.lower for g in self.groups)])
         self.upper = np.concatenate([upper.ravel(), *(g.upper for g in self.groups)])
-        ends = np.cumsum([lower.size, *(g.size for g in self.groups)]).tolist()
-        self.slices = [slice(start, end) for start, end in pairwise(ends)]  # where the rows of each group are
+        self.slices = slices_of([lower.size, *(g.size for g in self.groups)])[1:]  # where the rows of each group are
         self.scale = np.ones(len(self.lower))
         self.multipliers = np.zeros(len(self.lower))
         self.penalty = FIRST_PENALTIES[0]
