@@ -67,6 +67,8 @@ def test_gravity_is_named(pendulum):
     w = dd.explain(pendulum, driven(gravity=9.0))
     assert among(w, "model.gravity"), w
     assert w.values["model.gravity"][2] == pytest.approx(-9.0, abs=0.05)
+    assert "model.gravity[1] cannot be known" in w.sentence  # it is along the hinge
+    assert "inf" not in w.sentence
 
 
 def test_what_cannot_be_told_apart_is_named_together(pendulum):

@@ -485,6 +485,8 @@ class _Search:
         unit = f" {unit}" if unit not in ("", "1") else ""
         return ", ".join(
             f"{column} is {v:.4g}{unit} ({low:.4g} to {high:.4g}), not {was:.4g}"
+            if np.isfinite(low) and np.isfinite(high)
+            else f"{column} cannot be known"
             for column, v, (low, high), was in zip(columns, value, interval, start, strict=True)
         )
 
