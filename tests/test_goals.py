@@ -25,7 +25,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
-from drake_diff.optimize.problem.goals import AIMED
+from drake_diff.optimize.problem.goals import AIMED, in_words
 from drake_diff.optimize.transcription.expressions import Symbolic, trace
 
 UPPER, LOWER = 0.8, 0.5  # [m] of double_pendulum.urdf
@@ -460,3 +460,18 @@ def test_a_goal_that_was_moved_is_found_although_the_record_is_whole(run, tmp_pa
     record.model_copy(update={"problem": dict(record.problem) | {"goals": goals}}).write(copy)
     found = dd.verify(copy)
     assert not found.holds
+
+
+@each_row(
+    "value, unit, words",
+    [
+        (0.0031, "m", "3.1 mm"),
+        (0.0994, "m", "99 mm"),
+        (0.0999999, "m", "0.1 m"),
+        (1.25, "m/s", "1.2 m/s"),
+        (0.033, "m/s", "33 mm/s"),
+        (0.002, "rad", "0.002 rad"),
+    ],
+)
+def test_a_distance_is_written_as_people_write_it(value, unit, words):
+    assert in_words(value, unit) == words

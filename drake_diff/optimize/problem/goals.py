@@ -102,7 +102,7 @@ class GoalConstraint(Constraint):
 
 def in_words(value: float, unit: str) -> str:
     """A length, an angle or a speed as people write it: 0.31 mm, 0.002 rad."""
-    if unit in ("m", "m/s") and abs(value) < 0.1:
+    if unit in ("m", "m/s") and abs(value) < 0.0995:  # which two digits would make 1e+02 mm
         return f"{1000 * value:.2g} m{unit}"
     return f"{value:.2g} {unit}"
 

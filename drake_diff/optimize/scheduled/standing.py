@@ -103,7 +103,7 @@ def _check(legs: Legs, x: Array, u: Array, off: float) -> None:
     over = legs.heights()
     highest = int(np.argmax(over))
     if over[highest] > 0:
-        got = f"{legs.feet[highest]} {1e3 * over[highest]:.2g} mm over the ground"
+        got = f"{legs.feet[highest]} {1e3 * over[highest]:.3g} mm over the ground"
         raise InputError(what, got=got, expected="a posture in which all feet of the schedule touch it")
     if off >= AT_REST:
         expected = "a posture that rests on its feet, the centre of mass over them"
