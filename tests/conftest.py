@@ -1,5 +1,6 @@
 """Fixtures of several test modules."""
 
+import signal
 import sys
 
 import numpy as np
@@ -12,6 +13,10 @@ from helpers.loops import CART, H  # noqa: E402
 from helpers.models import MODELS  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
+
+# A shell starts what runs in the background with Ctrl-C ignored, and what tests start and interrupt would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 for public in dd.__all__:  # a module that is first loaded while a test has patched another would keep the patch
     getattr(dd, public)
