@@ -48,6 +48,7 @@ from drake_diff.model.repairs import (
     weld_link,
 )
 from drake_diff.model.separable import touch_what_can_separate
+from drake_diff.model.threads import OfThread, SharedPlant
 from drake_diff.model.twin import AddedForce, Twin
 
 T = TypeVar("T")
@@ -61,8 +62,8 @@ class Model(ShowsItsRepr):
 
     Make one with `load_model` or `model_from_diagram`. The state is Drake's, `x = [q; v]`, and the input `u` the
     plant's actuation, forces on bodies and what a diagram exports, all in SI units. A Model keeps its contexts between
-    calls and sets all of x, u and the parameters on each call, so results do not depend on the order of calls; for the
-    same reason one Model serves one thread.
+    calls and sets all of x, u and the parameters on each call, so results do not depend on the order of calls. Each
+    thread that uses a Model has contexts of its own.
 
     Attributes:
         nq, nv, nx, nu: Numbers of positions, velocities, states (nq + nv) and inputs.
@@ -92,6 +93,7 @@ class Model(ShowsItsRepr):
         forces: tuple[AddedForce, ...] = (),
         coupling: Coupling | None = None,
         body_forces: tuple[BodyForce, ...] = (),
+        shared: SharedPlant | None = None,
     ):
         self.diagram = diagram
         self.forces = forces  # they act beside the plant's own
@@ -102,12 +104,10 @@ class Model(ShowsItsRepr):
         self.file_facts = FileFacts()  # what the file says that the plant does not keep
         self._rebuild = rebuild
         self._others: dict[frozenset[tuple[str, Hashable]], Model] = {}  # the same model with something changed
-        self._cache: dict[Hashable, Any] = {}
+        self._here = OfThread()
+        self.shared = SharedPlant() if shared is None else shared
         self._whole: Model | None = None
         self.held = 0 if coupling is None else len(coupling.mimics)  # constraints that the reduced state keeps to
-        # What parameters in its contexts are, for the time being, not the model's own: see `parameters.applied`.
-        self.other_quantities: frozenset[str] = frozenset()
-        self.applied: Any = None  # the ParameterVector that is applied, if one is
         self.path = path_to_the_plant(diagram)
         self.plant: MultibodyPlant = follow(diagram, self.path)
         _check_plant(self)
@@ -133,9 +133,23 @@ class Model(ShowsItsRepr):
         self.input_names = self.inputs.names
 
     @property
+    def other_quantities(self) -> frozenset[str]:
+        """What parameters are applied in this thread that are not the model's own."""
+        return self._here.other_quantities
+
+    @property
+    def applied(self) -> Any:
+        """The ParameterVector that is applied in this thread, or None."""
+        return self._here.applied
+
+    @property
     def has_other_parameters(self) -> bool:
         """Whether parameters are applied that are not the model's own."""
-        return bool(self.other_quantities)
+        return bool(self._here.other_quantities)
+
+    def set_applied(self, vector: Any, quantities: frozenset[str]) -> None:
+        """Note that the `quantities` of `vector`, None of none, stand in this thread's contexts."""
+        self._here.applied, self._here.other_quantities = vector, quantities
 
     @property
     def name(self) -> str:
@@ -172,11 +186,18 @@ class Model(ShowsItsRepr):
             return self
         if self._whole is None:
             self._whole = Model(
-                self.diagram, source=self.source, notes=self.notes, forces=self.forces, body_forces=self.body_forces
+                self.diagram,
+                source=self.source,
+                notes=self.notes,
+                forces=self.forces,
+                body_forces=self.body_forces,
+                shared=self.shared,
             )
-            self._whole.double = replace(self.double, coupling=None)
             self._whole.held = self.held
-        self._whole.other_quantities = self.other_quantities
+        here = self._whole._here
+        if here.double is None:
+            here.double = replace(self.double, coupling=None)
+        here.other_quantities = self._here.other_quantities
         return self._whole
 
     @property
@@ -237,11 +258,13 @@ class Model(ShowsItsRepr):
         except (TypeError, ValueError):
             return self._rebuild(**change)  # which says what is wrong with it
         if key not in self._others:
-            if len(self._others) >= OTHERS_KEPT:
-                self._others.pop(next(iter(self._others)))
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
-                self._others[key] = self._rebuild(**change)
+                made = self._rebuild(**change)
+            with self.shared.lock:
+                if len(self._others) >= OTHERS_KEPT:
+                    self._others.pop(next(iter(self._others)))
+                return self._others.setdefault(key, made)  # another thread may have been faster
         return self._others[key]
 
     @property
@@ -271,23 +294,40 @@ class Model(ShowsItsRepr):
         """By geometry the name of the body that carries it and whether that is fixed, as far as they were asked for."""
         return {}
 
-    @cached_property
+    @property
     def double(self) -> Twin:
-        """The plant that everything is measured on.
+        """The plant that everything is measured on, with this thread's context.
 
-        Raises ModelError where what the diagram's systems exert cannot be told, or depends on time.
+        Raises ModelError where what the diagram's systems exert cannot be told, or depends on time, and where another
+        thread has set a parameter that Drake keeps in the plant.
         """
-        twin = self._twin(float, self.diagram, self.plant)
-        if self.inputs.systems and not self.body_forces:
-            _check_time(self, twin)
-        return twin
+        found = self._here.double
+        if found is None:
+            self.shared.enter()
+            found = self._twin(float, self.diagram, self.plant)
+            if self.inputs.systems and not self.body_forces:
+                _check_time(self, found)
+            self._here.double = found
+        return found
 
-    @cached_property
+    @property
     def autodiff(self) -> Twin:
-        """The AutoDiffXd twin, with the PD gains that Drake's conversion drops put back.
+        """The AutoDiffXd twin, this thread's own, with the PD gains that Drake's conversion drops put back.
 
         Raises ModelError where a system of the diagram has no AutoDiffXd form.
         """
+        found = self._here.autodiff
+        if found is None:
+            self.shared.enter()
+            found = self._here.autodiff = self._converted()
+        return found
+
+    @property
+    def has_autodiff(self) -> bool:
+        """Whether this thread has an AutoDiffXd twin already."""
+        return self._here.autodiff is not None
+
+    def _converted(self) -> Twin:
         try:
             diagram = self.diagram.ToAutoDiffXd()
         except RuntimeError as error:
@@ -312,17 +352,18 @@ class Model(ShowsItsRepr):
         )
 
     def cache(self, key: Hashable, make: Callable[[], T], *, of_structure: bool = False) -> T:
-        """The result of `make` for `key`, made once and kept as long as the model.
+        """The result of `make` for `key`, made once in each thread and kept as long as it and the model.
 
         What is made while parameters are applied that are not the model's own is not kept, unless it depends on the
         model's structure alone (`of_structure`), which no parameter changes.
         """
-        if key in self._cache:
-            found: T = self._cache[key]
+        kept = self._here.cache
+        if key in kept:
+            found: T = kept[key]
             return found
         made = make()
         if of_structure or not self.has_other_parameters:
-            self._cache[key] = made
+            kept[key] = made
         return made
 
     def _twin(self, scalar: Any, diagram: Any, plant: Any) -> Twin:

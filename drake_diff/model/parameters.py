@@ -18,7 +18,7 @@ one, which is all that a discrete plant uses.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, cast
@@ -256,16 +256,17 @@ def applied(vector: ParameterVector) -> Iterator[Model]:
     h = vector.time_step(vector.values)
     model = vector.model if h == vector.model.time_step else vector.model.at_time_step(h)
     model.contract  # noqa: B018  the model's own, so it is read before anything else is set
-    try:
-        vector.write(model.double, vector.values)
-        model.other_quantities = frozenset(p.kind.quantity for p in vector.parameters if p.name != TIME_STEP)
-        model.applied = vector
-        yield model
-    finally:
-        model.other_quantities, model.applied = frozenset(), None
-        vector.restore(model.double)
-        if "autodiff" in vars(model):  # made on the way, or before
-            vector.restore(model.autodiff)
+    of_plant = ", ".join(p.name for p in vector.parameters if p.kind.on_plant)
+    with model.shared.changed(of_plant) if of_plant else nullcontext():
+        try:
+            vector.write(model.double, vector.values)
+            model.set_applied(vector, frozenset(p.kind.quantity for p in vector.parameters if p.name != TIME_STEP))
+            yield model
+        finally:
+            model.set_applied(None, frozenset())
+            vector.restore(model.double)
+            if model.has_autodiff:  # made on the way, or before
+                vector.restore(model.autodiff)
 
 
 def write_autodiff(vector: ParameterVector, model: Model, variables: Any) -> None:

@@ -122,6 +122,7 @@ def softened(model: Model, contact: SoftContact) -> Model:
         forces=(*model.forces, contact),
         coupling=model.coupling,
         body_forces=model.body_forces,
+        shared=model.shared,
     )
     contact.force(soft.plant, soft.double.context)  # refuses what has no distance
     return soft

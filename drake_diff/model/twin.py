@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from threading import get_ident
 from typing import Any, Protocol
 
 import numpy as np
 from pydrake.multibody.tree import MultibodyForces_
 
 from drake_diff._base.arrays import Array
-from drake_diff.exceptions import SimulationError
+from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.inputs import Inputs
 from drake_diff.model.mimic import Coupling
 from drake_diff.model.plant import actuators, bodies, instances, joints, labelled
@@ -88,6 +89,7 @@ class Twin:
     own: tuple[AddedForce, ...] = ()  # the model's own beside Drake's, which no parameter changes
     coupling: Coupling | None = None  # where x has the independent coordinates of the plant alone
     added: dict[str, AddedForce] = field(default_factory=dict)  # for parameters that Drake does not have
+    thread: int = field(default_factory=get_ident)  # whose context it is
 
     def body(self, label: str) -> Any:
         return self._labelled[0][label]
@@ -142,7 +144,12 @@ class Twin:
         return limits if self.coupling is None else self.coupling.limits(*limits, of_velocities=True)
 
     def set_state(self, x: Any) -> None:
-        """Put the state x (nx,) into the context."""
+        """Put the state x (nx,) into the context. ModelError in another thread than that which it was made in."""
+        if self.thread != get_ident():
+            raise ModelError(
+                "a context that was made in one thread is used in another, where it would hold two states: take "
+                "model.double, or make what holds it, in the thread that uses it"
+            )
         self.plant.SetPositionsAndVelocities(self.context, x if self.coupling is None else self.coupling.state(x))
 
     def state(self) -> Any:
