@@ -16,6 +16,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
+from drake_diff._base.strangers import arrays_of, read_plain
 from drake_diff.artifact.identified_motion import joined
 from drake_diff.artifact.rerun import TRACE, rebuilt
 from drake_diff.comparison.recordings import Recording, read_recording
@@ -225,7 +226,7 @@ def identified_again(folder: Path, record: IdentificationRecord) -> tuple[Identi
     if record.inputs.parameters == [] or not record.recordings:
         raise ArtifactError(f"{record.FILE}: it names no parameters or no recordings")
     carried = "" if record.model.file is None else record.model.file.path
-    attachments = {carried: (folder / carried).read_bytes()} if carried in record.files else None
+    attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
     with rebuilt(record.model, record.contract.get("source"), attachments) as model:
         given: list[Recording] = []
         files: list[tuple[Path, str] | None] = []
@@ -257,9 +258,9 @@ def identified_again(folder: Path, record: IdentificationRecord) -> tuple[Identi
 
 
 def _read_arrays(path: Path, kept: records.RecordingEvidence) -> Recording:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            times, xs, us = (np.asarray(file[name], dtype=float) for name in ("times", "xs", "us"))
-    except Exception as error:  # NumPy's reader fails in many ways on what is no such file
-        raise ArtifactError(f"{kept.path} is not a recording: {type(error).__name__}: {error}") from error
+    found = arrays_of(path)
+    missing = {"times", "xs", "us"} - found.keys()
+    if missing:
+        raise ArtifactError(f"{kept.path} is not a recording: it has no {', '.join(sorted(missing))}")
+    times, xs, us = (found[name] for name in ("times", "xs", "us"))
     return Recording(kept.name, kept.version, times, xs, us, dict(kept.facts))

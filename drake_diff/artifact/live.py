@@ -58,7 +58,7 @@ def serve(directory: str | Path) -> tuple[Meshcat, tuple[str, ...]]:
 def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
     """The scene in a run directory, and what of it is missing; the model's source file need not exist any more."""
     folder = Path(directory)
-    record, log = EvidenceRecord.read(folder), read_mcap(folder / TRACE)
+    record, log = EvidenceRecord.read(folder), read_mcap(folder / TRACE, links=False)
     rows = log.messages.get("/tf", [])
     if not record.contract:
         raise ArtifactError(f"{folder} is a run of plain dynamics: there is no body to draw")

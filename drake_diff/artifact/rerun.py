@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, frozen, positive_float
+from drake_diff._base.arrays import Array, positive_float
 from drake_diff._base.files import write_whole
+from drake_diff._base.strangers import arrays_of
 from drake_diff.artifact.sections import rebuild_problem
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
 from drake_diff.model.load_file import FORMATS
@@ -63,17 +64,11 @@ def write_plan(path: Path, solution: Solution) -> None:
 
 def read_plan(path: Path) -> dict[str, Array]:
     """The arrays in `path`, by their names. ArtifactError where it is missing or not such a file."""
-    known = {*REQUIRED, *OPTIONAL, START, *(GUESS + name for name in GUESSED)}
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            unknown, missing = set(file.files).difference(known), set(REQUIRED).difference(file.files)
-            if unknown or missing:
-                raise ArtifactError(f"{path}: unknown arrays {sorted(unknown)}, missing {sorted(missing)}")
-            return {name: frozen(file[name]) for name in file.files}
-    except ArtifactError:
-        raise
-    except Exception as error:  # NumPy's reader fails in many ways on what is no such file
-        raise ArtifactError(f"{path} is not a plan: {type(error).__name__}: {error}") from error
+    found, known = arrays_of(path), {*REQUIRED, *OPTIONAL, START, *(GUESS + name for name in GUESSED)}
+    unknown, missing = found.keys() - known, set(REQUIRED) - found.keys()
+    if unknown or missing:
+        raise ArtifactError(f"{path}: unknown arrays {sorted(unknown)}, missing {sorted(missing)}")
+    return found
 
 
 def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:

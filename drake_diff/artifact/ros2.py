@@ -28,7 +28,7 @@ def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
     except ImportError as error:
         raise MissingDependencyError("a ROS 2 bag needs rosbags: pip install 'drake-diff[ros2]'") from error
     source, out = Path(run) / TRACE, Path(out)
-    log = read_mcap(source)
+    log = read_mcap(source, links=False)
     missing = CONVERTED.keys() - log.messages.keys()
     if missing:
         raise ArtifactError(f"{source}: no channel {', '.join(sorted(missing))}")

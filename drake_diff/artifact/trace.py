@@ -235,7 +235,7 @@ def read_trace(path: str | Path) -> Trace:
         >>> trace.xs.shape, trace.us.shape, float(trace.times[-1])
         ((41, 2), (40, 1), 0.8)
     """
-    log = read_mcap(path)
+    log = read_mcap(path, links=False)
     missing = CHANNELS - set(log.messages)
     if missing:
         raise ArtifactError(f"{path}: no channel {', '.join(sorted(missing))}")

@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.strangers import MOST_TEXT, files_in, read_plain, sha256_of
 from drake_diff.artifact.again import SAME_PLAN, SEARCH_TOPICS, SEARCHED, Again, contract_as, is_below, made_again
 from drake_diff.artifact.claim import claims_of
 from drake_diff.artifact.differences import (
@@ -32,7 +33,7 @@ from drake_diff.record.comparison import ComparisonRecord
 from drake_diff.record.identification import IdentificationRecord
 from drake_diff.record.parts import FileEvidence
 from drake_diff.record.phases import PhasesRecord
-from drake_diff.record.provenance import provenance_of
+from drake_diff.record.provenance import packages_here
 from drake_diff.record.read import KINDS, kind_of
 from drake_diff.record.sealed import SCHEMA_VERSION, SealedRecord, canonical, own_sha256, read_fields, reproducible
 from drake_diff.record.solve import EvidenceRecord
@@ -267,7 +268,7 @@ def _read_checked(folder: Path, kind: type[R]) -> tuple[R, tuple[str, ...]]:
     try:
         fields, problems = read_fields(folder / kind.FILE), []
         record = kind.parse(folder / kind.FILE, fields)
-        if canonical(fields).encode() != (folder / kind.FILE).read_bytes():
+        if canonical(fields).encode() != read_plain(folder / kind.FILE, MOST_TEXT):
             problems.append(f"{kind.FILE}: its bytes are not those that drake_diff writes for its content")
         if fields.get("schema_version") == SCHEMA_VERSION and fields != record.model_dump(mode="json"):
             problems.append(f"{kind.FILE}: a field is missing, or has another type than drake_diff writes")
@@ -280,20 +281,22 @@ def _read_checked(folder: Path, kind: type[R]) -> tuple[R, tuple[str, ...]]:
 
 def _damage_of_files(folder: Path, record: SealedRecord) -> Iterator[str]:
     """Whether the directory holds the recorded files, as they were, and no others. Nothing outside it is opened."""
-    paths = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()}
+    paths = files_in(folder)
     paths.pop(record.FILE, None)
     for name in sorted(record.files.keys() - paths.keys()):
         yield f"{name}: missing, {record.FILE} lists it"
     for name, path in sorted(paths.items()):
         described = record.files.get(name)
-        if path.is_symlink() or not path.is_file():
+        if not path.is_file(follow_symlinks=False):
             yield f"{name}: a link, or not a plain file"
         elif described is None:
             yield f"{name}: {record.FILE} does not list it"
         else:
-            data = path.read_bytes()
-            if described != FileEvidence(path=name, bytes=len(data), sha256=sha256(data).hexdigest()):
-                yield f"{name}: its {len(data)} bytes are not those that {record.FILE} describes"
+            size, found = path.stat(follow_symlinks=False).st_size, ""
+            if size == described.bytes:  # one of another size is not read
+                size, found = sha256_of(Path(path.path))
+            if described != FileEvidence(path=name, bytes=size, sha256=found):
+                yield f"{name}: its {size} bytes are not those that {record.FILE} describes"
 
 
 def _solve_again(found: Verification, record: EvidenceRecord) -> Verification:
@@ -313,7 +316,7 @@ def _solve_again(found: Verification, record: EvidenceRecord) -> Verification:
         if name not in again.files:
             unchecked.append(f"{name}: it has what was not run again")
             continue
-        one, recorded = Compared(name), (folder / name).read_bytes()
+        one, recorded = Compared(name), read_plain(folder / name)
         if name == TRACE:
             skip = SEARCH_TOPICS if again.unrepeated else ()
             alike = (record.FILE, CONFIGURATION) if again.unrepeated else (record.FILE,)
@@ -411,7 +414,7 @@ def _judged(found: Verification, problems: Sequence[str], undecided: Sequence[st
 def _certify_again(found: Verification, record: CertificationRecord) -> Verification:
     """The same states from the same seed, each certified again."""
     carried = record.model.file.path if record.model.file is not None else ""
-    data = (found.directory / carried).read_bytes() if carried in record.files else None
+    data = read_plain(found.directory / carried) if carried in record.files else None
     attachments = None if data is None else {carried: data}
     with rebuilt(record.model, record.contract.get("source"), attachments) as model:
         again = certify_model(
@@ -444,10 +447,10 @@ def _identify_again(found: Verification, record: IdentificationRecord) -> Verifi
             if name not in record.files:
                 one.differ("the file", "none", "written with every identification")
             elif name == TRACE:
-                new, kept = ((place / name).read_bytes() for place in (Path(folder), found.directory))
+                new, kept = (read_plain(place / name) for place in (Path(folder), found.directory))
                 compare_traces(one, kept, new, alike=(record.FILE,))
             else:
-                compare_text(one, (found.directory / name).read_bytes(), (Path(folder) / name).read_bytes())
+                compare_text(one, read_plain(found.directory / name), read_plain(Path(folder) / name))
             compared.append(one)
     differing = [d for one in compared for d in one.differing]
     problems = [*_odd_schema(record), *(str(d) for d in differing if not d.allowed)]
@@ -479,7 +482,7 @@ def _odd_contract(record: EvidenceRecord, again: dict[str, Any]) -> Iterator[str
 
 
 def _other_versions(record: SealedRecord) -> tuple[str, ...]:
-    was, now = record.provenance.packages, provenance_of().packages
+    was, now = record.provenance.packages, packages_here()
     used = ["drake", "drake-diff", "numpy", "casadi"]
     if isinstance(record, EvidenceRecord) and record.elsewhere is not None:
         used += record.elsewhere.engines

@@ -14,7 +14,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
+import zstandard
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap import records as kinds
 from mcap.data_stream import ReadDataStream
@@ -26,11 +28,15 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from drake_diff._base.files import whole_file
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.strangers import GIB, MIB, read_plain
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 
 CHUNK_SIZE = 64 * 1024  # the most that is lost if a process is killed or a file damaged
 LIBRARY = "drake_diff"
 RECOVERED = "recovered"  # the name of the metadata record that a recovered file gets
+MOST_UNPACKED = GIB  # of all chunks of a file
+PACKED_AT_MOST, PACKED_APART = 100, 16 * MIB  # what unpacks to more times its size, and this, is a bomb: ours 20 times
+MOST_MESSAGES = 5_000_000
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, CRC of the summary
 DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of all before it
@@ -129,18 +135,20 @@ class McapLog(ShowsItsRepr):
         return f"McapLog: {self}\n  {topics or 'no channels'}"
 
 
-def read_mcap(path: str | Path) -> McapLog:
-    """Read everything in an MCAP file of protobuf channels.
+def read_mcap(path: str | Path, *, links: bool = True) -> McapLog:
+    """Read everything in an MCAP file of protobuf channels, of at most 1 GiB, packed and unpacked.
 
     Args:
         path: the file; of this project's runs it is trace.mcap.
+        links: whether a link is followed, as where you name the file; not in a directory that somebody else made.
 
     Returns:
         The log; its times are in nanoseconds of simulated time, `arrays` gives a channel's fields as arrays.
 
     Raises:
-        ArtifactError: the file is missing, cut short, a checksum (of chunks, data section, summary, attachments)
-            does not hold, or the schema of a channel does not decode. The message names the file.
+        ArtifactError: the file is missing, no plain file, cut short, unpacks to too much, a checksum (of chunks,
+            data section, summary, attachments) does not hold, or the schema of a channel does not decode. The message
+            names the file.
 
     Source:
         The format: https://mcap.dev/spec
@@ -151,7 +159,7 @@ def read_mcap(path: str | Path) -> McapLog:
         1
     """
     path = Path(path)
-    data = read_bytes(path)
+    data = read_plain(path, links=links)
     log = McapLog({}, {}, {}, {}, {})
     try:
         _check_crcs(data)
@@ -170,7 +178,7 @@ def recover_mcap(path: str | Path, out: str | Path) -> "Recovered":
     path, out = Path(path), Path(out)
     if out.exists() or not out.parent.is_dir():
         raise InputError("OUT", got=str(out), expected="a file that does not exist, in a directory that does")
-    data = read_bytes(path)
+    data = read_plain(path, links=True)
     if not data.startswith(MAGIC):
         raise ArtifactError(f"{path} is no MCAP file: it does not begin as one does")
     with whole_file(out) as file:
@@ -198,23 +206,16 @@ class Recovered:
     stopped_at: str
 
 
-def read_bytes(path: Path) -> bytes:
-    """The file's bytes. ArtifactError if it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ArtifactError(f"{path}: cannot be read: {error}") from error
-
-
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
     """(opcode, body) of each record of a file, from its start to the first that is not whole.
 
-    Attachments' checksums are checked: the `mcap` package skips them. ValueError if one does not hold, and at the
-    end if the last record is cut short.
+    Attachments' checksums are checked: the `mcap` package skips them. So is what chunks unpack to, before they are
+    unpacked. ValueError if a checksum does not hold or that is too much, and at the end if the last record is cut
+    short.
     """
     if not data.startswith(MAGIC):
         raise ValueError("it does not begin as an MCAP file does")
-    at = len(MAGIC)
+    at, unpacked, most = len(MAGIC), 0, min(MOST_UNPACKED, PACKED_AT_MOST * len(data) + PACKED_APART)
     while at + RECORD.size <= len(data):
         opcode, length = RECORD.unpack_from(data, at)
         at += RECORD.size + length
@@ -223,10 +224,30 @@ def records(data: bytes) -> Iterator[tuple[int, bytes]]:
             break
         if opcode == ATTACHMENT and CRC.unpack(body[-4:])[0] != zlib.crc32(body[:-4]):
             raise ValueError("the checksum of an attachment does not match")
+        if opcode == CHUNK:
+            unpacked += _unpacked_size(body, most - unpacked)
         yield opcode, body
         if opcode == FOOTER_OPCODE:
             return
     raise ValueError("it was cut short")
+
+
+def _unpacked_size(body: bytes, most: int) -> int:
+    """What a chunk says that it unpacks to; ValueError where that is more than `most`, or not what is packed in it."""
+    chunk = kinds.Chunk.read(ReadDataStream(BytesIO(body)))
+    if chunk.uncompressed_size > most:
+        raise ValueError(f"it unpacks to more than is read: {most} bytes are left for {chunk.uncompressed_size}")
+    if chunk.compression == "zstd":
+        packed = zstandard.frame_content_size(chunk.data)
+        if packed not in (-1, chunk.uncompressed_size):  # -1: the frame does not say it, and no more is unpacked
+            raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes unpacks to {packed}")
+    else:
+        found: Any = chunk.data
+        if chunk.compression == "lz4":  # whose frames need not say it: unpacked as far as the chunk says, to be sure
+            found = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
+        if len(found) != chunk.uncompressed_size:
+            raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes has {len(found)}")
+    return int(chunk.uncompressed_size)
 
 
 def _check_crcs(data: bytes) -> None:
@@ -266,7 +287,9 @@ def _collect(data: bytes, log: McapLog) -> None:
         log.message_types[channel.topic] = type(decode(b""))
         log.messages[channel.topic] = []
         log.channel_metadata[channel.topic] = {key: json.loads(text) for key, text in channel.metadata.items()}
-    for _, channel, message, decoded in reader().iter_decoded_messages():
+    for count, (_, channel, message, decoded) in enumerate(reader().iter_decoded_messages()):
+        if count >= MOST_MESSAGES:
+            raise ValueError(f"it holds more than {MOST_MESSAGES} messages")
         log.messages[channel.topic].append((message.log_time, decoded))
     log.metadata.update({record.name: dict(record.metadata) for record in reader().iter_metadata()})
     log.attachments.update({a.name: bytes(a.data) for a in reader().iter_attachments()})

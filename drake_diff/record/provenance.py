@@ -79,17 +79,25 @@ def written_now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def provenance_of() -> Provenance:
-    """With which versions, from which commit and by which command something is made."""
+def packages_here() -> dict[str, str]:
+    """The versions of what is installed here."""
     packages = {}
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
             packages[name] = version(name)
+    return packages
+
+
+def provenance_of() -> Provenance:
+    """With which versions, from which commit and by which command something is made.
+
+    Git runs what the settings of a checkout say: this is for what one makes oneself, not for a stranger's directory.
+    """
     words = (Path(sys.argv[0]).name, *sys.argv[1:])
     return Provenance(
         python=platform.python_version(),
         platform=f"{platform.system()} {platform.machine()}",
-        packages=packages,
+        packages=packages_here(),
         git=_git(),
         command=[w.encode("utf-8", "replace").decode() for w in words],  # a file's name may have bytes that are no text
     )

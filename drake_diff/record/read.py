@@ -1,5 +1,6 @@
 """Which record a directory holds, and how to read it."""
 
+import os
 from pathlib import Path
 
 from drake_diff.exceptions import ArtifactError
@@ -24,8 +25,11 @@ KINDS: tuple[type[SealedRecord], ...] = (
 
 
 def kind_of(directory: str | Path) -> type[SealedRecord] | None:
-    """The class of the record in `directory`, by the record's file name; None where there is none."""
-    return next((kind for kind in KINDS if (Path(directory) / kind.FILE).is_file()), None)
+    """The class of the record in `directory`, by the record's file name; None where there is none.
+
+    What has that name need not be a plain file: reading it says so.
+    """
+    return next((kind for kind in KINDS if os.path.lexists(Path(directory) / kind.FILE)), None)
 
 
 def load_record(directory: str | Path) -> SealedRecord:

@@ -5,6 +5,7 @@ written when a run begins, as "incomplete", and again, last of all files, when e
 """
 
 import json
+import os
 from collections.abc import Iterable, Mapping
 from functools import reduce
 from hashlib import sha256
@@ -16,6 +17,7 @@ from pydantic import Field, ValidationError
 
 from drake_diff._base.files import write_whole
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.strangers import MOST_TEXT, json_of, read_plain
 from drake_diff.exceptions import ArtifactError
 from drake_diff.record.parts import FileEvidence, ModelInput, Part, Provenance
 from drake_diff.record.provenance import file_evidence
@@ -169,16 +171,12 @@ def files_below(directory: Path, but: str) -> dict[str, FileEvidence]:
 
 def read_fields(path: Path) -> dict[str, Any]:
     """The JSON object in `path` as it stands there; ArtifactError where it is none."""
+    if not os.path.lexists(path):
+        raise ArtifactError(f"{path}: no such record; expected a directory that drake_diff wrote")
     try:
-        fields = json.loads(path.read_bytes().decode("utf-8"), parse_constant=_refuse)
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path}: no such record; expected a directory that drake_diff wrote") from error
-    except (OSError, ValueError, RecursionError) as error:
+        fields = json_of(read_plain(path, MOST_TEXT))
+    except ValueError as error:
         raise ArtifactError(f"{path} is not JSON: {type(error).__name__}: {error}") from error
     if not isinstance(fields, dict):
         raise ArtifactError(f"{path}: expected a JSON object, got {type(fields).__name__}")
     return fields
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not a number in JSON")
