@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.contracts import arms
 from helpers.engines import engine_of, needs
+from helpers.followers import followed
 from helpers.models import robot
 from helpers.table import each_row
 from typer.testing import CliRunner
@@ -23,7 +24,7 @@ from drake_diff.exceptions import CertificateError, InputError, ModelError, Mode
 from drake_diff.export import checks, export
 from drake_diff.export.checks import check_small_models, complaints, written
 from drake_diff.export.export import export_model
-from drake_diff.mechanics.description import describe
+from drake_diff.mechanics.description import describe, describe_whole
 from drake_diff.model.sampling import sample_states
 
 FILES = {"contract.json", "initial_states.csv", "inputs.csv", "README.md"}
@@ -158,6 +159,58 @@ def test_mujoco_s_own_urdf_reader_has_the_same_mass_matrix(tmp_path):
         for column, unit in zip(M, np.eye(4), strict=True):
             mujoco.mj_mulM(theirs, data, column, unit)
         np.testing.assert_allclose(M, drake.mass_matrix(q) - armature, atol=1e-12)
+
+
+# ---- joints that follow others ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["urdf", "sdf", "mjcf"])
+def test_joints_that_follow_others_come_back_and_one_that_does_not_is_named(tmp_path, form):
+    model = followed(tmp_path, ("revolute", "prismatic"), damping=0.2)
+    text = written(form, describe_whole(model), model.time_step)
+    assert complaints(form, model, text) == []
+    elements = {
+        "urdf": ["<mimic .*?/>"], "mjcf": ["(?s)<equality>.*</equality>"], "sdf": ["(?s)<mimic .*?</mimic>"]
+    }  # fmt: skip
+    for pattern in ("1\\.7", "\\b0\\.3\\b", *elements[form]):
+        wrong, count = re.subn(pattern, lambda found: "" if "<" in found[0] else found[0] + "1", text)
+        assert count
+        told = complaints(form, model, wrong)
+        assert any("joints that follow others: b" in each for each in told), (pattern, told)
+
+
+def test_mujoco_holds_the_exported_follower(tmp_path):
+    """(m + r^2 M) v' = u: 2 kg and 3 kg that go 1.7 times as far, of Euler's steps; MuJoCo's constraint is soft."""
+    mujoco = pytest.importorskip("mujoco", reason="no MuJoCo (the extra `engines`)")
+    model = followed(tmp_path)
+    export_model(model, tmp_path / "out", target="mjcf", states=2)
+    theirs = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml"))
+    data = mujoco.MjData(theirs)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = [0.1, 0.1 * 1.7 + 0.3], [0.5, 0.5 * 1.7], 6.0
+    mujoco.mj_step(theirs, data, 100)
+    a = 6.0 / (2 + 1.7**2 * 3)
+    right = np.array([0.1 + 0.5 + a * 0.01**2 * 100 * 101 / 2, 0.5 + a])
+    # It gives way by 1 - 0.9999 of what would be missing after one step, 1e-7 m at such accelerations.
+    np.testing.assert_allclose([data.qpos[0], data.qvel[0]], right, atol=1e-6)
+    np.testing.assert_allclose(data.qpos[1], 1.7 * right[0] + 0.3, atol=1e-6)
+    states = rows_of(tmp_path / "out" / "initial_states.csv")
+    assert states[0] == ["state", "kind", "a_x", "b_x", "a_v", "b_v"]
+    for _, _, q, follower, v, its in states[1:]:
+        np.testing.assert_allclose([float(follower), float(its)], [1.7 * float(q) + 0.3, 1.7 * float(v)], rtol=1e-12)
+    contract = json.loads((tmp_path / "out" / "contract.json").read_text())
+    assert contract["followers"] == [{"joint": "b", "leader": "a", "ratio": 1.7, "offset": 0.3}]
+    readme = (tmp_path / "out" / "README.md").read_text()
+    assert "Joints that follow others: b = 1.7 a + 0.3" in readme
+    assert "    time,a_x,a_v,motor" in readme
+    urdf_of = mujoco.MjModel.from_xml_string(urdf(describe_whole(model)))  # its own reader of URDF
+    np.testing.assert_allclose(urdf_of.eq_data[:, :3], [[0.3, 1.7, 0]])
+
+
+def test_followers_that_are_not_reduced_are_refused(tmp_path):
+    followed(tmp_path)
+    model = dd.load_model(tmp_path / "followed.urdf", time_step=0.01)
+    with pytest.raises(ModelError, match="mimic joints, for which see mimic="):
+        export_model(model, tmp_path / "out", target="urdf")
 
 
 # ---- the gate ----------------------------------------------------------------------------------------------------

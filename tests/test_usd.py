@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from helpers.contracts import arms
 from helpers.engines import engine_of
+from helpers.followers import followed
 
 from drake_diff.exceptions import ModelError
 from drake_diff.export.export import export_model
-from drake_diff.mechanics.description import describe
+from drake_diff.mechanics.description import describe, describe_whole
 
 pytest.importorskip("pxr", reason="no usd-core (the extra `usd`)")
 
@@ -20,7 +21,7 @@ def newton_of(model, tmp_path):
     from drake_diff.export.usd import usd
 
     path = tmp_path / f"{model.name}.usda"  # USD keeps files by path, and does not read one again
-    path.write_text(usd(describe(model)))
+    path.write_text(usd(describe_whole(model)))
     builder = newton.ModelBuilder()
     builder.add_usd(str(path))
     return newton, builder
@@ -126,6 +127,43 @@ def test_whatever_is_dropped_from_the_file_is_found(load, tmp_path, what):
                              .replace("hysx", "hysicx").replace("collision_0", "shown"), text)  # fmt: skip
     assert count
     assert complaints(description, without)
+
+
+def test_a_joint_that_follows_another_is_read_by_usd_core(tmp_path):
+    """In degrees for a hinge, as newton-usd-schemas says."""
+    pytest.importorskip("newton_usd_schemas", reason="no newton-usd-schemas")
+    from pxr import Usd
+
+    from drake_diff.export.usd import complaints, usd
+
+    description = describe_whole(followed(tmp_path, ("revolute", "revolute")))
+    text = usd(description)
+    stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().ImportFromString(text)
+    prim = stage.GetPrimAtPath("/robot/joints/b")
+    assert "NewtonMimicAPI" in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+    found = [prim.GetAttribute(f"newton:mimicCoef{k}").Get() for k in (0, 1)]
+    np.testing.assert_allclose(found, [0.3 * 180 / np.pi, 1.7], rtol=1e-6)
+    assert complaints(description, text) == []
+    for dropped, other in (("mimicCoef0 = 1", "mimicCoef0 = 2"), ("Coef1", "Coef2"), ("joints/a>", "joints/b>"),
+                           (', "NewtonMimicAPI"', "")):  # fmt: skip
+        assert dropped in text
+        assert complaints(description, text.replace(dropped, other)), dropped
+
+
+def test_usd_has_no_hinge_that_follows_a_slide(tmp_path):
+    export_model(followed(tmp_path, ("prismatic", "revolute")), tmp_path / "out", target="isaaclab", states=2)
+    assert not (tmp_path / "out" / "model.usda").exists()
+    assert "No USD is written: b follows a: in USD a hinge cannot" in (tmp_path / "out" / "README.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_newton_finds_the_follower(tmp_path, kind):
+    _, builder = newton_of(followed(tmp_path, (kind, kind)), tmp_path)
+    assert [label.split("/")[-1] for label in builder.joint_label] == ["a", "b"]
+    assert list(builder.joint_mimic_joint) == [-1, 0]
+    np.testing.assert_allclose(builder.joint_mimic_coeffs[1], [0.3, 1.7], rtol=1e-6)  # of float32, in rad or m
 
 
 def test_what_is_lost_is_told_by_name(load):

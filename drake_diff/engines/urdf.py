@@ -143,6 +143,8 @@ def _tree(description: Description, base: str, links: tuple[Link, ...]) -> tuple
             own = [e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint]
             sides = None if kind == "continuous" else (link.lower, link.upper)
             _add_freedom(joint, zero.axis(link), link.damping, min([UNLIMITED, *own]), sides)
+            for each in (each for each in description.followers if each.joint == link.joint):
+                SubElement(joint, "mimic", joint=each.leader, multiplier=row(each.ratio), offset=row(each.offset))
     return root, elements
 
 

@@ -4,11 +4,13 @@ The small models are compared in Drake with the hand calculation, and as files o
 """
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -22,7 +24,7 @@ from drake_diff.engines.mujoco.mjcf import mjcf
 from drake_diff.engines.urdf import urdf
 from drake_diff.exceptions import DrakeDiffError, ModelWarning
 from drake_diff.export.sdf import collision_name, sdf
-from drake_diff.mechanics.description import Description
+from drake_diff.mechanics.description import Description, Follower, describe_whole
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.tangent import tangent_space
 
@@ -76,8 +78,8 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
 
     Drake reads no springs in MJCF: of a model with springs only MuJoCo reads it, or nobody does, which is a complaint.
     """
-    reference, gravity = DrakeEngine(model), model.plant.gravity_field().gravity_vector()
-    springs = any(link.stiffness for link in reference.description.links)
+    own, gravity = describe_whole(model), model.plant.gravity_field().gravity_vector()
+    springs = any(link.stiffness for link in own.links)
     readers = ["drake"] if form != "mjcf" or not springs else []
     readers += ["mujoco"] if form == "mjcf" and find_spec("mujoco") else []
     found = [] if readers else ["MuJoCo is not installed, and Drake reads no springs in MJCF"]
@@ -87,7 +89,8 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
         for reader in readers:
             try:
                 if reader == "mujoco":
-                    engine = load_engine("mujoco", model, path=path)
+                    followers, path = _followers_in_mujoco(path)
+                    engine: Any = load_engine("mujoco", model.whole, path=path)
                 else:
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore", ModelWarning)  # of what is other engines' alone
@@ -95,10 +98,15 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
                         found_there = load_model(
                             path, time_step=model.time_step, gravity=gravity,
                             contact_approximation=model.contract.contact.approximation,
+                            mimic="reduce" if own.followers else None,
                         )  # fmt: skip
-                        engine = _Unlimited(found_there)
-                        found += _other_materials(form, reference.description, engine.description)
-                lines = match_contracts(_Named(model, form), engine)
+                        followers, engine = describe_whole(found_there).followers, _Unlimited(found_there.whole)
+                        found += _other_materials(form, own, engine.description)
+                        if form == "sdf":
+                            of_sdf = _other_followers(own.followers, _followers_by_sdf(text))
+                            found += [f"SDF's own <mimic>, {told}" for told in of_sdf]
+                found += [f"read by {reader}, {told}" for told in _other_followers(own.followers, followers)]
+                lines = match_contracts(_Named(model.whole, form), engine)
             except DrakeDiffError as error:
                 found.append(f"{reader} cannot read it: {error}")
             else:
@@ -109,6 +117,45 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
                     wrong = [line for line in wrong if not line.reason]
                 found += [f"read by {reader}, {line.quantity}: {line.detail}" for line in wrong]
     return found
+
+
+def _followers_in_mujoco(path: Path) -> tuple[tuple[Follower, ...], Path]:
+    """The joints that follow others in an MJCF, by MuJoCo, and a file with all else of it, which is an engine."""
+    from drake_diff.engines.mujoco.engine import followers_in
+
+    tree = ElementTree.parse(path)
+    for section in tree.getroot().findall("equality"):
+        tree.getroot().remove(section)
+    apart = path.with_stem("uncoupled")
+    tree.write(apart)
+    return followers_in(path), apart
+
+
+def _followers_by_sdf(text: str) -> list[Follower]:
+    """The joints that follow others by SDF's own element, which Drake does not read."""
+    found = []
+    for joint in ElementTree.fromstring(text).iter("joint"):
+        mimic = joint.find("axis/mimic")
+        if mimic is not None:
+            ratio, offset, at = (float(mimic.findtext(name, "nan")) for name in ("multiplier", "offset", "reference"))
+            leader = mimic.get("joint", "")
+            found.append(Follower(joint.get("name", ""), leader, ratio, offset - ratio * at))
+    return found
+
+
+def _other_followers(own: Sequence[Follower], read: Sequence[Follower]) -> list[str]:
+    """Joints that follow others otherwise than they should, or not at all."""
+    meant, there = ({f.joint: f for f in side} for side in (own, read))
+    found = []
+    for joint in sorted(meant.keys() | there.keys()):
+        a, b = meant.get(joint), there.get(joint)
+        if a is None or b is None or a.leader != b.leader or not _same([a.ratio, a.offset], [b.ratio, b.offset]):
+            found.append(f"joints that follow others: {b or f'{joint} follows none'} where {a or 'none'} was meant")
+    return found
+
+
+def _same(a: Sequence[float], b: Sequence[float]) -> bool:
+    return bool(np.allclose(a, b, rtol=STEP_TOLERANCE, atol=STEP_TOLERANCE))
 
 
 def _other_materials(form: str, own: Description, read: Description) -> list[str]:

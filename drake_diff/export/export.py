@@ -7,18 +7,20 @@ the file, read back, says what the plant does.
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from drake_diff._base.arrays import positive_int
+import numpy as np
+
+from drake_diff._base.arrays import Array, positive_int
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.exceptions import CertificateError, InputError, MissingDependencyError, ModelError, UnknownNameError
 from drake_diff.export.checks import SUFFIX, check_small_models, complaints, written
 from drake_diff.export.sdf import collision_name
-from drake_diff.mechanics.description import describe
+from drake_diff.mechanics.description import Follower, describe_whole
 from drake_diff.model.model import Model
 from drake_diff.model.sampling import ATTEMPTS, DEPTH, EFFORT, REACH, SPEED, sample_states
 
@@ -27,6 +29,7 @@ README = """# {name} for {target}
 Written by drake_diff from Drake's plant. `{file}` has every number of its bodies and joints; `contract.json` has them
 again, with what the file cannot say (null means no limit, or a value that the model does not give).
 Shapes that are not in the file, to be added by hand: {left_out}. {about_usd}
+Joints that follow others: {followers}
 
 ## Set
 
@@ -128,7 +131,7 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     failed = [check for check in check_small_models() if not check.holds]
     if failed:
         raise CertificateError(f"nothing is exported: the check {failed[0].name!r} failed: {failed[0].found}")
-    form, description = TARGETS[target], describe(model)
+    form, description = TARGETS[target], describe_whole(model)
     text = written(form, description, model.time_step)
     missing = complaints(form, model, text)
     if missing:
@@ -151,22 +154,33 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
             about_usd = f"No USD is written: {error}. UrdfConverter makes one."
     names = {g.name: collision_name(g.name) if form == "sdf" else g.name for g in description.geometries}
     left_out = [own for own, name in names.items() if f'"{name}"' not in text]
-    contract = DrakeEngine(model).contract
+    contract = DrakeEngine(model.whole).contract
     made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
     facts: dict[str, Any] = {**vars(contract), "h": repr(contract.time_step), "gravity": list(contract.gravity)}
     facts["inputs"] = ", ".join(contract.inputs) or "none"
     readme = README.format(
         name=model.name, target=target, file=f"model{SUFFIX[form]}", about_usd=about_usd,
         settings=(COMMON + OF_TARGET.get(target, "")).format(**facts), left_out=", ".join(left_out) or "none",
-        header=",".join(["time", *model.state_names, *model.input_names]), **facts, **made,
+        header=",".join(["time", *model.state_names, *model.input_names]),
+        followers=_told(description.followers), **facts, **made,
     )  # fmt: skip
     files = {
         f"model{SUFFIX[form]}": text,
         "contract.json": json.dumps(
-            _plain({**asdict(contract), "not_in_the_file": left_out, "initial_states": made}), indent=1
+            _plain(
+                {
+                    **asdict(contract),
+                    "followers": [asdict(each) for each in description.followers],
+                    "not_in_the_file": left_out,
+                    "initial_states": made,
+                }
+            ),
+            indent=1,
         )
         + "\n",
-        "initial_states.csv": _table(["state", "kind", *model.state_names], ([s.kind, *s.x] for s in samples)),
+        "initial_states.csv": _table(
+            ["state", "kind", *model.whole.state_names], ([s.kind, *_whole(model, s.x)] for s in samples)
+        ),
         "inputs.csv": _table(["state", *model.input_names], (s.u for s in samples)),
         "README.md": readme,
         **made_usd,
@@ -175,6 +189,22 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     for name, content in files.items():
         (directory / name).write_text(content)
     return [directory / name for name in files]
+
+
+def _told(followers: Sequence[Follower]) -> str:
+    """In the README."""
+    if not followers:
+        return "none."
+    listed = "; ".join(map(str, followers))
+    return (
+        f"{listed} (m and rad). The file says so. Check that your reader holds them, and that they start so. "
+        "A recording has no columns of them."
+    )
+
+
+def _whole(model: Model, x: Array) -> Array:
+    """The state of all joints."""
+    return x if model.coupling is None else np.asarray(model.coupling.state(x))
 
 
 def _table(header: list[str], rows: Iterable[Iterable[Any]]) -> str:

@@ -21,9 +21,11 @@ def sdf(description: Description, time_step: float) -> str:
     """The SDF text. Geometries that are no sphere, box, cylinder, capsule, ellipsoid or half space are left out.
 
     Friction and softness of contact are written for each geometry as Drake reads them, and friction as others do
-    where all pairs have the same: these combine that of two geometries otherwise.
+    where all pairs have the same: these combine that of two geometries otherwise. Joints that follow others are written
+    as Drake reads them, and as SDF has them.
     """
-    root = Element("sdf", {"version": "1.9", "xmlns:drake": "http://drake.mit.edu"})
+    version = "1.11" if description.followers else "1.9"  # the first that has <mimic>
+    root = Element("sdf", {"version": version, "xmlns:drake": "http://drake.mit.edu"})
     world = SubElement(root, "world", name="from_drake")
     SubElement(SubElement(world, "physics", name="step", type="ode"), "max_step_size").text = row(time_step)
     SubElement(world, "gravity").text = row(description.gravity)
@@ -78,6 +80,12 @@ def _add_joint(model: Element, description: Description, link: Link, zero: AtZer
     numbers = {"damping": link.damping, "spring_reference": link.rest, "spring_stiffness": link.stiffness}
     for name, value in numbers.items():
         SubElement(dynamics, name).text = row(value)
+    for each in (each for each in description.followers if each.joint == link.joint):
+        numbers = {"multiplier": each.ratio, "offset": each.offset}
+        mimic = SubElement(axis, "mimic", joint=each.leader)
+        for name, value in {**numbers, "reference": 0.0}.items():
+            SubElement(mimic, name).text = row(value)
+        SubElement(joint, "drake:mimic", {"joint": each.leader, **{name: row(x) for name, x in numbers.items()}})
     if link.armature:
         SubElement(joint, "drake:rotor_inertia").text = row(link.armature)
         SubElement(joint, "drake:gear_ratio").text = "1.0"

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from drake_diff.engines.common import principal, shape_of
 from drake_diff.engines.urdf import AtZero
 from drake_diff.exceptions import MissingDependencyError, ModelError
-from drake_diff.mechanics.description import Description, Geometry, Link
+from drake_diff.mechanics.description import Description, Follower, Geometry, Link
 
 try:
     from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
@@ -23,17 +23,18 @@ except ImportError as error:
 ROOT, GROUND, MATERIALS = "/robot", "/fixed_to_the_world", "/materials"
 SINGLE = 1e-6  # of USD's float32
 SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
+MIMIC = "NewtonMimicAPI"  # of newton-usd-schemas, which Newton and Isaac Sim read
 
 
 def usd(description: Description) -> str:
     """The text of a .usda file, with friction of each shape, and the pairs that may touch; `lost` is what it lacks.
 
     ModelError where a link has no mass or moment of inertia, which USD takes for one to be computed from its shapes,
-    and where a name is none of USD's.
+    where a name is none of USD's, and where a joint follows one of another type.
     """
     anchored = _anchored(description)
     moving = [link for link in description.links if link.body not in anchored]
-    _refuse(moving)
+    _refuse(moving, description.followers)
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -53,6 +54,8 @@ def usd(description: Description) -> str:
     for link in moving:
         if link.kind != "quaternion_floating":
             _add_joint(stage, link, zero, anchored)
+    for follower in description.followers:
+        _add_follower(stage, follower, _unit_of(moving, follower.joint))
     prims = {}
     for i, geometry in enumerate(description.geometries):
         if shape_of(geometry)[0] in SHAPES:
@@ -62,8 +65,14 @@ def usd(description: Description) -> str:
     return str(stage.GetRootLayer().ExportToString())
 
 
-def _refuse(moving: Sequence[Link]) -> None:
+def _refuse(moving: Sequence[Link], followers: Sequence[Follower]) -> None:
     """ModelError for what USD cannot hold."""
+    kinds = {link.joint: link.kind for link in moving}
+    for each in followers:
+        if kinds[each.joint] != kinds[each.leader]:
+            raise ModelError(
+                f"{each.joint} follows {each.leader}: in USD a hinge cannot follow a slide, nor a slide a hinge"
+            )
     for link in moving:
         if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
             raise ModelError(f"link {link.body}: USD cannot hold a mass or moment of inertia of 0")
@@ -116,6 +125,11 @@ def complaints(description: Description, text: str) -> list[str]:
             limits = {"physics:lowerLimit": link.lower * unit, "physics:upperLimit": link.upper * unit}
             wanted |= {name: value for name, value in limits.items() if np.isfinite(value)}
             check(f"joint {link.joint}", f"{ROOT}/joints/{link.joint}", wanted)
+    for follower in description.followers:
+        path = f"{ROOT}/joints/{follower.joint}"
+        offset = follower.offset * _unit_of(description.moving, follower.joint)
+        check(str(follower), path, {"newton:mimicCoef0": offset, "newton:mimicCoef1": follower.ratio})
+        found += _other_leaders(stage.GetPrimAtPath(path), follower)
     for i, geometry in enumerate(description.geometries):
         if shape_of(geometry)[0] not in SHAPES:
             continue
@@ -129,6 +143,14 @@ def complaints(description: Description, text: str) -> list[str]:
         wanted = {names[name]: value for name, value in geometry.material.items() if name in names}
         check(f"geometry {geometry.name}", str(bound.GetPath()) if bound else "/none", wanted)
     return found
+
+
+def _other_leaders(prim: Any, follower: Follower) -> list[str]:
+    leaders = [str(p) for p in prim.GetRelationship("newton:mimicJoint").GetTargets()] if prim else []
+    if leaders != [f"{ROOT}/joints/{follower.leader}"]:
+        return [f"{follower}: it follows {', '.join(leaders) or 'none'}"]
+    schemas = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+    return [] if MIMIC in schemas else [f"{follower}: expected the schema {MIMIC}, got {', '.join(schemas)}"]
 
 
 def _vector(values: Any) -> Any:
@@ -191,6 +213,19 @@ def _add_joint(stage: Any, link: Link, zero: AtZero, anchored: set[str]) -> None
     drive.CreateTargetPositionAttr(float(link.rest * unit))
     joint.GetPrim().AddAppliedSchema("PhysxJointAPI")
     joint.GetPrim().CreateAttribute("physxJoint:armature", Sdf.ValueTypeNames.Float).Set(float(link.armature))
+
+
+def _unit_of(links: Sequence[Link], joint: str) -> float:
+    """How much of USD's unit of position is 1 rad or 1 m of this joint."""
+    return 180 / np.pi if any(x.joint == joint and x.kind == "revolute" for x in links) else 1.0
+
+
+def _add_follower(stage: Any, follower: Follower, unit: float) -> None:
+    prim = stage.GetPrimAtPath(f"{ROOT}/joints/{follower.joint}")
+    prim.AddAppliedSchema(MIMIC)
+    prim.CreateRelationship("newton:mimicJoint", custom=False).SetTargets([f"{ROOT}/joints/{follower.leader}"])
+    for name, value in (("mimicCoef0", follower.offset * unit), ("mimicCoef1", follower.ratio)):
+        prim.CreateAttribute(f"newton:{name}", Sdf.ValueTypeNames.Float, custom=False).Set(float(value))
 
 
 def _add_geometry(stage: Any, number: int, geometry: Geometry, X: RigidTransform) -> Any:

@@ -5,7 +5,7 @@ formulas that go joint by joint; `joint_contracts` gives the same in one frame, 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -115,6 +115,19 @@ class Geometry:
     material: Mapping[str, float] = field(default_factory=dict)  # what the model gives of MATERIAL
 
 
+@dataclass(frozen=True)
+class Follower:
+    """A joint that follows another: its q = ratio * q of `leader` + offset, and the leader follows none."""
+
+    joint: str
+    leader: str
+    ratio: float
+    offset: float
+
+    def __str__(self) -> str:
+        return f"{self.joint} = {self.ratio:.10g} {self.leader} + {self.offset:.10g}"
+
+
 @dataclass(frozen=True, eq=False)
 class Description:
     """A tree of hinges, slides and free bodies; `links` has every parent before its children."""
@@ -126,6 +139,7 @@ class Description:
     effort_limits: Array
     geometries: tuple[Geometry, ...]
     pairs: tuple[PairContract, ...]
+    followers: tuple[Follower, ...] = ()  # of `describe_whole` alone
 
     @property
     def moving(self) -> tuple[Link, ...]:
@@ -175,6 +189,20 @@ def describe(model: Model) -> Description:
     if found:
         raise ModelError("this model cannot be given to another engine: " + "; ".join(found))
     return describe_tree(model)
+
+
+def describe_whole(model: Model) -> Description:
+    """As `describe`, of a model whose mimic joints are reduced too: with all joints, and which of them follow."""
+    found, coupling = describe(model.whole), model.coupling
+    if coupling is None:
+        return found
+    by_start = {link.v_start: link for link in found.moving}
+    followers = []
+    for i in np.setdiff1d(np.arange(len(coupling.of_v)), coupling.own_v):
+        link, leader = by_start[int(i)], by_start[int(coupling.own_v[coupling.of_v[i]])]
+        ratio, offset = float(coupling.ratio_v[i]), float(coupling.offset[link.q_start])
+        followers.append(Follower(link.joint, leader.joint, ratio, offset))
+    return replace(found, followers=tuple(followers))
 
 
 def describe_tree(model: Model) -> Description:

@@ -105,6 +105,8 @@ def _read(path: Path, packages: PackageMap, instance: str | None, found: FileFac
         _read_mjcf(Mjcf(with_includes(xml, path)), instance or root.get("model") or path.stem, found)
     for model in root.findall("model"):  # of SDF
         _read_sdf(model, instance or model.get("name"), found)
+    for model in (model for world in root.findall("world") for model in world.findall("model")):
+        _read_sdf(model, model.get("name"), found)
 
 
 def _read_urdf(robot: Element, name: str, found: FileFacts) -> None:

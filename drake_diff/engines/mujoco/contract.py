@@ -12,13 +12,14 @@ from drake_diff.engines.interface import DRAKES_STEP, EngineContract, float_rows
 from drake_diff.engines.mujoco.contacts import read_geometries, read_pairs
 from drake_diff.engines.mujoco.coordinates import KINDS, MujocoCoordinates, name_of
 from drake_diff.exceptions import ModelError
-from drake_diff.mechanics.description import Description, JointContract, PairContract, joint_contract
+from drake_diff.mechanics.description import Description, Follower, JointContract, PairContract, joint_contract
 
 CONES = {0: "pyramidal", 1: "elliptic"}  # mjtCone
 INTEGRATORS = {0: "EULER", 2: "IMPLICIT", 3: "IMPLICITFAST"}  # mjtIntegrator; MuJoCo differentiates no step of others
 OTHERS = {1: "RK4", 4: "DISCRETE"}
 SOLVERS = {0: "PGS", 1: "CG", 2: "Newton's method"}  # mjtSolver
 JOINT_TRANSMISSION = 0  # mjtTrn
+JOINT_EQUALITY = 2  # mjtEq
 DISABLED = (
     "constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper", "gravity", "clampctrl",
     "warmstart", "filterparent", "actuation", "refsafe", "sensor", "midphase", "eulerdamp", "autoreset", "nativeccd",
@@ -128,6 +129,20 @@ def _side(name: str, both: Any) -> float:
     if lower != -upper:
         raise ModelError(f"actuator {name} of the MJCF: expected equal limits up and down, got {lower}, {upper}")
     return upper
+
+
+def read_followers(m: Any) -> tuple[Follower, ...]:
+    """The joints that follow others; ModelError for an equality that is something else."""
+    found = []
+    for k in range(m.neq):
+        joint, leader, coefficients = int(m.eq_obj1id[k]), int(m.eq_obj2id[k]), [float(x) for x in m.eq_data[k][:5]]
+        if int(m.eq_type[k]) != JOINT_EQUALITY or leader < 0 or not m.eq_active0[k] or any(coefficients[2:]):
+            raise ModelError(f"equality {k} of the MJCF: expected a joint that follows another linearly")
+        names = [name_of(m, m.name_jntadr[j]) for j in (joint, leader)]
+        start, leader_start = (float(m.qpos0[m.jnt_qposadr[j]]) for j in (joint, leader))
+        offset = start + coefficients[0] - coefficients[1] * leader_start
+        found.append(Follower(names[0], names[1], coefficients[1], offset))
+    return tuple(found)
 
 
 def touches(m: Any) -> bool:

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, frozen, positive_float
 from drake_diff.engines.common import PlantEngine
 from drake_diff.engines.interface import EngineContract, StepJacobian
-from drake_diff.engines.mujoco.contract import check_known, read_contract
+from drake_diff.engines.mujoco.contract import check_known, read_contract, read_followers
 from drake_diff.engines.mujoco.coordinates import MujocoCoordinates
 from drake_diff.engines.mujoco.mjcf import mjcf
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError
-from drake_diff.mechanics.description import Description
+from drake_diff.mechanics.description import Description, Follower
 from drake_diff.model.model import Model
 
 try:
@@ -129,13 +129,21 @@ def mujoco_model(description: Description, time_step: float, path: str | Path | 
         text = generated(description, time_step)
         model = _compile(text)
     else:
-        text = Path(path).read_text()
-        try:
-            model = mujoco.MjModel.from_xml_path(str(path))
-        except ValueError as error:
-            raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
+        text, model = Path(path).read_text(), _read(path)
     check_known(model)
     return text, model
+
+
+def followers_in(path: str | Path) -> tuple[Follower, ...]:
+    """The joints that follow others in an MJCF; ModelError for equalities of another kind."""
+    return read_followers(_read(path))
+
+
+def _read(path: str | Path) -> Any:
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
 
 
 def generated(description: Description, time_step: float) -> str:

@@ -16,6 +16,7 @@ SMALLEST = 2e-15
 # Constant impedance of contacts: near enough to rigid for friction to hold, far enough for a spring to be one.
 IMPEDANCE = 0.9
 FRICTION_IMPEDANCE_RATIO = 100.0  # so that what sticks creeps little
+STIFFEST = 0.9999  # MuJoCo's largest impedance: joints that follow others give way by a ten-thousandth
 
 
 def mjcf(description: Description, time_step: float, inverse_masses: Mapping[str, float] | None = None) -> str:
@@ -55,6 +56,11 @@ def mjcf(description: Description, time_step: float, inverse_masses: Mapping[str
             if inverse_masses and pair.stiffness:
                 s = pair.stiffness * (1 - IMPEDANCE) * sum(inverse_masses[body_of[name]] for name in pair.names)
                 element.set("solref", row([-s, -2 * np.sqrt(s)]))
+    equality = SubElement(root, "equality") if description.followers else root
+    for each in description.followers:
+        element = SubElement(equality, "joint", joint1=each.joint, joint2=each.leader)
+        element.set("polycoef", row([each.offset, each.ratio, 0, 0, 0]))
+        element.set("solimp", row([STIFFEST, STIFFEST, 0.001]))
     return xml_text(root)
 
 
