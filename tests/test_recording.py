@@ -9,6 +9,7 @@ from helpers.contracts import arms
 from helpers.engines import engine_of, needs
 from helpers.models import MODELS
 from helpers.table import each_row
+from helpers.two_bases import two_bases
 from pydrake.math import RollPitchYaw
 from typer.testing import CliRunner
 
@@ -436,6 +437,151 @@ def test_pose_and_twist_say_their_frame(tmp_path, frame):
     _, _, path = ball_bag(tmp_path / "camera", [poses, unknown])
     with pytest.raises(InputError, match=r"frame_id of TwistStamped: expected 'world'.*got 'camera'"):
         dd.comparison.read_recording(path, model)
+
+
+# ---- several free bodies -----------------------------------------------------------------------------------------
+
+
+def two_in_mujoco(model, *, fine=1, count=30):
+    """Both bodies thrown and turning, their arms driven: MuJoCo in steps of H / fine."""
+    random = np.random.default_rng(0)
+    x0 = np.array(model.default_state)
+    x0[16:] = 0.3 * random.standard_normal(14)
+    us = 0.5 * random.standard_normal((count // 10, 2)).repeat(10, axis=0)
+    engine = engine_of("mujoco", model, time_step=H / fine)
+    xs = move(engine, x0, us.repeat(fine, axis=0)).xs[::fine]
+    return dd.Recording("mujoco", "1", H * np.arange(count + 1), xs, us)
+
+
+def csv_of(path, model, r):
+    us = [*r.us.tolist(), [""] * model.nu]
+    rows = [[repr(float(t)), *map(repr, map(float, x)), *u] for t, x, u in zip(r.times, r.xs, us, strict=True)]
+    return write_csv(path, ["time", *model.state_names, *model.input_names], rows)
+
+
+def test_a_recording_of_two_free_bodies_is_compared_and_the_wrong_mass_is_seen(tmp_path):
+    """By MuJoCo, whose turn of a free body is the only difference of the right model."""
+    needs("mujoco")
+    model = two_bases(tmp_path)
+    right = csv_of(tmp_path / "right.csv", model, two_in_mujoco(model))
+    e = compared(model, dd.comparison.read_recording(right, model))
+    assert (e.verdict, e.first.as_if) == ("other law", "as if rotations were by the exponential")
+    wrong = csv_of(tmp_path / "wrong.csv", model, two_in_mujoco(two_bases(tmp_path, 0.65)))
+    e = compared(model, dd.comparison.read_recording(wrong, model))
+    assert e.verdict == "unexplained"
+    assert e.step_gaps.max() > 1e-4  # 30 % of an arm's mass, where the turn's law makes 1e-7
+
+
+@pytest.mark.slow
+def test_a_mass_on_the_second_of_two_free_bodies_is_identified(tmp_path):
+    """MuJoCo in steps of 0.2 ms is the hidden truth, with noise of 1 mm, 1 mrad, 1 mm/s: 0.65 kg, not 0.5."""
+    needs("mujoco")
+    model, truth = two_bases(tmp_path), two_in_mujoco(two_bases(tmp_path, 0.65), fine=50, count=60)
+    noisy = truth.xs + 1e-3 * np.random.default_rng(1).standard_normal(truth.xs.shape)
+    for i in (0, 8):
+        noisy[:, i : i + 4] /= np.linalg.norm(noisy[:, i : i + 4], axis=1)[:, None]
+    log = csv_of(tmp_path / "log.csv", model, dd.Recording("mujoco", "1", truth.times, noisy, truth.us))
+    found = dd.identify(model, log, ["left_arm.mass", "right_arm.mass"])
+    assert found.values["right_arm.mass"] == pytest.approx(0.65, rel=0.01)  # of 30 %; the step's own error is 0.1 %
+    assert found.values["left_arm.mass"] == pytest.approx(0.5, rel=0.01)
+
+
+def two_bag(path, model, xs, names):
+    """Joint states, and each body's odometry in the topic and with the child frame that `names` says."""
+    rows = []
+    for k, x in enumerate(xs):
+        t = STAMP + 10_000_000 * k
+        state = joints(["right_turn", "left_turn"], x[[15, 7]], x[[29, 22]], [0.2, 0.1])
+        rows.append(("/joint_states", "sensor_msgs/msg/JointState", "", t, state))
+        for (topic, frame), i, j in zip(names, (8, 0), (23, 16), strict=True):  # the right one is written first
+            body = np.concatenate([x[i : i + 7], x[j : j + 6]])
+            made = lambda types, body=body, frame=frame: {  # noqa: E731
+                **odometry(types, body, rotation_of(body)),
+                "child_frame_id": frame,
+            }
+            rows.append((topic, "nav_msgs/msg/Odometry", "world", t, made))
+    return bag_of(path, rows)
+
+
+@each_row(
+    "names, match",
+    [
+        ([("/odom", "right_body"), ("/odom", "left_body")], ""),  # one topic, told apart by the frame
+        ([("/a", "/right_body"), ("/b", "left_body")], ""),
+        ([("/right_body/odom", "base_link"), ("/left_body/odom", "base_link")], ""),  # by the topic
+        ([("/a", "base_link"), ("/b", "left_body")], r"Odometry of the free body right_body: .*/b \(of left_body\)"),
+        ([("/a", "left_body"), ("/b", "left_body")], r"Odometry of the free body left_body"),
+    ],
+)
+def test_the_odometry_of_two_bodies_is_told_apart(tmp_path, names, match):
+    model = two_bases(tmp_path)
+    xs = two_in_mujoco(model, count=10).xs
+    path = two_bag(tmp_path / "bag", model, xs, names)
+    if match:
+        with pytest.raises(InputError, match=match):
+            dd.comparison.read_recording(path, model)
+        return
+    found = dd.comparison.read_recording(path, model)
+    np.testing.assert_allclose(found.xs, xs, atol=1e-14)
+    np.testing.assert_array_equal(found.us, np.tile([0.1, 0.2], (10, 1)))
+
+
+def test_a_body_that_is_missing_at_one_time_is_named(tmp_path):
+    model = two_bases(tmp_path)
+    xs = two_in_mujoco(model, count=10).xs
+    rows = []
+
+    def kept(*row):
+        if not (row[0] == "/a" and row[3] == STAMP + 30_000_000):
+            rows.append(row)
+
+    for k, x in enumerate(xs):
+        t = STAMP + 10_000_000 * k
+        kept("/joint_states", "sensor_msgs/msg/JointState", "", t,
+             joints(["left_turn", "right_turn"], x[[7, 15]], x[[22, 29]], [0.0, 0.0]))  # fmt: skip
+        for topic, frame, i, j in (("/a", "left_body", 0, 16), ("/b", "right_body", 8, 23)):
+            body = np.concatenate([x[i : i + 7], x[j : j + 6]])
+            kept(topic, "nav_msgs/msg/Odometry", "world", t,
+                 lambda types, body=body, frame=frame: {**odometry(types, body, rotation_of(body)),
+                                                        "child_frame_id": frame})  # fmt: skip
+    with pytest.raises(InputError, match=r"t = 1700000000030000000 ns: .*got the joints, right_body alone"):
+        dd.comparison.read_recording(bag_of(tmp_path / "bag", rows), model)
+
+
+def test_the_exported_bag_of_two_free_bodies_is_a_recording(tmp_path):
+    pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
+    from drake_diff.artifact import measure
+    from drake_diff.artifact.ros2 import export_ros2
+    from drake_diff.artifact.trace import write_trace
+
+    model = two_bases(tmp_path)
+    x0 = np.array(model.default_state)
+    x0[16:] = 0.3
+    problem = dd.Problem(model, x0=x0, num_steps=5, final_cost=lambda x: x[4] ** 2)
+    motion = dd.rollout(model, x0, np.tile([0.3, -0.4], (5, 1)))
+    solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
+    write_trace(tmp_path / "trace.mcap", measure(solution), {})
+    counts = export_ros2(tmp_path, tmp_path / "bag")
+    assert counts["/odometry/left_body"] == counts["/odometry/right_body"] == 6
+    found = dd.comparison.read_recording(tmp_path / "bag", model)
+    np.testing.assert_allclose(found.xs, motion.xs, atol=1e-15)  # the twist is turned there and back
+    np.testing.assert_array_equal(found.us, motion.us)
+
+
+def test_a_follower_is_left_out_of_a_bag_s_state(tmp_path):
+    """`a` is in the state, `b` follows it; a reader of this bag has both."""
+    from helpers.followers import followed
+
+    model = followed(tmp_path)
+    xs = dd.rollout(model, [0.1, 0.5], np.full((4, 1), 2.0)).xs
+    rows = [
+        ("/joint_states", "sensor_msgs/msg/JointState", "", STAMP + 10_000_000 * k,
+         joints(["b", "a"], [1.7 * q + 0.3, q], [1.7 * v, v], [0.0, 2.0]))
+        for k, (q, v) in enumerate(xs)
+    ]  # fmt: skip
+    found = dd.comparison.read_recording(bag_of(tmp_path / "bag", rows), model)
+    np.testing.assert_array_equal(found.xs, xs)
+    np.testing.assert_array_equal(found.us, np.full((4, 1), 2.0))
 
 
 def joints(names, position, velocity, effort):

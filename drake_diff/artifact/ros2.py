@@ -1,6 +1,8 @@
 """A run's motion as a bag that `ros2 bag` reads: the trace's own channels in ROS 2's messages and encoding."""
 
+import re
 from collections.abc import Callable
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -9,8 +11,10 @@ import numpy as np
 
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
 from drake_diff.logs.mcap_file import read_mcap
+from drake_diff.mechanics.coordinates import rotation
 
-TRACE = "trace.mcap"
+TRACE, STATE = "trace.mcap", "/state"
+QUATERNION_POSE = ("qw", "qx", "qy", "qz", "x", "y", "z")  # of a free body's coordinates, by the ends of their names
 INFO, ERROR = 20, 40  # of rcl_interfaces/Log
 BAG_VERSION = 8  # of metadata.yaml: the one that Humble and everything newer reads
 Convert = Callable[[dict[str, Any], int, Any, dict[str, Any]], Any]  # ROS types, time [ns], message, channel metadata
@@ -19,8 +23,9 @@ Convert = Callable[[dict[str, Any], int, Any, dict[str, Any]], Any]  # ROS types
 def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
     """Write the bag directory `out` from the trace of the run directory `run`; gives messages by topic.
 
-    Times are simulated, from 0. Raises ArtifactError where the trace is missing, damaged or without joints,
-    InputError where `out` exists, MissingDependencyError without the `rosbags` package.
+    Each free body is nav_msgs/Odometry in /odometry/BODY. Times are simulated, from 0. Raises ArtifactError where the
+    trace is missing, damaged or without joints, InputError where `out` exists, MissingDependencyError without the
+    `rosbags` package.
     """
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
@@ -37,13 +42,46 @@ def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer(out, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
         bag.set_custom_data("written_by", "drake_diff")
-        bags = {topic: bag.add_connection(topic, name, typestore=store) for topic, (name, _) in CONVERTED.items()}
-        rows = [(time, topic, message) for topic in CONVERTED for time, message in log.messages[topic]]
+        written = {topic: (topic, *converted) for topic, converted in CONVERTED.items()}
+        written |= _free_bodies(log.channel_metadata.get(STATE, {}))
+        bags = {topic: bag.add_connection(topic, name, typestore=store) for topic, (_, name, _) in written.items()}
+        rows = [(time, topic, message) for topic, (own, *_) in written.items() for time, message in log.messages[own]]
         for time, topic, message in sorted(rows, key=itemgetter(0)):
-            name, convert = CONVERTED[topic]
-            converted = convert(store.types, time, message, log.channel_metadata[topic])
+            own, name, convert = written[topic]
+            converted = convert(store.types, time, message, log.channel_metadata[own])
             bag.write(bags[topic], time, store.serialize_cdr(converted, name))
-    return {topic: len(log.messages[topic]) for topic in CONVERTED}
+    return {topic: len(log.messages[own]) for topic, (own, *_) in written.items()}
+
+
+def _free_bodies(metadata: dict[str, Any]) -> dict[str, tuple[str, str, Convert]]:
+    """By topic the channel, the type and the conversion of each free body, known by the names of its coordinates."""
+    names: dict[str, list[str]] = metadata.get("names", {})
+    q, v = names.get("q", []), names.get("v", [])
+    found: dict[str, tuple[str, str, Convert]] = {}
+    for i, first in enumerate(q):
+        body = first.removesuffix("_qw")
+        if q[i : i + 7] == [f"{body}_{part}" for part in QUATERNION_POSE] and f"{body}_wx" in v:
+            convert = partial(_odometry, body=body, i=i, j=v.index(f"{body}_wx"))
+            found[f"/odometry/{re.sub(r'[^A-Za-z0-9_]', '_', body)}"] = (STATE, "nav_msgs/msg/Odometry", convert)
+    return found
+
+
+def _odometry(types: dict[str, Any], time: int, message: Any, _: dict[str, Any], *, body: str, i: int, j: int) -> Any:
+    """nav_msgs/Odometry, as REP 105 has it: the twist in the body's frame. `i` and `j` are its places in q and v."""
+    w, x, y, z, *p = message.q[i : i + 7]
+    turn = rotation(np.array([w, x, y, z])).T
+    angular, linear = (turn @ np.array(message.v[k : k + 3]) for k in (j, j + 3))
+    vector, unknown = types["geometry_msgs/msg/Vector3"], np.zeros(36)
+    pose = types["geometry_msgs/msg/Pose"](
+        position=types["geometry_msgs/msg/Point"](*p),
+        orientation=types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
+    )
+    twist = types["geometry_msgs/msg/Twist"](linear=vector(*map(float, linear)), angular=vector(*map(float, angular)))
+    return types["nav_msgs/msg/Odometry"](
+        header=_header(types, time, "world"), child_frame_id=body,
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=unknown),
+        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=unknown),
+    )  # fmt: skip
 
 
 def _joint_state(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
