@@ -23,6 +23,7 @@ from .comparison.recordings import Recording as Recording
 from .comparison.side_by_side import compare as compare
 from .derivatives.step import differentiate_step as differentiate_step
 from .derivatives.step import linearize as linearize
+from .identification.excite import excite as excite
 from .identification.explain import explain as explain
 from .identification.identify import identify as identify
 from .model import quantities as quantities

@@ -1,3 +1,5 @@
+from .excite import Excitation as Excitation
+from .excite import excite as excite
 from .explain import Explanation as Explanation
 from .explain import explain as explain
 from .identify import Identification as Identification

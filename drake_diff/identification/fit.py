@@ -125,6 +125,7 @@ class Reduced:
     own: list[tuple[Array, Array, Array]]  # of each piece: R_ss (2 nv, 2 nv), R_sz (2 nv, np), b_s (2 nv,)
     nodes: list[tuple[Array, Array]]  # of each segment: D (2 nv, 2 nv + np) and e (2 nv,): its start moves by D d + e
     residuals: list[Array]  # of each piece (n, 2 nv), gaps linearized, in units of the noise; NaN where unmeasured
+    each: list[Array]  # of each piece by itself, R (np, np)
 
 
 class Fit:
@@ -254,7 +255,7 @@ class Fit:
             rest += float(R[nt + nz, -1] ** 2)
         R = _triangle(np.vstack(rows_z))
         rest += float(R[nz, -1] ** 2)
-        return Reduced(R[:nz, :nz], R[:nz, -1], rest, own, nodes, by_piece)
+        return Reduced(R[:nz, :nz], R[:nz, -1], rest, own, nodes, by_piece, [rows[:, :nz] for rows in rows_z[1:]])
 
     def step_of(self, z: Array, found: Reduced) -> Array:
         """dz (np,) of the linearized problem, within bounds and not far."""

@@ -18,7 +18,9 @@ from drake_diff.identification.unknowns import Unknowns, by_complex_step, set_nu
 from drake_diff.model.model import Model
 
 CHUNK = 128  # steps that are differentiated in one call
-STAGES, WEIGHTS = [np.array(row[:i]) for i, row in enumerate(DOP853.A)], np.array(DOP853.B)
+STAGES, WEIGHTS = tuple(np.array(row[:i]) for i, row in enumerate(DOP853.A)), np.array(DOP853.B)
+# Runge and Kutta's of order 4, where a rough motion does.
+ROUGH = tuple(np.array(row) for row in ([], [0.5], [0.0, 0.5], [0.0, 0.0, 1.0])), np.array([1, 2, 2, 1]) / 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +33,7 @@ class ContinuousMotion:
     unknowns: Unknowns
     longest: float  # [s] the longest step
     segment: float = 0.15  # [s]
+    method: tuple[tuple[Array, ...], Array] = (STAGES, WEIGHTS)
 
     @property
     def words(self) -> str:
@@ -52,14 +55,15 @@ class ContinuousMotion:
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
         accelerate = self.tree.acceleration(set_numbers(self.model, self.tree, self.unknowns, values))
+        stages, weights = self.method
         xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
         xs[:, 0] = starts
         for m in range(hs.shape[1]):
             h, u, x = hs[:, m, None], us[:, m], xs[:, m]
-            slopes = np.empty((len(WEIGHTS), *x.shape))
-            for i, weights in enumerate(STAGES):
-                slopes[i] = self._rates(accelerate, x + h * np.tensordot(weights, slopes[:i], 1), u)
-            xs[:, m + 1] = x + h * np.tensordot(WEIGHTS, slopes, 1)
+            slopes = np.empty((len(weights), *x.shape))
+            for i, row in enumerate(stages):
+                slopes[i] = self._rates(accelerate, x + h * np.tensordot(row, slopes[:i], 1), u)
+            xs[:, m + 1] = x + h * np.tensordot(weights, slopes, 1)
         return xs
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
@@ -84,14 +88,15 @@ class ContinuousMotion:
         nx, h = x.shape[1], h[:, None, None]
         start = np.zeros((*x.shape, nx + by.shape[1]))
         start[:, :, :nx] = np.eye(nx)
-        rates, changes = np.empty((len(WEIGHTS), *x.shape)), np.empty((len(WEIGHTS), *start.shape))
-        for i, weights in enumerate(STAGES):
-            at = x + h[..., 0] * np.tensordot(weights, rates[:i], 1)
-            moved = start + h * np.tensordot(weights, changes[:i], 1)
+        stages, weights = self.method
+        rates, changes = np.empty((len(weights), *x.shape)), np.empty((len(weights), *start.shape))
+        for i, row in enumerate(stages):
+            at = x + h[..., 0] * np.tensordot(row, rates[:i], 1)
+            moved = start + h * np.tensordot(row, changes[:i], 1)
             rates[i], by_x, by_z = self._rate_slopes(numbers, by, at, u)
             np.matmul(by_x, moved, out=changes[i])
             changes[i, :, :, nx:] += by_z
-        return np.asarray(start + h * np.tensordot(WEIGHTS, changes, 1))
+        return np.asarray(start + h * np.tensordot(weights, changes, 1))
 
     def _rates(self, accelerate: Callable[[Array, Array, Array], Array], x: Array, u: Array) -> Array:
         q, v = x[:, : self.model.nq], x[:, self.model.nq :]

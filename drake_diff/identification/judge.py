@@ -62,15 +62,21 @@ def _sparse(directions: Array) -> list[Array]:
     return found
 
 
-def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float) -> Array:
-    """(np, 2) with 95 % in each; a mass's is about its logarithm, and none goes below what is possible."""
-    t = float(stats.t.ppf((1 + CONFIDENCE) / 2, max(freedom, 1.0)))
-    values, by_z = unknowns.values(z), unknowns.by_z(z)
-    found = np.empty((len(z), 2))
+def deviations_of(unknowns: Unknowns, z: Array, covariance: Array) -> Array:
+    """(np,) the standard deviation of each value, by the covariance of z; infinite where nothing is known."""
+    by_z = unknowns.by_z(z)
     finite = np.where(np.isfinite(np.diag(covariance)), 1.0, 0.0)
     safe = np.where(np.isfinite(covariance), covariance, 0.0)
     spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", by_z, safe, by_z), 0.0))
     spread[(np.abs(by_z) @ (1 - finite)) > 0] = np.inf
+    return np.asarray(spread)
+
+
+def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float) -> Array:
+    """(np, 2) with 95 % in each; a mass's is about its logarithm, and none goes below what is possible."""
+    t = float(stats.t.ppf((1 + CONFIDENCE) / 2, max(freedom, 1.0)))
+    values, spread = unknowns.values(z), deviations_of(unknowns, z, covariance)
+    found = np.empty((len(z), 2))
     for one, s in zip(unknowns.each, unknowns.slices, strict=True):
         if one.quantity == MASS:
             wide = t * spread[s] / values[s]

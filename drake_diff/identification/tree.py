@@ -181,6 +181,18 @@ class Tree:
         by_q, by_v = self._own(by_q), self._own(by_v)
         return Slopes(own, -inverse @ by_q, -inverse @ by_v, by_u, -inverse @ self._along_columns(change))
 
+    def efforts(self, numbers: Numbers) -> Array:
+        """(nv, nu) the generalized force by the inputs."""
+        return self._along_columns(self.actuation * numbers.strength)
+
+    def inputs_for(self, numbers: Numbers, q: Array, v: Array, a: Array) -> Array:
+        """(N, nu) the inputs that give accelerations a (N, nv), the nearest where none do; limits are not looked at."""
+        q, v = self._all(q, v)
+        moving, force, mass = self._moved(numbers, q, v, np.zeros((len(q), self.actuation.shape[1])))
+        bias = moving.forces(np.zeros_like(v))[0]
+        needed = (self._own(mass) @ a[..., None])[..., 0] + self._along(bias - force)
+        return np.asarray(needed @ np.linalg.pinv(self.efforts(numbers)).T)
+
     def _all(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Positions and velocities of all joints, those that follow another included."""
         coupling = self.dynamics.coupling

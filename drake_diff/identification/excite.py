@@ -1,0 +1,474 @@
+"""A motion from which parameters can be told: inputs that make the information of recordings about them large.
+
+What is maximized is the determinant of the information that `identify` would have, first states taken out, with the
+weak pull to the file's values: D-optimality, which does not depend on the units of the parameters. Where every joint
+has an input of its own, the motion of each joint is a Fourier series, as by Swevers, and the inputs follow by inverse
+dynamics; else the inputs themselves are the series. A window starts and ends it at rest.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linprog
+
+from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.refusal import Refusal
+from drake_diff.comparison.recordings import Recording
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.fit import Fit, growth_cuts
+from drake_diff.identification.flow import ROUGH, ContinuousMotion
+from drake_diff.identification.identify import LONGEST
+from drake_diff.identification.judge import deviations_of, known_of, unidentifiable
+from drake_diff.identification.measured import LEAST, Piece, given_noise
+from drake_diff.identification.tree import Tree, tree_for_identification
+from drake_diff.identification.unknowns import FAR, Unknowns, choose_unknowns
+from drake_diff.mechanics.description import coordinates_of
+from drake_diff.model.model import Model
+from drake_diff.model.plant import joints
+from drake_diff.model.step import set_state
+from drake_diff.model.tangent import tangent_space
+
+NOISE = 1e-3  # [rad] or [m], of positions, where nothing is said
+WINDOW = 0.125  # of the duration: how long the motion takes to begin, and to end
+COARSE = 0.04  # [s] between samples while it is searched; the result is told of the samples that were asked for
+MARGIN = 0.02  # of each range, which the search leaves for what inputs that are held change
+RANDOM = 15  # motions by random coefficients: what is compared with, and where the search begins
+DIFFERENCE = 1e-4  # of a coefficient
+SMALLER = (1.0, 0.95, 0.9)  # of coefficients, where inputs that are held go beyond a limit
+BOX, LEAST_BOX = 0.2, 1e-3  # of coefficients, in one step
+PARTS = np.array([1.0, 0.5, 0.25, 0.1])  # of a step, that are tried
+GAIN = 1e-2  # of the log of the determinant: a smaller one ends the search
+SHRINKINGS = 30
+FASTEST = 20.0  # [1/s] by which what inputs that are held do to the motion is taken back
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation(ShowsItsRepr):
+    """Inputs that tell much of a model's parameters, and what they will tell; `dd.excite` makes one."""
+
+    times: Array  # (n,) [s]
+    xs: Array  # (n, nx) how the model moves, from rest
+    us: Array  # (n - 1, nu) each held until the next time
+    deviations: Mapping[str, Any]  # by parameter, the standard deviation that it will be known with; inf: not at all
+    random: Mapping[str, Any]  # the same of the middle one of some random motions, which keep the same limits
+    rest: Mapping[str, Any]  # the same of a recording of the first state, held as far as the inputs can
+    units: Mapping[str, str]
+    unidentifiable: tuple[str, ...]  # combinations that stay open, in words
+    gain: float  # by how much a deviation falls from random to this on (geometric) average
+    noise: Mapping[str, float]  # what was taken as measured, with which standard deviation
+    sentence: str
+
+    def __repr__(self) -> str:
+        return self.sentence
+
+    def recording(self, name: str = "planned") -> Recording:
+        """The motion as a recording, such as `drake_diff.comparison.write_csv` takes."""
+        return Recording(name, "1", self.times, self.xs, self.us)
+
+
+def excite(
+    model: Model,
+    parameters: Sequence[str] | str = "all",
+    *,
+    duration: float = 5.0,
+    period: float = 0.01,
+    x0: Any = None,
+    noise: Mapping[str, float] | None = None,
+    limits: Mapping[str, float | tuple[float, float]] | None = None,
+    harmonics: int = 4,
+    max_iterations: int = 20,
+    seed: int = 0,
+) -> Excitation:
+    """Find a motion whose recording tells as much of some parameters as the limits allow.
+
+    The determinant of their information is maximized (D-optimality), at the model's own values. Inputs and joints keep
+    their limits, and bodies do not touch. The motion is the best that a local search finds from random ones.
+
+    Args:
+        model: The model, which moves as in continuous time.
+        parameters: Names as for `dd.identify`.
+        duration: Of the motion [s].
+        period: Between samples [s], at which inputs change too.
+        x0: (nx,) the first state, at rest; the model's default, in the middle of its limits where that is beyond them.
+        noise: What is measured: the standard deviation of states by name. None: 1e-3 rad or m of each position.
+        limits: By the name of a state or input: the lower and upper limit, or how far from 0 it may be, within the
+            model's own. Needed of inputs without a limit where not every joint has an input, and of slides without one.
+            A hinge without limits turns half a turn to either side of x0.
+        harmonics: Frequencies of the Fourier series, multiples of 1 / duration.
+        max_iterations: Of the search. 0: the best of the random motions.
+        seed: Of the random motions.
+
+    Returns:
+        `.us` and `.xs` at `.times`; `.deviations` of each parameter, beside those of a `.random` motion and at `.rest`;
+        `.unidentifiable` combinations.
+
+    Raises:
+        InputError, UnknownNameError, ShapeError, NonFiniteError: A name, number or state is none of this model.
+        ModelError: The model has no motion in continuous time, or no motion was found that keeps the limits.
+
+    Source:
+        Swevers et al., "Optimal robot excitation and identification" (1997).
+
+    Example:
+        >>> model = dd.load_model("models/double_pendulum.urdf", time_step=0.01)
+        >>> limits = {"shoulder_motor": 20.0, "elbow_motor": 5.0}
+        >>> names = ["lower.mass", "elbow.damping"]
+        >>> e = dd.excite(model, names, limits=limits, duration=2.0, harmonics=3, max_iterations=5)
+        >>> e.deviations["lower.mass"] < e.random["lower.mass"] < e.rest["lower.mass"]
+        True
+    """
+    positive_float("duration", duration)
+    positive_float("period", period)
+    positive_int("harmonics", harmonics)
+    if round(duration / period) < 2 * LEAST:
+        raise InputError("duration", got=f"{duration} s", expected=f"{2 * LEAST} periods of {period} s, or more")
+    tree = tree_for_identification(model)
+    if isinstance(tree, Refusal):
+        raise ModelError(f"{model.name} has no motion in continuous time here: {tree}")
+    unknowns, chart = choose_unknowns(model, tree, parameters), Chart(coordinates_of(model))
+    if noise is None:
+        names = tangent_space(model).names[: model.nv]
+        noise = dict.fromkeys(names, NOISE)
+    stated, first = given_noise(model, chart, noise), _first(model, x0)
+    design = _Design(model, tree, chart, unknowns, stated, first, duration, limits, period, harmonics)
+    return design.found(max_iterations, seed, dict(noise))
+
+
+def _first(model: Model, x0: Any) -> Array:
+    if x0 is not None:
+        x = np.array(finite_array("x0", x0, (model.nx,)))
+        if np.any(x[model.nq :] != 0):
+            raise InputError("x0", got="a moving state", expected="one at rest")
+        return x
+    x = np.array(model.default_state)
+    lower, upper = model.position_limits
+    with np.errstate(invalid="ignore"):
+        middle = np.where(np.isfinite(lower) & np.isfinite(upper), (lower + upper) / 2, x[: model.nq])
+    beyond = (x[: model.nq] < lower) | (x[: model.nq] > upper)
+    x[: model.nq] = np.where(beyond, middle, x[: model.nq])
+    x[model.nq :] = 0.0
+    return x
+
+
+@dataclass(eq=False)
+class _Design:
+    """What is sought, and within which limits."""
+
+    model: Model
+    tree: Tree
+    chart: Chart
+    unknowns: Unknowns
+    noise: Array  # (2 nv,)
+    x0: Array
+    duration: float
+    given: Mapping[str, float | tuple[float, float]] | None
+    period: float
+    harmonics: int
+
+    @cached_property
+    def times(self) -> Array:
+        """(n,) [s] of the samples."""
+        n = round(self.duration / self.period)
+        return np.asarray(self.duration / n * np.arange(n + 1))
+
+    @cached_property
+    def few(self) -> Array:
+        """[s] of the samples by which motions are compared during the search."""
+        most = len(self.times) - 1
+        return np.linspace(0, self.duration, max(2 * LEAST, min(most, round(self.duration / COARSE))) + 1)
+
+    @cached_property
+    def law(self) -> ContinuousMotion:
+        return ContinuousMotion(self.model, self.tree, self.chart, self.unknowns, LONGEST)
+
+    @cached_property
+    def rough(self) -> ContinuousMotion:
+        return replace(self.law, longest=1.01 * COARSE, method=ROUGH)
+
+    @cached_property
+    def follows(self) -> bool:
+        """Whether any motion of the joints has inputs."""
+        reach = np.linalg.matrix_rank(self.tree.efforts(self.tree.numbers))
+        return not self.chart.coordinates.free and self.model.nu > 0 and int(reach) == self.model.nv
+
+    @cached_property
+    def limits(self) -> tuple[Array, Array]:
+        """(nx + nu,) lower and upper, of states and inputs."""
+        model = self.model
+        low, high = (
+            np.concatenate([q, v, sign * self.tree.limits])
+            for q, v, sign in zip(model.position_limits, model.velocity_limits, (-1, 1), strict=True)
+        )
+        names = (*model.state_names, *model.input_names)
+        for name, value in (self.given or {}).items():
+            if name not in names:
+                raise UnknownNameError("limit of", got=name, known=names)
+            a, b = (-abs(value), abs(value)) if isinstance(value, (int, float)) else value
+            if not a < b:
+                raise InputError(f"limits of {name}", got=value, expected="a lower limit below the upper")
+            i = names.index(name)
+            low[i], high[i] = max(low[i], a), min(high[i], b)
+        if self.follows:
+            for joint in joints(model.plant):
+                for i in model.places(joint)[0] if joint.num_positions() == 1 else ():
+                    if not np.isfinite(high[i] - low[i]) and joint.type_name() == "prismatic":
+                        got, expected = "none", "some, as the model has none of its own"
+                        raise InputError(f"limits of {names[i]}", got=got, expected=expected)
+                    low[i] = low[i] if np.isfinite(low[i]) else self.x0[i] - np.pi
+                    high[i] = high[i] if np.isfinite(high[i]) else self.x0[i] + np.pi
+        return low, high
+
+    @cached_property
+    def reach(self) -> tuple[Array, Array]:
+        """The middle and the half range of what the series are of: positions, or inputs."""
+        low, high = self.limits
+        if not self.follows:
+            low, high = low[self.model.nx :], high[self.model.nx :]
+            for name, a, b in zip(self.model.input_names, low, high, strict=True):
+                if not np.isfinite(b - a):
+                    raise InputError(f"limits of {name}", got="none", expected="some, as the model has none of its own")
+            return np.zeros(len(low)), np.minimum(-low, high)
+        q0, nq = self.x0[: self.model.nq], self.model.nq
+        for name, q, a, b in zip(self.model.position_names, q0, low, high, strict=False):
+            if not a < q < b:
+                raise InputError(f"{name} of x0", got=q, expected=f"{a:g} to {b:g}, its limits")
+        return q0, (high[:nq] - low[:nq]) / 2
+
+    def basis(self, times: Array) -> tuple[Array, Array, Array]:
+        """(n, 2 H) windowed waves, and their first and second derivatives by time."""
+        T, ramp = self.duration, WINDOW * self.duration
+        window, slope, bend = np.ones_like(times), np.zeros_like(times), np.zeros_like(times)
+        for s, sign in ((times / ramp, 1.0), ((T - times) / ramp, -1.0)):
+            s = np.clip(s, 0, 1)
+            window *= s**3 * (10 - 15 * s + 6 * s**2)
+            slope += sign * 30 * s**2 * (1 - s) ** 2 / ramp
+            bend += 60 * s * (1 - s) * (1 - 2 * s) / ramp**2
+        w = 2 * np.pi * np.arange(1, self.harmonics + 1) / T
+        sin, cos = np.sin(np.outer(times, w)), np.cos(np.outer(times, w))
+        waves = np.hstack([sin, cos])
+        first, second = np.hstack([w * cos, -w * sin]), np.hstack([-(w**2) * sin, -(w**2) * cos])
+        W, S, B = window[:, None], slope[:, None], bend[:, None]
+        return W * waves, S * waves + W * first, B * waves + 2 * S * first + W * second
+
+    def planned(self, law: ContinuousMotion, c: Array, times: Array) -> tuple[Array, Array, Array | None]:
+        """xs (K, n, nx) and us (K, n - 1, nu) by coefficients c (K, m), and accelerations (K, n, nv) where planned."""
+        middle, half = self.reach
+        K, n = len(c), len(times)
+        phi, slope, bend = self.basis(times)
+        series = c.reshape(K, len(middle), -1) * half[:, None]
+        if not self.follows:
+            us = np.swapaxes(series @ phi.T, 1, 2)[:, :-1] + middle
+            hs = np.tile(np.concatenate([law.cut(h) for h in np.diff(times)]), (K, 1))
+            each = hs.shape[1] // (n - 1)
+            values = self.unknowns.values(self.unknowns.z_start)
+            with np.errstate(over="ignore", invalid="ignore"):
+                xs = law.run(values, np.tile(self.x0, (K, 1)), hs, np.repeat(us, each, axis=1))
+            return xs[:, ::each], us, None
+        q, v, a = (np.swapaxes(series @ part.T, 1, 2) for part in (phi, slope, bend))
+        xs = np.concatenate([q + middle, v], axis=2)
+        between = (xs[:, 1:] + xs[:, :-1]) / 2
+        flat = between.reshape(-1, self.model.nx)
+        us = self.tree.inputs_for(
+            self.tree.numbers,
+            flat[:, : self.model.nq],
+            flat[:, self.model.nq :],
+            ((a[:, 1:] + a[:, :-1]) / 2).reshape(len(flat), -1),
+        )
+        return xs, us.reshape(K, n - 1, -1), a
+
+    def simulated(self, c: Array) -> tuple[Array, Array]:
+        """xs (n, nx) as the model moves under us (n - 1, nu) that are held; they take back what that changes."""
+        planned, us, a = self.planned(self.law, c[None], self.times)
+        if a is None:
+            return planned[0], us[0]
+        nq, numbers = self.model.nq, self.tree.numbers
+        values = self.unknowns.values(self.unknowns.z_start)
+        xs, us = np.empty_like(planned[0]), us[0]
+        xs[0] = planned[0, 0]
+        for k, h in enumerate(np.diff(self.times)):
+            rate = min(FASTEST, 0.2 / h)
+            off = planned[0, k] - xs[k]
+            wanted = (a[0, k] + a[0, k + 1]) / 2 + rate**2 * off[:nq] + 2 * rate * off[nq:]
+            us[k] = self.tree.inputs_for(numbers, xs[k, None, :nq], xs[k, None, nq:], wanted[None])[0]
+            hs = np.array([self.law.cut(float(h))])
+            xs[k + 1] = self.law.run(values, xs[k, None], hs, np.tile(us[k], (1, hs.shape[1], 1)))[0, -1]
+        return xs, us
+
+    def beyond(self, xs: Array, us: Array) -> Array:
+        """(..., n - 1, 2 (nx + nu)) how far each sample is below and above limits, in ranges; -1 without one."""
+        low, high = self.limits
+        size = np.where(np.isfinite(high - low), (high - low) / 2, 1.0)
+        each = np.concatenate([xs[..., 1:, :], us], axis=-1)
+        both = np.concatenate([(low - each) / size, (each - high) / size], axis=-1)
+        return np.where(np.isfinite(both), both, np.where(np.isnan(both) | (both > 0), 1e3, -1.0))
+
+    def over(self, c: Array) -> Array:
+        """(K, stretches, 2 (nx + nu)) how far motions by c (K, m) go beyond their limits, less the margin."""
+        xs, us, a = self.planned(self.rough, c, self.few)
+        if a is None:
+            return self.beyond(xs, us) + MARGIN
+        every = self.beyond(*self.planned(self.rough, c, self.times)[:2])
+        first = np.searchsorted(self.times[:-1], self.few[:-1] - 1e-9)
+        return np.maximum.reduceat(every, first, axis=1) + MARGIN
+
+    def fit(self, law: ContinuousMotion, xs: Array, us: Array, times: Array) -> tuple[Fit, Array]:
+        """Of K motions (K, n, nx), each a piece of its own; and where its segments start."""
+        pieces = [
+            Piece("planned", times, x, u, held_out=False, recording=k)
+            for k, (x, u) in enumerate(zip(xs, us, strict=True))
+        ]
+        fit = Fit(self.model, law, self.chart, self.unknowns, pieces, self.noise)
+        return fit, self.starts(fit)
+
+    def starts(self, fit: Fit) -> Array:
+        s = fit.segments
+        return np.array([s.pieces[p].ys[k] for p, k in zip(s.of_piece, s.first, strict=True)])
+
+    def informed(self, xs: Array, us: Array, times: Array) -> list[Array]:
+        """Of each motion R (np, np), of which R' R is the information about z; of zeros where there is no motion."""
+        fit, starts = self.fit(self.rough, xs, us, times)
+        z = self.unknowns.z_start
+        point = fit.at(z, starts)
+        if point is None:
+            return [np.zeros((len(z), len(z)))] * len(xs)
+        with np.errstate(over="ignore", invalid="ignore"):
+            each = fit.reduce(point).each
+        return [R if np.all(np.isfinite(R)) else np.zeros_like(R) for R in each]
+
+    def told(self, xs: Array, us: Array) -> tuple[Array, tuple[str, ...]]:
+        """(R of one motion as `identify` would cut it, what stays open)."""
+        z = self.unknowns.z_start
+        fit, starts = self.fit(self.law, xs[None], us[None], self.times)
+        cut = Fit(self.model, self.law, self.chart, self.unknowns, growth_cuts(fit, z, starts), self.noise)
+        point = cut.at(z, self.starts(cut))
+        if point is None:
+            raise ModelError(f"{self.model.name} has no motion under the inputs that were planned")
+        R = cut.reduce(point).R
+        return R, unidentifiable(self.unknowns, z, known_of(self.unknowns, z, R))
+
+    def worth(self, R: Array, scale: Array) -> float:
+        """log of the determinant of the information with the pull to the file's values."""
+        pull = np.where(np.isfinite(self.unknowns.widths), scale / self.unknowns.widths, 1e-6)
+        s = np.linalg.svd(np.vstack([R * scale, np.diag(pull)]), compute_uv=False)
+        return 2 * float(np.sum(np.log(s)))
+
+    def found(self, most: int, seed: int, noise: dict[str, float]) -> Excitation:
+        size = len(self.reach[0]) * 2 * self.harmonics
+        random = np.random.default_rng(seed).standard_normal((RANDOM, size)) / np.sqrt(2 * self.harmonics)
+        starts = [c for c in map(self.within, random) if c is not None]
+        if not starts:
+            raise ModelError(f"{self.model.name}: no random motion from x0 keeps the limits without bodies that touch")
+        Rs = self.informed(*self.planned(self.rough, np.array(starts), self.few)[:2], self.few)
+        norms = np.median([np.linalg.norm(R, axis=0) for R in Rs], axis=0)
+        widths = self.unknowns.widths
+        scale = np.where(np.isfinite(widths), widths / FAR, 1 / np.where(norms > 0, norms, 1.0))
+        order = np.argsort([-self.worth(R, scale) for R in Rs], kind="stable")
+        tried = self.searched(starts[order[0]], scale, most) if most else []
+        best = next((one for one in map(self.kept, [*tried, *(starts[i] for i in order)]) if one), None)
+        middle = next((one for one in map(self.kept, (starts[i] for i in order[len(order) // 2 :])) if one), None)
+        if best is None or middle is None:
+            raise ModelError(f"{self.model.name}: no motion from x0 was found that keeps the limits at every sample")
+        R, open_ = self.told(*best)
+        R_random, _ = self.told(*middle)
+        R_rest, _ = self.told(*self.simulated(np.zeros(size)))
+        gain = float(np.exp((self.worth(R, scale) - self.worth(R_random, scale)) / (2 * len(scale))))
+        each = [self.deviations(one) for one in (R, R_random, R_rest)]
+        e = Excitation(
+            times=frozen(self.times), xs=frozen(best[0]), us=frozen(best[1]),
+            deviations=each[0], random=each[1], rest=each[2],
+            units={one.name: one.unit for one in self.unknowns.each},
+            unidentifiable=open_, gain=gain, noise=noise, sentence="",
+        )  # fmt: skip
+        object.__setattr__(e, "sentence", _sentence(e))
+        return e
+
+    def deviations(self, R: Array) -> dict[str, Any]:
+        z = self.unknowns.z_start
+        return self.unknowns.named(deviations_of(self.unknowns, z, known_of(self.unknowns, z, R).covariance))
+
+    def within(self, c: Array) -> Array | None:
+        """c, made smaller until limits are kept and bodies do not touch; None where no part of it does."""
+        parts = 0.85 ** np.arange(SHRINKINGS)
+        inside = np.max(self.over(parts[:, None] * c), axis=(1, 2)) <= 0
+        for part in parts[inside]:
+            if not self.touches(self.planned(self.rough, part * c[None], self.few)[0][0]):
+                return np.asarray(part * c)
+        return None
+
+    def touches(self, xs: Array) -> bool:
+        if not self.model.contract.contact.collision_pairs:
+            return False
+        for x in xs:
+            set_state(self.model.double, x)
+            if self.model.double.overlaps():
+                return True
+        return False
+
+    def kept(self, c: Array) -> tuple[Array, Array] | None:
+        """The motion, where it, or one that is a little smaller, keeps all limits at every sample."""
+        for part in SMALLER:
+            xs, us = self.simulated(part * c)
+            if np.all(np.isfinite(xs)) and np.max(self.beyond(xs, us)) <= 0 and not self.touches(xs):
+                return xs, us
+        return None
+
+    def searched(self, c: Array, scale: Array, most: int) -> list[Array]:
+        """Where the search has been, best first: linear programs by differences, within a box that follows success."""
+
+        def of(many: Array) -> tuple[Array, Array]:
+            xs, us, _ = self.planned(self.rough, many, self.few)
+            worth, alive = np.full(len(many), -np.inf), np.isfinite(xs).all(axis=(1, 2))
+            if np.any(alive):
+                worth[alive] = [self.worth(R, scale) for R in self.informed(xs[alive], us[alive], self.few)]
+            return worth, self.over(many)[..., bounded].reshape(len(many), -1)
+
+        bounded = np.flatnonzero(np.isfinite(np.concatenate(self.limits)))
+        been, box = [c], BOX
+        worth, over = (each[0] for each in of(c[None]))
+        for _ in range(most):
+            moved, moved_over = of(c + DIFFERENCE * np.eye(len(c)))
+            gradient, J = (moved - worth) / DIFFERENCE, (moved_over - over).T / DIFFERENCE
+            if not np.all(np.isfinite(gradient)):
+                break
+            before = worth
+            while box >= LEAST_BOX:
+                near = over + box * np.sum(np.abs(J), axis=1) > 0
+                step = linprog(-gradient, A_ub=J[near], b_ub=np.maximum(-over[near], 0.0), bounds=(-box, box)).x
+                worths, overs = of(c + PARTS[:, None] * step)
+                worths[np.max(overs, axis=1) > MARGIN / 10] = -np.inf
+                k = int(np.argmax(worths))
+                if worths[k] > worth and not self.touches(
+                    self.planned(self.rough, c[None] + PARTS[k] * step, self.few)[0][0]
+                ):
+                    c, worth, over = c + PARTS[k] * step, worths[k], overs[k]
+                    box *= 2.0 if k == 0 else 1.0 if k == 1 else 0.5
+                    break
+                box /= 4
+            if worth - before < GAIN:
+                break
+            been.append(c)
+        return been[:0:-1]
+
+
+def _sentence(e: Excitation) -> str:
+    told = []
+    for name, value in e.deviations.items():
+        now, was = np.atleast_1d(value), np.atleast_1d(e.random[name])
+        if len(now) == 1:
+            unit = f" {e.units[name]}" if e.units[name] not in ("", "1") else ""
+            told.append(
+                f"{name} to {now[0]:.3g}{unit} (random {was[0]:.3g}, at rest {np.atleast_1d(e.rest[name])[0]:.3g})"
+            )
+        else:
+            told.append(f"{name} to {', '.join(f'{d:.3g}' for d in now)} {e.units[name]}")
+    more = f" and {len(told) - 4} more" if len(told) > 4 else ""
+    open_ = f" Open: {'; '.join(e.unidentifiable[:3])}." if e.unidentifiable else ""
+    return (
+        f"{e.times[-1]:.3g} s that tell {', '.join(told[:4])}{more}, at one standard deviation: "
+        f"{e.gain:.3g} times better than a random motion.{open_}"
+    )

@@ -1,0 +1,110 @@
+"""Motions that tell much: what they promise against closed forms, and against estimates from noisy motions."""
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from scipy import stats
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, UnknownNameError
+
+
+def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motion_gives(write_urdf):
+    """x = x0 + v0 t + s (double integral of u / m): linear in x0, v0 and the strength s; the mass is one over it."""
+    model, sigma = write_urdf(mass=2.0), 0.002
+    x_name, v_name, u_name = *model.state_names, *model.input_names
+    limits = {x_name: 0.5, v_name: 2.0, u_name: 3.0}
+    found = {}
+    for name, most in ((f"{u_name}.strength", 4), (f"{u_name}.strength", 0), ("block.mass", 0)):
+        e = dd.excite(
+            model,
+            [name],
+            duration=1.0,
+            period=0.02,
+            noise={x_name: sigma},
+            limits=limits,
+            harmonics=2,
+            max_iterations=most,
+        )
+        moved = e.xs[:, 0] - e.xs[0, 0]  # what s = 1 does, as it starts from rest
+        X = np.column_stack([np.ones(51), e.times, moved])
+        deviation = sigma * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
+        wanted = deviation * (2.0 if name == "block.mass" else 1.0)
+        # The search and the textbook have the same numbers: rounding, and Runge and Kutta's steps of order 8.
+        assert e.deviations[name] == pytest.approx(wanted, rel=1e-6)
+        assert np.all(np.abs(e.xs) <= [0.5, 2.0])
+        assert np.all(np.abs(e.us) <= 3.0)
+        assert e.rest[name] == np.inf
+        found[name, most] = e
+    best = found[f"{u_name}.strength", 4]
+    (name,) = best.deviations
+    assert best.deviations[name] < 0.8 * found[name, 0].deviations[name]  # the best of 15 random motions
+    assert best.deviations[name] < 0.5 * best.random[name]
+    assert best.gain == pytest.approx(best.random[name] / best.deviations[name], rel=1e-2)
+    # The motion is the double integral of inputs that are held.
+    v = np.concatenate([[0.0], np.cumsum(best.us[:, 0]) * 0.02 / 2.0])
+    np.testing.assert_allclose(best.xs[:, 1], v, atol=1e-9)
+
+
+def test_what_no_motion_tells_stays_open(load):
+    model, names = load("pendulum.urdf"), ["hinge.damping", "pole.center_of_mass"]
+    e = dd.excite(model, names, duration=1.0, limits={"hinge_q": 1.0}, max_iterations=0)
+    assert e.unidentifiable == ("pole.center_of_mass[1]: a change of it leaves the motion as it is",)
+    assert np.isinf(e.deviations["pole.center_of_mass"][1])
+    assert np.isfinite(e.deviations["hinge.damping"])
+    assert "Open: pole.center_of_mass[1]" in e.sentence
+
+
+def test_what_makes_no_sense_is_refused(load, write_urdf):
+    model = load("cart_pole.urdf")
+    with pytest.raises(InputError, match="limits of"):
+        dd.excite(write_urdf(), ["block.mass"])
+    with pytest.raises(UnknownNameError, match="limit of"):
+        dd.excite(model, ["pole.mass"], limits={"nothing": 1.0})
+    with pytest.raises(InputError, match="one at rest"):
+        dd.excite(model, ["pole.mass"], x0=[0, 0, 1, 0])
+    with pytest.raises(InputError, match="periods"):
+        dd.excite(model, ["pole.mass"], duration=0.1)
+
+
+@pytest.mark.slow
+def test_estimates_from_motions_of_another_simulator_scatter_as_promised():
+    """A double pendulum in MuJoCo with another mass and damping than the model's, eight times with other noise."""
+    mujoco = pytest.importorskip("mujoco")
+    model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.01)
+    names = ["lower.mass", "upper.mass", "elbow.damping"]
+    sigma = {"shoulder_q": 1e-3, "elbow_q": 1e-3}
+    limits = {"shoulder_q": 2.0, "elbow_q": 2.0, "shoulder_motor": 20.0, "elbow_motor": 5.0}
+    e = dd.excite(model, names, duration=2.0, noise=sigma, limits=limits, harmonics=3, max_iterations=8)
+    assert e.gain > 2
+    text = (
+        (MODELS / "double_pendulum.urdf")
+        .read_text()
+        .replace('<link name="upper">', '<link name="world"/><link name="upper">')
+    )
+    # Rods without a moment about their axis, about which they do not turn, are no bodies in MuJoCo.
+    twin = mujoco.MjModel.from_xml_string(text.replace('izz="0"', 'izz="1e-3"'))
+    twin.opt.timestep, twin.opt.integrator = 2.5e-4, mujoco.mjtIntegrator.mjINT_RK4
+    twin.dof_damping[:] = 0.0, 0.002
+    data = mujoco.MjData(twin)
+    data.qpos[:] = e.xs[0, :2]
+    positions = [data.qpos.copy()]
+    for u in e.us:
+        data.qfrc_applied[:] = u
+        mujoco.mj_step(twin, data, 40)
+        positions.append(data.qpos.copy())
+    truth = {"lower.mass": 0.7, "upper.mass": 1.0, "elbow.damping": 0.002}
+    scores = []
+    for seed in range(8):
+        xs = np.full((len(positions), 4), np.nan)
+        xs[:, :2] = positions + 1e-3 * np.random.default_rng(seed).standard_normal((len(positions), 2))
+        found = dd.identify(model, dd.Recording("MuJoCo", "3", e.times, xs, e.us), names, noise=sigma, held_out=0)
+        for name, value in truth.items():
+            low, high = found.intervals[name]
+            # The promise is of the model's own values; the damping, which is 0 there, moves the motion by percents.
+            if low > 0:
+                assert (high - low) / 2 / 1.96 == pytest.approx(e.deviations[name], rel=0.25), name
+            scores.append((found.values[name] - value) / e.deviations[name])
+    # The sum of squares of 24 standard normal numbers; 25 % wider for the same reason.
+    assert np.sum(np.square(scores)) < 1.25**2 * stats.chi2.ppf(0.999, len(scores))
+    assert np.sum(np.square(scores)) > stats.chi2.ppf(0.001, len(scores)) / 1.25**2
