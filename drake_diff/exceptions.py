@@ -21,12 +21,32 @@ Example:
     drake_diff.exceptions.ShapeError: x: expected shape (2,), got shape (1,)
 """
 
+import pickle
 from collections.abc import Iterable
 from typing import Any
 
 
 class DrakeDiffError(Exception):
-    """The root of the tree."""
+    """The root of the tree. All pickle: a pool of processes whose worker raises one that does not waits for ever."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _again, (type(self), self.args), {name: _picklable(value) for name, value in vars(self).items()}
+
+
+def _again(kind: type[DrakeDiffError], args: tuple[Any, ...]) -> DrakeDiffError:
+    """An error with its message; `__init__` would make the message from what it was given."""
+    error = kind.__new__(kind)
+    error.args = args
+    return error
+
+
+def _picklable(value: Any) -> Any:
+    """`value`, or its repr where it cannot be pickled, and read again."""
+    try:
+        pickle.loads(pickle.dumps(value))
+    except Exception:
+        return repr(value)
+    return value
 
 
 class InputError(DrakeDiffError, ValueError):

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -131,6 +132,15 @@ class Model(ShowsItsRepr):
         self.velocity_names: tuple[str, ...] = tuple(velocities)
         self.state_names = self.position_names + self.velocity_names
         self.input_names = self.inputs.names
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A model pickles by its file and what `load_model` was asked, and is loaded again where it is read."""
+        if self.options is None or self.source is None:
+            raise ModelError(
+                f"the model {self.name} cannot be pickled: `load_model` did not make it from a file, by which it could "
+                "be made again; build it in each process"
+            )
+        return _load_again, (str(self.source.absolute()), sha256(self.source.read_bytes()).hexdigest(), self.options)
 
     @property
     def other_quantities(self) -> frozenset[str]:
@@ -566,6 +576,17 @@ def load_model(
     model.options = options
     model.file_facts = facts
     return model
+
+
+def _load_again(path: str, digest: str, options: dict[str, Any]) -> Model:
+    """A model that was pickled; its file must be what it was, that files it names are is not looked at."""
+    source = Path(path)
+    if not source.is_file() or sha256(source.read_bytes()).hexdigest() != digest:
+        was = "is another one now" if source.is_file() else "is not there"
+        raise ModelError(f"{source}: a model that was pickled is loaded from its file, which {was}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
+        return load_model(source, **options)
 
 
 def _set_contact_law(

@@ -104,6 +104,9 @@ class ParameterVector:
     parameters: tuple[Parameter, ...]
     values: Array
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _select_again, (self.model, self.to_dict())
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """A name for each entry: `pole.mass`, `pole.center_of_mass[0]`, ..."""
@@ -224,6 +227,11 @@ def select(model: Model, parameters: Parameters) -> ParameterVector:
     given = parameters if isinstance(parameters, Mapping) else {}
     values = [_check_value(p, given[p.name]) if p.name in given else p.value for p in found]
     return ParameterVector(model, found, frozen(np.concatenate(values)))
+
+
+def _select_again(model: Model | None, values: dict[str, Array]) -> ParameterVector:
+    """A vector that was pickled: kinds of parameters are functions of this module, and the same ones afterwards."""
+    return plain_parameters(values) if model is None else select(model, values)
 
 
 def plain_parameters(values: Mapping[str, Any]) -> ParameterVector:

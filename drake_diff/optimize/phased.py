@@ -15,6 +15,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.pickling import PicklesItsFields
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.optimize.certified import certify_equations
@@ -45,7 +46,7 @@ PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PhasedSolution(ShowsItsRepr):
+class PhasedSolution(PicklesItsFields, ShowsItsRepr):
     """The motion that `solve` found for a `PhasedProblem`, and what it measures.
 
     Each phase is a `Solution` with its own measures and status. `link_errors` and `chain` are computed from the states

@@ -14,6 +14,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.pickling import PicklesItsFields
 from drake_diff._base.refusal import Refusal
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
@@ -93,7 +94,7 @@ class Search:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Solution(ShowsItsRepr):
+class Solution(PicklesItsFields, ShowsItsRepr):
     """The motion that `solve` found, how it was found, and what it measures on Drake's double plant.
 
     `cost`, `defect`, `goal_error`, `bound_violation`, `constraint_violation`, `replays` and the rest are computed from

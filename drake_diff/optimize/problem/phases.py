@@ -9,6 +9,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.pickling import PicklesItsFields
 from drake_diff.exceptions import InputError
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.dynamics import Pointwise
@@ -19,7 +20,7 @@ MOST_PHASES = 100
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PhasedProblem(ShowsItsRepr):
+class PhasedProblem(PicklesItsFields, ShowsItsRepr):
     """Phases one after the other, each with dynamics, bounds, costs, constraints and a duration of its own.
 
     The cost is the sum of the phases' costs. A phase ends where its next begins: its last state, through the reset

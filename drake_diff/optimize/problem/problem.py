@@ -11,6 +11,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen, positive_float, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.pickling import PicklesItsFields
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
@@ -44,7 +45,7 @@ SMALLEST_SHARE = 0.2  # of the largest range of its kind (positions, velocities)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Problem(ShowsItsRepr):
+class Problem(PicklesItsFields, ShowsItsRepr):
     """A trajectory to be optimized: minimize the time integral of running_cost(x, u), plus final_cost(x_N).
 
     On a model's discrete steps the integral is sum_k h * running_cost(x_k, u_k) with h = model.time_step; collocation

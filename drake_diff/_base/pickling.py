@@ -1,0 +1,52 @@
+"""Values that pickle by their fields, with the functions in them: lambdas, closures, what a script defines."""
+
+import pickle
+from contextvars import ContextVar
+from dataclasses import fields
+from typing import Any, TypeVar
+
+import cloudpickle
+
+from drake_diff.exceptions import DrakeDiffError, InputError
+
+Made = TypeVar("Made")
+INSIDE: ContextVar[bool] = ContextVar("INSIDE", default=False)  # something that is being pickled
+
+
+class PicklesItsFields:
+    """A dataclass that pickles by its fields; what is computed when it is first asked for is computed again.
+
+    Functions go along whatever they are. Raises InputError where a field cannot, with its name.
+    """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        found = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        if INSIDE.get():  # once for all, so that what two parts share is one thing afterwards too
+            return _empty, (type(self),), found
+        token = INSIDE.set(True)
+        try:
+            return pickle.loads, (cloudpickle.dumps(self),)
+        except DrakeDiffError:
+            raise
+        except Exception as error:  # whatever a user's object raises
+            for name, value in found.items():
+                _check(f"{type(self).__name__}.{name}", value)
+            raise InputError(type(self).__name__, got=f"{error}", expected="what can be pickled") from error
+        finally:
+            INSIDE.reset(token)
+
+    def __copy__(self: Made) -> Made:
+        found: Made = object.__new__(type(self))
+        vars(found).update(vars(self))
+        return found
+
+
+def _empty(kind: type[Made]) -> Made:
+    return object.__new__(kind)
+
+
+def _check(name: str, value: Any) -> None:
+    try:
+        cloudpickle.dumps(value)
+    except Exception as error:
+        raise InputError(name, got=f"{value!r:.80}: {error}", expected="what can be pickled") from error
