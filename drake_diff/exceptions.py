@@ -11,7 +11,8 @@ DrakeDiffError
 ├── SimulationError                Drake could not take a step
 ├── MissingDependencyError         an optional engine or solver that is not there; says what to install
 ├── NotOfferedError                something that an engine does not compute
-└── ArtifactError                  a run directory or log that is missing, incomplete or damaged
+├── ArtifactError                  a run directory or log that is missing, incomplete or damaged
+└── WriteError (OSError)           the disk is full, or does not let a file be written; says what is kept where
 
 ModelWarning (UserWarning)         what was left out of a model that is used all the same
 
@@ -106,6 +107,10 @@ class NotOfferedError(DrakeDiffError):
 
 class ArtifactError(DrakeDiffError):
     """A run directory or log that is missing, incomplete or damaged."""
+
+
+class WriteError(DrakeDiffError, OSError):
+    """The disk is full, or does not let a file be written."""
 
 
 class ModelWarning(UserWarning):

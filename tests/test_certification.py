@@ -112,11 +112,13 @@ def test_the_record_is_written_and_says_incomplete_until_it_is_not(load, tmp_pat
 
     monkeypatch.setattr("drake_diff.record.certification.sample_states", killed)
     with pytest.raises(KeyboardInterrupt):
-        dd.record.certify_model(load("pendulum.urdf"), directory=tmp_path)
-    assert json.loads((tmp_path / "certification.json").read_text())["verdict"] == "incomplete"
+        dd.record.certify_model(load("pendulum.urdf"), directory=tmp_path / "out")
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith("out.partial-")
+    assert json.loads((left / "certification.json").read_text())["verdict"] == "incomplete"
     monkeypatch.undo()
-    record = dd.record.certify_model(load("pendulum.urdf"), states=3, directory=tmp_path)
-    written = dd.record.CertificationRecord.model_validate_json((tmp_path / "certification.json").read_text())
+    record = dd.record.certify_model(load("pendulum.urdf"), states=3, directory=tmp_path / "out")
+    written = dd.record.CertificationRecord.model_validate_json((tmp_path / "out" / "certification.json").read_text())
     assert written == record
     assert written.verdict == "pass"
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.comparison import files as comparison_trace
-from drake_diff.comparison.files import begin_comparison, record_of
+from drake_diff.comparison.files import record_of
 from drake_diff.comparison.page import comparison_data
 from drake_diff.record.sealed import own_sha256
 
@@ -141,19 +141,20 @@ def test_names_of_engines_are_escaped(load, tmp_path):
     assert "&lt;script&gt;alert" in page
 
 
-def test_what_is_begun_and_not_ended_says_so(ball, tmp_path, monkeypatch):
-    begin_comparison(tmp_path, ball.model)
-    assert json.loads((tmp_path / "comparison.json").read_text())["verdict"] == "incomplete"
-    dd.comparison.save_comparison(ball, tmp_path)
+def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(ball, tmp_path, monkeypatch):
+    before = dd.comparison.save_comparison(ball, tmp_path / "out")
 
     def fails(*_):
         raise OSError("no space left")
 
     monkeypatch.setattr(comparison_trace, "write_comparison_trace", fails)
     with pytest.raises(OSError, match="no space"):
-        dd.comparison.save_comparison(ball, tmp_path)
-    assert json.loads((tmp_path / "comparison.json").read_text())["verdict"] == "incomplete"
-    assert not (tmp_path / "comparison.html").exists()
+        dd.comparison.save_comparison(ball, tmp_path / "out")
+    (left,) = tmp_path.glob("out.partial-*")
+    assert json.loads((left / "comparison.json").read_text())["verdict"] == "incomplete"
+    assert not (left / "comparison.html").exists()
+    assert dd.load_record(tmp_path / "out") == before
+    assert dd.verify(tmp_path / "out").verdict == "intact"
 
 
 def test_the_command(tmp_path):

@@ -15,7 +15,7 @@ from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.parameters import list_parameters
 from drake_diff.optimize.replay import track
 from drake_diff.trials.perturbation import PERTURBATIONS, Setup, parameters_of, perturbed
-from drake_diff.trials.run import TOLD, Sensitivity, levels_of, trial_seed
+from drake_diff.trials.run import TOLD, Sensitivity, levels_named, trial_seed
 from drake_diff.trials.trial import Task, run_trial
 
 A, B = np.array([[1.0, H], [0.0, 1.0]]), np.array([[H * H], [H]]) / MASS  # v+ = v + h u / m, x+ = x + h v+
@@ -205,7 +205,7 @@ def test_unknown_names_and_levels_are_named(cart, setup):
     with pytest.raises(UnknownNameError, match="initial_state"):
         perturbed(setup, {"wind": 1.0}, 0)
     with pytest.raises(UnknownNameError, match="actuator_delay"):
-        levels_of(task, ["wind"])
+        levels_named(task.model, ["wind"])
     with pytest.raises(UnknownNameError, match="tvlqr"):
         Task(task.plan, "prayer")
     for name, level in (("mass", -0.1), ("mass", np.nan), ("mass", 1.0), ("latency", 1.5), ("time_step", 2.5)):
@@ -215,17 +215,17 @@ def test_unknown_names_and_levels_are_named(cart, setup):
         draws(setup, "initial_state", 1.7e308)
     for name in ("friction", "contact_approximation"):
         with pytest.raises(InputError, match="one that applies to cart"):
-            levels_of(task, [name])
+            levels_named(task.model, [name])
         with pytest.raises(InputError, match="one that applies to cart"):
             perturbed(setup, {name: 0.1}, 0)
     for levels in ([], [0.0], [np.inf]):
         with pytest.raises(InputError, match="levels of mass"):
-            levels_of(task, {"mass": levels})
+            levels_named(task.model, {"mass": levels})
     for options in ({"trials": 0}, {"seed": -1}):
         with pytest.raises(InputError, match=f"{next(iter(options))}: expected a whole number"):
             dd.robustness(pushed_and_stopped(cart), ["mass"], **options)
-    assert levels_of(task, {"mass": [0.2, 0.1]}) == {"mass": (0.1, 0.2)}
-    assert "friction" not in levels_of(task, None)
+    assert levels_named(task.model, {"mass": [0.2, 0.1]}) == {"mass": (0.1, 0.2)}
+    assert "friction" not in levels_named(task.model, None)
 
 
 # ---- whose fault it is

@@ -22,7 +22,7 @@ from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 from drake_diff.record.sealed import own_sha256
 from drake_diff.trials import page as robustness_page
-from drake_diff.trials.files import begin_robustness, record_of
+from drake_diff.trials.files import record_of
 from drake_diff.trials.page import robustness_data
 from drake_diff.trials.panel_trial import evaluate
 
@@ -254,24 +254,26 @@ def test_the_words_say_whether_gradients_knew(result):
     assert record_of(doctored(result, {name: [94] * 2 for name in LEVELS}), "x").verdict == "fail"
 
 
-def test_what_is_begun_and_not_ended_says_so(result, tmp_path, monkeypatch):
-    other = tmp_path / "worst" / "mine"
-    other.mkdir(parents=True)
-    (other / "notes.txt").write_text("keep")
-    begin_robustness(tmp_path, result.task.model)
-    assert json.loads((tmp_path / "robustness.json").read_text())["verdict"] == "incomplete"
-    dd.trials.save_robustness(result, tmp_path)
+def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(result, tmp_path, monkeypatch):
+    before = dd.trials.save_robustness(result, tmp_path / "out")
 
     def fails(*_):
         raise OSError("no space left")
 
     monkeypatch.setattr(robustness_page, "write_robustness_page", fails)
     with pytest.raises(OSError, match="no space"):
-        dd.trials.save_robustness(result, tmp_path)
-    assert json.loads((tmp_path / "robustness.json").read_text())["verdict"] == "incomplete"
-    assert not (tmp_path / "robustness.html").exists()
-    begin_robustness(tmp_path, result.task.model)
-    assert [p.name for p in (tmp_path / "worst").iterdir()] == ["mine"]
+        dd.trials.save_robustness(result, tmp_path / "out")
+    (left,) = tmp_path.glob("out.partial-*")
+    assert json.loads((left / "robustness.json").read_text())["verdict"] == "incomplete"
+    assert not (left / "robustness.html").exists()
+    assert dd.load_record(tmp_path / "out") == before
+    assert dd.verify(tmp_path / "out").verdict == "intact"
+    monkeypatch.undo()
+    other = tmp_path / "out" / "worst" / "mine"
+    other.mkdir()
+    (other / "notes.txt").write_text("keep")
+    with pytest.raises(InputError, match="which holds 'mine'"):
+        dd.trials.save_robustness(result, tmp_path / "out")
     assert (other / "notes.txt").read_text() == "keep"
 
 
@@ -444,4 +446,4 @@ def test_the_command_refuses_what_it_cannot_try(run, tmp_path):
     for words in (("--perturbations", "wind"), ("--controller", "prayer")):
         found = call(run, *words, "--out", tmp_path / "out")
         assert isinstance(found.exception, UnknownNameError)
-        assert json.loads((tmp_path / "out" / "robustness.json").read_text())["verdict"] == "incomplete"
+        assert not [path for path in tmp_path.iterdir() if path.name.lstrip(".").startswith("out")]

@@ -13,9 +13,11 @@ from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
 from drake_diff.artifact.listing import compare_runs, list_runs
-from drake_diff.artifact.save import begin, save_failure
+from drake_diff.artifact.save import begin, begin_failure
 from drake_diff.cli.text import plain
 from drake_diff.exceptions import ArtifactError
+
+FAILED, OPEN = "failed.partial-1-0123abcd", "open.partial-22-0123abcd"
 
 
 def solve(**changes):
@@ -31,8 +33,9 @@ def runs(tmp_path_factory):
     solution = solve()
     dd.save(solution, folder / "a")
     dd.save(solve(x_goal=[0.5, 0]), folder / "b")
-    save_failure(ZeroDivisionError("[red]no[/]\x1b[31m"), folder / "failed", solution.problem)
-    begin(folder / "open", solution.problem)
+    begin_failure(ZeroDivisionError("[red]no[/]\x1b[31m"), folder / FAILED, solution.problem)
+    begin(folder / OPEN, solution.problem)
+    (folder / "killed.partial-1-00000000").mkdir()
     (folder / "odd").mkdir()
     (folder / "odd" / "record.json").write_text("{}")
     (folder / "empty").mkdir()
@@ -50,9 +53,10 @@ def test_a_line_for_each_run_with_what_its_record_says(runs):
     assert {name: line.verdict for name, line in lines.items()} == {
         "a": "pass",
         "b": "pass",
-        "failed": "fail",
+        FAILED: "incomplete",
+        "killed.partial-1-00000000": "incomplete",
         "odd": "unreadable",
-        "open": "incomplete",
+        OPEN: "incomplete",
     }
     assert lines["a"].cost == dd.load_record(runs / "a").metrics[0].value
     assert (lines["a"].status, lines["a"].model) == ("converged", "pendulum")
@@ -96,12 +100,12 @@ def test_metrics_that_are_defined_otherwise_are_not_compared(runs, tmp_path):
 
 
 def test_the_record_of_an_error_has_a_label_and_the_message(runs):
-    record = dd.load_record(runs / "failed")
-    assert (record.state, record.verdict) == ("complete", "fail")
+    record = dd.load_record(runs / FAILED)
+    assert (record.name, record.verdict) == ("failed", "incomplete")
     failure = record.failures[0]
     assert (failure.label, failure.code) == ("evaluation_error", "exception")
     assert failure.message.startswith("ZeroDivisionError")
-    assert dd.verify(runs / "failed").verdict == "undecided"
+    assert "ZeroDivisionError" in str(dd.verify(runs / FAILED))
 
 
 def test_text_of_a_record_changes_nothing_on_a_terminal():
@@ -117,16 +121,17 @@ def test_the_commands_print_and_exit_as_they_should(runs, tmp_path):
     done = drake_diff("verify", copy, cwd=tmp_path)
     assert done.returncode == 1
     assert "trace.mcap: its 0 bytes are not those that record.json describes" in done.stdout
-    assert drake_diff("verify", runs / "open", cwd=tmp_path).returncode == 1
+    assert "verdict: incomplete" in drake_diff("verify", runs / OPEN, cwd=tmp_path).stdout
     assert drake_diff("verify", runs / "nowhere", cwd=tmp_path).returncode == 2
     done = drake_diff("list", runs, cwd=tmp_path)
     assert done.returncode == 0
     assert [line.split()[:2] for line in done.stdout.splitlines()[1:]] == [
         ["a", "pass"],
         ["b", "pass"],
-        ["failed", "fail"],
+        [FAILED, "incomplete"],
+        ["killed.partial-1-00000000", "incomplete"],
         ["odd", "unreadable"],
-        ["open", "incomplete"],
+        [OPEN, "incomplete"],
     ]
     assert "\x1b" not in done.stdout
     done = drake_diff("compare-runs", runs / "a", runs / "b", cwd=tmp_path)
@@ -159,18 +164,15 @@ def problem():
 solve_options = {{"method": "shooting"}}
 """
     )
+    dd.save(solve(), tmp_path / "run")
     done = drake_diff("run", tmp_path / "task.py", "--out", tmp_path / "run", cwd=tmp_path)
     assert done.returncode == 4, done.stdout
-    record = dd.load_record(tmp_path / "run")
-    assert (record.verdict, record.failures[0].code) == ("fail", "exception")
+    assert dd.verify(tmp_path / "run").complaints == ()  # the earlier one
+    (left,) = tmp_path.glob("run.partial-*")
+    assert str(left) in done.stderr
+    record = dd.load_record(left)
+    assert (record.verdict, record.failures[0].code) == ("incomplete", "exception")
     assert "late" in record.sentence
-
-
-def test_a_second_run_in_a_directory_leaves_nothing_of_the_first(runs, tmp_path):
-    directory = Path(shutil.copytree(runs / "a", tmp_path / "a"))
-    (directory / "trace.mcap.partial").write_bytes(b"half")
-    begin(directory, solve().problem)
-    assert [p.name for p in directory.iterdir()] == ["record.json"]
 
 
 def test_a_motion_that_is_not_finite_is_saved_and_verified(tmp_path):

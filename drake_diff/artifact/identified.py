@@ -5,7 +5,6 @@ The recordings are kept as they were read, so that `verify` fits them again.
 
 import io
 import json
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.files import write_whole
+from drake_diff._base.files import make_folder, write_whole
 from drake_diff._base.strangers import arrays_of, read_plain
 from drake_diff.artifact.identified_motion import joined
 from drake_diff.artifact.rerun import TRACE, rebuilt
@@ -27,6 +26,7 @@ from drake_diff.logs.channels import input_channel, state_channel, transform_cha
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.record import identification as records
+from drake_diff.record.directory import name_of, written_whole
 from drake_diff.record.identification import IdentificationRecord
 from drake_diff.record.provenance import model_input, provenance_of, written_now
 from drake_diff.record.sealed import WallClock, canonical, reproducible
@@ -41,25 +41,27 @@ def save_identification(identification: Identification, directory: str | Path) -
 
     Raises InputError where it did not come from `identify`, ArtifactError where a recording's file has changed since.
     """
-    asked = identification.asked
-    if asked is None:
-        raise InputError("identification", got="one without what was asked", expected="what dd.identify returned")
-    folder = Path(directory)
-    copies = [_place(i, asked) for i in range(len(asked.recordings))]
+    with written_whole(directory) as folder:
+        return write_identification(identification, folder)
+
+
+def write_identification(identification: Identification, folder: Path) -> IdentificationRecord:
+    """Write what `save_identification` does into `folder`, which `written_whole` gave."""
+    asked, name = _asked(identification), name_of(folder)
+    kept = (folder.with_name(name) / RECORDINGS).resolve()
     for recording, given in zip(asked.recordings, asked.files, strict=True):
-        if given is not None and (not given[0].exists() or hash_of(given[0]) != given[1]):
-            raise ArtifactError(f"recording {recording.name}: {given[0]} has changed since it was read")
-        if given is not None and given[0].resolve().is_relative_to((folder / RECORDINGS).resolve()):
+        if given is not None and given[0].resolve().is_relative_to(kept):
             got = f"{given[0]}, which is in the directory to be written"
             raise InputError(f"recording {recording.name}", got=got, expected="one elsewhere")
+        if given is not None and (not given[0].exists() or hash_of(given[0]) != given[1]):
+            raise ArtifactError(f"recording {recording.name}: {given[0]} has changed since it was read")
         if given is not None and (size := _size(given[0])) > LARGEST:
             expected = f"at most {LARGEST} bytes, as it is kept in the directory"
             raise InputError(f"recording {recording.name}", got=f"{size} bytes", expected=expected)
-    _begun(folder.name, asked).begin(folder, MADE)
-    shutil.rmtree(folder / RECORDINGS, ignore_errors=True)
-    for i, place in enumerate(copies):
-        _keep(folder / place, asked.recordings[i], asked.files[i])
-    record = record_of(identification, folder.name)
+    _begun(name, asked).begin(folder)
+    for i, recording in enumerate(asked.recordings):
+        _keep(folder / _place(i, asked), recording, asked.files[i])
+    record = record_of(identification, name)
     write_made(folder, identification, record)
     if asked.model.source is not None:
         write_whole(folder / asked.model.source.name, asked.model.source.read_bytes())
@@ -76,13 +78,16 @@ def _size(path: Path) -> int:
 
 
 def _keep(place: Path, recording: Recording, given: tuple[Path, str] | None) -> None:
-    place.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(place.parent)
     if given is None:
         buffer = io.BytesIO()
         np.savez(buffer, times=recording.times, xs=recording.xs, us=recording.us)
         write_whole(place, buffer.getvalue())
     elif given[0].is_dir():
-        shutil.copytree(given[0], place)
+        for path in sorted(given[0].rglob("*")):
+            if path.is_file():
+                make_folder((place / path.relative_to(given[0])).parent)
+                write_whole(place / path.relative_to(given[0]), path.read_bytes())
     else:
         write_whole(place, given[0].read_bytes())
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from drake_diff.artifact.differences import READ, differences, is_near, is_number
 from drake_diff.exceptions import ArtifactError
+from drake_diff.record.directory import is_partial
 from drake_diff.record.read import kind_of
 from drake_diff.record.sealed import SealedRecord
 from drake_diff.record.solve import EvidenceRecord
@@ -19,7 +20,8 @@ NO_CHOICE = ("contract.source", "solver.status", "solver.message", "solver.solve
 class RunLine:
     """One directory: what its record says, unverified; `verdict` is "unreadable" where it says nothing.
 
-    `kind` is "solve", "comparison", "robustness" or "certification"; only a solve has a status and a cost.
+    It is "incomplete" of what was not moved to its place, whatever it says. `kind` is "solve", "comparison",
+    "robustness" or "certification"; only a solve has a status and a cost.
 
     Example:
         >>> from drake_diff.artifact import list_runs
@@ -99,10 +101,13 @@ def list_runs(directory: str | Path) -> list[RunLine]:
     folder = Path(directory)
     if not folder.is_dir():
         raise ArtifactError(f"{folder}: expected a directory of runs, got no directory")
-    return [_line(path, kind) for path in sorted(folder.iterdir()) if (kind := kind_of(path))]
+    paths = [path for path in sorted(folder.iterdir()) if path.is_dir()]
+    return [_line(path, kind_of(path)) for path in paths if kind_of(path) or is_partial(path)]
 
 
-def _line(path: Path, kind: type[SealedRecord]) -> RunLine:
+def _line(path: Path, kind: type[SealedRecord] | None) -> RunLine:
+    if kind is None:
+        return RunLine(path, path.name, "", "incomplete", "", None, "", "")
     try:
         record = kind.read(path)
     except ArtifactError:
@@ -112,7 +117,8 @@ def _line(path: Path, kind: type[SealedRecord]) -> RunLine:
         cost = next((m.value for m in record.metrics if m.name == "cost"), None)
         status = record.solver.status if record.solver else "-"
         model = str(record.contract.get("name", ""))
-    return RunLine(path, path.name, record.kind, record.verdict, status, cost, model, record.wall_clock.written_utc)
+    verdict = "incomplete" if is_partial(path) else record.verdict
+    return RunLine(path, path.name, record.kind, verdict, status, cost, model, record.wall_clock.written_utc)
 
 
 def compare_runs(a: str | Path, b: str | Path) -> RunComparison:

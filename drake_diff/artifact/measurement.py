@@ -336,7 +336,7 @@ def elsewhere_evidence(found: Elsewhere | None) -> ElsewhereEvidence | None:
     return ElsewhereEvidence(sentence=found.sentence, engines=list(found.engines), period_s=found.period, rows=rows)
 
 
-def failure_of(error: Exception) -> Failure:
+def failure_of(error: BaseException) -> Failure:
     """The failure of a run that `error` ended before there was a solution."""
     label: Label = "evaluation_error"
     if isinstance(error, (SimulationError, GradientError)):

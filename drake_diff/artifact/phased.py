@@ -1,7 +1,7 @@
 """Write the directory of a solve in phases: phases.json, and in phase_0, phase_1, ... a directory of each phase."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,12 @@ from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.rigid import RigidReset
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Solution
+from drake_diff.record.directory import name_of
 from drake_diff.record.parts import ModelInput
 from drake_diff.record.phases import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesRecord
 from drake_diff.record.provenance import gradient_evidence, provenance_of, written_now
 from drake_diff.record.sealed import Passed, WallClock
-from drake_diff.record.solve import Claim, EvidenceRecord, Solver
+from drake_diff.record.solve import Claim, Solver
 
 LIMITATIONS = ["of the model in simulation only: nothing here was measured on a robot"]
 AT_THEIR_TIMES = (
@@ -34,32 +35,17 @@ def directory_of(i: int) -> str:
     return f"phase_{i}"
 
 
-def save_phases(
-    solution: PhasedSolution, folder: Path, save_phase: Callable[[Solution, Path], Any], files: Sequence[str]
-) -> PhasesRecord:
-    """Write the directory of a solution in phases; `save_phase` writes that of one, with `files`."""
-    begin_phases(folder, solution.problem, files)
+def save_phases(solution: PhasedSolution, folder: Path, save_phase: Callable[[Solution, Path], Any]) -> PhasesRecord:
+    """Write the solution in phases into `folder`; `save_phase` writes that of one."""
     for i, phase in enumerate(solution.phases):
         save_phase(phase, folder / directory_of(i))
     return _record(folder, solution).write(folder)
 
 
-def begin_phases(folder: Path, problem: PhasedProblem, files: Sequence[str]) -> None:
-    """Mark `folder` as a run that is under way, and remove what an earlier one left there under the same names."""
-    sentence = "the run has started and not finished: it is still running, or it was killed or broke off"
-    leftovers = (EvidenceRecord.FILE, EvidenceRecord.schema_file(), *files)  # of a run that was one problem
-    phases_record(folder, problem, "incomplete", sentence).begin(folder, leftovers)
-    for old in folder.glob("phase_*"):
-        for name in (*files, EvidenceRecord.FILE, EvidenceRecord.schema_file()):
-            (old / name).unlink(missing_ok=True)
-        if old.is_dir() and not any(old.iterdir()):
-            old.rmdir()
-
-
 def phases_record(folder: Path, problem: PhasedProblem, verdict: Passed, sentence: str) -> PhasesRecord:
     """The record of a run without a solution."""
     return PhasesRecord(
-        name=folder.name, verdict=verdict, sentence=sentence, search=None, initial_guess=None, **_asked(problem)
+        name=name_of(folder), verdict=verdict, sentence=sentence, search=None, initial_guess=None, **_asked(problem)
     )
 
 
@@ -87,7 +73,7 @@ def _record(folder: Path, solution: PhasedSolution) -> PhasesRecord:
     asked = _asked(solution.problem)
     asked["wall_clock"] = WallClock(written_utc=written_now(), duration_s=solution.wall_time)
     return PhasesRecord(
-        name=folder.name,
+        name=name_of(folder),
         verdict="pass" if solution.success else "fail",
         sentence=solution.message,
         search=None if solution.search is None else solution.search.arguments,

@@ -1,6 +1,7 @@
 """Write the directory of a solve: what was asked, what came out, what was measured again, and with which versions.
 
-record.json is complete last, so that a run that is killed leaves a record that says so.
+It is written beside its place and moved there whole. record.json is complete last, so that a run that is killed leaves
+a record that says so.
 """
 
 import json
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 from drake_diff.artifact.measurement import Measurement, elsewhere_evidence, failure_of, measure, replay_evidence
-from drake_diff.artifact.phased import begin_phases, phases_record, save_phases
+from drake_diff.artifact.phased import phases_record, save_phases
 from drake_diff.artifact.rerun import PLAN, TRACE, write_plan
 from drake_diff.artifact.sections import asked, found, panel_of
 from drake_diff.exceptions import InputError
@@ -16,6 +17,7 @@ from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
+from drake_diff.record.directory import name_of, written_whole
 from drake_diff.record.parts import Event
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.provenance import provenance_of, written_now
@@ -27,20 +29,16 @@ if TYPE_CHECKING:
     from drake_diff.record.identification import IdentificationRecord
 
 REPLAY, REPORT = "replay.html", "report.html"
+UNDER_WAY = "the run has started and not finished: it is still running, or it was killed or broke off"
 FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record and its schema
 
 
-def begin(directory: str | Path, problem: Problem | PhasedProblem) -> None:
-    """Mark `directory` as a run that is under way: whatever happens next, its record says "incomplete".
-
-    What an earlier run left there under the names of ours is removed.
-    """
-    folder = Path(directory)
+def begin(folder: Path, problem: Problem | PhasedProblem) -> None:
+    """Mark `folder` as a run that is under way: whatever happens next, its record says "incomplete"."""
     if isinstance(problem, PhasedProblem):
-        begin_phases(folder, problem, FILES)
+        phases_record(folder, problem, "incomplete", UNDER_WAY).begin(folder)
         return
-    sentence = "the run has started and not finished: it is still running, or it was killed or broke off"
-    _record(folder, verdict="incomplete", sentence=sentence, **asked(problem)).begin(folder, FILES)
+    _record(folder, verdict="incomplete", sentence=UNDER_WAY, **asked(problem)).begin(folder)
 
 
 @overload
@@ -54,8 +52,9 @@ def save(
 ) -> "EvidenceRecord | PhasesRecord | IdentificationRecord":
     """Measure a solution and write its directory: record, plan, trace, replay and report.
 
-    Each file is written aside and moved into place, record.json last, so that at any moment the record is complete
-    only if everything that it names is.
+    All of it is written beside `directory`, in a folder that is called `directory`.partial-..., and takes its place at
+    the end: at any moment a run that was there before is there whole, or the new one is. What breaks off leaves that
+    folder, with the plan.
 
     Args:
         solution: A result of `solve`, of any status. Of one in phases, phases.json says how they are linked, and each
@@ -63,17 +62,18 @@ def save(
             Or a result of `identify`: identification.json, the recordings, the model file, trace.mcap and report.html
             are written, and "pass" says that the values found explain the recordings.
         directory: Where to write record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html.
-            It is made where there is none; files of these names are replaced. Plain dynamics have nothing to draw
-            in 3D, and so no replay.html.
+            It is made where there is none, and replaced where a run wrote it. Plain dynamics have nothing to draw in
+            3D, and so no replay.html.
 
     Returns:
         The record that was written. Its verdict is "pass" only where the solver converged and every metric keeps its
         tolerance.
 
     Raises:
-        OSError: A file cannot be written.
-        InputError: It is none of these.
-        ArtifactError: The file of a recording has changed since `identify` read it.
+        InputError: It is none of these, or `directory` holds what no run wrote.
+        ArtifactError: Somebody else is writing `directory`, or the file of a recording has changed since `identify`
+            read it.
+        WriteError: The disk is full, or does not let a file be written; the message says where the plan is.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -83,26 +83,36 @@ def save(
         >>> record.verdict, sorted(record.files)
         ('pass', ['plan.npz', 'record.schema.json', 'replay.html', 'report.html', 'trace.mcap'])
     """
-    folder = Path(directory)
+    if not isinstance(solution, (Solution, PhasedSolution)):
+        return _save_other(solution, directory)
+    with written_whole(directory) as folder:
+        return write_run(solution, folder)
+
+
+def _save_other(result: Any, directory: str | Path) -> "IdentificationRecord":
+    from drake_diff.artifact.identified import save_identification  # what saves a solve need not load it
+    from drake_diff.identification.identify import Identification
+
+    if not isinstance(result, Identification):
+        raise InputError("solution", got=type(result).__name__, expected="a result of solve or of identify")
+    return save_identification(result, directory)
+
+
+@overload
+def write_run(solution: Solution, folder: Path) -> EvidenceRecord: ...
+@overload
+def write_run(solution: PhasedSolution, folder: Path) -> PhasesRecord: ...
+def write_run(solution: Solution | PhasedSolution, folder: Path) -> EvidenceRecord | PhasesRecord:
+    """Write what `save` does into `folder`, which `written_whole` gave."""
     if isinstance(solution, PhasedSolution):
-        return save_phases(solution, folder, save, FILES)
-    if not isinstance(solution, Solution):
-        return _save_other(solution, folder)
+        begin(folder, solution.problem)
+        return save_phases(solution, folder, write_run)
     begin(folder, solution.problem)
     write_plan(folder / PLAN, solution)  # what is measured next may take long
     measurement = measure(solution)
     record = record_of(measurement, folder)
     write_files(folder, measurement, record)
     return record.write(folder)
-
-
-def _save_other(result: Any, folder: Path) -> "IdentificationRecord":
-    from drake_diff.artifact.identified import save_identification  # what saves a solve need not load it
-    from drake_diff.identification.identify import Identification
-
-    if not isinstance(result, Identification):
-        raise InputError("solution", got=type(result).__name__, expected="a result of solve or of identify")
-    return save_identification(result, folder)
 
 
 def write_files(folder: Path, measurement: Measurement, record: EvidenceRecord) -> None:
@@ -116,25 +126,24 @@ def write_files(folder: Path, measurement: Measurement, record: EvidenceRecord) 
     write_pages(folder / REPLAY, folder / REPORT, measurement, fields)
 
 
-def save_failure(
-    error: Exception, directory: str | Path, problem: Problem | PhasedProblem
-) -> EvidenceRecord | PhasesRecord:
-    """Write the record of a run that `error` ended before there was a solution."""
-    folder, failure = Path(directory), failure_of(error)
+def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedProblem) -> None:
+    """Say in the record of a run that is under way in `folder` that `error` ended it before there was a solution."""
+    failure = failure_of(error)
+    sentence = f"the run ended with an error: {failure.message}"
     if isinstance(problem, PhasedProblem):
-        sentence = f"the run ended with an error: {failure.message}"
-        return phases_record(folder, problem, "fail", sentence).write(folder)
+        phases_record(folder, problem, "incomplete", sentence).begin(folder)
+        return
     told: dict[str, Any] = {
-        "verdict": "fail",
-        "sentence": f"the run ended with an error: {failure.message}",
+        "verdict": "incomplete",
+        "sentence": sentence,
         "failures": [failure],
         "events": [Event(t_s=None, kind="failure", message=failure.message)],
     }
-    return _record(folder, **told, **asked(problem)).write(folder)
+    _record(folder, **told, **asked(problem)).begin(folder)
 
 
 def record_of(m: Measurement, folder: Path) -> EvidenceRecord:
-    """The record of a measurement, but for the files; it has the name of `folder`."""
+    """The record of a measurement, but for the files; `folder` is where they are written."""
     return _record(
         folder,
         m.solution.wall_time,
@@ -155,4 +164,4 @@ def record_of(m: Measurement, folder: Path) -> EvidenceRecord:
 
 def _record(folder: Path, duration: float | None = None, **fields: Any) -> EvidenceRecord:
     clock = WallClock(written_utc=written_now(), duration_s=duration)
-    return EvidenceRecord(name=folder.name, provenance=provenance_of(), wall_clock=clock, **fields)
+    return EvidenceRecord(name=name_of(folder), provenance=provenance_of(), wall_clock=clock, **fields)

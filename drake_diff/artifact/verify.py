@@ -30,6 +30,7 @@ from drake_diff.exceptions import ArtifactError, DrakeDiffError, MissingDependen
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.certification import CertificationRecord, certify_model
 from drake_diff.record.comparison import ComparisonRecord
+from drake_diff.record.directory import is_partial
 from drake_diff.record.identification import IdentificationRecord
 from drake_diff.record.parts import FileEvidence
 from drake_diff.record.phases import PhasesRecord
@@ -188,6 +189,8 @@ def verify(directory: str | Path) -> Verification:
     if not folder.is_dir():
         raise ArtifactError(f"{folder}: expected a directory that drake_diff wrote, got no directory")
     kind = kind_of(folder)
+    if is_partial(folder):
+        return _of_a_part(folder, kind)
     if kind is None:
         names = ", ".join(known.FILE for known in KINDS)
         return Verification(folder, None, complaints=(f"there is no record: none of {names}",))
@@ -201,6 +204,16 @@ def verify(directory: str | Path) -> Verification:
     if record.state == "incomplete" or (isinstance(record, (EvidenceRecord, PhasesRecord)) and record.solver is None):
         return replace(found, undecided=(f"there is nothing to run again: {record.sentence}",))
     return _run_again(found, record)
+
+
+def _of_a_part(folder: Path, kind: type[SealedRecord] | None) -> Verification:
+    """What can be said of a run that was not moved to its place."""
+    try:
+        record = None if kind is None else kind.read(folder)
+    except ArtifactError:
+        record = None
+    told = "it has no record" if record is None else record.sentence
+    return Verification(folder, record, undecided=(f"it is incomplete, and never took its place: {told}",))
 
 
 def _run_again(found: Verification, record: SealedRecord) -> Verification:

@@ -113,15 +113,16 @@ def compare(
 
     Exit status 0 only if every engine agrees with Drake, or differs by a law that its contract states.
     """
-    from drake_diff.comparison.files import PAGE, begin_comparison, save_comparison
+    from drake_diff.comparison.files import PAGE, write_comparison
     from drake_diff.comparison.recordings import read_recording
     from drake_diff.comparison.side_by_side import compare as compare_engines
+    from drake_diff.record.directory import written_whole
 
     directory = out or Path("artifacts") / f"compare_{file.stem}"
     recordings = [read_recording(path, model) for path in recording or ()]
-    begin_comparison(directory, model)
-    found = compare_engines(model, names_in(engines), recordings=recordings, num_steps=num_steps, seed=seed)
-    record = save_comparison(found, directory)
+    with written_whole(directory) as folder:
+        found = compare_engines(model, names_in(engines), recordings=recordings, num_steps=num_steps, seed=seed)
+        record = write_comparison(found, folder)
     rows = table(
         "engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian", wrap=False
     )
@@ -171,8 +172,9 @@ def identify(
     Writes identification.json, the recordings, trace.mcap and report.html. Exit status 0 only if the values found
     explain the recordings.
     """
-    from drake_diff.artifact.save import save
+    from drake_diff.artifact.identified import write_identification
     from drake_diff.identification.identify import identify as estimate
+    from drake_diff.record.directory import written_whole
 
     directory = out or Path("artifacts") / f"identify_{file.stem}"
     names: Any = "all" if parameters is None else names_in(parameters)
@@ -181,9 +183,10 @@ def identify(
         part: float | str = float(held_out)
     except ValueError:
         part = held_out
-    with progress_line("fitting"):
-        found = estimate(model, list(recording), names, noise=given or None, held_out=part, motion=motion)
-    record: Any = save(found, directory)
+    with written_whole(directory) as folder:
+        with progress_line("fitting"):
+            found = estimate(model, list(recording), names, noise=given or None, held_out=part, motion=motion)
+        record: Any = write_identification(found, folder)
     show(judged(record.verdict), record.sentence)
     rows = table("parameter", "before", "found", "95 % from", "to", "unit", "", left=1)
     for e in record.estimates:

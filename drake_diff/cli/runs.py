@@ -4,6 +4,7 @@ import importlib.util
 import inspect
 import sys
 import threading
+from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -11,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from drake_diff.cli.text import RunDirectory, judged, out_option, plain, progress_line, show, table
-from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
+from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, WriteError
 
 LogFile = Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that drake_diff wrote.")]
 
@@ -47,11 +48,12 @@ def run(
     directory = out or Path("artifacts") / script.stem
     # Only here: a script that is missing or wrong is refused before Drake is loaded.
     from drake_diff.artifact.other_plants import elsewhere as follow_elsewhere
-    from drake_diff.artifact.save import begin, save, save_failure
+    from drake_diff.artifact.save import begin, begin_failure, write_run
     from drake_diff.optimize.problem.phases import PhasedProblem
     from drake_diff.optimize.problem.problem import Problem
     from drake_diff.optimize.solution import Solution
     from drake_diff.optimize.solve import solve
+    from drake_diff.record.directory import written_whole
 
     if not isinstance(problem, (Problem, PhasedProblem)):
         raise InputError("problem()", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
@@ -64,23 +66,24 @@ def run(
         raise UnknownNameError("solve_options", got=name, known=known)
     parts = problem.phases if isinstance(problem, PhasedProblem) else (problem,)
     show(plain(script.name, "bold"), "; ".join(f"{part.system}, {part.num_steps} steps" for part in parts))
-    begun: list[Path] = []
+    with ExitStack() as stack:
+        begun: list[Path] = []
 
-    def on_start() -> None:
-        begin(directory, problem)
-        begun.append(directory)
+        def on_start() -> None:
+            begun.append(stack.enter_context(written_whole(directory)))
+            begin(begun[0], problem)
 
-    try:
-        with progress_line("solving") as report:
-            solution = solve(problem, progress=report, on_start=on_start, **options)
-    except Exception as error:
-        if begun:
-            save_failure(error, directory, problem)
-        raise
-    if elsewhere and isinstance(solution, Solution):
-        with progress_line("following it elsewhere"):
-            solution = follow_elsewhere(solution)
-    record = save(solution, directory)
+        try:
+            with progress_line("solving") as report:
+                solution = solve(problem, progress=report, on_start=on_start, **options)
+        except Exception as error:
+            if begun and not isinstance(error, WriteError):
+                begin_failure(error, begun[0], problem)
+            raise
+        if elsewhere and isinstance(solution, Solution):
+            with progress_line("following it elsewhere"):
+                solution = follow_elsewhere(solution)
+        record: Any = write_run(solution, begun[0])
     (_show_phases if isinstance(problem, PhasedProblem) else _show_record)(record)
     show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)
@@ -268,6 +271,8 @@ def check(file: LogFile) -> None:
     """Check every checksum and schema of FILE. Exit status 1 if one fails."""
     from drake_diff.logs.mcap_file import read_mcap
 
+    if not file.is_file():
+        raise InputError("FILE", got=str(file), expected="a file that exists")
     try:
         log = read_mcap(file)
     except ArtifactError as error:

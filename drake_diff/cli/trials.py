@@ -47,16 +47,19 @@ def robustness(
     trials succeed.
     """
     from drake_diff.artifact.verify import recalled
-    from drake_diff.trials.files import PAGE, begin_robustness, save_robustness
+    from drake_diff.record.directory import written_whole
+    from drake_diff.trials.files import PAGE, write_robustness
+    from drake_diff.trials.run import levels_named
     from drake_diff.trials.run import robustness as try_plan
 
     names, whole = names_in(perturbations), run.resolve()
     directory = out or whole.with_name(f"{whole.name}_robustness")
     with recalled(run) as solution:
-        begin_robustness(directory, solution.problem.model)
-        with progress_line("trying", stderr=True) as report:
-            result = try_plan(solution, names, trials=trials, controller=controller, seed=seed, progress=report)
-        record = save_robustness(result, directory, run)
+        levels = levels_named(solution.problem.model, names)
+        with written_whole(directory) as folder:
+            with progress_line("trying", stderr=True) as report:
+                result = try_plan(solution, levels, trials=trials, controller=controller, seed=seed, progress=report)
+            record = write_robustness(result, folder, run)
     columns = ("perturbation", "level", "success", "95 % interval", "goal error", "measured", "predicted", "labels")
     rows = table(*columns, wrap=False)
     for p in record.perturbations:

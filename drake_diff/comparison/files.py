@@ -15,10 +15,10 @@ from drake_diff.logs.messages import TYPES
 from drake_diff.model.model import Model
 from drake_diff.record import comparison as records
 from drake_diff.record.comparison import ComparisonRecord
+from drake_diff.record.directory import name_of, written_whole
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 
 TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
-FILES = (TRACE, REPLAY, PAGE)
 # Of ghosts: the second and further colours of the page's plots, the first being the reference's.
 COLOURS = (
     (0.85, 0.4, 0.04), (0.06, 0.54, 0.42), (0.64, 0.22, 0.61), (0.43, 0.42, 0), (0.32, 0.38, 0.43), (0.76, 0.09, 0.36),
@@ -27,25 +27,21 @@ COLOURS = (
 OPACITY = 0.35
 
 
-def begin_comparison(directory: str | Path, model: Model) -> None:
-    """Mark `directory` as a comparison under way: until it is saved its record says "incomplete"."""
-    _begun(Path(directory).name, model).begin(Path(directory), FILES)
-
-
 def save_comparison(comparison: Comparison, directory: str | Path) -> ComparisonRecord:
     """Write a comparison as a directory: comparison.json, trace.mcap, replay.html and comparison.html.
 
-    comparison.json is written last, so that it says "incomplete" until everything that it names is there.
+    All of it is written beside `directory`, and takes its place at the end.
 
     Args:
         comparison: from `dd.compare`.
-        directory: where to write; an earlier comparison there is replaced.
+        directory: where to write; an earlier run there is replaced.
 
     Returns:
         The record in comparison.json, which `dd.verify` checks against the other files.
 
     Raises:
-        OSError: a file cannot be written.
+        InputError: `directory` holds what no run wrote.
+        WriteError: the disk is full, or does not let a file be written.
 
     Example:
         >>> import tempfile
@@ -54,12 +50,17 @@ def save_comparison(comparison: Comparison, directory: str | Path) -> Comparison
         >>> print(dd.comparison.save_comparison(found, tempfile.mkdtemp()).verdict)
         pass
     """
+    with written_whole(directory) as folder:
+        return write_comparison(comparison, folder)
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> ComparisonRecord:
+    """Write what `save_comparison` does into `folder`, which `written_whole` gave."""
     from drake_diff.comparison.page import write_comparison_page  # what saves nothing need not load them
     from drake_diff.pages.meshcat import write_replay
 
-    folder = Path(directory)
-    begin_comparison(folder, comparison.model)
-    record = record_of(comparison, folder.name)
+    _begun(name_of(folder), comparison.model).begin(folder)
+    record = record_of(comparison, name_of(folder))
     write_comparison_trace(folder / TRACE, comparison)
     write_replay(folder / REPLAY, _scene(comparison), title=f"{record.name}: {record.verdict}")
     write_comparison_page(folder / PAGE, comparison, record, folder / REPLAY)

@@ -17,7 +17,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from drake_diff._base.files import write_whole
+from drake_diff._base.files import doing, write_whole
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import success_rate
 from drake_diff.exceptions import ArtifactError
@@ -43,9 +43,10 @@ class Journal:
         self.rows[trial] = row
 
     def _write(self, line: bytes) -> None:
-        self.file.write(line)
-        self.file.flush()
-        os.fsync(self.file.fileno())
+        with doing("write", self.path):
+            self.file.write(line)
+            self.file.flush()
+            os.fsync(self.file.fileno())
 
     def _read(self, panel: Mapping[str, Any], known: Collection[str]) -> dict[str, Row]:
         """Read all whole lines and cut off the rest: a line that a killed process left half written."""

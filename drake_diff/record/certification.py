@@ -18,6 +18,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, select
 from drake_diff.model.sampling import SampledState, sample_states
 from drake_diff.model.step import advance
+from drake_diff.record.directory import written_whole
 from drake_diff.record.parts import Certified, FiniteTable, Part
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 from drake_diff.record.sealed import Passed, SealedRecord, WallClock
@@ -85,14 +86,16 @@ def certify_model(
         seed: Seed of the states.
         parameters: Names of parameters whose derivatives are certified too.
         method: How the derivative is taken: "auto", "autodiff", "implicit", "analytic" or "finite_difference".
-        directory: Where to write certification.json and a copy of the model file; nothing is written without one. The
-            record there says "incomplete" until the last state is done.
+        directory: Where to write certification.json and a copy of the model file; nothing is written without one. An
+            earlier run there is replaced when the last state is done.
 
     Returns:
         A `CertificationRecord`, whose verdict is "pass" only where every certificate agrees.
 
     Raises:
-        InputError: `states`, `seed`, `parameters` or `method` is not one that can be used.
+        InputError: `states`, `seed`, `parameters` or `method` is not one that can be used, or `directory` holds what
+            no run wrote.
+        WriteError: The disk is full, or does not let `directory` be written.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -121,18 +124,21 @@ def certify_model(
             wall_clock=WallClock(written_utc=written_now(), duration_s=time.monotonic() - start),
         )
 
-    if directory is not None:
-        sentence = "the run has started and not finished: it is still running, or it was killed"
-        record("incomplete", sentence).begin(Path(directory))
-    found = [_certify_state(model, state, parameters, method) for state in sample_states(model, states, int(seed))]
-    agree = sum(state.verdict == "agree" for state in found)
-    sentence = f"{agree} of {len(found)} sampled states have a certified derivative"
-    made = record("pass" if agree == len(found) else "fail", sentence, found)
+    def certified() -> CertificationRecord:
+        found = [_certify_state(model, state, parameters, method) for state in sample_states(model, states, int(seed))]
+        agree = sum(state.verdict == "agree" for state in found)
+        sentence = f"{agree} of {len(found)} sampled states have a certified derivative"
+        return record("pass" if agree == len(found) else "fail", sentence, found)
+
     if directory is None:
-        return made.sealed()
-    if model.source is not None and made.model.file is not None:
-        write_whole(Path(directory) / model.source.name, model.source.read_bytes())  # to certify it again
-    return made.write(Path(directory))
+        return certified().sealed()
+    with written_whole(directory) as folder:
+        sentence = "the run has started and not finished: it is still running, or it was killed"
+        record("incomplete", sentence).begin(folder)
+        made = certified()
+        if model.source is not None and made.model.file is not None:
+            write_whole(folder / model.source.name, model.source.read_bytes())  # to certify it again
+        return made.write(folder)
 
 
 def _certify_state(model: Model, state: SampledState, parameters: Parameters, method: str) -> CertifiedState:

@@ -13,6 +13,7 @@ from drake_diff.certificates.sampled import SampledCertificate
 from drake_diff.certificates.truth import TrueSlope, Truth
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
+from drake_diff.record.directory import written_whole
 from drake_diff.record.parts import Certified, Part
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 from drake_diff.record.sealed import SealedRecord, WallClock
@@ -98,13 +99,15 @@ def save_rollout(
     Args:
         certificate: What `certify_rollout` gave, not `sampled`.
         model: The model that was rolled out.
-        directory: Where to write rollout.json and its schema.
+        directory: Where to write rollout.json and its schema; an earlier run there is replaced.
 
     Returns:
         A `RolloutRecord`, whose verdict is "pass" only where every entry agrees.
 
     Raises:
-        InputError: It is no certificate of a whole rollout, or the rollout is of another model.
+        InputError: It is no certificate of a whole rollout, the rollout is of another model, or `directory` holds
+            what no run wrote.
+        WriteError: The disk is full, or does not let `directory` be written.
 
     Example:
         >>> import tempfile
@@ -138,7 +141,8 @@ def save_rollout(
         provenance=provenance_of(),
         wall_clock=WallClock(written_utc=written_now()),
     )
-    return record.write(Path(directory))
+    with written_whole(directory) as folder:
+        return record.write(folder)
 
 
 def truth_evidence(truth: Truth) -> TruthEvidence:

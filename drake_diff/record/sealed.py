@@ -1,12 +1,12 @@
 """What all records have in common: verdict, provenance, the files of their directory, a hash of their own.
 
 A record is canonical JSON beside the files that it describes, and a copy of its JSON Schema lies with them. It is
-written when a run begins, as "incomplete", and again, last of all files, when everything that it names is in place.
+written when a run begins, as "incomplete", and again, last of all files, when everything that it names is there.
 """
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import reduce
 from hashlib import sha256
 from operator import getitem
@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationError
 
-from drake_diff._base.files import write_whole
+from drake_diff._base.files import make_folder, write_whole
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.strangers import MOST_TEXT, json_of, read_plain
 from drake_diff.exceptions import ArtifactError
@@ -117,17 +117,14 @@ class SealedRecord(ShowsItsRepr, Part):
         """This record with its own hash."""
         return self.model_copy(update={"record_sha256": own_sha256(self.model_dump(mode="json"))})
 
-    def begin(self, directory: Path, leftovers: Iterable[str] = ()) -> None:
-        """Write this record of a run that is under way; then remove `leftovers`, files of an earlier run there."""
-        directory.mkdir(parents=True, exist_ok=True)
+    def begin(self, directory: Path) -> None:
+        """Write this record of a run that is under way."""
+        make_folder(directory)
         write_whole(directory / self.FILE, self.sealed().to_json().encode())
-        for name in (self.schema_file(), *leftovers):
-            for left in (directory / name, directory / f"{name}.partial"):
-                left.unlink(missing_ok=True)
 
     def write(self, directory: Path) -> Self:
         """Write the schema and then this record, with the hash of every other file in `directory` and its own."""
-        directory.mkdir(parents=True, exist_ok=True)
+        make_folder(directory)
         write_whole(directory / self.schema_file(), self.published_schema())
         record = self.model_copy(update={"files": files_below(directory, self.FILE)}).sealed()
         write_whole(directory / self.FILE, record.to_json().encode())

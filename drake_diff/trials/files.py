@@ -12,6 +12,7 @@ from drake_diff._base.files import write_whole
 from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
 from drake_diff.model.model import Model
+from drake_diff.record.directory import name_of, written_whole
 from drake_diff.record.provenance import model_input, provenance_of, written_now
 from drake_diff.record.robustness import (
     CellEvidence,
@@ -26,22 +27,10 @@ from drake_diff.record.solve import EvidenceRecord
 from drake_diff.trials.perturbation import perturbation_named
 from drake_diff.trials.run import Cell, Robustness
 from drake_diff.trials.trial import Task
-from drake_diff.trials.trial_files import FILES as TRIAL_FILES
 from drake_diff.trials.trial_files import REPLAY, finite, write_trial
 
 PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
 PLAIN = Loop()
-
-
-def begin_robustness(directory: str | Path, model: Model) -> None:
-    """Mark `directory` as trials under way: until they are saved its record says "incomplete"."""
-    folder = Path(directory)
-    sentence = "the trials have not ended: they are still running, or they were killed or broke off"
-    old_trials = [f.relative_to(folder).as_posix() for f in folder.glob(f"{WORST}/*/*") if f.name in TRIAL_FILES]
-    _record(folder.name, model, "incomplete", sentence).begin(folder, (PAGE, TABLE, *old_trials))
-    for path in folder.glob(f"{WORST}/*"):
-        if path.is_dir() and not any(path.iterdir()):
-            path.rmdir()
 
 
 def save_robustness(result: Robustness, directory: str | Path, run: str | Path | None = None) -> RobustnessRecord:
@@ -49,19 +38,21 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
 
     robustness.html is the report, trials.csv has a row for each trial, and worst/NAME_LEVEL/ has, for each
     perturbation, the worst trial at the lowest level where one fails (without a failure, the one furthest from the
-    goal): trial.json, trace.mcap, replay.html, latencies.json. robustness.json is written last, so that it says "pass"
-    or "fail" only once all the rest is there. The same trials give the same bytes, but for wall-clock times.
+    goal): trial.json, trace.mcap, replay.html, latencies.json. All of it is written beside `directory`, and takes its
+    place at the end. The same trials give the same bytes, but for wall-clock times.
 
     Args:
         result: what `robustness` returned.
-        directory: where to write; it is created.
+        directory: where to write; it is created, and an earlier run there is replaced.
         run: the run directory that the plan is from, if there is one: its trials can then be run again from it.
 
     Returns:
         The record, as in robustness.json.
 
     Raises:
+        InputError: `directory` holds what no run wrote.
         ArtifactError: there is no record in `run`.
+        WriteError: the disk is full, or does not let a file be written.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -72,12 +63,19 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
         >>> dd.trials.save_robustness(result, mkdtemp()).verdict
         'pass'
     """
+    with written_whole(directory) as folder:
+        return write_robustness(result, folder, run)
+
+
+def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -> RobustnessRecord:
+    """Write what `save_robustness` does into `folder`, which `written_whole` gave."""
     from drake_diff.trials.page import write_robustness_page  # loads the page templates: not needed before
 
-    folder, task = Path(directory), result.task
+    task = result.task
     source = None if run is None else RunEvidence(path=str(run), record_sha256=EvidenceRecord.read(run).record_sha256)
-    begin_robustness(folder, task.model)
-    record = record_of(result, folder.name, source)
+    sentence = "the trials are still being written, or that was killed or broke off"
+    _record(name_of(folder), task.model, "incomplete", sentence).begin(folder)
+    record = record_of(result, name_of(folder), source)
     # A trial can be run again from what trial.json says where nothing in the loop is a user's own.
     loop, named = task.loop, ("sensor", "actuator", "fallback", "substeps")
     plain = all(repr(getattr(loop, name)) == repr(getattr(PLAIN, name)) for name in named)

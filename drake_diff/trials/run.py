@@ -20,6 +20,7 @@ from drake_diff.exceptions import InputError
 from drake_diff.loop.mpc import MPC
 from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
+from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
@@ -84,7 +85,7 @@ def robustness(
     if solution.problem.motion != STEPS:
         raise InputError("solution", got='one with motion="continuous"', expected='motion="steps": trials are stepped')
     task = Task(solution.plan, controller, loop)
-    levels, sensitivity = levels_of(task, perturbations), Sensitivity(task)
+    levels, sensitivity = levels_named(task.model, perturbations), Sensitivity(task)
     cells = []
     for name, values in levels.items():
         for level in values:
@@ -221,14 +222,14 @@ def trial_seed(seed: int, index: int) -> int:
     return int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
 
 
-def levels_of(task: Task, perturbations: Levels | Sequence[str] | None) -> dict[str, tuple[float, ...]]:
+def levels_named(model: Model, perturbations: Levels | Sequence[str] | None) -> dict[str, tuple[float, ...]]:
     """By name the levels to try, in increasing order. UnknownNameError; InputError for what cannot be tried."""
     if perturbations is None:
-        return {name: kind.levels for name, kind in PERTURBATIONS.items() if kind.is_of(task.model)}
+        return {name: kind.levels for name, kind in PERTURBATIONS.items() if kind.is_of(model)}
     if not isinstance(perturbations, Mapping):
         perturbations = {name: perturbation_named(name).levels for name in perturbations}
     for name, values in perturbations.items():
-        perturbation_named(name).check_is_of(task.model)
+        perturbation_named(name).check_is_of(model)
         if not len(values) or not all(np.isfinite(v) and v > 0 for v in values):
             raise InputError(f"levels of {name}", got=values, expected="numbers above 0")
     return {name: tuple(sorted(values)) for name, values in perturbations.items()}

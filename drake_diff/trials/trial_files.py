@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.files import write_whole
+from drake_diff._base.files import make_folder, write_whole
 from drake_diff.logs.channels import Shown, input_channel, motion_channels, nanoseconds, state_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.logs.messages import TYPES
@@ -21,18 +21,18 @@ from drake_diff.trials.trial import Task, Trial
 
 TRIAL, TRACE, REPLAY, LATENCIES = "trial.json", "trace.mcap", "replay.html", "latencies.json"
 FURTHEST = 1e6  # m and rad: what runs away further is drawn here; the trace has it as it was
-FILES = (TRIAL, TRACE, REPLAY, LATENCIES)
 
 
 def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None:
-    """Write all FILES of `trial` into `folder`; `run` is the run directory that its plan is from, if there is one.
+    """Write trial.json, trace.mcap, replay.html and latencies.json of `trial` into `folder`.
 
-    The same trial gives the same bytes, but for the latencies.
+    `run` is the run directory that its plan is from, if there is one. The same trial gives the same bytes, but for the
+    latencies.
     """
     from drake_diff.pages.meshcat import write_replay
     from drake_diff.pages.scene import BLUE, scene_of
 
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     evidence = trial_evidence(task, trial, run)
     write_whole(folder / TRIAL, canonical(evidence.model_dump(mode="json")).encode())
     latencies = {"budget_s": trial.outcome.run.latency_budget, "latencies_s": trial.outcome.run.latencies.tolist()}
