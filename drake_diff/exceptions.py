@@ -24,6 +24,7 @@ Example:
 
 import pickle
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 
@@ -110,7 +111,9 @@ class ArtifactError(DrakeDiffError):
 
 
 class WriteError(DrakeDiffError, OSError):
-    """The disk is full, or does not let a file be written."""
+    """The disk is full, or does not let a file be written; `kept` is the folder of what was written of a run."""
+
+    kept: Path | None = None
 
 
 class ModelWarning(UserWarning):

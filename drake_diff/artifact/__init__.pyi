@@ -5,5 +5,6 @@ from .listing import list_runs as list_runs
 from .measurement import Measurement as Measurement
 from .measurement import measure as measure
 from .other_plants import elsewhere as elsewhere
+from .recover import recover as recover
 from .trace import Trace as Trace
 from .verify import Verification as Verification

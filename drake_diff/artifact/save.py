@@ -5,22 +5,29 @@ a record that says so.
 """
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import gettempdir
 from typing import TYPE_CHECKING, Any, overload
 
+import numpy as np
+
+from drake_diff._base.files import make_folder
 from drake_diff.artifact.measurement import Measurement, elsewhere_evidence, failure_of, measure, replay_evidence
-from drake_diff.artifact.phased import phases_record, save_phases
-from drake_diff.artifact.rerun import PLAN, TRACE, write_plan
+from drake_diff.artifact.phased import directory_of, phases_record, save_phases
+from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, write_plan
 from drake_diff.artifact.sections import asked, found, panel_of
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import ArtifactError, InputError, WriteError
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
-from drake_diff.record.directory import name_of, written_whole
+from drake_diff.record.directory import name_of, partial_of, written_whole
 from drake_diff.record.parts import Event
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.provenance import provenance_of, written_now
+from drake_diff.record.read import load_record
 from drake_diff.record.sealed import WallClock, canonical, reproducible
 from drake_diff.record.solve import EvidenceRecord
 
@@ -30,6 +37,7 @@ if TYPE_CHECKING:
 
 REPLAY, REPORT = "replay.html", "report.html"
 UNDER_WAY = "the run has started and not finished: it is still running, or it was killed or broke off"
+NOT_MEASURED = "the search has ended, and its plan is not measured yet"
 FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record and its schema
 
 
@@ -85,7 +93,7 @@ def save(
     """
     if not isinstance(solution, (Solution, PhasedSolution)):
         return _save_other(solution, directory)
-    with written_whole(directory) as folder:
+    with plan_kept(solution, Path(directory).resolve().name), written_whole(directory) as folder:
         return write_run(solution, folder)
 
 
@@ -104,15 +112,63 @@ def write_run(solution: Solution, folder: Path) -> EvidenceRecord: ...
 def write_run(solution: PhasedSolution, folder: Path) -> PhasesRecord: ...
 def write_run(solution: Solution | PhasedSolution, folder: Path) -> EvidenceRecord | PhasesRecord:
     """Write what `save` does into `folder`, which `written_whole` gave."""
+    keep_plan(solution, folder)  # what is measured next may take long
     if isinstance(solution, PhasedSolution):
-        begin(folder, solution.problem)
         return save_phases(solution, folder, write_run)
-    begin(folder, solution.problem)
-    write_plan(folder / PLAN, solution)  # what is measured next may take long
     measurement = measure(solution)
     record = record_of(measurement, folder)
     write_files(folder, measurement, record)
     return record.write(folder)
+
+
+def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
+    """Write the plan, with a record that says "incomplete", into `folder`: `recover` measures it from there."""
+    if isinstance(solution, PhasedSolution):
+        for i, phase in enumerate(solution.phases):
+            keep_plan(phase, folder / directory_of(i))
+        sentence = f"{NOT_MEASURED}: {solution.message}"
+        phases_record(folder, solution.problem, "incomplete", sentence).begin(folder)
+        return
+    make_folder(folder)
+    write_plan(folder / PLAN, solution)
+    sections = asked(solution.problem, solution) | found(solution, measured=False)
+    sentence = f"{NOT_MEASURED}: {solution.message}"
+    _record(folder, solution.wall_time, verdict="incomplete", sentence=sentence, **sections).begin(folder)
+
+
+@contextmanager
+def plan_kept(solution: Solution | PhasedSolution, name: str, folder: Path | None = None) -> Iterator[None]:
+    """Where a WriteError leaves no plan in `folder`, or where it says that files were kept, it is kept elsewhere."""
+    try:
+        yield
+    except WriteError as error:
+        kept = folder or error.kept
+        if kept is not None and _has_plan(kept, solution):
+            raise
+        raise WriteError(f"{error}; {_kept_elsewhere(solution, name)}") from error
+
+
+def _has_plan(folder: Path, solution: Solution | PhasedSolution) -> bool:
+    if isinstance(solution, PhasedSolution):
+        return all(_has_plan(folder / directory_of(i), phase) for i, phase in enumerate(solution.phases))
+    try:
+        plan = read_plan(folder / PLAN)
+    except ArtifactError:
+        return False
+    return all(np.array_equal(plan[name], getattr(solution, name), equal_nan=True) for name in ("xs", "us"))
+
+
+def _kept_elsewhere(solution: Solution | PhasedSolution, name: str) -> str:
+    """Keep the plan in the first folder that takes it; a sentence says which."""
+    places: tuple[Callable[[], Path], ...] = (lambda: Path(gettempdir()), Path.cwd, Path.home)
+    for place in places:
+        try:
+            folder = partial_of(place() / name)
+            keep_plan(solution, folder)
+        except OSError:  # the next one, and the sentence says where it was
+            continue
+        return f"the plan is in {folder}"
+    return "the plan could be kept nowhere: no temporary folder can be written"
 
 
 def write_files(folder: Path, measurement: Measurement, record: EvidenceRecord) -> None:
@@ -124,6 +180,12 @@ def write_files(folder: Path, measurement: Measurement, record: EvidenceRecord) 
     write_plan(folder / PLAN, measurement.solution)
     write_trace(folder / TRACE, measurement, {record.FILE: ("application/json", reproducible(fields).encode())})
     write_pages(folder / REPLAY, folder / REPORT, measurement, fields)
+
+
+def begin_interrupted(folder: Path) -> None:
+    """Say in the record of a run that is under way in `folder` that it was interrupted."""
+    record = load_record(folder)
+    record.model_copy(update={"sentence": f"the run was interrupted; {record.sentence}"}).begin(folder)
 
 
 def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedProblem) -> None:

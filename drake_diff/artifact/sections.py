@@ -209,8 +209,11 @@ def _search(solution: Solution) -> dict[str, Any] | None:
     return {**solution.search.arguments, "initial_guess": kind}
 
 
-def found(solution: Solution) -> dict[str, Any]:
-    """The sections that say how a solution was found. An option that is no finite number is null."""
+def found(solution: Solution, *, measured: bool = True) -> dict[str, Any]:
+    """The sections that say how a solution was found. An option that is no finite number is null.
+
+    Norms of gradients are there of what is `measured`, as they take time.
+    """
     problem, vector = solution.problem, solution.vector
     units = [p.unit for p in vector.parameters for _ in p.value]
     lower, upper = (finite_list(side) for side in problem.bounds_of_parameters())
@@ -238,7 +241,7 @@ def found(solution: Solution) -> dict[str, Any]:
         options={k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in options.items()},
         iterations=len(solution.iterations),
     )
-    return {"solver": solver, "parameters": parameters, "gradient": _gradient(solution)}
+    return {"solver": solver, "parameters": parameters, "gradient": _gradient(solution, measured)}
 
 
 def units_of(problem: Problem) -> tuple[str, ...]:
@@ -292,7 +295,7 @@ def _action(problem: Problem, time_step: float, limit: float | None) -> ActionIn
     )
 
 
-def _gradient(solution: Solution) -> GradientEvidence:
+def _gradient(solution: Solution, measured: bool) -> GradientEvidence:
     """What the solver differentiated, where each column came from, and how far it agrees with differences.
 
     The source of states and inputs is that of the certificates.
@@ -312,7 +315,8 @@ def _gradient(solution: Solution) -> GradientEvidence:
     units = (*units_of(problem), *(p.unit for p in vector.parameters for _ in p.value))
     sources = (*[methods] * (problem.nx + problem.nu), *vector.sources)
     columns = zip(names, units, sources, strict=True)
-    ends, found = solution.final_state_norms, solution.optimality
+    later = Refusal("not measured yet")
+    ends, found = (solution.final_state_norms, solution.optimality) if measured else (later, later)
     ratio = None if isinstance(found, Refusal) or not math.isfinite(found.ratio) else found.ratio
     return GradientEvidence(
         differentiated=list(problem.optimize),

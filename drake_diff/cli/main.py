@@ -1,7 +1,7 @@
 """The command `drake-diff`.
 
 Exit status: 0 what was asked for holds, 1 a check failed, 2 wrong usage or input, 3 a solver or engine is missing,
-4 an internal error. A panel that was ended by Ctrl-C exits with 130.
+4 an internal error. A run or panel that was ended by Ctrl-C, SIGTERM or SIGHUP exits with 130.
 """
 
 import sys
@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from drake_diff._base.signals import interrupt_alike
 from drake_diff.cli import models, planning, runs, trials
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 
@@ -58,10 +59,12 @@ def about(
 
 def main() -> None:
     """The entry point: every error of ours becomes a sentence and an exit status."""
+    interrupt_alike()
     try:
         app()
     except DrakeDiffError as error:
-        print(f"drake-diff: {type(error).__name__}: {error}", file=sys.stderr)
+        words = "; ".join((str(error), *getattr(error, "__notes__", ())))
+        print(f"drake-diff: {type(error).__name__}: {words}", file=sys.stderr)
         sys.exit(MISSING if isinstance(error, MissingDependencyError) else USAGE)
     except Exception:
         traceback.print_exc()

@@ -1,7 +1,8 @@
-"""Commands on runs: run, verify, list, compare-runs, schema, view, export, and `mcap info | check | recover`."""
+"""Commands on runs: run, recover, verify, list, compare-runs, schema, view, export, `mcap info | check | recover`."""
 
 import importlib.util
 import inspect
+import shlex
 import sys
 import threading
 from contextlib import ExitStack
@@ -11,11 +12,13 @@ from typing import Annotated, Any
 
 import typer
 
+from drake_diff._base.signals import INTERRUPTED
 from drake_diff.cli.text import RunDirectory, judged, out_option, plain, progress_line, show, table
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, WriteError
 
 LogFile = Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that drake_diff wrote.")]
 
+OURS = ("problem", "progress", "on_start", "on_plan")  # arguments of `solve` that a script does not give
 mcap = typer.Typer(no_args_is_help=True, help="Look at, check and repair trace.mcap.")
 
 
@@ -24,6 +27,7 @@ def add_commands(app: typer.Typer) -> None:
     for command in (run, verify, compare_runs, schema, view, export):
         app.command()(command)
     app.command("list")(list_all)
+    app.command("recover")(recover_run)
     mcap.command()(info)
     mcap.command()(check)
     mcap.command()(recover)
@@ -41,19 +45,16 @@ def run(
 
     SCRIPT may also define solve_options, a dictionary of arguments of drake_diff.solve. With --elsewhere the plan is
     followed in other plants too, and the record says where it holds; the exit status does not depend on that.
-    Exit status 0 only if the solution passes every check.
+    Exit status 0 only if the solution passes every check. Ctrl-C, SIGTERM and SIGHUP end the search: its best plan is
+    written. One that comes later, while it is measured, ends the run (exit status 130), which `recover` completes.
     """
     module = _loaded(script)
     problem, options = module.problem(), getattr(module, "solve_options", {})
     directory = out or Path("artifacts") / script.stem
     # Only here: a script that is missing or wrong is refused before Drake is loaded.
-    from drake_diff.artifact.other_plants import elsewhere as follow_elsewhere
-    from drake_diff.artifact.save import begin, begin_failure, write_run
     from drake_diff.optimize.problem.phases import PhasedProblem
     from drake_diff.optimize.problem.problem import Problem
-    from drake_diff.optimize.solution import Solution
     from drake_diff.optimize.solve import solve
-    from drake_diff.record.directory import written_whole
 
     if not isinstance(problem, (Problem, PhasedProblem)):
         raise InputError("problem()", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
@@ -61,32 +62,58 @@ def run(
         raise InputError("--elsewhere", got="a problem without a model, or in phases", expected="a model's problem")
     if not isinstance(options, dict):
         raise InputError("solve_options", got=type(options).__name__, expected="a dictionary")
-    known = [name for name in inspect.signature(solve).parameters if name not in ("problem", "progress", "on_start")]
+    known = [name for name in inspect.signature(solve).parameters if name not in OURS]
     for name in options.keys() - set(known):
         raise UnknownNameError("solve_options", got=name, known=known)
     parts = problem.phases if isinstance(problem, PhasedProblem) else (problem,)
     show(plain(script.name, "bold"), "; ".join(f"{part.system}, {part.num_steps} steps" for part in parts))
-    with ExitStack() as stack:
-        begun: list[Path] = []
-
-        def on_start() -> None:
-            begun.append(stack.enter_context(written_whole(directory)))
-            begin(begun[0], problem)
-
-        try:
-            with progress_line("solving") as report:
-                solution = solve(problem, progress=report, on_start=on_start, **options)
-        except Exception as error:
-            if begun and not isinstance(error, WriteError):
-                begin_failure(error, begun[0], problem)
-            raise
-        if elsewhere and isinstance(solution, Solution):
-            with progress_line("following it elsewhere"):
-                solution = follow_elsewhere(solution)
-        record: Any = write_run(solution, begun[0])
+    record = _solved_into(directory, problem, options, elsewhere)
     (_show_phases if isinstance(problem, PhasedProblem) else _show_record)(record)
     show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def _solved_into(directory: Path, problem: Any, options: dict[str, Any], elsewhere: bool) -> Any:
+    """Solve, measure and write `directory`; what is interrupted takes no other run's place."""
+    from drake_diff.artifact.other_plants import elsewhere as follow_elsewhere
+    from drake_diff.artifact.save import begin, begin_failure, begin_interrupted, keep_plan, plan_kept, write_run
+    from drake_diff.optimize.solve import solve
+    from drake_diff.record.directory import written_whole
+
+    folders: list[Path] = []
+
+    def on_start() -> None:
+        folders.append(stack.enter_context(written_whole(directory)))
+        begin(folders[0], problem)
+
+    def on_plan(plan: Any) -> None:
+        with plan_kept(plan, directory.name, folders[0]):
+            keep_plan(plan, folders[0])
+
+    with ExitStack() as stack:
+        try:
+            with progress_line("solving") as report:
+                solution: Any = solve(problem, progress=report, on_start=on_start, on_plan=on_plan, **options)
+            if elsewhere:
+                with progress_line("following it elsewhere"):
+                    solution = follow_elsewhere(solution)
+            with plan_kept(solution, directory.name, folders[0]):
+                record = write_run(solution, folders[0])
+        except KeyboardInterrupt:
+            if folders:
+                begin_interrupted(folders[0])
+                show(f"interrupted: what there is of the run is in {folders[0]}")
+                show(plain(f"drake-diff recover {shlex.quote(str(folders[0]))} measures its plan, if there is one"))
+            raise typer.Exit(INTERRUPTED) from None
+        except Exception as error:
+            if folders and not isinstance(error, WriteError):
+                begin_failure(error, folders[0], problem)
+            raise
+        if record.solver.status == "interrupted" and directory.is_dir() and any(directory.iterdir()):
+            show(judged(record.verdict), f" interrupted: {record.sentence}")
+            show(f"{directory} has an earlier run, which stays; this one is in {folders[0]}")
+            raise typer.Exit(1)
+    return record
 
 
 def _show_phases(record: Any) -> None:
@@ -171,6 +198,23 @@ def list_all(
         words = (line.kind, line.status, line.cost, line.model, line.written_utc)
         rows.add_row(plain(line.name), judged(line.verdict), *(plain(word) for word in words))
     show(rows)
+
+
+def recover_run(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="The directory NAME.partial-... that a run left.")],
+    out: Annotated[Path | None, out_option("<NAME>")] = None,
+) -> None:
+    """Complete a run that was killed, interrupted, or met a full disk: measure the plan in RUN, and write the rest.
+
+    Exit status 0 only if the plan passes every check. No run is replaced.
+    """
+    from drake_diff.artifact.recover import recover as complete
+
+    record: Any = complete(run, out)
+    show(judged(record.verdict), f" {record.sentence}")
+    place = out or run.resolve().with_name(record.name)
+    show(f"wrote {place}: {record.FILE}, {', '.join(sorted(record.files))}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 
 def compare_runs(

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from drake_diff._base.signals import INTERRUPTED
 from drake_diff.cli.text import (
     RunDirectory,
     Seed,
@@ -22,7 +23,6 @@ from drake_diff.cli.text import (
     table,
 )
 
-INTERRUPTED = 130  # 128 + SIGINT, as in shells
 COLOURS = {"rigid answer": "green", "right": "green", "own law's": "yellow", "not asked": "dim", "none": "dim"}
 EVERY = 5.0  # seconds between two lines of a panel's progress where there is no terminal
 

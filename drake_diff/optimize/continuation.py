@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.soft_contact import SoftContact, distances, separations, softened
@@ -30,7 +31,7 @@ from drake_diff.optimize.ilqr.through_contact import (
     where_it_jumps,
 )
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report, ctrl_c
+from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.relaxed.plant import RelaxedPlant, Softness
 from drake_diff.optimize.relaxed.search import Found
 from drake_diff.optimize.relaxed.stages import describe, solve_relaxed
@@ -86,7 +87,7 @@ def solve_continuation(
     rest are left out and the motion is the true plant's rollout. A search that ends short of a minimum is taken to the
     goal by `restore_goal`, which its message says. Raises GradientError or SimulationError if the true plant refuses.
     """
-    with ctrl_c() as interrupted:
+    with noted_interrupts() as interrupted:
         through = _Stages(problem, limits, report, interrupted)
         if isinstance(stages, RelaxedPlant):
             through.relax(xs, us, stages)

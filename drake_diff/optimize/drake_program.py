@@ -12,8 +12,9 @@ from pydrake import solvers
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolutionResult
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
-from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, ctrl_c
+from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch
 
 SOLVERS = ("ipopt", "snopt")
 SNOPT_STEP_LIMIT = 2.0  # its own default: by how much of itself the point may change in a step
@@ -41,7 +42,7 @@ def solve_program(
     engine = IpoptSolver() if solver == "ipopt" else SnoptSolver()
     if not (engine.available() and engine.enabled()):
         raise MissingDependencyError(f"the solver {solver} is not in this Drake: take another one, or Drake's wheel")
-    with tempfile.TemporaryDirectory() as folder, ctrl_c() as interrupted:
+    with tempfile.TemporaryDirectory() as folder, noted_interrupts() as interrupted:
         print_file = Path(folder) / "log"
         watch = Watch(limits, interrupted)
         callback = _Callback(program, watch, report)

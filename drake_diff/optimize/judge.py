@@ -95,6 +95,13 @@ def overlaps(solution: Solution) -> bool:
     return motion is not None and solution.problem.has_model and next(_overlaps(solution, motion), "") != ""
 
 
+def unmeasured(draft: Solution, result: NlpResult) -> Solution:
+    """The draft as the solver leaves it: nothing of it is measured, so that it is no success."""
+    status = _STATUSES.get(result.outcome, Status.CONVERGED_NOT_VERIFIED)
+    fields = {"iterations": result.iterations, "solver_message": result.message}
+    return ended(draft, status, f"{result.message}; nothing was measured yet", **fields)
+
+
 def refused(draft: Solution, error: Exception) -> Solution:
     """The draft of a solve that ended because a step or its derivative was refused."""
     status = Status.NO_GRADIENT if isinstance(error, GradientError) else Status.DIVERGED

@@ -20,7 +20,7 @@ from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.optimize.certified import certify_equations
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
-from drake_diff.optimize.judge import judged, may_be_too_coarse, status_of
+from drake_diff.optimize.judge import judged, may_be_too_coarse, status_of, unmeasured
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.rigid import RigidReset
@@ -479,21 +479,17 @@ class _PhasedRun:
         return found
 
     def _judged(self, result: NlpResult, motions: list[Transcribed], derivatives: str) -> PhasedSolution:
-        drafts: list[Solution] = []
         error: Exception | None = None
         options = {"derivatives": derivatives, "initial_guess": "default" if self.by_default else "given"}
-        for t, motion in zip(self.transcriptions, motions, strict=True):
-            xs, us = motion.xs, motion.us[:-1]
-            certificates: tuple[Certificate, ...] = ()
-            if np.all(np.isfinite(xs)):
+        drafts = [self._draft(t, m, options) for t, m in zip(self.transcriptions, motions, strict=True)]
+        self._offer(drafts, result, options)
+        for i, (t, plan) in enumerate(zip(self.transcriptions, list(drafts), strict=True)):
+            if np.all(np.isfinite(plan.xs)):
                 try:
-                    certificates = certify_equations(t.problem, t.jacobian, xs, us, t.task)
+                    certificates = certify_equations(t.problem, t.jacobian, plan.xs, plan.us, t.task)
+                    drafts[i] = replace(plan, certificates=certificates)
                 except (GradientError, SimulationError) as refusal:
                     error = refusal
-            found = {name: value for name, value in _arrays(motion).items() if value is not None}
-            found |= {"scheme": self.scheme, "certificates": certificates, "options": dict(options)}
-            by = t.problem, "collocation", "ipopt", Status.FAILED, ""
-            drafts.append(Solution(*by, frozen(xs), frozen(us), **found))
         phases, links = tuple(judged(draft, result) for draft in drafts), tuple[Certificate, ...]()
         try:
             links = self._certified_links(motions)
@@ -514,6 +510,18 @@ class _PhasedRun:
         if error is not None and solution.status in PLANS:
             return _ended(solution, Status.NO_GRADIENT, [str(error)])
         return solution
+
+    def _draft(self, t: Transcription, motion: Transcribed, options: dict[str, Any]) -> Solution:
+        found = {name: value for name, value in _arrays(motion).items() if value is not None}
+        found |= {"scheme": self.scheme, "options": dict(options)}
+        by = t.problem, "collocation", "ipopt", Status.FAILED, ""
+        return Solution(*by, frozen(motion.xs), frozen(motion.us[:-1]), **found)
+
+    def _offer(self, drafts: Sequence[Solution], result: NlpResult, options: dict[str, Any]) -> None:
+        """Hand on what a search came to; what it claims is not looked at yet."""
+        phases = tuple(unmeasured(draft, result) for draft in drafts)
+        told = phases[0].status, phases[0].message, phases
+        self.report.found(PhasedSolution(self.problem, *told, iterations=result.iterations, options=options))
 
     def _certified_links(self, motions: list[Transcribed]) -> tuple[Certificate, ...]:
         """GradientError where a derivative is refused."""

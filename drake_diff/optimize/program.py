@@ -2,12 +2,10 @@
 
 import enum
 import math
-import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,10 +37,23 @@ class Iteration:
 
 
 class Report:
-    """Where the progress of a solve goes: a `line` for people, an Iteration for `callback`."""
+    """Where the progress of a solve goes: a `line` for people, an Iteration for `callback`, and for `plan` what a
+    search came to, before it is measured.
+    """
 
-    def __init__(self, line: Callable[[str], None] | None = None, callback: Callable[[Iteration], None] | None = None):
-        self.line, self.callback = line, callback
+    def __init__(
+        self,
+        line: Callable[[str], None] | None = None,
+        callback: Callable[[Iteration], None] | None = None,
+        plan: Callable[[Any], None] | None = None,
+    ):
+        self.line, self.callback, self.plan = line, callback, plan
+        self.asked: Any = None  # the `Search` that is reported on
+
+    def found(self, plan: Any) -> None:
+        """Hand on a solution that is not measured yet."""
+        if self.plan is not None:
+            self.plan(replace(plan, search=self.asked))
 
     def row(self, row: Iteration, *, printed: bool = True) -> None:
         """Hand on `row`, and print it."""
@@ -110,7 +121,7 @@ class NlpResult:
 
 
 class Watch:
-    """What is kept of a solve while it runs: the best iterate, and whether Ctrl-C or the clock ends it."""
+    """What is kept of a solve while it runs: the best iterate, and whether a signal or the clock ends it."""
 
     def __init__(self, limits: Limits, interrupted: threading.Event):
         self.limits, self.interrupted = limits, interrupted
@@ -144,28 +155,3 @@ class Watch:
     def best_of(self, guess: Array) -> Array:
         """The best iterate, the guess where there was none."""
         return guess if self.best is None else self.best
-
-
-class _Flag(threading.Event):
-    """A handler of Ctrl-C that notes it."""
-
-    def __call__(self, *_: Any) -> None:
-        self.set()
-
-
-@contextmanager
-def ctrl_c() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets, in the main thread, until the block ends; that of a block around it, if any."""
-    flag = _Flag()
-    if threading.current_thread() is not threading.main_thread():
-        yield flag
-        return
-    former = signal.getsignal(signal.SIGINT)
-    if isinstance(former, _Flag):
-        yield former
-        return
-    signal.signal(signal.SIGINT, flag)
-    try:
-        yield flag
-    finally:
-        signal.signal(signal.SIGINT, former)

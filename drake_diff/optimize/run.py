@@ -20,7 +20,7 @@ from drake_diff.optimize.continuation import Stages, solve_continuation
 from drake_diff.optimize.guess import Guess
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through_jumps
-from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused
+from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused, unmeasured
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
@@ -162,6 +162,7 @@ class Run:
         result, xs, us, u_final = solve_collocation(
             self.problem, guess.xs, guess.us, solver=self.solver, limits=self.limits, report=self.report
         )
+        self._offer(self._draft(xs, us, u_final=u_final), result)
         if np.all(np.isfinite(xs)):
             certificates += certify_equations(self.problem, jacobian, xs, us)
         return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates), result)
@@ -171,19 +172,18 @@ class Run:
     ) -> Solution:
         xs, us = motion.xs, motion.us[:-1]
         self.options["derivatives"] = motion.derivatives
+        found = {
+            "u_final": None if self.problem.is_map else motion.us[-1],
+            "us_mid": None if self.scheme == "drake" else motion.us_mid,
+            "free_horizon": motion.horizon if self.problem.horizon else None,
+            "mesh": motion.mesh if len(us) > self.problem.num_steps else None,
+            "parameters": frozen(motion.task.parameters),
+            "multipliers": motion.result.multipliers,
+        }
+        self._offer(self._draft(xs, us, **found), motion.result)
         if np.all(np.isfinite(xs)):
             certificates += certify_equations(self.problem, transcription.jacobian, xs, us, motion.task)
-        draft = self._draft(
-            xs,
-            us,
-            u_final=None if self.problem.is_map else motion.us[-1],
-            us_mid=None if self.scheme == "drake" else motion.us_mid,
-            free_horizon=motion.horizon if self.problem.horizon else None,
-            mesh=motion.mesh if len(us) > self.problem.num_steps else None,
-            parameters=frozen(motion.task.parameters),
-            multipliers=motion.result.multipliers,
-            certificates=certificates,
-        )
+        draft = self._draft(xs, us, certificates=certificates, **found)
         if self.searched is None and draft.transcribed is not None:  # else it was measured under another cost
             draft.transcribed.measured_as(motion)
         return self._judge(draft, motion.result)
@@ -264,18 +264,29 @@ class Run:
             z = variables.pack(xs[0], us, result.parameters)
             if self.method == "shooting" and len(result.z) == variables.size:
                 z = np.clip(result.z, *variables.limits())  # which solvers keep within their tolerance
+            if self.report is not None and self.report.plan is not None:  # else it need not be rolled out
+                drawn = variables.states(z), variables.unpack(z)[1]
+                self._offer(self._draft(*drawn, **self._design_of(variables, z)), result)
             xs, us, after, blindness = self._look_at(variables, z, found=True)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us, certificates=before), error)
-        values = variables.parameters(z).values
         if result.note:
             self.options["contact_sequence"] = result.note
-        design, horizon = self.problem.design, None
-        if self.problem.horizon is not None:
-            horizon = float(np.clip(design.time_step(values) * self.problem.num_steps, *self.problem.horizon))
-        found = {"certificates": before + after, "parameters": frozen(design.own(values)), "free_horizon": horizon}
+        found = {"certificates": before + after, **self._design_of(variables, z)}
         solution = self._judge(self._draft(xs, us, multipliers=result.multipliers, **found), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
+
+    def _design_of(self, variables: ShootingVariables, z: Array) -> dict[str, Any]:
+        """The parameters and the horizon in z."""
+        design, values, horizon = self.problem.design, variables.parameters(z).values, None
+        if self.problem.horizon is not None:
+            horizon = float(np.clip(design.time_step(values) * self.problem.num_steps, *self.problem.horizon))
+        return {"parameters": frozen(design.own(values)), "free_horizon": horizon}
+
+    def _offer(self, draft: Solution, result: NlpResult) -> None:
+        """Hand on what a search came to; what it claims is not looked at yet."""
+        if self.report is not None:
+            self.report.found(unmeasured(draft, result))
 
     def _first_values(self, guess: Guess) -> Array:
         """(np,) those of the problem's `design` where a search begins."""

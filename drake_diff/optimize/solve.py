@@ -77,6 +77,7 @@ def solve(
     progress: bool | Progress = False,
     callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
+    on_plan: Callable[[Any], None] | None = None,
 ) -> Solution: ...
 @overload
 def solve(
@@ -95,6 +96,7 @@ def solve(
     progress: bool | Progress = False,
     callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
+    on_plan: Callable[[Any], None] | None = None,
 ) -> PhasedSolution: ...
 def solve(
     problem: Problem | PhasedProblem,
@@ -116,6 +118,7 @@ def solve(
     progress: bool | Progress = False,
     callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
+    on_plan: Callable[[Any], None] | None = None,
 ) -> Solution | PhasedSolution:
     """Solve `problem`, certify the derivatives that were used, and measure the result again on Drake's plant.
 
@@ -159,6 +162,7 @@ def solve(
         callback: gets an `Iteration` for each of the solver's (of SNOPT, and of IPOPT by shooting, a few times a
             second). What it raises ends the solve.
         on_start: called once, when all input has been checked and the work begins.
+        on_plan: gets what each search comes to, a `Solution` or `PhasedSolution` that is not measured yet.
 
     Returns:
         A `Solution`, whatever happened: how the solve ended is its `status` and `message`.
@@ -195,7 +199,7 @@ def solve(
     )
     if refine not in (None, True, False):
         raise InputError("refine", got=repr(refine), expected="None, True or False")
-    report = Report(print if progress is True else (progress or None), callback)
+    report = Report(print if progress is True else (progress or None), callback, on_plan)
     arguments: dict[str, Any] = {
         "method": method,
         "scheme": scheme,
@@ -212,6 +216,7 @@ def solve(
     }
     if _count("restarts", restarts):
         arguments["restarts"] = int(restarts)
+    report.asked = Search(arguments, initial_guess)
     if isinstance(problem, PhasedProblem):
         if restarts:
             raise InputError("restarts", got=restarts, expected="0 for a PhasedProblem")

@@ -41,7 +41,7 @@ def written_whole(directory: str | Path) -> Iterator[Path]:
     target = Path(directory).resolve()
     check_place(target)
     with writing(target):
-        partial = target.with_name(f"{target.name}.partial-{os.getpid()}-{secrets.token_hex(4)}")
+        partial = partial_of(target)
         make_folder(partial)
         try:
             yield partial
@@ -50,7 +50,7 @@ def written_whole(directory: str | Path) -> Iterator[Path]:
             with suppress(OSError):
                 partial.rmdir()  # where nothing was written
             if partial.is_dir() and isinstance(error, WriteError):
-                raise WriteError(f"{error}; what was written is in {partial}") from error
+                raise _kept(f"{error}; what was written is in {partial}", partial) from error
             if partial.is_dir():
                 error.add_note(f"what was written is in {partial}")
             raise
@@ -127,7 +127,18 @@ def _clear(old: Path | None, target: Path) -> None:
             remove_folder(replaced)
     except WriteError as error:
         left = "" if old is None else f", and the one before in {old}"
-        raise WriteError(f"{error}; the run is in {target}{left}") from error
+        raise _kept(f"{error}; the run is in {target}{left}", target) from error
+
+
+def _kept(message: str, folder: Path) -> WriteError:
+    error = WriteError(message)
+    error.kept = folder
+    return error
+
+
+def partial_of(target: Path) -> Path:
+    """A new name beside `target`, for what is written there first."""
+    return target.with_name(f"{target.name}.partial-{os.getpid()}-{secrets.token_hex(4)}")
 
 
 def name_of(folder: Path) -> str:

@@ -17,6 +17,7 @@ from functools import cache
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
@@ -48,7 +49,6 @@ from drake_diff.optimize.program import (
     NlpResult,
     Outcome,
     Report,
-    ctrl_c,
 )
 
 # Regularization, of the inputs' own curvature: the least at all, the first that is tried, and the last.
@@ -121,7 +121,7 @@ def solve_ilqr(
     search.constraints.penalty = max(search.constraints.penalty, least_penalty)
     if begun is not None and begun.sizes == (0, len(search.constraints.forces)):
         search.constraints.forces = begun.rows
-    with ctrl_c() as interrupted:
+    with noted_interrupts() as interrupted:
         outcome = search.run(interrupted)
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps{search.told_of_refusals}"
     motion, found = search.motion, problem.design.values(search.motion.c)

@@ -17,6 +17,7 @@ from pydrake.autodiffutils import ExtractValue
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
+from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.soft_contact import Separation, distances, separations
@@ -25,7 +26,7 @@ from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Outcome, Report, ctrl_c
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 
 MARGIN = 1e-5  # [m] that a held pair keeps from just touching: differences of 1e-6 then see no jump
@@ -113,7 +114,7 @@ def solve_through_jumps(
     sequences together. Raises as `solve_ilqr` does.
     """
     search = _Sequences(problem, limits, report, values)
-    with ctrl_c() as interrupted:
+    with noted_interrupts() as interrupted:
         result, xs, us = search.run(xs, us, interrupted)
     return replace(result, z=us.ravel(), iterations=tuple(search.rows)), xs, us
 

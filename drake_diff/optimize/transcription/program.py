@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,
@@ -28,7 +29,6 @@ from drake_diff.optimize.program import (
     Outcome,
     Report,
     Watch,
-    ctrl_c,
 )
 from drake_diff.optimize.transcription.coupled import SlopeRows, rows_of, slopes_of
 from drake_diff.optimize.transcription.expressions import KnotFunctions, Timed
@@ -402,7 +402,7 @@ def solve_ipopt(
     }
     if not exact:
         options |= {"ipopt.hessian_approximation": "limited-memory", "pass_nonlinear_variables": False}
-    with ctrl_c() as interrupted:
+    with noted_interrupts() as interrupted:
         watch = Watch(limits, interrupted)
         callback = _IterateCallback(program, watch, report)
         options |= program.derivatives(exact) | {"iteration_callback": callback}

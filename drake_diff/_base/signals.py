@@ -1,0 +1,69 @@
+"""Ctrl-C, SIGTERM and SIGHUP alike: a search notes them and ends with its best plan, all else is interrupted."""
+
+import os
+import signal
+import stat
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+INTERRUPTED = 130  # the exit status, as shells have it after Ctrl-C
+ALIKE = (signal.SIGTERM, signal.SIGHUP)
+
+
+def interrupt(number: int, frame: Any) -> None:
+    """A handler that does what Python does at Ctrl-C."""
+    _hush(number)
+    raise KeyboardInterrupt
+
+
+class _Flag(threading.Event):
+    """A handler that notes that a signal came."""
+
+    def __call__(self, number: int, frame: Any) -> None:
+        _hush(number)
+        self.set()
+
+
+def interrupt_alike() -> None:
+    """From here on SIGTERM and SIGHUP raise KeyboardInterrupt, where they would have ended the process."""
+    for number in ALIKE:
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, interrupt)
+
+
+@contextmanager
+def noted_interrupts() -> Iterator[threading.Event]:
+    """An event that these signals set, in the main thread, until the block ends; that of a block around it, if any.
+
+    What a user's own handler does, and what is ignored, as after nohup, stays so for SIGTERM and SIGHUP.
+    """
+    flag = _Flag()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    former = {number: signal.getsignal(number) for number in (signal.SIGINT, *ALIKE)}
+    outer = former[signal.SIGINT]
+    if isinstance(outer, _Flag):
+        yield outer
+        return
+    taken = [n for n, was in former.items() if n == signal.SIGINT or was in (signal.SIG_DFL, interrupt)]
+    for number in taken:
+        signal.signal(number, flag)
+    try:
+        yield flag
+    finally:
+        for number in taken:
+            signal.signal(number, former[number])
+
+
+def _hush(number: int) -> None:
+    """A terminal that has hung up takes no more words: they go nowhere, where else each would be an error."""
+    if number != signal.SIGHUP:
+        return
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty says no of one that has hung up
+            os.dup2(nowhere, stream)
+    os.close(nowhere)
