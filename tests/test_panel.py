@@ -5,23 +5,29 @@ import json
 import math
 import os
 import random
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.table import each_row
+from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff._base.statistics import success_rate
+from drake_diff.artifact import list_runs
+from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
-from drake_diff.panels.panel_file import canonical, expand, load_panel
+from drake_diff.panels.panel_file import expand, load_panel
 from drake_diff.panels.ranking import ranked
 from drake_diff.panels.workers import row_of
+from drake_diff.record.sealed import canonical as sealed_canonical
+from drake_diff.record.sealed import own_sha256
 
 FUNCTIONS = """
 import os, random, time
@@ -488,11 +494,86 @@ def test_every_trial_has_a_record_that_is_the_same_for_any_number_of_workers(wri
         record = told[row["id"]]
         assert record["inputs"]["seed"] == row["seed"]
         assert record["cell"] == {"method": "a", "level": row["level"]}
-        assert record["verdict"] == ("fail" if row["level"] == 2 else "not judged")
+        assert record["verdict"] == ("fail" if row["level"] == 2 else "pass")
         assert ("error" in record["result"]) == (row["level"] == 2)
         assert record["panel"]["evaluate"] == "trials.py:fails"
-        content = {key: value for key, value in record.items() if key != "sha256"}
-        assert record["sha256"] == sha256(canonical(content)).hexdigest()
+        assert own_sha256(record) == record["record_sha256"]
+
+
+def test_a_panel_and_its_trials_are_records(write, tmp_path):
+    done = dd.panels.run_panel(write("fails"), out=tmp_path / "runs" / "mine", workers=1)
+    record = dd.load_record(done.directory)
+    assert (record.kind, record.verdict, record.trials, record.errors) == ("panel", "fail", len(done.rows), done.errors)
+    assert record.ranking[0]["name"] in record.sentence
+    found = dd.verify(done.directory)
+    assert (found.verdict, found.complaints) == ("intact", ())
+    assert "no trial was evaluated again" in found.unchecked[0]
+    (line,) = list_runs(tmp_path / "runs")
+    assert (line.name, line.kind, line.verdict) == ("mine", "panel", "fail")
+    trials = list_runs(done.directory)
+    assert [t.name for t in trials] == [dd.load_record(t.directory).name for t in trials]
+    assert [t.kind for t in trials] == ["trial"] * len(done.rows)
+    for row in done.rows:
+        path = done.directory / "trials" / f"{row['id']}.json"
+        assert dd.load_record(path).result == {k: v for k, v in row.items() if k in ("cost", "error", "threads")}
+        assert dd.verify(path).verdict == "intact"
+    listed = CliRunner().invoke(app, ["list", str(done.directory)])
+    assert listed.exit_code == 0
+    assert "method=a level=2" in listed.output
+
+
+def sealed_again(path, **changes):
+    """Whoever changes a record can take its hash again."""
+    fields = {**json.loads(path.read_bytes()), **changes}
+    path.write_text(sealed_canonical({**fields, "record_sha256": own_sha256(fields)}))
+
+
+def files_again(directory):
+    """And the hashes of all files in the panel's record."""
+    dd.load_record(directory).write(directory)
+
+
+def test_a_panel_whose_files_do_not_follow_from_its_journal_is_broken(write, tmp_path):
+    made = dd.panels.run_panel(write("fails"), out=tmp_path / "panel", workers=1).directory
+    trial = min((made / "trials").iterdir())
+    one = json.loads(trial.read_bytes())
+
+    def broken(change, expected, *, of=None):
+        copy = tmp_path / "copy"
+        shutil.copytree(made, copy)
+        change(copy)
+        files_again(copy)
+        told = dd.verify(copy if of is None else copy / of)
+        assert told.verdict == "broken", expected
+        assert any(re.search(expected, line) for line in told.complaints), told.complaints
+        shutil.rmtree(copy)
+
+    in_trials = f"trials/{trial.name}"
+    better = {
+        "result": {"cost": -1.0},
+        "verdict": "pass",
+        "sentence": "it ran, and does not say whether it is a success",
+    }
+    broken(lambda d: sealed_again(d / in_trials, **better), "its result or its panel is not that of trials.jsonl")
+    broken(lambda d: sealed_again(d / in_trials, **better), "is not that of trials.jsonl", of=in_trials)
+    other = {**one["inputs"], "seed": 1}
+    broken(lambda d: sealed_again(d / in_trials, inputs=other), "its inputs are those of trial", of=in_trials)
+    wrong = (made / "table.csv").read_text().replace("ValueError", "Nothing")
+    broken(lambda d: (d / "table.csv").write_text(wrong), "table.csv: it does not come out")
+    broken(lambda d: (d / in_trials).write_text(trial.read_text().replace("a level", "b level")), "record_sha256",
+           of=in_trials)  # fmt: skip
+    ranking = [{**row, "place": 1} for row in dd.load_record(made).ranking]
+    broken(lambda d: sealed_again(d / "panel.json", ranking=ranking), "panel.json: ranking is not what the table says")
+
+    def cut(directory):
+        lines = (directory / "trials.jsonl").read_bytes().splitlines(keepends=True)
+        (directory / "trials.jsonl").write_bytes(b"".join(lines[:-1]))
+
+    broken(cut, "only one of them has trial|does not have this trial")
+    plain = tmp_path / "changed"
+    shutil.copytree(made, plain)
+    (plain / "summary.json").write_text("{}")  # without new hashes
+    assert any("summary.json: its 2 bytes" in line for line in dd.verify(plain).complaints)
 
 
 def cell(name, successes, trials, cost=None, errors=0):

@@ -23,6 +23,7 @@ from drake_diff import artifact
 from drake_diff.artifact import measure
 from drake_diff.artifact.sections import describe_problem, rebuild_problem
 from drake_diff.exceptions import ArtifactError
+from drake_diff.record.panel import PanelTrialRecord
 from drake_diff.record.parts import DataBoundary, Metric
 from drake_diff.record.provenance import named_files
 from drake_diff.record.read import KINDS
@@ -126,7 +127,7 @@ def pendulum(**changes):
 
 
 def test_the_published_schema_is_what_pydantic_generates():
-    for kind in KINDS:
+    for kind in (*KINDS, PanelTrialRecord):
         assert kind.published_schema() == kind.generated_schema()
 
 

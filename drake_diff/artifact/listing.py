@@ -7,7 +7,8 @@ from typing import Any
 from drake_diff.artifact.differences import READ, differences, is_near, is_number
 from drake_diff.exceptions import ArtifactError
 from drake_diff.record.directory import is_partial
-from drake_diff.record.read import kind_of
+from drake_diff.record.panel import TRIALS, PanelTrialRecord, is_trial_file
+from drake_diff.record.read import kind_of, load_record
 from drake_diff.record.sealed import SealedRecord
 from drake_diff.record.solve import EvidenceRecord
 
@@ -20,8 +21,9 @@ NO_CHOICE = ("contract.source", "solver.status", "solver.message", "solver.solve
 class RunLine:
     """One directory: what its record says, unverified; `verdict` is "unreadable" where it says nothing.
 
-    It is "incomplete" of what was not moved to its place, whatever it says. `kind` is "solve", "comparison",
-    "robustness" or "certification"; only a solve has a status and a cost.
+    It is "incomplete" of what was not moved to its place, whatever it says. `kind` is that of the record, as "solve",
+    "comparison" or "trial"; only a solve has a status, and only a solve and a trial of a panel a cost. A trial is
+    called by its cell.
 
     Example:
         >>> from drake_diff.artifact import list_runs
@@ -85,7 +87,7 @@ def list_runs(directory: str | Path) -> list[RunLine]:
     """List the directories in `directory` that have a record, by name, without verifying them.
 
     Args:
-        directory: Where the directories are.
+        directory: Where the directories are. Of a panel's own directory its trials are listed.
 
     Returns:
         A `RunLine` for each.
@@ -101,15 +103,21 @@ def list_runs(directory: str | Path) -> list[RunLine]:
     folder = Path(directory)
     if not folder.is_dir():
         raise ArtifactError(f"{folder}: expected a directory of runs, got no directory")
-    paths = [path for path in sorted(folder.iterdir()) if path.is_dir()]
-    return [_line(path, kind_of(path)) for path in paths if kind_of(path) or is_partial(path)]
+    trials = folder / TRIALS
+    files = trials.iterdir() if trials.is_dir() else folder.iterdir() if folder.name == TRIALS else ()
+    paths = [*(path for path in folder.iterdir() if path.is_dir()), *(path for path in files if is_trial_file(path))]
+    return [_line(path, _kind(path)) for path in sorted(paths) if _kind(path) or is_partial(path)]
+
+
+def _kind(path: Path) -> type[SealedRecord] | None:
+    return PanelTrialRecord if is_trial_file(path) else kind_of(path)
 
 
 def _line(path: Path, kind: type[SealedRecord] | None) -> RunLine:
     if kind is None:
         return RunLine(path, path.name, "", "incomplete", "", None, "", "")
     try:
-        record = kind.read(path)
+        record = load_record(path)
     except ArtifactError:
         return RunLine(path, path.name, kind.FILE.removesuffix(".json"), "unreadable", "", None, "", "")
     cost, status, model = None, "-", record.model.file.path if record.model.file else ""
@@ -117,8 +125,11 @@ def _line(path: Path, kind: type[SealedRecord] | None) -> RunLine:
         cost = next((m.value for m in record.metrics if m.name == "cost"), None)
         status = record.solver.status if record.solver else "-"
         model = str(record.contract.get("name", ""))
-    verdict = "incomplete" if is_partial(path) else record.verdict
-    return RunLine(path, path.name, record.kind, verdict, status, cost, model, record.wall_clock.written_utc)
+    verdict, name = "incomplete" if is_partial(path) else record.verdict, path.name
+    if isinstance(record, PanelTrialRecord):
+        name, given = record.name, record.result.get("cost")
+        cost = float(given) if isinstance(given, (int, float)) else None
+    return RunLine(path, name, record.kind, verdict, status, cost, model, record.wall_clock.written_utc)
 
 
 def compare_runs(a: str | Path, b: str | Path) -> RunComparison:

@@ -22,6 +22,7 @@ from drake_diff.artifact.differences import (
     compare_text,
     compare_traces,
 )
+from drake_diff.artifact.panel_again import odd_panel, odd_trial
 from drake_diff.artifact.phases_again import PhasesAgain, inconsistencies, phases_again
 from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, rebuilt, resolve
 from drake_diff.artifact.save import FILES
@@ -32,6 +33,7 @@ from drake_diff.record.certification import CertificationRecord, certify_model
 from drake_diff.record.comparison import ComparisonRecord
 from drake_diff.record.directory import is_partial
 from drake_diff.record.identification import IdentificationRecord
+from drake_diff.record.panel import PanelRecord, PanelTrialRecord, is_trial_file
 from drake_diff.record.parts import FileEvidence
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.provenance import packages_here
@@ -62,6 +64,8 @@ NOT_RERUN = {
     "comparison": "the engines were not run again",
     "robustness": "the trials were not run again",
     "rollout": "a loss is a function, and was not asked again",
+    "panel": "no trial was evaluated again: their function is not in the directory",
+    "trial": "it was not evaluated again: its function is not in the directory",
 }
 
 
@@ -166,13 +170,15 @@ def verify(directory: str | Path) -> Verification:
     again. So whoever changes a value and all hashes with it is found, and the message names the value. A record of an
     easier task is as true as any: `claimed` says what was asked.
 
-    Comparisons, robustness trials and rollouts' certificates are not run again: their verdict is at best "intact". What
+    Comparisons, robustness trials, panels and rollouts' certificates are not run again: their verdict is at best
+    "intact". Of a panel, and of the record of one trial of it, what follows from its journal is made again. What
     cannot be run again (a model that came from a diagram, a user's functions, a search that a time limit ended) makes
     the verdict "undecided", and so does another version of Drake where numbers differ. It takes as long as the solve
     did.
 
     Args:
-        directory: What `save`, `save_comparison`, `save_robustness`, `certify_model` or `save_rollout` wrote.
+        directory: What `save`, `save_comparison`, `save_robustness`, `certify_model`, `run_panel` or `save_rollout`
+            wrote; or trials/ID.json of a panel.
 
     Returns:
         A `Verification`: the verdict, what was claimed, what was not checked, and what does not hold.
@@ -186,6 +192,8 @@ def verify(directory: str | Path) -> Verification:
         ('holds', ())
     """
     folder = Path(directory)
+    if is_trial_file(folder):
+        return _verify_trial(folder)
     if not folder.is_dir():
         raise ArtifactError(f"{folder}: expected a directory that drake_diff wrote, got no directory")
     kind = kind_of(folder)
@@ -227,6 +235,8 @@ def _run_again(found: Verification, record: SealedRecord) -> Verification:
             return _phases_again(found, record)
         if isinstance(record, IdentificationRecord):
             return _identify_again(found, record)
+        if isinstance(record, PanelRecord):
+            found = _judged(found, odd_panel(found.directory, record), [])
     except (ModelError, MissingDependencyError) as error:
         return _without_its_functions(found, record, error)
     except ArtifactError as error:
@@ -234,6 +244,10 @@ def _run_again(found: Verification, record: SealedRecord) -> Verification:
     except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
         # what a forger put together need not fit in any way
         return _judged(found, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
+    return _not_run_again(found, record)
+
+
+def _not_run_again(found: Verification, record: SealedRecord) -> Verification:
     told = [f"every number: {NOT_RERUN[record.kind]}"]
     for e in record.engines if isinstance(record, ComparisonRecord) else ():
         if e.function is not None:
@@ -276,20 +290,37 @@ def _refuse(folder: Path, problems: Sequence[str]) -> None:
         raise ArtifactError(f"{folder}: {problems[0]}")
 
 
+def _verify_trial(path: Path) -> Verification:
+    """The record of one trial of a panel, its hash and id, and the journal of its panel where that is beside it."""
+    try:
+        record, problems = _parsed(path, PanelTrialRecord)
+        problems += odd_trial(path, record)
+    except ArtifactError as error:
+        return Verification(path, None, complaints=(str(error),))
+    found = Verification(path, record, claimed=claims_of(record), notes=_other_versions(record))
+    return replace(found, complaints=tuple(problems), unchecked=(f"every number: {NOT_RERUN[record.kind]}",))
+
+
 def _read_checked(folder: Path, kind: type[R]) -> tuple[R, tuple[str, ...]]:
     """The record in `folder`, and what of it and of the files beside it is damaged."""
-    try:
-        fields, problems = read_fields(folder / kind.FILE), []
-        record = kind.parse(folder / kind.FILE, fields)
-        if canonical(fields).encode() != read_plain(folder / kind.FILE, MOST_TEXT):
-            problems.append(f"{kind.FILE}: its bytes are not those that drake_diff writes for its content")
-        if fields.get("schema_version") == SCHEMA_VERSION and fields != record.model_dump(mode="json"):
-            problems.append(f"{kind.FILE}: a field is missing, or has another type than drake_diff writes")
-        if own_sha256(fields) != fields.get("record_sha256"):
-            problems.append(f"{kind.FILE}: its content does not match its record_sha256: something in it was changed")
-    except RecursionError as error:
-        raise ArtifactError(f"{kind.FILE}: nested too deep") from error
+    record, problems = _parsed(folder / kind.FILE, kind)
     return record, (*problems, *_damage_of_files(folder, record))
+
+
+def _parsed(path: Path, kind: type[R]) -> tuple[R, list[str]]:
+    """The record in a file, and what of it is damaged."""
+    try:
+        fields, problems = read_fields(path), []
+        record = kind.parse(path, fields)
+        if canonical(fields).encode() != read_plain(path, MOST_TEXT):
+            problems.append(f"{path.name}: its bytes are not those that drake_diff writes for its content")
+        if fields.get("schema_version") == SCHEMA_VERSION and fields != record.model_dump(mode="json"):
+            problems.append(f"{path.name}: a field is missing, or has another type than drake_diff writes")
+        if own_sha256(fields) != fields.get("record_sha256"):
+            problems.append(f"{path.name}: its content does not match its record_sha256: something in it was changed")
+    except RecursionError as error:
+        raise ArtifactError(f"{path.name}: nested too deep") from error
+    return record, problems
 
 
 def _damage_of_files(folder: Path, record: SealedRecord) -> Iterator[str]:

@@ -121,7 +121,9 @@ def panel(
         rows.add_row(*(plain(word) for word in words))
     show(rows)
     show(f"{found.summary['trials']} trials, {found.errors} errors")
-    show(f"wrote {directory}: table.csv, summary.json, trials.jsonl, a record of each trial in trials, panel.html")
+    show(
+        f"wrote {directory}: panel.json, table.csv, summary.json, trials.jsonl, panel.html, a record of each in trials"
+    )
     raise typer.Exit(1 if found.errors else 0)
 
 

@@ -1,12 +1,13 @@
 """Run a panel: from its file to its table, going on where an earlier run was stopped."""
 
+import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
 from drake_diff._base.arrays import positive_int
 from drake_diff.panels.panel_file import expand, load_panel
-from drake_diff.panels.results import PanelTable, journal, write_table
+from drake_diff.panels.results import PanelTable, begun_record, ended_record, journal, write_table
 from drake_diff.panels.workers import TrialFunction, check_engine, evaluate_all
 from drake_diff.record.provenance import provenance_of
 
@@ -26,7 +27,8 @@ def run_panel(
 
     Each finished trial is at once a line of `trials.jsonl`. After a kill or Ctrl-C the same call evaluates only what
     is missing. Table and summary are the same to the byte as without the interruption, for any number of workers and
-    for both engines. A trial that raises is a row with the column `error`.
+    for both engines. A trial that raises is a row with the column `error`. `dd.load_record`, `dd.verify` and
+    `drake-diff list` take the directory, and the record of each trial in it.
 
     Args:
         path: the panel, a TOML file; `drake_diff.panels.panel_file` says what stands in it.
@@ -72,7 +74,10 @@ def run_panel(
         **{name: used.packages.get(name) for name in ("drake", "drake-diff", "numpy")},
     }
     directory = Path(out) if out is not None else Path("artifacts") / path.stem
+    start = time.monotonic()
     with journal(directory, made, {trial.id for trial in trials}) as book:
+        begun = begun_record(directory, len(trials), made)
+        begun.begin(directory)
         errors = sum("error" in row for row in book.rows.values())
         left = [trial for trial in trials if trial.id not in book.rows]
         with closing(evaluate_all(left, function, count, engine, address)) as finished:
@@ -81,4 +86,6 @@ def run_panel(
                 errors += "error" in row
                 if progress:
                     progress(len(book.rows), len(trials), errors)
-        return write_table(directory, trials, book.rows, made)
+        table = write_table(directory, trials, book.rows, made)
+        ended_record(begun, table, time.monotonic() - start).write(directory)
+        return table

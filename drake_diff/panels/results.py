@@ -22,10 +22,14 @@ from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import success_rate
 from drake_diff.exceptions import ArtifactError
 from drake_diff.panels.panel_file import PanelTrial, canonical, cell_name
-from drake_diff.panels.ranking import write_ranking
+from drake_diff.panels.ranking import ranked, write_ranking
 from drake_diff.panels.workers import Row
+from drake_diff.record.panel import TRIALS, PanelRecord, PanelTrialRecord, no_model, trial_record
+from drake_diff.record.provenance import provenance_of, written_now
+from drake_diff.record.sealed import WallClock
 
-JOURNAL, TABLE, SUMMARY, TRIALS, PAGE = "trials.jsonl", "table.csv", "summary.json", "trials", "panel.html"
+JOURNAL, TABLE, SUMMARY, PAGE = "trials.jsonl", "table.csv", "summary.json", "panel.html"
+RANKED = ("place", "name", "apart", "trials", "errors", "success", "numbers")  # of a cell in the record of a panel
 SHOWN_CELLS = 8  # in a repr
 
 
@@ -88,6 +92,25 @@ def journal(directory: Path, panel: Mapping[str, Any], known: Collection[str]) -
             raise ArtifactError(f"{path}: another process is at work on this panel") from error
         file.seek(0)
         yield Journal(path, file, panel, known)
+
+
+def read_journal(path: Path, data: bytes) -> tuple[dict[str, Any], dict[str, Row]]:
+    """What the panel is, and the rows by trial, of the bytes of a journal that is complete.
+
+    ArtifactError where a line is damaged, half written, or of a trial that stands there twice.
+    """
+    *lines, rest = data.split(b"\n")
+    if rest or not lines:
+        raise ArtifactError(f"{path}: its last line is half written")
+    panel, rows, head = _read_line(path, 1, lines[0], b"").get("panel"), {}, lines[0] + b"\n"
+    for number, line in enumerate(lines[1:], 2):
+        found = _read_line(path, number, line, head)
+        if not isinstance(found.get("row"), dict) or found.get("id") in rows:
+            raise ArtifactError(f"{path}, line {number}: expected a row, of each trial once")
+        rows[str(found["id"])] = found["row"]
+    if not isinstance(panel, dict):
+        raise ArtifactError(f"{path}, line 1: expected what the panel is")
+    return panel, rows
 
 
 def _line(content: Mapping[str, Any], head: bytes) -> bytes:
@@ -166,29 +189,40 @@ def write_table(
     write_whole(directory / SUMMARY, text.encode() + b"\n")
     (directory / TRIALS).mkdir(exist_ok=True)
     for trial in trials:
-        write_whole(directory / TRIALS / f"{trial.id}.json", trial_record(trial, found[trial.id], made))
+        record = trial_record(trial.id, trial.name, trial.cell, trial.fields, found[trial.id], made)
+        write_whole(directory / TRIALS / f"{trial.id}.json", record.to_json().encode())
+    write_whole(directory / PanelTrialRecord.schema_file(), PanelTrialRecord.published_schema())
     write_ranking(directory / PAGE, summary)
     return PanelTable(directory, rows, summary)
 
 
-def trial_record(trial: PanelTrial, row: Row, made: Mapping[str, Any]) -> bytes:
-    """The record of one trial as JSON: what it was given, what came out, of which panel, with which versions.
+def begun_record(directory: Path, trials: int, made: Mapping[str, Any]) -> PanelRecord:
+    """What panel.json says while trials are missing."""
+    return PanelRecord(
+        name=directory.name,
+        verdict="incomplete",
+        sentence="the panel has started and not finished: it is still running, or it was killed",
+        panel=dict(made),
+        trials=trials,
+        errors=None,
+        model=no_model(),
+        provenance=provenance_of(),
+        wall_clock=WallClock(written_utc=written_now()),
+    )
 
-    It is the same, byte for byte, whichever engine and worker evaluated it; `sha256` is of all else in it.
-    """
-    failed = "error" in row or row.get("success") is False
-    judged = isinstance(row.get("success"), bool)
-    told = {
-        "kind": "trial",
-        "id": trial.id,
-        "cell": trial.cell,
-        "inputs": trial.fields,
-        "result": row,
-        "verdict": "fail" if failed else "pass" if judged else "not judged",
-        "panel": dict(made),
-    }
-    return (
-        json.dumps({**told, "sha256": sha256(canonical(told)).hexdigest()}, sort_keys=True, indent=1).encode() + b"\n"
+
+def ended_record(begun: PanelRecord, table: PanelTable, seconds: float) -> PanelRecord:
+    """What panel.json says at the end; `seconds` is how long this call of the panel took."""
+    by, rows = ranked(table.summary)
+    return begun.model_copy(
+        update={
+            "verdict": "fail" if table.errors else "pass",
+            "sentence": f"{rows[0]['name']} is the best of {len(rows)} cells, by {by}; {table.errors} errors",
+            "errors": table.errors,
+            "ranked_by": by,
+            "ranking": [{key: row[key] for key in RANKED if key in row} for row in rows],
+            "wall_clock": WallClock(written_utc=written_now(), duration_s=seconds),
+        }
     )
 
 

@@ -2,6 +2,8 @@ from .certification import CertificationRecord as CertificationRecord
 from .certification import certify_model as certify_model
 from .comparison import ComparisonRecord as ComparisonRecord
 from .identification import IdentificationRecord as IdentificationRecord
+from .panel import PanelRecord as PanelRecord
+from .panel import PanelTrialRecord as PanelTrialRecord
 from .phases import PhasesRecord as PhasesRecord
 from .robustness import RobustnessRecord as RobustnessRecord
 from .rollout import RolloutRecord as RolloutRecord

@@ -7,10 +7,11 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.record.certification import CertificationRecord
 from drake_diff.record.comparison import ComparisonRecord
 from drake_diff.record.identification import IdentificationRecord
+from drake_diff.record.panel import PanelRecord, PanelTrialRecord, is_trial_file
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.robustness import RobustnessRecord
 from drake_diff.record.rollout import RolloutRecord
-from drake_diff.record.sealed import SealedRecord
+from drake_diff.record.sealed import SealedRecord, read_fields
 from drake_diff.record.solve import EvidenceRecord
 
 KINDS: tuple[type[SealedRecord], ...] = (
@@ -21,6 +22,7 @@ KINDS: tuple[type[SealedRecord], ...] = (
     PhasesRecord,
     RolloutRecord,
     IdentificationRecord,
+    PanelRecord,
 )
 
 
@@ -33,18 +35,18 @@ def kind_of(directory: str | Path) -> type[SealedRecord] | None:
 
 
 def load_record(directory: str | Path) -> SealedRecord:
-    """Read the record in a directory that a solve, a comparison, trials, a certification, an identification or
-    `save_rollout` wrote.
+    """Read the record in a directory that a solve, a comparison, trials, a certification, an identification, a panel or
+    `save_rollout` wrote, or of one trial of a panel.
 
     It is read, not verified: see `verify`.
 
     Args:
         directory: The directory that holds record.json, phases.json, comparison.json, robustness.json,
-            certification.json, rollout.json or identification.json.
+            certification.json, rollout.json, identification.json or panel.json; or trials/ID.json of a panel.
 
     Returns:
         An `EvidenceRecord`, `PhasesRecord`, `ComparisonRecord`, `RobustnessRecord`, `CertificationRecord`,
-        `RolloutRecord` or `IdentificationRecord`.
+        `RolloutRecord`, `IdentificationRecord`, `PanelRecord` or `PanelTrialRecord`.
 
     Raises:
         ArtifactError: There is no such record, or it does not follow its schema.
@@ -54,6 +56,8 @@ def load_record(directory: str | Path) -> SealedRecord:
         >>> record.kind, record.verdict, record.solver.method
         ('solve', 'pass', 'shooting')
     """
+    if is_trial_file(Path(directory)):
+        return PanelTrialRecord.parse(Path(directory), read_fields(Path(directory)))
     kind = kind_of(directory)
     if kind is None:
         names = ", ".join(known.FILE for known in KINDS)
