@@ -65,12 +65,15 @@ def _cells(path: Path) -> dict[bytes, dict[str, Any]]:
 
 
 def _ids(table: bytes) -> list[str]:
+    most = csv.field_size_limit(len(table) + 1)
     try:
         rows = list(csv.reader(io.StringIO(table.decode(), newline="")))
         column = rows[0].index("id")
         names = [row[column] for row in rows[1:]]
     except (UnicodeDecodeError, ValueError, IndexError, csv.Error) as error:
         raise ArtifactError(f"{TABLE}: not a table of trials: {type(error).__name__}: {error}") from error
+    finally:
+        csv.field_size_limit(most)
     if any(not name.isalnum() for name in names):  # it becomes a path
         raise ArtifactError(f"{TABLE}: expected ids of trials, got other names")
     return names

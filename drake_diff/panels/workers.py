@@ -284,7 +284,11 @@ def _check_listens(address: str | None) -> None:
 
 
 def _ray_answers(ray: Any, trials: Sequence[PanelTrial], function: TrialFunction, workers: int | None) -> Answers:
-    lost = (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError, ray.exceptions.OutOfMemoryError)
+    errors = ray.exceptions
+    lost = (
+        errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError,
+        errors.ObjectLostError,  # a row of 100 kB and more stays with its node until it is fetched, and dies with it
+    )  # fmt: skip
     task = ray.remote(max_retries=0)(_answer)  # `evaluate_all` tries again, for both engines
     waiting, flying = iter(trials), {}
     while True:
