@@ -106,6 +106,8 @@ def _begun(name: str, asked: Asked) -> IdentificationRecord:
             held_out=asked.held_out,
             motion=asked.motion,
             max_iterations=asked.max_iterations,
+            priors={key: [np.ravel(part).tolist() for part in pair] for key, pair in asked.priors.items()},
+            bounds={key: [_known(bound) for bound in pair] for key, pair in asked.bounds.items()},
         ),
         recordings=[],
         provenance=provenance_of(),
@@ -139,6 +141,11 @@ def _asked(e: Identification) -> Asked:
 
 def _known(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
+
+
+def _bounds(pair: list[float | None]) -> tuple[float, float]:
+    low, high = pair
+    return -np.inf if low is None else low, np.inf if high is None else high
 
 
 def _recording(i: int, e: Identification, asked: Asked) -> records.RecordingEvidence:
@@ -253,6 +260,8 @@ def identified_again(folder: Path, record: IdentificationRecord) -> tuple[Identi
         found = identify(
             model, given, inputs.parameters, noise=inputs.noise or None, held_out=inputs.held_out, motion=inputs.motion,
             max_iterations=inputs.max_iterations,
+            priors={key: (mean, deviation) for key, (mean, deviation) in inputs.priors.items()} or None,
+            bounds={key: _bounds(pair) for key, pair in inputs.bounds.items()} or None,
         )  # fmt: skip
         if found.asked is None:
             raise ArtifactError("the fit does not say what was asked")

@@ -13,6 +13,7 @@ from drake_diff.cli.text import (
     names_option,
     numbers_in,
     out_option,
+    pairs_in,
     plain,
     progress_line,
     show,
@@ -165,6 +166,14 @@ def identify(
         typer.Option(metavar="PART|NAME", help="The part at the end of each recording, or a recording, to predict."),
     ] = "0.2",
     motion: Annotated[str, typer.Option(help="auto, continuous or steps")] = "auto",
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PARAMETER=MEAN,DEVIATION", help="What is known of a parameter. Can be given again."),
+    ] = None,
+    bounds: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PARAMETER=LOWER,UPPER", help="Between which a parameter is. Can be given again."),
+    ] = None,
     out: Annotated[Path | None, out_option("artifacts/identify_<model>")] = None,
 ) -> None:
     """Estimate parameters of MODEL from recordings: which differ, by how much, how sure, and what stays open.
@@ -179,13 +188,16 @@ def identify(
     directory = out or Path("artifacts") / f"identify_{file.stem}"
     names: Any = "all" if parameters is None else names_in(parameters)
     given = numbers_in("--noise", noise or (), "STATE=DEVIATION")
+    priors = pairs_in("--prior", prior or (), "PARAMETER=MEAN,DEVIATION")
+    within = pairs_in("--bounds", bounds or (), "PARAMETER=LOWER,UPPER")
     try:
         part: float | str = float(held_out)
     except ValueError:
         part = held_out
+    asked: dict[str, Any] = {"noise": given or None, "held_out": part, "motion": motion}
     with written_whole(directory) as folder:
         with progress_line("fitting"):
-            found = estimate(model, list(recording), names, noise=given or None, held_out=part, motion=motion)
+            found = estimate(model, list(recording), names, **asked, priors=priors, bounds=within)
         record: Any = write_identification(found, folder)
     show(judged(record.verdict), record.sentence)
     rows = table("parameter", "before", "found", "95 % from", "to", "unit", "", left=1)

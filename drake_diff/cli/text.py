@@ -154,6 +154,18 @@ def numbers_in(option: str, words: Iterable[str], expected: str) -> dict[str, fl
     return {name: _number(option, value, expected) for name, value in pairs}
 
 
+def pairs_in(option: str, words: Iterable[str], expected: str) -> dict[str, tuple[float, float]]:
+    """Two numbers by name, of "NAME=NUMBER,NUMBER" each."""
+    found = {}
+    for word in words:
+        name, value = _split(option, word, expected)
+        first, comma, second = value.partition(",")
+        if not comma:
+            raise InputError(option, got=repr(word), expected=expected)
+        found[name] = _number(option, first, expected), _number(option, second, expected)
+    return found
+
+
 def _number(option: str, words: str, expected: str) -> float:
     try:
         return float(words)

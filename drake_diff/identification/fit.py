@@ -69,6 +69,10 @@ class Law(Protocol):
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
         ...
 
+    def rates(self, values: Array, x: Array, u: Array) -> Array:
+        """(N, nx) by time, of states (N, nx) under u (N, nu)."""
+        ...
+
 
 @dataclass(eq=False)
 class Segments:
@@ -82,11 +86,40 @@ class Segments:
     counts: NDArray[np.intp]  # (K,) steps of each
     samples: list[NDArray[np.intp]]  # of each segment, the samples of its piece that belong to it
     at: list[NDArray[np.intp]]  # and after how many steps they are
+    by_delay: Array  # (K, M) the lengths of the steps by a delay of inputs
 
 
-def cut_segments(law: Law, pieces: Sequence[Piece], nu: int) -> Segments:
+def steps_between(law: Law, piece: Piece, k: int, delay: float | None) -> tuple[Array, Array, Array]:
+    """From sample k to the next: lengths of the steps (m,) [s], inputs (m, nu), and the lengths by the delay (m,).
+
+    With a delay, steps end where an input changes too; before the first input it is as if that had always acted. An
+    input that changes at a sample makes steps of no length, by which the delay has a derivative there.
+    """
+    a, b = float(piece.times[k]), float(piece.times[k + 1])
+    if delay is None:
+        lengths = np.array(law.cut(b - a))
+        return lengths, np.repeat(piece.us[k : k + 1], len(lengths), axis=0), np.zeros(len(lengths))
+    begin, inputs = piece.switches
+    late = begin + delay
+    inner = np.flatnonzero((late >= a) & (late < b))
+    ends = np.concatenate([[a], late[inner], [b]])
+    before = max(int(inner[0]) - 1 if len(inner) else int(np.searchsorted(late, a, side="right")) - 1, 0)
+    held = [before, *inner]
+    moves = np.concatenate([[0.0], np.ones(len(inner)), [0.0]])
+    parts = [
+        (np.array(law.cut(end - start)), inputs[i], change)
+        for start, end, i, change in zip(ends[:-1], ends[1:], held, np.diff(moves), strict=True)
+    ]
+    return (
+        np.concatenate([lengths for lengths, _, _ in parts]),
+        np.concatenate([np.repeat(u[None], len(lengths), axis=0) for lengths, u, _ in parts]),
+        np.concatenate([np.full(len(lengths), change / len(lengths)) for lengths, _, change in parts]),
+    )
+
+
+def cut_segments(law: Law, pieces: Sequence[Piece], nu: int, delay: float | None = None) -> Segments:
     """The last sample of a piece belongs to its last segment, any other to the segment that it starts or is within."""
-    of_piece, first, hs, us, samples, at = [], [], [], [], [], []
+    of_piece, first, hs, us, samples, at, by_delay = [], [], [], [], [], [], []
     for p, piece in enumerate(pieces):
         n = len(piece.times)
         bounds = [0]
@@ -97,22 +130,24 @@ def cut_segments(law: Law, pieces: Sequence[Piece], nu: int) -> Segments:
         if len(bounds) > 2 and bounds[-1] - bounds[-2] < SEGMENT_SAMPLES:
             bounds.pop(-2)
         for a, b in pairwise(bounds):
-            lengths = [law.cut(float(piece.times[k + 1] - piece.times[k])) for k in range(a, b)]
+            lengths, inputs, changes = zip(*(steps_between(law, piece, k, delay) for k in range(a, b)), strict=True)
             of_piece.append(p)
             first.append(a)
             hs.append(np.concatenate(lengths))
-            us.append(np.repeat(piece.us[a:b], [len(each) for each in lengths], axis=0))
+            us.append(np.concatenate(inputs))
+            by_delay.append(np.concatenate(changes))
             last = b + 1 if b == n - 1 else b
             samples.append(np.arange(a, last))
             at.append(np.concatenate([[0], np.cumsum([len(each) for each in lengths])])[: last - a])
     counts = np.array([len(each) for each in hs], dtype=np.intp)
     longest = max(len(each) for each in hs)
-    all_h, all_u = np.zeros((len(hs), longest)), np.zeros((len(hs), longest, nu))
+    all_h, all_u, all_d = np.zeros((len(hs), longest)), np.zeros((len(hs), longest, nu)), np.zeros((len(hs), longest))
     for k, (h, u) in enumerate(zip(hs, us, strict=True)):
-        all_h[k, : len(h)], all_u[k, : len(u)] = h, u
+        all_h[k, : len(h)], all_u[k, : len(u)], all_d[k, : len(h)] = h, u, by_delay[k]
         all_u[k, len(u) :] = u[-1]
     ids = np.array(of_piece, dtype=np.intp), np.array(first, dtype=np.intp)
-    return Segments(list(pieces), *ids, all_h, all_u, counts, samples, [np.asarray(a, dtype=np.intp) for a in at])
+    after = [np.asarray(a, dtype=np.intp) for a in at]
+    return Segments(list(pieces), *ids, all_h, all_u, counts, samples, after, all_d)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +179,7 @@ class Fit:
     ):
         self.fixed = fixed  # whether the unknowns stay, and only first states are sought
         self.model, self.law, self.chart, self.unknowns, self.noise = model, law, chart, unknowns, noise
-        self.segments = cut_segments(law, pieces, model.nu)
+        self.segments = cut_segments(law, pieces, model.nu, None if unknowns.delay is None else 0.0)
         self.gap_scale = np.empty(chart.size)
         nv, period = model.nv, max(float(np.median(np.diff(pieces[0].times))), 1e-3)
         from_positions = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0) / (5 * period)
@@ -156,15 +191,22 @@ class Fit:
         """How many numbers were measured."""
         return int(sum(np.isfinite(self._measured(p)).sum() for p in range(len(self.segments.pieces))))
 
+    def cut(self, values: Array) -> Segments:
+        """The segments with the steps that these values make: those of a delay of inputs are its own."""
+        if self.unknowns.delay is None:
+            return self.segments
+        return cut_segments(self.law, self.segments.pieces, self.model.nu, float(values[self.unknowns.delay]))
+
     def _measured(self, p: int) -> Array:
         piece = self.segments.pieces[p]
         return np.where(np.isfinite(self.noise), self.chart.minus(piece.ys, piece.ys), np.nan)
 
     def at(self, z: Array, starts: Array) -> "Point | None":
         """The motion there; None where there is none."""
-        values, s = self.unknowns.values(z), self.segments
+        values = self.unknowns.values(z)
         if not self.law.is_possible(values):
             return None
+        s = self.cut(values)
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 xs = self.law.run(values, starts, s.hs, s.us)
@@ -181,13 +223,14 @@ class Fit:
         if len(inner):
             gaps[inner] = self.chart.minus(xs[inner, s.counts[inner]], starts[inner + 1])
         value = sum(float(np.nansum(r**2)) for r in residuals) + self._pull(z)
-        return Point(z, starts, xs, residuals, gaps, value, float(np.linalg.norm(gaps / self.gap_scale)))
+        return Point(z, starts, xs, residuals, gaps, value, float(np.linalg.norm(gaps / self.gap_scale)), s)
 
     def states(self, solved: "Solved") -> list[Array]:
         """(n, nx) of each piece: the motion at its samples."""
-        s = self.segments
+        values = self.unknowns.values(solved.z)
+        s = self.cut(values)
         with np.errstate(over="ignore", invalid="ignore"):
-            xs = self.law.run(self.unknowns.values(solved.z), solved.starts, s.hs, s.us)
+            xs = self.law.run(values, solved.starts, s.hs, s.us)
         found = [np.empty((len(piece.times), self.model.nx)) for piece in s.pieces]
         for k, p in enumerate(s.of_piece):
             found[p][s.samples[k]] = xs[k, s.at[k]]
@@ -212,13 +255,18 @@ class Fit:
         return found
 
     def _pull(self, z: Array) -> float:
-        return float(np.sum(((z - self.unknowns.z_start) / self.unknowns.widths) ** 2))
+        weak = np.sum(((z - self.unknowns.z_start) / self.unknowns.pulls) ** 2)
+        return float(weak + np.sum(self.unknowns.prior_rows(z)[0] ** 2))
 
     def reduce(self, point: "Point") -> Reduced:
         """Linearize, close the gaps to first order, and take the first states out."""
         z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
-        s, nt, nz = self.segments, self.chart.size, len(z)
+        s, nt, nz = point.segments, self.chart.size, len(z)
         A, C = self.law.slopes(z, xs, s.hs, s.us)
+        if self.unknowns.delay is not None:
+            flat = xs[:, 1:].reshape(-1, xs.shape[2]), s.us.reshape(-1, s.us.shape[2])
+            rates = self.law.rates(self.unknowns.values(z), *flat).reshape(xs[:, 1:].shape)
+            C[..., self.unknowns.delay] = rates * s.by_delay[..., None]
         K, M, nx = A.shape[:3]
         along = np.zeros((K, M + 1, nx, nt + nz))
         along[:, 0, :, :nt] = self.chart.from_motion(starts)
@@ -264,10 +312,10 @@ class Fit:
         widths = self.unknowns.widths
         norms = np.linalg.norm(found.R, axis=0)
         scale = np.where(np.isfinite(widths), widths, 1 / np.where(norms > 0, norms, 1.0))
-        pull = np.where(np.isfinite(widths), scale / widths, 0.0)
-        offset = np.where(np.isfinite(widths), (self.unknowns.z_start - z) / widths, 0.0)
-        matrix = np.vstack([found.R * scale, np.diag(pull)])
-        right = np.concatenate([found.b, offset])
+        pulls = self.unknowns.pulls
+        off, by_z = self.unknowns.prior_rows(z)
+        matrix = np.vstack([found.R * scale, np.diag(scale / pulls), by_z * scale])
+        right = np.concatenate([found.b, (self.unknowns.z_start - z) / pulls, -off])
         lower, upper = self.unknowns.bounds
         far = np.where(np.isfinite(widths), LARGEST / 3 * widths, np.inf)
         low, high = np.maximum(lower - z, -far) / scale, np.minimum(upper - z, far) / scale
@@ -332,6 +380,7 @@ class Point:
     gaps: Array  # (K, 2 nv), 0 where a piece ends
     value: float  # |r|^2 with the pull to the file's values
     gap: float  # the size of the gaps
+    segments: Segments
 
 
 def _triangle(matrix: Array) -> Array:

@@ -66,6 +66,10 @@ class ContinuousMotion:
             xs[:, m + 1] = x + h * np.tensordot(weights, slopes, 1)
         return xs
 
+    def rates(self, values: Array, x: Array, u: Array) -> Array:
+        """(N, nx) by time, of states (N, nx) under u (N, nu)."""
+        return self._rates(self.tree.acceleration(set_numbers(self.model, self.tree, self.unknowns, values)), x, u)
+
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
         model, tree, unknowns = self.model, self.tree, self.unknowns

@@ -1,7 +1,7 @@
 """Which parameters of a model are wrong, and by how much, from recordings of its motion."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,7 @@ MOTIONS = ("auto", "continuous", "steps")
 LONGEST, SHORTEST = 0.02, 1e-4  # [s] of the steps of Runge and Kutta
 STEP_ERROR = 1e-3  # of the noise: what a step of half the length may change over a segment
 ROUNDS = 5  # of estimating the noise
+DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0)  # of a time between samples: delays that are tried at first
 SAME_NOISE = 0.01
 
 
@@ -63,6 +64,8 @@ class Asked:
     held_out: float | str
     motion: str
     max_iterations: int
+    priors: Mapping[str, Any] = field(default_factory=dict)
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +118,8 @@ def identify(
     held_out: float | str = 0.2,
     motion: str = "auto",
     max_iterations: int = 60,
+    priors: Mapping[str, tuple[Any, Any]] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> Identification:
     """Estimate parameters of a model from recordings of its motion, with intervals.
 
@@ -124,7 +129,8 @@ def identify(
             were not measured are NaN, or columns that a file lacks; positions alone are enough. Inputs are held from
             each sample to the next. Samples may be any time apart.
         parameters: Names as by `dd.list_parameters`, and beside them JOINT.coulomb_friction, INPUT.strength and
-            STATE.bias; or "all": masses, centres of mass, inertias, dampings, spring stiffnesses and rotor inertias.
+            STATE.bias, and model.input_delay [s], by which inputs act later than they are recorded; or "all": masses,
+            centres of mass, inertias, dampings, spring stiffnesses and rotor inertias.
         noise: The standard deviation of the noise of states, by name. What is not given is estimated.
         held_out: Which part of each recording, its end, is not fitted but predicted; or the name of a recording.
         motion: Which motion is fitted:
@@ -133,6 +139,9 @@ def identify(
             - "steps": the model's own discrete steps with all that acts in them, contact parameters included;
             - "auto": continuous, but steps where bodies touch, a joint is beyond its limit, or the model has no other.
         max_iterations: How many steps of Gauss and Newton the fit may take.
+        priors: What is known of parameters beside the recordings: mean and standard deviation, by name. It counts as
+            one measurement more; without it the file's value only decides where the data say nothing.
+        bounds: Lower and upper bound of parameters, by name.
 
     Returns:
         `.values`, `.intervals` (95 %), `.unidentifiable`, `.explained` with its `.reason`, and a `.sentence`.
@@ -164,7 +173,7 @@ def identify(
         raise ModelError(f"{model.name} has no motion in continuous time here: {why}")
     continuous = motion == "continuous" or (motion == "auto" and not why)
     own_tree = tree if continuous and not isinstance(tree, Refusal) else None
-    unknowns = choose_unknowns(model, own_tree, parameters)
+    unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds)
     stated = given_noise(model, chart, noise)
     scatter = noise_by_differences(chart, pieces)
     problem = Problem(model, chart, unknowns, pieces, stated, scatter)
@@ -176,7 +185,19 @@ def identify(
     fit, solved = problem.solve(law, max_iterations)
     found = problem.judged(fit, solved, why if motion == "auto" else "")
     names = parameters if isinstance(parameters, str) else tuple(parameters)
-    return replace(found, asked=Asked(model, given, files, names, dict(noise or {}), held_out, motion, max_iterations))
+    asked = Asked(
+        model,
+        given,
+        files,
+        names,
+        dict(noise or {}),
+        held_out,
+        motion,
+        max_iterations,
+        dict(priors or {}),
+        dict(bounds or {}),
+    )
+    return replace(found, asked=asked)
 
 
 def what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
@@ -225,7 +246,7 @@ class Problem:
 
     def prepared(self, law: Law) -> tuple[Fit, Array]:
         """By steps that follow the motion, over pieces that are short enough; and a guess of the starts of segments."""
-        z, noise = self.unknowns.z_start, self.first_noise
+        z, noise = self.unknowns.z_first, self.first_noise
         fit = self.fit(law, self.fitted, noise)
         starts = self.guess(fit)
         while not self.follows(fit, z, starts):
@@ -235,15 +256,35 @@ class Problem:
 
     def solve(self, law: Law, most: int) -> tuple[Fit, Solved]:
         """With steps so short that half of them give the same motion over the segments, at the start and at the end."""
-        z = self.unknowns.z_start
         fit, starts = self.prepared(law)
-        pieces = fit.segments.pieces
+        z, pieces = self.first(fit, starts), fit.segments.pieces
         while True:
             fit, solved = self.weighted(fit, z, starts, most)
             if self.follows(fit, solved.z, solved.starts):
                 return fit, solved
             z, starts = solved.z, solved.starts
             fit = self.shortened(fit, pieces, fit.noise)
+
+    def first(self, fit: Fit, starts: Array) -> Array:
+        """Where the search begins: the model's values, and of some delays that by which the rest could fit best.
+
+        A step of Gauss and Newton sees a delay only as far as inputs stay what they are.
+        """
+        z, column = self.unknowns.z_first, self.unknowns.delay
+        if column is None:
+            return z
+        low, high = (float(bound[column]) for bound in self.unknowns.bounds)
+        period = float(np.median(np.diff(self.pieces[0].times)))
+        tried = []
+        for delay in np.clip(period * np.array(DELAYS), low, high):
+            at = z.copy()
+            at[column] = delay
+            if (point := fit.at(at, starts)) is not None:
+                found = fit.reduce(point)
+                dz = fit.step_of(at, found)
+                dz[column] = 0.0
+                tried.append((found.rest + float(np.sum((found.b - found.R @ dz) ** 2)), tuple(at)))
+        return np.array(min(tried)[1]) if tried else z
 
     def follows(self, fit: Fit, z: Array, starts: Array) -> bool:
         """Whether steps of half the length lead to the same ends of all segments; the model's own steps need not."""
@@ -254,8 +295,9 @@ class Problem:
         for law in (fit.law, shorter):
             other = self.fit(law, fit.segments.pieces, fit.noise)
             with np.errstate(over="ignore", invalid="ignore"):
-                xs = law.run(self.unknowns.values(z), starts, other.segments.hs, other.segments.us)
-            ends.append(xs[np.arange(len(xs)), other.segments.counts])
+                segments = other.cut(self.unknowns.values(z))
+                xs = law.run(self.unknowns.values(z), starts, segments.hs, segments.us)
+            ends.append(xs[np.arange(len(xs)), segments.counts])
         gap = self.chart.minus(*ends) / fit.gap_scale
         return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= STEP_ERROR)
 
@@ -350,6 +392,11 @@ class Problem:
         """Why the model does not explain the recordings; empty where it does."""
         if not solved.converged:
             return f"the fit did not converge: {solved.why}"
+        off, _ = self.unknowns.prior_rows(solved.z)
+        if len(off) and np.sum(off**2) > stats.chi2.ppf(0.9999, len(off)):
+            known = [name for one in self.unknowns.each if one.prior is not None for name in one.columns]
+            worst = int(np.argmax(np.abs(off)))
+            return f"{known[worst]} is {abs(off[worst]):.3g} standard deviations from its prior"
         names = tangent_space(self.model).names
         every = np.concatenate(solved.reduced.residuals)
         numbers = np.isfinite(every).sum(axis=0)
@@ -381,7 +428,13 @@ def _sentence(e: Identification, intervals: Array, unknowns: Unknowns, values: A
             size = abs(now - was) / max(high - low, 1e-300)
             changed.append((size, f"{name} is {now:.4g} {unit} ({low:.4g} to {high:.4g}), not {was:.4g}{by}"))
     changed.sort(key=lambda pair: -pair[0])
-    told = [text for _, text in changed[:4]]
+    limits = [bound for one in unknowns.each for bound in [(one.lower, one.upper)] * len(one.start)]
+    at_bound = [
+        f"{name} is at its bound, {now:.4g} {unit}".rstrip()
+        for name, now, unit, bounds in zip(unknowns.columns, values, unknowns.units, limits, strict=True)
+        if any(bound != 0 and abs(now - bound) <= 1e-9 * abs(bound) for bound in bounds)
+    ]
+    told = [text for _, text in changed[:4]] + at_bound[:3]
     if len(changed) > 4:
         told.append(f"{len(changed) - 4} more differ")
     if not changed:

@@ -29,6 +29,7 @@ class Known:
 
 def known_of(unknowns: Unknowns, z: Array, R: Array) -> Known:
     """By the singular values of the Jacobian R (np, np) in units of the noise, first states taken out."""
+    R = np.vstack([R, unknowns.prior_rows(z)[1]])
     norms = np.linalg.norm(R, axis=0)
     sizes = unknowns.widths / FAR
     # Of what has no size, 10 times what the data could tell of it alone: only beside others can it stay open.
@@ -84,7 +85,7 @@ def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float
                 found[s] = np.column_stack([values[s] * np.exp(-wide), values[s] * np.exp(wide)])
         else:
             found[s] = np.column_stack([values[s] - t * spread[s], values[s] + t * spread[s]])
-            found[s] = np.maximum(found[s], one.lower)
+        found[s] = np.clip(found[s], one.lower, one.upper)
     return found
 
 

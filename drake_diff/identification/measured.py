@@ -33,11 +33,21 @@ class Piece:
     us: Array  # (n-1, nu) held from each sample to the next
     held_out: bool
     recording: int = 0  # which one it is of
+    earlier: tuple[Array, Array] | None = None  # times (m,) and inputs (m, nu) of the recording before this piece
+
+    @property
+    def switches(self) -> tuple[Array, Array]:
+        """When inputs begin (m,) [s], from the recording's first, and what they are then (m, nu)."""
+        if self.earlier is None:
+            return self.times[:-1], self.us
+        times, us = self.earlier
+        return np.concatenate([times, self.times[:-1]]), np.concatenate([us, self.us])
 
     def part(self, first: int, last: int) -> "Piece":
         """From one sample to another, both included."""
         span = slice(first, last + 1)
-        return replace(self, times=self.times[span], ys=self.ys[span], us=self.us[first:last])
+        earlier = Piece(self.name, self.times[: first + 1], self.ys, self.us[:first], False, 0, self.earlier).switches
+        return replace(self, times=self.times[span], ys=self.ys[span], us=self.us[first:last], earlier=earlier)
 
 
 def read_pieces(

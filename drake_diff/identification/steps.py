@@ -9,7 +9,7 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.derivatives.steps import take_steps
-from drake_diff.exceptions import GradientError, InputError
+from drake_diff.exceptions import GradientError, InputError, ModelError
 from drake_diff.identification.measured import Piece
 from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
@@ -52,6 +52,10 @@ class DiscreteMotion:
                 xs[k, 1 : count + 1] = take_steps(model, vector, starts[k], us[k, :count]).x_next
                 xs[k, count + 1 :] = xs[k, count]
         return xs
+
+    def rates(self, values: Array, x: Array, u: Array) -> Array:
+        """There are none: whoever needs them is refused."""
+        raise ModelError(f"{self.words} have no rates in between: a delay is sought in continuous time")
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""

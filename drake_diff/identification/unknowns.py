@@ -7,7 +7,7 @@ Damping, stiffness, friction and rotor inertia enter the equations of motion lin
 themselves, and are kept at 0 or above.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,7 @@ from drake_diff.model.plant import actuators, bodies, joints, labelled
 
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
+DELAY = "input_delay"  # [s] of all inputs
 OF_TREE = (
     MASS, CENTER, INERTIA, "damping", "offset", "spring_stiffness", "spring_rest_angle", "spring_rest_length",
     "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH,
@@ -46,6 +47,9 @@ class Unknown:
     start: Array
     lower: float
     size: float  # 0 where the model says nothing of it, such as a damping of 0
+    upper: float = np.inf
+    prior: tuple[Array, Array] | None = None  # mean (k,) and standard deviation (k,), as somebody else knows it
+    shifts: bool = False  # whether inputs act so much later
 
     @property
     def label(self) -> str:
@@ -110,13 +114,44 @@ class Unknowns:
         return FAR * widths
 
     @property
+    def pulls(self) -> Array:
+        """(np,) the widths of those whose file's value is all that is known before; infinite where there is a prior."""
+        pulls = self.widths
+        for one, s in zip(self.each, self.slices, strict=True):
+            if one.prior is not None:
+                pulls[s] = np.inf
+        return pulls
+
+    def prior_rows(self, z: Array) -> tuple[Array, Array]:
+        """How far the values (m, in standard deviations) are from their priors, and by z (m, np)."""
+        told = [(one.prior, s) for one, s in zip(self.each, self.slices, strict=True) if one.prior is not None]
+        if not told:
+            return np.zeros(0), np.zeros((0, len(z)))
+        values, by_z = self.values(z), self.by_z(z)
+        off = [(values[s] - mean) / deviation for (mean, deviation), s in told]
+        return np.concatenate(off), np.vstack([by_z[s] / deviation[:, None] for (_, deviation), s in told])
+
+    @property
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper z (np,)."""
-        lower = np.full(len(self.start), -np.inf)
+        lower, upper = np.full(len(self.start), -np.inf), np.full(len(self.start), np.inf)
         for one, s in zip(self.each, self.slices, strict=True):
-            if one.quantity not in (MASS, INERTIA):
-                lower[s] = one.lower
-        return lower, np.full(len(self.start), np.inf)
+            if one.quantity == MASS:
+                lower[s] = np.log(one.lower) if one.lower > 0 else -np.inf
+                upper[s] = np.log(one.upper)
+            elif one.quantity != INERTIA:
+                lower[s], upper[s] = one.lower, one.upper
+        return lower, upper
+
+    @property
+    def z_first(self) -> Array:
+        """Where a search begins: the model's own values, within bounds."""
+        return np.clip(self.z_start, *self.bounds)
+
+    @property
+    def delay(self) -> int | None:
+        """Which column of z is a delay of inputs."""
+        return next((s.start for one, s in zip(self.each, self.slices, strict=True) if one.shifts), None)
 
     def values(self, z: Any) -> Any:
         """(np,) of z (np,), complex or float."""
@@ -174,13 +209,20 @@ def _spread(one: Unknown) -> float:
     return float(np.sqrt(max(np.trace(second_moment(one.start)) / 3, 1e-300)))
 
 
-def choose_unknowns(model: Model, tree: Tree | None, names: Sequence[str] | str) -> Unknowns:
+def choose_unknowns(
+    model: Model,
+    tree: Tree | None,
+    names: Sequence[str] | str,
+    priors: Mapping[str, Any] | None = None,
+    bounds: Mapping[str, Any] | None = None,
+) -> Unknowns:
     """The quantities called `names`; "all" are all inertias, dampings, spring stiffnesses and rotor inertias.
 
     Raises UnknownNameError, which lists those that exist, or InputError where one cannot be estimated.
     """
     known = {p.name: (p.unit, p.value, p.lower) for p in list_parameters(model)}
     own = list(known)
+    known[f"model.{DELAY}"] = ("s", np.zeros(1), 0.0)
     known = {n: e for n, e in _extra(model).items() if tree is not None or n.endswith(f".{BIAS}")} | known
     if isinstance(names, str) and names == "all":
         names = [name for name in own if name.rsplit(".", 1)[1] in OF_ALL]
@@ -195,10 +237,48 @@ def choose_unknowns(model: Model, tree: Tree | None, names: Sequence[str] | str)
         why = _why_not(model, tree, name, value)
         if why is not None:
             raise InputError(name, got=why, expected="a quantity that can be estimated here")
-        found.append(Unknown(name, unit, np.array(value, dtype=float), lower, _size(model, name, value)))
+        low, high = _bounds_of(name, (bounds or {}).get(name), lower)
+        start = np.array(value, dtype=float)
+        prior = _prior_of(name, priors[name], len(start)) if priors and name in priors else None
+        shifts = name.endswith(f".{DELAY}")
+        found.append(Unknown(name, unit, start, low, _size(model, name, value), high, prior, shifts))
+    for subject, given in (("prior of", priors), ("bounds of", bounds)):
+        for name in given or {}:
+            if name not in names:
+                raise UnknownNameError(subject, got=name, known=names)
     if len({one.name for one in found}) < len(found) or not found:
         raise InputError("parameters", got=", ".join(names) or "none", expected="one or more names, each once")
     return Unknowns(tuple(found))
+
+
+def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
+    """The lower and the upper bound: those that were given, within what is possible."""
+    if given is None:
+        return lower, np.inf
+    try:
+        low, high = (float(value) for value in given)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"bounds of {name}", got=given, expected="a lower and an upper number") from error
+    if name.endswith(f".{INERTIA}"):
+        raise InputError(f"bounds of {name}", got=given, expected="none: an inertia is kept possible; give a prior")
+    low = max(low, lower)
+    if not low < high:
+        raise InputError(f"bounds of {name}", got=given, expected=f"a lower one below the upper, from {lower:g}")
+    return low, high
+
+
+def _prior_of(name: str, given: Any, count: int) -> tuple[Array, Array]:
+    """Mean and standard deviation (count,)."""
+    expected = f"a mean and a standard deviation above 0, of 1 or {count} numbers each"
+    try:
+        mean, deviation = (np.array(np.broadcast_to(np.asarray(part, dtype=float), count)) for part in given)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"prior of {name}", got=given, expected=expected) from error
+    if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(deviation)) and np.all(deviation > 0)):
+        raise InputError(f"prior of {name}", got=given, expected=expected)
+    if name.endswith(f".{MASS}") and mean[0] <= 0:
+        raise InputError(f"prior of {name}", got=given, expected="a mean above 0")
+    return mean, deviation
 
 
 def _extra(model: Model) -> dict[str, tuple[str, Array, float]]:
@@ -224,7 +304,9 @@ def _why_not(model: Model, tree: Tree | None, name: str, value: Array) -> str | 
     label, quantity = name.rsplit(".", 1)
     if quantity == "time_step":
         return "the model's time step, of which a fit makes no sense"
-    if tree is not None and quantity not in (*OF_TREE, BIAS):
+    if tree is None and quantity == DELAY:
+        return 'a delay, which is looked for in motion in continuous time only; see motion="continuous"'
+    if tree is not None and quantity not in (*OF_TREE, BIAS, DELAY):
         return 'a quantity of contact or control, of which motion in continuous time knows nothing; see motion="steps"'
     if quantity in (MASS, CENTER, INERTIA) and not labelled(bodies(model.plant))[label].default_mass() > 0:
         return "a body without mass"

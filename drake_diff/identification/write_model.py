@@ -14,7 +14,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
 from drake_diff.identification.identify import Asked, Identification
-from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, INERTIA, MASS, STRENGTH
+from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, INERTIA, MASS, STRENGTH
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.model.xml_text import Element, XmlText
@@ -33,6 +33,7 @@ NO_ROOM = {
     COULOMB: "Drake has no dry friction of joints",
     STRENGTH: "no file says how strong an input is",
     BIAS: "it is a property of the recording",
+    DELAY: "no file says how late inputs act",
     "gravity": "it is an option of load_model",
 }
 

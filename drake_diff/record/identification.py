@@ -16,6 +16,8 @@ class Asked(Part):
     held_out: float | str
     motion: str
     max_iterations: int
+    priors: dict[str, list[list[float]]] = Field(default_factory=dict)  # means, and standard deviations
+    bounds: dict[str, list[float | None]] = Field(default_factory=dict)  # lower and upper; null: none
 
 
 class RecordingEvidence(Part):
