@@ -161,7 +161,7 @@ def _read_table(solver: str, print_file: Path) -> tuple[Iteration, ...]:
         return ()
     lines = print_file.read_text(errors="replace").splitlines()
     rows = _ipopt_rows(lines) if solver == "ipopt" else _snopt_rows(lines)
-    return tuple(rows)
+    return tuple({row.iteration: row for row in rows}.values())  # SNOPT repeats an iteration whose Hessian it resets
 
 
 # iter, objective, inf_pr, inf_du, four that are left out, alpha_pr with the letter of its step, line searches
