@@ -35,7 +35,8 @@ def test_every_file_that_a_document_names_is_there(path):
     linked = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in link]
     if path.name != "zoo.md":  # which names files of other packages
         assert not [name for name in named if not (ROOT / name).is_file()]
-    assert not [link for link in linked if not (path.parent / link).is_file()]
+    made = re.compile(r"reference/|changelog|contributing")  # pages of the site that are written when it is built
+    assert not [link for link in linked if not ((path.parent / link).is_file() or made.match(link))]
 
 
 def test_every_module_that_contributing_names_is_there():
@@ -149,6 +150,12 @@ SOURCES = {
         "3": "drake_diff.optimize.replay:FEEDBACK_TOLERANCE",
         "5": "drake_diff.optimize.replay:STATE_TOLERANCE",
     },
+    "docs/index.md": {},
+    "docs/methods.md": {},
+    "docs/report.md": {},
+    "docs/loop.md": {},
+    "docs/glossary.md": {"1": "drake_diff.certificates.judgement:POWER"},
+    "docs/gradients.md": {},
     "docs/logs.md": {
         "1": "tests/test_verify.py::",
         "1e-6": "drake_diff.artifact.differences:RELATIVE",
@@ -182,7 +189,7 @@ SOURCES = {
 
 def prose(path):
     """The text without code, links, and tables of figures, which have tests or a command of their own."""
-    text = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", " ", path.read_text(), flags=re.DOTALL)
+    text = re.sub(r"<!--.*?-->|```.*?```|`[^`]*`|\]\([^)]*\)", " ", path.read_text(), flags=re.DOTALL)
     if path.name in ("contact.md", "tasks.md"):
         text = "\n".join(line for line in text.splitlines() if not line.startswith("|"))
     return NAMES.sub(" ", text)

@@ -1,0 +1,73 @@
+"""What of the site is written when it is built: the reference, tables of modules, and the files of the top folder."""
+
+import ast
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "drake_diff"
+NAME = re.compile(r"^from \.([\w.]+) import (\w+) as \w+$", re.MULTILINE)
+TOP = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
+
+
+def names_of(package: str) -> dict[str, str]:
+    """Each public name of a package ("" for the root) with the module that defines it."""
+    folder = PACKAGE / package
+    found = NAME.findall((folder / "__init__.pyi").read_text())
+    prefix = ".".join(["drake_diff", *([package] if package else [])])
+    return {name: f"{prefix}.{module}.{name}" for module, name in found}
+
+
+def reference() -> dict[str, str]:
+    """Each page of the reference with its text: one for the names of `dd`, one for each package that has names."""
+    root = names_of("")
+    pages = {"reference/index.md": _page("drake_diff", "Everything that `import drake_diff as dd` has.", "dd", root)}
+    for stub in sorted(PACKAGE.glob("*/__init__.pyi")):
+        package = stub.parent.name
+        names = {name: where for name, where in names_of(package).items() if root.get(name) != where}
+        if names:
+            first = (stub.parent / "__init__.py").read_text().split('"""')[1].split("\n")[0]
+            pages[f"reference/{package}.md"] = _page(f"dd.{package}", first, f"dd.{package}", names)
+    errors = "# dd.exceptions\n\n::: drake_diff.exceptions\n    options: {show_root_heading: false}\n"
+    return {**pages, "reference/exceptions.md": errors}
+
+
+def _page(title: str, intro: str, prefix: str, names: dict[str, str]) -> str:
+    listed = "\n".join(f"[`{name}`](#{where}) " for name, where in names.items())
+    sections = [f"::: {where}\n    options: {{heading: {prefix}.{name}}}\n" for name, where in names.items()]
+    return "\n".join([f"# {title}\n", intro + "\n", listed + "\n", *sections])
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add what is generated to the files of docs/."""
+    for path, text in reference().items():
+        files.append(File.generated(config, path, content=text))
+    for path, name in TOP.items():
+        text = re.sub(r"\]\(docs/", "](", (ROOT / name).read_text())
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put the table of a room's modules where a page asks for it."""
+    return re.sub(r"<!-- modules of (\w+) -->", lambda found: modules_of(found[1]), markdown)
+
+
+def modules_of(room: str) -> str:
+    """A row for each module of a room, with the first sentence of what it says of itself."""
+    folder = PACKAGE / room
+    paths = [*folder.glob("*.py"), *folder.glob("*/__init__.py")]
+    rows = [f"| `{_path(path, folder)}` | {_first(path)} |" for path in sorted(paths) if path != folder / "__init__.py"]
+    return "\n".join(["| Module | What it is |", "|---|---|", *rows])
+
+
+def _path(path: Path, folder: Path) -> str:
+    return f"{path.parent.name}/" if path.name == "__init__.py" else path.relative_to(folder).as_posix()
+
+
+def _first(path: Path) -> str:
+    text = ast.get_docstring(ast.parse(path.read_text())) or ""
+    return text.split("\n\n")[0].replace("\n", " ").replace("|", "\\|")
