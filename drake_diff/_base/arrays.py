@@ -1,5 +1,7 @@
 """Arrays and numbers that come from users, checked once; cross products of many vectors at once."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from itertools import accumulate, pairwise
 from math import hypot, isfinite

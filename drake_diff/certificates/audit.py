@@ -4,6 +4,8 @@
 of contact come after the others; every number in them was measured on the Drake that this package is tested with.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -3,6 +3,8 @@
 What the differences say is in `neighbourhood`, the verdict in `judgement`, and what it means in `Certificate`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -138,7 +140,7 @@ class Certificate(ShowsItsRepr):
         verdict, reason = VERDICTS[self.codes[row, column]], self.reasons.get((row, column), "")
         return Entry(self.rows[row], self.columns[column], a, d, t, n, verdict, reason)
 
-    def of(self, derivative: ArrayLike) -> "Certificate":
+    def of(self, derivative: ArrayLike) -> Certificate:
         """The certificate of another `derivative` (m, n) at this point, by the same differences."""
         if self.around is None:
             raise InputError("of", got="a certificate without differences of each entry", expected="one by `certify`")
@@ -152,7 +154,7 @@ class Certificate(ShowsItsRepr):
         """How many entries have this verdict."""
         return int((self.codes == VERDICTS.index(verdict)).sum())
 
-    def require(self) -> "Certificate":
+    def require(self) -> Certificate:
         """This certificate if every entry agrees; otherwise CertificateError, which names the worst entry."""
         if self.verdict != "agree":
             raise CertificateError(f"{self.subject}: {self}")

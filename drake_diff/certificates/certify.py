@@ -1,5 +1,7 @@
 """Certify the derivative of one step before it is used: every entry against differences of the double step."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

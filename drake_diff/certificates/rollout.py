@@ -1,5 +1,7 @@
 """Certify the gradient of a whole rollout before it is used."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -4,6 +4,8 @@ Drake, as the model is set, is the reference. Every step of another engine is co
 the same state, so that a gap is where it arises and not what has become of it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

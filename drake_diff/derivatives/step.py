@@ -1,5 +1,7 @@
 """The Jacobians of discrete steps, and the gate that each must pass before anyone sees it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,5 +1,7 @@
 """What stands around a controller: sensor, estimator, actuator, and a fallback for where the controller fails."""
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -7,6 +7,8 @@ that the controller takes is measured. What is simulated depends on it only wher
 that comes after it is not used, and the last command is held.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter

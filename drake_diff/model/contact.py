@@ -1,5 +1,7 @@
 """What touches: contact forces and modes of a step, and how deep geometries overlap in a state."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """A robot file or a Drake diagram as a discrete plant, with its contexts and its AutoDiffXd twin."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
@@ -90,7 +92,7 @@ class Model(ShowsItsRepr):
         source: Path | None,
         notes: tuple[str, ...] = (),
         contact_geometry: str | None = None,
-        rebuild: "Callable[..., Model] | None" = None,
+        rebuild: Callable[..., Model] | None = None,
         forces: tuple[AddedForce, ...] = (),
         coupling: Coupling | None = None,
         body_forces: tuple[BodyForce, ...] = (),
@@ -187,7 +189,7 @@ class Model(ShowsItsRepr):
         return self.double.velocity_limits
 
     @property
-    def whole(self) -> "Model":
+    def whole(self) -> Model:
         """The model with all of the plant's coordinates, on the same contexts; itself where none is left out.
 
         The constraints of mimic joints, which the reduced state keeps to by itself, are none of its `num_constraints`.
@@ -240,16 +242,16 @@ class Model(ShowsItsRepr):
         )
         return tuple(range(int(p[0]), int(p[-1]) + 1) if len(p) else range(0) for p in (q, v))  # type: ignore[return-value]
 
-    def at_time_step(self, time_step: float) -> "Model":
+    def at_time_step(self, time_step: float) -> Model:
         """The same model at another time step [s]. ModelError where it came from a diagram, which has but one."""
         return self.changed(time_step=positive_float("time_step [s]", time_step))
 
-    def with_contact(self, approximation: str) -> "Model":
+    def with_contact(self, approximation: str) -> Model:
         """The same model with another contact approximation (sap, similar, lagged). ModelError like `at_time_step`."""
         _check_choice("contact_approximation", approximation, CONTACT_APPROXIMATIONS)
         return self.changed(contact_approximation=approximation)
 
-    def changed(self, **change: Any) -> "Model":
+    def changed(self, **change: Any) -> Model:
         """The same model with some options of `load_model` changed; the same changes give the same Model again.
 
         Raises:

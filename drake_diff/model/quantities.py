@@ -15,6 +15,8 @@ Example:
     >>> problem = dd.Problem(model, x0=[0, 0, 0, 0], num_steps=10, final_cost=lambda x: (cart(x)[0] - 1) ** 2)
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

@@ -1,5 +1,7 @@
 """One discrete step of Drake's double plant."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from typing import Any

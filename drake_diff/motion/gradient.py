@@ -1,5 +1,7 @@
 """The gradient of a scalar back through the steps of a rollout, with its norm at every step."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -60,7 +62,7 @@ class RolloutGradient(ShowsItsRepr):
     us: Array  # (N, nu) the inputs that were applied
     methods: tuple[str, ...]  # where the step Jacobians came from: one name, or more where a fallback was taken
     # Of method="continuous": the columns in which the loss has no slope, the derivative being that of a point alone.
-    undefined: "tuple[Undefined, ...]" = ()
+    undefined: tuple[Undefined, ...] = ()
 
     def __repr__(self) -> str:
         sizes = [f"|by x0| {np.linalg.norm(self.by_x0):.3g}", f"|by us| {np.linalg.norm(self.by_us):.3g}"]

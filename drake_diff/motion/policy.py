@@ -9,6 +9,8 @@ minimum, clip, where, sum, mean, dot, @, outer, einsum, concatenate, linalg.norm
 logaddexp, hypot, interp, heaviside, var, std, and every function of the module `math`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """Many steps; energy, contact, penetration and constraint violation along them."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

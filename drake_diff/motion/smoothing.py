@@ -17,6 +17,8 @@ a bound on a |b| for an accuracy that is given.) Of few samples the rare and lar
 variances of a blend count the farthest sample three times. No estimate knows of a jump that no sample crosses.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -338,7 +340,7 @@ class Sums:
     variance: Array
     cautious: Array
 
-    def where(self, chosen: Flags, other: "Sums") -> "Sums":
+    def where(self, chosen: Flags, other: Sums) -> Sums:
         """`other` in the entries that are not `chosen`."""
         return Sums(*(np.where(chosen, getattr(self, name), getattr(other, name)) for name in vars(self)))
 

@@ -1,5 +1,7 @@
 """The shapes that are seen of a robot: its visuals, meshes with fewer faces, and a skeleton where there is neither."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """Robustness saved: its record, a page, a row for each trial, and the worst trials as artifacts of their own."""
 
+from __future__ import annotations
+
 import csv
 import io
 from pathlib import Path

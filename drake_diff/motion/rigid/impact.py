@@ -5,6 +5,8 @@ its velocity along the normal, or its impulse, is given, and so is its slide or 
 of an implicit function: by positions, velocities, restitution and friction.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -55,7 +57,7 @@ class Impact(ShowsItsRepr):
     impulses: Array
     ways: tuple[str, ...]
     energy_lost: float
-    record: "Struck"  # what the derivatives are made of
+    record: Struck  # what the derivatives are made of
 
     def __repr__(self) -> str:
         at = f" at {self.time:.6g} s" if self.time else ""

@@ -9,6 +9,8 @@ of Non-Smooth Mechanical Systems", 2004)
 and where a closed contact lets go, as its force falls through 0, R is the identity and g that force.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -119,7 +121,7 @@ class RigidMotion(ShowsItsRepr):
     xs: Array
     us: Array
     impacts: tuple[Impact, ...]
-    _steps: "RigidSteps"
+    _steps: RigidSteps
     _flow: RigidFlow
 
     def __repr__(self) -> str:
