@@ -31,6 +31,7 @@ from drake_diff.record.identification import IdentificationRecord
 from drake_diff.record.provenance import model_input, provenance_of, written_now
 from drake_diff.record.sealed import WallClock, canonical, reproducible
 
+OUTPUT = "output "  # before the name of a sensor's column, among the arrays
 REPORT, RECORDINGS, ARRAYS = "report.html", "recordings", "arrays.npz"
 MADE = (TRACE, REPORT)  # what is made again, beside the record
 LARGEST = 64 * 2**20  # bytes of a recording that is kept
@@ -81,7 +82,8 @@ def _keep(place: Path, recording: Recording, given: tuple[Path, str] | None) -> 
     make_folder(place.parent)
     if given is None:
         buffer = io.BytesIO()
-        np.savez(buffer, times=recording.times, xs=recording.xs, us=recording.us)
+        outputs: dict[str, Any] = {f"{OUTPUT}{name}": values for name, values in recording.outputs.items()}
+        np.savez(buffer, times=recording.times, xs=recording.xs, us=recording.us, **outputs)
         write_whole(place, buffer.getvalue())
     elif given[0].is_dir():
         for path in sorted(given[0].rglob("*")):
@@ -108,6 +110,10 @@ def _begun(name: str, asked: Asked) -> IdentificationRecord:
             max_iterations=asked.max_iterations,
             priors={key: [np.ravel(part).tolist() for part in pair] for key, pair in asked.priors.items()},
             bounds={key: [_known(bound) for bound in pair] for key, pair in asked.bounds.items()},
+            sensors={
+                key: records.Mounted(body=body, pose=[float(value) for value in pose])
+                for key, (body, pose) in asked.sensors.items()
+            },
         ),
         recordings=[],
         provenance=provenance_of(),
@@ -262,6 +268,7 @@ def identified_again(folder: Path, record: IdentificationRecord) -> tuple[Identi
             max_iterations=inputs.max_iterations,
             priors={key: (mean, deviation) for key, (mean, deviation) in inputs.priors.items()} or None,
             bounds={key: _bounds(pair) for key, pair in inputs.bounds.items()} or None,
+            sensors={key: (one.body, one.pose) for key, one in inputs.sensors.items()} or None,
         )  # fmt: skip
         if found.asked is None:
             raise ArtifactError("the fit does not say what was asked")
@@ -276,5 +283,6 @@ def _read_arrays(path: Path, kept: records.RecordingEvidence) -> Recording:
     missing = {"times", "xs", "us"} - found.keys()
     if missing:
         raise ArtifactError(f"{kept.path} is not a recording: it has no {', '.join(sorted(missing))}")
-    times, xs, us = (found[name] for name in ("times", "xs", "us"))
-    return Recording(kept.name, kept.version, times, xs, us, dict(kept.facts))
+    times, xs, us = (found.pop(name) for name in ("times", "xs", "us"))
+    outputs = {name.removeprefix(OUTPUT): values for name, values in found.items() if name.startswith(OUTPUT)}
+    return Recording(kept.name, kept.version, times, xs, us, dict(kept.facts), outputs)

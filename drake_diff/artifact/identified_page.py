@@ -8,7 +8,6 @@ import numpy as np
 
 from drake_diff.artifact.identified_motion import joined
 from drake_diff.identification.identify import Identification
-from drake_diff.model.tangent import tangent_space
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 
 MOST_PLOTS = 12  # of coordinates
@@ -47,7 +46,7 @@ def _residual_plots(e: Identification) -> Iterator[Plot]:
     """What is left of each entry that was fitted, in standard deviations of the noise."""
     if e.asked is None:
         return
-    names = tangent_space(e.asked.model).names
+    names = e.entries
     fitted = [m.piece for m in e.motions if not m.piece.held_out]
     for j, name in enumerate([n for n in names if n in e.noise][:MOST_PLOTS]):
         column = names.index(name)

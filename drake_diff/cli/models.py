@@ -15,6 +15,7 @@ from drake_diff.cli.text import (
     out_option,
     pairs_in,
     plain,
+    poses_in,
     progress_line,
     show,
     table,
@@ -174,6 +175,12 @@ def identify(
         list[str] | None,
         typer.Option(metavar="PARAMETER=LOWER,UPPER", help="Between which a parameter is. Can be given again."),
     ] = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LABEL=BODY:X,Y,Z[,R,P,Y]", help="Where a sensor sits on a body [m, rad]. Can be given again."
+        ),
+    ] = None,
     out: Annotated[Path | None, out_option("artifacts/identify_<model>")] = None,
 ) -> None:
     """Estimate parameters of MODEL from recordings: which differ, by how much, how sure, and what stays open.
@@ -190,11 +197,12 @@ def identify(
     given = numbers_in("--noise", noise or (), "STATE=DEVIATION")
     priors = pairs_in("--prior", prior or (), "PARAMETER=MEAN,DEVIATION")
     within = pairs_in("--bounds", bounds or (), "PARAMETER=LOWER,UPPER")
+    mounted = poses_in("--sensor", sensor or (), "LABEL=BODY:X,Y,Z or LABEL=BODY:X,Y,Z,ROLL,PITCH,YAW")
     try:
         part: float | str = float(held_out)
     except ValueError:
         part = held_out
-    asked: dict[str, Any] = {"noise": given or None, "held_out": part, "motion": motion}
+    asked: dict[str, Any] = {"noise": given or None, "held_out": part, "motion": motion, "sensors": mounted}
     with written_whole(directory) as folder:
         with progress_line("fitting"):
             found = estimate(model, list(recording), names, **asked, priors=priors, bounds=within)

@@ -166,6 +166,18 @@ def pairs_in(option: str, words: Iterable[str], expected: str) -> dict[str, tupl
     return found
 
 
+def poses_in(option: str, words: Iterable[str], expected: str) -> dict[str, tuple[str, list[float]]]:
+    """A body and numbers by name, of "NAME=BODY:NUMBER,NUMBER,..." each."""
+    found = {}
+    for word in words:
+        name, value = _split(option, word, expected)
+        body, colon, numbers = value.rpartition(":")
+        if not (body and colon):
+            raise InputError(option, got=repr(word), expected=expected)
+        found[name] = body, [_number(option, number, expected) for number in numbers.split(",")]
+    return found
+
+
 def _number(option: str, words: str, expected: str) -> float:
     try:
         return float(words)

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +40,8 @@ class Recording:
         us: (n - 1, nu) inputs, each held until the next time.
         facts: what is known of the engine's contract, by quantity: "precision", "time step", "integrator",
             "contact law", "limit law", "gravity", "seeds", "reset distribution".
+        outputs: what sensors read, for `dd.identify`: (n,) by column, BODY.position_x, BODY.gyro_x, BODY.accel_x (or y,
+            z) or JOINT.force; NaN is what was not measured.
 
     Example:
         >>> fall = dd.Recording("lab", "1.0", times=[0, 0.01], xs=[[0, 0], [0, 0]], us=[[0]])
@@ -52,6 +55,7 @@ class Recording:
     xs: Array
     us: Array
     facts: Mapping[str, str] = field(default_factory=dict)
+    outputs: Mapping[str, Array] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"{self.name} {self.version}: {len(self.times)} samples over {self.times[-1] - self.times[0]:.6g} s"
@@ -108,8 +112,9 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
 
     A CSV file has a header row and a row per sample. Its columns, in any order, are `time`, `model.state_names` and
     `model.input_names`; `position.JOINT` and `velocity.JOINT` may stand for a joint of one degree of freedom. Inputs
-    are held until the next sample and may be empty in the last row. An MCAP file has the channels /state and /input
-    that this package writes, or ROS 2 messages as `recordings_ros2` describes.
+    are held until the next sample and may be empty in the last row. With `gaps` it may have columns of sensors, called
+    as in `Recording`. An MCAP file has the channels /state and /input that this package writes, or ROS 2 messages as
+    `recordings_ros2` describes.
 
     What is known of the engine is a JSON object in NAME.contract.json beside the recording NAME, or the metadata
     record "contract" of the MCAP file, with any of the facts of `Recording` and "engine" and "version".
@@ -141,8 +146,9 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
     if not path.exists():
         raise InputError("recording", got=f"{path}, which is not there", expected=SUFFIXES)
     facts: Mapping[str, str] = {}
+    outputs: dict[str, Array] = {}
     if path.suffix == ".csv":
-        motion = _read_csv(path, model, gaps)
+        motion, outputs = _read_csv(path, model, gaps)
     elif path.is_dir() or (path.suffix == ".mcap" and is_ros2(path)):
         motion, facts = read_ros2(path, model)
     elif path.suffix == ".mcap":
@@ -152,7 +158,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
     facts = {**facts, **_told(path)}
     name, version = name or facts.get("engine", path.stem), facts.get("version", "(version unknown)")
     times, xs, us = (frozen(part) for part in motion)
-    recording = Recording(name, version, times, xs, us, facts)
+    recording = Recording(name, version, times, xs, us, facts, outputs)
     if not gaps:
         check_recording(recording, model)
     return recording
@@ -172,21 +178,28 @@ def _told(path: Path) -> dict[str, str]:
     return {key: value if isinstance(value, str) else json.dumps(value) for key, value in told.items()}
 
 
-def _read_csv(path: Path, model: Model, gaps: bool) -> Motion:
+def is_output(column: str) -> bool:
+    """Whether a column is called as what a sensor reads."""
+    return re.fullmatch(r".+\.((position|gyro|accel)_[xyz]|force)", column) is not None
+
+
+def _read_csv(path: Path, model: Model, gaps: bool) -> tuple[Motion, dict[str, Array]]:
     with path.open(newline="", encoding="utf-8-sig") as file:
         rows = [(line, row) for line, row in enumerate(csv.reader(file), start=1) if row]
     if not rows:
         raise InputError(str(path), got="an empty file", expected="a header row and samples")
-    wanted = ("time", *model.state_names, *model.input_names)
+    outputs = tuple(text.strip() for text in rows[0][1] if gaps and is_output(text.strip()))
+    wanted = ("time", *model.state_names, *model.input_names, *outputs)
     places = _columns(path, model, rows[0][1], wanted, model.state_names if gaps else ())
+    last = 1 + model.nx + model.nu
     table = np.zeros((len(rows) - 1, len(wanted)))
     for k, (line, row) in enumerate(rows[1:]):
         if len(row) != len(rows[0][1]):
             raise InputError(f"{path} line {line}", got=f"{len(row)} cells", expected=f"{len(rows[0][1])}")
         for j, (column, place) in enumerate(zip(wanted, places, strict=True)):
-            if k == len(table) - 1 and j > model.nx and not row[place].strip():
+            if k == len(table) - 1 and model.nx < j < last and not row[place].strip():
                 continue  # no step begins at the last sample
-            if place < 0 or (gaps and 0 < j <= model.nx and not row[place].strip()):
+            if place < 0 or (gaps and (0 < j <= model.nx or j >= last) and not row[place].strip()):
                 table[k, j] = np.nan
                 continue
             table[k, j] = _number(f"{path} line {line}, column {column}", row[place])
@@ -194,7 +207,8 @@ def _read_csv(path: Path, model: Model, gaps: bool) -> Motion:
         k = int(np.flatnonzero(np.diff(table[:, 0]) <= 0)[0]) + 1
         got, before = table[k, 0], table[k - 1, 0]
         raise InputError(f"{path} line {rows[k + 1][0]}, column time", got=got, expected=f"more than {before}")
-    return table[:, 0], table[:, 1 : model.nx + 1], table[:-1, model.nx + 1 :]
+    motion = table[:, 0], table[:, 1 : model.nx + 1], table[:-1, model.nx + 1 : last]
+    return motion, {name: frozen(table[:, last + i]) for i, name in enumerate(outputs)}
 
 
 def _number(subject: str, text: str) -> float:

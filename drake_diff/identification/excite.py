@@ -67,7 +67,7 @@ class Excitation(ShowsItsRepr):
         return self.sentence
 
     def recording(self, name: str = "planned") -> Recording:
-        """The motion as a recording, such as `drake_diff.comparison.write_csv` takes."""
+        """The motion as a recording without noise."""
         return Recording(name, "1", self.times, self.xs, self.us)
 
 

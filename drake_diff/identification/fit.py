@@ -24,7 +24,8 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.measured import LEAST, Piece
-from drake_diff.identification.unknowns import BIAS, Unknowns
+from drake_diff.identification.sensors import Sensors
+from drake_diff.identification.unknowns import BIAS, Unknowns, by_complex_step, set_numbers
 from drake_diff.model.model import Model
 
 SEGMENT_SAMPLES = 5  # of a segment at least
@@ -159,7 +160,7 @@ class Reduced:
     rest: float
     own: list[tuple[Array, Array, Array]]  # of each piece: R_ss (2 nv, 2 nv), R_sz (2 nv, np), b_s (2 nv,)
     nodes: list[tuple[Array, Array]]  # of each segment: D (2 nv, 2 nv + np) and e (2 nv,): its start moves by D d + e
-    residuals: list[Array]  # of each piece (n, 2 nv), gaps linearized, in units of the noise; NaN where unmeasured
+    residuals: list[Array]  # of each piece (n, 2 nv + m), gaps linearized, in units of the noise; NaN where unmeasured
     each: list[Array]  # of each piece by itself, R (np, np)
 
 
@@ -175,8 +176,10 @@ class Fit:
         pieces: Sequence[Piece],
         noise: Array,
         *,
+        sensors: Sensors | None = None,
         fixed: bool = False,
     ):
+        self.sensors = Sensors(None, (), ()) if sensors is None else sensors
         self.fixed = fixed  # whether the unknowns stay, and only first states are sought
         self.model, self.law, self.chart, self.unknowns, self.noise = model, law, chart, unknowns, noise
         self.segments = cut_segments(law, pieces, model.nu, None if unknowns.delay is None else 0.0)
@@ -184,7 +187,7 @@ class Fit:
         nv, period = model.nv, max(float(np.median(np.diff(pieces[0].times))), 1e-3)
         from_positions = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0) / (5 * period)
         self.gap_scale[:nv] = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0)
-        self.gap_scale[nv:] = np.where(np.isfinite(noise[nv:]), noise[nv:], from_positions)
+        self.gap_scale[nv:] = np.where(np.isfinite(noise[nv : 2 * nv]), noise[nv : 2 * nv], from_positions)
 
     @property
     def count(self) -> int:
@@ -199,7 +202,8 @@ class Fit:
 
     def _measured(self, p: int) -> Array:
         piece = self.segments.pieces[p]
-        return np.where(np.isfinite(self.noise), self.chart.minus(piece.ys, piece.ys), np.nan)
+        every = np.hstack([self.chart.minus(piece.ys, piece.ys), *([] if piece.outs is None else [piece.outs])])
+        return np.where(np.isfinite(self.noise), every, np.nan)
 
     def at(self, z: Array, starts: Array) -> "Point | None":
         """The motion there; None where there is none."""
@@ -214,10 +218,12 @@ class Fit:
             return None
         if not np.all(np.isfinite(xs)):
             return None
-        residuals, shift = [], self._shift(values)
+        residuals, shift, read = [], self._shift(values), self._read(values, s, xs)
         for k, piece in enumerate(s.pieces[p] for p in s.of_piece):
-            e = self.chart.minus(piece.ys[s.samples[k]], xs[k, s.at[k]]) - shift
-            residuals.append(e / self.noise)
+            e = self.chart.minus(piece.ys[s.samples[k]], xs[k, s.at[k]])
+            if piece.outs is not None:
+                e = np.hstack([e, piece.outs[s.samples[k]] - read[k]])
+            residuals.append((e - shift) / self.noise)
         gaps = np.zeros((len(s.first), self.chart.size))
         inner = np.flatnonzero(s.of_piece[:-1] == s.of_piece[1:])
         if len(inner):
@@ -236,8 +242,37 @@ class Fit:
             found[p][s.samples[k]] = xs[k, s.at[k]]
         return found
 
+    def _samples(self, s: Segments, xs: Array) -> tuple[Array, Array, Array]:
+        """q, v and u at the samples of all segments, one after the other; an input is that of the step that begins."""
+        at = [(k, i) for k, each in enumerate(s.at) for i in each]
+        rows, steps = np.array(at, dtype=np.intp).T
+        x = xs[rows, steps]
+        return x[:, : self.model.nq], x[:, self.model.nq :], s.us[rows, np.minimum(steps, s.us.shape[1] - 1)]
+
+    def _split(self, s: Segments, every: Array) -> list[Array]:
+        return np.split(every, np.cumsum([len(each) for each in s.at])[:-1])
+
+    def _read(self, values: Array, s: Segments, xs: Array) -> list[Array]:
+        """Of each segment (samples, m), what sensors read."""
+        if not self.sensors.count:
+            return [np.zeros((len(each), 0)) for each in s.at]
+        numbers = set_numbers(self.model, self.sensors.known, self.unknowns, values)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._split(s, self.sensors.read(numbers, *self._samples(s, xs)))
+
+    def _read_slopes(self, z: Array, s: Segments, xs: Array) -> list[tuple[Array, Array]]:
+        """Of each segment (samples, m, 2 nv) by the state, and (samples, m, np) by z."""
+        model, tree, unknowns = self.model, self.sensors.known, self.unknowns
+
+        def flat(z: Array) -> Array:
+            return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
+
+        numbers = set_numbers(model, tree, unknowns, unknowns.values(z))
+        by_x, by_z = self.sensors.slopes(numbers, *self._samples(s, xs), by_complex_step(flat, z))
+        return list(zip(self._split(s, by_x), self._split(s, by_z), strict=True))
+
     def _shift(self, values: Array) -> Array:
-        shift = np.zeros(self.chart.size)
+        shift = np.zeros(self.chart.size + self.sensors.count)
         for column, entry in self._bias_columns():
             shift[entry] += values[column]
         return shift
@@ -248,7 +283,9 @@ class Fit:
         singles = dict(self.chart.coordinates.single)
         names = (*self.model.position_names, *self.model.velocity_names)
         for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
-            if one.quantity == BIAS:
+            if one.quantity == BIAS and one.label in self.sensors.columns:
+                found.append((s.start, self.chart.size + self.sensors.columns.index(one.label)))
+            elif one.quantity == BIAS:
                 i = names.index(one.label)
                 entry = singles[i] if i < self.model.nq else self.model.nv + i - self.model.nq
                 found.append((s.start, entry))
@@ -274,13 +311,19 @@ class Fit:
             along[:, m + 1] = A[:, m] @ along[:, m]
             along[:, m + 1, :, nt:] += C[:, m]
         own, rows_z, nodes, by_piece, rest = [], [np.zeros((0, nz + 1))], [], [], 0.0
+        read = self._read_slopes(z, s, xs) if self.sensors.count else []
         for p, piece in enumerate(s.pieces):
             D, e = np.eye(nt, nt + nz), np.zeros(nt)
-            rows, found = [], np.full((len(piece.times), nt), np.nan)
+            rows, found = [], np.full((len(piece.times), len(self.noise)), np.nan)
             for k in np.flatnonzero(s.of_piece == p):
                 nodes.append((D, e))
                 at = xs[k, s.at[k]]
                 moved = self.chart.to_motion(at) @ along[k, s.at[k]]
+                if read:
+                    by_x, by_z = read[k]
+                    of_outputs = by_x @ moved
+                    of_outputs[..., nt:] += by_z
+                    moved = np.concatenate([moved, of_outputs], axis=1)
                 J = moved[..., :nt] @ D
                 J[..., nt:] += moved[..., nt:]
                 r = residuals[k] - (moved[..., :nt] @ e) / self.noise
@@ -376,7 +419,7 @@ class Point:
     z: Array
     starts: Array
     xs: Array  # (K, M+1, nx)
-    residuals: list[Array]  # of each segment (samples, 2 nv) in units of the noise
+    residuals: list[Array]  # of each segment (samples, 2 nv + m) in units of the noise
     gaps: Array  # (K, 2 nv), 0 where a piece ends
     value: float  # |r|^2 with the pull to the file's values
     gap: float  # the size of the gaps

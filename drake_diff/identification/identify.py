@@ -30,12 +30,14 @@ from drake_diff.identification.judge import (
 )
 from drake_diff.identification.measured import (
     Piece,
+    columns_of,
     given_noise,
     guess_states,
     noise_by_differences,
     read_given,
     read_pieces,
 )
+from drake_diff.identification.sensors import Sensors, choose_sensors
 from drake_diff.identification.steps import discrete_motion
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
@@ -66,6 +68,7 @@ class Asked:
     max_iterations: int
     priors: Mapping[str, Any] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    sensors: Mapping[str, tuple[str, Sequence[float]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +97,9 @@ class Identification(ShowsItsRepr):
     noise: Mapping[str, float]  # the standard deviation of each measured entry, given or from the residuals
     error_before: float  # of the held-out samples (of all, where none are), in standard deviations of the noise
     error_after: float
-    residuals: tuple[Array, ...]  # of each fitted piece (n, 2 nv), in standard deviations; NaN where unmeasured
+    residuals: tuple[Array, ...]  # of each fitted piece (n, 2 nv + m), in standard deviations; NaN where unmeasured
     columns: tuple[str, ...]  # (np,) a name for each entry of the values
+    entries: tuple[str, ...]  # (2 nv + m,) a name for each column of the residuals
     covariance: Array  # (np, np) of the values; infinite where nothing is known
     score: float  # -2 log of the likelihood, up to a constant of the data
     count: int  # how many numbers were measured
@@ -120,6 +124,7 @@ def identify(
     max_iterations: int = 60,
     priors: Mapping[str, tuple[Any, Any]] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    sensors: Mapping[str, tuple[str, Sequence[float]]] | None = None,
 ) -> Identification:
     """Estimate parameters of a model from recordings of its motion, with intervals.
 
@@ -142,6 +147,8 @@ def identify(
         priors: What is known of parameters beside the recordings: mean and standard deviation, by name. It counts as
             one measurement more; without it the file's value only decides where the data say nothing.
         bounds: Lower and upper bound of parameters, by name.
+        sensors: Where sensors sit that recordings have columns of and that are not the frame of a body: by label, the
+            body and x, y, z [m], or x, y, z, roll, pitch, yaw [rad], in its frame.
 
     Returns:
         `.values`, `.intervals` (95 %), `.unidentifiable`, `.explained` with its `.reason`, and a `.sentence`.
@@ -166,17 +173,23 @@ def identify(
     if motion not in MOTIONS:
         raise UnknownNameError("motion", got=motion, known=MOTIONS)
     given, files = read_given(model, recordings)
-    chart, pieces = Chart(coordinates_of(model)), read_pieces(model, given, held_out)
+    columns = columns_of(given)
+    chart, pieces = Chart(coordinates_of(model)), read_pieces(model, given, held_out, columns)
     tree = tree_for_identification(model)
     why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces)
     if motion == "continuous" and isinstance(tree, Refusal):
         raise ModelError(f"{model.name} has no motion in continuous time here: {why}")
     continuous = motion == "continuous" or (motion == "auto" and not why)
     own_tree = tree if continuous and not isinstance(tree, Refusal) else None
-    unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds)
-    stated = given_noise(model, chart, noise)
+    if columns and own_tree is None:
+        raise ModelError(
+            f"{model.name}: sensors are read from motion in continuous time, and {why or 'steps are fitted'}"
+        )
+    outputs = choose_sensors(model, own_tree, columns, sensors)
+    unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds, columns)
+    stated = given_noise(model, chart, noise, columns)
     scatter = noise_by_differences(chart, pieces)
-    problem = Problem(model, chart, unknowns, pieces, stated, scatter)
+    problem = Problem(model, chart, unknowns, pieces, stated, scatter, outputs)
     law: Law = (
         discrete_motion(model, unknowns, pieces)
         if own_tree is None
@@ -196,6 +209,7 @@ def identify(
         max_iterations,
         dict(priors or {}),
         dict(bounds or {}),
+        dict(sensors or {}),
     )
     return replace(found, asked=asked)
 
@@ -225,11 +239,17 @@ class Problem:
     chart: Chart
     unknowns: Unknowns
     pieces: list[Piece]
-    stated: Array  # (2 nv,) the noise as it was given, NaN where it was not
-    scatter: Array  # (2 nv,) that of neighbouring samples
+    stated: Array  # (2 nv + m,) the noise as it was given, NaN where it was not
+    scatter: Array  # (2 nv + m,) that of neighbouring samples
+    sensors: Sensors | None = None
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """A name for each number of a sample."""
+        return (*tangent_space(self.model).names, *(() if self.sensors is None else self.sensors.columns))
 
     def fit(self, law: Law, pieces: Sequence[Piece], noise: Array, *, fixed: bool = False) -> Fit:
-        return Fit(self.model, law, self.chart, self.unknowns, pieces, noise, fixed=fixed)
+        return Fit(self.model, law, self.chart, self.unknowns, pieces, noise, sensors=self.sensors, fixed=fixed)
 
     def guess(self, fit: Fit) -> Array:
         s = fit.segments
@@ -331,7 +351,7 @@ class Problem:
         covariance = by_z @ np.where(np.isfinite(known.covariance), known.covariance, 0.0) @ by_z.T
         hidden = np.any(by_z[:, lost] != 0, axis=1)
         covariance[hidden, hidden] = np.inf
-        names, open_ = tangent_space(self.model).names, unidentifiable(unknowns, z, known)
+        names, open_ = self.entries, unidentifiable(unknowns, z, known)
         result = Identification(
             values=unknowns.named(values),
             start=unknowns.named(unknowns.start),
@@ -349,6 +369,7 @@ class Problem:
             error_after=after,
             residuals=tuple(frozen(r) for r in solved.reduced.residuals),
             columns=unknowns.columns,
+            entries=names,
             covariance=frozen(covariance),
             score=score_of(fit, solved),
             count=count,
@@ -366,7 +387,7 @@ class Problem:
         """(error with the model's own values, with those found, why that is too much: empty where not; the motions)."""
         held = [piece for piece in self.pieces if piece.held_out]
         pieces = held or list(fit.segments.pieces)
-        own = Fit(self.model, fit.law, self.chart, self.unknowns, pieces, fit.noise, fixed=True)
+        own = self.fit(fit.law, pieces, fit.noise, fixed=True)
         found, moved = [], []
         for z in (self.unknowns.z_start, solved.z):
             fixed = own.solve(z, self.guess(own), 20)
@@ -397,7 +418,7 @@ class Problem:
             known = [name for one in self.unknowns.each if one.prior is not None for name in one.columns]
             worst = int(np.argmax(np.abs(off)))
             return f"{known[worst]} is {abs(off[worst]):.3g} standard deviations from its prior"
-        names = tangent_space(self.model).names
+        names = self.entries
         every = np.concatenate(solved.reduced.residuals)
         numbers = np.isfinite(every).sum(axis=0)
         size = noise_of(fit, solved)

@@ -34,6 +34,7 @@ class Piece:
     held_out: bool
     recording: int = 0  # which one it is of
     earlier: tuple[Array, Array] | None = None  # times (m,) and inputs (m, nu) of the recording before this piece
+    outs: Array | None = None  # (n, m) what sensors read; NaN where nothing was
 
     @property
     def switches(self) -> tuple[Array, Array]:
@@ -47,13 +48,21 @@ class Piece:
         """From one sample to another, both included."""
         span = slice(first, last + 1)
         earlier = Piece(self.name, self.times[: first + 1], self.ys, self.us[:first], False, 0, self.earlier).switches
-        return replace(self, times=self.times[span], ys=self.ys[span], us=self.us[first:last], earlier=earlier)
+        outs = None if self.outs is None else self.outs[span]
+        return replace(
+            self, times=self.times[span], ys=self.ys[span], us=self.us[first:last], earlier=earlier, outs=outs
+        )
 
 
 def read_pieces(
-    model: Model, recordings: Recording | str | Path | Sequence[Recording | str | Path], held_out: float | str
+    model: Model,
+    recordings: Recording | str | Path | Sequence[Recording | str | Path],
+    held_out: float | str,
+    columns: Sequence[str] = (),
 ) -> list[Piece]:
     """Each recording's first part to fit, and its last to be held out: a part of the samples, or a recording by name.
+
+    `columns` are those of sensors that are read.
 
     Raises InputError, ShapeError or NonFiniteError, naming recording and entry.
     """
@@ -71,7 +80,7 @@ def read_pieces(
         raise InputError("held_out", got=held_out, expected="from 0 to 0.8 of the samples, or a recording's name")
     pieces = []
     for i, r in enumerate(each):
-        whole = replace(_checked(r, model), recording=i)
+        whole = replace(_checked(r, model, columns), recording=i)
         if isinstance(held_out, str):
             pieces.append(replace(whole, held_out=r.name == held_out))
             continue
@@ -103,7 +112,12 @@ def hash_of(path: Path) -> str:
     return sha256("".join(f"{hash_of(path / name)} {name}\n" for name in names).encode()).hexdigest()
 
 
-def _checked(recording: Recording, model: Model) -> Piece:
+def columns_of(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """The columns of sensors of all recordings."""
+    return tuple(dict.fromkeys(name for recording in recordings for name in recording.outputs))
+
+
+def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Piece:
     subject = f"recording {recording.name}"
     times = finite_array(f"{subject}: times", recording.times, ("n",))
     if len(times) < LEAST:
@@ -129,16 +143,23 @@ def _checked(recording: Recording, model: Model) -> Piece:
         turn[seen[1:]] *= np.cumprod(np.where(signs == 0, 1, signs))[:, None]
     if not np.any(np.isfinite(ys[:, : model.nq])):
         raise InputError(f"{subject}: xs", got="no position", expected="some measured positions")
-    return Piece(recording.name, times - times[0], ys, us, held_out=False)
+    outs = np.full((len(times), len(columns)), np.nan)
+    for j, name in enumerate(columns):
+        if name in recording.outputs:
+            outs[:, j] = array_with_gaps(f"{subject}: {name}", recording.outputs[name], (len(times),))
+    if np.any(np.isinf(outs)):
+        k, j = (int(i) for i in np.argwhere(np.isinf(outs))[0])
+        raise InputError(f"{subject}: {columns[j]} at sample {k}", got=outs[k, j], expected="a number or NaN")
+    return Piece(recording.name, times - times[0], ys, us, held_out=False, outs=outs)
 
 
-def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None) -> Array:
-    """(2 nv,) what the user says of the noise of each entry; NaN where nothing.
+def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, columns: Sequence[str] = ()) -> Array:
+    """(2 nv + m,) what the user says of the noise of each entry; NaN where nothing.
 
     Names are those of states; a free body's turn is called base_rx, base_ry, base_rz.
     """
-    names = tangent_space(model).names
-    found = np.full(chart.size, np.nan)
+    names = (*tangent_space(model).names, *columns)
+    found = np.full(len(names), np.nan)
     for name, value in (noise or {}).items():
         if name not in names:
             raise UnknownNameError("noise of", got=name, known=names)
@@ -149,14 +170,18 @@ def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None) -
 
 
 def noise_by_differences(chart: Chart, pieces: Sequence[Piece]) -> Array:
-    """(2 nv,) an upper estimate of the noise of each entry: of differences of order 1 to 8, the one that says least.
+    """(2 nv + m,) an upper estimate of the noise of each entry: of differences of orders 1 to 8, the least one.
 
     White noise s makes the difference of order d vary by s sqrt(binomial(2 d, d)); what moves adds to that.
     """
-    least = np.full(chart.size, np.inf)
-    reach = np.zeros(chart.size)
     increments = [chart.minus(piece.ys[1:], piece.ys[:-1]) for piece in pieces]
-    for j in range(chart.size):
+    increments = [
+        each if piece.outs is None else np.hstack([each, np.diff(piece.outs, axis=0)])
+        for each, piece in zip(increments, pieces, strict=True)
+    ]
+    count = increments[0].shape[1]
+    least, reach = np.full(count, np.inf), np.zeros(count)
+    for j in range(count):
         for order in range(1, 9):
             parts = [np.diff(each[:, j], n=order - 1) for each in increments]
             known = np.concatenate([part[np.isfinite(part)] for part in parts])

@@ -215,6 +215,7 @@ def choose_unknowns(
     names: Sequence[str] | str,
     priors: Mapping[str, Any] | None = None,
     bounds: Mapping[str, Any] | None = None,
+    columns: Sequence[str] = (),
 ) -> Unknowns:
     """The quantities called `names`; "all" are all inertias, dampings, spring stiffnesses and rotor inertias.
 
@@ -223,6 +224,7 @@ def choose_unknowns(
     known = {p.name: (p.unit, p.value, p.lower) for p in list_parameters(model)}
     own = list(known)
     known[f"model.{DELAY}"] = ("s", np.zeros(1), 0.0)
+    known |= {f"{column}.{BIAS}": ("", np.zeros(1), -np.inf) for column in columns}
     known = {n: e for n, e in _extra(model).items() if tree is not None or n.endswith(f".{BIAS}")} | known
     if isinstance(names, str) and names == "all":
         names = [name for name in own if name.rsplit(".", 1)[1] in OF_ALL]

@@ -8,6 +8,13 @@ from drake_diff.record.parts import FiniteTable, Part
 from drake_diff.record.sealed import SealedRecord
 
 
+class Mounted(Part):
+    """Where a sensor sits: x, y, z [m], or with roll, pitch, yaw [rad], in a body's frame."""
+
+    body: str
+    pose: list[float]
+
+
 class Asked(Part):
     """What `identify` was called with."""
 
@@ -18,6 +25,7 @@ class Asked(Part):
     max_iterations: int
     priors: dict[str, list[list[float]]] = Field(default_factory=dict)  # means, and standard deviations
     bounds: dict[str, list[float | None]] = Field(default_factory=dict)  # lower and upper; null: none
+    sensors: dict[str, Mounted] = Field(default_factory=dict)  # where those sit that are no body's frame
 
 
 class RecordingEvidence(Part):

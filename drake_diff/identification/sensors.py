@@ -1,0 +1,271 @@
+"""What sensors read that are no coordinates: where a point is, how a body turns and accelerates, a joint's force.
+
+Readings are functions of positions, velocities, accelerations and the tree's numbers. Accelerations follow from the
+equations of motion, with their derivatives; the rest is kinematics, which is differentiated by complex steps.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, finite_array, skew
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.identification.tree import SLIP_SPEED, Numbers, Tree
+from drake_diff.model.model import Model
+from drake_diff.model.plant import bodies, joints, labelled
+
+AXES = ("x", "y", "z")
+OF_BODY = ("position", "gyro", "accel")  # [m] in world; [rad/s] and [m/s^2] in the sensor's frame
+FORCE = "force"  # [N m] or [N] of a joint
+TINY = 1e-30  # of a complex step
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """Three readings of a body, or one of a joint."""
+
+    label: str  # as its columns call it
+    quantity: str
+    link: int  # which carries it; of a force, its joint's
+    turn: Array  # (3, 3) of its frame on the link
+    point: Array  # (3,) [m] of its origin there
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """A name for each reading."""
+        if self.quantity == FORCE:
+            return (f"{self.label}.{FORCE}",)
+        return tuple(f"{self.label}.{self.quantity}_{axis}" for axis in AXES)
+
+
+def sensor_of(column: str) -> tuple[str, str]:
+    """(label, quantity) of a column. InputError where it is none of a sensor."""
+    label, dot, last = column.rpartition(".")
+    quantity, _, axis = last.partition("_")
+    if dot and label and (last == FORCE or (quantity in OF_BODY and axis in AXES)):
+        return label, quantity
+    expected = "BODY.position_x, BODY.gyro_x, BODY.accel_x (or y, z), or JOINT.force"
+    raise InputError("output", got=column, expected=expected)
+
+
+def choose_sensors(
+    model: Model, tree: Tree | None, columns: Sequence[str], mounted: Mapping[str, tuple[str, Sequence[float]]] | None
+) -> "Sensors":
+    """Those whose readings the columns are. A label is a joint, a body, whose frame it then is, or one of `mounted`.
+
+    Raises UnknownNameError or InputError where there is no such body or joint, ModelError where it cannot be told.
+    """
+    mounted = dict(mounted or {})
+    wanted = dict.fromkeys(sensor_of(column) for column in columns)
+    if wanted and (tree is None or tree.dynamics.coupling is not None):
+        why = "joints follow others" if tree is not None else "there is none here"
+        raise ModelError(f"{model.name}: sensors are read from motion in continuous time, and {why}")
+    for name in mounted:
+        if name not in {label for label, _ in wanted}:
+            raise UnknownNameError("sensor of which there are columns", got=name, known=[s for s, _ in wanted])
+    if tree is None:
+        return Sensors(None, (), ())
+    return Sensors(tree, tuple(_sensor(model, tree, *one, mounted.get(one[0])) for one in wanted), tuple(columns))
+
+
+def _sensor(model: Model, tree: Tree, label: str, quantity: str, mounted: Any) -> Sensor:
+    if quantity == FORCE:
+        found = labelled(joints(model.plant))
+        known = [name for name, joint in found.items() if joint.num_velocities() == 1]
+        if label not in known:
+            raise UnknownNameError("joint with a force", got=label, known=known)
+        at = next(i for i, link in enumerate(tree.links) if link.joint.joint == label)
+        return Sensor(label, quantity, at, np.eye(3), np.zeros(3))
+    body, turn, point = label, np.eye(3), np.zeros(3)
+    if mounted is not None:
+        body, turn, point = _mounted(label, mounted)
+    if body not in tree.placed:
+        raise UnknownNameError(f"body of sensor {label}", got=body, known=list(labelled(bodies(model.plant))))
+    at, pose = tree.placed[body]
+    if at < 0:
+        raise InputError(f"sensor {label}", got=f"on {body}, which is fixed to the world", expected="one that moves")
+    R = pose.rotation().matrix()
+    return Sensor(label, quantity, at, R @ turn, R @ point + pose.translation())
+
+
+def _mounted(label: str, given: Any) -> tuple[str, Array, Array]:
+    """Its body, and the pose on it: a point, or a point with roll, pitch and yaw."""
+    expected = "a body, and x, y, z [m], or x, y, z, roll, pitch, yaw [rad] in its frame"
+    try:
+        body, pose = given
+        numbers = np.array(pose, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"sensor {label}", got=given, expected=expected) from error
+    if not isinstance(body, str) or numbers.shape not in ((3,), (6,)):
+        raise InputError(f"sensor {label}", got=given, expected=expected)
+    finite_array(f"sensor {label}", numbers, (len(numbers),))
+    roll, pitch, yaw = numbers[3:] if len(numbers) == 6 else np.zeros(3)
+    turn = (
+        _about(np.array([0, 0, 1.0]), yaw) @ _about(np.array([0, 1.0, 0]), pitch) @ _about(np.array([1.0, 0, 0]), roll)
+    )
+    return body, turn, numbers[:3]
+
+
+def _about(axis: Array, angle: Any) -> Any:
+    """(..., 3, 3) by angles (...,), complex or float."""
+    hat, angle = skew(axis), np.asarray(angle)[..., None, None]
+    return np.eye(3) + np.sin(angle) * hat + (1 - np.cos(angle)) * (hat @ hat)
+
+
+@dataclass(frozen=True, eq=False)
+class _At:
+    """Where a frame is and how it moves, in world; acceleration less gravity."""
+
+    R: Any
+    p: Any
+    w: Any
+    v: Any
+    w_dot: Any
+    a: Any
+
+    def to(self, turn: Any, point: Any) -> "_At":
+        """A frame that is fixed on it."""
+        r = (self.R @ point[..., None])[..., 0] if point.ndim > 1 else self.R @ point
+        v = self.v + np.cross(self.w, r)
+        a = self.a + np.cross(self.w_dot, r) + np.cross(self.w, np.cross(self.w, r))
+        return _At(self.R @ turn, self.p + r, self.w, v, self.w_dot, a)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensors:
+    """All sensors of a fit; `columns` are those that were recorded, in their order."""
+
+    tree: Tree | None
+    each: tuple[Sensor, ...]
+    columns: tuple[str, ...]
+
+    @property
+    def count(self) -> int:
+        return len(self.columns)
+
+    def _entries(self) -> list[int]:
+        every = [column for sensor in self.each for column in sensor.columns]
+        return [every.index(column) for column in self.columns]
+
+    def read(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Array:
+        """(N, m) at q (N, nq), v (N, nv), under u (N, nu)."""
+        tree = self._tree
+        a = tree.accelerate(numbers, q, v, u) if self._accelerates else np.zeros_like(v)
+        return np.asarray(self._read(numbers, q, v, a, u).real)
+
+    @property
+    def known(self) -> Tree:
+        """The tree that carries them."""
+        return self._tree
+
+    @property
+    def _tree(self) -> Tree:
+        if self.tree is None:
+            raise ModelError("sensors without motion in continuous time")
+        return self.tree
+
+    @property
+    def _accelerates(self) -> bool:
+        return any(sensor.quantity in ("accel", FORCE) for sensor in self.each)
+
+    def slopes(self, numbers: Numbers, q: Array, v: Array, u: Array, by: Array) -> tuple[Array, Array]:
+        """(N, m, 2 nv) by small motions of the state, and (N, m, np) by parameters, of which `by` moves the numbers."""
+        tree, nv = self._tree, v.shape[1]
+        moving = tree.slopes(numbers, q, v, u, by) if self._accelerates else None
+        a = np.zeros_like(v) if moving is None else moving.a
+        moved = np.zeros((len(q), self.count, 2 * nv))
+        by_a = np.zeros((len(q), self.count, nv))
+        used = np.flatnonzero(self._above())
+        for j in used:
+            step = np.zeros(nv, dtype=complex)
+            step[j] = 1j * TINY
+            moved[..., j] = self._read(numbers, q, v, a, u, small=step).imag / TINY
+            moved[..., nv + j] = self._read(numbers, q, v + step, a, u).imag / TINY
+            if moving is not None:
+                by_a[..., j] = self._read(numbers, q, v, a + step, u).imag / TINY
+        found = np.zeros((len(q), self.count, by.shape[1]))
+        flat = numbers.flat
+        for column in range(by.shape[1]):
+            if np.any(by[:, column] != 0):
+                turned = flat + 1j * TINY * by[:, column]
+                parts = {name: turned[numbers.places(name)] for name in Numbers.__dataclass_fields__}
+                found[..., column] = self._read(Numbers(**parts), q, v, a, u).imag / TINY
+        if moving is not None:
+            moved[..., :nv] += by_a @ moving.by_q
+            moved[..., nv:] += by_a @ moving.by_v
+            found += by_a @ moving.by_numbers
+        return moved, found
+
+    def _above(self) -> Array:
+        """(nv,) which coordinates any of the sensors sees by its place or motion."""
+        tree = self._tree
+        seen = np.zeros(len(tree.dynamics.mass), dtype=bool)
+        for sensor in self.each:
+            i = sensor.link
+            while i >= 0:
+                start = tree.first[i]
+                seen[start : start + (6 if tree.links[i].free else 1)] = True
+                i = tree.links[i].parent
+        return seen
+
+    def _read(self, numbers: Numbers, q: Any, v: Any, a: Any, u: Array, small: Any = None) -> Any:
+        """(N, m), complex where anything is; `small` (nv,) is a small motion of the positions."""
+        small = np.zeros(v.shape[1]) if small is None else small
+        known: dict[int, _At] = {}
+        every = []
+        for sensor in self.each:
+            if sensor.quantity == FORCE:
+                every.append(self._force(numbers, sensor, q, v, a, u, small))
+                continue
+            at = self._frame(sensor.link, numbers, q, v, a, small, known).to(sensor.turn, sensor.point)
+            if sensor.quantity == "position":
+                every.append(at.p)
+            else:
+                of = at.w if sensor.quantity == "gyro" else at.a
+                every.append((np.swapaxes(at.R, -1, -2) @ of[..., None])[..., 0])
+        return np.concatenate(every, axis=1)[:, self._entries()]
+
+    def _force(self, numbers: Numbers, sensor: Sensor, q: Any, v: Any, a: Any, u: Array, small: Any) -> Any:
+        """(N, 1) what the drive, its rotor, spring and friction give to the link."""
+        tree = self._tree
+        link, k = tree.links[sensor.link], tree.first[sensor.link]
+        effort = np.clip(u, -tree.limits, tree.limits) * numbers.strength
+        stretched = q[:, link.joint.q_start] + small[k] - numbers.rest[k]
+        force = effort @ tree.actuation[k] - numbers.stiffness[k] * stretched - numbers.damping[k] * v[:, k]
+        return (force - numbers.coulomb[k] * np.tanh(v[:, k] / SLIP_SPEED) - numbers.reflected[k] * a[:, k])[:, None]
+
+    def _frame(self, i: int, numbers: Numbers, q: Any, v: Any, a: Any, small: Any, known: dict[int, _At]) -> _At:
+        """Of link i."""
+        if i in known:
+            return known[i]
+        tree = self._tree
+        link, k = tree.links[i], tree.first[i]
+        if link.free:
+            s = link.joint.q_start
+            quaternion, place = q[:, s : s + 4], q[:, s + 4 : s + 7] + small[k + 3 : k + 6]
+            vector = skew(quaternion[:, 1:])
+            scale = 2 / np.sum(quaternion * quaternion, axis=1)[:, None, None]
+            R = np.eye(3) + scale * (quaternion[:, :1, None] * vector + vector @ vector)
+            w = small[k : k + 3]
+            R = R + np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]) @ R
+            found = _At(
+                R, place, v[:, k : k + 3], v[:, k + 3 : k + 6], a[:, k : k + 3], a[:, k + 3 : k + 6] - numbers.gravity
+            )
+        else:
+            zero = np.zeros((len(q), 3))
+            ground = _At(np.broadcast_to(np.eye(3), (len(q), 3, 3)), zero, zero, zero, zero, zero - numbers.gravity)
+            before = self._frame(link.parent, numbers, q, v, a, small, known) if link.parent >= 0 else ground
+            at = before.to(link.on_parent.rotation().matrix(), numbers.offset[i])
+            angle, speed, change = q[:, link.joint.q_start] + small[k], v[:, k, None], a[:, k, None]
+            axis = at.R @ link.axis
+            if link.joint.kind == "revolute":
+                w_dot = at.w_dot + axis * change + np.cross(at.w, axis * speed)
+                found = _At(at.R @ _about(link.axis, angle), at.p, at.w + axis * speed, at.v, w_dot, at.a)
+            else:
+                moved = at.to(np.eye(3), angle[:, None] * link.axis)
+                acceleration = moved.a + 2 * np.cross(at.w, axis * speed) + axis * change
+                found = _At(moved.R, moved.p, moved.w, moved.v + axis * speed, moved.w_dot, acceleration)
+        known[i] = found
+        return found

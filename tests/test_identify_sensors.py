@@ -1,0 +1,177 @@
+"""Sensors that measure no coordinates: Drake's kinematics, closed forms, then a robot in another simulator."""
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from helpers.mujoco_arm import MuJoCoArm, bare_arm, drakes, shaken
+from helpers.pendulum import GRAVITY, LEVER, swing
+from helpers.robots import example_robot, state_in_range
+from helpers.table import each_row
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.tree import JacobianWrtVariable
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.sensors import choose_sensors
+from drake_diff.identification.tree import Numbers, tree_for_identification
+from drake_diff.mechanics.description import coordinates_of
+
+POSE = (0.1, -0.05, 0.2, 0.3, -0.4, 0.5)
+
+
+def columns(label):
+    return [f"{label}.{quantity}_{axis}" for quantity in ("position", "gyro", "accel") for axis in "xyz"]
+
+
+@each_row(
+    "name, body, joint", [("ur5_robot.urdf", "wrist_2_link", "elbow_joint"), ("solo12.urdf", "FR_LOWER_LEG", "FR_KFE")]
+)
+def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, joint):
+    model, random = example_robot(name), np.random.default_rng(0)
+    tree, plant, chart = tree_for_identification(model), model.plant, Chart(coordinates_of(model))
+    sensors = choose_sensors(model, tree, [*columns("imu"), f"{joint}.force"], {"imu": (body, POSE)})
+    x, u = state_in_range(model, random), random.uniform(-1, 1, model.nu)
+    nq, nv, numbers = model.nq, model.nv, tree.numbers
+    read = sensors.read(numbers, x[None, :nq], x[None, nq:], u[None])[0]
+    context = plant.CreateDefaultContext()
+    plant.SetPositionsAndVelocities(context, x)
+    a = tree.accelerate(numbers, x[None, :nq], x[None, nq:], u[None])[0]
+    frame, world = plant.GetBodyByName(body).body_frame(), plant.world_frame()
+    on_body = RigidTransform(RollPitchYaw(*POSE[3:]), POSE[:3])
+    pose = frame.CalcPoseInWorld(context) @ on_body
+    J = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, frame, POSE[:3], world, world)
+    bias = plant.CalcBiasSpatialAcceleration(
+        context, JacobianWrtVariable.kV, frame, POSE[:3], world, world
+    ).get_coeffs()
+    R = pose.rotation().matrix().T
+    spatial, acceleration = J @ x[nq:], J @ a + bias
+    np.testing.assert_allclose(read[:3], pose.translation(), atol=1e-12)
+    np.testing.assert_allclose(read[3:6], R @ spatial[:3], atol=1e-12)
+    size = np.abs(acceleration).max()
+    np.testing.assert_allclose(read[6:9], R @ (acceleration[3:] + 9.81 * np.eye(3)[2]), atol=1e-9 * size)
+    # What the links need is what the drive gives: inverse dynamics without rotors, springs and friction.
+    k = plant.GetJointByName(joint).velocity_start()
+    moving = tree._with(numbers).moving(tree.place(numbers, x[None, :nq]), x[None, nq:])
+    assert read[9] == pytest.approx(moving.forces(a[None])[0][0, k], abs=1e-9 * np.abs(a).max())
+
+    by = np.eye(len(numbers.flat))
+    by_x, by_numbers = sensors.slopes(numbers, x[None, :nq], x[None, nq:], u[None], by)
+    direction = random.uniform(-1, 1, 2 * nv)
+    change = random.uniform(-1, 1, len(by)) * np.maximum(np.abs(numbers.flat), 1e-3)
+
+    def at(h):
+        moved = chart.plus(x[None], h * direction[None])
+        flat = numbers.flat + h * change
+        parts = {name: flat[numbers.places(name)] for name in Numbers.__dataclass_fields__}
+        return sensors.read(Numbers(**parts), moved[:, :nq], moved[:, nq:], u[None])[0]
+
+    difference = (at(1e-5) - at(-1e-5)) / 2e-5
+    found = by_x[0] @ direction + by_numbers[0] @ change
+    # Differences over 1e-5 of accelerations of light links are good to 1e-6 of the largest.
+    np.testing.assert_allclose(found, difference, atol=1e-6 * max(np.abs(difference).max(), 1.0))
+
+
+def test_a_pendulum_is_known_by_an_accelerometer_and_a_gyro_on_it(load):
+    """At r from the hinge it feels r w' + g sin q across and r w^2 + g cos q along; the gyro has a bias."""
+    model, random, r = load("pendulum.urdf"), np.random.default_rng(0), 0.4
+    exact = swing(damping=0.15, noise=0.0, velocities=True)
+    q, w = exact.xs.T
+    w_dot = -GRAVITY / LEVER * np.sin(q) - 0.15 * w / LEVER**2  # of 1 kg
+    outputs = {  # the rod hangs along -z of its frame and turns about +y
+        "imu.gyro_y": w + 0.05 + 1e-3 * random.standard_normal(len(q)),
+        "imu.accel_x": -r * w_dot - GRAVITY * np.sin(q) + 1e-2 * random.standard_normal(len(q)),
+        "imu.accel_z": r * w**2 + GRAVITY * np.cos(q) + 1e-2 * random.standard_normal(len(q)),
+    }
+    measured = swing(damping=0.15, noise=5e-3, seed=3)
+    without = dd.identify(model, measured, ["hinge.damping"])
+    log = dd.Recording("lab", "1", exact.times, measured.xs, exact.us, outputs=outputs)
+    mounted = {"imu": ("pole", (0, 0, -r))}
+    e = dd.identify(model, log, ["hinge.damping", "imu.gyro_y.bias"], sensors=mounted)
+    assert e.explained, e.reason
+    low, high = e.intervals["hinge.damping"]
+    assert low < 0.15 < high
+    assert high - low < 0.3 * np.ptp(without.intervals["hinge.damping"])
+    low, high = e.intervals["imu.gyro_y.bias"]
+    assert low < 0.05 < high < low + 1e-3
+    assert e.noise["imu.accel_x"] == pytest.approx(1e-2, rel=0.2)
+    wrong = dd.identify(model, log, ["hinge.damping", "imu.gyro_y.bias"], sensors={"imu": ("pole", (0, 0, -0.3))})
+    assert not wrong.explained
+
+
+def test_a_sensor_file_is_kept_and_comes_out_again(tmp_path):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
+    log = swing(damping=0.15, times=np.linspace(0, 1, 81))
+    tip = 0.5 * np.sin(-log.xs[:, 0]) + 1e-4 * np.random.default_rng(0).standard_normal(81)
+    rows = [
+        f"{t!r},{x!r},{y!r},0" for t, x, y in zip(*map(np.ndarray.tolist, (log.times, log.xs[:, 0], tip)), strict=True)
+    ]
+    rows[5] = rows[5].replace(f"{tip[5]!r}", "")
+    path = tmp_path / "lab.csv"
+    path.write_text("\n".join([f"time,hinge_q,tip.position_x,{model.input_names[0]}", *rows]))
+    e = dd.identify(model, path, ["hinge.damping"], sensors={"tip": ("pole", [0, 0, -0.5])})
+    assert e.explained, e.reason
+    assert set(e.noise) == {"hinge_q", "tip.position_x"}
+    record = dd.save(e, tmp_path / "run")
+    assert record.inputs.sensors["tip"].body == "pole"
+    assert dd.verify(tmp_path / "run").holds
+    read = dd.comparison.read_recording(path, model, gaps=True)
+    again = dd.save(
+        dd.identify(model, read, ["hinge.damping"], sensors={"tip": ("pole", [0, 0, -0.5])}), tmp_path / "b"
+    )
+    assert again.estimates == record.estimates
+    assert dd.verify(tmp_path / "b").holds
+
+
+def test_what_makes_no_sense_is_refused(load):
+    model, log = load("pendulum.urdf"), swing()
+
+    def refused(error, words, column, **more):
+        recording = dd.Recording("lab", "1", log.times, log.xs, log.us, outputs={column: np.zeros(len(log.times))})
+        with pytest.raises(error, match=words):
+            dd.identify(model, recording, ["hinge.damping"], **more)
+
+    refused(InputError, "BODY.position_x", "pole.speed_x")
+    refused(UnknownNameError, "body of sensor", "pool.gyro_x")
+    refused(UnknownNameError, "joint with a force", "pole.force")
+    refused(UnknownNameError, "sensor of which there are columns", "pole.gyro_x", sensors={"imu": ("pole", [0, 0, 0])})
+    refused(InputError, "x, y, z", "imu.gyro_x", sensors={"imu": ("pole", [0, 0])})
+    refused(ModelError, "continuous", "pole.gyro_x", motion="steps")
+
+
+@pytest.mark.slow
+def test_an_arm_is_known_by_its_hand_its_imu_and_its_torques_in_another_simulator(tmp_path):
+    """A UR5 in MuJoCo with a heavier forearm, with encoders of 4 mrad and MuJoCo's own sensors."""
+    mujoco = pytest.importorskip("mujoco")
+    path = bare_arm(tmp_path)
+    model, random = drakes(path), np.random.default_rng(0)
+    q0 = np.array([0.3, -1.2, 1.0, -0.5, 0.4, 0.2])
+    us = shaken(model, q0, 150, 0.01, random)
+    arm = MuJoCoArm(mujoco, path)
+    point = [0.05, 0.02, 0.1]
+    arm.spec.body("wrist_3_link").add_site(name="imu", pos=point)
+    for kind in ("FRAMEPOS", "GYRO", "ACCELEROMETER"):
+        arm.spec.add_sensor(
+            name=kind, type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"), objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu"
+        )
+    arm.spec.body("forearm_link").add_site(name="elbow")  # whose y is the joint's axis
+    site = {"objtype": mujoco.mjtObj.mjOBJ_SITE, "objname": "elbow"}
+    arm.spec.add_sensor(name="torque", type=mujoco.mjtSensor.mjSENS_TORQUE, **site)
+    q, v, sensed = arm.move(q0, us, 0.01, masses={"forearm_link": 1.2})
+    sensed = sensed[:, [*range(9), 10]]
+    noise = [*np.repeat([1e-3, 2e-3, 2e-2], 3), 0.5]
+    sensed = sensed + noise * random.standard_normal(sensed.shape)
+    names = [*columns("imu"), "elbow_joint.force"]
+    xs = np.hstack([q + 4e-3 * random.standard_normal(q.shape), np.full_like(v, np.nan)])
+    start = next(p.value[0] for p in dd.list_parameters(model) if p.name == "forearm_link.mass")
+    found = {}
+    for name, outputs in (("encoders", {}), ("all", dict(zip(names, sensed.T, strict=True)))):
+        log = dd.Recording("MuJoCo", mujoco.__version__, 0.01 * np.arange(151), xs, us, outputs=outputs)
+        more = {"sensors": {"imu": ("wrist_3_link", point)}} if outputs else {}
+        found[name] = dd.identify(model, log, ["forearm_link.mass", "elbow_joint.damping"], motion="continuous", **more)
+        assert found[name].explained, found[name].reason
+        for parameter, truth in (("forearm_link.mass", 1.2 * start), ("elbow_joint.damping", 0.5)):
+            # Intervals of 95 % twice as wide, in which the truth is but once in 10,000 times not.
+            assert abs(found[name].values[parameter] - truth) < np.ptp(found[name].intervals[parameter]), parameter
+    widths = {name: np.ptp(e.intervals["elbow_joint.damping"]) for name, e in found.items()}
+    assert widths["all"] < 0.5 * widths["encoders"]
