@@ -1,3 +1,5 @@
+from .base import BaseParameter as BaseParameter
+from .base import base_parameters as base_parameters
 from .excite import Excitation as Excitation
 from .excite import excite as excite
 from .explain import Explanation as Explanation

@@ -181,6 +181,15 @@ class Tree:
         by_q, by_v = self._own(by_q), self._own(by_v)
         return Slopes(own, -inverse @ by_q, -inverse @ by_v, by_u, -inverse @ self._along_columns(change))
 
+    def regressors(self, numbers: Numbers, q: Array, v: Array, a: Array) -> list[Array]:
+        """Of each link (N nv, 10): the force of inverse dynamics at q, v and a (N, nv) by its ten numbers."""
+        every, v = self._all(q, v)
+        poses = self.place(numbers, every)
+        moving = self._with(numbers).moving(poses, v)
+        A = moving.forces(self._all(q, a)[1])[1]
+        each = (self._along_columns(self._regressor(i, poses, moving, A)) for i in range(len(self.links)))
+        return [one.reshape(-1, 10) for one in each]
+
     def efforts(self, numbers: Numbers) -> Array:
         """(nv, nu) the generalized force by the inputs."""
         return self._along_columns(self.actuation * numbers.strength)
