@@ -214,11 +214,15 @@ OF_SDF = '<mimic joint="a"><multiplier>1.7</multiplier><offset>0.64</offset><ref
 OF_DRAKE = '<drake:mimic joint="a" multiplier="1.7" offset="0.3"/>'
 
 
-@each_row("inside, beside", [(OF_SDF, ""), ("", OF_DRAKE)])
-def test_both_elements_of_sdf_are_read(tmp_path, inside, beside):
-    """Drake reads its own alone, and says nothing of the other: q = 1.7 (a - 0.2) + 0.64."""
-    path = tmp_path / "m.sdf"
-    path.write_text(SDF.format(inside=inside, beside=beside))
+@each_row(
+    "inside, beside, world", [(OF_SDF, "", False), ("", OF_DRAKE, False), (OF_SDF, "", True), ("", OF_DRAKE, True)]
+)
+def test_both_elements_of_sdf_are_read(tmp_path, inside, beside, world):
+    """Drake reads its own alone, and says nothing of the other: q = 1.7 (a - 0.2) + 0.64. A model may be in a world."""
+    path, text = tmp_path / "m.sdf", SDF.format(inside=inside, beside=beside)
+    if world:
+        text = text.replace("<model", '<world name="w"><model', 1).replace("</model>", "</model></world>")
+    path.write_text(text)
     assert load(path, None).nv == 2
     model = load(path)
     assert model.state_names == ("a_x", "a_v")

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.models import Plant, contact_properties, random_state
+from helpers.models import MODELS, Plant, contact_properties, random_state
 from helpers.table import each_row
 
 import drake_diff as dd
@@ -282,3 +282,18 @@ def test_a_state_that_is_not_finite_is_an_error_not_the_end_of_the_process(load)
 
     with pytest.raises(SimulationError, match="not finite"):
         advance(load("pendulum.urdf").double, np.array([np.nan, 0.0]), np.zeros(1))
+
+
+def test_all_that_is_simulated_in_a_block_is_counted_and_nothing_beside_it():
+    """A rollout of N steps takes N, and a step with its derivative by AutoDiffXd two; blocks may lie in each other."""
+    model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01)
+    still = [0, 0.9, 0, 0.45, 0, 0, 0, 0]  # in the air
+    with dd.model.count_steps() as around:
+        dd.rollout(model, still, np.zeros((7, 2)))
+        with dd.model.count_steps() as inside:
+            dd.differentiate_step(model, still, [0, 0], method="autodiff")
+        assert (inside.steps, around.steps) == (2, 9)
+        dd.rollout(model, still, np.zeros((5, 2)), method="continuous")
+    assert (inside.steps, around.steps) == (2, 14)
+    dd.step(model, still, [0, 0])
+    assert around.steps == 14

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.exceptions import SimulationError
+from drake_diff.model.counted import stepped
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.twin import Twin
@@ -73,6 +74,7 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
     if not _is_finite(np.asarray(u)):
         raise SimulationError(f"an input is not finite: {u}")
     twin.set_input(u)
+    stepped()
     if twin.forces:
         plant.get_applied_generalized_force_input_port().FixValue(context, twin.added_force())
     try:

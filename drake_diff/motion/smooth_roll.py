@@ -18,6 +18,7 @@ from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.compiled_tree import compiled_tree
 from drake_diff.mechanics.description import describe_tree
+from drake_diff.model.counted import stepped
 from drake_diff.model.model import Model
 
 KERNEL = "drake_diff.mechanics.roll_kernel"
@@ -42,6 +43,7 @@ class SmoothRoll:
         compiled, (count, nu), nx = kernel(KERNEL), wanted.shape, len(x0)
         xs, us = np.empty((count + 1, nx)), np.empty((count, nu))
         xs[0] = x0
+        stepped(count)
         told = [np.array(part, float, order="C") for part in (old, gaps, wanted, gains)]
         compiled_bounds = compiled.Bounds(*(np.array(part, float, order="C") for part in bounds))
         tables = compiled.Tree(*self.tree), compiled.Forces(*self.forces)

@@ -8,6 +8,7 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff.derivatives.contact.material import QUANTITIES, material_change
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import ModelError, SimulationError
+from drake_diff.model.counted import stepped
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector
 from drake_diff.motion.flow.integrate import TOLERANCE, Flow, Integrator
@@ -40,6 +41,7 @@ class FlowSteps:
         for k in range(count):
             us[k] = choose(xs[k], k)
             begin = len(flow.hs)
+            stepped()
             xs[k + 1] = self.integrator.advance(flow, us[k], model.time_step)
             self._check_limits(np.array(flow.xs[begin:]))
         return xs, us, flow
