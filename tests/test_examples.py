@@ -10,7 +10,7 @@ import pytest
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import ModelWarning
+from drake_diff.exceptions import GradientWarning, ModelWarning
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -232,3 +232,39 @@ def test_the_quadruped_goes_as_its_schedule_says(name, way):
             body = model.plant.GetBodyByName(foot)
             height = model.plant.EvalBodyPoseInWorld(context, body).translation()[2] - 0.025  # its radius
             assert (height < 1e-6) == (foot in standing)
+
+
+@pytest.mark.slow
+def test_the_leg_that_is_designed_jumps_by_a_design_inside_its_bounds():
+    """Found with its torques: no length and no stiffness is at a bound, and every replay of its torques is a jump."""
+    module = example("jumping_leg")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)  # the linkage is told
+        problem = module.problem()
+    solution = dd.solve(problem, **module.solve_options)
+    assert solution.success, solution.message
+    lower, upper = problem.bounds_of_parameters()
+    moves = upper > lower
+    inside = (solution.parameters - lower)[moves] / (upper - lower)[moves]
+    assert np.all((inside > 0.1) & (inside < 0.9))
+    replays = [replay for replay in solution.replays if replay.control == "open loop"]
+    assert all(replay.holds and replay.motion.xs[-1][0] > 0.5 for replay in replays)  # [m] half of what is out of reach
+
+
+@pytest.mark.slow
+def test_the_policy_hops_to_its_height_and_its_plan_can_be_verified(tmp_path):
+    """From heights that it was not trained on too; what is saved is its own motion, to the last input."""
+    module = example("hopping_policy")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GradientWarning)  # a height of the fall at which a touch begins at a knot
+        weights = module.train(16)
+    for height in module.DROPS + module.UNSEEN:
+        assert module.hop(dd.rollout, weights, height).xs[-1][0] == pytest.approx(module.HEIGHT, abs=0.03)
+    solution = dd.solve(module.problem(weights))
+    assert solution.success, solution.message
+    own = module.hop(dd.rollout, weights, module.DROPS[0])
+    assert solution.us == pytest.approx(own.us, abs=1e-6)
+    assert any(own.contacts)
+    assert not own.contacts[-1]  # it ends in the air
+    dd.save(solution, tmp_path / "run")
+    assert dd.verify(tmp_path / "run").verdict == "holds"

@@ -30,7 +30,7 @@ def count_steps() -> Iterator[StepCount]:
 
     One is a step of Drake's plant, by numbers or by AutoDiffXd, or an interval of `time_step` of a motion in continuous
     time. All are counted: those of a rollout or a search, and those by which derivatives, certificates and replays are
-    taken. A derivative by formula takes none. The block counts what its own thread does, not other threads or processes.
+    taken. A derivative by formula takes none. The block counts what its own thread does, no other threads or processes.
 
     Returns:
         A context that gives a `StepCount`.

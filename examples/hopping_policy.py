@@ -1,0 +1,60 @@
+"""A policy of 36 weights that hops to 0.75 m from wherever it falls, trained by gradients through landing and take-off.
+
+They are those of the motion in continuous time, impacts included. What is saved is the plan that the policy makes.
+
+    drake-diff run examples/hopping_policy.py    trains, and writes artifacts/hopping_policy, which `verify` accepts
+    python examples/hopping_policy.py            beside Powell's search, by values alone, and as many simulated steps
+"""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import minimize
+
+import drake_diff as dd
+
+HEIGHT, HIDDEN, DROPS, UNSEEN = 0.75, 6, (0.6, 0.75, 0.9), (0.65, 0.85)  # [m] where to, and where the body falls from
+FIRST = np.random.default_rng(0).normal(0, np.repeat([0.5, 0.1], [5 * HIDDEN, HIDDEN]))  # the weights
+model = dd.load_model(Path(__file__).parent.parent / "models/hopper.sdf", time_step=0.02, fix_joints=("x", "swing"))
+miss = dd.QuadraticCost(Q=np.diag([1, 0, 0.05, 0]), x_ref=[HEIGHT, 0, 0, 0])  # at rest at the height after 0.8 s
+
+
+def network(x, t, weights):
+    """The force of the leg [N] (1,): a spring, a damper and a network on top."""
+    inner, bias, outer = np.split(weights, [4 * HIDDEN, 5 * HIDDEN])
+    hidden = np.tanh(inner.reshape(HIDDEN, 4) @ ((x - [0.6, 0.5, 0, 0]) * [3, 3, 0.5, 0.5]) + bias)
+    return np.array([12 - 100 * (x[1] - 0.45) - 3 * x[3] + 30 * (outer @ hidden)])
+
+
+def hop(function, weights, height, *loss):
+    asked = {"policy": dd.motion.ParametricPolicy(network, weights), "num_steps": 40, "method": "continuous"}
+    return function(model, [height, 0.45, 0, 0], None, *loss, **asked)
+
+
+def train(evaluations: int, *, gradients: bool = True) -> np.ndarray:
+    def mean(weights):
+        if not gradients:
+            return np.mean([miss(hop(dd.rollout, weights, z).xs[-1]) for z in DROPS])
+        found = [hop(dd.differentiate_rollout, weights, z, lambda x: miss(x)) for z in DROPS]
+        return np.mean([g.loss for g in found]), np.mean([g.by_policy for g in found], axis=0)
+
+    method, limit = ("L-BFGS-B", "maxfun") if gradients else ("Powell", "maxfev")
+    return minimize(mean, FIRST, jac=gradients, method=method, options={limit: evaluations}).x
+
+
+def problem(weights=None) -> dd.Problem:
+    """The policy's motion after the first drop, to be followed: its own inputs do that at no cost."""
+    motion = hop(dd.rollout, train(16) if weights is None else weights, DROPS[0])
+    table = motion.times, motion.xs, np.vstack([motion.us, motion.us[-1:]])
+    follow = dd.optimize.TrackingCost(table, Q=np.eye(4), R=[[1.0]])
+    return dd.Problem(model, x0=motion.xs[0], num_steps=40, motion="continuous", us=motion.us, running_cost=follow)
+
+
+if __name__ == "__main__":
+    with dd.model.count_steps() as count:
+        found = {"gradients": train(16)}
+    found["Powell"] = train(count.steps // (40 * len(DROPS)), gradients=False)
+    print(f"{count.steps} simulated steps each; 0.8 s after drops from {DROPS}, and {UNSEEN} m not trained on, at")
+    for name, weights in found.items():
+        heights = [hop(dd.rollout, weights, z).xs[-1][0] for z in DROPS + UNSEEN]
+        print(f"{name} {np.round(heights, 3)} m; its plan: {dd.solve(problem(weights)).message}")

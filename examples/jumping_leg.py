@@ -1,0 +1,59 @@
+"""Co-design: the lengths of a leg, the spring at its knee and the torques, for the highest jump.
+
+From a crouch the leg is to come as high as it can in the same crouch, so that no spring gives energy for nothing: what
+it adds to the push, the motor puts in again in the air. A long leg is a slow gear, too weak for its weight; in a short
+one, a fast gear, damping takes the motor's work. So the best design lies in between.
+
+    drake-diff run examples/jumping_leg.py    writes artifacts/jumping_leg, which `drake-diff verify` makes again
+    python examples/jumping_leg.py            beside differential evolution, by as many simulated steps
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+import drake_diff as dd
+
+MODEL = Path(__file__).parent.parent / "models" / "jumper.sdf"
+START, CROUCH, NUM_STEPS = [0.0287, 1.9, 0, 0], 1.9, 50  # foot [m], knee [rad], and their rates
+BOUNDS = {  # [m], along z of the link before; [N m/rad]
+    "knee.offset": ([0, 0, 0.05], [0, 0, 0.8]),
+    "hip.offset": ([0, 0, 0.05], [0, 0, 0.8]),
+    "knee.spring_stiffness": (0.1, 30.0),
+}
+solve_options = {"method": "shooting", "tolerance": 1e-6, "max_iterations": 600}
+
+
+def problem() -> dd.Problem:
+    """The foot as near to 1 m as it gets, which is out of reach, and a little for the effort."""
+    return dd.Problem(
+        dd.load_model(MODEL, time_step=0.01, mimic="reduce"),
+        x0=START,
+        x_goal={"knee": CROUCH},
+        num_steps=NUM_STEPS,
+        final_cost=dd.QuadraticCost(Q=np.diag([1.0, 0, 0, 0]), x_ref=[1.0, 0, 0, 0]),
+        running_cost=dd.QuadraticCost(R=[[1e-3]]),
+        bounds={"knee": (0.4, 2.4)},
+        optimize=("controls", "parameters"),
+        parameters=tuple(BOUNDS),
+        parameter_bounds=BOUNDS,
+        us=np.where(np.arange(NUM_STEPS) < 11, -4.0, 3.0)[:, None],  # a push
+    )
+
+
+def main() -> None:
+    with dd.model.count_steps() as count:
+        plan = dd.solve(problem(), **solve_options)
+    other = dd.studies.without_derivatives(problem(), count.steps)
+    print(f"{count.steps} simulated steps each; the foot at its lowest in the replays; shank, thigh, spring")
+    for name, found in {"gradients": plan, "evolution": other}.items():
+        tried = [replay for replay in found.replays if replay.control == "open loop"]
+        height, hold = min(replay.motion.xs[-1][0] for replay in tried), sum(replay.holds for replay in tried)
+        verdicts = ", ".join(sorted({certificate.verdict for certificate in found.certificates})) or "none"
+        print(f"{name} {height:.3f} m, {hold} of {len(tried)} replays hold, {found.status.value};", end=" ")
+        print("{2:.3f} m, {5:.3f} m, {6:.2f} N m/rad;".format(*found.parameters), f"certificates: {verdicts}")
+    print(plan.message)
+
+
+if __name__ == "__main__":
+    main()
