@@ -27,7 +27,9 @@ from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.record import identification as records
 from drake_diff.record.directory import name_of, written_whole
+from drake_diff.record.embodiment import embodiment_of
 from drake_diff.record.identification import IdentificationRecord
+from drake_diff.record.parts import DataBoundary, DataUse
 from drake_diff.record.provenance import model_input, provenance_of, written_now
 from drake_diff.record.sealed import WallClock, canonical, reproducible
 
@@ -101,6 +103,7 @@ def _begun(name: str, asked: Asked) -> IdentificationRecord:
         verdict="incomplete",
         sentence="it is still being written, or that was killed or broke off",
         model=model_input(asked.model),
+        embodiment=embodiment_of(asked.model.contract),
         contract=asked.model.contract.to_dict(),
         inputs=records.Asked(
             parameters=parameters,
@@ -124,10 +127,12 @@ def _begun(name: str, asked: Asked) -> IdentificationRecord:
 def record_of(e: Identification, name: str) -> IdentificationRecord:
     """The record of an identification, but for the files."""
     asked = _asked(e)
+    recordings = [_recording(i, e, asked) for i in range(len(asked.recordings))]
     found: dict[str, Any] = {
         "verdict": "pass" if e.explained else "fail",
         "sentence": e.sentence,
-        "recordings": [_recording(i, e, asked) for i in range(len(asked.recordings))],
+        "recordings": recordings,
+        "data": _data(recordings),
         "estimates": estimates_of(e),
         "unidentifiable": list(e.unidentifiable),
         "noise": dict(e.noise),
@@ -137,6 +142,24 @@ def record_of(e: Identification, name: str) -> IdentificationRecord:
     }
     begun = _begun(name, asked)
     return IdentificationRecord(**{**{key: getattr(begun, key) for key in type(begun).model_fields}, **found})
+
+
+def _data(recordings: list[records.RecordingEvidence]) -> DataBoundary:
+    """Which spans of which recordings were fitted, and which were predicted only."""
+
+    def uses(r: records.RecordingEvidence, spans: list[list[float]], whole: bool) -> list[DataUse]:
+        hashed = r.sha256 if whole else None  # that of a file is of no part of it
+        return [
+            DataUse(name=f"{r.path}, {a:g} to {b:g} s", what=f"recording {r.name}", sha256=hashed) for a, b in spans
+        ]
+
+    seen = [use for r in recordings for use in uses(r, r.fitted_s, not r.held_out_s)]
+    held_out = [use for r in recordings for use in uses(r, r.held_out_s, not r.fitted_s)]
+    fitted, kept = ("1 span" if len(part) == 1 else f"{len(part)} spans" for part in (seen, held_out))
+    statement = f"parameters were fitted on {fitted}, and the fit is judged on {kept} that it did not see, and its own"
+    return DataBoundary(
+        statement=statement, seen=seen, judged_on=[*seen, *held_out], held_out=[use.name for use in held_out]
+    )
 
 
 def _asked(e: Identification) -> Asked:

@@ -35,7 +35,6 @@ from drake_diff.optimize.solution import Solution
 from drake_diff.record.embodiment import NO_BODY, embodiment_of
 from drake_diff.record.parts import DataBoundary, DataUse, ModelInput, Quantity
 from drake_diff.record.provenance import gradient_evidence, model_input
-from drake_diff.record.sealed import canonical
 from drake_diff.record.solve import (
     ActionInterface,
     Claim,
@@ -196,8 +195,7 @@ def panel_of(solution: Solution) -> EvaluationPanel:
     statement = "the plan's own start, model and inputs in each case; a variant that decides holds under one control"
     if not problem.has_model:
         statement = "the given equations alone, at and between the knots: there is no plant to replay it on"
-    told = EvaluationPanel(statement=statement, cases=cases, perturbations=[], latencies_s=[0.0])
-    return told.model_copy(update={"sha256": sha256(canonical(told.model_dump(mode="json")).encode()).hexdigest()})
+    return EvaluationPanel(statement=statement, cases=cases, perturbations=[], latencies_s=[0.0]).hashed()
 
 
 def _search(solution: Solution) -> dict[str, Any] | None:

@@ -1,6 +1,7 @@
 """A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page."""
 
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from drake_diff.model.model import Model
 from drake_diff.record import comparison as records
 from drake_diff.record.comparison import ComparisonRecord
 from drake_diff.record.directory import name_of, written_whole
+from drake_diff.record.embodiment import embodiment_of
+from drake_diff.record.parts import DataBoundary, DataUse
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 
 TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
@@ -74,6 +77,7 @@ def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
         "sentence": str(comparison),
         "states": [records.StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
         "engines": [_engine(e) for e in comparison.engines],
+        "data": _data(comparison),
         "refused": [records.RefusedEvidence(**vars(refused)) for refused in comparison.refused],
         "wall_clock": records.ComparisonClock(
             written_utc=written_now(),
@@ -90,11 +94,29 @@ def _begun(name: str, model: Model) -> ComparisonRecord:
     return ComparisonRecord(
         name=name, verdict="incomplete",
         sentence="the comparison is still running, or it was killed or failed before its end",
-        tolerances={**steps, **jacobians}, model=model_input(model), contract=model.contract.to_dict(),
+        tolerances={**steps, **jacobians}, model=model_input(model),
+        embodiment=embodiment_of(model.contract), contract=model.contract.to_dict(),
         time_step_s=model.time_step, state_names=list(model.state_names), input_names=list(model.input_names),
         states=[], engines=[], refused=[], provenance=provenance_of(),
         wall_clock=records.ComparisonClock(written_utc=written_now()),
     )  # fmt: skip
+
+
+def _data(comparison: Comparison) -> DataBoundary:
+    """What all were given, and the recordings, which have neither Jacobians nor times."""
+
+    def use(name: str, what: str, *arrays: Array) -> DataUse:
+        data = b"".join(np.asarray(array, dtype=float).tobytes() for array in arrays)
+        return DataUse(name=name, what=what, sha256=sha256(data).hexdigest())
+
+    motion = use("motion", "the first state and the inputs that every engine was given", comparison.x0, comparison.us)
+    recorded = [e for e in comparison.engines if not e.jacobians and e.seconds_per_step is None]
+    recordings = [
+        use(e.engine, f"a recording of {len(e.motion.xs)} states", e.motion.times, e.motion.xs, e.motion.us)
+        for e in recorded
+    ]
+    statement = "nothing was fitted: engines are compared by their own steps, recordings as they were made"
+    return DataBoundary(statement=statement, seen=[], judged_on=[motion, *recordings])
 
 
 def _engine(e: Compared) -> records.EngineEvidence:

@@ -19,6 +19,7 @@ from drake_diff.model.parameters import Parameters, select
 from drake_diff.model.sampling import SampledState, sample_states
 from drake_diff.model.step import advance
 from drake_diff.record.directory import written_whole
+from drake_diff.record.embodiment import embodiment_of
 from drake_diff.record.parts import Certified, FiniteTable, Part
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 from drake_diff.record.sealed import Passed, SealedRecord, WallClock
@@ -118,6 +119,7 @@ def certify_model(
             method=method,
             parameters=names,
             model=model_input(model),
+            embodiment=embodiment_of(model.contract),
             contract=model.contract.to_dict(),
             states=list(found),
             provenance=provenance_of(),

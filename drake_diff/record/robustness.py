@@ -6,6 +6,7 @@ from pydantic import model_validator
 
 from drake_diff.record.parts import Label, Part
 from drake_diff.record.sealed import SealedRecord, WallClock
+from drake_diff.record.solve import EvaluationPanel
 
 
 class RunEvidence(Part):
@@ -126,6 +127,7 @@ class RobustnessRecord(SealedRecord):
     loop: LoopEvidence | None
     nominal: Nominal | None
     perturbations: list[PerturbationEvidence]
+    panel: EvaluationPanel | None = None  # null in records of before 2.3, and before anything was judged
     wall_clock: RobustnessClock
 
     @model_validator(mode="after")

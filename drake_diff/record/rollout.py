@@ -14,6 +14,7 @@ from drake_diff.certificates.truth import TrueSlope, Truth
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.record.directory import written_whole
+from drake_diff.record.embodiment import embodiment_of
 from drake_diff.record.parts import Certified, Part
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 from drake_diff.record.sealed import SealedRecord, WallClock
@@ -138,6 +139,7 @@ def save_rollout(
         truth=None if certificate.truth is None else truth_evidence(certificate.truth),
         no_truth=certificate.no_truth,
         model=model_input(model),
+        embodiment=embodiment_of(model.contract),
         provenance=provenance_of(),
         wall_clock=WallClock(written_utc=written_now()),
     )

@@ -19,11 +19,11 @@ from drake_diff._base.files import make_folder, write_whole
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.strangers import MOST_TEXT, json_of, read_plain
 from drake_diff.exceptions import ArtifactError
-from drake_diff.record.parts import FileEvidence, ModelInput, Part, Provenance
+from drake_diff.record.parts import DataBoundary, Embodiment, FileEvidence, ModelInput, Part, Provenance
 from drake_diff.record.provenance import file_evidence
 
 # A new major one where a field goes or changes its meaning, a minor one where one is added.
-SCHEMA_VERSION = "2.2.0"
+SCHEMA_VERSION = "2.3.0"
 # How others are read, word for word in every published schema.
 READING = (
     f"This is version {SCHEMA_VERSION}. An earlier minor version of the same major one is read with what it lacks "
@@ -58,6 +58,8 @@ class SealedRecord(ShowsItsRepr, Part):
     verdict: Passed
     sentence: str
     model: ModelInput
+    embodiment: Embodiment | None = None  # null: of no robot, of one in each phase, or of before 2.3 (solves: 2.2)
+    data: DataBoundary | None = None  # null: nothing was fitted to data or judged on them, or the same
     provenance: Provenance
     wall_clock: WallClock
     files: dict[str, FileEvidence] = Field(default_factory=dict)

@@ -1,13 +1,12 @@
 """The fields of record.json: one solve, from what was asked to what was measured again."""
 
+from hashlib import sha256
 from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from drake_diff.record.parts import (
     Certified,
-    DataBoundary,
-    Embodiment,
     Evaluation,
     Event,
     Failure,
@@ -16,7 +15,7 @@ from drake_diff.record.parts import (
     Part,
     Quantity,
 )
-from drake_diff.record.sealed import SealedRecord
+from drake_diff.record.sealed import SealedRecord, canonical
 
 METRIC_WRONG = "metric_wrong"  # the code of a failure: a metric is not what it is by a second measurement
 
@@ -205,6 +204,11 @@ class EvaluationPanel(Part):
     latencies_s: list[float]
     sha256: str = ""
 
+    def hashed(self) -> "EvaluationPanel":
+        """The same with its hash."""
+        bare = self.model_copy(update={"sha256": ""})
+        return bare.model_copy(update={"sha256": sha256(canonical(bare.model_dump(mode="json")).encode()).hexdigest()})
+
 
 class EvidenceRecord(SealedRecord):
     """Everything a stranger needs to judge one solve; the motion is in plan.npz and trace.mcap.
@@ -219,9 +223,7 @@ class EvidenceRecord(SealedRecord):
     inputs: Inputs
     problem: FiniteTable
     contract: FiniteTable
-    embodiment: Embodiment | None = None  # null in records of before 2.2
-    data: DataBoundary | None = None  # the same
-    panel: EvaluationPanel | None = None  # the same, and before anything was judged
+    panel: EvaluationPanel | None = None  # null in records of before 2.2, and before anything was judged
     units: dict[str, str]  # of the numbers in `problem` and `contract`, by their key
     solver: Solver | None = None
     parameters: list[ParameterEvidence] = Field(default_factory=list)

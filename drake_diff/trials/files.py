@@ -15,6 +15,8 @@ from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
 from drake_diff.model.model import Model
 from drake_diff.record.directory import name_of, written_whole
+from drake_diff.record.embodiment import embodiment_of
+from drake_diff.record.parts import DataBoundary, DataUse
 from drake_diff.record.provenance import model_input, provenance_of, written_now
 from drake_diff.record.robustness import (
     CellEvidence,
@@ -25,12 +27,13 @@ from drake_diff.record.robustness import (
     RobustnessRecord,
     RunEvidence,
 )
-from drake_diff.record.solve import EvidenceRecord
+from drake_diff.record.solve import EvaluationPanel, EvidenceRecord
 from drake_diff.trials.perturbation import perturbation_named
 from drake_diff.trials.run import Cell, Robustness
 from drake_diff.trials.trial import Task
 from drake_diff.trials.trial_files import REPLAY, finite, write_trial
 
+LATENCY = "latency"  # the perturbation whose levels are steps of the controller
 PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
 PLAIN = Loop()
 
@@ -99,6 +102,8 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
         "pass" if result.success else "fail",
         result.sentence,
         run=run,
+        panel=_panel(result),
+        data=_data(result, run),
         trials=result.trials,
         seed=result.seed,
         loop=_loop(task),
@@ -123,6 +128,29 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
     )
 
 
+def _panel(result: Robustness) -> EvaluationPanel:
+    """Every level of every perturbation, and the latencies among them."""
+    units = {name: perturbation_named(name).unit for name in result.names}
+    period = result.task.loop.substeps * result.task.model.time_step
+    late = [0.0, *(c.level * period for name in result.names if name == LATENCY for c in result.of(name))]
+    statement = f"the plan under the controller {result.task.controller_name}, each level by itself, seed {result.seed}"
+    return EvaluationPanel(
+        statement=statement,
+        cases=[],
+        perturbations=[f"{c.perturbation} {c.level:g} {units[c.perturbation]}, {c.rate.trials} trials"
+                       for name in result.names for c in result.of(name)],
+        latencies_s=[float(value) for value in late],
+    ).hashed()  # fmt: skip
+
+
+def _data(result: Robustness, run: RunEvidence | None) -> DataBoundary:
+    plan = DataUse(name="plan", what="given as it is" if run is None else run.path,
+                   sha256=None if run is None else run.record_sha256)  # fmt: skip
+    trials = DataUse(name="trials", what=f"{result.trials} of each level, drawn from the seed {result.seed}")
+    statement = "the plan was made before, without these trials; nothing was fitted to them"
+    return DataBoundary(statement=statement, seen=[plan], judged_on=[trials], held_out=[trials.name])
+
+
 def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -> RobustnessRecord:
     clock = RobustnessClock(written_utc=written_now())
     unknown: dict[str, Any] = dict.fromkeys(("run", "trials", "seed", "loop", "nominal"))
@@ -131,6 +159,7 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -
         verdict=verdict,
         sentence=sentence,
         model=model_input(model),
+        embodiment=embodiment_of(model.contract),
         state_names=list(model.state_names),
         input_names=list(model.input_names),
         provenance=provenance_of(),

@@ -1,0 +1,94 @@
+"""What records of all kinds say of the robot and of their data, and how records of before are read."""
+
+import json
+from hashlib import sha256
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+
+import drake_diff as dd
+from drake_diff.record.embodiment import embodiment_of
+from drake_diff.record.sealed import SCHEMA_VERSION, canonical, own_sha256
+
+H = 0.02
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A directory of each kind, of the pendulum."""
+    folder = tmp_path_factory.mktemp("kinds")
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=H)
+    dd.record.certify_model(model, states=1, directory=folder / "certification")
+    still = dd.Recording("lab", "1", H * np.arange(3), np.zeros((3, 2)), np.zeros((2, 1)))
+    dd.comparison.save_comparison(dd.compare(model, ["numpy"], recordings=(still,)), folder / "comparison")
+    certificate = dd.certify_rollout(model, [0.5, 0], np.zeros((5, 1)), lambda x: x[0])
+    dd.record.save_rollout(certificate, model, folder / "rollout")
+    cost = dd.QuadraticCost(R=[[1.0]])
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost)
+    result = dd.robustness(dd.solve(problem, method="shooting"), {"mass": [0.05], "latency": [1, 2]}, trials=2)
+    dd.trials.save_robustness(result, folder / "robustness")
+    motion = dd.rollout(model, [1.0, 0.0], np.zeros((150, 1)), parameters={"hinge.damping": 0.2})
+    noisy = motion.xs + 1e-3 * np.random.default_rng(0).standard_normal(motion.xs.shape)
+    log = dd.Recording("swing", "1", H * np.arange(151), noisy, np.zeros((150, 1)))
+    dd.save(dd.identify(model, log, ["hinge.damping"]), folder / "identification")
+    return model, folder
+
+
+def test_every_record_of_a_robot_says_which(written):
+    model, folder = written
+    for path in folder.iterdir():
+        assert dd.load_record(path).embodiment == embodiment_of(model.contract), path.name
+
+
+def test_what_was_seen_and_what_was_judged_on(written):
+    _, folder = written
+    data = {path.name: dd.load_record(path).data for path in folder.iterdir()}
+    assert data["certification"] is data["rollout"] is None  # nothing was fitted, and no data were judged on
+    assert [use.name for use in data["comparison"].judged_on] == ["motion", "lab"]
+    arrays = (H * np.arange(3), np.zeros((3, 2)), np.zeros((2, 1)))
+    hashed = sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
+    assert data["comparison"].judged_on[1].sha256 == hashed
+    assert data["robustness"].held_out == ["trials"]
+    spans = data["identification"]
+    assert [use.name.split(", ")[1] for use in spans.seen] == ["0 to 2.4 s"]  # the last fifth of 3 s is held out
+    assert [name.split(", ")[1] for name in spans.held_out] == ["2.4 to 3 s"]
+
+
+def test_the_panel_of_robustness_names_every_level(written):
+    panel = dd.load_record(written[1] / "robustness").panel
+    assert panel.perturbations == ["mass 0.05 1, 2 trials", "latency 1 steps, 2 trials", "latency 2 steps, 2 trials"]
+    assert panel.latencies_s == [0.0, H, 2 * H]
+    assert panel.hashed().sha256 == panel.sha256
+    other = panel.model_copy(update={"perturbations": panel.perturbations[:1]})
+    assert other.hashed().sha256 != panel.sha256
+
+
+def before(folder, copy, version):
+    """The directory as a drake_diff of schema `version` wrote it: without what came later, with its own hash."""
+    copy.mkdir()
+    for path in folder.rglob("*"):
+        if path.is_file():
+            (copy / path.relative_to(folder)).parent.mkdir(parents=True, exist_ok=True)
+            (copy / path.relative_to(folder)).write_bytes(path.read_bytes())
+    kind = type(dd.load_record(folder))
+    fields = json.loads((copy / kind.FILE).read_bytes())
+    fields = {key: value for key, value in fields.items() if key not in ("embodiment", "data", "panel")}
+    fields["schema_version"] = version
+    (copy / kind.FILE).write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
+    return copy
+
+
+@pytest.mark.parametrize("kind", ["certification", "comparison", "rollout", "robustness", "identification"])
+def test_a_record_of_an_earlier_minor_version_is_read_with_nulls(written, tmp_path, kind):
+    old = before(written[1] / kind, tmp_path / kind, "2.2.0")
+    record = dd.load_record(old)
+    assert (record.embodiment, record.data, record.schema_version) == (None, None, "2.2.0")
+    found = dd.verify(old)
+    # What it lacks differs from what is made again: that may be the version's doing, and is told.
+    rerun = kind in ("certification", "identification")
+    assert found.verdict == ("undecided" if rerun else "intact"), found.lines
+    assert any(f"recorded by schema 2.2.0, whose fields are not those of {SCHEMA_VERSION}" in n for n in found.notes)
+    gone = before(written[1] / kind, tmp_path / "other", "1.9.0")
+    with pytest.raises(dd.exceptions.ArtifactError, match=r"schema_version '1\.9\.0'; this drake_diff reads 2\.x\.y"):
+        dd.load_record(gone)
