@@ -178,6 +178,59 @@ def test_other_kinds_of_files_are_refused(arm, load, tmp_path):
         write_model(replace(found, asked=None), tmp_path / "right.urdf")
 
 
+OVERLAY = """directives:
+- add_model:
+    name: one
+    file: {0}  # the arm
+    default_joint_positions:
+      shoulder: [0.4]
+- add_frame:
+    name: tilted
+    X_PF: {{base_frame: world, translation: [0, 0, 2], rotation: !Rpy {{deg: [0, 30, 0]}}}}
+- add_weld: {{parent: tilted, child: one::base}}
+"""
+
+
+def test_an_overlay_stays_over_a_corrected_copy_of_the_file_that_it_adds(tmp_path):
+    robot = ARM.replace('<robot name="arm">', '<robot name="arm"><link name="base"/>').replace(
+        '<parent link="world"/>', '<parent link="base"/>'
+    )
+    (tmp_path / "arm.urdf").write_text(robot)
+    (tmp_path / "arm.dmd.yaml").write_text(OVERLAY.format(f"file://{tmp_path / 'arm.urdf'}"))
+    model = dd.load_model(tmp_path / "arm.dmd.yaml", time_step=0.01)
+    values = {"shoulder.damping": 0.7, "shoulder.offset": np.array([0.0, 0.1, 1.2])}
+    path = write_model(saying(model, values), tmp_path / "right.dmd.yaml")
+    same(model, path, values)
+    new = dd.load_model(path, time_step=0.01)
+    np.testing.assert_array_equal(new.default_state, model.default_state)  # the positions of the overlay
+    lines = path.read_text().splitlines()
+    assert lines[0].startswith("# Explained: so -- it is -->.")
+    assert [line for line in lines[1:] if "file:" not in line] == [
+        line for line in (tmp_path / "arm.dmd.yaml").read_text().splitlines() if "file:" not in line
+    ]
+    assert "# the arm" in path.read_text()
+    assert "shoulder.damping was 0 N m s/rad, is 0.7" in (tmp_path / "right_arm.urdf").read_text()
+    assert (tmp_path / "arm.urdf").read_text() == robot
+
+
+def test_what_an_overlay_cannot_tell_apart_is_refused_and_nothing_stays(tmp_path):
+    robot = ARM.replace('<parent link="world"/>', '<parent link="base"/>').replace(
+        '<robot name="arm">', '<robot name="arm"><link name="base"/>'
+    )
+    (tmp_path / "arm.urdf").write_text(robot)
+    (tmp_path / "other.urdf").write_text(robot)
+    weld = "- add_weld: {{parent: world, child: {0}::base}}\n"
+    adds = "- add_model: {{name: {0}, file: 'file://{1}'}}\n"
+    parts = [adds.format(n, tmp_path / f"{f}.urdf") + weld.format(n) for n, f in (("one", "arm"), ("two", "other"))]
+    (tmp_path / "two.dmd.yaml").write_text("directives:\n" + "".join(parts))
+    model = dd.load_model(tmp_path / "two.dmd.yaml", time_step=0.01)
+    with pytest.raises(InputError, match=r"one::arm\.mass: .*0 URDF or SDF files .* have one::arm"):
+        write_model(saying(model, {"one::arm.mass": 3.0}), tmp_path / "right.dmd.yaml")
+    with pytest.raises(InputError, match=r"a \.dmd\.yaml file, as the model's own"):
+        write_model(saying(model, {"one::arm.mass": 3.0}), tmp_path / "right.urdf")
+    assert not list(tmp_path.glob("right*"))
+
+
 def test_a_name_that_the_file_has_twice_is_refused(tmp_path):
     path = tmp_path / "two.sdf"
     link = '<link name="a"><inertial><mass>1</mass></inertial></link>'

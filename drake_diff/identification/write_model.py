@@ -3,12 +3,14 @@
 A comment at each changed element says what it was, what it is, with which interval and from which recordings.
 """
 
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydrake.multibody.parsing import LoadModelDirectives, PackageMap
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
@@ -17,6 +19,7 @@ from drake_diff.identification.identify import Asked, Identification
 from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, INERTIA, MASS, STRENGTH
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.parameters import applied, list_parameters, select
+from drake_diff.model.robot_text import add_packages
 from drake_diff.model.xml_text import Element, XmlText
 
 BODY = (MASS, CENTER, INERTIA)
@@ -29,6 +32,8 @@ ROTOR = ("rotor_inertia", "gear_ratio")
 IN_URDF, IN_SDF = (*BODY, "damping", "offset", *ROTOR), (*BODY, "damping", *SPRING, *ROTOR)
 SAME = 1e-9  # of a parameter's largest entry: what printing, and moving an inertia to its centre of mass, may change
 ROUNDING = 1e-13  # of m c^2: what is left of an inertia of 0 that was moved from the body's origin
+OVERLAY = ".dmd.yaml"
+KINDS = (".urdf", ".sdf", OVERLAY)
 NO_ROOM = {
     COULOMB: "Drake has no dry friction of joints",
     STRENGTH: "no file says how strong an input is",
@@ -45,16 +50,18 @@ def write_model(identification: Identification, path: str | Path) -> Path:
     was found, before it stays.
 
     Args:
-        identification: What `identify` returned, of a model from one URDF or SDF file. Where it is not explained, the
-            file says so at its top.
-        path: The file to write, of the same kind. It must not exist yet, and it names meshes as the old one does.
+        identification: What `identify` returned, of a model from one URDF or SDF file, or from a .dmd.yaml file that
+            adds such files. Where it is not explained, the file says so at its top.
+        path: The file to write, of the same kind. It must not exist yet, and it names meshes as the old one does. Of a
+            .dmd.yaml this is the same overlay of welds, frames and default positions, over a corrected copy of each
+            robot file in which a value changed, NAME_FILE beside it.
 
     Returns:
         The path.
 
     Raises:
         InputError: The path is taken or of another kind, or a value is one that no file of this kind can have.
-        ModelError: The model is not from one URDF or SDF file, or the new file does not have the values.
+        ModelError: The model is not from such a file, or the new file does not have the values.
 
     Example:
         >>> import pathlib, tempfile
@@ -70,34 +77,97 @@ def write_model(identification: Identification, path: str | Path) -> Path:
     if asked is None:
         raise InputError("identification", got="one without what was asked", expected="what dd.identify returned")
     source = asked.model.source
-    if source is None or source.suffix not in (".urdf", ".sdf"):
+    kind = None if source is None else next((kind for kind in KINDS if source.name.endswith(kind)), None)
+    if source is None or kind is None:
         got = "a diagram" if source is None else source.name
-        raise ModelError(f"{asked.model.name} is from {got}: a corrected model is written of one URDF or SDF file")
-    if path.suffix != source.suffix:
-        raise InputError("path", got=str(path), expected=f"a {source.suffix} file, as the model's own")
-    if path.exists() or not path.parent.is_dir():
-        raise InputError("path", got=str(path), expected="a file that does not exist, in a folder that does")
-    text = _Corrected(identification, asked, source).text()
-    write_whole(path, text.encode())
+        raise ModelError(
+            f"{asked.model.name} is from {got}: a corrected model is written of one URDF or SDF file, or of a "
+            f"{OVERLAY} that adds such files"
+        )
+    if not path.name.endswith(kind):
+        raise InputError("path", got=str(path), expected=f"a {kind} file, as the model's own")
+    if kind == OVERLAY:
+        texts = _overlay(identification, asked, source, path)
+    else:
+        texts = {path: _Corrected(identification, asked, source, _changed(identification)).text()}
+    for place in texts:
+        if place.exists() or not place.parent.is_dir():
+            raise InputError("path", got=str(place), expected="a file that does not exist, in a folder that does")
     try:
+        for place, text in texts.items():
+            write_whole(place, text.encode())
         _check(identification, asked.model, path)
     except DrakeDiffError as error:
-        path.unlink()
+        for place in texts:
+            place.unlink(missing_ok=True)
         raise ModelError(f"no corrected model is written: {error}") from error
     return path
+
+
+def _changed(e: Identification) -> dict[str, Any]:
+    return {n: v for n, v in e.values.items() if not np.array_equal(v, e.start[n])}
+
+
+def _overlay(e: Identification, asked: Asked, source: Path, path: Path) -> dict[Path, str]:
+    """The texts to write of a model from a .dmd.yaml: corrected copies of robot files, and the overlay over them."""
+    packages, text = PackageMap(), source.read_text()
+    options = asked.model.options or {}
+    add_packages(packages, source, options.get("packages"))
+    files = {}
+    for directive in LoadModelDirectives(str(source)).directives:
+        if directive.add_model is not None:
+            files[str(directive.add_model.file)] = Path(packages.ResolveUrl(directive.add_model.file))
+    has = {uri: _names_in(file) for uri, file in files.items() if file.suffix in (".urdf", ".sdf")}
+    by_file: dict[str, dict[str, Any]] = {}
+    for name, value in _changed(e).items():
+        label = name.rsplit(".", 1)[0]
+        places = [uri for uri, names in has.items() if label in names]
+        if len(places) != 1:
+            got = f"{len(places)} URDF or SDF files that {source.name} itself adds have {label}"
+            raise InputError(name, got=got, expected="one, to be changed")
+        by_file.setdefault(places[0], {})[name] = value
+    texts = {}
+    for uri, values in by_file.items():
+        beside = path.with_name(f"{path.name.removesuffix(OVERLAY)}_{files[uri].name}").resolve()
+        if beside in texts:
+            raise InputError(
+                source.name, got=f"two robot files called {files[uri].name}", expected="names of their own"
+            )
+        texts[beside] = _Corrected(e, asked, files[uri], values).text()
+        text = _pointed(text, uri, f"file://{beside}", source)
+    data = " ".join(_data(asked).split())
+    said = "".join(c if c.isprintable() else " " for c in f"{e.sentence} By drake_diff from {data}; {e.motion}.")
+    return {**texts, path: f"# {said}\n{text}"}
+
+
+def _pointed(text: str, uri: str, new: str, source: Path) -> str:
+    """A .dmd.yaml that names the file `new` in place of `uri`."""
+    line = re.compile(rf"^([^#\n]*\bfile:\s*)(['\"]?){re.escape(uri)}\2(?=[\s,}}]|$)", re.MULTILINE)
+    found = list(line.finditer(text))
+    if len(found) != 1:
+        raise InputError(source.name, got=f"{uri} in {len(found)} of its lines", expected="file: with it in one line")
+    return f"{text[: found[0].start()]}{found[0][1]}{json.dumps(new)}{text[found[0].end() :]}"
+
+
+def _names_in(file: Path) -> set[str]:
+    root = XmlText(file.read_bytes()).root
+    return {str(one.get("name")) for one in root.iter("link", "joint", "actuator") if one.get("name")}
+
+
+def _data(asked: Asked) -> str:
+    return ", ".join(
+        r.name if file is None else f"{file[0].name} (SHA-256 {file[1][:12]})"
+        for r, file in zip(asked.recordings, asked.files, strict=True)
+    )
 
 
 class _Corrected:
     """The text of a file, and the changes to it."""
 
-    def __init__(self, e: Identification, asked: Asked, source: Path):
+    def __init__(self, e: Identification, asked: Asked, source: Path, changed: Mapping[str, Any]):
         self.e, self.model, self.is_sdf = e, asked.model, source.suffix == ".sdf"
         self.xml = XmlText(source.read_bytes())
-        self.data = ", ".join(
-            r.name if file is None else f"{file[0].name} (SHA-256 {file[1][:12]})"
-            for r, file in zip(asked.recordings, asked.files, strict=True)
-        )
-        self.changed = {n: v for n, v in e.values.items() if not np.array_equal(v, e.start[n])}
+        self.data, self.changed = _data(asked), changed
         for name in self.changed:
             quantity = name.rsplit(".", 1)[1]
             if quantity not in (IN_SDF if self.is_sdf else IN_URDF):
