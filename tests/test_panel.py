@@ -517,6 +517,9 @@ def test_a_panel_and_its_trials_are_records(write, tmp_path):
         path = done.directory / "trials" / f"{row['id']}.json"
         assert dd.load_record(path).result == {k: v for k, v in row.items() if k in ("cost", "error", "threads")}
         assert dd.verify(path).verdict == "intact"
+    (tmp_path / "trials").mkdir()  # a directory of that name need not be of a panel
+    (tmp_path / "trials" / "robustness.json").write_text("{}")
+    assert [line.kind for line in list_runs(tmp_path)] == ["robustness"]
     listed = CliRunner().invoke(app, ["list", str(done.directory)])
     assert listed.exit_code == 0
     assert "method=a level=2" in listed.output

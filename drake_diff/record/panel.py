@@ -1,5 +1,6 @@
 """The fields of panel.json, and of the record of each trial in trials/ID.json."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -107,4 +108,4 @@ def trial_record(
 
 def is_trial_file(path: Path) -> bool:
     """Whether `path` can be the record of a trial of a panel: ID.json in trials/."""
-    return path.suffix == ".json" and path.parent.name == TRIALS and path.is_file() and "." not in path.stem
+    return path.parent.name == TRIALS and re.fullmatch(r"[0-9a-f]{16}\.json", path.name) is not None and path.is_file()
