@@ -259,16 +259,19 @@ def _channels_of(e: Identification, i: int) -> Iterator[Channel]:
         yield state_channel(f"/{i}/before/state", times[seen], before[seen], *entries)
 
 
-def identified_again(folder: Path, record: IdentificationRecord) -> tuple[IdentificationRecord, Identification]:
+def identified_again(
+    folder: Path, record: IdentificationRecord, models: Path | None
+) -> tuple[IdentificationRecord, Identification]:
     """The record of the fit run again from the directory's own recordings, and that fit.
 
-    ArtifactError where the directory does not have what the record says; ModelError where the model cannot be rebuilt.
+    ArtifactError where the directory does not have what the record says; ModelError where the model cannot be rebuilt,
+    `models` as in `rebuilt`.
     """
     if record.inputs.parameters == [] or not record.recordings:
         raise ArtifactError(f"{record.FILE}: it names no parameters or no recordings")
     carried = "" if record.model.file is None else record.model.file.path
     attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
-    with rebuilt(record.model, record.contract.get("source"), attachments) as model:
+    with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
         given: list[Recording] = []
         files: list[tuple[Path, str] | None] = []
         for i, kept in enumerate(record.recordings):

@@ -14,6 +14,8 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_diff._base.strangers import read_plain
+from drake_diff.artifact.apart import first_look
 from drake_diff.artifact.marks import drawn_goals
 from drake_diff.artifact.rerun import TRACE
 from drake_diff.artifact.sections import rebuild_goal
@@ -31,6 +33,7 @@ from drake_diff.pages.scene import (
     moving_bodies,
 )
 from drake_diff.pages.shapes import Drawn, ball, body_path, meshcat_path, shapes_of
+from drake_diff.record.provenance import names_in
 from drake_diff.record.solve import EvidenceRecord
 
 GHOST = "planned/"  # before the frame names of the plan's bodies
@@ -39,12 +42,14 @@ OPEN_LOOP = "open loop"
 LOOPBACK = "127.0.0.1"
 
 
-def serve(directory: str | Path) -> tuple[Meshcat, tuple[str, ...]]:
+def serve(directory: str | Path, *, models: str | Path | None = None) -> tuple[Meshcat, tuple[str, ...]]:
     """A Meshcat that shows a run, for browsers on this machine alone; it serves as long as it is kept.
+
+    `models` is as in `verify`: without it meshes are not drawn, as the run does not hold them.
 
     Also gives what could not be shown, a sentence each. ArtifactError where the run is damaged or has no motion.
     """
-    scene, notes = scene_of_run(directory)
+    scene, notes = scene_of_run(directory, models=models)
     meshcat = Meshcat(MeshcatParams(host=LOOPBACK, show_stats_plot=False))
     draw(meshcat, scene)
     if any(ghost.name == WITHOUT for ghost in scene.ghosts):
@@ -55,9 +60,24 @@ def serve(directory: str | Path) -> tuple[Meshcat, tuple[str, ...]]:
     return meshcat, notes
 
 
-def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
-    """The scene in a run directory, and what of it is missing; the model's source file need not exist any more."""
+def scene_of_run(directory: str | Path, *, models: str | Path | None = None) -> tuple[Scene, tuple[str, ...]]:
+    """The scene in a run directory, and what of it is missing; the model's source file need not exist any more.
+
+    A process of its own reads the run first: ArtifactError where it does not survive that.
+    """
     folder = Path(directory)
+    first_look("drake_diff.artifact.live:_scene_apart", folder, models)
+    return _scene(folder, None if models is None else Path(models))
+
+
+def _scene_apart(directory: str, models: str | None) -> None:
+    try:
+        _scene(Path(directory), None if models is None else Path(models))
+    except DrakeDiffError:
+        return  # which it is again where it is read for use
+
+
+def _scene(folder: Path, models: Path | None) -> tuple[Scene, tuple[str, ...]]:
     record, log = EvidenceRecord.read(folder), read_mcap(folder / TRACE, links=False)
     rows = log.messages.get("/tf", [])
     if not record.contract:
@@ -70,7 +90,7 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
     try:
         options: dict[str, Any] = dict(record.model.options or {})
         packages = options.get("packages") or {}
-        plant, context, notes = _load(log.attachments, record.contract.get("source"), packages)
+        plant, context, notes = _load(log.attachments, record.contract.get("source"), packages, models)
         moving = {f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}": b for b in moving_bodies(plant)}
         paths = {name: body_path(body) for name, body in moving.items()}
         shapes = tuple(shapes_of(plant, context, bodies(plant)))
@@ -125,21 +145,27 @@ def _forces(message: Any) -> tuple[Force, ...]:
     return tuple(Force(point, force) for point, force in zip(points, forces, strict=True))
 
 
-def _load(attachments: dict[str, bytes], source: Any, packages: dict[str, str]) -> tuple[Any, Any, tuple[str, ...]]:
-    """Plant, context and notes: of the source file where it is still the one attached, else of the attachment."""
-    packages = {name: folder for name, folder in packages.items() if Path(folder).is_dir()}
+def _load(
+    attachments: dict[str, bytes], source: Any, packages: dict[str, str], models: Path | None
+) -> tuple[Any, Any, tuple[str, ...]]:
+    """Plant, context and notes: of the source file if it is below `models` and as attached, else of the attachment."""
     name = next((name for name in attachments if name.endswith(FORMATS)), None)
     if name is None:
         raise ModelError("the run has no model file attached: it was made from a diagram")
-    if isinstance(source, str) and Path(source).is_file() and Path(source).read_bytes() == attachments[name]:
-        return _plant(Path(source), packages)
+    file = Path(str(source))
+    below = models is not None and file.resolve().is_relative_to(models.resolve())
+    if below and file.is_file() and read_plain(file, links=True) == attachments[name]:
+        return _plant(file, {name: folder for name, folder in packages.items() if Path(folder).is_dir()})
     suffix = next(end for end in FORMATS if name.endswith(end))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"model{suffix}"
         text, skipped = _without_meshes(attachments[name], suffix)
         path.write_bytes(text)
-        plant, context, notes = _plant(path, packages)
-    gone = (f"the model's source is gone or changed: {skipped} meshes are not drawn",) if skipped else ()
+        if names_in(path):
+            raise ModelError(f"it names {names_in(path)[0]!r:.100}, and the run holds no such file")
+        plant, context, notes = _plant(path, {})
+    where = f"models=FOLDER, or --models, says below which folder {name} and they are"
+    gone = (f"{skipped} meshes are not drawn, the run does not hold them: {where}",) if skipped else ()
     return plant, context, gone + notes
 
 

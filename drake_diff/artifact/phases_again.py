@@ -54,8 +54,10 @@ class PhasesAgain:
         self.problems.append(f"{PhasesRecord.FILE}: {key} is {recorded!r}, made again {again!r}")
 
 
-def phases_again(folder: Path, record: PhasesRecord, of_phase: Callable[[Path], PhasesAgain]) -> PhasesAgain:
-    """The directory beside the same made again; `of_phase` makes that of one phase again."""
+def phases_again(
+    folder: Path, record: PhasesRecord, models: Path | None, of_phase: Callable[[Path], PhasesAgain]
+) -> PhasesAgain:
+    """The directory beside the same made again; `of_phase` makes that of one phase again, `models` as in `rebuilt`."""
     found = PhasesAgain()
     records: list[EvidenceRecord] = []
     plans: list[dict[str, Array]] = []
@@ -77,7 +79,7 @@ def phases_again(folder: Path, record: PhasesRecord, of_phase: Callable[[Path], 
         found.same("horizon_s", True, _within(record))
     with ExitStack() as stack:
         try:
-            solutions = list(_rebuilt(stack, folder, record, records, plans))
+            solutions = list(_rebuilt(stack, folder, record, records, plans, models))
         except ModelError as error:
             found.undecided.append(f"the search and the chain of all phases were not run again: {error}")
             return found
@@ -149,7 +151,12 @@ def _check_links(found: PhasesAgain, record: PhasesRecord, plans: list[dict[str,
 
 
 def _rebuilt(
-    stack: ExitStack, folder: Path, record: PhasesRecord, records: list[EvidenceRecord], plans: list[dict[str, Array]]
+    stack: ExitStack,
+    folder: Path,
+    record: PhasesRecord,
+    records: list[EvidenceRecord],
+    plans: list[dict[str, Array]],
+    models: Path | None,
 ) -> Iterator[Solution]:
     """Each phase as its record tells it; ModelError where one has what is in no artifact."""
     for i, link in enumerate(record.links):
@@ -160,7 +167,7 @@ def _rebuilt(
         if reasons:
             raise ModelError(f"{phase.name}: {reasons[0]}")
         attachments = read_trace(folder / phase.directory / TRACE).attachments
-        model = stack.enter_context(rebuilt(own.model, own.contract.get("source"), attachments))
+        model = stack.enter_context(rebuilt(own.model, own.contract.get("source"), attachments, models))
         yield resolve(own, model, plan)
 
 

@@ -2,7 +2,7 @@
 
 The model is built from the file that trace.mcap carries, in a folder of its own. One that names other files (meshes) is
 built where it stood, and only if it and all of them are still what the record says: the artifact has their hashes, not
-their bytes.
+their bytes. As a record may name any file, this is only done below a folder that the caller gives.
 """
 
 import io
@@ -30,7 +30,7 @@ from drake_diff.optimize.program import Multipliers
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.solve import solve
 from drake_diff.record.parts import ModelInput
-from drake_diff.record.provenance import file_evidence, named_files
+from drake_diff.record.provenance import file_evidence, named_files, names_in
 from drake_diff.record.solve import EvidenceRecord
 
 PLAN = "plan.npz"
@@ -80,17 +80,20 @@ def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
 
 
 @contextmanager
-def rebuilt(given: ModelInput, source: Any, attachments: dict[str, bytes] | None) -> Iterator[Model]:
+def rebuilt(
+    given: ModelInput, source: Any, attachments: dict[str, bytes] | None, models: Path | None
+) -> Iterator[Model]:
     """The model of a record, for as long as the block runs, from the files `attachments` that the directory carries.
 
-    Where there are none, or the model names other files, it is built from `source`, if all of them are unchanged.
+    Where there are none, or the model names other files, it is built from `source`, if that is below the folder
+    `models` and all of them are unchanged.
 
     Raises ModelError, saying why, where it cannot be built again, ArtifactError where the artifact is damaged.
     """
     if given.file is None or given.options is None:
         raise ModelError("the system is a user's own diagram or function, which no artifact can hold")
     if given.named or attachments is None:
-        yield _load(_source_if_unchanged(given, Path(str(source))), given.options)
+        yield _load(_source_if_unchanged(given, Path(str(source)), models), given.options)
         return
     name, data = given.file.path, attachments.get(given.file.path)
     if data is None or sha256(data).hexdigest() != given.file.sha256:
@@ -100,13 +103,20 @@ def rebuilt(given: ModelInput, source: Any, attachments: dict[str, bytes] | None
     with TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(data)
-        if named_files(path):
+        if names_in(path):
             raise ArtifactError(f"record.json: it does not list the files that {name} names")
         yield _load(path, given.options)
 
 
-def _source_if_unchanged(given: ModelInput, source: Path) -> Path:
+def _source_if_unchanged(given: ModelInput, source: Path, models: Path | None) -> Path:
     """The model file where it stood; ModelError where it or a file that it names is not the recorded one."""
+    if models is None:
+        what = f"names {len(given.named)} files, which the artifact does not hold" if given.named else "is not in it"
+        raise ModelError(
+            f"the model {what}: models=FOLDER, or --models, lets them be read below a folder that you give"
+        )
+    if not source.resolve().is_relative_to(models.resolve()):
+        raise ModelError(f"the model's file {source} is not below {models}, the folder of models that was given")
     if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
         raise ModelError(f"the model's file {source} is gone, and the artifact has no copy that could be used")
     if file_evidence(source, given.file.path) != given.file:

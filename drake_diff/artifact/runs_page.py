@@ -33,8 +33,8 @@ class _Curve:
     limits: tuple[float | None, float | None]
 
 
-def write_runs_page(path: Path, a: str | Path, b: str | Path) -> None:
-    """Write the page that compares the plans of the runs in the directories `a` and `b`.
+def write_runs_page(path: Path, a: str | Path, b: str | Path, *, models: str | Path | None = None) -> None:
+    """Write the page that compares the plans of the runs in the directories `a` and `b`; `models` as in `verify`.
 
     Raises:
         ArtifactError: One of them has no record or no trace that can be read.
@@ -47,7 +47,7 @@ def write_runs_page(path: Path, a: str | Path, b: str | Path) -> None:
     states, inputs = zip(*(_curves(r, folder) for r, folder in zip(records, folders, strict=True)), strict=True)
     plots = [*_plots("Positions and velocities", names, states), *_plots("Inputs", names, inputs, held=True)]
     ends = [float(max(c.times[-1] for c in one.values())) for one in states]
-    view, caption = _replay(folders, names)
+    view, caption = _replay(folders, names, models)
     runs = [
         {"name": n, "verdict": r.verdict, "sentence": r.sentence, "duration_s": end}
         for n, r, end in zip(names, records, ends, strict=True)
@@ -120,10 +120,10 @@ def _sentence(names: Sequence[str], states: Sequence[dict[str, _Curve]]) -> str:
     return f"{names[0]} and {names[1]}: {told}" if worst else f"{names[0]} and {names[1]} have the same plan"
 
 
-def _replay(folders: Sequence[Path], names: Sequence[str]) -> tuple[str, str]:
+def _replay(folders: Sequence[Path], names: Sequence[str], models: str | Path | None) -> tuple[str, str]:
     """The page with both plans, and what is seen in it; "" and why where one has none."""
     try:
-        scenes = [scene_of_run(folder) for folder in folders]
+        scenes = [scene_of_run(folder, models=models) for folder in folders]
     except ArtifactError as error:
         return "", str(error)
     notes = [note for _, found in scenes for note in found]

@@ -10,9 +10,11 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from drake_diff._base.arrays import positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.strangers import MOST_TEXT, files_in, read_plain, sha256_of
 from drake_diff.artifact.again import SAME_PLAN, SEARCH_TOPICS, SEARCHED, Again, contract_as, is_below, made_again
+from drake_diff.artifact.apart import call_on, first_look
 from drake_diff.artifact.claim import claims_of
 from drake_diff.artifact.differences import (
     Compared,
@@ -28,6 +30,7 @@ from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, rebuilt, resolve
 from drake_diff.artifact.save import FILES
 from drake_diff.artifact.trace import CONFIGURATION, Trace, read_trace
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, MissingDependencyError, ModelError
+from drake_diff.model.step import step
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.certification import CertificationRecord, certify_model
 from drake_diff.record.comparison import ComparisonRecord
@@ -43,6 +46,7 @@ from drake_diff.record.solve import EvidenceRecord
 
 MOST = 16  # lines of a kind that are printed
 R = TypeVar("R", bound=SealedRecord)
+MADE_APART = ("complaints", "undecided", "unchecked", "rounded")  # of a verification: told by the process apart
 # What nothing can make again, in every record, by key.
 UNCHECKED = (
     "wall_clock: when the record was made, and how long that took",
@@ -87,6 +91,7 @@ class Verification(ShowsItsRepr):
         claimed: What the record says was asked and came out. A weaker claim can be just as true.
         unchecked: What was not checked, by key.
         rounded: What differs by no more than machines round differently.
+        unlimited: What this system could not keep from the process that made it again.
         checked: How many values of record, trace and pages were compared with those made again.
         notes: Versions that differ from those of the record.
 
@@ -103,6 +108,7 @@ class Verification(ShowsItsRepr):
     claimed: tuple[str, ...] = ()
     unchecked: tuple[str, ...] = ()
     rounded: tuple[str, ...] = ()
+    unlimited: tuple[str, ...] = ()
     checked: int = 0
     notes: tuple[str, ...] = ()
 
@@ -138,6 +144,7 @@ class Verification(ShowsItsRepr):
             "undecided": self.undecided,
             "broken": self.complaints,
             "rounded": self.rounded,
+            "not limited": self.unlimited,
             "note": self.notes,
         }
         told = []
@@ -162,7 +169,9 @@ class Verification(ShowsItsRepr):
         return "\n  ".join((f"Verification of {self.directory}: {self.verdict}, {told}", *self.lines))
 
 
-def verify(directory: str | Path) -> Verification:
+def verify(
+    directory: str | Path, *, models: str | Path | None = None, time_limit: float = 60.0, memory_limit: float = 1.0
+) -> Verification:
     """Check a directory's schema, hashes and files, then make it again and compare all of it.
 
     A solve is run again as its record says `solve` was called; its plan is measured again, and record, trace and pages
@@ -176,15 +185,24 @@ def verify(directory: str | Path) -> Verification:
     the verdict "undecided", and so does another version of Drake where numbers differ. It takes as long as the solve
     did.
 
+    The directory may be a stranger's. Its model is read and run in a process of its own, which has limits of time and
+    memory, no network, and no file to open but those of the directory, of Python and below `models`. Where that process
+    crashes the verdict is "broken", where it comes to a limit "undecided".
+
     Args:
         directory: What `save`, `save_comparison`, `save_robustness`, `certify_model`, `run_panel` or `save_rollout`
             wrote; or trials/ID.json of a panel.
+        models: A folder below which the model file and the meshes that it names may be read, where the directory does
+            not hold them: the one in which the model stood when the run was made. Without it none of them is read.
+        time_limit: How long it may take to make the run again, in seconds. Give more for a solve that took longer.
+        memory_limit: How much memory that may take, in GiB.
 
     Returns:
         A `Verification`: the verdict, what was claimed, what was not checked, and what does not hold.
 
     Raises:
         ArtifactError: There is no such directory.
+        InputError: A limit is not positive, or `models` is no folder.
 
     Example:
         >>> found = dd.verify("artifacts/pendulum_swing_up")
@@ -196,6 +214,34 @@ def verify(directory: str | Path) -> Verification:
         return _verify_trial(folder)
     if not folder.is_dir():
         raise ArtifactError(f"{folder}: expected a directory that drake_diff wrote, got no directory")
+    for name, value in (("time_limit", time_limit), ("memory_limit", memory_limit)):
+        positive_float(name, value)
+    found = _looked_at(folder)
+    if found.complaints or found.undecided or found.record is None:
+        return found
+    if found.record.kind in NOT_RERUN:
+        return _run_again(found, found.record, None)
+    answer = call_on("drake_diff.artifact.verify:_apart", folder, models, float(time_limit), float(memory_limit))
+    found = replace(found, unlimited=answer.unlimited)
+    if answer.exceeded:
+        more = "time_limit= and memory_limit=, or --time-limit and --memory-limit, give it more"
+        return replace(found, undecided=(f"it was not made again: {answer.exceeded}: {more}",))
+    if answer.sentence:
+        return _judged(found, [f"it cannot be made again: {answer.sentence}"], [])
+    texts: dict[str, Any] = {name: tuple(str(line) for line in answer.value[name]) for name in MADE_APART}
+    return replace(found, **texts, checked=int(answer.value["checked"]))
+
+
+def _apart(directory: str, models: str | None) -> dict[str, Any]:
+    """What `verify` finds, of a directory whose files are as they were written, in a process of its own."""
+    found = _looked_at(Path(directory))
+    if found.record is not None and not (found.complaints or found.undecided):
+        found = _run_again(found, found.record, None if models is None else Path(models))
+    return {name: getattr(found, name) for name in (*MADE_APART, "checked")}
+
+
+def _looked_at(folder: Path) -> Verification:
+    """What can be said of a directory without making anything again."""
     kind = kind_of(folder)
     if is_partial(folder):
         return _of_a_part(folder, kind)
@@ -211,7 +257,7 @@ def verify(directory: str | Path) -> Verification:
         return replace(found, unchecked=("anything else: it is damaged",))
     if record.state == "incomplete" or (isinstance(record, (EvidenceRecord, PhasesRecord)) and record.solver is None):
         return replace(found, undecided=(f"there is nothing to run again: {record.sentence}",))
-    return _run_again(found, record)
+    return found
 
 
 def _of_a_part(folder: Path, kind: type[SealedRecord] | None) -> Verification:
@@ -224,17 +270,17 @@ def _of_a_part(folder: Path, kind: type[SealedRecord] | None) -> Verification:
     return Verification(folder, record, undecided=(f"it is incomplete, and never took its place: {told}",))
 
 
-def _run_again(found: Verification, record: SealedRecord) -> Verification:
+def _run_again(found: Verification, record: SealedRecord, models: Path | None) -> Verification:
     """The directory beside the same made again, where it can be."""
     try:
         if isinstance(record, EvidenceRecord):
-            return _solve_again(found, record)
+            return _solve_again(found, record, models)
         if isinstance(record, CertificationRecord):
-            return _certify_again(found, record)
+            return _certify_again(found, record, models)
         if isinstance(record, PhasesRecord):
-            return _phases_again(found, record)
+            return _phases_again(found, record, models)
         if isinstance(record, IdentificationRecord):
-            return _identify_again(found, record)
+            return _identify_again(found, record, models)
         if isinstance(record, PanelRecord):
             found = _judged(found, odd_panel(found.directory, record), [])
     except (ModelError, MissingDependencyError) as error:
@@ -270,17 +316,37 @@ def _without_its_functions(found: Verification, record: SealedRecord, error: Exc
 
 
 @contextmanager
-def recalled(directory: str | Path) -> Iterator[Solution]:
+def recalled(directory: str | Path, *, models: str | Path | None = None, trusted: bool = False) -> Iterator[Solution]:
     """The solution in a run directory, its model rebuilt from there, for as long as the block runs.
 
-    ArtifactError where there is none, it is damaged or it did not end; ModelError where it cannot be built again.
+    The model is read by a process of its own first, with the limits of `verify`, unless it is `trusted`; `models` is as
+    there.
+
+    ArtifactError where there is none, it is damaged or it did not end, or that process does not survive it; ModelError
+    where it cannot be built again.
     """
     folder = Path(directory)
+    if not trusted:
+        first_look("drake_diff.artifact.verify:_recalled_apart", folder, models)
+    with _recalled(folder, None if models is None else Path(models)) as solution:
+        yield solution
+
+
+def _recalled_apart(directory: str, models: str | None) -> None:
+    try:
+        with _recalled(Path(directory), None if models is None else Path(models)) as solution:
+            step(solution.problem.model, solution.xs[0], solution.us[0])
+    except DrakeDiffError:
+        return  # which it is again where it is read for use
+
+
+@contextmanager
+def _recalled(folder: Path, models: Path | None) -> Iterator[Solution]:
     record, problems = _read_checked(folder, EvidenceRecord)
     _refuse(folder, problems)
     _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
     plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
-    with rebuilt(record.model, record.contract.get("source"), trace.attachments) as model:
+    with rebuilt(record.model, record.contract.get("source"), trace.attachments, models) as model:
         _refuse(folder, (*_odd_trace(trace, plan, record), *_odd_contract(record, model.contract.to_dict())))
         yield resolve(record, model, plan)
 
@@ -343,12 +409,12 @@ def _damage_of_files(folder: Path, record: SealedRecord) -> Iterator[str]:
                 yield f"{name}: its {size} bytes are not those that {record.FILE} describes"
 
 
-def _solve_again(found: Verification, record: EvidenceRecord) -> Verification:
+def _solve_again(found: Verification, record: EvidenceRecord, models: Path | None) -> Verification:
     """Everything in the directory of a solve beside the same made again."""
     folder = found.directory
     plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
     problems = [*_odd_schema(record), *_odd_trace(trace, plan, record)]
-    with rebuilt(record.model, record.contract.get("source"), trace.attachments) as model:
+    with rebuilt(record.model, record.contract.get("source"), trace.attachments, models) as model:
         again = made_again(record, model, plan)
     fields, unchecked = Compared(record.FILE), [*UNCHECKED, GIVEN, *_others(record, FILES), *again.unchecked]
     compare_fields(fields, record.model_dump(mode="json"), again.fields)
@@ -373,19 +439,19 @@ def _solve_again(found: Verification, record: EvidenceRecord) -> Verification:
     return _told_of_a_solve(found, again, problems, compared, unchecked)
 
 
-def _phases_again(found: Verification, record: PhasesRecord) -> Verification:
+def _phases_again(found: Verification, record: PhasesRecord, models: Path | None) -> Verification:
     """All phases, their links, and the chain of all; what no artifact holds is undecided."""
 
     def of_phase(folder: Path) -> PhasesAgain:
         own, problems = _read_checked(folder, EvidenceRecord)
-        one, again = _run_again(Verification(folder, own), own), PhasesAgain()
+        one, again = _run_again(Verification(folder, own), own, models), PhasesAgain()
         again.problems = [*problems, *one.complaints]
         again.undecided = [line for line in one.undecided if WITHIN_PHASES not in line]
         again.unchecked = [line for line in one.unchecked if line.startswith(OF_FUNCTIONS)]
         again.rounded, again.checked = list(one.rounded), one.checked
         return again
 
-    again = phases_again(found.directory, record, of_phase)
+    again = phases_again(found.directory, record, models, of_phase)
     unchecked = (*UNCHECKED, GIVEN_IN_PHASES, *again.unchecked, *_other_directories(record))
     told = replace(found, unchecked=unchecked, rounded=tuple(again.rounded), checked=again.checked)
     return _judged(told, [*_odd_schema(record), *again.problems], again.undecided)
@@ -455,12 +521,12 @@ def _judged(found: Verification, problems: Sequence[str], undecided: Sequence[st
     return replace(found, complaints=tuple(problems), undecided=tuple(undecided))
 
 
-def _certify_again(found: Verification, record: CertificationRecord) -> Verification:
+def _certify_again(found: Verification, record: CertificationRecord, models: Path | None) -> Verification:
     """The same states from the same seed, each certified again."""
     carried = record.model.file.path if record.model.file is not None else ""
     data = read_plain(found.directory / carried) if carried in record.files else None
     attachments = None if data is None else {carried: data}
-    with rebuilt(record.model, record.contract.get("source"), attachments) as model:
+    with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
         again = certify_model(
             model, states=len(record.states), seed=record.seed, parameters=record.parameters, method=record.method
         )
@@ -475,11 +541,11 @@ def _certify_again(found: Verification, record: CertificationRecord) -> Verifica
     return _judged(replace(found, unchecked=unchecked, rounded=rounded, checked=fields.count), problems, [])
 
 
-def _identify_again(found: Verification, record: IdentificationRecord) -> Verification:
+def _identify_again(found: Verification, record: IdentificationRecord, models: Path | None) -> Verification:
     """The fit once more from the recordings in the directory, and all that was written of it."""
     from drake_diff.artifact.identified import MADE, identified_again, write_made
 
-    made, identification = identified_again(found.directory, record)
+    made, identification = identified_again(found.directory, record, models)
     again = made.model_copy(update={"contract": contract_as(made.contract, record.contract)})
     fields = Compared(record.FILE)
     compare_fields(fields, record.model_dump(mode="json"), again.model_dump(mode="json"))

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from drake_diff._base.signals import INTERRUPTED
-from drake_diff.cli.text import RunDirectory, judged, out_option, plain, progress_line, show, table
+from drake_diff.cli.text import ModelFolder, RunDirectory, judged, out_option, plain, progress_line, show, table
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, WriteError
 
 LogFile = Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that drake_diff wrote.")]
@@ -169,16 +169,25 @@ def _show_record(record: Any) -> None:
     )
 
 
-def verify(run: RunDirectory) -> None:
+def verify(
+    run: RunDirectory,
+    models: ModelFolder = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds that making it again may take.")] = 60.0,
+    memory_limit: Annotated[float, typer.Option(help="GiB of memory that it may take.")] = 1.0,
+) -> None:
     """Check every file of RUN, run it again from its own files, and compare record, trace and pages.
 
     RUN is what a solve, a comparison, robustness trials or a certification wrote.
     Exit status 0 only if all of it came out again. What was claimed and what was not checked is printed first.
     Comparisons and robustness trials are not run again: unchanged, they are "intact", with exit status 1.
+    RUN may be a stranger's: its model is read in a process with limits of time, memory and files, and no network.
     """
+    from drake_diff._base.guarded import start
+
+    start()  # it imports Drake while this process does
     from drake_diff.artifact.verify import verify as verify_run
 
-    found = verify_run(run)
+    found = verify_run(run, models=models, time_limit=time_limit, memory_limit=memory_limit)
     verdict = "unknown" if found.record is None else found.record.verdict
     told = found.sentence if found.verdict in ("holds", "intact") else "see below"
     show(judged(found.verdict), f"{run}: {told}; the run's verdict: {verdict}")
@@ -221,6 +230,7 @@ def compare_runs(
     a: Annotated[Path, typer.Argument(metavar="A", help="A run directory.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
     out: Annotated[Path | None, typer.Option("--out", metavar="PAGE", dir_okay=False, help="Page to write.")] = None,
+    models: ModelFolder = None,
 ) -> None:
     """Show what differs between the runs A and B: configuration, versions, metrics.
 
@@ -243,7 +253,7 @@ def compare_runs(
     if out is not None:
         from drake_diff.artifact.runs_page import write_runs_page
 
-        write_runs_page(out, a, b)
+        write_runs_page(out, a, b, models=models)
         show(f"wrote {out}")
     raise typer.Exit(0 if found.comparable else 1)
 
@@ -255,12 +265,12 @@ def schema() -> None:
     sys.stdout.write(EvidenceRecord.published_schema().decode())
 
 
-def view(run: RunDirectory) -> None:
+def view(run: RunDirectory, models: ModelFolder = None) -> None:
     """Show the motion of RUN in a browser on this machine, until Ctrl-C."""
     from drake_diff.artifact.live import serve
 
     try:
-        meshcat, notes = serve(run)
+        meshcat, notes = serve(run, models=models)
         for note in notes:
             show(plain(note, "yellow"))
         # Not by a console: interrupted after it has written, it would write the line once more.

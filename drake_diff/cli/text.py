@@ -23,6 +23,9 @@ GREEN, RED, YELLOW = ("pass", "holds", "agree"), ("fail", "broken", "error", "da
 
 ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file.")]
 RunDirectory = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")]
+ModelFolder = Annotated[
+    Path | None, typer.Option("--models", help="A folder below which meshes and models that RUN names may be read.")
+]
 TimeStep = Annotated[float, typer.Option(help="Time step of the discrete plant, in seconds.")]
 ContactModel = Annotated[str, typer.Option(help="point, hydroelastic or hydroelastic_with_fallback")]
 Approximation = Annotated[str, typer.Option(help="sap, similar or lagged")]

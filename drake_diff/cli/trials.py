@@ -10,6 +10,7 @@ import typer
 
 from drake_diff._base.signals import INTERRUPTED
 from drake_diff.cli.text import (
+    ModelFolder,
     RunDirectory,
     Seed,
     console,
@@ -39,6 +40,7 @@ def robustness(
     perturbations: Annotated[str | None, names_option("Perturbations", "all that apply to the model")] = None,
     controller: Annotated[str, typer.Option(help="tvlqr, mpc or open_loop")] = "tvlqr",
     seed: Seed = 0,
+    models: ModelFolder = None,
     out: Annotated[Path | None, out_option("<RUN>_robustness")] = None,
 ) -> None:
     """Try the plan of RUN under perturbations of plant, start, sensor and actuator: how often does it reach the goal?
@@ -54,7 +56,7 @@ def robustness(
 
     names, whole = names_in(perturbations), run.resolve()
     directory = out or whole.with_name(f"{whole.name}_robustness")
-    with recalled(run) as solution:
+    with recalled(run, models=models) as solution:
         levels = levels_named(solution.problem.model, names)
         with written_whole(directory) as folder:
             with progress_line("trying", stderr=True) as report:

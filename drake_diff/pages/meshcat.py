@@ -65,7 +65,7 @@ def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
 
     Forces are arrows (see `Scene.reference_of`), ghosts are translucent, and the trail is a line.
     """
-    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    meshcat = Meshcat(MeshcatParams(host="127.0.0.1", show_stats_plot=False))
     draw(meshcat, scene)
     name = f"<title>{html.escape(title)}</title>"
     page = re.sub(r"<title>.*?</title>", lambda _: name, meshcat.StaticHtml(), count=1)

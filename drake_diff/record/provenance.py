@@ -152,6 +152,20 @@ def named_files(
     return found
 
 
+def names_in(path: Path) -> list[str]:
+    """The files that the model file at `path` itself names, as it names them; no other file is opened.
+
+    What cannot be read out of it (Drake's parser forgives more than Python's) is the reason, as one name.
+    """
+    try:
+        if path.name.endswith(".dmd.yaml"):
+            return sorted(files_of_directives(path))
+        root = ET.fromstring(path.read_text())
+    except (OSError, UnicodeDecodeError, ET.ParseError, ModelError) as error:
+        return [f"what cannot be listed: {error}"]
+    return sorted({name for name, _ in _named_in(root)})
+
+
 def _unread(name: str, reason: str) -> FileEvidence:
     return FileEvidence(path=name, bytes=None, sha256=None, reason=reason)
 
