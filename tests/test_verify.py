@@ -516,9 +516,10 @@ def test_a_certification_carries_its_model_and_one_whose_mesh_changed_is_undecid
     (tmp_path / "m.urdf").write_text(EVIL.format(mesh="tetra.obj"))
     model = dd.load_model(tmp_path / "m.urdf", time_step=0.02)
     dd.record.certify_model(model, states=1, directory=tmp_path / "meshed")
-    assert dd.verify(tmp_path / "meshed").require().holds
+    assert "does not hold: models=FOLDER" in str(dd.verify(tmp_path / "meshed"))
+    assert dd.verify(tmp_path / "meshed", models=tmp_path).require().holds
     (tmp_path / "tetra.obj").write_text(TETRAHEDRON + "\n")
-    found = dd.verify(tmp_path / "meshed")
+    found = dd.verify(tmp_path / "meshed", models=tmp_path)
     assert (found.verdict, found.complaints) == ("undecided", ())
     assert "is not what it was" in str(found)
 
@@ -650,12 +651,15 @@ def test_a_mesh_is_hashed_and_a_changed_one_is_not_run(tmp_path):
     (tmp_path / "m.urdf").write_text(EVIL.format(mesh="tetra.obj"))
     record = dd.save(swing_up(dd.load_model(tmp_path / "m.urdf", time_step=0.02)), tmp_path / "run")
     assert [f.path for f in record.model.named] == ["tetra.obj"]
-    assert dd.verify(tmp_path / "run").require().holds
+    assert dd.verify(tmp_path / "run").verdict == "undecided"
+    assert dd.verify(tmp_path / "run", models=tmp_path).require().holds
+    (tmp_path / "other").mkdir()
+    assert "is not below" in str(dd.verify(tmp_path / "run", models=tmp_path / "other"))
     with (tmp_path / "tetra.obj").open("a") as file:
         file.write("\n")
-    assert "names tetra.obj, which is not what it was" in str(dd.verify(tmp_path / "run"))
+    assert "names tetra.obj, which is not what it was" in str(dd.verify(tmp_path / "run", models=tmp_path))
     (tmp_path / "m.urdf").unlink()
-    assert dd.verify(tmp_path / "run").verdict == "undecided"
+    assert dd.verify(tmp_path / "run", models=tmp_path).verdict == "undecided"
 
 
 def test_a_script_for_a_name_and_a_mesh_that_leads_elsewhere_do_no_harm(tmp_path):
@@ -667,7 +671,7 @@ def test_a_script_for_a_name_and_a_mesh_that_leads_elsewhere_do_no_harm(tmp_path
     record = dd.save(swing_up(dd.load_model(model_file, time_step=0.02)), tmp_path / "run")
     assert record.contract["name"] == "<script>alert(1)</script>"
     assert record.model.named[0].sha256 is None
-    assert dd.verify(tmp_path / "run").holds
+    assert dd.verify(tmp_path / "run", models=tmp_path).holds
     assert "<script>alert" not in (tmp_path / "run" / "replay.html").read_text()
     written = [path.read_bytes() for path in (tmp_path / "run").iterdir()]
     hashed = (secret.read_bytes(), sha256(secret.read_bytes()).hexdigest().encode())

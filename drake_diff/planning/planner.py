@@ -15,7 +15,7 @@ from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.artifact.measurement import measure
 from drake_diff.artifact.save import save
-from drake_diff.artifact.verify import Verification, verify
+from drake_diff.artifact.verify import Verification, verify_own
 from drake_diff.certificates.audit import audit
 from drake_diff.certificates.finding import Finding
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning
@@ -202,7 +202,7 @@ def plan(
         clock.begin("save", best.status.value)
         record = save(best, directory)
         clock.begin("verify", record.verdict)
-        verification = verify(directory)
+        verification = verify_own(directory)
         seconds = clock.end()
     return Plan(
         ready.model, ready.repairs, findings, best, record, verification, directory, tuple(tried), apart, seconds
