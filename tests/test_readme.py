@@ -206,6 +206,7 @@ FIGURES = (
     "derivatives.md",
     "speed.md",
     "identification.md",
+    "strangers.md",
 )  # pages that a benchmark writes
 
 

@@ -13,6 +13,7 @@ import socket
 import struct
 import sys
 from collections.abc import Iterable, Sequence
+from glob import glob
 from pathlib import Path
 
 NEWUSER, NEWNET = 0x10000000, 0x40000000  # of unshare(2)
@@ -20,18 +21,19 @@ DIE_WITH_PARENT, NO_NEW_PRIVILEGES = 1, 38  # of prctl(2)
 CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446  # Landlock's calls, the same on every machine
 VERSION, BENEATH = 1, 1
 SET_FLAGS, UP = 0x8914, 1  # of a network interface
-WRITE_FILE, READ_FILE, READ_DIR, REFER, TRUNCATE, IOCTL = 1 << 1, 1 << 2, 1 << 3, 1 << 13, 1 << 14, 1 << 15
+EXECUTE, WRITE_FILE, READ_FILE, READ_DIR, REFER, TRUNCATE, IOCTL = 1, 1 << 1, 1 << 2, 1 << 3, 1 << 13, 1 << 14, 1 << 15
 ALL_OF_1 = (1 << 13) - 1  # what the first version of Landlock knows, to run a file among it
 CONNECT = 2  # by TCP, since version 4; a page is drawn by a server that binds a port
 SIGNALS_AND_SOCKETS = 3  # to processes outside, since version 6
 LARGEST_FILE = 2**30  # bytes that are written into one
+LOADERS = "/lib*/ld-*", "/lib/*/ld-*"  # what starts a program
 SYSTEM = (
     "/usr/lib",
     "/usr/lib64",
-    "/usr/local/lib",
-    "/usr/share/zoneinfo",
     "/lib",
     "/lib64",
+    "/usr/local/lib",
+    "/usr/share/zoneinfo",
     "/sys/devices/system/cpu",
 )
 SYSTEM_FILES = ("/dev/urandom", "/proc/cpuinfo", "/proc/meminfo", "/etc/localtime", "/etc/ld.so.cache")
@@ -84,9 +86,13 @@ def _only_files(libc: ctypes.CDLL, version: int, readable: Iterable[Path], own: 
     rules = struct.pack(f"={len(words)}Q", *words)
     _done(libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0))
     ruleset = _done(libc.syscall(CREATE_RULESET, rules, len(rules), 0))
-    folders = [*readable, *pythons(), *map(Path, SYSTEM)]
-    allowed = [(path, READ_FILE | READ_DIR) for path in folders] + [(Path(name), READ_FILE) for name in SYSTEM_FILES]
-    for path, right in (*allowed, (Path(os.devnull), READ_FILE | WRITE_FILE), (own, rights)):
+    python = {Path(sys.executable), Path(sys.executable).resolve()}
+    allowed = [(path, READ_FILE | READ_DIR) for path in (*readable, *pythons(), *map(Path, SYSTEM))]
+    loaders = (Path(name) for pattern in LOADERS for name in glob(pattern))
+    allowed += [(path, READ_FILE | EXECUTE) for path in (*python, *loaders)]  # some engines have a process of their own
+    allowed += [(Path(name), READ_FILE) for name in SYSTEM_FILES]
+    allowed += [(Path(os.devnull), READ_FILE | WRITE_FILE), (own, rights)]
+    for path, right in allowed:
         try:
             place = os.open(path, os.O_PATH | os.O_CLOEXEC)
         except OSError:  # not on this machine: nothing to allow

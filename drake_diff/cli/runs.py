@@ -301,7 +301,7 @@ def info(file: LogFile) -> None:
     """List the channels of FILE with their messages and units, its metadata and its attachments."""
     from drake_diff.logs.mcap_file import read_mcap
 
-    log = read_mcap(file)
+    log = read_mcap(file, links=False)
     rows = table("channel", "schema", "messages", "from [s]", "to [s]", left=2)
     for topic, messages in log.messages.items():
         ends = [f"{messages[i][0] / 1e9:g}" for i in (0, -1)] if messages else ["", ""]
@@ -328,7 +328,7 @@ def check(file: LogFile) -> None:
     if not file.is_file():
         raise InputError("FILE", got=str(file), expected="a file that exists")
     try:
-        log = read_mcap(file)
+        log = read_mcap(file, links=False)
     except ArtifactError as error:
         show(judged("damaged"), f" {error}")
         raise typer.Exit(1) from error

@@ -178,7 +178,7 @@ def recover_mcap(path: str | Path, out: str | Path) -> "Recovered":
     path, out = Path(path), Path(out)
     if out.exists() or not out.parent.is_dir():
         raise InputError("OUT", got=str(out), expected="a file that does not exist, in a directory that does")
-    data = read_plain(path, links=True)
+    data = read_plain(path)
     if not data.startswith(MAGIC):
         raise ArtifactError(f"{path} is no MCAP file: it does not begin as one does")
     with whole_file(out) as file:
