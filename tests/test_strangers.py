@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shutil
 import socket
 import struct
@@ -19,6 +20,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base import strangers
+from drake_diff._base.confined import memory_at_most
 from drake_diff._base.strangers import arrays_of, files_in, read_plain
 from drake_diff.artifact import list_runs
 from drake_diff.exceptions import ArtifactError
@@ -210,3 +212,11 @@ def test_a_log_is_not_unpacked_before_its_size_is_known(tmp_path, made):
     finally:
         tracemalloc.stop()
     assert (done.messages, bool(done.stopped_at)) == (0, True)
+
+
+def test_what_a_log_makes_of_itself_in_memory_is_limited():
+    """A command that reads one may take some GiB; here it is what is taken already."""
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    with memory_at_most(2**20), pytest.raises(MemoryError):
+        bytearray(2**28)
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before

@@ -12,7 +12,8 @@ import signal
 import socket
 import struct
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from glob import glob
 from pathlib import Path
 
@@ -49,6 +50,18 @@ def limit_memory(bytes_: int) -> None:
         _, hard = resource.getrlimit(kind)
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (most, most))
+
+
+@contextmanager
+def memory_at_most(bytes_: int) -> Iterator[None]:
+    """Let this process have at most so much of its own memory while the block runs; MemoryError where it needs more."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    least = min(most for most in (bytes_, soft, hard) if most != resource.RLIM_INFINITY)
+    resource.setrlimit(resource.RLIMIT_DATA, (least, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
 def confine(readable: Iterable[Path], own: Path) -> list[str]:

@@ -75,7 +75,8 @@ def _measured(folder: Path, record: EvidenceRecord, target: Path) -> EvidenceRec
         told = f"{names}: a user's function, which no directory holds; start the script again from the plan in {PLAN}"
         raise ArtifactError(f"{folder}: {told}")
     plan = read_plan(folder / PLAN)
-    with rebuilt(record.model, record.contract.get("source"), None) as model, written_whole(target) as whole:
+    source, anywhere = record.contract.get("source"), Path("/")  # what a run left is one's own
+    with rebuilt(record.model, source, None, anywhere) as model, written_whole(target) as whole:
         measurement = measure(resolve(record, model, plan))
         made = _with_the_search(record_of(measurement, whole), record)
         write_files(whole, measurement, made)

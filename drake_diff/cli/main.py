@@ -66,6 +66,12 @@ def main() -> None:
         words = "; ".join((str(error), *getattr(error, "__notes__", ())))
         print(f"drake-diff: {type(error).__name__}: {words}", file=sys.stderr)
         sys.exit(MISSING if isinstance(error, MissingDependencyError) else USAGE)
+    except MemoryError:
+        print(
+            "drake-diff: MemoryError: it needs more memory than there is, or than this command may take",
+            file=sys.stderr,
+        )
+        sys.exit(USAGE)
     except Exception:
         traceback.print_exc()
         advice = "the last lines above say where it failed: mend your script there, or report a bug in drake-diff"

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from drake_diff._base.confined import memory_at_most
 from drake_diff._base.signals import INTERRUPTED
 from drake_diff.cli.text import ModelFolder, RunDirectory, judged, out_option, plain, progress_line, show, table
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, WriteError
@@ -19,6 +20,8 @@ from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, W
 LogFile = Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that drake_diff wrote.")]
 
 OURS = ("problem", "progress", "on_start", "on_plan")  # arguments of `solve` that a script does not give
+MOST_MEMORY = 4 * 2**30  # bytes
+
 mcap = typer.Typer(no_args_is_help=True, help="Look at, check and repair trace.mcap.")
 
 
@@ -196,6 +199,7 @@ def verify(
     raise typer.Exit(0 if found.holds else 1)
 
 
+@memory_at_most(MOST_MEMORY)
 def list_all(
     directory: Annotated[Path, typer.Argument(metavar="DIRECTORY", help="Where the runs are.")] = Path("artifacts"),
 ) -> None:
@@ -226,6 +230,7 @@ def recover_run(
     raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 
+@memory_at_most(MOST_MEMORY)
 def compare_runs(
     a: Annotated[Path, typer.Argument(metavar="A", help="A run directory.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
@@ -280,6 +285,7 @@ def view(run: RunDirectory, models: ModelFolder = None) -> None:
         typer.echo("ended")
 
 
+@memory_at_most(MOST_MEMORY)
 def export(
     run: RunDirectory,
     out: Annotated[
@@ -297,6 +303,7 @@ def export(
     show(f"wrote {folder}: {', '.join(f'{topic} {count}' for topic, count in counts.items())}")
 
 
+@memory_at_most(MOST_MEMORY)
 def info(file: LogFile) -> None:
     """List the channels of FILE with their messages and units, its metadata and its attachments."""
     from drake_diff.logs.mcap_file import read_mcap
@@ -321,6 +328,7 @@ def _units(units: dict[str, Any]) -> str:
     return ", ".join(f"{k} [{v}]" if isinstance(v, str) else f"{k} ({_units(v)})" for k, v in units.items())
 
 
+@memory_at_most(MOST_MEMORY)
 def check(file: LogFile) -> None:
     """Check every checksum and schema of FILE. Exit status 1 if one fails."""
     from drake_diff.logs.mcap_file import read_mcap
@@ -337,6 +345,7 @@ def check(file: LogFile) -> None:
     show(plain("whole", "bold green"), f" {file}: {told}, every checksum holds")
 
 
+@memory_at_most(MOST_MEMORY)
 def recover(
     file: LogFile, out: Annotated[Path, typer.Argument(metavar="OUT", help="The file to write.", dir_okay=False)]
 ) -> None:
