@@ -37,7 +37,7 @@ class DrakeDiffError(Exception):
 
 def _again(kind: type[DrakeDiffError], args: tuple[Any, ...]) -> DrakeDiffError:
     """An error with its message; `__init__` would make the message from what it was given."""
-    error = kind.__new__(kind)
+    error = kind.__new__(kind, *args)
     error.args = args
     return error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import accumulate, pairwise
 from math import hypot, isfinite
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from drake_diff.exceptions import InputError, NonFiniteError, ShapeError
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 FLOAT = np.dtype(float)
+NUMBERS = "fiub"  # the kinds of NumPy's types that are: floats, integers, booleans
+LARGEST, LARGEST_COUNT = float(np.finfo(float).max), 2**31 - 1  # what a double holds; an int of the solvers
+SHORTEST, LONGEST = 1e-12, 1e6  # [s]
 
 
 def frozen(values: ArrayLike) -> Array:
@@ -42,12 +46,7 @@ def array_with_gaps(subject: str, values: Any, shape: Sequence[int | str]) -> Ar
     """Like `finite_array`, where NaN and infinity have a meaning (a free goal entry, no bound)."""
     if type(values) is np.ndarray and values.dtype is FLOAT and values.shape == shape:
         return frozen(values)  # as a rule; what follows takes three times as long
-    try:
-        if np.iscomplexobj(values):
-            raise TypeError("complex")
-        array = frozen(values)
-    except (TypeError, ValueError) as error:
-        raise InputError(subject, got=repr(values)[:80], expected="an array of numbers") from error
+    array = _of_numbers(subject, values)
     if array.ndim != len(shape) or any(
         not isinstance(n, str) and n != m for m, n in zip(array.shape, shape, strict=True)
     ):
@@ -55,10 +54,26 @@ def array_with_gaps(subject: str, values: Any, shape: Sequence[int | str]) -> Ar
     return array
 
 
-def count(subject: str, value: Any, least: int) -> int:
-    """`value` as an int of at least `least`."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise InputError(subject, got=repr(value), expected=f"a whole number of at least {least}")
+def _of_numbers(subject: str, values: Any) -> Array:
+    """`values` as a read-only float array; NumPy alone takes dates, texts and what a mask hides for numbers."""
+    try:
+        array = np.array(values)
+        plain = array.dtype.kind in NUMBERS or (
+            array.dtype.kind == "O" and all(isinstance(each, Real) for each in array.flat)
+        )
+        if not plain or isinstance(values, np.ma.MaskedArray):
+            raise TypeError("no numbers")
+        return frozen(array)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(subject, got=f"{values!r:.80}", expected="an array of numbers") from error
+
+
+def count(subject: str, value: Any, least: int, most: int = LARGEST_COUNT) -> int:
+    """`value` as an int of at least `least` and at most `most`."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
+    if not whole or not least <= value <= most:
+        limit = f" and at most {most}" if whole and value > most else ""
+        raise InputError(subject, got=f"{value!r:.80}", expected=f"a whole number of at least {least}{limit}")
     return int(value)
 
 
@@ -69,11 +84,20 @@ def positive_int(subject: str, value: Any) -> int:
 
 def positive_float(subject: str, value: Any) -> float:
     """`value` as a finite float above 0."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise InputError(subject, got=repr(value), expected="a number above 0")
-    if not (np.isfinite(value) and value > 0):
-        raise InputError(subject, got=repr(value), expected="a finite number above 0")
+    number = isinstance(value, (int, float, np.integer, np.floating))
+    if not number or isinstance(value, (bool, np.timedelta64)):
+        raise InputError(subject, got=f"{value!r:.80}", expected="a number above 0")
+    if not 0 < value <= LARGEST:
+        raise InputError(subject, got=f"{value!r:.80}", expected="a finite number above 0")
     return float(value)
+
+
+def seconds(subject: str, value: Any) -> float:
+    """`value` as a float that a time step or a horizon can be [s]: others under- or overflow when they are squared."""
+    number = positive_float(subject, value)
+    if not SHORTEST <= number <= LONGEST:
+        raise InputError(subject, got=number, expected=f"a number from {SHORTEST:g} to {LONGEST:g}")
+    return number
 
 
 def part(subject: str, value: float) -> float:

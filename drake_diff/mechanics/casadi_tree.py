@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, skew
+from drake_diff._base.clock import Pace, check_time
 from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.description import Link, names_of, read_links, springs_of, without_welds
 from drake_diff.mechanics.tree import TreeDynamics, tree_for, tree_of
@@ -114,19 +115,30 @@ def _functions(plant: "_Plant", tree: TreeDynamics, model: Model, c: Any, actuat
     xu, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", 2 * n), ("mu", n), ("a", n)))
     knot = ca.vertcat(xu, c)
     q, v, u = xu[:n], xu[n : 2 * n], xu[2 * n :]
+    pace = Pace()
     mass, residual = mass_and_residual(plant, tree, q, v)
+    pace.go_on()
     factors = ca.ldl(mass)
     solved = ca.ldl_solve(actuation @ u - residual(ca.SX.zeros(n)), *factors)
-    r = residual(a)
-    rows = [ca.gradient(r[i], knot).T for i in range(n)]  # backwards: a fifth shorter than CasADi's own choice
+    pace.go_on()
+    r, rows = residual(a), []
+    for i in range(n):
+        check_time()
+        rows.append(ca.gradient(r[i], knot).T)  # backwards: a fifth shorter than CasADi's own choice
+    pace.go_on()
     slopes = ca.Function("slopes", [knot, a], [ca.vertcat(*rows)])
+    pace.go_on()
     slope = ca.gradient(ca.dot(mu, r), ca.vertcat(q, v, a, c))  # of mu' r, linear in a, whose factor is of q and c
     by_v = ca.jacobian(slope[n : 2 * n], v)
+    pace.go_on()
     curves = ca.Function("curves", [knot, a, mu], [ca.jacobian(slope, q), by_v, ca.jacobian(slope, c)])
+    pace.go_on()
     driven = ca.horzcat(ca.SX(n, 2 * n), actuation, ca.SX(n, more))
     by_knot = -ca.ldl_solve(slopes(knot, solved) - driven, *factors)
+    pace.go_on()
     identity = ca.horzcat(ca.SX(n, n), ca.SX.eye(n), ca.SX(n, model.nu + more))
     jacobian = ca.Function("jacobian", [knot], [ca.vertcat(identity, by_knot)])
+    pace.go_on()
     rows = ca.SX.sym("rows", jacobian.sparsity_out(0))
     by_q, by_v, by_c = curves(knot, solved, ca.ldl_solve(weights[n:], *factors))
     qv, aq = by_q[n : 2 * n, :].T, by_q[2 * n : 3 * n, :]
@@ -141,6 +153,7 @@ def _functions(plant: "_Plant", tree: TreeDynamics, model: Model, c: Any, actuat
             [qc.T, vc.T, uc.T, cc],
         ]
     )
+    pace.go_on()
     hessian = -(H + S + S.T)
     return PlantFunctions(
         ca.Function("plant", [knot], [ca.vertcat(v, solved)]),

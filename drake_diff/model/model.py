@@ -18,7 +18,7 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, Multibody
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from drake_diff._base.arrays import finite_array, positive_float
+from drake_diff._base.arrays import finite_array, positive_float, seconds
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.model.contact_geometry import CONTACT_MODELS, ROUTES, replace_collision_geometry
@@ -244,7 +244,7 @@ class Model(ShowsItsRepr):
 
     def at_time_step(self, time_step: float) -> Model:
         """The same model at another time step [s]. ModelError where it came from a diagram, which has but one."""
-        return self.changed(time_step=positive_float("time_step [s]", time_step))
+        return self.changed(time_step=seconds("time_step [s]", time_step))
 
     def with_contact(self, approximation: str) -> Model:
         """The same model with another contact approximation (sap, similar, lagged). ModelError like `at_time_step`."""
@@ -498,7 +498,7 @@ def load_model(
         >>> print(model)
         Model 'pendulum': nq=1, nv=1, nu=1, time step 0.01 s
     """
-    time_step = positive_float("time_step [s]", time_step)
+    time_step = seconds("time_step [s]", time_step)
     _check_choice("contact_model", contact_model, CONTACT_MODELS)
     _check_choice("contact_approximation", contact_approximation, CONTACT_APPROXIMATIONS)
     if contact_geometry is not None:

@@ -21,6 +21,7 @@ from pydrake.multibody.tree import (
     WeldJoint,
 )
 
+from drake_diff._base.arrays import LARGEST
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.file_facts import FileFacts
@@ -311,8 +312,9 @@ def as_ground(value: Any) -> float | bool | None:
     """The argument `ground` as it is kept: None, True or a friction coefficient; InputError where it is no such."""
     if value is None or value is True:
         return value
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not 0 <= value < np.inf:
-        raise InputError("ground", got=repr(value), expected="a friction coefficient of at least 0, or True")
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, (bool, np.timedelta64))
+    if not number or not 0 <= value <= LARGEST:
+        raise InputError("ground", got=f"{value!r:.80}", expected="a friction coefficient of at least 0, or True")
     return float(value)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from pydrake.multibody.tree import MultibodyForces_
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.clock import check_time
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.inputs import Inputs
 from drake_diff.model.mimic import Coupling
@@ -144,7 +145,11 @@ class Twin:
         return limits if self.coupling is None else self.coupling.limits(*limits, of_velocities=True)
 
     def set_state(self, x: Any) -> None:
-        """Put the state x (nx,) into the context. ModelError in another thread than that which it was made in."""
+        """Put the state x (nx,) into the context. ModelError in another thread than that which it was made in.
+
+        Raises TimeIsUpError where a time that was set is over: nearly all that takes time begins here.
+        """
+        check_time()
         if self.thread != get_ident():
             raise ModelError(
                 "a context that was made in one thread is used in another, where it would hold two states: take "

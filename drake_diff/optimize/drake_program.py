@@ -12,6 +12,7 @@ from pydrake import solvers
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolutionResult
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.clock import TimeIsUpError
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch
@@ -49,7 +50,7 @@ def solve_program(
         program.AddVisualizationCallback(callback, program.decision_variables())
         try:
             result = engine.Solve(program, guess, _options(solver, limits, print_file, longest))
-        except (DrakeDiffError, RuntimeError, _Stop) as error:
+        except (DrakeDiffError, RuntimeError, _Stop, TimeIsUpError) as error:
             outcome, message = _explain_exception(watch, error)
             callback.look_back()
             return NlpResult(watch.best_of(guess), outcome, message, _read_table(solver, print_file))
@@ -83,7 +84,7 @@ class _Callback:
         if self.before is not None:
             try:
                 self._look(self.before)
-            except DrakeDiffError:
+            except (DrakeDiffError, TimeIsUpError):
                 return  # nor can it be evaluated: the best that was seen stays
 
     def _look(self, z: Array) -> None:
@@ -122,6 +123,8 @@ def _explain_exception(watch: Watch, error: Exception) -> tuple[Outcome, str]:
     if watch.stopped_by is not None:
         return watch.stopped_by, f"stopped: {watch.stopped_by.value}"
     text = f"{type(error).__name__}: {error}"
+    if TimeIsUpError.__name__ in text:  # in the middle of an evaluation
+        return Outcome.TIME_LIMIT, f"stopped: {Outcome.TIME_LIMIT.value}"
     for name, outcome in (("SimulationError", Outcome.DIVERGED), ("GradientError", Outcome.NO_GRADIENT)):
         if name in text:
             return outcome, text[text.rindex(name) :].strip()  # SNOPT's text holds the traceback first

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.clock import TimeIsUpError, until
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.steps import certify_steps
 from drake_diff.exceptions import GradientError, SimulationError
@@ -20,7 +21,7 @@ from drake_diff.optimize.continuation import Stages, solve_continuation
 from drake_diff.optimize.guess import Guess
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through_jumps
-from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused, unmeasured
+from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused, status_of, unmeasured
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
@@ -41,9 +42,22 @@ from drake_diff.optimize.transcription.drake import solve_collocation
 
 CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
 FINER_ROUNDS = 6  # of a mesh whose plan does not hold
+GRACE = 0.05  # of the time limit, beyond it: for measures of what a search found that the limit ended
+# What a solve is made of, in this order; a time limit names what it cut.
+STAGES = ("certificates of the guess", "the search", "certificates of the result", "replays and other measures")
 PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 
 Searcher = Callable[[Problem, Array, Array, Array], tuple[NlpResult, Array, Array]]
+
+
+@dataclass(eq=False)
+class _SoFar:
+    """What a run has when the clock ends it, and the stage that it is in; see STAGES."""
+
+    stage: int
+    draft: Solution
+    result: NlpResult | None = None
+    judged: Solution | None = None  # where a finer mesh is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +74,38 @@ class Run:
     searched: Problem | None = None  # what is solved where that is more than what is asked
     start: float = field(default_factory=time.monotonic)
     certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
+    reached: list[_SoFar] = field(default_factory=list)  # the last is where it is
+
+    def within_time(self, search: Callable[[], Solution], guess: Guess) -> Solution:
+        """What `search`, one of the three below, gives; where the time limit comes first, what there is by then."""
+        self.reached.append(_SoFar(0, self._of_guess(guess)))
+        try:
+            with until(self.start + (1 + GRACE) * self.limits.time_limit):
+                return search()
+        except TimeIsUpError:
+            return self._cut(self.reached[-1])
+
+    def _of_guess(self, guess: Guess) -> Solution:
+        """The draft of a solve that found nothing: its guess, by collocation with an input at the last knot."""
+        if self.scheme == "step" or self.problem.is_map:
+            return self._draft(guess.xs, guess.us)
+        last = guess.us[-1] if guess.u_final is None else np.ravel(guess.u_final)
+        return self._draft(guess.xs, guess.us, u_final=last)
+
+    def _cut(self, reached: _SoFar) -> Solution:
+        if reached.judged is not None:
+            return reached.judged.told(message=f"{reached.judged.message}; no finer mesh: the time limit came first")
+        result, cut = reached.result, f"not made within the time limit: {', '.join(STAGES[reached.stage :])}"
+        if result is None:
+            return ended(reached.draft, Status.TIME_LIMIT, cut)
+        status, table = status_of(result.outcome) or Status.TIME_LIMIT, result.iterations
+        detail = f"{result.message}; {cut}"
+        return ended(reached.draft, status, detail, iterations=table, solver_message=result.message)
+
+    def _left(self) -> Limits:
+        """The limits of a search that begins now."""
+        left = self.limits.time_limit - (time.monotonic() - self.start)
+        return dataclasses.replace(self.limits, time_limit=max(left, 0.0))
 
     def collocate(self, guess: Guess, refinement: MeshRefinement | None, *, refine: bool | None) -> Solution:
         """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation.
@@ -68,7 +114,7 @@ class Run:
         """
         if self.solver == "snopt":
             return self._collocate_in_drake(guess)
-        problem, limits, report = self.problem, self.limits, self.report
+        problem, report = self.problem, self.report
         transcription = Transcription(self.searched or problem, self.scheme)
         try:
             before = certify_equations(
@@ -80,13 +126,14 @@ class Run:
                 knots=first_knots(guess.us),
             )
         except (GradientError, SimulationError) as error:
-            return refused(self._draft(guess.xs, guess.us), error)
+            return refused(self._of_guess(guess), error)
+        self._reach(1)
         us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
         begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
         motion = transcription.solve(
             begun,
             horizon=guess.horizon,
-            limits=limits,
+            limits=self._left(),
             report=report,
             refinement=refinement if refine else None,
             parameters=guess.parameters,
@@ -121,7 +168,7 @@ class Run:
         transcription: Transcription,
         motion: Transcribed,
         solution: Solution,
-        until: MeshRefinement,
+        most: MeshRefinement,
         judged: Callable[[Transcribed], Solution],
     ) -> Solution:
         """`solution`, or that on a mesh which is made finer for as long as the plan does not hold."""
@@ -130,11 +177,10 @@ class Run:
             if not may_be_too_coarse(solution):
                 break
             exceeded = violation_between_nodes(motion).intervals
-            if motion.largest_error <= until.tolerance and not exceeded:
+            if motion.largest_error <= most.tolerance and not exceeded:
                 break  # what does not hold is not the mesh's
-            left = self.limits.time_limit - (time.monotonic() - self.start)
-            limits = dataclasses.replace(self.limits, time_limit=max(left, 0.0))
-            finer = transcription.finer(motion, exceeded, until.most, limits, self.report)
+            self.reached.append(_SoFar(1, solution, judged=solution))
+            finer = transcription.finer(motion, exceeded, most.most, self._left(), self.report)
             if finer is None:
                 break
             if finer.result.outcome not in FOUND:
@@ -158,11 +204,13 @@ class Run:
             first = first_knots(guess.us)
             certificates = certify_equations(self.problem, jacobian, guess.xs, guess.us, knots=first)
         except (GradientError, SimulationError) as error:
-            return refused(self._draft(guess.xs, guess.us), error)
+            return refused(self._of_guess(guess), error)
+        self._reach(1)
         result, xs, us, u_final = solve_collocation(
-            self.problem, guess.xs, guess.us, solver=self.solver, limits=self.limits, report=self.report
+            self.problem, guess.xs, guess.us, solver=self.solver, limits=self._left(), report=self.report
         )
         self._offer(self._draft(xs, us, u_final=u_final), result)
+        self._reach(2, self._draft(xs, us, u_final=u_final, certificates=certificates), result)
         if np.all(np.isfinite(xs)):
             certificates += certify_equations(self.problem, jacobian, xs, us)
         return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates), result)
@@ -172,7 +220,7 @@ class Run:
     ) -> Solution:
         xs, us = motion.xs, motion.us[:-1]
         self.options["derivatives"] = motion.derivatives
-        found = {
+        found: dict[str, Any] = {
             "u_final": None if self.problem.is_map else motion.us[-1],
             "us_mid": None if self.scheme == "drake" else motion.us_mid,
             "free_horizon": motion.horizon if self.problem.horizon else None,
@@ -181,6 +229,7 @@ class Run:
             "multipliers": motion.result.multipliers,
         }
         self._offer(self._draft(xs, us, **found), motion.result)
+        self._reach(2, self._draft(xs, us, certificates=certificates, **found), motion.result)
         if np.all(np.isfinite(xs)):
             certificates += certify_equations(self.problem, transcription.jacobian, xs, us, motion.task)
         draft = self._draft(xs, us, certificates=certificates, **found)
@@ -194,9 +243,10 @@ class Run:
         With `stages` it need not have a gradient.
         """
         xs, us = guess.xs, guess.us
-        limits, report, first = self.limits, self.report, iter([xs] if given else [])
+        report, first = self.report, iter([xs] if given else [])
 
         def search(problem: Problem, rolled: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
+            limits = self._left()
             if stages:
                 result, xs_found, us, logs = solve_continuation(problem, xs, us, stages, limits=limits, report=report)
                 self.options["continuation"] = [asdict(log) for log in logs]
@@ -217,7 +267,7 @@ class Run:
 
         Several `segments` are looked at around their own states, which defects part.
         """
-        limits, report, xs, us = self.limits, self.report, guess.xs, guess.us
+        report, xs, us = self.report, guess.xs, guess.us
         if segments > 1:
             try:
                 xs = roll_segments(self.problem, xs, us, segments)
@@ -226,12 +276,12 @@ class Run:
 
         def search(problem: Problem, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
             if improve:
-                result, xs, us = solve_ilqr(problem, xs, us, limits=limits, report=report)
+                result, xs, us = solve_ilqr(problem, xs, us, limits=self._left(), report=report)
                 self.options["initial_guess"] = f"default, then {result.message}"
                 if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
                     return result, xs, us
             options: dict[str, Any] = {"solver": self.solver, "segments": segments, "values": values}
-            return solve_shooting(problem, xs, us, limits=limits, report=report, **options)
+            return solve_shooting(problem, xs, us, limits=self._left(), report=report, **options)
 
         return self._through_steps(xs, us, search, guess, segmented=segments > 1)
 
@@ -258,8 +308,10 @@ class Run:
             return refused(self._draft(xs, us), error)
         if blindness and not may_be_blind:
             return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
+        self._reach(1, self._draft(xs, us, certificates=before))
         try:
             result, xs, us = self._keeping_clear(search, xs, us, values)
+            self._reach(2, self._draft(xs, us, certificates=before, multipliers=result.multipliers), result)
             variables = ShootingVariables(self.problem, around=xs if segmented else None)
             z = variables.pack(xs[0], us, result.parameters)
             if self.method == "shooting" and len(result.z) == variables.size:
@@ -322,8 +374,15 @@ class Run:
         variables = ShootingVariables(self.problem)
         return variables.parameters(result.z).values if len(result.z) == variables.size else first
 
+    def _reach(self, stage: int, draft: Solution | None = None, result: NlpResult | None = None) -> None:
+        """Note the stage that begins, and what there is by then."""
+        last = self.reached[-1]
+        last.stage = stage
+        last.draft, last.result = draft or last.draft, result or last.result
+
     def _judge(self, draft: Solution, result: NlpResult) -> Solution:
         """`judged`, and no success where the cost asks for a motion that nothing here could have begun."""
+        self._reach(3, draft, result)
         solution, problem = judged(draft, result), self.problem
         if solution.status not in PLANS or not problem.has_model:
             return solution

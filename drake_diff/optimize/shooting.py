@@ -6,7 +6,6 @@ what a late input does need not be seen through all the steps before it. One seg
 """
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -25,6 +24,7 @@ from drake_diff.model.parameters import ParameterVector
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.loss import Totals, accumulate, differentiate_loss
 from drake_diff.optimize.drake_program import solve_program
+from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.coupling import BoundCoupling
 from drake_diff.optimize.problem.problem import Problem
@@ -313,9 +313,21 @@ def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:
 
 
 def final_sensitivity(variables: ShootingVariables, z: Array) -> Array:
-    """(nx, size): d x_n / d z, without the memory of `state_sensitivities`, which grows as n^2."""
-    (last,) = deque(_sensitivities(variables, z), maxlen=1)
-    return last
+    """(nx, size): d x_n / d z, backward: d x_n / d x_k from the last k on, in time and memory that grow as n.
+
+    Forward, all inputs' columns are carried through every step, which takes n^2.
+    """
+    steps, nu = variables.linearization(z), variables.shape[1]
+    found, after = np.zeros((variables.problem.model.nx, variables.size)), np.eye(variables.problem.model.nx)
+    for k in reversed(range(len(steps))):
+        d = steps[k]
+        if variables.problem.optimizes_controls:
+            start = variables.inputs.start + k * nu
+            found[:, start : start + nu] = after @ d.B
+        found[:, variables.inputs.stop :] += after @ variables.pull_back(z, d.C)
+        after = after @ d.A
+    found[:, np.arange(len(variables.free))] = after[:, variables.free]
+    return found
 
 
 def _sensitivities(variables: ShootingVariables, z: Array) -> Iterator[Array]:
@@ -456,6 +468,9 @@ def limits_of_constraints(problem: Problem, variables: ShootingVariables) -> Row
     knots = range(first, variables.steps.stop + variables.is_last)
     given = problem.initial_state_is_given
     here = [(k - first, c) for c in problem.kept for k in c.at_knots(problem.num_steps, given) if k in knots]
+    at_knot: dict[int, list[tuple[int, Constraint]]] = {}
+    for i, (k, c) in enumerate(here):
+        at_knot.setdefault(k, []).append((i, c))
 
     def values(z: Array) -> Array:
         xs, us = variables.states(z), variables.unpack(z)[1]
@@ -463,14 +478,14 @@ def limits_of_constraints(problem: Problem, variables: ShootingVariables) -> Row
             return np.concatenate([c(xs[k], us[min(k, len(us) - 1)]) for k, c in here])
 
     def jacobian(z: Array) -> Array:
-        xs, us, sensitivities = variables.states(z), variables.unpack(z)[1], state_sensitivities(variables, z)
-        found = []
-        for k, c in here:
-            by_xu = c.differentiate(xs[k], us[min(k, len(us) - 1)])[1]
-            found.append(by_xu[:, :nx] @ sensitivities[k])
-            if k < len(us) and problem.optimizes_controls:
-                start = variables.inputs.start + k * nu
-                found[-1][:, start : start + nu] += by_xu[:, nx:]
+        xs, us, found = variables.states(z), variables.unpack(z)[1], [none[0]] * len(here)
+        for k, sensitivity in enumerate(_sensitivities(variables, z)):  # of all knots they would take n^2 numbers
+            for row, c in at_knot.get(k, ()):
+                by_xu = c.differentiate(xs[k], us[min(k, len(us) - 1)])[1]
+                found[row] = by_xu[:, :nx] @ sensitivity
+                if k < len(us) and problem.optimizes_controls:
+                    start = variables.inputs.start + k * nu
+                    found[row][:, start : start + nu] += by_xu[:, nx:]
         return np.concatenate(found)
 
     none = [np.zeros(0)]

@@ -11,7 +11,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from drake_diff._base.arrays import positive_float, positive_int
+from drake_diff._base.arrays import count, positive_float, positive_int
 from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import penetration
 from drake_diff.model.parameters import applied
@@ -41,6 +41,7 @@ from drake_diff.optimize.transcription.collocation import (
 )
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
 
+LARGEST_SEED, LARGEST_TOLERANCE = 2**64, 1e3
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
 OTHER_GUESSES = 8  # of a collocation that finds no motion from a straight line
@@ -192,12 +193,12 @@ def solve(
     limits = Limits(
         positive_int("max_iterations", max_iterations),
         np.inf if time_limit is None else positive_float("time_limit [s]", time_limit),
-        positive_float("tolerance", tolerance),
+        _tolerance("tolerance", tolerance),
     )
     refinement = MeshRefinement(
-        positive_float("error_tolerance", error_tolerance), positive_int("max_num_steps", max_num_steps)
+        _tolerance("error_tolerance", error_tolerance), positive_int("max_num_steps", max_num_steps)
     )
-    if refine not in (None, True, False):
+    if not (refine is None or isinstance(refine, (bool, np.bool_))):
         raise InputError("refine", got=repr(refine), expected="None, True or False")
     report = Report(print if progress is True else (progress or None), callback, on_plan)
     arguments: dict[str, Any] = {
@@ -208,13 +209,13 @@ def solve(
         "time_limit": None if time_limit is None else limits.time_limit,
         "tolerance": limits.tolerance,
         "seed": int(seed),
-        "segments": int(segments),
+        "segments": positive_int("segments", segments),
         "continuation": _plain_stages(continuation),
         "refine": refine,
         "error_tolerance": refinement.tolerance,
         "max_num_steps": refinement.most,
     }
-    if _count("restarts", restarts):
+    if count("restarts", restarts, 0):
         arguments["restarts"] = int(restarts)
     report.asked = Search(arguments, initial_guess)
     if isinstance(problem, PhasedProblem):
@@ -242,18 +243,18 @@ def solve(
 def _check_common(problem: Any, seed: Any, callback: Any, progress: Any) -> None:
     if not isinstance(problem, (Problem, PhasedProblem)):
         raise InputError("problem", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
+    count("seed", seed, 0, LARGEST_SEED)
     if not (callback is None or callable(callback)):
         raise InputError("callback", got=repr(callback), expected="None or a function of an Iteration")
     if not (isinstance(progress, bool) or callable(progress)):
         raise InputError("progress", got=repr(progress), expected="True, False or a function")
 
 
-def _count(name: str, given: Any) -> int:
-    if isinstance(given, bool) or not isinstance(given, (int, np.integer)) or given < 0:
-        raise InputError(name, got=repr(given), expected="a whole number of at least 0")
-    return int(given)
+def _tolerance(name: str, given: Any) -> float:
+    found = positive_float(name, given)
+    if found > LARGEST_TOLERANCE:
+        raise InputError(name, got=found, expected=f"at most {LARGEST_TOLERANCE:g}")
+    return found
 
 
 def _takes(problem: Problem, method: str) -> bool:
@@ -306,6 +307,11 @@ class _Task:
     on_start: Callable[[], None] | None
     start: float = field(default_factory=time.monotonic)
 
+    @property
+    def is_late(self) -> bool:
+        """Whether the time is over."""
+        return time.monotonic() - self.start > self.limits.time_limit
+
     def prepare(self, attempt: Attempt, given: Any) -> Callable[[], Solution]:
         """Check that `attempt` can be made from the guess `given`; what is returned makes it."""
         problem, method = self.problem, attempt.method
@@ -342,11 +348,13 @@ class _Task:
                 self.on_start()
                 self.on_start = None
             if method == "collocation":
-                return run.collocate(guess, attempt.refinement, refine=attempt.refine)
-            if method == "ilqr":
-                return run.sweep(guess, given=given is not None, stages=stages)
-            improve = given is None and attempt.segments == 1 and is_unconstrained(problem)
-            return run.shoot(guess, attempt.segments, improve=improve)
+                search = partial(run.collocate, guess, attempt.refinement, refine=attempt.refine)
+            elif method == "ilqr":
+                search = partial(run.sweep, guess, given=given is not None, stages=stages)
+            else:
+                improve = given is None and attempt.segments == 1 and is_unconstrained(problem)
+                search = partial(run.shoot, guess, attempt.segments, improve=improve)
+            return run.within_time(search, guess)
 
         return make
 
@@ -359,6 +367,9 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
     found: list[Solution] = []
     chain: list[dict[str, str]] = []
     for attempt, guess in _attempts(task.problem, asked, given, found):
+        if found and task.is_late:
+            chain.append({"method": attempt.method, "reason": attempt.reason, "ended": "not begun: time limit"})
+            break
         try:
             make = task.prepare(attempt, guess)
         except DrakeDiffError as error:
@@ -376,7 +387,7 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
         if last.status in ENDED:
             break
 
-    best = min(found, key=_preference)
+    best = min(found, key=_preference) if len(found) > 1 else found[0]
     if asked.method != "auto" and len(chain) == 1:
         return best
     if len(found) > 1 and best.status not in PLANS and all(s.method == "collocation" for s in found):
@@ -384,7 +395,7 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
     return best.told(options=best.options | {"chain": chain})
 
 
-def _restarted(task: _Task, asked: Attempt, first: Solution, count: int) -> Solution:
+def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> Solution:
     """The cheapest verified of a solution and of `count` more by the same method, with all optima that were found.
 
     Ctrl-C and the time limit end it; an attempt that fails is told in the chain.
@@ -395,11 +406,11 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, count: int) -> Solu
     solver = asked.solver if first.method == asked.method else None
     base = dataclasses.replace(asked, method=first.method, solver=solver, continuation=None)
     found = [(first, f"that of {len(chain)} in the chain" if len(chain) > 1 else "the first")]
-    for number in range(1, count + 1):
+    for number in range(1, restarts + 1):
         if found[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
             break
         which = f"{OTHER_GUESS}, number {used + number} of seed {asked.seed}"
-        attempt = dataclasses.replace(base, reason=f"restart {number} of {count}: {which}")
+        attempt = dataclasses.replace(base, reason=f"restart {number} of {restarts}: {which}")
         if first.method == "collocation":
             begun = another_guess(task.problem, asked.seed, used + number)
         else:

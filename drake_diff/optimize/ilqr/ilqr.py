@@ -17,6 +17,7 @@ from functools import cache
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.clock import TimeIsUpError
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
@@ -234,7 +235,10 @@ class _Search:
 
         Where that leads elsewhere, the search goes on from there with Drake's own step alone.
         """
-        outcome = self._search(interrupted)
+        try:
+            outcome = self._search(interrupted)
+        except TimeIsUpError:  # in the middle of a step: what was found before it stays
+            return Outcome.TIME_LIMIT
         if self.tried_by is None or self.policy is None:
             return outcome
         self.tried_by = None

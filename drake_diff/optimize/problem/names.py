@@ -70,7 +70,10 @@ def bounds_of(system: Model | Dynamics, given: Any) -> Any:
         kind, place = ("x", places[name]) if name in places else ("u", inputs[name])
         for side, value in zip(SIDES, pair, strict=True):
             if value is not None:
-                sides[f"{kind}_{side}"][place] = array_with_gaps(f"bounds of {name}", value, ())
+                bound = array_with_gaps(f"bounds of {name}", value, ())
+                if np.isnan(bound):
+                    raise InputError(f"bounds of {name}", got=repr(pair)[:80], expected="numbers, None for no bound")
+                sides[f"{kind}_{side}"][place] = bound
     return Bounds(**sides)
 
 

@@ -9,7 +9,16 @@ from typing import Any, cast
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.arrays import (
+    Array,
+    Indices,
+    array_with_gaps,
+    count,
+    finite_array,
+    frozen,
+    positive_float,
+    seconds,
+)
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.pickling import PicklesItsFields
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
@@ -35,6 +44,7 @@ from drake_diff.optimize.problem.timed import (
     running_cost_of,
 )
 
+MOST_STEPS = 10**8  # each has a state and an input, at least
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
 SMALLEST_PART = 1e-3
@@ -130,7 +140,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             raise InputError("system", got=type(system).__name__, expected="a Model or Dynamics")
         x0 = state_of(system, "x0", self.x0, system.default_state)
         self._set("x0", finite_array("x0", x0, (self.nx,)))
-        self._set("num_steps", positive_int("num_steps", self.num_steps))
+        self._set("num_steps", count("num_steps", self.num_steps, 1, MOST_STEPS))
         self._set("optimize", _check_optimize(self.nu, self.optimize))
         if isinstance(system, Model):
             given = self.parameters
@@ -475,10 +485,14 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     def _check_waypoints(self) -> dict[int, Array]:
         found = {}
+        if not (self.waypoints is None or isinstance(self.waypoints, Mapping)):
+            got = f"{self.waypoints!r:.80}"
+            raise InputError("waypoints", got=got, expected="a mapping from knots to states")
         for knot, state in (self.waypoints or {}).items():
-            if isinstance(knot, bool) or not isinstance(knot, (int, np.integer)) or not 0 < knot < self.num_steps:
+            whole = isinstance(knot, (int, np.integer)) and not isinstance(knot, (bool, np.timedelta64))
+            if not whole or not 0 < knot < self.num_steps:
                 expected = f"whole numbers from 1 to {self.num_steps - 1} (the last state's is x_goal)"
-                raise InputError("knots of waypoints", got=repr(knot), expected=expected)
+                raise InputError("knots of waypoints", got=f"{knot!r:.80}", expected=expected)
             found[int(knot)] = self._check_state(f"waypoint at knot {knot}", state)
         return dict(sorted(found.items()))
 
@@ -642,7 +656,7 @@ def _check_horizon(given: Any) -> tuple[float, float]:
     pair = given if isinstance(given, (tuple, list)) else (given, given)
     if len(pair) != 2:
         raise InputError("horizon", got=repr(given), expected="a number of seconds, or (lower, upper)")
-    lower, upper = (positive_float("horizon [s]", value) for value in pair)
+    lower, upper = (seconds("horizon [s]", value) for value in pair)
     if lower > upper:
         raise InputError("horizon", got=repr(given), expected="lower at most upper")
     return lower, upper

@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.clock import Pace, TimeIsUpError
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.optimize.program import (
@@ -176,14 +177,16 @@ class TranscribedProgram:
 
     def derivatives(self, exact: bool) -> dict[str, Any]:
         """CasADi Functions by the names of nlpsol's options, "hess_lag" only where `exact`."""
-        p, sigma = ca.MX.sym("p", 0), ca.MX.sym("sigma")
+        pace, p, sigma = Pace(), ca.MX.sym("p", 0), ca.MX.sym("sigma")
         multipliers = ca.MX.sym("multipliers", self.nlp["g"].numel())
-        found = {
-            "grad_f": ca.Function("grad_f", [self.z, p], [self.nlp["f"], self._gradient()]),
-            "jac_g": ca.Function("jac_g", [self.z, p], [self.nlp["g"], self._jacobian()]),
-        }
+        pace.go_on()
+        found = {"grad_f": ca.Function("grad_f", [self.z, p], [self.nlp["f"], self._gradient()])}
+        pace.go_on()
+        found["jac_g"] = ca.Function("jac_g", [self.z, p], [self.nlp["g"], self._jacobian()])
         if exact:
+            pace.go_on()
             hessian = self._hessian(sigma, multipliers)
+            pace.go_on()
             found["hess_lag"] = ca.Function("hess_lag", [self.z, p, sigma, multipliers], [hessian])
         return found
 
@@ -415,6 +418,8 @@ def solve_ipopt(
     table = tuple(Iteration(i, *map(float, row)) for i, row in enumerate(zip(*columns, strict=True)))
     error = callback.error or program.functions.error
     if error is not None:
+        if isinstance(error, TimeIsUpError):
+            return NlpResult(watch.best_of(guess), Outcome.TIME_LIMIT, f"stopped: {error}", table)
         if not isinstance(error, DrakeDiffError):
             raise error
         outcome = Outcome.NO_GRADIENT if isinstance(error, GradientError) else Outcome.FAILED

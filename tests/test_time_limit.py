@@ -1,0 +1,127 @@
+"""The time limit of a solve: it holds in whatever the solve calls, and the result names what was not made.
+
+The clock is ours: it stands still but where a test lets time pass.
+"""
+
+import time
+
+import numpy as np
+import pytest
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff._base.clock import Pace, TimeIsUpError, check_time, until
+from drake_diff.optimize import run
+
+STATUS = dd.Status.TIME_LIMIT
+METHODS = [("collocation", None), ("shooting", "snopt"), ("shooting", "ipopt"), ("ilqr", None)]
+
+
+class Clock:
+    def __init__(self):
+        self.now = time.monotonic()  # of which a solve that has begun knows
+
+    def __call__(self):
+        return self.now
+
+
+def stopped(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(time, "monotonic", clock)
+    return clock
+
+
+def swing():
+    model = dd.example_model("pendulum", time_step=0.05)
+    effort = dd.QuadraticCost(R=[[1.0]])
+    return dd.Problem(model, x0=[0, 0], x_goal=[0.5, 0], num_steps=10, running_cost=effort)
+
+
+def late(clock, function, *, from_call):
+    """The function, whose calls from a number on take a year."""
+    calls = []
+
+    def run_late(*arguments, **options):
+        calls.append(1)
+        if len(calls) >= from_call:
+            clock.now += 3e7
+        return function(*arguments, **options)
+
+    return run_late
+
+
+def test_time_that_is_up_is_up_for_all_that_is_called(monkeypatch):
+    clock = stopped(monkeypatch)
+    clock.now = 0.0
+    check_time()
+    with until(10.0), until(20.0):
+        check_time(ahead=9.0)
+        with pytest.raises(TimeIsUpError):
+            check_time(ahead=11.0)  # the block around this one ends first
+        pace = Pace()
+        clock.now = 9.5
+        with pytest.raises(TimeIsUpError):  # 9.5 s for one piece, so that the next may take until after 10
+            pace.go_on()
+        clock.now = 10.5
+        with pytest.raises(TimeIsUpError):
+            dd.step(dd.example_model("pendulum"), [0, 0], [0])
+    check_time()
+
+
+@each_row("method, solver", METHODS)
+def test_what_is_found_in_time_and_not_certified_is_not_called_verified(monkeypatch, method, solver):
+    clock = stopped(monkeypatch)
+    for name in ("certify_equations", "certify_steps"):
+        monkeypatch.setattr(run, name, late(clock, getattr(run, name), from_call=2))
+    found = dd.solve(swing(), method=method, solver=solver, time_limit=10.0)
+    assert found.status is STATUS
+    assert "not made within the time limit: certificates of the result, replays and other measures" in found.message
+    assert found.goal_error < 1e-5  # the motion is the one that was found
+    assert len(found.certificates) == 3  # those of the guess
+
+
+@each_row("method, solver", METHODS)
+def test_replays_that_the_limit_cuts_are_named(monkeypatch, method, solver):
+    clock = stopped(monkeypatch)
+    monkeypatch.setattr(run, "judged", late(clock, run.judged, from_call=1))
+    found = dd.solve(swing(), method=method, solver=solver, time_limit=10.0)
+    assert found.status is STATUS
+    assert "not made within the time limit: replays and other measures" in found.message
+    assert len(found.certificates) > 3
+
+
+@each_row(
+    "method, place",
+    [
+        ("collocation", "drake_diff.mechanics.casadi_tree.mass_and_residual"),
+        ("shooting", "drake_diff.optimize.run.first_knots"),
+        ("ilqr", "drake_diff.optimize.run.first_knots"),
+    ],
+)
+def test_a_limit_that_comes_before_the_search_leaves_the_guess(monkeypatch, method, place):
+    clock = stopped(monkeypatch)
+    module, name = place.rsplit(".", 1)
+    function = getattr(__import__(module, fromlist=[name]), name)
+    monkeypatch.setattr(place, late(clock, function, from_call=1))
+    found = dd.solve(swing(), method=method, time_limit=10.0)
+    assert found.status is STATUS
+    assert "certificates of the guess, the search, certificates of the result" in found.message
+    assert np.array_equal(found.xs[0], [0, 0])
+    assert not found.certificates
+    assert np.isfinite(found.cost)
+
+
+def test_no_other_method_is_begun_after_the_limit(monkeypatch):
+    """A plan that is not verified is followed by others, if there is time."""
+    problem, clock = swing(), stopped(monkeypatch)
+
+    def unverified(self, search, guess):
+        found = search()
+        clock.now += 11.0
+        return found.told(status=dd.Status.CONVERGED_NOT_VERIFIED)
+
+    monkeypatch.setattr(run.Run, "within_time", lambda *of: unverified(*of))
+    monkeypatch.setattr(run.Run, "_reach", lambda *_: None)
+    found = dd.solve(problem, time_limit=10.0)
+    assert found.status is dd.Status.CONVERGED_NOT_VERIFIED
+    assert [link["ended"] for link in found.options["chain"]] == ["converged_not_verified", "not begun: time limit"]
