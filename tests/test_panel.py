@@ -11,8 +11,10 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
+import loky
 import numpy as np
 import pytest
 from helpers.table import each_row
@@ -23,6 +25,7 @@ from drake_diff._base.statistics import success_rate
 from drake_diff.artifact import list_runs
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
+from drake_diff.panels import workers as workers_module
 from drake_diff.panels.panel_file import expand, load_panel
 from drake_diff.panels.ranking import ranked
 from drake_diff.panels.workers import row_of
@@ -31,6 +34,7 @@ from drake_diff.record.sealed import own_sha256
 
 FUNCTIONS = """
 import os, random, time
+import loky
 import numpy as np
 
 def cheap(trial):
@@ -232,6 +236,29 @@ def test_a_trial_whose_worker_dies_twice_is_a_row_that_says_so(write, tmp_path):
     ]
     assert table.rows[2]["error"].startswith("WorkerDied: ")
     assert [row["cost"] for row in table.rows if "cost" in row] == [0.5, 1, 4, 8]
+
+
+@pytest.mark.slow  # 7 processes, each of which loads Drake
+@pytest.mark.parametrize(("deaths", "errors"), [(2, 0), (3, 1)])
+def test_a_worker_killed_at_its_start_is_started_again_and_said_so(write, tmp_path, monkeypatch, deaths, errors):
+    left = tmp_path / "left"
+    left.write_text(str(deaths))
+
+    def fall():  # as often as the file says
+        count = int(left.read_text())
+        if count:
+            left.write_text(str(count - 1))
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    dying = partial(loky.ProcessPoolExecutor, 1, initializer=fall, env=workers_module.ONE_THREAD)
+    monkeypatch.setattr(workers_module, "_one_process", dying)
+    with pytest.warns(RuntimeWarning, match="killed at its start: it is started again") as told:
+        table = dd.panels.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
+    assert len(told) == 2
+    assert table.errors == errors
+    if errors:
+        words = "WorkerDied: 3 processes in turn were killed at their start, before this trial began"
+        assert table.rows[0]["error"].startswith(words)
 
 
 def test_a_trial_that_calls_exit_ends_itself_alone(write, tmp_path):

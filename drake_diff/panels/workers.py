@@ -13,6 +13,7 @@ import signal
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
@@ -37,6 +38,11 @@ Row = dict[str, Any]
 Function = Callable[[dict[str, Any]], Mapping[str, Any]]
 # A worker dies when it is killed, runs out of memory, or crashes below Python.
 DIED: Row = {"error": "WorkerDied: the process that evaluated this trial died, and so did the one that tried again"}
+STARTS = 3  # processes in turn that may be killed before they begin a trial
+NOT_STARTED: Row = {
+    "error": f"WorkerDied: {STARTS} processes in turn were killed at their start, before this trial began: there may "
+    "be too little memory for so many workers"
+}
 # A worker has one core: its libraries start no threads of their own.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 Answers = Generator[tuple[PanelTrial, Row | None]]  # None for a row: the process died
@@ -186,34 +192,57 @@ def _accept(answer: tuple[Row | None, str]) -> Row | None:
 def _local_answers(trials: Sequence[PanelTrial], function: TrialFunction, workers: int) -> Answers:
     """Each process is a pool of its own: a larger pool cannot tell in which trial a process died."""
     waiting = iter(trials)
-    pools = [_one_process() for _ in range(min(workers, len(trials)))]
-    running: dict[Future[Any], tuple[int, PanelTrial]] = {}
-
-    def hand_out(place: int) -> None:
-        for trial in waiting:
-            with _deaf_to_ctrl_c():
-                try:
-                    future = pools[place].submit(_answer, function, trial.fields)
-                except loky.BrokenProcessPool:  # its process has died
-                    pools[place] = _one_process()
-                    future = pools[place].submit(_answer, function, trial.fields)
-            running[future] = place, trial
-            return
-
+    running: dict[Future[Any], tuple[_Worker, PanelTrial]] = {}
+    staff: list[_Worker] = []
     try:
-        for place in range(len(pools)):
-            hand_out(place)
+        for _, trial in zip(range(workers), waiting, strict=False):
+            staff.append(_Worker(function))
+            running[staff[-1].begin(trial)] = staff[-1], trial
         while running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                place, trial = running.pop(future)
+                worker, trial = running.pop(future)
                 row = None
                 with suppress(loky.BrokenProcessPool):
                     row = _accept(future.result())
-                hand_out(place)
+                if row is None and worker.died_at_its_start:
+                    if worker.starts < STARTS:
+                        warnings.warn("a worker was killed at its start: it is started again", RuntimeWarning, 2)
+                        running[worker.begin(trial, again=True)] = worker, trial
+                        continue
+                    row = NOT_STARTED
+                for other in waiting:
+                    running[worker.begin(other)] = worker, other
+                    break
                 yield trial, row
     finally:  # killed at once: all that was finished is on the disk, the rest is evaluated again
-        for pool in pools:
-            pool.shutdown(kill_workers=True)
+        for worker in staff:
+            worker.pool.shutdown(kill_workers=True)
+
+
+class _Worker:
+    """A process that evaluates one trial at a time; another one where it has died."""
+
+    def __init__(self, function: TrialFunction):
+        self.function, self.pool, self.starts = function, _one_process(), 0
+
+    def begin(self, trial: PanelTrial, *, again: bool = False) -> Future[Any]:
+        """The answer to a trial, which is begun `again` where the process before was killed at its start."""
+        self.starts = self.starts + 1 if again else 1
+        with _deaf_to_ctrl_c():
+            for _ in range(2):  # what has died is told when it is given more
+                try:
+                    self.ready = self.pool.submit(os.getpid)  # answered before the trial is begun
+                    return self.pool.submit(_answer, self.function, trial.fields)
+                except loky.BrokenProcessPool:
+                    self.pool = _one_process()
+        self.ready = Future()
+        self.ready.set_exception(loky.BrokenProcessPool("killed at its start"))
+        return self.ready
+
+    @property
+    def died_at_its_start(self) -> bool:
+        """Whether the process that had the last trial never began it."""
+        return self.ready.exception() is not None
 
 
 def _one_process() -> loky.ProcessPoolExecutor:
