@@ -4,6 +4,7 @@ from .excite import Excitation as Excitation
 from .excite import excite as excite
 from .explain import Explanation as Explanation
 from .explain import explain as explain
+from .flights import first_state as first_state
 from .identify import Identification as Identification
 from .identify import identify as identify
 from .impacts import ContactIdentification as ContactIdentification

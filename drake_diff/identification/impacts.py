@@ -1,42 +1,44 @@
-"""Contact parameters from motions through impacts, by segments that start at measured states.
+"""Contact parameters from motions through impacts: segments that start in the air, and slopes over a cloud of values.
 
-Where bodies strike each other a motion has no slope that is worth following: a touch a little earlier leads elsewhere.
-Three things help here. A segment starts at a measured pose and velocity, away from impacts, so that no state has to be
-sought through one. Short segments come first and whole recordings last: each stage begins where the one before ended.
-And slopes are secants over a width that moves an impact by about a tenth of a millimetre, with a robust loss, so that a
-segment that goes another way at an impact does not decide.
+Where bodies strike each other a motion has no slope that is worth following: a touch a little earlier leads elsewhere,
+and between steps of a time-stepping law the loss is ragged. Three things help here. A segment starts where nothing
+touches, at the state whose motion through the air goes through the measured positions: these are far better than the
+velocities, which are differences of them. Segments of one or two impacts come first and whole recordings last. And the
+slopes are those of a plane laid through the residuals of many values at once, a cloud that becomes smaller: what a
+residual differs from its plane by is how far it is to be believed.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
-from scipy.optimize import least_squares
 
-from drake_diff._base.arrays import Array, frozen, positive_int
+from drake_diff._base.arrays import Array, frozen, positive_float
 from drake_diff.comparison.recordings import Recording
 from drake_diff.derivatives.steps import take_steps
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.measured import Piece, read_pieces
+from drake_diff.identification.cloud import Plane, plane_at, shrink_to
+from drake_diff.identification.flights import flights_of, millisecond, start_of, steps_between
+from drake_diff.identification.measured import read_pieces
 from drake_diff.identification.steps import DiscreteMotion, discrete_motion
 from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import applied
+from drake_diff.model.parameters import ParameterVector, applied, select
 
-STAGES = (0.15, 0.3, np.inf)  # [s] how long segments are
-CALM = 3  # samples on each side of a start without an impact
-STILL = 0.1  # of the longest way of a segment: what moves less says little of impacts
-LOG_SCALE, LENGTH_SCALE, CENTER_SCALE = (
-    0.3,
-    1e-3,
-    0.02,
-)  # of a positive number; [m, rad] of a bias; of a radius of gyration
-WIDTH = 0.15  # of a secant, in these scales
+# [s] how long segments go on after a flight, and the widths of the clouds of each stage.
+STAGES = (
+    (0.15, tuple(0.6**k for k in range(6))),
+    (np.inf, (0.1, 0.05)),
+)
+REST = 0.15  # [s] the end of a recording: where things lie says how large they are
+# Of a positive number; [m, rad] of a bias or a length; of a radius of gyration.
+LOG_SCALE, LENGTH_SCALE, CENTER_SCALE = 0.3, 1e-3, 0.02
 SAMPLES = 3  # every so many samples are compared: neighbours say the same
-LOST = 100.0  # times the scale: the residual of a motion that Drake cannot step
+LOST = 1000.0  # times the unit: the residual of a motion that Drake cannot step
+Build = Callable[..., Model]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +49,9 @@ class ContactIdentification:
     start: Mapping[str, float | Array]
     intervals: Mapping[str, Array]  # (2,) or (k, 2), by the scatter between recordings
     unidentifiable: tuple[str, ...]  # entries whose interval is wider than a factor of 3, or than 10 mm or 10 mrad
-    cost_before: float  # the robust mean square of the whole recordings, in the scale that the last stage weighs by
+    cost_before: float  # soft-L1 mean over whole recordings, in units of the motion of a millisecond
     cost_after: float
+    flights: int  # segments whose first state is that of a flight; where 0, all start at measured states
     steps: int  # simulated steps of the fit
     time_step: float  # [s] of the steps that were fitted
 
@@ -63,21 +66,32 @@ class _Segment:
     piece: int
     first: int
     last: int  # the last sample
-    still: bool  # the end of a recording: where things lie says how large they are
+    x0: Array  # (nx,)
 
 
 class _Search:
     """Segments of all recordings, and the coordinates w in which the unknowns are sought: 0 at the model's values."""
 
-    def __init__(self, model: Model, recordings: Sequence[Recording], parameters: Sequence[str]):
-        self.model, self.chart = model, Chart(coordinates_of(model))
-        self.pieces = read_pieces(model, recordings, 0.0)
+    def __init__(
+        self, model: Model | Build, recordings: Sequence[Recording], names: Sequence[str], lengths: Mapping[str, float]
+    ):
+        if isinstance(model, Model) == bool(lengths):
+            got = "a model" if lengths else "a function"
+            expected = "a function that makes a model of `lengths`" if lengths else "a model, or `lengths` too"
+            raise InputError("model", got=got, expected=expected)
+        self.build = None if isinstance(model, Model) else model
+        self.lengths = {name: positive_float(name, value) for name, value in lengths.items()}
+        self.model = model if isinstance(model, Model) else model(**self.lengths)
+        self.chart = Chart(coordinates_of(self.model))
+        self.pieces = read_pieces(self.model, recordings, 0.0)
         for piece in self.pieces:
             if np.any(np.isnan(piece.ys)):
                 raise InputError(f"recording {piece.name}", got="NaN", expected="every position and velocity measured")
-        self.unknowns: Unknowns = choose_unknowns(model, None, parameters)
-        self.law: DiscreteMotion = discrete_motion(model, self.unknowns, self.pieces)
+        self.unknowns: Unknowns = choose_unknowns(self.model, None, names)
+        self.law: DiscreteMotion = discrete_motion(self.model, self.unknowns, self.pieces)
+        self.begin = np.concatenate([self.unknowns.start, list(self.lengths.values())])
         self.scale, self.by_log = self._scales()
+        self.unit = millisecond(self.chart, self.pieces)
         self.taken = 0
 
     def _scales(self) -> tuple[Array, Array]:
@@ -95,41 +109,49 @@ class _Search:
                 size = LENGTH_SCALE / one.size
             scales += [size] * len(one.start)
             logs += [by_log] * len(one.start)
-        return np.array(scales), np.array(logs)
+        extra = len(self.lengths)
+        return np.array(scales + [LENGTH_SCALE] * extra), np.array(logs + [False] * extra)
 
     def values(self, w: Array) -> Array:
-        start = self.unknowns.start
-        return np.asarray(
-            np.where(self.by_log, start * np.exp(np.where(self.by_log, self.scale * w, 0)), start + self.scale * w)
-        )
+        """(n,) of the parameters, then of the lengths."""
+        moved = self.scale * w
+        return np.asarray(self.begin * np.exp(np.where(self.by_log, moved, 0)) + np.where(self.by_log, 0, moved))
 
-    def segments(self, length: float) -> list[_Segment]:
-        """From the first sample of each recording, and from calm samples where what follows moves."""
-        found = []
-        for p, piece in enumerate(self.pieces):
-            last, period = len(piece.times) - 1, float(np.median(np.diff(piece.times)))
-            count = last if np.isinf(length) else min(last, max(5, round(length / period)))
-            rough = self._rough(piece)
-            ways = np.array([np.linalg.norm(piece.ys[min(k + count, last)] - piece.ys[k]) for k in range(last)])
-            k = 0
-            while k < last:
-                found.append(_Segment(p, k, min(k + count, last), still=False))
-                ahead = np.arange(k + max(5, count // 2), min(k + count + 1, last - 4))
-                ahead = ahead[ways[ahead] > STILL * np.max(ways)] if len(ahead) else ahead
-                if not len(ahead) or np.isinf(length):
-                    break
-                k = int(ahead[np.argmin(rough[ahead])])
-            found.append(_Segment(p, max(0, last - max(5, round(STAGES[0] / period))), last, still=True))
-        return found
+    def named(self, values: Array) -> dict[str, float | Array]:
+        count = len(self.unknowns.start)
+        return self.unknowns.named(values[:count]) | dict(zip(self.lengths, values[count:].tolist(), strict=True))
 
-    def _rough(self, piece: Piece) -> Array:
-        """(n,) the largest change of acceleration near each sample, in units of each velocity's own median."""
-        v = piece.ys[:, self.model.nq :]
-        jerk = np.zeros_like(v)
-        jerk[1:-1] = np.abs(v[2:] - 2 * v[1:-1] + v[:-2])
-        jerk /= np.maximum(np.median(jerk, axis=0), 1e-12)
-        each = np.max(jerk, axis=1)
-        return np.array([np.max(each[max(0, k - CALM) : k + CALM + 1]) for k in range(len(each))])
+    def vector(self, values: Array) -> ParameterVector:
+        """The model's parameters at values (n,), of a model of its own where there are lengths."""
+        own = values[self.law.own]
+        if self.build is None:
+            return self.law.vector.at(own)
+        model = self.build(**dict(zip(self.lengths, values[len(self.unknowns.start) :].tolist(), strict=True)))
+        if model.time_step != self.law.model.time_step:
+            model = model.at_time_step(self.law.model.time_step)
+        return select(model, self.law.vector.to_dict()).at(own)
+
+    def segments(self, w: Array, length: float) -> tuple[list[_Segment], int]:
+        """From the first sample of each recording and the start of each flight; and how many start by a flight.
+
+        Each goes on for `length` [s] after its flight. The end of each recording is one more.
+        """
+        found, known, vector = [], 0, self.vector(self.values(w))
+        with applied(vector) as model:
+            for p, piece in enumerate(self.pieces):
+                last, period = len(piece.times) - 1, float(np.median(np.diff(piece.times)))
+                count = last if np.isinf(length) else max(5, round(length / period))
+                flights = flights_of(model, piece.ys)
+                known += len(flights) if np.isfinite(length) else bool(flights and flights[0][0] == 0)
+                if not flights or flights[0][0] > 0:
+                    found.append(_Segment(p, 0, min(count, last), piece.ys[0]))
+                for a, b in flights:
+                    if a == 0 or np.isfinite(length):
+                        x0 = start_of(model, self.chart, piece.part(a, b), self.unit)
+                        found.append(_Segment(p, a, min(b + count, last), x0))
+                rest = max(0, last - max(5, round(REST / period)))
+                found.append(_Segment(p, rest, last, piece.ys[rest]))
+        return found, known
 
     def errors(self, w: Array, segments: Sequence[_Segment]) -> list[Array]:
         """Of each segment (samples, nv): measured minus simulated positions."""
@@ -139,70 +161,47 @@ class _Search:
         for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
             if one.quantity == BIAS:
                 shift[names.index(one.label)] = values[s][0]
-        vector, found = self.law.vector.at(values[self.law.own]), []
+        vector, found = self.vector(values), []
         with applied(vector) as model:
             for segment in segments:
                 piece = self.pieces[segment.piece].part(segment.first, segment.last)
-                each = round(float(piece.times[1] - piece.times[0]) / model.time_step)
+                each = steps_between(model, piece)
                 us = np.repeat(piece.us, each, axis=0)
                 self.taken += len(us)
                 try:
-                    xs = take_steps(model, vector, piece.ys[0] - shift, us).x_next[each - 1 :: each] + shift
+                    xs = take_steps(model, vector, segment.x0 - shift, us).x_next[each - 1 :: each] + shift
                     e = self.chart.minus(piece.ys[1:], xs)[:, : self.model.nv]
                 except SimulationError:
                     e = np.full((len(piece.us), self.model.nv), np.nan)
                 found.append(e)
         return found
 
-    def weights(self, w: Array, segments: Sequence[_Segment]) -> list[Array]:
-        """Of each segment (samples, nv): the scale that its errors have at w, those of ends by themselves."""
-        errors = self.errors(w, segments)
-        moving, ends = (
-            [e for e, s in zip(errors, segments, strict=True) if s.still is still] for still in (False, True)
-        )
-        # Where things lie, what all recordings share is the model's fault: the scale is what they differ by.
-        shared = np.nanmedian([np.nanmedian(e, axis=0) for e in ends], axis=0)
-        several = len(ends) > 2
-        scales = {False: self._scale(moving), True: self._scale([e - shared for e in ends] if several else ends)}
-        return [scales[s.still][: s.last - s.first] for s in segments]
-
-    def _scale(self, errors: Sequence[Array]) -> Array:
-        """(samples, nv) of errors so many samples after a start: the upper quartile, never falling."""
-        longest = max(len(e) for e in errors)
-        found = np.full((longest, self.model.nv), np.nan)
-        for k in range(longest):
-            those = np.array([e[k] for e in errors if len(e) > k])
-            found[k] = np.nanquantile(np.abs(those), 0.75, axis=0)
-        found = np.fmax.accumulate(found, axis=0)
-        return np.maximum(found, 1e-3 * np.max(found, axis=0)) + 1e-9
-
-    def residual(self, w: Array, segments: Sequence[_Segment], weights: Sequence[Array]) -> list[Array]:
-        found = []
-        for e, scale in zip(self.errors(w, segments), weights, strict=True):
-            r = (e / scale)[SAMPLES - 1 :: SAMPLES]
-            found.append(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
-        return found
-
-    def slopes(self, w: Array, segments: Sequence[_Segment], weights: Sequence[Array]) -> Array:
-        def flat(w: Array) -> Array:
-            return np.concatenate([r.ravel() for r in self.residual(w, segments, weights)])
-
-        here = flat(w)
-        columns = [(flat(w + WIDTH * d) - here) / WIDTH for d in np.eye(len(w))]
-        return np.stack(columns, axis=1)
+    def residual(self, w: Array, segments: Sequence[_Segment]) -> Array:
+        """Of every third sample of all segments, one after the other."""
+        found = [(e / self.unit)[SAMPLES - 1 :: SAMPLES].ravel() for e in self.errors(w, segments)]
+        r = np.concatenate(found)
+        return np.asarray(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
 
 
 def identify_contact(
-    model: Model, recordings: Sequence[Recording], parameters: Sequence[str], *, max_iterations: int = 8
+    model: Model | Build,
+    recordings: Sequence[Recording],
+    parameters: Sequence[str],
+    *,
+    lengths: Mapping[str, float] | None = None,
+    seed: int = 0,
 ) -> ContactIdentification:
     """Estimate friction, stiffness, dissipation, radii and centres of mass from motions through impacts.
 
     Args:
-        model: The model; its values are where the search begins, and its discrete steps are what is fitted.
+        model: The model; its values are where the search begins, and its discrete steps are what is fitted: several of
+            them must fit into the time for which an impact lasts. With `lengths` a function that makes a model of them.
         recordings: Several motions with every position and velocity measured, at equal times.
         parameters: Names as by `dd.list_parameters`, and STATE.bias: of a height, that of the ground below what was
             measured. A number of contact moves by its logarithm.
-        max_iterations: Of each stage.
+        lengths: [m] where the search for the function's arguments begins, such as where shapes are: a plant has no
+            parameter for that.
+        seed: Of the clouds of values from which slopes are taken.
 
     Returns:
         `.values` and `.intervals` (95 %, from the scatter between recordings).
@@ -221,58 +220,56 @@ def identify_contact(
         >>> print(round(found.values["ball.friction"], 3))
         0.2
     """
-    positive_int("max_iterations", max_iterations)
-    search = _Search(model, recordings, parameters)
-    w = np.zeros(len(search.scale))
-    for length in STAGES:
-        segments = search.segments(length)
-        weights = search.weights(w, segments)
+    search = _Search(model, recordings, parameters, lengths or {})
+    w, random, flights = np.zeros(len(search.scale)), np.random.default_rng(seed), 0
+    for length, widths in STAGES:
+        segments, known = search.segments(w, length)
+        flights = max(flights, known)
 
-        def flat(w: Array, segments: list[_Segment] = segments, weights: list[Array] = weights) -> Array:
-            return np.concatenate([r.ravel() for r in search.residual(w, segments, weights)])
+        def residual(w: Array, segments: list[_Segment] = segments) -> Array:
+            return search.residual(w, segments)
 
-        def slopes(w: Array, segments: list[_Segment] = segments, weights: list[Array] = weights) -> Array:
-            return search.slopes(w, segments, weights)
-
-        solved = least_squares(flat, w, jac=slopes, loss="soft_l1", max_nfev=max_iterations, xtol=1e-3, ftol=1e-4)
-        w = np.asarray(solved.x)
+        w = shrink_to(residual, w, widths, random)
+    plane = plane_at(residual, w, STAGES[-1][1][-1], random)
     taken = search.taken
-    costs = [float(np.mean(2 * (np.sqrt(1 + flat(at) ** 2) - 1))) for at in (np.zeros(len(w)), w)]
-    spread = _between(search, w, segments, weights)
+    costs = [float(np.mean(2 * (np.sqrt(1 + residual(at) ** 2) - 1))) for at in (np.zeros(len(w)), w)]
+    spread = _between(plane, segments, len(search.pieces))
     values, ends = search.values(w), [search.values(w + s * spread) for s in (-1, 1)]
     wide = np.stack(ends, axis=1)
-    named = search.unknowns.named
     open_ = np.where(search.by_log, search.scale * spread > np.log(3.0), search.scale * spread > 0.01)
+    intervals = {
+        one.name: frozen(wide[s][0] if len(one.start) == 1 else wide[s])
+        for one, s in zip(search.unknowns.each, search.unknowns.slices, strict=True)
+    }
+    intervals |= dict(zip(search.lengths, map(frozen, wide[len(search.unknowns.start) :]), strict=True))
+    columns = [*search.unknowns.columns, *search.lengths]
     return ContactIdentification(
-        values=named(values),
-        start=named(search.unknowns.start),
-        intervals={
-            one.name: frozen(wide[s][0] if len(one.start) == 1 else wide[s])
-            for one, s in zip(search.unknowns.each, search.unknowns.slices, strict=True)
-        },
-        unidentifiable=tuple(c for c, o in zip(search.unknowns.columns, open_, strict=True) if o),
+        values=search.named(values),
+        start=search.named(search.begin),
+        intervals=intervals,
+        unidentifiable=tuple(c for c, o in zip(columns, open_, strict=True) if o),
         cost_before=costs[0],
         cost_after=costs[1],
+        flights=flights,
         steps=taken,
         time_step=search.law.model.time_step,
     )
 
 
-def _between(search: _Search, w: Array, segments: Sequence[_Segment], weights: Sequence[Array]) -> Array:
-    """(np,) half widths of 95 % intervals of w: each recording counts as one observation, however it hangs together."""
-    residuals, J = search.residual(w, segments, weights), search.slopes(w, segments, weights)
-    scores, begin, bread = np.zeros((len(search.pieces), len(w))), 0, np.zeros((len(w), len(w)))
-    for r, segment in zip(residuals, segments, strict=True):
-        rows = J[begin : begin + r.size]
-        begin += r.size
-        rho = 1 / np.sqrt(1 + r.ravel() ** 2)
-        scores[segment.piece] += rows.T @ (rho * r.ravel())
-        bread += (rows.T * rho) @ rows
-    count = len(scores)
-    if count < 2:
-        return np.full(len(w), np.inf)
+def _between(plane: Plane, segments: Sequence[_Segment], count: int) -> Array:
+    """(n,) half widths of 95 % intervals of w: each recording counts as one observation, however it hangs together."""
+    n, begin = plane.J.shape[1], 0
+    if count <= n:
+        return np.full(n, np.inf)
+    weighted = plane.J * plane.weights(np.zeros(n))[:, None]
+    bread, scores = weighted.T @ plane.J, np.zeros((count, n))
+    nv = len(plane.r) // sum((s.last - s.first) // SAMPLES for s in segments)
+    for segment in segments:
+        end = begin + (segment.last - segment.first) // SAMPLES * nv
+        scores[segment.piece] += weighted[begin:end].T @ plane.r[begin:end]
+        begin = end
     inverse = np.linalg.pinv(bread)
-    meat = scores.T @ scores * count / max(count - 1, 1)
+    meat = scores.T @ scores * count / (count - n)
     lost = np.diag(bread) <= 0
     spread = np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), 0.0))
-    return np.asarray(np.where(lost, np.inf, spread * float(stats.t.ppf(0.975, count - 1))))
+    return np.asarray(np.where(lost, np.inf, spread * float(stats.t.ppf(0.975, count - n))))

@@ -1,7 +1,7 @@
 """The tosses of cube_tosses.py by MuJoCo's sysid toolbox, with as many simulated steps as Drake's fit took.
 
-Eight corner spheres, whole tosses from their first states, positions of the centre and of two sites, and the
-toolbox's own optimizer, its unknowns scaled by the Jacobian.
+Eight corner spheres, whole tosses from the same first states as Drake has, positions of the centre and of two sites,
+and the toolbox's own optimizer, its unknowns scaled by the Jacobian.
 """
 
 from itertools import product
@@ -12,18 +12,17 @@ import numpy as np
 from drake_diff._base.arrays import Array
 
 RATE, WIDTH, MASS, INERTIA, INSET = 148.0, 0.1048, 0.37, 0.00081, 0.0024
-STEPS = 2  # between two samples: 3.4 ms
 AT = WIDTH / 2 - INSET
 
 
-def model_text() -> str:
-    """MuJoCo's defaults for solref, and the friction that was published."""
+def model_text(steps: int) -> str:
+    """By so many steps between two samples. MuJoCo's defaults for solref, and the friction that was published."""
     corners = "".join(
         f'<geom name="corner{i}" type="sphere" size="{INSET}" pos="{a * AT} {b * AT} {c * AT}" priority="1"/>'
         for i, (a, b, c) in enumerate(product((-1, 1), repeat=3))
     )
     return (
-        f'<mujoco><option timestep="{1 / RATE / STEPS}" cone="elliptic"/><default><geom friction="0.15 0 0"/></default>'
+        f'<mujoco><option timestep="{1 / RATE / steps}" cone="elliptic"/><default><geom friction="0.15 0 0"/></default>'
         '<worldbody><geom name="board" type="plane" size="0 0 1"/><body name="cube"><freejoint/>'
         f'<inertial pos="0 0 0" mass="{MASS}" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>{corners}'
         '<site name="center"/><site name="x" pos="0.05 0 0"/><site name="y" pos="0 0.05 0"/></body></worldbody><sensor>'
@@ -76,55 +75,65 @@ def _parameters(sysid: Any) -> Any:
     return found
 
 
-def fit_by_sysid(fitted: list[Array], held: list[Array], steps: int) -> list[str]:
-    """Lines with what it found, and its errors on tosses that were held out."""
+def fit_by_sysid(
+    fitted: list[Array], held: list[Array], begins: list[Array], starts: list[Array], most: int, steps: int
+) -> list[str]:
+    """Lines with what it found by at most so many simulated steps, and its errors on tosses that were held out.
+
+    Those that are fitted begin at `begins`, those held out at `starts`; there are `steps` between two samples.
+    """
     import mujoco
     from mujoco import sysid
 
-    spec = mujoco.MjSpec.from_string(model_text())
+    spec = mujoco.MjSpec.from_string(model_text(steps))
     model = spec.compile()
-    starts, controls, sensors = [], [], []
-    for xs in fitted:
-        starts.append(sysid.create_initial_state(model, *_state(xs[0])))
-        t, fine = np.arange(len(xs)) / RATE, np.arange((len(xs) - 1) * STEPS + 1) / RATE / STEPS
+    firsts, controls, sensors = [], [], []
+    for xs, x0 in zip(fitted, begins, strict=True):
+        firsts.append(sysid.create_initial_state(model, *_state(x0)))
+        t, fine = np.arange(len(xs)) / RATE, np.arange((len(xs) - 1) * steps + 1) / RATE / steps
         sites = [xs[:, 4:7] + _turned(xs[:, :4], v) for v in (np.zeros(3), np.eye(3)[0] * 0.05, np.eye(3)[1] * 0.05)]
         every = np.concatenate(sites, axis=1)
         every = np.stack([np.interp(fine, t, column) for column in every.T], axis=1)
         controls.append(sysid.TimeSeries(fine, np.zeros((len(fine), 0))))
         sensors.append(sysid.TimeSeries.from_names(fine, every, model))
     names = [f"toss {i}" for i in range(len(fitted))]
-    sequences = sysid.ModelSequences("cube", spec, names, starts, controls, sensors)
+    sequences = sysid.ModelSequences("cube", spec, names, firsts, controls, sensors)
     residual = sysid.build_residual_fn(models_sequences=[sequences], n_threads=1)
     parameters, taken = _parameters(sysid), [0]
-    each = sum(len(xs) - 1 for xs in fitted) * STEPS
+    each = sum(len(xs) - 1 for xs in fitted) * steps
 
     def counted(x: Array, p: Any) -> Any:
         taken[0] += each * (x.shape[1] if np.ndim(x) == 2 else 1)
         return residual(x, p)
 
-    most = max(1, steps // (each * (parameters.size + 2)))
+    iterations = max(1, most // (each * (parameters.size + 2)))
     best, _ = sysid.optimize(
-        initial_params=parameters, residual_fn=counted, optimizer="mujoco", verbose=False, max_iters=most, x_scale="jac"
+        initial_params=parameters,
+        residual_fn=counted,
+        optimizer="mujoco",
+        verbose=False,
+        max_iters=iterations,
+        x_scale="jac",
     )
-    lines = [f"MuJoCo sysid: {taken[0]} simulated steps, {most} iterations"]
+    lines = [f"MuJoCo sysid: {taken[0]} simulated steps, {iterations} iterations"]
     for name, parameter in best.items():
         lines.append(f"  {name}: {np.round(parameter.value, 6).tolist()}")
     for tag, p in (("MuJoCo, by hand", parameters), ("MuJoCo, identified by its sysid", best)):
         by = sysid.apply_param_modifiers(p, spec)
-        e = np.array([_error(by, xs) for xs in held])
+        e = np.array([_error(by, xs, x0, steps) for xs, x0 in zip(held, starts, strict=True)])
         lines.append(
             f"{tag}: mean {np.mean(e):.1f} %, median {np.median(e):.1f} %, below 10 %: {np.sum(e < 10)} of {len(e)}"
         )
     return lines
 
 
-def _error(model: Any, xs: Array) -> float:
+def _error(model: Any, xs: Array, x0: Array, steps: int) -> float:
     import mujoco
 
     data = mujoco.MjData(model)
-    data.qpos, data.qvel = _state(xs[0])
+    data.qpos, data.qvel = _state(x0)
     found = [data.qpos[:3].copy()]
     for _ in range(len(xs) - 1):
-        mujoco.mj_step(model, data, STEPS)
+        mujoco.mj_step(model, data, steps)
         found.append(data.qpos[:3].copy())
     return float(np.mean(np.linalg.norm(np.array(found) - xs[:, 4:7], axis=1)) / WIDTH * 100)
