@@ -1,4 +1,7 @@
-"""Contact parameters from motions through impacts: a closed form, then throws of known truth."""
+"""Contact parameters from motions through impacts: a closed form, then throws and tosses of known truth."""
+
+import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,6 +10,8 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.identification import first_state, identify_contact
 from drake_diff.identification.cloud import shrink_to
+
+TOSSES = Path(__file__).parent / "benchmarks" / "cube_tosses.py"
 
 
 def throws(model, truth, *, steps=1, height=0.0):
@@ -90,3 +95,29 @@ def test_a_plane_follows_what_a_ragged_function_does_on_the_whole():
     w = shrink_to(residual, np.zeros(2), (1.0, 0.5, 0.25), np.random.default_rng(0))
     # What is ragged counts 20 / sqrt(2 * 40 * 8) of 100: a hundredth.
     np.testing.assert_allclose(w, [0.7, -0.4], atol=0.03)
+
+
+@pytest.mark.slow
+def test_a_cubes_half_width_and_friction_are_found_from_tosses_by_the_same_steps():
+    spec = importlib.util.spec_from_file_location("cube_tosses", TOSSES)
+    tosses = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tosses)
+    true = tosses.model_of(1, half_width=0.0534)
+    truth = {"cube.friction": 0.11, "cube.stiffness": 3e4, "cube.relaxation_time": 0.008}
+    rng, recordings = np.random.default_rng(0), []
+    for k in range(8):
+        turn = rng.standard_normal(4)
+        x0 = np.concatenate([turn / np.linalg.norm(turn), [0, 0, 0.16], rng.uniform(-3, 3, 3), [1.0, 0.3, -0.2]])
+        xs = dd.rollout(true, x0, np.zeros((100, 0)), parameters=truth).xs.copy()
+        xs[:, 6] -= 0.001  # the ground is 1 mm lower
+        recordings.append(tosses.recording(f"toss {k}", xs))
+    names = ["cube_z.bias", "cube.friction", "cube.stiffness", "cube.relaxation_time"]
+
+    def build(half_width):
+        return tosses.model_of(1, half_width=half_width)
+
+    found = identify_contact(build, recordings, names, lengths={"half_width": 0.0524})
+    # The half width to 0.5 %, half of what is asked of the real tosses.
+    assert found.values["half_width"] == pytest.approx(0.0534, rel=5e-3)
+    assert found.values["cube_z.bias"] == pytest.approx(-0.001, abs=3e-4)
+    assert found.values["cube.friction"] == pytest.approx(0.11, rel=0.03)

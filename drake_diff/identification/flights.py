@@ -60,7 +60,8 @@ def start_of(model: Model, chart: Chart, piece: Piece, scale: Array) -> Array:
         slopes.append(by_start)
         J = (chart.to_motion(xs) @ np.array(slopes))[:, :nv] / scale[:, None]
         e = chart.minus(piece.ys, xs)[:, :nv] / scale
-        x = chart.plus(x, np.linalg.lstsq(J.reshape(-1, 2 * nv), e.ravel(), rcond=None)[0])
+        d = np.linalg.lstsq(J.reshape(-1, 2 * nv), e.ravel(), rcond=None)[0]
+        x = chart.plus(x, np.asarray(d, dtype=float))
     return np.asarray(x)
 
 
