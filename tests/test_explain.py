@@ -1,6 +1,7 @@
 """What is wrong in a model, by name: recordings of equations of motion that SciPy integrates."""
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.exceptions import ModelError, UnknownNameError
+from drake_diff.identification.tree import tree_for_identification
+from drake_diff.identification.unknowns import Unknowns, choose_unknowns, set_numbers
 
 
 @pytest.fixture
@@ -84,6 +87,23 @@ def test_dry_friction_is_named(pendulum):
     assert w.names == ("hinge.coulomb_friction",)
     assert w.alternatives == ()
     assert w.values["hinge.coulomb_friction"] == pytest.approx(0.08, rel=0.02)
+
+
+def test_a_centre_of_mass_moves_as_in_a_file(tmp_path):
+    """With the inertia about it: a file with another origin of its inertia, read by Drake, is the same tree."""
+    text = (Path(dd.__file__).parents[1] / "models" / "pendulum.urdf").read_text()
+    assert text.count('<origin xyz="0 0 -0.5"/>') >= 1
+    (tmp_path / "pendulum.urdf").write_text(text.replace('<origin xyz="0 0 -0.5"/>', '<origin xyz="0.1 0 -0.4"/>', 1))
+    models = [
+        dd.load_model(Path(p) / "pendulum.urdf", time_step=0.01)
+        for p in (Path(dd.__file__).parents[1] / "models", tmp_path)
+    ]
+    tree, changed = map(tree_for_identification, models)
+    one = choose_unknowns(models[0], tree, ["pole.center_of_mass"]).each
+    numbers = set_numbers(models[0], tree, Unknowns(one, as_in_files=True), np.array([0.1, 0.0, -0.4]))
+    np.testing.assert_allclose(numbers.inertial, changed.numbers.inertial, atol=1e-12)
+    other = set_numbers(models[0], tree, Unknowns(one), np.array([0.1, 0.0, -0.4]))
+    assert np.max(np.abs(other.inertial - changed.numbers.inertial)) > 0.05  # [kg m^2]
 
 
 @pytest.mark.slow

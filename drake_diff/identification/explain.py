@@ -1,7 +1,9 @@
 """The smallest change of a model that explains what was recorded: one parameter, or two, or what no file has.
 
-Every possible change is tried by one step of Gauss and Newton from the model as it is, all in one pass of derivatives
-along the measured motion. Those that promise most are fitted. A change is named where
+One pass of derivatives along the measured motion says what every change promises, and every pair. Those that promise
+most go on by steps of Gauss and Newton of their own for as long as these help; what comes near the noise is fitted, with
+the noise estimated anew. Beside the single changes that left least, a second one is sought in a pass of derivatives with
+the first one made: a large change bends what others promise. A change is named where
 
     score(model) - score(changed) > limit,
 
@@ -10,7 +12,7 @@ chi^2 of as many numbers as the change has; the limit is its quantile at FALSE_N
 tried, and no less than the penalty of BIC. Of changes that are named, the one with the least BIC is the smallest.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -32,22 +34,28 @@ from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.identify import LONGEST, Problem, what_acts
 from drake_diff.identification.judge import freedom_of, intervals_of, known_of, noise_of
 from drake_diff.identification.measured import Piece, given_noise, noise_by_differences, read_pieces
+from drake_diff.identification.screen import DELAY, LEVELS, LIMIT, Inputs, Promise, View, changes_of_inputs, view
 from drake_diff.identification.tree import Tree, tree_for_identification
-from drake_diff.identification.unknowns import BIAS, Unknown, Unknowns, choose_unknowns, possible_changes
+from drake_diff.identification.unknowns import BIAS, COULOMB, Unknown, Unknowns, choose_unknowns, possible_changes
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
+from drake_diff.model.step import set_state
 
 FALSE_NAME = 0.003  # of right models in which some change is named
-FITTED = 4  # changes that are fitted, of those that promise most
-BEHIND, LEAST_BEHIND = 0.3, 40.0  # of the best promise: what promises less by so much is not fitted
+LOOKED_AT = 8  # changes that enter the race, of those that promise most
+RACE = (5, 4, 3, 2, 2, 1)  # so many stay after each step of Gauss and Newton
+FALLS = 0.7  # what does not fall to this part of what was left before is out of the race, after its first step
+BEHIND = 0.1  # what leaves more than the best divided by this is out of the race
+BESIDE = 3  # changes beside which a second one is sought
 STEPS, ROUNDS = 8, 4  # of Gauss and Newton, and of estimating the noise
 SAME_NOISE = 0.03  # what is left of its error changes a score by less than 0.001 of how many numbers were measured
 HOPELESS = 3.0  # times the noise: residuals that no better weights make good
 SAME = 6.0  # of a score: evidence of 20 to 1, below which two changes are not told apart
-DELAY, LIMIT = "input_delay", "limit"  # changes of how inputs act, found by a search over their one number
 MOTIONS = ("auto", "continuous")
+TOLD_APART = 40.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
 LONGEST_DELAY = 0.1  # [s]
-LEVELS = (0.85, 0.6, 0.35)  # of an input's largest value: limits that are tried
+LONGEST_DRY = 2.5e-3  # [s] of a step under dry friction, which turns within a small speed
+LEAST_SLIP, FOLLOWED = 5e-4, 2.0  # [rad/s, m/s] that speed; the rate of its decay, in steps, that they follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,71 +135,35 @@ class _Tried(NamedTuple):
     doubt: str
     values: dict[str, Any]
     intervals: dict[str, Array]
+    z: Array
+    starts: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Promise:
-    """What one step of Gauss and Newton from the model as it is promises of each change, and of two together."""
+@dataclass(eq=False)
+class _Runner:
+    """A change on its way to where it fits best, by whole steps of Gauss and Newton."""
 
     names: tuple[str, ...]
-    slices: tuple[slice, ...]
-    matrix: Array  # (np, np) R' R, with the weak pull to the file's values
-    right: Array  # (np,)
-    lower: Array  # (np,) of a step
-    freedoms: tuple[float, ...]
+    fit: Fit
+    z: Array
+    starts: Array
+    left: float  # of the squares, after the next step
+    freedom: float
+    special: dict[str, float] = field(default_factory=dict)  # the delay or limit that its pieces have
+    interval: dict[str, Array] = field(default_factory=dict)
 
-    def of(self, members: Sequence[int]) -> tuple[float, Array]:
-        """(by how much -2 log of the likelihood falls, the step); nothing where it leads out of bounds."""
-        at = np.concatenate([np.arange(self.slices[i].start, self.slices[i].stop) for i in members])
-        H, g = self.matrix[np.ix_(at, at)], self.right[at]
-        step = np.linalg.lstsq(H, g, rcond=1e-12)[0]
-        if np.any(step < self.lower[at]):
-            if len(at) > 1:
-                return 0.0, np.zeros(len(at))
-            step = np.maximum(step, self.lower[at])
-        return float(2 * g @ step - step @ H @ step), step
-
-
-@dataclass(frozen=True, eq=False)
-class _Inputs:
-    """A law that also says how steps change with a delay of inputs, and with what a limit takes off them."""
-
-    law: ContinuousMotion
-    unknowns: Unknowns
-    pieces: Sequence[Piece]
-
-    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        by_x, by_z = self.law.slopes(z, xs, hs, us)
-        columns = self.unknowns.columns
-        names, nq = self.law.model.input_names, self.law.model.nq
-        for j, one in enumerate(self.unknowns.each):
-            column = self.unknowns.slices[j].start
-            if one.quantity == DELAY:
-                accelerate = self.law.tree.acceleration(self.law.tree.numbers)
-                before = np.concatenate([us[:, :1], us[:, :-1]], axis=1)
-                before[1:, 0] = us[:-1, -1]
-                before[np.all(hs == 0, axis=1)] = 0.0
-                flat = xs[:, :-1].reshape(-1, xs.shape[2])
-                q, v = flat[:, :nq], flat[:, nq:]
-                nu = us.shape[2]
-                change = accelerate(q, v, before.reshape(-1, nu)) - accelerate(q, v, us.reshape(-1, nu))
-                pushed = (by_x[..., nq:] @ change.reshape(*hs.shape, -1, 1))[..., 0]
-                by_z[..., column] = np.where((hs > 0)[..., None], pushed, 0.0)
-            elif one.quantity.startswith(LIMIT):
-                i = names.index(one.label)
-                level = (
-                    float(one.quantity.removeprefix(LIMIT))
-                    / 100
-                    * max(float(np.max(np.abs(p.us[:, i]))) for p in self.pieces)
-                )
-                u = us[..., i]
-                cut = np.where(np.abs(u) > level, 1 - level / np.maximum(np.abs(u), 1e-300), 0.0)
-                strength = columns.index(f"{one.label}.strength")
-                by_z[..., column] = -cut[..., None] * by_z[..., strength]
-        return by_x, by_z
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.law, name)
+    def step(self) -> bool:
+        """Whether there is a motion to step from."""
+        point = self.fit.at(self.z, self.starts)
+        if point is None:
+            return False
+        found = self.fit.reduce(point)
+        dz = self.fit.step_of(self.z, found)
+        self.starts = self.fit.moved(self.starts, found, dz, 1.0)
+        self.z = self.z + dz
+        pull = float(np.sum(((self.z - self.fit.unknowns.z_start) / self.fit.unknowns.widths) ** 2))
+        self.left = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + pull
+        return True
 
 
 @dataclass(eq=False)
@@ -221,14 +193,11 @@ class _Search:
                 if not measured[i] or i not in singles:
                     continue
             names.append(name)
-        each = list(choose_unknowns(self.model, self.tree, names).each)
-        moving = [i for i in range(self.model.nu) if any(np.ptp(p.us[:, i]) > 0 for p in self.pieces)]
-        for i in moving:
-            label = self.model.input_names[i]
-            each += [Unknown(f"{label}.{LIMIT}{round(100 * part)}", "", np.zeros(1), 0.0, 0.0) for part in LEVELS]
-        if moving:
-            each.append(Unknown(f"model.{DELAY}", "s", np.zeros(1), 0.0, 0.0))
-        return Unknowns(tuple(each))
+        each = choose_unknowns(self.model, self.tree, names).each
+        return Unknowns((*each, *changes_of_inputs(self.model.input_names, self.pieces)), as_in_files=True)
+
+    def of(self, names: Sequence[str]) -> Unknowns:
+        return Unknowns(tuple(one for one in self.unknowns.each if one.name in names), as_in_files=True)
 
     def problem(self, unknowns: Unknowns, pieces: Sequence[Piece]) -> Problem:
         return Problem(self.model, self.chart, unknowns, list(pieces), self.stated, self.scatter)
@@ -236,79 +205,132 @@ class _Search:
     def law(self, unknowns: Unknowns, longest: float) -> ContinuousMotion:
         return ContinuousMotion(self.model, self.tree, self.chart, unknowns, longest)
 
+    def law_of(self, unknowns: Unknowns, z: Array) -> ContinuousMotion:
+        """With dry friction that holds as firmly as short steps can follow, where it is of this size."""
+        law = self.law(unknowns, self.longest)
+        dry = [(one.label, float(z[s][0])) for one, s in self.each_of(unknowns) if one.quantity == COULOMB]
+        if not dry:
+            return law
+        set_state(self.model.double, self.starts[0])
+        ease = np.diag(np.linalg.pinv(np.asarray(self.model.double.mass_matrix())))
+        at = {link.joint.joint: link.joint.v_start for link in self.tree.links}
+        rate = max(size * float(ease[at[joint]]) for joint, size in dry)
+        slip = float(np.clip(rate * LONGEST_DRY / FOLLOWED, LEAST_SLIP, self.tree.slip))
+        return replace(law, tree=replace(self.tree, slip=slip), longest=min(law.longest, LONGEST_DRY))
+
+    @staticmethod
+    def each_of(unknowns: Unknowns) -> list[tuple[Unknown, slice]]:
+        return list(zip(unknowns.each, unknowns.slices, strict=True))
+
     def found(self) -> Explanation:
-        nothing = Unknowns(())
+        nothing = self.of(())
         fit, starts = self.problem(nothing, self.pieces).prepared(self.law(nothing, LONGEST))
         longest = fit.law.longest if isinstance(fit.law, ContinuousMotion) else LONGEST
         self.longest, self.cut, self.starts = longest, list(fit.segments.pieces), starts
-        base = self.solved((), nothing, self.cut, starts)
-        if base is None:
+        base = self.solved((), nothing, self.law(nothing, longest), self.cut, starts, nothing.z_start)
+        alone = self.view(self.cut, self.unknowns.z_start, base.starts if base.explains else starts)
+        if alone is None:
             raise SimulationError(f"{self.model.name} has no motion near the states that were measured")
-        promise = self.promise(starts)
-        singles = self.tried([(i,) for i in range(len(promise.names))], promise, base)
-        named = self.enough(base, singles, len(promise.names))
+        count = len(alone.freedoms)
+        singles, runners = self.tried(alone, [(i,) for i in range(count)], base)
+        named = self.enough(base, singles, count)
         if named:
             return self.said(named)
         if base.explains:
             return self.right()
-        count = len(promise.names)
-        pairs = self.tried(list(combinations(range(count), 2)), promise, base)
+        pairs = self.paired(alone, runners, base)
         best = min([base, *singles], key=lambda one: one.score)
         named = self.enough(base, [one for one in pairs if one.score < best.score], count * (count - 1) // 2)
         if named:
             return self.said(named)
         return self.unexplained(min([base, *singles, *pairs], key=self.bic))
 
-    def promise(self, starts: Array) -> _Promise:
-        unknowns = self.unknowns
-        problem = self.problem(unknowns, self.cut)
-        law: Law = _Inputs(self.law(unknowns, self.longest), unknowns, self.cut)
-        fit = problem.fit(law, self.cut, problem.first_noise)
-        point = fit.at(unknowns.z_start, starts)
-        if point is None:
-            raise SimulationError(f"{self.model.name} has no motion near the states that were measured")
-        reduced = fit.reduce(point)
-        pull = np.where(np.isfinite(unknowns.widths), unknowns.widths, np.inf) ** -2.0
-        matrix = reduced.R.T @ reduced.R
-        scale = np.where(np.isfinite(unknowns.widths), unknowns.widths, 1e6)
-        freedoms = []
-        for s in unknowns.slices:
-            sizes = np.linalg.svd(reduced.R[:, s] * scale[s], compute_uv=False)
-            freedoms.append(float(np.sum(sizes**2 / (1 + sizes**2))))
-        lower = unknowns.bounds[0] - unknowns.z_start
-        names = tuple(one.name for one in unknowns.each)
-        right = reduced.R.T @ reduced.b
-        return _Promise(names, unknowns.slices, matrix + np.diag(pull), right, lower, tuple(freedoms))
-
-    def tried(self, changes: Sequence[tuple[int, ...]], promise: _Promise, base: _Tried) -> list[_Tried]:
-        """Those that promise most, fitted."""
-        log_count = np.log(self.count)
-        ranked = []
-        for members in changes:
-            gain, step = promise.of(members)
-            ranked.append((gain - log_count * sum(promise.freedoms[i] for i in members), members, step))
-        ranked.sort(key=lambda one: -one[0])
-        found: list[_Tried] = []
-        done: set[tuple[str, ...]] = set()
-        for gain, members, step in ranked:
-            if gain <= 0 or len(done) == FITTED or gain < ranked[0][0] - max(LEAST_BEHIND, BEHIND * ranked[0][0]):
-                break
-            names = tuple(self.plain(promise.names[i]) for i in members)
-            if names in done or len(set(names)) < len(names) or sum(map(self.is_of_inputs, names)) > 1:
+    def paired(self, alone: View, runners: Sequence[_Runner], base: _Tried) -> list[_Tried]:
+        """Pairs that promise most at the model, or beside a change that left least."""
+        count = len(alone.freedoms)
+        found, _ = self.tried(alone, combinations(range(count), 2), base)
+        names = [one.name for one in self.unknowns.each]
+        for runner in runners[:BESIDE]:
+            if runner.special or any(one.explains for one in found):
                 continue
-            done.add(names)
-            one = self.fitted(names, dict(self.starting(members, promise, step)))
-            if one is not None:
-                found.append(one)
-                self.evidence[" and ".join(names)] = base.score - one.score
+            i = names.index(runner.names[0])
+            z = self.unknowns.z_start.copy()
+            z[self.unknowns.slices[i]] = runner.z
+            seen = self.view(self.cut, z, runner.starts)
+            if seen is not None:
+                others = [(i, k) for k in range(count) if k != i]
+                more, _ = self.tried(seen, others, base)
+                found += more
         return found
 
-    def starting(self, members: Sequence[int], promise: _Promise, step: Array) -> Iterator[tuple[str, Array]]:
-        k = 0
-        for i in members:
-            size = promise.slices[i].stop - promise.slices[i].start
-            yield promise.names[i], step[k : k + size]
-            k += size
+    def view(self, pieces: Sequence[Piece], z: Array, starts: Array) -> View | None:
+        problem = self.problem(self.unknowns, pieces)
+        law: Law = Inputs(self.law(self.unknowns, self.longest), self.unknowns, pieces)
+        return view(problem.fit(law, pieces, problem.first_noise), self.unknowns, z, starts)
+
+    def tried(self, seen: View, changes: Iterable[tuple[int, ...]], base: _Tried) -> tuple[list[_Tried], list[_Runner]]:
+        """(those that are fitted, all that stayed in the race, best first) of those that promise most."""
+        names = [one.name for one in self.unknowns.each]
+        chosen: dict[tuple[str, ...], Promise] = {}
+        for promise in seen.promises(changes, float(np.log(self.count))):
+            if len(chosen) == LOOKED_AT:
+                break
+            own = tuple(self.plain(names[i]) for i in promise.members)
+            if len(set(own)) == len(own) and sum(map(self.is_of_inputs, own)) <= 1:
+                chosen.setdefault(own, promise)
+        return self.raced([self.runner(seen, promise, own) for own, promise in chosen.items()], base)
+
+    def runner(self, seen: View, promise: Promise, names: tuple[str, ...]) -> _Runner:
+        special = next((name for name in names if self.is_of_inputs(name)), None)
+        unknowns = self.of([name for name in names if name != special])
+        z, starts = seen.ahead(promise)
+        at = [i for one, s in self.each_of(self.unknowns) if one in unknowns.each for i in range(s.start, s.stop)]
+        if special is None:
+            return self.running(names, unknowns, self.cut, starts, np.clip(z[at], *unknowns.bounds), promise)
+        return self.searched(special, names, unknowns, promise)
+
+    def running(
+        self,
+        names: tuple[str, ...],
+        unknowns: Unknowns,
+        pieces: list[Piece],
+        starts: Array | None,
+        z: Array,
+        promise: Promise,
+    ) -> _Runner:
+        problem = self.problem(unknowns, pieces)
+        fit = problem.fit(self.law_of(unknowns, z), pieces, problem.first_noise)
+        starts = problem.guess(fit) if starts is None else starts
+        return _Runner(names, fit, z, starts, promise.left, promise.freedom)
+
+    def raced(self, runners: list[_Runner], base: _Tried) -> tuple[list[_Tried], list[_Runner]]:
+        alive, there = list(runners), []
+        for most in RACE:
+            before = {one.names: one.left for one in alive}
+            alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
+            there += [one for one in alive if not self.is_hopeless(one.left)]
+            hopeful = alive[0].left / BEHIND if alive else 0.0
+            alive = [
+                one
+                for one in alive[:most]
+                if self.is_hopeless(one.left)
+                and (one.left < hopeful and (most == RACE[0] or one.left < FALLS * before[one.names]))
+            ]
+        alive = there + alive
+        price = float(np.log(self.count))
+        alive.sort(key=lambda one: one.left + price * one.freedom)
+        found: list[_Tried] = []
+        for one in alive:
+            behind = one.left + price * one.freedom - (alive[0].left + price * alive[0].freedom)
+            enough = any(each.explains for each in found) and behind > TOLD_APART * max(1.0, alive[0].left / self.count)
+            if enough or self.is_hopeless(one.left) or one.fit.at(one.z, one.starts) is None:
+                continue
+            found.append(self.ended(one))
+            self.evidence[" and ".join(one.names)] = base.score - found[-1].score
+        return found, alive
+
+    def is_hopeless(self, left: float) -> bool:
+        return left > HOPELESS**2 * self.count
 
     @staticmethod
     def plain(name: str) -> str:
@@ -324,35 +346,34 @@ class _Search:
     def count(self) -> int:
         return int(sum(np.isfinite(p.ys).sum() for p in self.pieces))
 
-    def fitted(self, names: tuple[str, ...], steps: Mapping[str, Array]) -> _Tried | None:
-        own = [one for one in self.unknowns.each if one.name in names and not self.is_of_inputs(one.name)]
-        unknowns = Unknowns(tuple(own))
-        special = [name for name in names if self.is_of_inputs(name)]
-        try:
-            if special:
-                return self.searched(special[0], names, unknowns)
-            dz = np.concatenate([steps[one.name] for one in own])
-            far = np.where(np.isfinite(unknowns.widths), unknowns.widths / 3, np.inf)
-            z = np.clip(unknowns.z_start + np.clip(dz, -far, far), *unknowns.bounds)
-            return self.solved(names, unknowns, self.cut, self.starts, z)
-        except SimulationError:
-            return None
+    def ended(self, one: _Runner) -> _Tried:
+        """The change where it fits best, with the noise estimated anew."""
+        pieces = one.fit.segments.pieces
+        found = self.solved(one.names, one.fit.unknowns, one.fit.law, pieces, one.starts, one.z)
+        if not one.special:
+            return found
+        return found._replace(
+            freedom=found.freedom + 1.0,
+            values={**found.values, **one.special},
+            intervals={**found.intervals, **one.interval},
+        )
 
     def solved(
-        self, names: tuple[str, ...], unknowns: Unknowns, pieces: Sequence[Piece], starts: Array, z: Array | None = None
-    ) -> _Tried | None:
+        self, names: tuple[str, ...], unknowns: Unknowns, law: Law, pieces: Sequence[Piece], starts: Array, z: Array
+    ) -> _Tried:
         problem = self.problem(unknowns, pieces)
-        fit = problem.fit(self.law(unknowns, self.longest), pieces, problem.first_noise)
-        z = unknowns.z_start if z is None or fit.at(z, starts) is None else z
-        for _ in range(ROUNDS):
-            solved = fit.solve(z, starts, STEPS)
+        fit = problem.fit(law, pieces, problem.first_noise)
+        for k in range(ROUNDS):
+            solved = fit.solve(z, starts, 1 if not names and k == 0 else STEPS)
             z, starts = solved.z, solved.starts
             size = noise_of(fit, solved)
             seen = np.isfinite(size)
-            if solved.converged and np.any(
-                size[seen] > HOPELESS * np.where(np.isfinite(self.stated), self.stated, self.scatter)[seen]
-            ):
+            if np.any(size[seen] > HOPELESS * problem.first_noise[seen]):
+                solved = replace(solved, converged=True)
                 break
+            if any(one.quantity == COULOMB for one in unknowns.each) and not problem.follows(fit, z, starts):
+                fit = problem.shortened(fit, pieces, fit.noise)
+                continue
             noise = np.where(np.isfinite(self.stated), self.stated, np.fmax(size, 1e-3 * self.scatter))
             if solved.converged and np.max(np.abs(noise[seen] / fit.noise[seen] - 1)) < SAME_NOISE:
                 break
@@ -383,23 +404,21 @@ class _Search:
             for one, s in zip(unknowns.each, unknowns.slices, strict=True)
         }
         values = unknowns.named(unknowns.values(solved.z))
-        return _Tried(names, self.score(fit, solved), pull, taken - alone, not doubt, doubt, values, shaped)
+        own = solved.z, solved.starts
+        return _Tried(names, self.score(fit, solved), pull, taken - alone, not doubt, doubt, values, shaped, *own)
 
-    def searched(self, special: str, names: tuple[str, ...], unknowns: Unknowns) -> _Tried | None:
-        """The delay or limit by which the rest fits best, and its interval by how the score bends there."""
-        found: dict[float, _Tried | None] = {}
+    def searched(self, special: str, names: tuple[str, ...], unknowns: Unknowns, promise: Promise) -> _Runner:
+        """At the delay or limit by which the rest fits best, with its interval by how what is left bends there."""
+        found: dict[float, _Runner] = {}
 
-        def score(value: float) -> float:
+        def left(value: float) -> float:
             if value not in found:
                 pieces = [self.acted(piece, special, value) for piece in self.cut]
-                problem = self.problem(unknowns, pieces)
-                fit = problem.fit(self.law(unknowns, self.longest), pieces, problem.first_noise)
-                try:
-                    found[value] = self.solved(names, unknowns, pieces, problem.guess(fit))
-                except SimulationError:
-                    found[value] = None
-            one = found[value]
-            return np.inf if one is None else one.score
+                one = self.running(names, unknowns, pieces, None, unknowns.z_start, promise)
+                if not all(one.step() for _ in range(2)):
+                    one.left = np.inf
+                found[value] = one
+            return found[value].left
 
         period = float(np.median(np.diff(self.pieces[0].times)))
         if special.endswith(DELAY):
@@ -410,23 +429,19 @@ class _Search:
             i = self.model.input_names.index(special.rsplit(".", 1)[0])
             largest = max(float(np.max(np.abs(p.us[:, i]))) for p in self.pieces)
             grid, (low, high) = np.array(LEVELS) * largest, (0.0, largest)
-        best = min((float(v) for v in grid), key=score)
+        best = min((float(v) for v in grid), key=left)
         nearby = sorted([low, *map(float, grid), high])
         k = nearby.index(best)
-        least = minimize_scalar(score, bounds=(nearby[k - 1], nearby[k + 1]), method="bounded",
+        least = minimize_scalar(left, bounds=(nearby[k - 1], nearby[k + 1]), method="bounded",
                                 options={"xatol": 0.01 * best, "maxiter": 8})  # fmt: skip
         value = float(least.x)
-        one = found[value]
-        if one is None:
-            return None
         width = max(0.02 * value, 1e-12)
-        bend = (score(value + width) + score(value - width) - 2 * one.score) / width**2
-        half = 1.96 * np.sqrt(2 / bend) if bend > 0 else np.inf
-        return one._replace(
-            freedom=one.freedom + 1.0,
-            values={**one.values, special: value},
-            intervals={**one.intervals, special: frozen([max(value - half, 0.0), value + half])},
-        )
+        bend = (left(value + width) + left(value - width) - 2 * left(value)) / width**2
+        noise = left(value) / self.count
+        half = 1.96 * float(np.sqrt(2 * noise / bend)) if bend > 0 else np.inf
+        one = found[value]
+        one.special, one.interval = {special: value}, {special: frozen([max(value - half, 0.0), value + half])}
+        return one
 
     def acted(self, piece: Piece, special: str, value: float) -> Piece:
         """The piece with its inputs later, or cut; an input that changes between samples makes a sample of nothing."""

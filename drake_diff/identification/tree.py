@@ -87,6 +87,7 @@ class Tree:
     moved_by: Mapping[str, Array]  # (10, 10) by body: its ten numbers in the frame of its link
     bodies: Mapping[str, Link]
     numbers: Numbers  # the model's own
+    slip: float = SLIP_SPEED  # v_s [rad/s or m/s]
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -174,7 +175,7 @@ class Tree:
         _, by_q, by_v = moving.derivatives(a)
         by_q[:, diagonal, diagonal] += numbers.stiffness
         by_v[:, diagonal, diagonal] += (
-            numbers.damping + numbers.coulomb / SLIP_SPEED / np.cosh(np.clip(v / SLIP_SPEED, -300, 300)) ** 2
+            numbers.damping + numbers.coulomb / self.slip / np.cosh(np.clip(v / self.slip, -300, 300)) ** 2
         )
         change = self._by_numbers(numbers, moving, q, v, u, a, by)
         by_u = inverse @ self._along_columns(self.actuation * numbers.strength * self._passes(u)[:, None, :])
@@ -232,7 +233,7 @@ class Tree:
         effort = np.clip(u, -self.limits, self.limits) * numbers.strength
         stretched = np.where(numbers.stiffness != 0, q[:, self.dynamics.positions] - numbers.rest, 0.0)
         force = effort @ self.actuation.T - numbers.stiffness * stretched - numbers.damping * v
-        return np.asarray(force - numbers.coulomb * np.tanh(v / SLIP_SPEED))
+        return np.asarray(force - numbers.coulomb * np.tanh(v / self.slip))
 
     def _passes(self, u: Array) -> Array:
         """(N, nu) 1 where an input is within its limits, beyond which it changes nothing."""
@@ -295,7 +296,7 @@ class Tree:
             ("reflected", a),
             ("stiffness", stretched),
             ("rest", np.broadcast_to(-numbers.stiffness, v.shape)),
-            ("coulomb", np.tanh(v / SLIP_SPEED)),
+            ("coulomb", np.tanh(v / self.slip)),
         ):
             rows = by[numbers.places(name)]
             if np.any(rows):

@@ -70,6 +70,9 @@ class Unknowns:
     """All of them, one after the other."""
 
     each: tuple[Unknown, ...]
+    as_in_files: bool = (
+        False  # a centre of mass moves with the inertia about it, as in files; in Drake's plant, without
+    )
 
     @property
     def slices(self) -> tuple[slice, ...]:
@@ -186,7 +189,7 @@ class Unknowns:
         given = self.named(values)
         for one in self.each:
             if one.quantity == CENTER and f"{one.label}.{INERTIA}" not in given:
-                if room_of_inertia(np.asarray(_central(tree, one.label, {})[2])) <= 0:
+                if self.as_in_files or room_of_inertia(np.asarray(_central(tree, one.label, {})[2])) <= 0:
                     continue
                 _, _, inertia = _central(tree, one.label, given)
                 if room_of_inertia(np.asarray(inertia, dtype=float)) < 0:
@@ -335,13 +338,15 @@ def _size(model: Model, name: str, value: Array) -> float:
     return float(np.linalg.norm(value))
 
 
-def _central(tree: Tree, label: str, given: dict[str, Any]) -> tuple[Any, Any, Any]:
+def _central(tree: Tree, label: str, given: dict[str, Any], *, as_in_files: bool = False) -> tuple[Any, Any, Any]:
     """Mass, centre of mass and inertia (6,) about it of a body, as Drake's parameters set them one after the other."""
     link = tree.bodies[label]
     mass, center = given.get(f"{label}.{MASS}", link.mass), given.get(f"{label}.{CENTER}", link.center_of_mass)
     own = np.array([link.inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
     if f"{label}.{INERTIA}" in given:
         return mass, center, given[f"{label}.{INERTIA}"]
+    if as_in_files:
+        return mass, center, own * (mass / link.mass)
     unit = ten_numbers(1.0, link.center_of_mass, own / link.mass)[4:]  # about the body's origin, which stays
     shift = ten_numbers(1.0, center, np.zeros(6))[4:]
     return mass, center, mass * (unit - shift)
@@ -354,7 +359,7 @@ def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Nu
         given[one.name] = values[s][0] if len(one.start) == 1 else values[s]
     kind = np.result_type(np.asarray(values).dtype, float)
     own = {name: np.array(getattr(tree.numbers, name), dtype=kind) for name in Numbers.__dataclass_fields__}
-    _set_bodies(tree, given, own["inertial"])
+    _set_bodies(tree, given, own["inertial"], as_in_files=unknowns.as_in_files)
     by_joint = {link.joint: link for link in tree.bodies.values() if link.kind != "weld"}
     at = {link.joint.joint: i for i, link in enumerate(tree.links)}
     for name, value in given.items():
@@ -377,10 +382,11 @@ def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Nu
     return Numbers(**own)
 
 
-def _set_bodies(tree: Tree, given: dict[str, Any], inertial: Any) -> None:
+def _set_bodies(tree: Tree, given: dict[str, Any], inertial: Any, *, as_in_files: bool) -> None:
     for label in dict.fromkeys(n.rsplit(".", 1)[0] for n in given if n.rsplit(".", 1)[1] in (MASS, CENTER, INERTIA)):
         before = ten_numbers(*_central(tree, label, {}))
-        inertial[tree.placed[label][0]] += tree.moved_by[label] @ (ten_numbers(*_central(tree, label, given)) - before)
+        after = ten_numbers(*_central(tree, label, given, as_in_files=as_in_files))
+        inertial[tree.placed[label][0]] += tree.moved_by[label] @ (after - before)
 
 
 def _set_rotors(model: Model, by_joint: dict[str, Any], given: dict[str, Any], reflected: Any) -> None:
