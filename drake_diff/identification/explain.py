@@ -1,9 +1,9 @@
 """The smallest change of a model that explains what was recorded: one parameter, or two, or what no file has.
 
 One pass of derivatives along the measured motion says what every change promises, and every pair. Those that promise
-most go on by steps of Gauss and Newton of their own for as long as these help; what comes near the noise is fitted, with
-the noise estimated anew. Beside the single changes that left least, a second one is sought in a pass of derivatives with
-the first one made: a large change bends what others promise. A change is named where
+most go on by steps of Gauss and Newton of their own for as long as these help; what comes near the noise is fitted,
+with the noise estimated anew. Beside the single changes that left least, a second one is sought in a pass of
+derivatives with the first one made: a large change bends what others promise. A change is named where
 
     score(model) - score(changed) > limit,
 
