@@ -1,5 +1,6 @@
 """What is wrong in a model, by name: recordings of equations of motion that SciPy integrates."""
 
+import html
 from itertools import pairwise
 from pathlib import Path
 
@@ -8,11 +9,14 @@ import pytest
 from helpers.pendulum import GRAVITY, LEVER, MASS, swing
 from helpers.robots import example_robot
 from scipy.integrate import solve_ivp
+from typer.testing import CliRunner
 
 import drake_diff as dd
+from drake_diff.cli.main import app
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns, set_numbers
+from drake_diff.record.comparison import ComparisonRecord
 
 
 @pytest.fixture
@@ -123,6 +127,46 @@ def test_of_a_right_model_nothing_is_said(pendulum, seed):
         assert w.names == ()
         assert w.explained
         assert w.sentence == "Nothing: the model explains it."
+
+
+@pytest.mark.parametrize(("step", "names"), [(0.005, ()), (0.0025, ("model.time_step",))])
+def test_the_length_of_a_simulators_steps_is_named(load, step, names):
+    """Drake's own steps: those of the model are no change of it, and others are told by their length."""
+    model = load("double_pendulum.urdf", time_step=0.005)
+    times = 0.01 * np.arange(201)
+    us = np.stack([4 * np.sin(5 * times[:-1]), 2 * np.sin(8 * times[:-1] + 1)], axis=1)
+    every = round(0.01 / step)
+    moved = dd.rollout(model.at_time_step(step), [0.5, -0.3, 0, 0], np.repeat(us, every, axis=0)).xs[::every]
+    xs = moved + 1e-4 * np.random.default_rng(0).standard_normal(moved.shape)
+    xs[:, 2:] = np.nan
+    w = dd.explain(model, dd.Recording("Drake", "1", times, xs, us))
+    assert w.explained, w
+    assert w.names == names
+    assert "semi-implicit Euler steps" in w.sentence
+    if names:
+        assert w.values["model.time_step"] == pytest.approx(step)
+
+
+def test_a_comparison_with_a_recording_names_the_cause(pendulum, tmp_path):
+    """In the terminal, in the record and on the page; where nothing can be looked for, why."""
+    log = swing(damping=0.2, velocities=True)
+    rows = [",".join(["time", *pendulum.state_names, *pendulum.input_names])]
+    rows += [",".join(map(repr, map(float, (t, *x, 0)))) for t, x in zip(log.times, log.xs, strict=True)]
+    (tmp_path / "lab.csv").write_text("\n".join(rows))
+    (tmp_path / "brief.csv").write_text("\n".join(rows[:4]))
+    logs = [part for name in ("lab", "brief") for part in ("--recording", str(tmp_path / f"{name}.csv"))]
+    out = tmp_path / "out"
+    done = CliRunner().invoke(app, ["compare", str(pendulum.source), "--engines", "numpy", *logs, "--out", str(out)])
+    assert done.exit_code == 1, done.output
+    each = {e.engine: e.cause for e in ComparisonRecord.read(out).engines}
+    assert each["lab"].explained
+    assert ["hinge.damping"] in [each["lab"].names, *each["lab"].alternatives]
+    ((low, high),) = each["lab"].intervals["hinge.damping"]
+    assert low < 0.2 < high
+    assert each["brief"].sentence.startswith("No cause was looked for: recording brief: samples")
+    for text in (" ".join(done.output.split()), html.unescape((out / "comparison.html").read_text())):
+        assert each["lab"].sentence in text
+    assert dd.verify(out)
 
 
 def test_a_law_that_no_parameter_has_is_not_explained(pendulum):

@@ -113,18 +113,22 @@ def compare(
 ) -> None:
     """Simulate MODEL in every engine with the same masses, limits and time step; say which agree and why others differ.
 
-    Exit status 0 only if every engine agrees with Drake, or differs by a law that its contract states.
+    Of a recording that is apart, the smallest change of the model that explains it is named, with its interval. Exit
+    status 0 only if every engine agrees with Drake, or differs by a law that its contract states.
     """
     from drake_diff.comparison.files import PAGE, write_comparison
     from drake_diff.comparison.recordings import read_recording
     from drake_diff.comparison.side_by_side import compare as compare_engines
+    from drake_diff.identification.cause import cause_of
     from drake_diff.record.directory import written_whole
 
     directory = out or Path("artifacts") / f"compare_{file.stem}"
     recordings = [read_recording(path, model) for path in recording or ()]
     with written_whole(directory) as folder:
         found = compare_engines(model, names_in(engines), recordings=recordings, num_steps=num_steps, seed=seed)
-        record = write_comparison(found, folder)
+        apart = {e.engine for e in found.engines if e.verdict != "same"}
+        causes = {one.name: cause_of(model, one) for one in recordings if one.name in apart}
+        record = write_comparison(found, folder, causes=causes)
     rows = table(
         "engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian", wrap=False
     )
@@ -144,6 +148,8 @@ def compare(
     show(rows)
     for e in record.engines[1:]:
         show(plain(e.engine, "bold"), e.sentence)
+        if e.cause is not None:
+            show(plain(e.engine, "bold"), e.cause.sentence)
     for r in record.refused:
         show(plain(r.engine, "bold dim"), plain(f"not compared: {r.reason}", "dim"))
     show(judged(record.verdict), record.sentence)

@@ -1,8 +1,10 @@
 """A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -28,9 +30,12 @@ COLOURS = (
     (0.48, 0.29, 0.07), (0.04, 0.38, 0.72),
 )  # fmt: skip
 OPACITY = 0.35
+NONE: Mapping[str, records.CauseEvidence] = MappingProxyType({})
 
 
-def save_comparison(comparison: Comparison, directory: str | Path) -> ComparisonRecord:
+def save_comparison(
+    comparison: Comparison, directory: str | Path, *, causes: Mapping[str, records.CauseEvidence] | None = None
+) -> ComparisonRecord:
     """Write a comparison as a directory: comparison.json, trace.mcap, replay.html and comparison.html.
 
     All of it is written beside `directory`, and takes its place at the end.
@@ -38,6 +43,7 @@ def save_comparison(comparison: Comparison, directory: str | Path) -> Comparison
     Args:
         comparison: from `dd.compare`.
         directory: where to write; an earlier run there is replaced.
+        causes: by the name of a recording, what `dd.identification.cause_of` says of it.
 
     Returns:
         The record in comparison.json, which `dd.verify` checks against the other files.
@@ -54,29 +60,33 @@ def save_comparison(comparison: Comparison, directory: str | Path) -> Comparison
         pass
     """
     with written_whole(directory) as folder:
-        return write_comparison(comparison, folder)
+        return write_comparison(comparison, folder, causes=causes or {})
 
 
-def write_comparison(comparison: Comparison, folder: Path) -> ComparisonRecord:
+def write_comparison(
+    comparison: Comparison, folder: Path, *, causes: Mapping[str, records.CauseEvidence] = NONE
+) -> ComparisonRecord:
     """Write what `save_comparison` does into `folder`, which `written_whole` gave."""
     from drake_diff.comparison.page import write_comparison_page  # what saves nothing need not load them
     from drake_diff.pages.meshcat import write_replay
 
     _begun(name_of(folder), comparison.model).begin(folder)
-    record = record_of(comparison, name_of(folder))
+    record = record_of(comparison, name_of(folder), causes)
     write_comparison_trace(folder / TRACE, comparison)
     write_replay(folder / REPLAY, _scene(comparison), title=f"{record.name}: {record.verdict}")
     write_comparison_page(folder / PAGE, comparison, record, folder / REPLAY)
     return record.write(folder)
 
 
-def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
+def record_of(
+    comparison: Comparison, name: str, causes: Mapping[str, records.CauseEvidence] = NONE
+) -> ComparisonRecord:
     """The record of `comparison`, but for the files."""
     found = {
         "verdict": "pass" if comparison.holds else "fail",
         "sentence": str(comparison),
         "states": [records.StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
-        "engines": [_engine(e) for e in comparison.engines],
+        "engines": [_engine(e, causes.get(e.engine)) for e in comparison.engines],
         "data": _data(comparison),
         "refused": [records.RefusedEvidence(**vars(refused)) for refused in comparison.refused],
         "wall_clock": records.ComparisonClock(
@@ -119,7 +129,7 @@ def _data(comparison: Comparison) -> DataBoundary:
     return DataBoundary(statement=statement, seen=[], judged_on=[motion, *recordings])
 
 
-def _engine(e: Compared) -> records.EngineEvidence:
+def _engine(e: Compared, cause: records.CauseEvidence | None) -> records.EngineEvidence:
     same = ("engine", "version", "precision", "verdict", "sentence", "final_gap", "rollout_gap", "gradient")
     return records.EngineEvidence(
         **{name: getattr(e, name) for name in same}, contract=[records.LineEvidence(**vars(line)) for line in e.lines],
@@ -140,7 +150,7 @@ def _engine(e: Compared) -> records.EngineEvidence:
         function=None if e.function is None else records.FunctionEvidence(
             name=e.function.name, sha256=e.function.sha256, parameters=dict(e.function.parameters)
         ),
-        rollout_jacobian=None if e.rollout_jacobian is None else _rows(e.rollout_jacobian),
+        rollout_jacobian=None if e.rollout_jacobian is None else _rows(e.rollout_jacobian), cause=cause,
     )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 from .base import BaseParameter as BaseParameter
 from .base import base_parameters as base_parameters
+from .cause import cause_of as cause_of
 from .excite import Excitation as Excitation
 from .excite import excite as excite
 from .explain import Explanation as Explanation

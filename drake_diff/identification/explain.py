@@ -29,6 +29,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.identification.chart import Chart
+from drake_diff.identification.euler import EulerMotion
 from drake_diff.identification.fit import Fit, Law, Solved
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.identify import LONGEST, Problem, what_acts
@@ -45,13 +46,15 @@ FALSE_NAME = 0.003  # of right models in which some change is named
 LOOKED_AT = 8  # changes that enter the race, of those that promise most
 RACE = (5, 4, 3, 2, 2, 1)  # so many stay after each step of Gauss and Newton
 FALLS = 0.7  # what does not fall to this part of what was left before is out of the race, after its first step
-BEHIND = 0.1  # what leaves more than the best divided by this is out of the race
-BESIDE = 3  # changes beside which a second one is sought
+BESIDE, LOOKED_AT_BESIDE = 3, 4  # changes beside which a second one is sought, and how many of these go on
+PARTS = (1, 2, 4, 5, 10, 20)  # of a sample: Euler steps that are tried
+TIME_STEP = "time_step"
 STEPS, ROUNDS = 8, 4  # of Gauss and Newton, and of estimating the noise
 SAME_NOISE = 0.03  # what is left of its error changes a score by less than 0.001 of how many numbers were measured
 HOPELESS = 3.0  # times the noise: residuals that no better weights make good
 SAME = 6.0  # of a score: evidence of 20 to 1, below which two changes are not told apart
 MOTIONS = ("auto", "continuous")
+CLOSE = 1.0  # of the squares: what a step may still gain where two changes are told apart
 TOLD_APART = 40.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
 LONGEST_DELAY = 0.1  # [s]
 LONGEST_DRY = 2.5e-3  # [s] of a step under dry friction, which turns within a small speed
@@ -145,6 +148,7 @@ class _Runner:
 
     names: tuple[str, ...]
     fit: Fit
+    firm: Fit  # after the first step: with dry friction that holds
     z: Array
     starts: Array
     left: float  # of the squares, after the next step
@@ -174,6 +178,8 @@ class _Search:
     pieces: list[Piece]
     stated: Array
     evidence: dict[str, float] = field(default_factory=dict)
+    nearest: _Tried | None = None
+    step: float | None = None  # [s] of the Euler steps that stand for the motion; None for continuous time
 
     @cached_property
     def scatter(self) -> Array:
@@ -203,13 +209,14 @@ class _Search:
         return Problem(self.model, self.chart, unknowns, list(pieces), self.stated, self.scatter)
 
     def law(self, unknowns: Unknowns, longest: float) -> ContinuousMotion:
-        return ContinuousMotion(self.model, self.tree, self.chart, unknowns, longest)
+        kind = ContinuousMotion if self.step is None else EulerMotion
+        return kind(self.model, self.tree, self.chart, unknowns, longest if self.step is None else self.step)
 
     def law_of(self, unknowns: Unknowns, z: Array) -> ContinuousMotion:
         """With dry friction that holds as firmly as short steps can follow, where it is of this size."""
         law = self.law(unknowns, self.longest)
         dry = [(one.label, float(z[s][0])) for one, s in self.each_of(unknowns) if one.quantity == COULOMB]
-        if not dry:
+        if not dry or self.step is not None:
             return law
         set_state(self.model.double, self.starts[0])
         ease = np.diag(np.linalg.pinv(np.asarray(self.model.double.mass_matrix())))
@@ -227,23 +234,85 @@ class _Search:
         fit, starts = self.problem(nothing, self.pieces).prepared(self.law(nothing, LONGEST))
         longest = fit.law.longest if isinstance(fit.law, ContinuousMotion) else LONGEST
         self.longest, self.cut, self.starts = longest, list(fit.segments.pieces), starts
-        base = self.solved((), nothing, self.law(nothing, longest), self.cut, starts, nothing.z_start)
-        alone = self.view(self.cut, self.unknowns.z_start, base.starts if base.explains else starts)
+        found, base, alone, runners = self.by_one()
+        if found is None and self.steps and not base.explains:
+            found = self.by_steps(base)
+        if found is None and not base.explains:
+            found = self.by_two(alone, runners, base)
+        return found or (self.right() if base.explains else self.unexplained(base))
+
+    def by_one(self) -> tuple[Explanation | None, _Tried, View, list[_Runner]]:
+        nothing = self.of(())
+        one = self.running((), nothing, self.cut, self.starts, nothing.z_start, Promise((), np.inf, 0.0, np.zeros(0)))
+        before = np.inf
+        while one.step() and self.is_hopeless(one.left) and one.left < FALLS * before:
+            before = one.left
+        most = 1 if self.is_hopeless(one.left) else STEPS
+        base = self.solved((), nothing, one.fit.law, self.cut, self.starts if most == 1 else one.starts, one.z, most)
+        alone = self.view(self.cut, self.unknowns.z_start, base.starts if base.explains else self.starts)
         if alone is None:
             raise SimulationError(f"{self.model.name} has no motion near the states that were measured")
         count = len(alone.freedoms)
         singles, runners = self.tried(alone, [(i,) for i in range(count)], base)
         named = self.enough(base, singles, count)
-        if named:
-            return self.said(named)
-        if base.explains:
-            return self.right()
+        self.nearest = min([self.nearest or base, base, *singles], key=self.bic)
+        return self.said(named) if named else None, base, alone, runners
+
+    def by_two(self, alone: View, runners: Sequence[_Runner], base: _Tried) -> Explanation | None:
+        count = len(alone.freedoms)
         pairs = self.paired(alone, runners, base)
-        best = min([base, *singles], key=lambda one: one.score)
-        named = self.enough(base, [one for one in pairs if one.score < best.score], count * (count - 1) // 2)
-        if named:
-            return self.said(named)
-        return self.unexplained(min([base, *singles, *pairs], key=self.bic))
+        named = self.enough(base, pairs, count * (count - 1) // 2)
+        self.nearest = min([self.nearest or base, *pairs], key=self.bic)
+        return self.said(named) if named else None
+
+    @property
+    def steps(self) -> list[float]:
+        """[s] lengths of steps of which a whole number lies between samples."""
+        period = np.concatenate([np.diff(piece.times) for piece in self.cut])
+        if self.chart.coordinates.free or np.ptp(period) > 1e-6 * np.mean(period):
+            return []
+        return [float(np.mean(period)) / n for n in PARTS]
+
+    def by_steps(self, base: _Tried) -> Explanation | None:
+        """By Euler steps of a length, with one other change or none."""
+        nothing, left = self.of(()), dict[float, float]()
+        promise = Promise((), 0.0, 0.0, np.zeros(0))
+        for step in self.steps:
+            self.step = step
+            one = self.running((), nothing, self.cut, self.starts, nothing.z_start, promise)
+            seen = self.view(self.cut, self.unknowns.z_start, one.starts) if one.step() else None
+            if seen is not None:
+                each = seen.promises([(i,) for i in range(len(seen.freedoms))], float(np.log(self.count)))
+                left[step] = each[0].left if each else seen.most
+        self.step = min(left, key=left.__getitem__, default=None)
+        if self.step is None:
+            return None
+        name, own = f"model.{TIME_STEP}", abs(self.step / self.model.time_step - 1) < 1e-6
+        try:
+            found, stepped, _, _ = self.by_one()
+        finally:
+            step, self.step = self.step, None
+        if found is None and not (stepped.explains and base.score - stepped.score > self.least(1.0, len(self.steps))):
+            return None
+        steps = f"semi-implicit Euler steps of {1e3 * step:.4g} ms"
+        if own:
+            steps += ", as the model makes them"
+        more = () if own else (name,)
+        if found is None:
+            sentence = f"{'Nothing: the model' if own else name} explains it, by {steps}."
+            if not own:
+                sentence = f"{name} is {step:.4g} s, not {self.model.time_step:.4g}: {steps} explain the recording."
+            values = {} if own else {name: step}
+            within = {} if own else {name: frozen([step, step])}
+            return Explanation(more, values, within, (), True, sentence, self.evidence)
+        return replace(
+            found,
+            names=(*found.names, *more),
+            values={**found.values, **({} if own else {name: step})},
+            intervals={**found.intervals, **({} if own else {name: frozen([step, step])})},
+            alternatives=tuple((*names, *more) for names in found.alternatives),
+            sentence=f"{found.sentence.removesuffix('.')}, by {steps}.",
+        )
 
     def paired(self, alone: View, runners: Sequence[_Runner], base: _Tried) -> list[_Tried]:
         """Pairs that promise most at the model, or beside a change that left least."""
@@ -251,7 +320,10 @@ class _Search:
         found, _ = self.tried(alone, combinations(range(count), 2), base)
         names = [one.name for one in self.unknowns.each]
         for runner in runners[:BESIDE]:
-            if runner.special or any(one.explains for one in found):
+            if any(one.explains for one in found):
+                break
+            if runner.special:
+                found += self.beside_inputs(runner, base)
                 continue
             i = names.index(runner.names[0])
             z = self.unknowns.z_start.copy()
@@ -259,21 +331,38 @@ class _Search:
             seen = self.view(self.cut, z, runner.starts)
             if seen is not None:
                 others = [(i, k) for k in range(count) if k != i]
-                more, _ = self.tried(seen, others, base)
+                more, _ = self.tried(seen, others, base, LOOKED_AT_BESIDE)
                 found += more
         return found
+
+    def beside_inputs(self, runner: _Runner, base: _Tried) -> list[_Tried]:
+        """A change beside a delay or limit that is about what it is alone."""
+        ((special, value),) = runner.special.items()
+        pieces = runner.fit.segments.pieces
+        seen = self.view(pieces, self.unknowns.z_start, runner.starts)
+        if seen is None:
+            return []
+        each = [one.name for one in self.unknowns.each]
+        others = [(i,) for i, name in enumerate(each) if not self.is_of_inputs(self.plain(name))]
+        runners = []
+        for promise in seen.promises(others, float(np.log(self.count)))[:LOOKED_AT_BESIDE]:
+            name = each[promise.members[0]]
+            runners.append(self.searched(special, (name, special), self.of([name]), promise, value))
+        return self.raced(runners, base)[0]
 
     def view(self, pieces: Sequence[Piece], z: Array, starts: Array) -> View | None:
         problem = self.problem(self.unknowns, pieces)
         law: Law = Inputs(self.law(self.unknowns, self.longest), self.unknowns, pieces)
         return view(problem.fit(law, pieces, problem.first_noise), self.unknowns, z, starts)
 
-    def tried(self, seen: View, changes: Iterable[tuple[int, ...]], base: _Tried) -> tuple[list[_Tried], list[_Runner]]:
+    def tried(
+        self, seen: View, changes: Iterable[tuple[int, ...]], base: _Tried, most: int = LOOKED_AT
+    ) -> tuple[list[_Tried], list[_Runner]]:
         """(those that are fitted, all that stayed in the race, best first) of those that promise most."""
         names = [one.name for one in self.unknowns.each]
         chosen: dict[tuple[str, ...], Promise] = {}
         for promise in seen.promises(changes, float(np.log(self.count))):
-            if len(chosen) == LOOKED_AT:
+            if len(chosen) == most:
                 break
             own = tuple(self.plain(names[i]) for i in promise.members)
             if len(set(own)) == len(own) and sum(map(self.is_of_inputs, own)) <= 1:
@@ -299,9 +388,11 @@ class _Search:
         promise: Promise,
     ) -> _Runner:
         problem = self.problem(unknowns, pieces)
-        fit = problem.fit(self.law_of(unknowns, z), pieces, problem.first_noise)
+        fit = problem.fit(self.law(unknowns, self.longest), pieces, problem.first_noise)
+        law = self.law_of(unknowns, z)
+        firm = fit if law.longest == self.longest else problem.fit(law, pieces, problem.first_noise)
         starts = problem.guess(fit) if starts is None else starts
-        return _Runner(names, fit, z, starts, promise.left, promise.freedom)
+        return _Runner(names, fit, firm, z, starts, promise.left, promise.freedom)
 
     def raced(self, runners: list[_Runner], base: _Tried) -> tuple[list[_Tried], list[_Runner]]:
         alive, there = list(runners), []
@@ -309,13 +400,19 @@ class _Search:
             before = {one.names: one.left for one in alive}
             alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
             there += [one for one in alive if not self.is_hopeless(one.left)]
-            hopeful = alive[0].left / BEHIND if alive else 0.0
+            for one in alive:
+                one.fit = one.firm
             alive = [
                 one
                 for one in alive[:most]
-                if self.is_hopeless(one.left)
-                and (one.left < hopeful and (most == RACE[0] or one.left < FALLS * before[one.names]))
+                if self.is_hopeless(one.left) and (most == RACE[0] or one.left < FALLS * before[one.names])
             ]
+        for one in there:
+            for _ in range(STEPS):
+                last = one.left
+                if not one.step() or last - one.left < CLOSE:
+                    break
+        every = sorted(runners, key=lambda one: one.left)
         alive = there + alive
         price = float(np.log(self.count))
         alive.sort(key=lambda one: one.left + price * one.freedom)
@@ -327,7 +424,7 @@ class _Search:
                 continue
             found.append(self.ended(one))
             self.evidence[" and ".join(one.names)] = base.score - found[-1].score
-        return found, alive
+        return found, every
 
     def is_hopeless(self, left: float) -> bool:
         return left > HOPELESS**2 * self.count
@@ -359,12 +456,19 @@ class _Search:
         )
 
     def solved(
-        self, names: tuple[str, ...], unknowns: Unknowns, law: Law, pieces: Sequence[Piece], starts: Array, z: Array
+        self,
+        names: tuple[str, ...],
+        unknowns: Unknowns,
+        law: Law,
+        pieces: Sequence[Piece],
+        starts: Array,
+        z: Array,
+        most: int = STEPS,
     ) -> _Tried:
         problem = self.problem(unknowns, pieces)
         fit = problem.fit(law, pieces, problem.first_noise)
-        for k in range(ROUNDS):
-            solved = fit.solve(z, starts, 1 if not names and k == 0 else STEPS)
+        for _ in range(ROUNDS):
+            solved = fit.solve(z, starts, most)
             z, starts = solved.z, solved.starts
             size = noise_of(fit, solved)
             seen = np.isfinite(size)
@@ -407,7 +511,9 @@ class _Search:
         own = solved.z, solved.starts
         return _Tried(names, self.score(fit, solved), pull, taken - alone, not doubt, doubt, values, shaped, *own)
 
-    def searched(self, special: str, names: tuple[str, ...], unknowns: Unknowns, promise: Promise) -> _Runner:
+    def searched(
+        self, special: str, names: tuple[str, ...], unknowns: Unknowns, promise: Promise, near: float | None = None
+    ) -> _Runner:
         """At the delay or limit by which the rest fits best, with its interval by how what is left bends there."""
         found: dict[float, _Runner] = {}
 
@@ -429,6 +535,9 @@ class _Search:
             i = self.model.input_names.index(special.rsplit(".", 1)[0])
             largest = max(float(np.max(np.abs(p.us[:, i]))) for p in self.pieces)
             grid, (low, high) = np.array(LEVELS) * largest, (0.0, largest)
+        if near is not None:
+            grid = near * np.array([0.8, 1.0, 1.25])
+            low, high = max(low, 0.5 * near), min(high, 2 * near)
         best = min((float(v) for v in grid), key=left)
         nearby = sorted([low, *map(float, grid), high])
         k = nearby.index(best)
@@ -461,13 +570,16 @@ class _Search:
     def bic(self, one: _Tried) -> float:
         return one.score + one.pull + one.freedom * float(np.log(self.count))
 
+    def least(self, freedom: float, count: int) -> float:
+        """By how much a score must fall, where so many changes were tried."""
+        return max(float(stats.chi2.isf(FALSE_NAME / max(count, 1), freedom)), freedom * float(np.log(self.count)))
+
     def enough(self, base: _Tried, tried: Sequence[_Tried], count: int) -> list[_Tried]:
         """The changes that explain and have the evidence, best first, and not told from the best."""
         found = []
         for one in tried:
             freedom = max(one.freedom, 1.0)
-            limit = max(stats.chi2.isf(FALSE_NAME / max(count, 1), freedom), freedom * np.log(self.count))
-            if one.explains and base.score - one.score > limit:
+            if one.explains and base.score - one.score > self.least(freedom, count):
                 found.append(one)
         found.sort(key=self.bic)
         return [one for one in found if self.bic(one) - self.bic(found[0]) < SAME]
@@ -508,7 +620,8 @@ class _Search:
     def right(self) -> Explanation:
         return Explanation((), {}, {}, (), True, "Nothing: the model explains it.", self.evidence)
 
-    def unexplained(self, nearest: _Tried) -> Explanation:
+    def unexplained(self, base: _Tried) -> Explanation:
+        nearest = self.nearest or base
         near = f"with {' and '.join(nearest.names)}" if nearest.names else "as the model is"
         sentence = f"Not explained: no change of one or two quantities explains the recording; {near}, {nearest.doubt}."
         return Explanation((), {}, {}, (), False, sentence, self.evidence)

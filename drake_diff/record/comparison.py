@@ -50,6 +50,17 @@ class FunctionEvidence(Part):
     parameters: dict[str, float]
 
 
+class CauseEvidence(Part):
+    """The smallest change of the model that explains a recording, with 95 % intervals; or why nothing is named."""
+
+    names: list[str]  # what is changed, together
+    values: dict[str, Numbers]
+    intervals: dict[str, list[Numbers]]  # by name, lower and upper of each of its numbers
+    alternatives: list[list[str]]  # changes that the recording cannot tell from this one
+    explained: bool  # by the model as it is, or with the change
+    sentence: str
+
+
 class EngineEvidence(Part):
     """One engine beside the reference."""
 
@@ -73,6 +84,7 @@ class EngineEvidence(Part):
     rollout_gap: float | None
     gradient: Literal["its own step's", "not its own step's", "undecided", "none"]
     function: FunctionEvidence | None = None
+    cause: CauseEvidence | None = None  # of a recording
 
 
 class StateEvidence(Part):
