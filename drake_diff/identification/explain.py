@@ -88,7 +88,8 @@ def explain(
 
     Each parameter is tried alone: masses, centres of mass, inertias, dampings, springs, rotor inertias, offsets of
     joints and gravity; and what is no parameter of a file: dry friction, the strength and the limit of each input, a
-    delay of all inputs, and biases of sensors. Pairs are tried where none of them explains the recordings alone.
+    delay of all inputs, and biases of sensors. Where none of them explains the recordings alone, semi-implicit Euler
+    steps of several lengths are tried, with one change or none, and then pairs.
 
     Args:
         model: The model.
