@@ -3,7 +3,7 @@
 What is maximized is the determinant of the information that `identify` would have, first states taken out, with the
 weak pull to the file's values: D-optimality, which does not depend on the units of the parameters. Where every joint
 has an input of its own, the motion of each joint is a Fourier series, as by Swevers, and the inputs follow by inverse
-dynamics; else the inputs themselves are the series. A window starts and ends it at rest.
+dynamics; else the inputs themselves are the series. A window lets them begin and end at rest, or at 0.
 """
 
 from collections.abc import Mapping, Sequence
