@@ -1,9 +1,9 @@
-"""A policy of 36 weights that hops to 0.75 m from wherever it falls, trained by gradients through landing and take-off.
+"""A policy of 36 weights that lands from a fall and comes to rest at 0.75 m, trained by gradients through the landing.
 
 They are those of the motion in continuous time, impacts included. What is saved is the plan that the policy makes.
 
-    drake-diff run examples/hopping_policy.py    trains, and writes artifacts/hopping_policy, which `verify` accepts
-    python examples/hopping_policy.py            beside Powell's search, by values alone, and as many simulated steps
+    drake-diff run examples/landing_policy.py    trains, and writes artifacts/landing_policy, which `verify` accepts
+    python examples/landing_policy.py            beside Powell's search, by values alone, and as many simulated steps
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ def network(x, t, weights):
     return np.array([12 - 100 * (x[1] - 0.45) - 3 * x[3] + 30 * (outer @ hidden)])
 
 
-def hop(function, weights, height, *loss):
+def fall(function, weights, height, *loss):
     asked = {"policy": dd.motion.ParametricPolicy(network, weights), "num_steps": 40, "method": "continuous"}
     return function(model, [height, 0.45, 0, 0], None, *loss, **asked)
 
@@ -34,8 +34,8 @@ def hop(function, weights, height, *loss):
 def train(evaluations: int, *, gradients: bool = True) -> np.ndarray:
     def mean(weights):
         if not gradients:
-            return np.mean([miss(hop(dd.rollout, weights, z).xs[-1]) for z in DROPS])
-        found = [hop(dd.differentiate_rollout, weights, z, lambda x: miss(x)) for z in DROPS]
+            return np.mean([miss(fall(dd.rollout, weights, z).xs[-1]) for z in DROPS])
+        found = [fall(dd.differentiate_rollout, weights, z, lambda x: miss(x)) for z in DROPS]
         return np.mean([g.loss for g in found]), np.mean([g.by_policy for g in found], axis=0)
 
     method, limit = ("L-BFGS-B", "maxfun") if gradients else ("Powell", "maxfev")
@@ -44,7 +44,7 @@ def train(evaluations: int, *, gradients: bool = True) -> np.ndarray:
 
 def problem(weights=None) -> dd.Problem:
     """The policy's motion after the first drop, to be followed: its own inputs do that at no cost."""
-    motion = hop(dd.rollout, train(16) if weights is None else weights, DROPS[0])
+    motion = fall(dd.rollout, train(16) if weights is None else weights, DROPS[0])
     table = motion.times, motion.xs, np.vstack([motion.us, motion.us[-1:]])
     follow = dd.optimize.TrackingCost(table, Q=np.eye(4), R=[[1.0]])
     return dd.Problem(model, x0=motion.xs[0], num_steps=40, motion="continuous", us=motion.us, running_cost=follow)
@@ -56,5 +56,5 @@ if __name__ == "__main__":
     found["Powell"] = train(count.steps // (40 * len(DROPS)), gradients=False)
     print(f"{count.steps} simulated steps each; 0.8 s after drops from {DROPS}, and {UNSEEN} m not trained on, at")
     for name, weights in found.items():
-        heights = [hop(dd.rollout, weights, z).xs[-1][0] for z in DROPS + UNSEEN]
+        heights = [fall(dd.rollout, weights, z).xs[-1][0] for z in DROPS + UNSEEN]
         print(f"{name} {np.round(heights, 3)} m; its plan: {dd.solve(problem(weights)).message}")
