@@ -156,6 +156,25 @@ def test_ctrl_c_ends_the_run_with_the_best_motion_so_far(tmp_path):
     assert found.failures[0].code == "interrupted"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_what_is_interrupted_stays_beside_an_earlier_run(tmp_path, number):
+    earlier, runs = script(tmp_path, num_steps=5), tmp_path / "artifacts"
+    start(earlier, tmp_path).wait(timeout=60)
+    before = dd.load_record(runs / "task")
+    options = {"method": "shooting", "solver": "ipopt", "tolerance": 1e-14, "max_iterations": 100000}
+    running = start(script(tmp_path, num_steps=400, options=options), tmp_path)
+    wait_until(lambda: list(runs.glob("task.partial-*/record.json")))
+    time.sleep(1.0)
+    running.send_signal(number)
+    assert running.wait(timeout=60) == 1
+    assert dd.load_record(runs / "task") == before
+    (left,) = runs.glob("task.partial-*")
+    found = dd.load_record(left)
+    assert (found.state, found.solver.status) == ("complete", "interrupted")
+    assert {line.name: line.verdict for line in list_runs(runs)} == {"task": before.verdict, left.name: "incomplete"}
+
+
 @each_row("delay", [0.0, 0.3, 1.0, 1.5])
 def test_a_killed_run_never_looks_finished(tmp_path, delay):
     running = start(script(tmp_path, num_steps=60), tmp_path)

@@ -207,6 +207,7 @@ FIGURES = (
     "speed.md",
     "identification.md",
     "strangers.md",
+    "artifacts.md",
 )  # pages that a benchmark writes
 
 

@@ -9,6 +9,7 @@ import errno
 import fcntl
 import os
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -138,6 +139,12 @@ def _renameat2() -> Any:
     if found is not None:
         found.argtypes = (ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint)
     return found
+
+
+def take_mode(folder: Path, of: Path) -> None:
+    """Give `folder` the permissions of another."""
+    with doing("write", folder):
+        folder.chmod(stat.S_IMODE(of.stat().st_mode))
 
 
 def remove_folder(path: Path) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.clock import TimeIsUpError, until
+from drake_diff._base.signals import noted_interrupts
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.steps import certify_steps
 from drake_diff.exceptions import GradientError, SimulationError
@@ -116,30 +118,31 @@ class Run:
             return self._collocate_in_drake(guess)
         problem, report = self.problem, self.report
         transcription = Transcription(self.searched or problem, self.scheme)
-        try:
-            before = certify_equations(
-                self.problem,
-                transcription.jacobian,
-                guess.xs,
-                guess.us,
-                transcription.task,
-                knots=first_knots(guess.us),
+        with noted_interrupts():  # one that comes before the search ends it at its start
+            try:
+                before = certify_equations(
+                    self.problem,
+                    transcription.jacobian,
+                    guess.xs,
+                    guess.us,
+                    transcription.task,
+                    knots=first_knots(guess.us),
+                )
+            except (GradientError, SimulationError) as error:
+                return refused(self._of_guess(guess), error)
+            self._reach(1)
+            us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
+            begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
+            motion = transcription.solve(
+                begun,
+                horizon=guess.horizon,
+                limits=self._left(),
+                report=report,
+                refinement=refinement if refine else None,
+                parameters=guess.parameters,
+                far=guess.line,
+                **self._known(transcription, guess, finer=refine is not False),
             )
-        except (GradientError, SimulationError) as error:
-            return refused(self._of_guess(guess), error)
-        self._reach(1)
-        us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
-        begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
-        motion = transcription.solve(
-            begun,
-            horizon=guess.horizon,
-            limits=self._left(),
-            report=report,
-            refinement=refinement if refine else None,
-            parameters=guess.parameters,
-            far=guess.line,
-            **self._known(transcription, guess, finer=refine is not False),
-        )
         if refine:
             self.options["refinements"] = [list(each) for each in motion.refinements]
         if motion.cleared:
@@ -296,7 +299,25 @@ class Run:
         may_be_blind: bool = False,
         around: bool = False,
     ) -> Solution:
-        """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are.
+        """See `_searched`; a signal that comes before the search ends that at its start, with what it begins with."""
+        options = {"segmented": segmented, "may_be_blind": may_be_blind, "around": around}
+        with ExitStack() as until_found:
+            until_found.enter_context(noted_interrupts())
+            return self._searched(xs, us, search, guess, until_found.close, **options)
+
+    def _searched(
+        self,
+        xs: Array,
+        us: Array,
+        search: Searcher,
+        guess: Guess,
+        found: Callable[[], None],
+        *,
+        segmented: bool,
+        may_be_blind: bool,
+        around: bool,
+    ) -> Solution:
+        """Certify, search, call `found`, certify again, on Drake's own steps; at rollouts, or at states as they are.
 
         The latter if the motion is `segmented`; `around` its first states the guess alone.
         """
@@ -319,13 +340,14 @@ class Run:
             if self.report is not None and self.report.plan is not None:  # else it need not be rolled out
                 drawn = variables.states(z), variables.unpack(z)[1]
                 self._offer(self._draft(*drawn, **self._design_of(variables, z)), result)
+            found()
             xs, us, after, blindness = self._look_at(variables, z, found=True)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us, certificates=before), error)
         if result.note:
             self.options["contact_sequence"] = result.note
-        found = {"certificates": before + after, **self._design_of(variables, z)}
-        solution = self._judge(self._draft(xs, us, multipliers=result.multipliers, **found), result)
+        told = {"certificates": before + after, **self._design_of(variables, z)}
+        solution = self._judge(self._draft(xs, us, multipliers=result.multipliers, **told), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
 
     def _design_of(self, variables: ShootingVariables, z: Array) -> dict[str, Any]:

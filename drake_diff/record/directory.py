@@ -11,13 +11,12 @@ names, no moment is without either. Else the old one is called run.replaced-... 
 import os
 import re
 import secrets
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from drake_diff._base.files import exchange, locked, make_folder, move, remove_folder, sync_folder
+from drake_diff._base.files import exchange, locked, make_folder, move, remove_folder, sync_folder, take_mode
 from drake_diff.exceptions import ArtifactError, InputError, WriteError
 from drake_diff.record.sealed import SCHEMAS, own_sha256, read_fields
 
@@ -91,7 +90,7 @@ def _put(partial: Path, target: Path) -> Path | None:
         sync_folder(Path(folder))
     check_place(target)  # a run may take hours
     if target.is_dir():
-        partial.chmod(stat.S_IMODE(target.stat().st_mode))
+        take_mode(partial, target)
         if any(target.iterdir()):
             return _exchanged(partial, target)
     move(partial, target)

@@ -1,0 +1,419 @@
+"""A run is written beside its directory and takes its place whole: nothing that was there is lost, whatever fails."""
+
+import errno
+import os
+import pickle
+import random
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.faults import (
+    ERRORS,
+    FAULTS,
+    KILLED,
+    KILLED_AFTER,
+    ended,
+    forked,
+    goal_of,
+    has_plan,
+    killed_after,
+    quick_pages,
+    tried,
+    two_solutions,
+)
+from helpers.models import MODELS
+
+import drake_diff as dd
+from drake_diff._base import files
+from drake_diff.artifact import recover
+from drake_diff.artifact.listing import list_runs
+from drake_diff.artifact.save import begin, keep_plan
+from drake_diff.cli import main as cli
+from drake_diff.exceptions import ArtifactError, InputError, ModelError, WriteError
+from drake_diff.record.directory import RECORDS, writing, written_whole
+from drake_diff.record.read import KINDS
+
+OLD, NEW = 0.2, 0.3  # the goals of the two runs
+
+
+@pytest.fixture(scope="module")
+def solutions():
+    return two_solutions()
+
+
+@pytest.fixture(scope="module")
+def saved(solutions, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("saved") / "run"
+    dd.save(solutions[0], folder)
+    return folder
+
+
+@pytest.fixture
+def run(saved, tmp_path, monkeypatch):
+    """A run, alone in a folder of its own."""
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "kept").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "kept"))
+    return Path(shutil.copytree(saved, tmp_path / "runs" / "run"))
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_new_run_takes_the_place_of_the_old_and_nothing_else_is_left(run, solutions):
+    mode = 0o750
+    run.chmod(mode)
+    dd.save(solutions[1], run)
+    assert (goal_of(run), names(run.parent), run.stat().st_mode & 0o777) == (NEW, ["run"], mode)
+
+
+def test_what_breaks_off_leaves_the_old_run_and_says_where_its_own_files_are(run):
+    def breaks_off(name):
+        with written_whole(run) as folder:
+            if name is not None:
+                (folder / name).write_text("")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError) as raised:
+        breaks_off("half")
+    (left,) = run.parent.glob("run.partial-*")
+    assert raised.value.__notes__ == [f"what was written is in {left}"]
+    with pytest.raises(ZeroDivisionError):
+        breaks_off(None)
+    assert (goal_of(run), names(run.parent)) == (OLD, ["run", left.name])  # where nothing was written nothing is left
+
+
+def test_a_file_system_that_cannot_exchange_names_keeps_the_old_one_until_the_new_is_there(run, solutions, monkeypatch):
+    monkeypatch.setattr(files, "_renameat2", lambda: None)
+    dd.save(solutions[1], run)
+    assert (goal_of(run), names(run.parent)) == (NEW, ["run"])
+
+
+def test_others_files_are_refused_and_stay(run, solutions, monkeypatch):
+    def notes(folder):
+        (folder / "notes.txt").write_text("mine")
+
+    def link(folder):
+        (folder / "link").symlink_to("record.json")
+
+    def subfolder(folder):
+        (folder / "mine").mkdir()
+
+    def edited(folder):
+        text = (folder / "record.json").read_text()
+        (folder / "record.json").write_text(text.replace('"verdict": "pass"', '"verdict": "fail"'))
+
+    def own_page(folder):
+        shutil.rmtree(folder)
+        folder.mkdir()
+        (folder / "report.html").write_text("mine")
+
+    def file(folder):
+        shutil.rmtree(folder)
+        folder.write_text("mine")
+
+    def here(folder):
+        monkeypatch.chdir(folder)
+
+    for change, told in (
+        (notes, "'notes.txt'"),
+        (link, "'link'"),
+        (subfolder, "'mine'"),
+        (edited, "which holds"),
+        (own_page, "'report.html'"),
+        (file, "no directory"),
+        (here, "where this process works"),
+    ):
+        target = Path(shutil.copytree(run, run.parent / change.__name__))
+        change(target)
+        before = {path: path.read_bytes() for path in [target, *target.rglob("*")] if path.is_file()}
+        with pytest.raises(InputError, match=told):
+            dd.save(solutions[1], target)
+        assert before == {path: path.read_bytes() for path in [target, *target.rglob("*")] if path.is_file()}
+        assert not list(run.parent.glob("*.partial-*")) + list(run.parent.glob(".*"))
+        monkeypatch.undo()
+
+
+def test_a_link_to_a_run_stays_and_an_empty_directory_is_taken(run, solutions, tmp_path):
+    (tmp_path / "link").symlink_to(run)
+    (tmp_path / "empty").mkdir()
+    for target in (tmp_path / "link", tmp_path / "empty"):
+        dd.save(solutions[1], target)
+        assert goal_of(target) == NEW
+    assert (tmp_path / "link").is_symlink()
+    assert goal_of(run) == NEW
+
+
+def test_every_kind_of_record_is_known_by_its_name():
+    assert sorted(RECORDS) == sorted(kind.FILE for kind in KINDS)
+
+
+def test_who_comes_second_is_refused_at_once_and_a_kill_leaves_no_lock(run, solutions):
+    def wait():
+        with written_whole(run):
+            os.kill(os.getpid(), 9)
+
+    with writing(run), pytest.raises(ArtifactError, match="another run is being written there"):
+        dd.save(solutions[1], run)
+    assert ended(*forked(wait)) == {"ended": "killed"}
+    assert ".run.lock" in names(run.parent)
+    assert [line.verdict for line in list_runs(run.parent)] == ["pass", "incomplete"]
+    dd.save(solutions[1], run)
+    assert goal_of(run) == NEW
+    assert ".run.lock" not in names(run.parent)
+
+
+def test_of_two_at_a_time_each_is_whole_or_refused(run, solutions, monkeypatch):
+    quick_pages(monkeypatch)
+    for _ in range(5):
+        pair = [forked(lambda solution=solution: dd.save(solution, run).verdict) for solution in solutions]
+        found = [ended(*each) for each in pair]
+        assert {"ended": "done", "found": "pass"} in found
+        assert all(each["ended"] in ("done", "ArtifactError") for each in found)
+        assert goal_of(run) in (OLD, NEW)
+        assert names(run.parent) == ["run"]
+
+
+def calls_of(run, solution, **how):
+    """The calls that a save makes below the folder of `run`, which is as before after that."""
+    copy = shutil.copytree(run, run.parent.parent / "copy")
+    found = tried(lambda: dd.save(solution, run), run.parent, **how)["found"]
+    shutil.rmtree(run)
+    shutil.move(copy, run)
+    return found
+
+
+def check(run, solutions, at, fault, *, exchanges=True):
+    """One fault in one save: the old run is there or the new one, and the new plan is where the message says."""
+    kept = run.parent.parent / "kept"
+    told = tried(lambda: dd.save(solutions[1], run), run.parent, at, fault, exchanges=exchanges)
+    left = [path for path in run.parent.iterdir() if path.name.startswith("run.")]
+    if not run.exists():  # only where names cannot be exchanged, in the moment between two renames
+        assert not exchanges
+        assert fault in (KILLED, KILLED_AFTER)
+        assert sorted(goal_of(path) for path in left) == [OLD, NEW]
+        (partial,) = run.parent.glob("run.partial-*")
+        recover(partial)
+        left.remove(partial)
+    now = goal_of(run)
+    assert now in (OLD, NEW)
+    if told["ended"] == "done":
+        assert now == NEW
+    elif told["ended"] != "killed":
+        assert (told["ended"], told["named"]) == ("WriteError", True), told
+        places = [run, *left, *kept.iterdir()]
+        assert any(str(place) in told["message"] and has_plan(place, solutions[1]) for place in places), told
+    for path in left:
+        shutil.rmtree(path)
+    for path in [*kept.iterdir()]:
+        shutil.rmtree(path)
+    (run.parent / ".run.lock").unlink(missing_ok=True)
+    assert names(run.parent) == ["run"]
+    return now
+
+
+def test_the_trace_has_every_call_that_changes_the_disk(run, solutions):
+    """As the interpreter's own audit tells of them."""
+
+    def seen():
+        opened = []
+
+        def hear(event, words):
+            if event == "open" and not isinstance(words[0], int) and isinstance(words[2], int):
+                path = os.fsdecode(words[0])
+                if path.startswith(str(run.parent)) and words[2] & (os.O_WRONLY | os.O_RDWR):
+                    opened.append(path)
+            if event in ("os.mkdir", "os.rename") and str(words[0]).startswith(str(run.parent)):
+                opened.append(event)
+
+        sys.addaudithook(hear)
+        dd.save(solutions[1], run)
+        return [sum(name in ("os.mkdir", "os.rename") for name in opened), len(opened)]
+
+    calls = calls_of(run, solutions[1])
+    renames, heard = ended(*forked(seen))["found"]
+    kinds = [call.split()[0] for call in calls]
+    assert kinds.count("mkdir") + kinds.count("replace") == renames
+    assert kinds.count("create") == heard - renames
+    assert kinds.count("exchange") == 1
+
+
+def test_a_fault_in_any_call_loses_nothing(run, solutions, monkeypatch):
+    """Every fourth call meets one fault, and each fault comes; the slow test has every call meet all."""
+    quick_pages(monkeypatch)
+    calls = calls_of(run, solutions[1])
+    assert len(calls) > 50
+    for at in range(0, len(calls), 4):
+        if check(run, solutions, at, FAULTS[at // 4 % len(FAULTS)]) == NEW:
+            dd.save(solutions[0], run)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exchanges", [True, False])
+def test_every_fault_in_any_call_loses_nothing(run, solutions, monkeypatch, exchanges):
+    quick_pages(monkeypatch)
+    count = len(calls_of(run, solutions[1], exchanges=exchanges))
+    for at in range(count):
+        for fault in FAULTS if exchanges else (*ERRORS[:1], KILLED):
+            if check(run, solutions, at, fault, exchanges=exchanges) == NEW:
+                dd.save(solutions[0], run)
+
+
+@pytest.mark.slow
+def test_of_200_kills_at_random_moments_none_loses_a_run(run, solutions, monkeypatch):
+    quick_pages(monkeypatch)
+    rng, seen = random.Random(3), []
+    for _ in range(200):
+        killed_after(lambda: dd.save(solutions[1], run), rng.uniform(0, 0.3))
+        seen.append(goal_of(run))
+        for path in run.parent.glob("run.partial-*"):
+            shutil.rmtree(path)
+        if seen[-1] == NEW:
+            dd.save(solutions[0], run)
+    assert OLD in seen
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_each_signal_ends_a_search_with_its_best_plan(solutions, tmp_path, number):
+    before, plans = signal.getsignal(number), []
+    words = {"method": "ilqr", "on_plan": plans.append, "progress": lambda _: signal.raise_signal(number)}
+    solution = dd.solve(solutions[1].problem, **words)
+    assert solution.status is dd.Status.INTERRUPTED
+    assert signal.getsignal(number) is before
+    (plan,) = plans
+    assert (plan.status, plan.search.arguments["method"]) == (dd.Status.INTERRUPTED, "ilqr")
+    assert np.array_equal(plan.us, solution.us)
+    assert np.array_equal(plan.xs, solution.xs)
+    keep_plan(plan, tmp_path / "run.partial-1-0123abcd")
+    assert "the run was interrupted" in dd.load_record(tmp_path / "run.partial-1-0123abcd").sentence
+    assert has_plan(tmp_path / "run.partial-1-0123abcd", plan)
+
+
+def test_a_signal_that_somebody_hears_or_that_is_ignored_is_left_to_them(solutions):
+    heard, before = [], signal.signal(signal.SIGTERM, lambda *_: heard.append("own"))
+    hup = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+
+        def raise_both(_):
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGHUP)
+
+        assert dd.solve(solutions[1].problem, method="ilqr", progress=raise_both).success
+    finally:
+        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGHUP, hup)
+    assert heard
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or sys.platform != "linux", reason="only root mounts a small disk")
+def test_on_a_disk_that_is_full_the_plan_is_kept_on_another(solutions, tmp_path, monkeypatch):
+    disk, kept = tmp_path / "disk", tmp_path / "kept"
+    disk.mkdir()
+    kept.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(kept))
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", str(disk)], check=False).returncode:
+        pytest.skip("no disk can be mounted here")
+    try:
+        with pytest.raises(WriteError, match="No space left on device") as raised:
+            dd.save(solutions[1], disk / "run")
+        (left,) = disk.glob("run.partial-*")
+        assert str(left) in str(raised.value)
+        assert has_plan(left, solutions[1])
+        shutil.rmtree(left)
+        with pytest.raises(OSError, match="No space"):
+            (disk / "filled").write_bytes(bytes(2**17))
+        with pytest.raises(WriteError, match="the plan is in") as raised:
+            dd.save(solutions[1], disk / "run")
+        (elsewhere,) = kept.iterdir()
+        assert str(elsewhere) in str(raised.value)
+        assert has_plan(elsewhere, solutions[1])
+        assert recover(elsewhere, tmp_path / "out").verdict == "pass"
+        assert goal_of(tmp_path / "out") == NEW
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_the_command_tells_of_a_refusing_disk_in_a_sentence(tmp_path, monkeypatch, capsys):
+    task = f"""
+import drake_diff as dd
+
+def problem():
+    model = dd.load_model({str(MODELS / "pendulum.urdf")!r}, time_step=0.02)
+    return dd.Problem(model, x0=[0, 0], x_goal=[0.1, 0], num_steps=5, running_cost=dd.QuadraticCost(R=[[1.0]]))
+
+solve_options = {{"method": "shooting"}}
+"""
+    (tmp_path / "task.py").write_text(task)
+
+    def refused(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(files, "FileIO", refused)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["drake-diff", "run", str(tmp_path / "task.py"), "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    told = capsys.readouterr().err
+    assert end.value.code == cli.USAGE
+    assert told.startswith(f"drake-diff: WriteError: cannot write {tmp_path}/out.partial-")
+    assert "No space left on device" in told
+    assert "bug" not in told
+
+
+def test_the_error_of_a_disk_is_an_os_error_and_travels(tmp_path):
+    with pytest.raises(OSError, match=r"cannot write .*No such file") as raised:
+        files.write_whole(tmp_path / "missing" / "file", b"")
+    again = pickle.loads(pickle.dumps(raised.value))
+    assert (type(again), str(again)) == (WriteError, str(raised.value))
+
+
+def test_a_plan_that_was_kept_is_measured_as_it_would_have_been(run, solutions):
+    expected = dd.save(solutions[1], run.parent / "expected")
+    shutil.rmtree(run)
+    partial = run.parent / "run.partial-1-0123abcd"
+    keep_plan(solutions[1], partial)
+    assert dd.load_record(partial).verdict == "incomplete"
+    assert "incomplete" in str(dd.verify(partial))
+    record = recover(partial)
+    assert names(run.parent) == ["expected", "run"]
+    assert (record.verdict, record.name) == ("pass", "run")
+    assert record.metrics == expected.metrics
+    assert record.replays == expected.replays
+    assert record.gradient == expected.gradient
+    assert goal_of(run) == NEW
+    found = dd.verify(run)
+    assert (found.verdict, found.complaints) == ("undecided", ()), found
+
+
+def test_what_cannot_be_recovered_is_said(run, solutions, tmp_path):
+    with pytest.raises(InputError, match=r"a directory NAME\.partial-"):
+        recover(run)
+    open_ = run.parent / "run.partial-1-0123abcd"
+    begin(open_, solutions[1].problem)
+    with pytest.raises(InputError, match="no run is replaced"):
+        recover(open_)
+    with pytest.raises(ArtifactError, match="no plan of a solve in it"):
+        recover(open_, tmp_path / "out")
+    with writing(run), pytest.raises(ArtifactError, match="being written"):
+        recover(open_, tmp_path / "out")
+    model_file = Path(shutil.copy(MODELS / "pendulum.urdf", tmp_path))
+    model = dd.load_model(model_file, time_step=0.02)
+    problem = dd.Problem(model, x0=[0, 0], num_steps=3, final_cost=lambda x: x[0] ** 2)
+    shown = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", np.zeros((4, 2)), np.zeros((3, 1)))
+    keep_plan(shown, run.parent / "mine.partial-1-0123abcd")
+    with pytest.raises(ArtifactError, match="a user's function"):
+        recover(run.parent / "mine.partial-1-0123abcd")
+    problem = dd.Problem(model, x0=[0, 0], num_steps=3, running_cost=dd.QuadraticCost(R=[[1.0]]))
+    keep_plan(dd.solve(problem, method="shooting"), run.parent / "moved.partial-1-0123abcd")
+    model_file.unlink()
+    with pytest.raises(ModelError, match="is gone"):
+        recover(run.parent / "moved.partial-1-0123abcd")
+    assert names(run.parent) == [
+        "mine.partial-1-0123abcd", "moved.partial-1-0123abcd", "run", "run.partial-1-0123abcd",
+    ]  # fmt: skip
