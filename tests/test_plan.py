@@ -146,9 +146,9 @@ def test_bad_words_are_one_sentence_and_status_2(words, arm, tmp_path, monkeypat
 
 def test_unknown_names_list_the_known_ones(arm, tmp_path):
     with pytest.raises(UnknownNameError, match="elbow, shoulder"):
-        plan(arm, goals={"knee": 1.0}, out=tmp_path)
+        plan(arm, goals={"knee": 1.0}, out=tmp_path / "out")
     with pytest.raises(InputError, match="limits"):
-        plan(arm, goals={"elbow": 4.0}, out=tmp_path)
+        plan(arm, goals={"elbow": 4.0}, out=tmp_path / "out")
 
 
 def test_what_nothing_drives_is_refused(tmp_path):

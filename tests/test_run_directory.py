@@ -311,6 +311,20 @@ def test_a_signal_that_somebody_hears_or_that_is_ignored_is_left_to_them(solutio
     assert heard
 
 
+def test_a_signal_that_comes_while_a_plan_is_kept_waits_for_it(solutions, tmp_path, monkeypatch):
+    partial, begun = tmp_path / "run.partial-1-0123abcd", files.write_whole
+
+    def interrupted(path, data):
+        signal.raise_signal(signal.SIGINT)
+        begun(path, data)
+
+    monkeypatch.setattr("drake_diff.artifact.rerun.write_whole", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        keep_plan(solutions[1], partial)
+    assert has_plan(partial, solutions[1])
+    assert dd.load_record(partial).solver.status == "converged"
+
+
 @pytest.mark.skipif(os.geteuid() != 0 or sys.platform != "linux", reason="only root mounts a small disk")
 def test_on_a_disk_that_is_full_the_plan_is_kept_on_another(solutions, tmp_path, monkeypatch):
     disk, kept = tmp_path / "disk", tmp_path / "kept"

@@ -58,6 +58,26 @@ def noted_interrupts() -> Iterator[threading.Event]:
             signal.signal(number, former[number])
 
 
+@contextmanager
+def held_interrupts() -> Iterator[None]:
+    """What comes while the block runs does what it does when that has ended: what is short and must be whole."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    former = {number: signal.getsignal(number) for number in (signal.SIGINT, *ALIKE)}
+    taken = [number for number, was in former.items() if was not in (None, signal.SIG_IGN)]
+    for number in taken:
+        signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, former[number])
+        for each in came:
+            signal.raise_signal(each)
+
+
 def _hush(number: int) -> None:
     """A terminal that has hung up takes no more words: they go nowhere, where else each would be an error."""
     if number != signal.SIGHUP:

@@ -10,7 +10,7 @@ from drake_diff.artifact.rerun import PLAN, read_plan, rebuilt, resolve
 from drake_diff.artifact.save import record_of, write_files
 from drake_diff.artifact.sections import unknown_functions
 from drake_diff.exceptions import ArtifactError, InputError
-from drake_diff.record.directory import is_partial, name_of, place, writing, written_whole
+from drake_diff.record.directory import is_partial, is_taken, name_of, place, writing, written_whole
 from drake_diff.record.read import load_record
 from drake_diff.record.sealed import SealedRecord, files_below
 from drake_diff.record.solve import EvidenceRecord
@@ -52,7 +52,7 @@ def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecor
     own = folder.with_name(name_of(folder))
     target = own if out is None else Path(out).resolve()
     with nullcontext() if target == own else writing(own):
-        if target.is_dir() and any(target.iterdir()):
+        if is_taken(target):
             expected = "a new or empty directory, as no run is replaced: --out names another"
             raise InputError("OUT", got=str(target), expected=expected)
         record = load_record(folder)

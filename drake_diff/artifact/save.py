@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from drake_diff._base.files import make_folder
+from drake_diff._base.signals import held_interrupts
 from drake_diff.artifact.measurement import Measurement, elsewhere_evidence, failure_of, measure, replay_evidence
 from drake_diff.artifact.phased import directory_of, phases_record, save_phases
 from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, write_plan
@@ -122,18 +123,21 @@ def write_run(solution: Solution | PhasedSolution, folder: Path) -> EvidenceReco
 
 
 def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
-    """Write the plan, with a record that says "incomplete", into `folder`: `recover` measures it from there."""
-    if isinstance(solution, PhasedSolution):
-        for i, phase in enumerate(solution.phases):
-            keep_plan(phase, folder / directory_of(i))
+    """Write the plan, with a record that says "incomplete", into `folder`: `recover` measures it from there.
+
+    A signal waits until both are there.
+    """
+    with held_interrupts():
         sentence = f"{NOT_MEASURED}: {solution.message}"
-        phases_record(folder, solution.problem, "incomplete", sentence).begin(folder)
-        return
-    make_folder(folder)
-    write_plan(folder / PLAN, solution)
-    sections = asked(solution.problem, solution) | found(solution, measured=False)
-    sentence = f"{NOT_MEASURED}: {solution.message}"
-    _record(folder, solution.wall_time, verdict="incomplete", sentence=sentence, **sections).begin(folder)
+        if isinstance(solution, PhasedSolution):
+            for i, phase in enumerate(solution.phases):
+                keep_plan(phase, folder / directory_of(i))
+            phases_record(folder, solution.problem, "incomplete", sentence).begin(folder)
+            return
+        make_folder(folder)
+        write_plan(folder / PLAN, solution)
+        sections = asked(solution.problem, solution) | found(solution, measured=False)
+        _record(folder, solution.wall_time, verdict="incomplete", sentence=sentence, **sections).begin(folder)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import typer
 from rich.live import Live
 from rich.text import Text
 
+from drake_diff._base.signals import INTERRUPTED
 from drake_diff.cli.text import Seed, console, judged, out_option, plain, show, table
 from drake_diff.exceptions import InputError
 
@@ -64,10 +65,15 @@ def plan(
     obstacles = [SphereObstacle(n[:3], n[3]) if kind == "sphere" else BoxObstacle(n[:3], n[3:]) for kind, n in shapes]
 
     file = robot or example_files()[EXAMPLE]
-    with _live(file.name) as report:
-        done = planned(
-            file, goals=goals, avoid=obstacles, time=time, out=out, seed=seed, restarts=restarts, report=report
-        )
+    try:
+        with _live(file.name) as report:
+            done = planned(
+                file, goals=goals, avoid=obstacles, time=time, out=out, seed=seed, restarts=restarts, report=report
+            )
+    except KeyboardInterrupt as error:
+        show("; ".join(("interrupted", *getattr(error, "__notes__", ()))))
+        show("drake-diff recover measures the plan there, if there is one")
+        raise typer.Exit(INTERRUPTED) from None
     show(judged("pass" if done.success else "fail"), f" {file.name}: {done.solution.status.value}")
     for line in done.lines:
         show(plain(line))

@@ -81,7 +81,7 @@ def _solved_into(directory: Path, problem: Any, options: dict[str, Any], elsewhe
     from drake_diff.artifact.other_plants import elsewhere as follow_elsewhere
     from drake_diff.artifact.save import begin, begin_failure, begin_interrupted, keep_plan, plan_kept, write_run
     from drake_diff.optimize.solve import solve
-    from drake_diff.record.directory import written_whole
+    from drake_diff.record.directory import is_taken, written_whole
 
     folders: list[Path] = []
 
@@ -112,7 +112,7 @@ def _solved_into(directory: Path, problem: Any, options: dict[str, Any], elsewhe
             if folders and not isinstance(error, WriteError):
                 begin_failure(error, folders[0], problem)
             raise
-        if record.solver.status == "interrupted" and directory.is_dir() and any(directory.iterdir()):
+        if record.solver.status == "interrupted" and is_taken(directory):
             show(judged(record.verdict), f" interrupted: {record.sentence}")
             show(f"{directory} has an earlier run, which stays; this one is in {folders[0]}")
             raise typer.Exit(1)

@@ -3,7 +3,9 @@
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,18 +16,18 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.artifact.measurement import measure
-from drake_diff.artifact.save import save
+from drake_diff.artifact.save import keep_plan, plan_kept, write_run
 from drake_diff.artifact.verify import Verification, verify_own
 from drake_diff.certificates.audit import audit
 from drake_diff.certificates.finding import Finding
-from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning
+from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning, WriteError
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import QuadraticCost
 from drake_diff.optimize.problem.goals import FrameGoal
 from drake_diff.optimize.problem.obstacles import Obstacle, along_steps, doubts_of
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.solution import Solution
+from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.solve import solve
 from drake_diff.planning.around import Space, lines
 from drake_diff.planning.flying import flight
@@ -35,6 +37,7 @@ from drake_diff.planning.robot import Robot, load_robot
 from drake_diff.planning.shifting import random_shift, shift_to
 from drake_diff.planning.standing import Legged, Rest
 from drake_diff.planning.task import Task, asked, postures
+from drake_diff.record.directory import check_place, is_taken, name_of, written_whole
 from drake_diff.record.solve import EvidenceRecord
 
 TIMES = (None, "least")
@@ -163,6 +166,9 @@ def plan(
     Raises:
         InputError: A goal, an obstacle or an option is wrong.
         ModelError: The file cannot be read, nothing in it can be driven, or a goal cannot be reached.
+        ArtifactError: Somebody else is writing `out`.
+        WriteError: The disk is full, or does not let a file be written; the message says where the plan is.
+        KeyboardInterrupt: It was interrupted, and an earlier run is in `out`; a note says where this one is.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -175,32 +181,41 @@ def plan(
     if time not in TIMES:
         raise InputError("time", got=repr(time), expected='None or "least"')
     clock = _Clock(report or _quiet)
-    with warnings.catch_warnings():
+    if out is not None:
+        check_place(Path(out).resolve())  # before minutes are spent
+    with warnings.catch_warnings(), ExitStack() as stack:
         warnings.simplefilter("ignore", ModelWarning)
+        folders: list[Path] = []
         held = "the least time is sought without contact" if time else ""
         for _ in range(2):
             clock.begin("load", path.name)
             ready = load_robot(path, seed, held)
+            if not folders:
+                directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
+                folders.append(stack.enter_context(written_whole(directory)))
             clock.begin("audit", str(ready.model))
             findings = tuple(audit(ready.model))
             clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
             task = asked(ready.model, goals or {}, avoid)
             try:
                 attempts = (attempt.restarted(restarts) for attempt in _attempts(ready, task, time, seed))
-                tried, found, apart = _first_that_holds(attempts, clock)
+                tried, found, apart = _first_that_holds(attempts, clock, partial(_keep, folder=folders[0]))
             except ModelError as error:
                 if ready.standing is None:
                     raise
                 tried, found, apart = [str(error)], [], False
-            if apart or ready.standing is None:
+            if apart or ready.standing is None or (found and found[-1].status is Status.INTERRUPTED):
                 break
             held = f"no plan with its feet on the ground was verified: {'; '.join(tried)}"
         if not found:
             raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or NOTHING}")
         best = found[-1] if apart else min(found, key=lambda s: s.defect + s.goal_error)
-        directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
         clock.begin("save", best.status.value)
-        record = save(best, directory)
+        with plan_kept(best, directory.name, folders[0]):
+            record = write_run(best, folders[0])
+        if best.status is Status.INTERRUPTED and is_taken(directory):
+            raise KeyboardInterrupt  # it stays beside the earlier run
+        stack.close()  # it takes its place
         clock.begin("verify", record.verdict)
         verification = verify_own(directory)
         seconds = clock.end()
@@ -227,9 +242,9 @@ class _Attempt:
         """The same with as many more first guesses."""
         return replace(self, options={**self.options, "restarts": restarts})
 
-    def solved(self, progress: Callable[[str], None]) -> Solution:
+    def solved(self, progress: Callable[[str], None], on_plan: Callable[[Solution], None]) -> Solution:
         begun = None if self.guess is None else (self.guess.xs, self.guess.us)
-        return solve(self.problem, initial_guess=begun, progress=progress, **self.options)
+        return solve(self.problem, initial_guess=begun, progress=progress, on_plan=on_plan, **self.options)
 
     def depth(self, solution: Solution) -> float:
         """[m] the deepest overlap of shapes along a solution; 0 where none is looked for, or all are in its steps."""
@@ -241,8 +256,18 @@ class _Attempt:
         return max(self.robot.overlap(x[: self.problem.model.nq]) for x in xs[::LOOKS])
 
 
-def _first_that_holds(attempts: Iterator[_Attempt], clock: "_Clock") -> tuple[list[str], list[Solution], bool]:
-    """How each attempt ended, the solutions, and whether the last one is verified and keeps shapes apart."""
+def _keep(plan: Solution, folder: Path) -> None:
+    with plan_kept(plan, name_of(folder), folder):
+        keep_plan(plan, folder)
+
+
+def _first_that_holds(
+    attempts: Iterator[_Attempt], clock: "_Clock", on_plan: Callable[[Solution], None]
+) -> tuple[list[str], list[Solution], bool]:
+    """How each attempt ended, the solutions, and whether the last one is verified and keeps shapes apart.
+
+    An interrupt ends the attempts.
+    """
     tried: list[str] = []
     found: list[Solution] = []
     for first in attempts:
@@ -250,13 +275,17 @@ def _first_that_holds(attempts: Iterator[_Attempt], clock: "_Clock") -> tuple[li
         while attempt is not None:
             clock.begin("solve", attempt.name)
             try:
-                solution = attempt.solved(lambda line: clock.report("solve", line))
+                solution = attempt.solved(lambda line: clock.report("solve", line), on_plan)
+            except WriteError:
+                raise
             except DrakeDiffError as error:
                 tried.append(f"{attempt.name}: not possible ({error})")
                 break
             depth = attempt.depth(solution) if solution.success else 0.0
             found.append(solution)
             tried.append(f"{attempt.name}: {solution.status.value}")
+            if solution.status is Status.INTERRUPTED:
+                return tried, found, False
             failures = measure(solution).failures if solution.success else ()
             if solution.success and depth <= TOUCHING and not failures:
                 return tried, found, True

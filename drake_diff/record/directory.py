@@ -91,7 +91,7 @@ def _put(partial: Path, target: Path) -> Path | None:
     check_place(target)  # a run may take hours
     if target.is_dir():
         take_mode(partial, target)
-        if any(target.iterdir()):
+        if is_taken(target):
             return _exchanged(partial, target)
     move(partial, target)
     return None
@@ -133,6 +133,11 @@ def _kept(message: str, folder: Path) -> WriteError:
     error = WriteError(message)
     error.kept = folder
     return error
+
+
+def is_taken(directory: Path) -> bool:
+    """Whether there is anything in `directory`."""
+    return directory.is_dir() and any(directory.iterdir())
 
 
 def partial_of(target: Path) -> Path:
