@@ -151,7 +151,18 @@ def test_a_link_to_a_run_stays_and_an_empty_directory_is_taken(run, solutions, t
 
 
 def test_every_kind_of_record_is_known_by_its_name():
-    assert sorted(RECORDS) == sorted(kind.FILE for kind in KINDS)
+    assert {kind.FILE for kind in KINDS} <= set(RECORDS)
+
+
+def test_a_panel_leaves_others_files_alone(tmp_path):
+    (tmp_path / "trials.py").write_text("def square(trial): return {'cost': trial['x'] ** 2}")
+    (tmp_path / "panel.toml").write_text('evaluate = "trials.py:square"\n[axes]\nx = [1, 2]')
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "table.csv").write_text("mine")
+    with pytest.raises(InputError, match=r"which holds 'table\.csv'"):
+        dd.panels.run_panel(tmp_path / "panel.toml", out=tmp_path / "out", workers=1)
+    assert names(tmp_path / "out") == ["table.csv"]
+    assert (tmp_path / "out" / "table.csv").read_text() == "mine"
 
 
 def test_who_comes_second_is_refused_at_once_and_a_kill_leaves_no_lock(run, solutions):

@@ -42,7 +42,7 @@ def run_panel(
         The rows and the summary, as in `table.csv` and `summary.json`.
 
     Raises:
-        InputError: the panel file is wrong, or its function cannot be loaded.
+        InputError: the panel file is wrong, its function cannot be loaded, or `out` holds what no panel wrote.
         ArtifactError: `out` holds another panel or a damaged journal, or another process is writing there.
         MissingDependencyError: Ray is asked for and not installed.
 

@@ -17,13 +17,14 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from drake_diff._base.files import doing, write_whole
+from drake_diff._base.files import doing, make_folder, write_whole
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import success_rate
-from drake_diff.exceptions import ArtifactError
+from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.panels.panel_file import PanelTrial, canonical, cell_name
 from drake_diff.panels.ranking import ranked, write_ranking
 from drake_diff.panels.workers import Row
+from drake_diff.record.directory import is_taken
 from drake_diff.record.panel import TRIALS, PanelRecord, PanelTrialRecord, no_model, trial_record
 from drake_diff.record.provenance import provenance_of, written_now
 from drake_diff.record.sealed import WallClock
@@ -81,10 +82,14 @@ class Journal:
 def journal(directory: Path, panel: Mapping[str, Any], known: Collection[str]) -> Iterator[Journal]:
     """Open the journal in `directory` of the panel that `panel` describes, with the trials `known`.
 
-    ArtifactError where it is another panel's, where a whole line is damaged, or where another process has it open.
+    ArtifactError where it is another panel's, where a whole line is damaged, or where another process has it open;
+    InputError where the directory holds other things, and no journal.
     """
-    directory.mkdir(parents=True, exist_ok=True)
     path = directory / JOURNAL
+    if not path.exists() and is_taken(directory):
+        expected = "a new or empty directory, or one in which a panel was begun"
+        raise InputError("out", got=f"{directory}, which holds {next(directory.iterdir()).name!r}", expected=expected)
+    make_folder(directory)
     with open(path, "a+b") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
