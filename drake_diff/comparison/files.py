@@ -87,7 +87,7 @@ def record_of(
         "sentence": str(comparison),
         "states": [records.StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
         "engines": [_engine(e, causes.get(e.engine)) for e in comparison.engines],
-        "data": _data(comparison),
+        "data": _data(comparison, causes),
         "refused": [records.RefusedEvidence(**vars(refused)) for refused in comparison.refused],
         "wall_clock": records.ComparisonClock(
             written_utc=written_now(),
@@ -112,7 +112,7 @@ def _begun(name: str, model: Model) -> ComparisonRecord:
     )  # fmt: skip
 
 
-def _data(comparison: Comparison) -> DataBoundary:
+def _data(comparison: Comparison, causes: Mapping[str, records.CauseEvidence]) -> DataBoundary:
     """What all were given, and the recordings, which have neither Jacobians nor times."""
 
     def use(name: str, what: str, *arrays: Array) -> DataUse:
@@ -126,7 +126,10 @@ def _data(comparison: Comparison) -> DataBoundary:
         for e in recorded
     ]
     statement = "nothing was fitted: engines are compared by their own steps, recordings as they were made"
-    return DataBoundary(statement=statement, seen=[], judged_on=[motion, *recordings])
+    seen = [recording for recording in recordings if recording.name in causes]
+    if seen:
+        statement = "engines are compared by their own steps; the cause of a recording was fitted to that recording itself"
+    return DataBoundary(statement=statement, seen=seen, judged_on=[motion, *recordings])
 
 
 def _engine(e: Compared, cause: records.CauseEvidence | None) -> records.EngineEvidence:
