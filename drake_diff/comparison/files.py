@@ -128,7 +128,7 @@ def _data(comparison: Comparison, causes: Mapping[str, records.CauseEvidence]) -
     statement = "nothing was fitted: engines are compared by their own steps, recordings as they were made"
     seen = [recording for recording in recordings if recording.name in causes]
     if seen:
-        statement = "engines are compared by their own steps; the cause of a recording was fitted to that recording itself"
+        statement = "engines are compared by their own steps; the cause of a recording was fitted to it"
     return DataBoundary(statement=statement, seen=seen, judged_on=[motion, *recordings])
 
 
