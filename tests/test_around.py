@@ -104,7 +104,8 @@ def test_the_same_seed_finds_the_same_lines(arm):
 def test_a_hand_goes_around_a_ball_and_the_plan_is_clear_by_the_closed_form(arm, tmp_path):
     angle = 0.5
     center = -0.95 * np.array([np.sin(angle), 0, np.cos(angle)])
-    done = plan(arm, goals={"shoulder": 1.0, "elbow": 0.0}, avoid=[dd.SphereObstacle(center, 0.08)], out=tmp_path)
+    ball = dd.SphereObstacle(center, 0.08)
+    done = plan(arm, goals={"shoulder": 1.0, "elbow": 0.0}, avoid=[ball], out=tmp_path / "run")
     assert done.success, done.lines
     times = np.linspace(0, done.solution.horizon, 1 + round(1000 * done.solution.horizon))
     qs = done.solution.transcribed.at(times)[0][:, :2]

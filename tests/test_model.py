@@ -23,7 +23,7 @@ NAMES = sorted(p.name for p in MODELS.iterdir())
 
 def test_there_is_a_model_of_each_format():
     assert {name.rsplit(".", 1)[1] for name in NAMES} == {"urdf", "sdf", "xml"}
-    assert len(NAMES) == 16
+    assert len(NAMES) == 17
 
 
 @each_row("name", NAMES)

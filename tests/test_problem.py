@@ -122,7 +122,7 @@ def test_a_nan_goal_is_free(load):
             {"optimize": "initial_state", "us": np.full((10, 1), 21.0)},
             r"us, force: expected within \[-20, 20\], got 21",
         ),
-        ({"x0": None}, "x0: expected an array of numbers, got None"),
+        ({"x0": None}, r"x0: expected shape \(4,\), got shape \(\)"),
         ({"x0": "rest"}, "x0: expected an array of numbers, got 'rest'"),
         ({"x0": [0, 0, 0, math.inf]}, r"x0\[3\]: expected a finite number, got inf"),
         ({"num_steps": 10.0}, "num_steps: expected a whole number of at least 1, got 10.0"),

@@ -43,8 +43,8 @@ def saying(model, values, *, file=None, explained=True):
     return Identification(
         values=values, start=start, intervals=intervals, units={n: own[n].unit if n in own else "1" for n in values},
         unidentifiable=(), explained=explained, reason="", sentence="Explained: so -- it is -->.", noise={},
-        error_before=2.0, error_after=1.0, residuals=(), columns=(), covariance=np.eye(count), score=0.0, count=9,
-        converged=True, steps=1, motion="continuous time", motions=(),
+        error_before=2.0, error_after=1.0, residuals=(), entries=(), columns=(), covariance=np.eye(count), score=0.0,
+        count=9, converged=True, steps=1, motion="continuous time", motions=(),
         asked=Asked(model, (recording,), (file,), tuple(values), {}, 0.2, "auto", 60),
     )  # fmt: skip
 

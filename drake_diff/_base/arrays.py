@@ -18,6 +18,7 @@ Indices = NDArray[np.intp]
 FLOAT = np.dtype(float)
 NUMBERS = "fiub"  # the kinds of NumPy's types that are: floats, integers, booleans
 LARGEST, LARGEST_COUNT = float(np.finfo(float).max), 2**31 - 1  # what a double holds; an int of the solvers
+LARGEST_SEED = 2**64  # of NumPy's generators, which are also given the seeds of 32 bits that others make
 SHORTEST, LONGEST = 1e-12, 1e6  # [s]
 
 
@@ -55,11 +56,11 @@ def array_with_gaps(subject: str, values: Any, shape: Sequence[int | str]) -> Ar
 
 
 def _of_numbers(subject: str, values: Any) -> Array:
-    """`values` as a read-only float array; NumPy alone takes dates, texts and what a mask hides for numbers."""
+    """`values` as a read-only float array, None being NaN; NumPy alone takes dates, texts and what a mask hides."""
     try:
         array = np.array(values)
         plain = array.dtype.kind in NUMBERS or (
-            array.dtype.kind == "O" and all(isinstance(each, Real) for each in array.flat)
+            array.dtype.kind == "O" and all(each is None or isinstance(each, Real) for each in array.flat)
         )
         if not plain or isinstance(values, np.ma.MaskedArray):
             raise TypeError("no numbers")

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_diff._base.arrays import Array, array_with_gaps, count, finite_array, frozen, positive_float
+from drake_diff._base.arrays import LARGEST_SEED, Array, array_with_gaps, count, finite_array, frozen, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, NonFiniteError, SimulationError, UnknownNameError
 from drake_diff.loop.parts import Actuator, Estimator, Fallback, Hold, Sensor
@@ -163,7 +163,8 @@ def closed_loop(
         array([0.5, 0.5, 0.5])
     """
     x0, steps = finite_array("x0", x0, (model.nx,)), count("num_steps", num_steps, 1)
-    return _LoopRun(model, controller, loop or Loop(), np.random.default_rng(count("seed", seed, 0))).result(x0, steps)
+    noise = np.random.default_rng(count("seed", seed, 0, LARGEST_SEED))
+    return _LoopRun(model, controller, loop or Loop(), noise).result(x0, steps)
 
 
 class OpenLoop:

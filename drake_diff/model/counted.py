@@ -39,7 +39,7 @@ def count_steps() -> Iterator[StepCount]:
         >>> from drake_diff.model import count_steps
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
         >>> with count_steps() as count:
-        ...     motion = dd.rollout(model, [0.1, 0], num_steps=20)
+        ...     motion = dd.rollout(model, [0.1, 0], np.zeros((20, 1)))
         >>> count
         StepCount: 20 steps
     """

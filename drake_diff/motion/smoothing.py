@@ -26,7 +26,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_diff._base.arrays import Array, array_with_gaps, count, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.arrays import (
+    LARGEST_SEED,
+    Array,
+    array_with_gaps,
+    count,
+    finite_array,
+    frozen,
+    positive_float,
+    positive_int,
+)
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
@@ -212,7 +221,7 @@ def smooth(
         raise InputError("jacobian", got=None, expected=why)
     if positive_int("samples", samples) < 2:
         raise InputError("samples", got=samples, expected="at least 2: one has no variance")
-    samples, seed = int(samples), count("seed", seed, 0)
+    samples, seed = int(samples), count("seed", seed, 0, LARGEST_SEED)
     sums = _moments(f, x, jacobian, noise, moved, samples, seed, corrects=method == "blend")
     common: dict[str, Any] = {"method": method, "samples": samples, "seed": seed, "noise": noise}
     common |= {"value": frozen(sums["value"].mean), "value_variance": frozen(sums["value"].variance)}

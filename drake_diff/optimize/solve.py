@@ -11,7 +11,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from drake_diff._base.arrays import count, positive_float, positive_int
+from drake_diff._base.arrays import LARGEST_SEED, count, positive_float, positive_int
 from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import penetration
 from drake_diff.model.parameters import applied
@@ -41,7 +41,7 @@ from drake_diff.optimize.transcription.collocation import (
 )
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
 
-LARGEST_SEED, LARGEST_TOLERANCE = 2**64, 1e3
+LARGEST_TOLERANCE = 1e3
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
 OTHER_GUESSES = 8  # of a collocation that finds no motion from a straight line

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, count, positive_int
+from drake_diff._base.arrays import LARGEST_SEED, Array, count, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import Rate, margin, success_rate
 from drake_diff.derivatives.step import derivatives_along
@@ -81,7 +81,7 @@ def robustness(
         >>> result.margins
         {'mass': 0.05}
     """
-    trials, seed = positive_int("trials", trials), count("seed", seed, 0)
+    trials, seed = positive_int("trials", trials), count("seed", seed, 0, LARGEST_SEED)
     if solution.problem.motion != STEPS:
         raise InputError("solution", got='one with motion="continuous"', expected='motion="steps": trials are stepped')
     task = Task(solution.plan, controller, loop)
