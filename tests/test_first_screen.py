@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.artifact import measure
-from drake_diff.artifact.first_screen import asked_for, checks_of
+from drake_diff.artifact.first_screen import _of_replays, asked_for, checks_of
 from drake_diff.artifact.page import alike
 from drake_diff.artifact.save import record_of
 
@@ -117,6 +118,18 @@ def test_a_plan_that_misses_its_goal_is_not_green_whatever_the_solver_says(swung
     assert found["Solver"].kind == "pass"
     assert found["Plan"].kind == "fail"
     assert "pass" not in {found[name].kind for name in found if name in CONTROLS}
+
+
+@pytest.mark.parametrize(("success", "kind"), [(True, "warn"), (False, "fail")])
+def test_replays_that_hold_by_one_of_two_in_turn_are_red_only_where_the_plan_fails(success, kind):
+    """One holds open loop alone, the next with feedback alone: neither way holds in both, and the verdict may pass."""
+    replays = [
+        {"control": control, "variant": variant, "holds": (control == "TVLQR") == (variant == "half"), "failures": []}
+        for control in ("open loop", "TVLQR")
+        for variant in ("whole", "half")
+    ]
+    m = SimpleNamespace(solution=SimpleNamespace(judged_replay=None, success=success))
+    assert [check.kind for check in _of_replays(m, replays)] == [kind, kind]
 
 
 def test_certificates_that_say_the_same_are_one_row():
