@@ -1,11 +1,10 @@
 """A policy of 36 weights that lands from a fall and comes to rest at 0.75 m, trained by gradients through the landing.
 
-They are those of the motion in continuous time, impacts included. What is saved is the plan that the policy makes.
-
-    drake-diff run examples/landing_policy.py    trains, and writes artifacts/landing_policy, which `verify` accepts
-    python examples/landing_policy.py            beside Powell's search, by values alone, and as many simulated steps
+drake-diff run examples/landing_policy.py    trains, and writes the plan that the policy makes, which `verify` accepts
+python examples/landing_policy.py            beside Powell's search, by values alone, and as many simulated steps
 """
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ import drake_diff as dd
 
 HEIGHT, HIDDEN, DROPS, UNSEEN = 0.75, 6, (0.6, 0.75, 0.9), (0.65, 0.85)  # [m] where to, and where the body falls from
 FIRST = np.random.default_rng(0).normal(0, np.repeat([0.5, 0.1], [5 * HIDDEN, HIDDEN]))  # the weights
+warnings.simplefilter("ignore", dd.exceptions.GradientWarning)  # mostly of the first state, which nobody moves
 model = dd.load_model(Path(__file__).parent.parent / "models/hopper.sdf", time_step=0.02, fix_joints=("x", "swing"))
 miss = dd.QuadraticCost(Q=np.diag([1, 0, 0.05, 0]), x_ref=[HEIGHT, 0, 0, 0])  # at rest at the height after 0.8 s
 
@@ -38,8 +38,8 @@ def train(evaluations: int, *, gradients: bool = True) -> np.ndarray:
         found = [fall(dd.differentiate_rollout, weights, z, lambda x: miss(x)) for z in DROPS]
         return np.mean([g.loss for g in found]), np.mean([g.by_policy for g in found], axis=0)
 
-    method, limit = ("L-BFGS-B", "maxfun") if gradients else ("Powell", "maxfev")
-    return minimize(mean, FIRST, jac=gradients, method=method, options={limit: evaluations}).x
+    how = ("L-BFGS-B", {"maxfun": evaluations}) if gradients else ("Powell", {"maxfev": evaluations})
+    return minimize(mean, FIRST, jac=gradients, method=how[0], options=how[1]).x
 
 
 def problem(weights=None) -> dd.Problem:
