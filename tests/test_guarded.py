@@ -223,7 +223,7 @@ def test_20_strange_directories():
 
 
 @pytest.mark.slow
-def test_1000_strange_directories():
-    wrong, ended, _ = fuzz(1000, 0)
+def test_100_strange_directories():
+    wrong, ended, _ = fuzz(100, 0)
     assert wrong == []
-    assert ended["verify: exit status 1"] > 300
+    assert ended["verify: exit status 1"] > 30
