@@ -14,6 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 
 import pytest
+from helpers.forks import fork, status_of
 from helpers.models import MODELS, ROOT
 from helpers.table import each_row
 
@@ -139,10 +140,12 @@ def test_threads_and_forked_processes_each_get_their_answers():
     for thread in threads:
         thread.join()
     assert found == {i: i for i in range(8)}
-    child = os.fork()
-    if child == 0:
-        os._exit(0 if ask(give, value=5).value == 5 else 1)
-    assert os.waitpid(child, 0)[1] == 0
+
+    def asks():
+        answer = ask(give, value=5)
+        assert answer.value == 5, answer
+
+    assert status_of(fork(asks)) == 0
     assert ask(give, value=6).value == 6
 
 

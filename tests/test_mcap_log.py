@@ -8,10 +8,10 @@ import signal
 import struct
 import time
 import tracemalloc
-import warnings
 
 import numpy as np
 import pytest
+from helpers.forks import fork, status_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -287,17 +287,10 @@ def _write_until_killed(path, *, after):
             k += 1
             count[:8] = struct.pack("<q", k)
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # fork beside threads: the child only writes
-        child = os.fork()
-    if child == 0:
-        try:
-            write(path, forever())
-        finally:
-            os._exit(1)
+    child = fork(lambda: write(path, forever()))
     deadline = time.monotonic() + 60
     while struct.unpack("<q", count[:8])[0] < after and time.monotonic() < deadline:
         time.sleep(1e-4)
     os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
+    assert status_of(child) == -signal.SIGKILL
     return struct.unpack("<q", count[:8])[0]

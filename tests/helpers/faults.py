@@ -16,6 +16,7 @@ import drake_diff as dd
 from drake_diff._base import files
 from drake_diff.artifact import page, save
 from drake_diff.record.sealed import files_below
+from helpers.forks import fork, status_of
 
 ERRORS = ("ENOSPC", "EIO", "EACCES")
 FULL = "full"  # a disk that is full from then on: what writes fails, what removes and renames does not
@@ -78,10 +79,10 @@ class Disk:
 
 
 def forked(action):
-    """A running process of `action()`, and the pipe from which `ended` takes what became of it."""
+    """A running process of `action()`, which returns what JSON has, and the pipe from which `ended` takes its end."""
     reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
+
+    def tell():
         try:
             told = {"ended": "done", "found": action()}
         except BaseException as error:
@@ -90,8 +91,10 @@ def forked(action):
                 "message": str(error),
                 "named": isinstance(error, dd.exceptions.DrakeDiffError),
             }
-        os.write(writing, json.dumps(told).encode())
-        os._exit(0)
+        with os.fdopen(writing, "wb") as pipe:
+            pipe.write(json.dumps(told).encode())
+
+    child = fork(tell)
     os.close(writing)
     return child, reading
 
@@ -100,8 +103,9 @@ def ended(child, reading):
     """What became of a process: what it returned, what it raised, or that it was killed."""
     with os.fdopen(reading, "rb") as pipe:
         told = pipe.read()
-    os.waitpid(child, 0)
-    return json.loads(told) if told else {"ended": "killed"}
+    status = status_of(child)
+    assert status in (0, -signal.SIGKILL), f"a forked process ended with status {status}, and told {told!r}"
+    return json.loads(told) if status == 0 else {"ended": "killed"}
 
 
 def tried(action, root, at=None, fault="", *, exchanges=True):
@@ -118,8 +122,12 @@ def tried(action, root, at=None, fault="", *, exchanges=True):
 
 
 def killed_after(action, seconds):
-    """Kill a process of `action()` after so many seconds."""
-    child, reading = forked(action)
+    """Kill a process of `action()` after so many seconds; what it returned, where it had ended by then, is not told."""
+
+    def act():
+        action()
+
+    child, reading = forked(act)
     time.sleep(seconds)
     os.kill(child, signal.SIGKILL)
     return ended(child, reading)

@@ -13,6 +13,7 @@ import numpy as np
 
 import drake_diff as dd
 from drake_diff.exceptions import DrakeDiffError
+from helpers.forks import fork, status_of
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 PROPERTIES = (
@@ -157,21 +158,19 @@ def ends(cases: Iterator[tuple[str, bytes]], path: Path, seconds: int) -> dict[s
     """
     log = path.with_suffix(".log")
     log.touch()
-    child = os.fork()
-    if child == 0:
+
+    def load_all() -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-        try:
-            with log.open("w") as lines:
-                for name, data in cases:
-                    path.write_bytes(data)
-                    lines.write(repr(name) + "\t")
-                    lines.flush()
-                    lines.write(repr(_end(path)) + "\n")
-        finally:
-            os._exit(0)
-    _, status = os.waitpid(child, 0)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what the parsers say
+        with log.open("w") as lines:
+            for name, data in cases:
+                path.write_bytes(data)
+                lines.write(repr(name) + "\t")
+                lines.flush()
+                lines.write(repr(_end(path)) + "\n")
+
+    status = status_of(fork(load_all))
     rows = [line.split("\t") for line in log.read_text().splitlines()]
     assert status == 0, f"the process ended with {status} at {rows[-1][0]}"
     return {name: end for name, end, *_ in rows}
