@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import json
 import os
+import resource
 import shutil
 import socket
 import subprocess
@@ -141,12 +142,37 @@ def test_threads_and_forked_processes_each_get_their_answers():
         thread.join()
     assert found == {i: i for i in range(8)}
 
-    def asks():
-        answer = ask(give, value=5)
-        assert answer.value == 5, answer
-
     assert status_of(fork(asks)) == 0
     assert ask(give, value=6).value == 6
+
+
+def asks():
+    answer = ask(give, value=5)
+    assert answer.value == 5, answer
+
+
+def test_a_process_forked_while_a_thread_asks_waits_for_nobody():
+    """The lock that the thread held stayed locked for ever in a process that has not that thread."""
+    with guarded._taken:
+        assert status_of(fork(asks)) == 0
+
+
+def test_a_process_with_many_open_files_gets_its_answer():
+    """select() refuses files of a number above 1023."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = 2048 if hard == resource.RLIM_INFINITY else min(hard, 2048)
+    if wanted < 2048:
+        pytest.skip("this system does not let a process open so many files")
+    opened = []
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, wanted), hard))
+    try:
+        opened += [os.open(os.devnull, os.O_RDONLY) for _ in range(1100)]
+        guarded._end()
+        assert ask(give, value=7).value == 7
+    finally:
+        for number in opened:
+            os.close(number)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_no_process_is_left_behind():

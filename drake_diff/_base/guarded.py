@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -74,8 +74,9 @@ class _Keeper:
         own = {"PYTHONPATH": os.pathsep.join(places), "OBJC_DISABLE_INITIALIZE_FORK_SAFETY": "YES"}
         if not sys.executable:
             raise ArtifactError("a stranger's model is read in a process of its own, and this Python cannot start one")
-        self.pid, self.process = os.getpid(), subprocess.Popen(
+        self.process = subprocess.Popen(
             [sys.executable, "-P", "-c", COMMAND],  # -P: the current directory may be the stranger's
+            bufsize=0,  # half a request in a buffer would be sent by a process forked from this one too
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True,
             env={**os.environ, **own},
         )  # fmt: skip
@@ -85,21 +86,18 @@ class _Keeper:
         given, answers = self.process.stdin, self.process.stdout
         if given is None or answers is None:
             return None
+        words = json.dumps(request).encode() + b"\n"
         try:
-            given.write(json.dumps(request).encode() + b"\n")
-            given.flush()
+            while words:
+                words = words[os.write(given.fileno(), words) :]
         except OSError:
             return None
         data = _read(answers.fileno(), time.monotonic() + seconds, until=b"\n")
         return None if data is None else json.loads(data)
 
-    @property
-    def alive(self) -> bool:
-        return self.pid == os.getpid() and self.process.poll() is None
-
     def end(self) -> None:
         """Close its input, at which it ends what it does and itself."""
-        if self.pid == os.getpid() and self.process.stdin is not None and self.process.stdout is not None:
+        if self.process.stdin is not None and self.process.stdout is not None:
             with suppress(OSError):
                 self.process.stdin.close()
             self.process.stdout.close()
@@ -122,7 +120,7 @@ def start() -> None:
 
 def _running() -> _Keeper:
     global _one
-    if _one is None or not _one.alive:
+    if _one is None or _one.process.poll() is not None:
         _end()
         _one = _Keeper()
     return _one
@@ -134,6 +132,15 @@ def _end() -> None:
     if _one is not None:
         _one.end()
     _one = None
+
+
+def _forget() -> None:
+    """In a process forked from this one: the keeper is not its own, and who held the lock is not there."""
+    global _one, _taken
+    _one, _taken = None, threading.Lock()
+
+
+os.register_at_fork(after_in_child=_forget)
 
 
 def call(function: str, arguments: Mapping[str, Any], limits: Limits) -> Answer:
@@ -167,9 +174,8 @@ def _read(place: int, deadline: float, until: bytes = b"", watched: int | None =
     None too where `watched` ends; ValueError where there is too much of it.
     """
     found = bytearray()
-    places = [place] if watched is None else [place, watched]
     while True:
-        ready, _, _ = select.select(places, [], [], max(0.0, deadline - time.monotonic()))
+        ready = _ready((place,) if watched is None else (place, watched), deadline - time.monotonic())
         if not ready or watched in ready:
             return None
         piece = os.read(place, 2**16)
@@ -180,6 +186,14 @@ def _read(place: int, deadline: float, until: bytes = b"", watched: int | None =
             return bytes(found)
         if len(found) > MOST_ANSWER:
             raise ValueError(f"its answer has more than {MOST_ANSWER} bytes")
+
+
+def _ready(places: Iterable[int], seconds: float) -> list[int]:
+    """Those of `places` that can be read within so many seconds; select() takes none of a number above 1023."""
+    asked = select.poll()
+    for place in places:
+        asked.register(place, select.POLLIN)
+    return [place for place, _ in asked.poll(max(0.0, 1e3 * seconds))]
 
 
 def keep() -> None:
@@ -199,7 +213,7 @@ def keep() -> None:
 def _line() -> bytes:
     """A line of the input, read byte by byte: nothing of the next one is taken from it, which is watched."""
     found = bytearray()
-    if not select.select([0], [], [], KEPT)[0]:
+    if not _ready((0,), KEPT):
         return b""
     while (piece := os.read(0, 1)) and piece != b"\n":
         found += piece
