@@ -1,5 +1,7 @@
 """Parameters from recordings: closed forms first, then motions integrated by SciPy, which knows nothing of Drake."""
 
+from math import comb
+
 import numpy as np
 import pytest
 from helpers.pendulum import swing
@@ -12,7 +14,7 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.flow import ContinuousMotion
-from drake_diff.identification.judge import colour_of
+from drake_diff.identification.judge import FALSE_ALARM, colour_of, most_scatter
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
@@ -113,6 +115,35 @@ def test_residuals_that_hang_together_are_told_from_white_ones():
     assert colour_of(white, ["a"])[1] > 0.01
     wave = [r + np.sin(np.arange(400) / 9)[:, None] for r in white]
     assert colour_of(wave, ["a"])[1] < 1e-6
+
+
+@pytest.mark.parametrize("count", [25, 49])
+def test_of_few_samples_white_ones_are_not_told_to_hang_together(count):
+    """A line is fitted to each series: by chi-square alone, 5 times as many as should be would be below 0.001."""
+    random = np.random.default_rng(1)
+    line = np.linalg.qr(np.column_stack([np.ones(count), np.arange(count)]))[0]
+    noise = random.standard_normal((count, 4_000))
+    rows = noise - line @ (line.T @ noise)
+    below = sum(colour_of([rows[:, [j]]], ["a"])[1] < 1e-3 for j in range(4_000))
+    assert below <= stats.binom.ppf(0.9999, 4_000, 1.5e-3)  # half as many again as should be
+
+
+@pytest.mark.parametrize("count", [25, 100])
+def test_few_samples_of_noise_scatter_and_few_are_refused_for_it(count):
+    """Of 2,000 times 28 entries of white noise, the share refused is at most what it is said to be."""
+    random, trials, entries = np.random.default_rng(count), 2_000, 28
+    limit = most_scatter(count, entries)
+    refused = 0
+    for _ in range(entries):
+        noise = random.standard_normal((trials, count))
+        least = np.full(trials, np.inf)
+        for order in range(1, 9):
+            differences = np.diff(noise, n=order, axis=1)
+            least = np.minimum(least, np.sqrt(np.mean(differences**2, axis=1) / comb(2 * order, order)))
+        refused += int(np.sum(np.std(noise, axis=1) > limit * least))
+    assert refused <= stats.binom.ppf(0.9999, trials * entries, 2 * FALSE_ALARM / entries)  # the law is right to half
+    assert most_scatter(100_000, entries) == 1.6
+    assert limit < {25: 6, 100: 1.8}[count]  # a motion that is missed by some times the noise is still refused
 
 
 def test_a_chaotic_motion_is_fitted(load):

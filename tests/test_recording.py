@@ -484,6 +484,7 @@ def test_a_mass_on_the_second_of_two_free_bodies_is_identified(tmp_path):
     found = dd.identify(model, log, ["left_arm.mass", "right_arm.mass"])
     assert found.values["right_arm.mass"] == pytest.approx(0.65, rel=0.01)  # of 30 %; the step's own error is 0.1 %
     assert found.values["left_arm.mass"] == pytest.approx(0.5, rel=0.01)
+    assert found.explained, found.reason
 
 
 def two_bag(path, model, xs, names):

@@ -18,12 +18,12 @@ from drake_diff.identification.fit import Fit, Law, Solved, growth_cuts
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.judge import (
     FALSE_ALARM,
-    SCATTER,
     Known,
     colour_of,
     freedom_of,
     intervals_of,
     known_of,
+    most_scatter,
     noise_of,
     score_of,
     unidentifiable,
@@ -427,7 +427,7 @@ class Problem:
                 ratio = float(size[j] / self.stated[j])
                 if ratio**2 > stats.chi2.ppf(0.9999, numbers[j]) / numbers[j]:
                     return f"what is left of {name} is {ratio:.3g} times the noise that was given"
-            elif numbers[j] and size[j] > SCATTER * self.scatter[j]:
+            elif numbers[j] and size[j] > most_scatter(int(numbers[j]), len(names)) * self.scatter[j]:
                 return f"what is left of {name} is {size[j] / self.scatter[j]:.3g} times the scatter of its samples"
         name, p = colour_of(solved.reduced.residuals, names)
         if p < FALSE_ALARM:

@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from math import comb
 
 import numpy as np
 from scipy import stats
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.fit import NO_PRIOR, Fit, Solved
+from drake_diff.identification.measured import ORDERS
 from drake_diff.identification.unknowns import FAR, MASS, Unknowns
 
 CONFIDENCE = 0.95
@@ -16,7 +19,9 @@ NOTHING = 1e-8  # of a unit's effect: rounding
 PART = 0.03  # of the largest change in a combination: what is not told
 FALSE_ALARM = 0.004  # of all tests of residuals together, where the model is right
 LAGS = 10
-SCATTER = 1.6  # times the scatter of neighbouring samples: residuals beyond it are no noise
+MANY = 1000  # samples, from which on Q is nearly as chi-square says
+DRAWN = 2_000_000  # numbers of white noise for each length of a piece
+SCATTER = 1.6  # times the scatter of neighbouring samples: residuals beyond it are no noise, where samples are many
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,27 +172,60 @@ def score_of(fit: Fit, solved: Solved) -> float:
     return float(np.nansum(every**2)) + 2 * float(np.sum(logs))
 
 
+def most_scatter(count: int, tests: int) -> float:
+    """How many times the scatter of neighbouring samples the residuals of `count` samples may be, of `tests` entries.
+
+    The scatter is the least by differences of orders 1 to 8. Of order d it varies as if chi-square had n / C_d degrees
+    of freedom, C_d = binomial(4 d, 2 d) / binomial(2 d, d)^2; the mean of squares, by the same samples, leaves C_d - 1.
+    """
+    freedom = max(count - ORDERS, 1) / (comb(4 * ORDERS, 2 * ORDERS) / comb(2 * ORDERS, ORDERS) ** 2 - 1)
+    return max(SCATTER, float(np.sqrt(freedom / stats.chi2.ppf(FALSE_ALARM / tests, freedom))))
+
+
 def colour_of(residuals: Sequence[Array], names: Sequence[str]) -> tuple[str, float]:
     """(the entry whose residuals are least like white noise, the probability of that in white noise of all entries).
 
-    The test of Ljung and Box (1978), each piece by itself: Q = n (n + 2) sum over lags of rho_k^2 / (n - k).
+    The test of Ljung and Box (1978), each piece by itself: Q = n (n + 2) sum over lags of rho_k^2 / (n - k). Of few
+    samples, Q is not as chi-square says, and the fit has taken a first position and velocity from each piece: Q's mean,
+    variance and skewness are those of white noise less its line, and its tail a gamma's with the same three.
     """
     worst, least, tests = "", 1.0, 0
     for j, name in enumerate(names):
-        total, freedom = 0.0, 0
+        total, cumulants = 0.0, np.zeros(3)
         for piece in residuals:
             r = piece[np.isfinite(piece[:, j]), j]
             n, lags = len(r), min(LAGS, len(r) // 5)
             if lags < 2 or not np.any(r):
                 continue
-            r = r - np.mean(r)
-            size = float(r @ r)
-            rho = np.array([r[k:] @ r[:-k] / size for k in range(1, lags + 1)])
-            total += n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-            freedom += lags
-        if freedom:
+            total += float(_ljung_box(r[None], lags)[0])
+            cumulants += _white(n, lags)
+        if np.any(cumulants):
             tests += 1
-            p = float(stats.chi2.sf(total, freedom))
+            mean, variance, third = cumulants
+            shape, scale = 4 * variance**3 / third**2, third / (2 * variance)
+            p = float(stats.gamma.sf(total - mean + shape * scale, shape, scale=scale))
             if p < least:
                 worst, least = name, p
     return worst, min(1.0, least * tests)
+
+
+def _ljung_box(rows: Array, lags: int) -> Array:
+    """Q of each row."""
+    n = rows.shape[1]
+    r = rows - np.mean(rows, axis=1, keepdims=True)
+    size = np.sum(r**2, axis=1)
+    products = [np.sum(r[:, k:] * r[:, :-k], axis=1) for k in range(1, lags + 1)]
+    found = n * (n + 2) * sum((each / size) ** 2 / (n - k) for k, each in enumerate(products, 1))
+    return np.asarray(found)
+
+
+@lru_cache
+def _white(n: int, lags: int) -> Array:
+    """(3,) mean, variance and third central moment of Q in white noise from which a line was fitted and taken."""
+    if n > MANY:
+        return np.array([lags, 2 * lags, 8 * lags], dtype=float)  # chi-square's
+    line = np.linalg.qr(np.column_stack([np.ones(n), np.arange(n)]))[0]
+    noise = np.random.default_rng(n).standard_normal((DRAWN // n, n))
+    Q = _ljung_box(noise - (noise @ line) @ line.T, lags)
+    off = Q - np.mean(Q)
+    return np.array([np.mean(Q), np.mean(off**2), np.mean(off**3)])

@@ -20,6 +20,7 @@ from drake_diff.model.tangent import tangent_space
 LEAST = 8  # samples of a piece
 WINDOW = 9  # samples that a cubic is laid through, at least
 WINDOW_TIME = 0.05  # [s] and over this time at least
+ORDERS = 8  # of differences of neighbouring samples that tell the noise
 NO_NOISE = 1e-9  # of a column's range: what is recorded without noise is still rounded
 
 
@@ -170,7 +171,7 @@ def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, c
 
 
 def noise_by_differences(chart: Chart, pieces: Sequence[Piece]) -> Array:
-    """(2 nv + m,) an upper estimate of the noise of each entry: of differences of orders 1 to 8, the least one.
+    """(2 nv + m,) an upper estimate of the noise of each entry: of differences of orders 1 to ORDERS, the least one.
 
     White noise s makes the difference of order d vary by s sqrt(binomial(2 d, d)); what moves adds to that.
     """
@@ -182,7 +183,7 @@ def noise_by_differences(chart: Chart, pieces: Sequence[Piece]) -> Array:
     count = increments[0].shape[1]
     least, reach = np.full(count, np.inf), np.zeros(count)
     for j in range(count):
-        for order in range(1, 9):
+        for order in range(1, ORDERS + 1):
             parts = [np.diff(each[:, j], n=order - 1) for each in increments]
             known = np.concatenate([part[np.isfinite(part)] for part in parts])
             if len(known) >= 6:
