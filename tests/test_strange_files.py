@@ -1,11 +1,16 @@
 """Broken robot files end in an error that names the file, never in a library's traceback or the end of the process."""
 
+import os
 import re
+import sys
 
 import pytest
 from helpers.strange import DIRECTIVES, FILES, MJCF, URDF, broken, ends, put
+from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff._base.guarded import crash_of
+from drake_diff.cli import main as cli
 from drake_diff.exceptions import ModelError
 
 ENDINGS = tuple(FILES)
@@ -76,3 +81,43 @@ def test_aliases_that_grow_and_lists_that_nest_without_end_are_refused(tmp_path)
     path.write_text("directives: " + "[" * 5000 + "]" * 5000)
     with pytest.raises(ModelError, match="its lists are too deep"):
         dd.load_model(path, time_step=0.01)
+
+
+WRONG_INDEX = {
+    "obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 99999999 4 3\n",
+    "vtk": "# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 4 double\n0 0 0 1 0 0 0 1 0 0 0 1\n"
+    "CELLS 1 5\n4 0 1 2 99999999\nCELL_TYPES 1\n10\n",
+}
+
+
+@each_row(
+    "command, ending",
+    [("audit", "obj"), ("audit", "vtk"), ("certify", "vtk"), ("plan", "obj"), ("plan", "vtk")],
+)
+def test_a_command_survives_a_file_that_ends_drakes_process(command, ending, tmp_path, monkeypatch, capfd):
+    (tmp_path / f"mesh.{ending}").write_text(WRONG_INDEX[ending])
+    path = tmp_path / "robot.urdf"
+    path.write_text(URDF.replace('<sphere radius="0.1"/>', f'<mesh filename="mesh.{ending}"/>'))
+    monkeypatch.setattr(sys, "argv", ["drake-diff", command, str(path), "--out", str(tmp_path / "out")])
+    if command == "audit":
+        del sys.argv[3:]
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    told = capfd.readouterr().err
+    assert end.value.code == 1
+    assert told.startswith(
+        f"drake-diff: ModelError: {path}: the model cannot be read: the process that tried to ended by"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_only_a_crash_is_told_of_what_was_tried_apart():
+    def aborts():
+        os.write(2, b"first\nfree(): invalid pointer\n")
+        os.abort()
+
+    def raises():
+        raise SystemExit(3)
+
+    assert crash_of(aborts) == "SIGABRT (free(): invalid pointer)"
+    assert [crash_of(raises), crash_of(list)] == ["", ""]

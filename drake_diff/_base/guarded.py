@@ -5,8 +5,10 @@ an import of Drake costs a second. The keeper itself never reads what a stranger
 """
 
 import atexit
+import faulthandler
 import json
 import os
+import resource
 import select
 import shutil
 import signal
@@ -15,7 +17,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -223,7 +226,7 @@ def _line() -> bytes:
 def _forked(request: Mapping[str, Any]) -> dict[str, Any]:
     """The answer to a request, by a process of its own, which is gone when this returns, and its folder with it."""
     folder = tempfile.mkdtemp(prefix="drake_diff_")
-    words = os.open(folder, os.O_TMPFILE | os.O_RDWR) if hasattr(os, "O_TMPFILE") else os.open(os.devnull, os.O_RDWR)
+    words = _file_of_words(folder)
     end, begin = os.pipe()
     child = os.fork()
     if child == 0:
@@ -241,24 +244,66 @@ def _forked(request: Mapping[str, Any]) -> dict[str, Any]:
                 _kill(child)
             _, status = os.waitpid(child, 0)
             _kill(child)  # what it started
-        said = os.pread(words, LAST_WORDS, max(0, os.fstat(words).st_size - LAST_WORDS))
+        crash = _crash(status, words)
     finally:
         os.close(end)
         os.close(words)
         shutil.rmtree(folder, ignore_errors=True)
     if data is None:
         return {"exceeded": f"it did not end within {request['seconds']:g} s, the limit that was given"}
-    if os.WIFSIGNALED(status):
-        number = os.WTERMSIG(status)
-        if number == signal.SIGKILL:
-            return {"exceeded": "its process was killed from outside, as where a machine has no memory left"}
-        last = said.decode(errors="replace").strip().rpartition("\n")[2]
-        return {"crashed": signal.Signals(number).name + (f" ({last})" if last else "")}
+    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
+        return {"exceeded": "its process was killed from outside, as where a machine has no memory left"}
+    if crash:
+        return {"crashed": crash}
     try:
         answer: dict[str, Any] = json.loads(data)
     except ValueError:
         return {"error": f"its process ended with status {os.waitstatus_to_exitcode(status)} and gave no answer"}
     return answer
+
+
+def crash_of(action: Callable[[], object]) -> str:
+    """The signal that ended a process forked from this one to call `action()`, and its last words; "" where none did.
+
+    For a file of the user's own, which nothing is kept from: it takes as long as `action()`, and some milliseconds.
+    Only for a process without threads of Python, as a command is.
+    """
+    words, own = _file_of_words(tempfile.gettempdir()), os.getpid()
+    child = 0
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 counts the threads of libraries too
+            child = os.fork()
+        if child == 0:
+            os.dup2(words, 1)
+            os.dup2(words, 2)
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            faulthandler.disable()  # its words would be the last ones
+            action()
+        return _crash(os.waitpid(child, 0)[1], words)
+    except BaseException:  # Ctrl-C; in the child, whatever `action` raises is for the caller to meet
+        if child:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+        raise
+    finally:
+        if os.getpid() != own:
+            os._exit(0)
+        os.close(words)
+
+
+def _file_of_words(folder: str) -> int:
+    """A file without a name, for what a process writes to its terminal."""
+    return os.open(folder, os.O_TMPFILE | os.O_RDWR) if hasattr(os, "O_TMPFILE") else os.open(os.devnull, os.O_RDWR)
+
+
+def _crash(status: int, words: int) -> str:
+    """The signal that a process ended by, with the last line that it wrote; "" where it ended by itself."""
+    if not os.WIFSIGNALED(status):
+        return ""
+    said = os.pread(words, LAST_WORDS, max(0, os.fstat(words).st_size - LAST_WORDS))
+    last = said.decode(errors="replace").strip().rpartition("\n")[2]
+    return signal.Signals(os.WTERMSIG(status)).name + (f" ({last})" if last else "")
 
 
 def _kill(child: int) -> None:

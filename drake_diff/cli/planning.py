@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.text import Text
 
 from drake_diff._base.signals import INTERRUPTED
-from drake_diff.cli.text import Seed, console, judged, out_option, plain, show, table
+from drake_diff.cli.text import Seed, console, judged, out_option, plain, show, survived, table
 from drake_diff.exceptions import InputError
 
 EXAMPLE = "panda"  # what `drake-diff plan` alone plans for
@@ -61,10 +61,13 @@ def plan(
     from drake_diff.model.example import example_files
     from drake_diff.optimize.problem.obstacles import BoxObstacle, SphereObstacle
     from drake_diff.planning.planner import plan as planned
+    from drake_diff.planning.robot import TIME_STEP
 
     obstacles = [SphereObstacle(n[:3], n[3]) if kind == "sphere" else BoxObstacle(n[:3], n[3:]) for kind, n in shapes]
 
     file = robot or example_files()[EXAMPLE]
+    if robot is not None:
+        survived(robot, {"time_step": TIME_STEP})
     try:
         with _live(file.name) as report:
             done = planned(

@@ -109,21 +109,41 @@ def _load(
         "actuators": _actuators(actuators),
         "packages": dict(_split("--packages", words, "NAME=FOLDER") for words in packages) if packages else None,
     }
+    options |= {
+        "time_step": time_step,
+        "contact_model": contact_model,
+        "contact_approximation": contact_approximation,
+        "contact_geometry": contact_geometry,
+        "base": base,
+        "fix_joints": names_in(fix_joints) or (),
+        "meshes": meshes,
+        "mimic": mimic,
+        "contact": contact,
+    }
     from drake_diff.model.model import load_model
 
-    return load_model(
-        model,
-        time_step=time_step,
-        contact_model=contact_model,
-        contact_approximation=contact_approximation,
-        contact_geometry=contact_geometry,
-        base=base,
-        fix_joints=names_in(fix_joints) or (),
-        meshes=meshes,
-        mimic=mimic,
-        contact=contact,
-        **options,
-    )
+    survived(model, options)
+    return load_model(model, **options)
+
+
+def survived(file: Path, options: Mapping[str, Any]) -> None:
+    """Read a model and make a step of it in a process apart; where that crashes, say so and exit with status 1.
+
+    Drake's parsers crash on some files, OBJ and VTK meshes of wrong numbers among them, and would end this process.
+    """
+    from drake_diff._base.guarded import crash_of
+    from drake_diff.model.model import load_model
+    from drake_diff.model.step import step
+
+    def read() -> None:
+        model = load_model(file, **options)
+        step(model, model.default_state, [0.0] * model.nu)
+
+    crash = crash_of(read)
+    if crash:
+        told = f"ModelError: {file}: the model cannot be read: the process that tried to ended by {crash}"
+        console(stderr=True).print(plain(f"drake-diff: {told}"), soft_wrap=True)
+        raise typer.Exit(1)
 
 
 def _ground(words: str | None) -> float | bool | None:
