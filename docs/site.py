@@ -1,6 +1,7 @@
-"""What of the site is written when it is built: the reference, tables of modules, and the files of the top folder."""
+"""What of the site is written when it is built: reference, tables of modules, notebooks, files of the top folder."""
 
 import ast
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "drake_diff"
 NAME = re.compile(r"^from \.([\w.]+) import (\w+) as \w+$", re.MULTILINE)
+NOTEBOOKS = ROOT / "docs/notebooks"
 TOP = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
 
 
@@ -48,11 +50,31 @@ def on_files(files: Files, config: Any) -> Files:
     for path, name in TOP.items():
         text = re.sub(r"\]\(docs/", "](", (ROOT / name).read_text())
         files.append(File.generated(config, path, content=text))
+    for path in NOTEBOOKS.glob("*.ipynb"):
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=page_of(path)))
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
+def page_of(notebook: Path) -> str:
+    """A notebook as a page: its text and its code, and the file itself to open in Jupyter."""
+    parts = []
+    for cell in json.loads(notebook.read_text())["cells"]:
+        text = "".join(cell["source"])
+        parts.append(f"```python\n{text}\n```" if cell["cell_type"] == "code" else text)
+    text = _to_pages("\n\n".join(parts))
+    title, _, rest = text.partition("\n")
+    return f"{title}\n\n[Open this notebook]({notebook.name}) in Jupyter to run it and to see its plots.\n{rest}\n"
+
+
+def _to_pages(text: str) -> str:
+    """The same, with links to notebooks leading to their pages."""
+    return re.sub(r"\]\((\w+)\.ipynb\)", r"](\1.md)", text)
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Put the table of a room's modules where a page asks for it."""
+    if page.file.src_uri == "notebooks/index.md":
+        return _to_pages(markdown)
     return re.sub(r"<!-- modules of (\w+) -->", lambda found: modules_of(found[1]), markdown)
 
 

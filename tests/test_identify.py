@@ -55,6 +55,7 @@ def test_the_damping_of_a_pendulum_is_found_from_positions_alone(pendulum):
     assert e.error_after < 1.3 < e.error_before
     assert "hinge.damping is 0.1" in e.sentence
     assert "+5" in e.sentence
+    assert "bound" not in e.sentence  # none was given
 
 
 def test_samples_may_be_any_time_apart_and_missing(pendulum):

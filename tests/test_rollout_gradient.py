@@ -98,7 +98,7 @@ def test_results_print_in_a_few_lines_and_escape_names_for_a_notebook(load):
     for result in (g, d, dd.rollout(model, [0.1, 0.0], us)):
         assert len(repr(result).splitlines()) <= 4
         assert str(result) == repr(result)
-        assert result._repr_html_().startswith("<pre>")
+        assert result._repr_html_().startswith("<pre ")
     page = dataclasses.replace(g, parameter_names=("<script>.mass",))._repr_html_()
     assert "&lt;script&gt;.mass" in page
     assert "<script>" not in page

@@ -2,10 +2,12 @@
 
 from html import escape
 
+BETWEEN_WORDS = "white-space: pre-wrap; word-break: normal; overflow-wrap: anywhere"  # JupyterLab breaks inside them
+
 
 def preformatted(text: str) -> str:
-    """`text` as HTML, line by line as it is."""
-    return f"<pre>{escape(text)}</pre>"
+    """`text` as HTML, line by line as it is; what is too long for the page goes on in the next line."""
+    return f'<pre style="{BETWEEN_WORDS}">{escape(text)}</pre>'
 
 
 class ShowsItsRepr:

@@ -453,7 +453,7 @@ def _sentence(e: Identification, intervals: Array, unknowns: Unknowns, values: A
     at_bound = [
         f"{name} is at its bound, {now:.4g} {unit}".rstrip()
         for name, now, unit, bounds in zip(unknowns.columns, values, unknowns.units, limits, strict=True)
-        if any(bound != 0 and abs(now - bound) <= 1e-9 * abs(bound) for bound in bounds)
+        if any(np.isfinite(bound) and bound != 0 and abs(now - bound) <= 1e-9 * abs(bound) for bound in bounds)
     ]
     told = [text for _, text in changed[:4]] + at_bound[:3]
     if len(changed) > 4:

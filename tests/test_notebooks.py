@@ -1,0 +1,75 @@
+"""The notebooks of the course run from their first cell to their last, and are kept without what they print."""
+
+import json
+import shutil
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import pytest
+from helpers.models import ROOT
+from helpers.table import each_row
+
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
+NAMES = [path.stem for path in NOTEBOOKS]
+
+
+def cells(path):
+    return json.loads(path.read_text())["cells"]
+
+
+def has_output(path):
+    return any(cell.get("outputs") or cell.get("execution_count") is not None for cell in cells(path))
+
+
+@each_row("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_kept_without_its_output(path):
+    assert not has_output(path)
+
+
+def test_output_in_a_notebook_is_seen(tmp_path):
+    made = json.loads(NOTEBOOKS[0].read_text())
+    next(cell for cell in made["cells"] if cell["cell_type"] == "code")["execution_count"] = 1
+    (tmp_path / "run.ipynb").write_text(json.dumps(made))
+    assert has_output(tmp_path / "run.ipynb")
+
+
+def test_the_course_has_eight_notebooks_and_each_leads_to_the_next():
+    assert [name.split("_")[0] for name in NAMES] == [str(k) for k in range(1, 9)]
+    for path, following in zip(NOTEBOOKS, [*NAMES[1:], None], strict=True):
+        last = "".join(cells(path)[-1]["source"])
+        assert "## What next\n" in last
+        assert following is None or f"({following}.ipynb)" in last
+
+
+def run(path, folder):
+    """What nbmake says of a copy of the notebook."""
+    shutil.copy(path, folder)
+    command = [sys.executable, "-m", "pytest", "--nbmake", "--nbmake-timeout=600", "-p", "no:cacheprovider", path.name]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=900)
+
+
+needs_nbmake = pytest.mark.skipif(
+    not (find_spec("nbmake") and find_spec("ipykernel")), reason="nbmake and ipykernel, the extra `notebooks`, missing"
+)
+
+
+@pytest.mark.slow
+@needs_nbmake
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
+def test_a_notebook_runs(path, tmp_path):
+    done = run(path, tmp_path)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
+    assert "1 passed" in done.stdout
+
+
+@pytest.mark.slow
+@needs_nbmake
+def test_a_notebook_that_raises_fails(tmp_path):
+    made = json.loads(NOTEBOOKS[0].read_text())
+    made["cells"][1]["source"] = ["raise RuntimeError('a cell that fails')"]
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/broken.ipynb").write_text(json.dumps(made))
+    done = run(tmp_path / "in/broken.ipynb", tmp_path)
+    assert done.returncode == 1
+    assert "a cell that fails" in done.stdout
