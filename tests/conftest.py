@@ -14,9 +14,12 @@ from helpers.models import MODELS  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
 
-# A shell starts what runs in the background with Ctrl-C ignored, and what tests start and interrupt would inherit that.
+# A shell starts what runs in the background with Ctrl-C ignored, nohup with SIGHUP ignored, and what tests start and
+# interrupt would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 for public in dd.__all__:  # a module that is first loaded while a test has patched another would keep the patch
     getattr(dd, public)
