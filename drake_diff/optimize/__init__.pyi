@@ -12,4 +12,5 @@ from .problem.rigid import RigidReset as RigidReset
 from .problem.schedule import ContactSchedule as ContactSchedule
 from .problem.terminal import TerminalSet as TerminalSet
 from .problem.timed import TrackingCost as TrackingCost
+from .program import Iteration as Iteration
 from .transcription.between import violation_between_nodes as violation_between_nodes

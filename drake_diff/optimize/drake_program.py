@@ -3,7 +3,7 @@
 import math
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.clock import TimeIsUpError
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
+from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch
 
 SOLVERS = ("ipopt", "snopt")
@@ -33,10 +34,12 @@ def solve_program(
     limits: Limits,
     report: Report | None = None,
     longest: float = 1.0,
+    motions: Callable[[Array], tuple[Iterate, ...]] = lambda z: (),
 ) -> NlpResult:
     """Solve `program` from `guess` (n,) with "ipopt" or "snopt", which takes steps of at most `longest` its default.
 
-    `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
+    `report` gets a line of progress a few times a second, with what `motions` makes of the point. Ctrl-C ends the solve
+    with the best iterate so far.
     """
     if solver not in SOLVERS:
         raise UnknownNameError("solver", got=solver, known=SOLVERS)
@@ -46,7 +49,7 @@ def solve_program(
     with tempfile.TemporaryDirectory() as folder, noted_interrupts() as interrupted:
         print_file = Path(folder) / "log"
         watch = Watch(limits, interrupted)
-        callback = _Callback(program, watch, report)
+        callback = _Callback(program, watch, report, motions)
         program.AddVisualizationCallback(callback, program.decision_variables())
         try:
             result = engine.Solve(program, guess, _options(solver, limits, print_file, longest))
@@ -62,8 +65,14 @@ def solve_program(
 class _Callback:
     """Called by the solver at every evaluation: reports, keeps the best iterate, raises to stop."""
 
-    def __init__(self, program: MathematicalProgram, watch: Watch, report: Report | None):
-        self.program, self.watch, self.report = program, watch, report
+    def __init__(
+        self,
+        program: MathematicalProgram,
+        watch: Watch,
+        report: Report | None,
+        motions: Callable[[Array], tuple[Iterate, ...]],
+    ):
+        self.program, self.watch, self.report, self.motions = program, watch, report, motions
         self.evaluations = 0
         self.current: Array | None = None
         self.before: Array | None = None  # the last point but this at which everything could be evaluated
@@ -97,7 +106,8 @@ class _Callback:
         violation = max(violations, default=0.0)
         self.watch.offer(z, cost, violation)
         if self.report:
-            self.report.row(Iteration(self.evaluations, cost, violation, math.nan, math.nan), printed=False)
+            row = Iteration(self.evaluations, cost, violation, math.nan, math.nan)
+            self.report.row(row, lambda: self.motions(z), printed=False)
             spent = f"violation {violation:9.2e}  {self.watch.elapsed:6.1f} s"
             self.report.say(f"evaluation {self.evaluations:5d}  cost {cost:12.6g}  {spent}")
 

@@ -445,9 +445,9 @@ class _PhasedRun:
         left = max(0.0, self.limits.time_limit - (time.monotonic() - self.start))
         limits, why = replace(self.limits, time_limit=left, max_iterations=most), program.functions.why_not
         told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-        result = solve_ipopt(program, guess, limits, self.report, exact=not why)
+        result = solve_ipopt(program, guess, limits, self.report, exact=not why, motions=program.iterates)
         if not why and result.message == NOT_FINITE:
-            again = solve_ipopt(program, guess, limits, self.report, exact=False)
+            again = solve_ipopt(program, guess, limits, self.report, exact=False, motions=program.iterates)
             if again.message != NOT_FINITE:  # then it was the Hessian
                 told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
         motions = []

@@ -5,12 +5,14 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.model.contact import ContactPoint
+from drake_diff.optimize.iterate import Iterate
 
 FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, in the state's and input's own units
 REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluation of every constraint
@@ -18,13 +20,52 @@ REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluatio
 
 @dataclass(frozen=True, slots=True)
 class Iteration:
-    """One row of the solver's own table; NaN where it prints no such number."""
+    """One row of the solver's own table; NaN where it prints no such number.
+
+    What a callback gets has the motion at which the solver stands too. The arrays are copies that may be kept.
+    Everything of it is None where the motion cannot be simulated, in `Solution.iterations`, and of a PhasedProblem,
+    which has one for each phase in `motions`.
+
+    Attributes:
+        iteration, objective, primal_infeasibility, dual_infeasibility, step: the solver's row.
+        motions: an `Iterate` for each phase; one where there are no phases.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
+        >>> effort = dd.QuadraticCost(R=[[1.0]])
+        >>> problem = dd.Problem(model, x0=[0, 0], x_goal=[0.5, 0], num_steps=20, running_cost=effort)
+        >>> ends = []
+        >>> solution = dd.solve(problem, method="ilqr", callback=lambda row: ends.append(row.xs[-1]))
+        >>> ends[-1].round(6)
+        array([0.5, 0. ])
+    """
 
     iteration: int
     objective: float
     primal_infeasibility: float
     dual_infeasibility: float
     step: float
+    motions: tuple[Iterate, ...] = field(default=(), compare=False, repr=False, kw_only=True)
+
+    @property
+    def times(self) -> Array | None:
+        """(N+1,) [s]"""
+        return self.motions[0].times if len(self.motions) == 1 else None
+
+    @property
+    def xs(self) -> Array | None:
+        """(N+1, nx), in the states' units; see `Iterate`."""
+        return self.motions[0].xs if len(self.motions) == 1 else None
+
+    @property
+    def us(self) -> Array | None:
+        """(N, nu), in the inputs' units; see `Iterate`."""
+        return self.motions[0].us if len(self.motions) == 1 else None
+
+    @property
+    def contacts(self) -> tuple[tuple[ContactPoint, ...], ...] | None:
+        """N tuples: the contacts of each step, computed when they are first asked for; see `Iterate.contacts`."""
+        return self.motions[0].contacts if len(self.motions) == 1 else None
 
     def __str__(self) -> str:
         columns = [f"iteration {self.iteration:5d}", f"cost {self.objective:12.6g}"]
@@ -55,10 +96,10 @@ class Report:
         if self.plan is not None:
             self.plan(replace(plan, search=self.asked))
 
-    def row(self, row: Iteration, *, printed: bool = True) -> None:
-        """Hand on `row`, and print it."""
+    def row(self, row: Iteration, motions: Callable[[], tuple[Iterate, ...]], *, printed: bool = True) -> None:
+        """Hand on `row` with its `motions`, which are made only where somebody gets them, and print it."""
         if self.callback is not None:
-            self.callback(row)
+            self.callback(replace(row, motions=motions()))
         if printed:
             self.say(str(row))
 

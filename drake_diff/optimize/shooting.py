@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydrake.autodiffutils import ExtractValue
 from pydrake.solvers import MathematicalProgram
 
-from drake_diff._base.arrays import Array, positive_int
+from drake_diff._base.arrays import Array, frozen, positive_int
 from drake_diff._base.autodiff import chain, chain_rows
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, InputError, SimulationError
@@ -24,6 +24,7 @@ from drake_diff.model.parameters import ParameterVector
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.loss import Totals, accumulate, differentiate_loss
 from drake_diff.optimize.drake_program import solve_program
+from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.coupling import BoundCoupling
@@ -75,8 +76,8 @@ def solve_shooting(
         left = replace(
             limits, time_limit=limits.time_limit - spent, max_iterations=max(1, limits.max_iterations - len(table))
         )
-        longest = SHORTER**-backed
-        result = solve_program(motion.program(), start, solver=solver, limits=left, report=report, longest=longest)
+        options: dict[str, Any] = {"solver": solver, "limits": left, "longest": SHORTER**-backed}
+        result = solve_program(motion.program(), start, report=report, motions=motion.iterates, **options)
         table += result.iterations
         why = motion.refusal or why
         refused = (Outcome.NO_GRADIENT, Outcome.DIVERGED, *[Outcome.FAILED] * bool(motion.refusal))
@@ -168,6 +169,16 @@ class SegmentedMotion:
         """(N+1, nx): each segment's rollout from its own start."""
         rolled = [segment.states(z[self.indices_of(i)]) for i, segment in enumerate(self.segments)]
         return np.vstack([xs[:-1] for xs in rolled] + [rolled[-1][-1:]])
+
+    def iterates(self, z: Array) -> tuple[Iterate, ...]:
+        """The motion at z, for callbacks; none where the plant cannot be stepped along it."""
+        try:
+            xs = frozen(self.states(z))
+        except (GradientError, SimulationError):
+            return ()
+        z, problem = z[: self.whole.size], self.problem
+        times = frozen(self.whole.time_step(z) * np.arange(len(xs)))
+        return (Iterate(problem, times, xs, frozen(self.inputs(z)), self.whole.parameters(z), by_steps=True),)
 
     def program(self) -> MathematicalProgram:
         """The program; a binding has the variables of one segment, a defect those of the next one's start too."""

@@ -160,8 +160,9 @@ def solve(
         restarts: how many more first guesses are tried, one after the other, smooth random ones by `seed`, also where
             one was verified: the cheapest verified plan is kept, and `Solution.optima` has those that differ.
         progress: True prints a line a few times a second, a function gets each line.
-        callback: gets an `Iteration` for each of the solver's (of SNOPT, and of IPOPT by shooting, a few times a
-            second). What it raises ends the solve.
+        callback: gets an `optimize.Iteration` for each of the solver's, with the motion there: times, xs, us, contacts.
+            SNOPT, and IPOPT by shooting, evaluate without saying where an iteration ends: of these it gets the point
+            of an evaluation, a few times a second. Relaxed stages give none. What it raises ends the solve.
         on_start: called once, when all input has been checked and the work begins.
         on_plan: gets what each search comes to, a `Solution` or `PhasedSolution` that is not measured yet.
 

@@ -16,7 +16,7 @@ from functools import cache
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.clock import TimeIsUpError
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, InputError, SimulationError
@@ -40,6 +40,7 @@ from drake_diff.optimize.ilqr.riccati import (
     slope_along,
     solve_riccati,
 )
+from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.cost import CostToGo
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import (
@@ -423,8 +424,14 @@ class _Search:
         self.gains = self.gains[1], merit - found
         self.rows.append(Iteration(len(self.rows), cost, self._infeasibility(), policy.gradient, size))
         if self.report:
-            self.report.row(self.rows[-1])
+            self.report.row(self.rows[-1], self._iterates)
         return None
+
+    def _iterates(self) -> tuple[Iterate, ...]:
+        """The motion, for callbacks."""
+        vector, xs, us = self.design.at(self.motion.c), frozen(self.motion.xs), frozen(self.motion.us)
+        times = frozen(self.design.time_step(vector.values) * np.arange(len(xs)))
+        return (Iterate(self.problem, times, xs, us, vector, by_steps=True),)
 
     def _roll(self, policy: AffinePolicy, size: float) -> Motion:
         """Step from x_0 with feedback, each gap shrunk to 1 - `size` of itself."""

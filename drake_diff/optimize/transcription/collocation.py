@@ -523,16 +523,17 @@ class Transcription:
         moved = None if parameters is None else self.task.at(self._inside(parameters)).coordinates
         guess = program.pack(nodes, horizon, moved)
         told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-        more, start = FAR if far and program.free else None, time.monotonic()
+        start = time.monotonic()
         sizes = len(program.lower), len(program.sides[0])
         begun = multipliers if multipliers and multipliers.sizes == sizes else None
-        result = solve_ipopt(program, guess, limits, report, exact=not why, begun=begun, more=more)
+        options: dict[str, Any] = {"more": FAR if far and program.free else None, "motions": program.iterates}
+        result = solve_ipopt(program, guess, limits, report, exact=not why, begun=begun, **options)
         if begun and result.outcome not in (*FOUND, Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
-            result = solve_ipopt(program, guess, _left(limits, start), report, exact=not why, more=more)
+            result = solve_ipopt(program, guess, _left(limits, start), report, exact=not why, **options)
         elif begun:
             result = replace(result, message=f"{result.message}, from the guess's multipliers")
         if not why and result.message == NOT_FINITE:
-            again = solve_ipopt(program, guess, limits, report, exact=False, more=more)
+            again = solve_ipopt(program, guess, limits, report, exact=False, **options)
             if again.message != NOT_FINITE:  # then it was the Hessian
                 told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
         found, horizon = program.unpack(result.z)

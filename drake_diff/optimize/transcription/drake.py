@@ -8,10 +8,11 @@ import numpy as np
 from pydrake.autodiffutils import ExtractValue
 from pydrake.solvers import MathematicalProgram
 
-from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff._base.autodiff import chain
 from drake_diff.model.equations import ContinuousSystem, EquationsOfMotion
 from drake_diff.optimize.drake_program import solve_program
+from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.cost import QuadraticCost, differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Report
@@ -42,11 +43,14 @@ def solve_collocation(
     guess, steps = np.zeros(program.num_vars()), [drake.time_step(k) for k in range(count)]
     for variables, values in zip([*states, *inputs, *steps], [*xs, *us, us[-1], *[[h]] * count], strict=True):
         program.SetDecisionVariableValueInVector(variables, values, guess)
-    result = solve_program(program, guess, solver=solver, limits=limits, report=report)
-    xs, us = (
-        np.array([result.z[program.FindDecisionVariableIndices(v)] for v in variables])
-        for variables in (states, inputs)
-    )
+    places = [np.array([program.FindDecisionVariableIndices(v) for v in variables]) for variables in (states, inputs)]
+
+    def motions(z: Array) -> tuple[Iterate, ...]:
+        xs, us = frozen(z[places[0]]), frozen(z[places[1][:-1]])
+        return (Iterate(problem, frozen(h * np.arange(count + 1)), xs, us, problem.parameters, by_steps=False),)
+
+    result = solve_program(program, guess, solver=solver, limits=limits, report=report, motions=motions)
+    xs, us = (result.z[at] for at in places)
     return result, xs, us[:-1], us[-1]
 
 

@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.phases import PhasedProblem, duration_of
 from drake_diff.optimize.transcription.coupled import CoupledRows
 from drake_diff.optimize.transcription.expressions import KnotFunction, KnotFunctions, constraint_function
@@ -71,6 +72,12 @@ class PhasedProgram:
     def split(self, z: Array) -> list[Array]:
         """The decision variables of each phase."""
         return np.split(z, self.starts[1:-1])
+
+    def iterates(self, z: Array) -> tuple[Iterate, ...]:
+        """The motion of each phase at z, for callbacks."""
+        return tuple(
+            one for program, part in zip(self.programs, self.split(z), strict=True) for one in program.iterates(part)
+        )
 
     @cached_property
     def sides(self) -> tuple[Array, Array]:

@@ -10,17 +10,18 @@ linear ones. Path constraints add rows to g and terms to the blocks of their nod
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
 
-from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff._base.clock import Pace, TimeIsUpError
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
+from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,
     Iteration,
@@ -119,6 +120,14 @@ class TranscribedProgram:
         own = (*self.task.dynamics.state_names, *self.task.dynamics.input_names)
         others = self.task.problem.parameters.names if self.task.varied else ()
         return (*[f"{name} at node {k}" for k in self.every for name in own], *others, *["horizon"] * self.free)
+
+    def iterates(self, z: Array) -> tuple[Iterate, ...]:
+        """The motion at z, for callbacks."""
+        problem = self.task.problem
+        vector = problem.parameters.at(self.parameter_values(z)) if self.task.varied else problem.parameters
+        times = frozen(self.unpack(z)[1] * self.mesh)
+        xs, us = frozen(z[self.states_at]), frozen(z[self.inputs_at[:-1]])
+        return (Iterate(problem, times, xs, us, vector, by_steps=False),)
 
     def pack(self, nodes: Array, horizon: float, coordinates: Array | None = None) -> Array:
         """The decision variables of `nodes` (K, nx + nu), `horizon` [s] and `coordinates` (np,), the task's if None."""
@@ -389,13 +398,15 @@ def solve_ipopt(
     exact: bool,
     begun: Multipliers | None = None,
     more: dict[str, Any] | None = None,
+    motions: Callable[[Array], tuple[Iterate, ...]] = lambda z: (),
 ) -> NlpResult:
     """Solve `program` from `guess` (n,), with its `exact` Hessian or IPOPT's limited-memory one.
 
     With multipliers `begun` the guess is taken for nearly optimal. `more` are options of nlpsol.
 
-    `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
-    An error that a function of the user's raised is raised again, but that of a simulation or gradient is told.
+    `report` gets a line of progress a few times a second, with what `motions` makes of the iterate. Ctrl-C ends the
+    solve with the best iterate so far. An error that a function of the user's raised is raised again, but that of a
+    simulation or gradient is told.
     """
     options = OPTIONS | (BEGUN if begun else {}) | (more or {})
     options |= {
@@ -407,7 +418,7 @@ def solve_ipopt(
         options |= {"ipopt.hessian_approximation": "limited-memory", "pass_nonlinear_variables": False}
     with noted_interrupts() as interrupted:
         watch = Watch(limits, interrupted)
-        callback = _IterateCallback(program, watch, report)
+        callback = _IterateCallback(program, watch, report, motions)
         options |= program.derivatives(exact) | {"iteration_callback": callback}
         solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
         lower, upper = program.sides
@@ -461,9 +472,15 @@ def _holding(multipliers: Array, values: Array, lower: Array, upper: Array) -> A
 class _IterateCallback(ca.Callback):  # type: ignore[misc]
     """Called by the solver at every iterate: reports, keeps the best, says when to stop."""
 
-    def __init__(self, program: Program, watch: Watch, report: Report | None):
+    def __init__(
+        self,
+        program: Program,
+        watch: Watch,
+        report: Report | None,
+        motions: Callable[[Array], tuple[Iterate, ...]],
+    ):
         ca.Callback.__init__(self)
-        self.program, self.watch, self.report = program, watch, report
+        self.program, self.watch, self.report, self.motions = program, watch, report, motions
         size = len(program.lower)
         self.sizes = {"x": size, "f": 1, "g": program.nlp["g"].numel(), "lam_x": size}
         self.sizes |= {"lam_g": self.sizes["g"], "lam_p": 0}
@@ -492,7 +509,8 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
             self.watch.offer(x, float(f[0]), violation)
             due = self.watch.look_up()
             if self.report:
-                self.report.row(Iteration(self.iterates, float(f[0]), violation, math.nan, math.nan), printed=due)
+                row = Iteration(self.iterates, float(f[0]), violation, math.nan, math.nan)
+                self.report.row(row, lambda: self.motions(x), printed=due)
             self.iterates += 1
         except Exception as error:  # of `report`; must not go through C++, the solve raises it
             self.error = error

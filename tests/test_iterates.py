@@ -1,0 +1,125 @@
+"""What callbacks get of a search: the motion at which the solver stands, and never an earlier one."""
+
+import itertools
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RotationMatrix
+
+import drake_diff as dd
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+@pytest.fixture
+def every_point(monkeypatch):
+    """What is reported a few times a second is reported at once."""
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    return dd.Problem(model, x0=[0, 0], x_goal=[1.0, 0], num_steps=20, running_cost=EFFORT)
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """A ball of 1 kg on the ground, pushed forward: it is to roll 5 mm."""
+    push = dd.model.BodyForce("push", "ball", direction=(1, 0, 0))
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01, body_forces=[push])
+    x0 = np.array(model.default_state)
+    x0[6] = 0.0995  # [m] of a radius of 0.1
+    return dd.Problem(model, x0=x0, num_steps=5, running_cost=EFFORT, final_cost=lambda x: 1e4 * (x[4] - 0.005) ** 2)
+
+
+def searched(problem, **options):
+    rows = []
+    solution = dd.solve(problem, callback=rows.append, **options)
+    assert len(rows) >= 1
+    return rows, solution
+
+
+@pytest.mark.usefixtures("every_point")
+@pytest.mark.parametrize(
+    "options",
+    [{"method": "ilqr"}, {"method": "shooting"}, {"method": "shooting", "solver": "snopt", "segments": 4}],
+    ids=["ilqr", "ipopt", "snopt"],
+)
+def test_states_are_those_of_the_inputs_whose_cost_is_told(swing, options):
+    """The cost is h sum u^2, and the states are what Drake's steps make of the inputs, segment by segment."""
+    rows, solution = searched(swing, **options)
+    ends = np.linspace(0, 20, options.get("segments", 1) + 1).astype(int)
+    for row in rows:
+        assert row.objective == pytest.approx(0.05 * float(np.sum(row.us**2)), rel=1e-12)
+        np.testing.assert_allclose(row.times, 0.05 * np.arange(21), atol=1e-15)
+        for a, b in itertools.pairwise(ends):
+            rolled = dd.rollout(swing.model, row.xs[a], row.us[a:b]).xs
+            last = b + (b == 20)
+            # iLQR tries motions by the compiled form of the step, which is Drake's but for rounding
+            np.testing.assert_allclose(row.xs[a:last], rolled[: last - a], atol=1e-9)
+    assert len({row.us.tobytes() for row in rows}) > 1
+    np.testing.assert_allclose(rows[-1].us, solution.us, atol=1e-3)
+
+
+@pytest.mark.usefixtures("every_point")
+@pytest.mark.parametrize(
+    "options", [{"scheme": "trapezoid"}, {"scheme": "drake", "solver": "snopt"}], ids=["ipopt", "snopt"]
+)
+def test_collocated_states_have_the_cost_that_is_told(options):
+    """The trapezoid rule of x'x over the times that are told, the horizon being free where that is possible."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.1)
+    free = {} if "solver" in options else {"horizon": (0.5, 2.0)}
+    cost = dd.QuadraticCost(Q=np.eye(2))
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[1.0, 0], num_steps=8, running_cost=cost, **free)
+    rows, solution = searched(problem, method="collocation", refine=False, **options)
+    for row in rows:
+        by_knot = np.sum(row.xs**2, axis=1)
+        assert row.objective == pytest.approx(np.trapezoid(by_knot, row.times), rel=1e-9)
+        assert row.us.shape == (8, 1)
+        assert row.contacts == ((),) * 8
+    np.testing.assert_allclose(rows[-1].xs, solution.xs, atol=1e-6)
+    np.testing.assert_allclose(rows[-1].us, solution.us, atol=1e-3)
+
+
+def test_what_a_callback_keeps_stays_as_it_was(swing):
+    seen = []
+    dd.solve(swing, method="ilqr", callback=lambda row: seen.append((row, row.xs.tobytes())))
+    assert all(row.xs.tobytes() == then for row, then in seen)
+    with pytest.raises(ValueError, match="read-only"):
+        seen[0][0].xs[0] = 1.0
+
+
+def test_contacts_are_what_newton_asks_for_and_reading_them_changes_nothing(pushed):
+    """m (v' - v) / h = the weight, the push along the ball's own x axis, and the forces of contact."""
+    rows = []
+    watched = dd.solve(pushed, method="ilqr", callback=lambda row: rows.append((row, row.contacts)))
+    assert len(rows) > 1
+    for row, contacts in rows:
+        for x, after, u, step in zip(row.xs, row.xs[1:], row.us, contacts, strict=False):
+            pushing = u[0] * RotationMatrix(Quaternion(x[:4] / np.linalg.norm(x[:4]))).matrix()[:, 0]
+            told = sum(point.force for point in step) + pushing + [0, 0, -9.81]
+            assert len(step) == 1
+            np.testing.assert_allclose(told, (after[10:] - x[10:]) / 0.01, atol=1e-4)  # [N], Drake's solver to 1e-6
+    alone = dd.solve(pushed, method="ilqr")
+    assert (watched.xs.tobytes(), watched.us.tobytes()) == (alone.xs.tobytes(), alone.us.tobytes())
+    assert watched.iterations == alone.iterations
+
+
+def test_a_table_holds_no_motions(swing):
+    rows, solution = searched(swing, method="ilqr")
+    assert all(row.xs is None and row.contacts is None for row in solution.iterations)
+    assert rows[0] == solution.iterations[1]
+
+
+def test_phases_have_a_motion_each():
+    block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+    first = dd.Problem(block, x0=[0, 0], x_goal=[1, 1], num_steps=4, horizon=1.0, running_cost=EFFORT)
+    second = dd.Problem(block, x0=[1, 1], x_goal=[2, 0], num_steps=6, horizon=1.0, running_cost=EFFORT)
+    rows, solution = searched(dd.optimize.PhasedProblem([first, second]))
+    assert rows[-1].xs is None
+    for motion, phase in zip(rows[-1].motions, solution.phases, strict=True):
+        np.testing.assert_allclose(motion.xs, phase.xs, atol=1e-9)
+        np.testing.assert_allclose(motion.us, phase.us, atol=1e-9)
