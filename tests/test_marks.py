@@ -7,8 +7,8 @@ from pydrake.geometry import Box, Sphere
 
 import drake_diff as dd
 from drake_diff.artifact.live import scene_of_run
-from drake_diff.artifact.marks import drawn_goals, meaning_of
 from drake_diff.exceptions import UnknownNameError
+from drake_diff.optimize.marks import drawn_goals, meaning_of
 from drake_diff.pages.scene import scene_of
 
 

@@ -16,13 +16,13 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_diff._base.strangers import read_plain
 from drake_diff.artifact.apart import first_look
-from drake_diff.artifact.marks import drawn_goals
 from drake_diff.artifact.rerun import TRACE
 from drake_diff.artifact.sections import rebuild_goal
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, ModelError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS, read_into
 from drake_diff.model.plant import bodies
+from drake_diff.optimize.marks import drawn_goals
 from drake_diff.pages.meshcat import draw
 from drake_diff.pages.scene import (
     BLUE,

@@ -10,14 +10,14 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.artifact.first_screen import asked_for, checks_of
-from drake_diff.artifact.marks import css, drawn_goals, meaning_of
 from drake_diff.artifact.measurement import Column, Measurement, gradient_norms
+from drake_diff.optimize.live import differ, scene_of_plan
+from drake_diff.optimize.marks import Colour, colours_of, meaning_of
 from drake_diff.pages.html import Line, Plot, page_data, write_page
-from drake_diff.pages.meshcat import RED, TRAIL, VIOLET, write_replay
-from drake_diff.pages.scene import BLUE, Scene, scene_of
+from drake_diff.pages.meshcat import write_replay
+from drake_diff.pages.scene import Scene
 
 SERIES_PER_PLOT = 6  # more lines cannot be told apart
-SEEN = 1e-3  # of the height of a plot: less than a pixel
 PHYSICS, SEARCH = "Energy and contact", "Search"
 
 
@@ -29,9 +29,9 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
     """
     plots, view, colours = list(plots_of(m)), "", list[Colour]()
     if m.solution.problem.has_model:
-        scene = _scene(m)
+        scene = scene_of_plan(m.solution, m.shown[0])
         write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value.replace('_', ' ')}")
-        view, colours = replay.read_text(encoding="utf-8"), [*colours_of(scene), *meaning_of(m.solution.problem.goals)]
+        view, colours = replay.read_text(encoding="utf-8"), [*_colours_of(scene), *meaning_of(m.solution.problem.goals)]
     data = page_data(float(m.times[-1]), plots, m.solution.certificates)
     judged = m.solution.judged_replay
     write_page(
@@ -52,31 +52,9 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
     )
 
 
-def _scene(m: Measurement) -> Scene:
-    """The motion that the verdict rests on beside the plan, or the plan alone where there is no motion."""
-    problem, motion = m.solution.problem, m.shown[0]
-    model = problem.model
-    marks = drawn_goals(model.plant, model.double.context, problem.goals)
-    if motion is None:  # states of the plan that are not finite are drawn at x0
-        xs = np.where(np.all(np.isfinite(m.xs), axis=1)[:, None], m.xs, problem.x0)
-        return scene_of(model, m.times, xs, marks=marks)
-    planned = m.solution.plan.sample(_parts(m))[0]
-    ghosts = {"plan": (planned, BLUE)} if np.all(np.isfinite(planned)) and _differ(motion.xs, planned) else None
-    return scene_of(model, motion.times, motion.xs, us=motion.us, contacts=motion.contacts, ghosts=ghosts, marks=marks)
-
-
-Colour = tuple[str, str, str]  # of the page's legend: a colour of CSS, "line", "dot" or "arrow", and what it means
-
-
-def colours_of(scene: Scene) -> list[Colour]:
+def _colours_of(scene: Scene) -> list[Colour]:
     """What is drawn in a replay beside the robot."""
-    found = [(css(BLUE), "dot", "the plan, where the motion is elsewhere")] if scene.ghosts else []
-    found.append((css(TRAIL), "line", "path of the centre of mass of the body that moves most"))
-    if any(scene.contacts):
-        found.append((css(RED), "arrow", "contact forces: longer is more, and the largest tenth may be cut"))
-    if any(scene.thrusts):
-        found.append((css(VIOLET), "arrow", "forces of the inputs on bodies"))
-    return found
+    return colours_of(plan=bool(scene.ghosts), contacts=any(scene.contacts), thrusts=any(scene.thrusts))
 
 
 def alike(certificates: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -118,19 +96,12 @@ def _state_plots(m: Measurement, group: str, start: int, columns: Sequence[Colum
     """A plot for each column: the motion, and the plan where it is another. Plain dynamics have "states" alone."""
     shown = m.shown[0]
     motion = m.integrated if shown is None else shown.xs[:: _parts(m)]
-    differs = motion is not None and _differ(motion, m.xs)
+    differs = motion is not None and differ(motion, m.xs)
     for i, c in enumerate(columns, start):
         lines = [] if motion is None else [Line("motion", motion[:, i])]
         if motion is None or differs:
             lines.append(Line("plan", m.xs[:, i], dashed=differs))
         yield Plot(c.name, c.unit, m.times, lines, limits=(c.lower, c.upper), group=group if m.velocities else "States")
-
-
-def _differ(motion: Array, plan: Array) -> bool:
-    """Whether a reader could tell a motion (n, m) from its plan: by SEEN of what a column moves, 1e-3 at least."""
-    moved = np.ptp(motion, axis=0)
-    apart = np.max(np.abs(motion - plan), axis=0)
-    return not bool(np.all(apart <= SEEN * np.maximum(moved, 1e-3)))  # what is not finite differs
 
 
 def _parts(m: Measurement) -> int:
@@ -147,7 +118,7 @@ def _input_plots(m: Measurement) -> Iterator[Plot]:
         lines = [planned]
         if motion is not None:
             applied = motion.us[:: _parts(m), i]
-            same = held and not _differ(applied[:, None], m.us[:, i : i + 1])
+            same = held and not differ(applied[:, None], m.us[:, i : i + 1])
             ours = Line("motion", _as_long(applied, m.times), held=True)
             lines = [ours] if same else [ours, replace(planned, dashed=True)]
         yield Plot(f"input {c.name}", c.unit, m.times, lines, limits=(c.lower, c.upper), percent=True, group="Inputs")

@@ -19,7 +19,7 @@ from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, W
 
 LogFile = Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that drake_diff wrote.")]
 
-OURS = ("problem", "progress", "on_start", "on_plan")  # arguments of `solve` that a script does not give
+OURS = ("problem", "progress", "on_start", "on_plan", "view")  # arguments of `solve` that a script does not give
 MOST_MEMORY = 4 * 2**30  # bytes
 
 mcap = typer.Typer(no_args_is_help=True, help="Look at, check and repair trace.mcap.")
@@ -42,6 +42,9 @@ def run(
     out: Annotated[Path | None, out_option("artifacts/<script>")] = None,
     elsewhere: Annotated[
         bool, typer.Option("--elsewhere", help="Follow the plan in finer steps, continuous time and MuJoCo too.")
+    ] = False,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the search in a browser on this machine, and its plan until Ctrl-C.")
     ] = False,
 ) -> None:
     """Solve the problem that SCRIPT defines, measure the solution again, and write the run directory.
@@ -70,10 +73,29 @@ def run(
         raise UnknownNameError("solve_options", got=name, known=known)
     parts = problem.phases if isinstance(problem, PhasedProblem) else (problem,)
     show(plain(script.name, "bold"), "; ".join(f"{part.system}, {part.num_steps} steps" for part in parts))
-    record = _solved_into(directory, problem, options, elsewhere)
+    shown: list[str] = []  # the address of the page
+
+    def show_address(address: str) -> None:
+        shown.append(address)
+        typer.echo(f"the search is shown at {address}")
+
+    told: dict[str, Any] = {"view": show_address} if view else {}
+    record = _solved_into(directory, problem, options | told, elsewhere)
     (_show_phases if isinstance(problem, PhasedProblem) else _show_record)(record)
     show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
+    if shown:
+        _wait_at(f"the plan is at {shown[0]}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def _wait_at(place: str) -> None:
+    """Say that until Ctrl-C something is at a place."""
+    try:
+        # Not by a console: interrupted after it has written, it would write the line once more.
+        typer.echo(f"{place} (Ctrl-C ends it)")
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        typer.echo("ended")
 
 
 def _solved_into(directory: Path, problem: Any, options: dict[str, Any], elsewhere: bool) -> Any:
@@ -278,11 +300,10 @@ def view(run: RunDirectory, models: ModelFolder = None) -> None:
         meshcat, notes = serve(run, models=models)
         for note in notes:
             show(plain(note, "yellow"))
-        # Not by a console: interrupted after it has written, it would write the line once more.
-        typer.echo(f"{run} is at {meshcat.web_url()} (Ctrl-C ends it)")
-        threading.Event().wait()
     except KeyboardInterrupt:
         typer.echo("ended")
+        return
+    _wait_at(f"{run} is at {meshcat.web_url()}")
 
 
 @memory_at_most(MOST_MEMORY)

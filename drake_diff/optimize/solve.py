@@ -79,6 +79,7 @@ def solve(
     callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
     on_plan: Callable[[Any], None] | None = None,
+    view: bool | Callable[[str], None] = False,
 ) -> Solution: ...
 @overload
 def solve(
@@ -98,6 +99,7 @@ def solve(
     callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
     on_plan: Callable[[Any], None] | None = None,
+    view: bool | Callable[[str], None] = False,
 ) -> PhasedSolution: ...
 def solve(
     problem: Problem | PhasedProblem,
@@ -120,6 +122,7 @@ def solve(
     callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
     on_plan: Callable[[Any], None] | None = None,
+    view: bool | Callable[[str], None] = False,
 ) -> Solution | PhasedSolution:
     """Solve `problem`, certify the derivatives that were used, and measure the result again on Drake's plant.
 
@@ -165,6 +168,9 @@ def solve(
             of an evaluation, a few times a second. Relaxed stages give none. What it raises ends the solve.
         on_start: called once, when all input has been checked and the work begins.
         on_plan: gets what each search comes to, a `Solution` or `PhasedSolution` that is not measured yet.
+        view: True serves a page for browsers on this machine and prints its address, a function gets the address: the
+            iterates in Drake's Meshcat beside their cost and violation, and at the end the motion of the plan, to be
+            played. It changes nothing of what is found, but takes time. It is served until the process ends.
 
     Returns:
         A `Solution`, whatever happened: how the solve ended is its `status` and `message`.
@@ -184,7 +190,7 @@ def solve(
         >>> solution.success, solution.xs.shape, solution.us.shape
         (True, (21, 2), (20, 1))
     """
-    _check_common(problem, seed, callback, progress)
+    _check_common(problem, seed, callback, progress, view)
     if method not in METHODS:
         raise UnknownNameError("method", got=method, known=METHODS)
     if solver is not None and solver not in SOLVERS:
@@ -218,13 +224,42 @@ def solve(
     }
     if count("restarts", restarts, 0):
         arguments["restarts"] = int(restarts)
+    asked = Attempt(method, "asked for", scheme, solver, segments, continuation, int(seed), refine, refinement)
+    options: dict[str, Any] = {"limits": limits, "restarts": restarts}
+    if view is False:
+        return _solved(problem, asked, arguments, initial_guess, report, on_start, **options)
+    from drake_diff.optimize.live import LiveSearch  # loads a web server
+
+    live = LiveSearch(problem, _print_address if view is True else view)
+    with live.running(on_start) as start:
+        solution = _solved(problem, asked, arguments, initial_guess, live.beside(report), start, **options)
+        live.end(solution)
+    return solution
+
+
+def _print_address(address: str) -> None:
+    print(f"the search is shown at {address}", flush=True)
+
+
+def _solved(
+    problem: Problem | PhasedProblem,
+    asked: "Attempt",
+    arguments: dict[str, Any],
+    initial_guess: Any,
+    report: Report,
+    on_start: Callable[[], None] | None,
+    *,
+    limits: Limits,
+    restarts: int,
+) -> Solution | PhasedSolution:
+    """What `solve` gives, whose `arguments` have been checked one by one."""
     report.asked = Search(arguments, initial_guess)
     if isinstance(problem, PhasedProblem):
         if restarts:
             raise InputError("restarts", got=restarts, expected="0 for a PhasedProblem")
         return solve_phased(problem, arguments, initial_guess, report, on_start)
-    task = _Task(problem, limits, seed, report, on_start)
-    asked = Attempt(method, "asked for", scheme, solver, segments, continuation, int(seed), refine, refinement)
+    task = _Task(problem, limits, asked.seed, report, on_start)
+    method, segments, continuation = asked.method, asked.segments, asked.continuation
     if method == "auto" and continuation is not None:
         asked = dataclasses.replace(asked, method="ilqr", reason="a continuation is asked for")
     initial_guess = sampled(problem, asked.method, initial_guess)
@@ -241,7 +276,7 @@ def solve(
     return solution.told(message=message, search=Search(arguments, initial_guess))
 
 
-def _check_common(problem: Any, seed: Any, callback: Any, progress: Any) -> None:
+def _check_common(problem: Any, seed: Any, callback: Any, progress: Any, view: Any) -> None:
     if not isinstance(problem, (Problem, PhasedProblem)):
         raise InputError("problem", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
     count("seed", seed, 0, LARGEST_SEED)
@@ -249,6 +284,8 @@ def _check_common(problem: Any, seed: Any, callback: Any, progress: Any) -> None
         raise InputError("callback", got=repr(callback), expected="None or a function of an Iteration")
     if not (isinstance(progress, bool) or callable(progress)):
         raise InputError("progress", got=repr(progress), expected="True, False or a function")
+    if not (isinstance(view, bool) or callable(view)):
+        raise InputError("view", got=repr(view), expected="True, False or a function")
 
 
 def _tolerance(name: str, given: Any) -> float:

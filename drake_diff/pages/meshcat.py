@@ -115,26 +115,83 @@ class _Arrows:
             meshcat.SetProperty(path, "visible", used, time_in_recording=time)
 
 
+STILLS = 7  # of a motion that is searched for: so many of its states are seen at once
+FAINT = 0.22  # how opaque they are, but for the last one
+ASIDE = 0.03  # of its size: so far a motion may leave what the camera has in view, which looks anew where it is further
+SMALLER = 0.5  # or where the motion is so much smaller
+
+
+def stills_of(count: int) -> list[int]:
+    """Which of `count` states are seen at once: the first, the last, and others evenly between them."""
+    return sorted({round(k * (count - 1) / (STILLS - 1)) for k in range(STILLS)})
+
+
+class Stills:
+    """A motion that changes while it is searched for: some of its states at once, the last of them solid.
+
+    All that `meshcat` shows is taken away first. The shapes are those of the first scene.
+    """
+
+    def __init__(self, meshcat: Meshcat, scene: Scene):
+        self.meshcat, self.shapes, self.framed = meshcat, scene.shapes, scene
+        self.made = {"contacts": 0, "thrusts": 0}  # arrows
+        meshcat.Delete()
+        for name in [f"stills/{i}" for i in range(STILLS - 1)]:
+            for k, drawn in enumerate(scene.shapes):
+                if drawn.body in scene.poses:
+                    c = drawn.colour
+                    _draw_shape(
+                        meshcat, f"{name}/{drawn.body}/{k}", drawn, Rgba(c.r(), c.g(), c.b(), FAINT), scene.size
+                    )
+        _draw_shapes(meshcat, scene)
+        _look_at(meshcat, scene)
+        self.show(scene)
+
+    @property
+    def size(self) -> float:
+        """[m] of what the camera has in view."""
+        return self.framed.size
+
+    def show(self, scene: Scene) -> None:
+        """Put the shapes where `scene` has them."""
+        places = stills_of(len(scene.times))
+        (low, high), (least, most) = scene.box, self.framed.box
+        if max(np.max(least - low), np.max(high - most)) > ASIDE * self.size or scene.size < SMALLER * self.size:
+            self.framed = scene
+            _look_at(self.meshcat, scene)
+        for path in {drawn.body for drawn in (*self.shapes, *scene.marks)} & scene.poses.keys():
+            for i in range(STILLS - 1):  # of a motion with fewer states, several at one place
+                self.meshcat.SetTransform(f"stills/{i}/{path}", scene.poses[path][places[min(i, len(places) - 1)]])
+            self.meshcat.SetTransform(f"motion/{path}", scene.poses[path][-1])
+        for i, mark in enumerate(scene.marks):
+            if mark.origin is not None:
+                self.meshcat.SetTransform(f"level/{i}", RigidTransform(scene.poses[mark.body][-1] @ mark.origin))
+        radius = THICKNESS * self.size
+        if not _draw_tube(self.meshcat, "trail", scene.trail, radius):
+            self.meshcat.Delete("trail")
+        for root, steps, colour in (("contacts", scene.contacts, RED), ("thrusts", scene.thrusts, VIOLET)):
+            seen = [one for k in places[:-1] for one in (steps[k] if k < len(steps) else ()) if np.any(one.force)]
+            arrows = _Arrows(root, [seen], colour, ARROW_PART * self.size, scene.reference_of([seen]))
+            if arrows.slots > self.made[root]:
+                arrows.make(self.meshcat, radius)
+            self.made[root] = max(self.made[root], arrows.slots)
+            arrows.place(self.meshcat, 0, None)
+            for slot in range(arrows.slots, self.made[root]):
+                self.meshcat.SetProperty(f"{root}/{slot}", "visible", False)
+
+
 def _arrows_of(root: str, steps: Sequence[Sequence[Force]], colour: Rgba, scene: Scene) -> _Arrows:
     return _Arrows(root, steps, colour, ARROW_PART * scene.size, scene.reference_of(steps))
 
 
 def draw(meshcat: Meshcat, scene: Scene) -> None:
     """Draw `scene` and publish its animation."""
-    for i, drawn in enumerate(scene.shapes):
-        name = f"ground{i}" if isinstance(drawn.shape, HalfSpace) else str(i)  # replay.js paints the former
-        _draw_shape(meshcat, f"motion/{drawn.body or WORLD}/{name}", drawn, drawn.colour, scene.size)
-        for ghost in scene.ghosts:
-            if drawn.body in ghost.poses:
-                _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene.size)
-    level: dict[str, list[RigidTransform]] = {}  # marks that go with a body, and do not turn with it
-    for i, mark in enumerate(scene.marks):
-        kind = "above" if mark.above else "mark"  # replay.js draws the former through all else
-        path = f"motion/{mark.body or WORLD}/{kind}{i}"
-        if mark.origin is not None:
-            path = f"level/{i}/{kind}"
-            level[str(i)] = [RigidTransform(pose @ mark.origin) for pose in scene.poses[mark.body]]
-        _draw_shape(meshcat, path, mark, mark.colour, scene.size)
+    _draw_shapes(meshcat, scene)
+    level = {  # marks that go with a body, and do not turn with it
+        str(i): [RigidTransform(pose @ mark.origin) for pose in scene.poses[mark.body]]
+        for i, mark in enumerate(scene.marks)
+        if mark.origin is not None
+    }
     radius = THICKNESS * scene.size
     _draw_tube(meshcat, "trail", scene.trail, radius)
     arrows = [_arrows_of("contacts", scene.contacts, RED, scene), _arrows_of("thrusts", scene.thrusts, VIOLET, scene)]
@@ -157,6 +214,20 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
     meshcat.PublishRecording()
     _look_at(meshcat, scene)
     meshcat.Flush()
+
+
+def _draw_shapes(meshcat: Meshcat, scene: Scene) -> None:
+    """The robot and its ghosts, goals and obstacles, each on its body. A page's bytes are those of this order."""
+    for i, drawn in enumerate(scene.shapes):
+        name = f"ground{i}" if isinstance(drawn.shape, HalfSpace) else str(i)  # replay.js paints the former
+        _draw_shape(meshcat, f"motion/{drawn.body or WORLD}/{name}", drawn, drawn.colour, scene.size)
+        for ghost in scene.ghosts:
+            if drawn.body in ghost.poses:
+                _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene.size)
+    for i, mark in enumerate(scene.marks):
+        kind = "above" if mark.above else "mark"  # replay.js draws the former through all else
+        path = f"motion/{mark.body or WORLD}/{kind}{i}" if mark.origin is None else f"level/{i}/{kind}"
+        _draw_shape(meshcat, path, mark, mark.colour, scene.size)
 
 
 def frames_of(times: Array, most: int = MOST_POSES) -> list[tuple[float, int]]:
@@ -205,12 +276,12 @@ def _hull(shape: Mesh) -> tuple[Array, Any]:
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())]).T, np.array(corners, dtype=np.int32).T
 
 
-def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> None:
-    """A line along `points` (n, 3) thick enough to be seen, which a browser's own lines are not."""
+def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> bool:
+    """A line along `points` (n, 3) thick enough to be seen, which a browser's own lines are not; if it has a length."""
     apart = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > radius / 10)
     points = points[apart]
     if len(points) < 2:
-        return
+        return False
     along = np.gradient(points, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     side = np.cross(along, np.where(np.abs(along[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]))
@@ -225,6 +296,7 @@ def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> Non
             a, b = 6 * k + i, 6 * k + (i + 1) % 6
             faces += [[a, b, a + 6], [b, b + 6, a + 6]]
     meshcat.SetTriangleMesh(path, vertices.T, np.array(faces, dtype=np.int32).T, TRAIL)
+    return True
 
 
 def _only(poses: Poses, shaped: set[str]) -> Poses:

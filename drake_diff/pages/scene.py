@@ -107,6 +107,7 @@ def scene_of(
     ghosts: Mapping[str, tuple[Array, Rgba]] | None = None,
     frame: str | None = None,
     marks: Sequence[Drawn] = (),
+    shapes: Sequence[Drawn] = (),
 ) -> Scene:
     """The scene of a motion of `model`.
 
@@ -119,6 +120,7 @@ def scene_of(
         ghosts: States (N+1, nx) and colour by name; a ghost that would hide behind the motion is left out.
         frame: The name of the frame or body whose origin leaves a trail; by default the centre of mass that moves most.
         marks: Goals and obstacles.
+        shapes: Those of an earlier scene of this model, which need not be read again.
 
     Raises:
         UnknownNameError: If there is no such frame.
@@ -130,7 +132,7 @@ def scene_of(
     of_ghosts = {name: _poses_of(model, moving, states) for name, states in seen.items()}
     trail = longest_path(poses, moving) if frame is None else _path_of(model, poses, len(xs), frame)
     return Scene(
-        shapes=tuple(shapes_of(model.plant, model.double.context, drawn)),
+        shapes=tuple(shapes or shapes_of(model.plant, model.double.context, drawn)),
         times=times,
         poses=poses,
         ghosts=tuple(Ghost(name, found, (ghosts or {})[name][1]) for name, found in of_ghosts.items()),

@@ -13,10 +13,13 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import UnknownNameError
 from drake_diff.optimize.problem.goals import Goal, Mark
 from drake_diff.optimize.problem.obstacles import Obstacle
+from drake_diff.pages.meshcat import RED, TRAIL, VIOLET
+from drake_diff.pages.scene import BLUE
 from drake_diff.pages.shapes import Drawn, body_path
 
 AXES = (Rgba(0.8, 0.15, 0.1, 0.9), Rgba(0.1, 0.6, 0.15, 0.9), Rgba(0.1, 0.3, 0.85, 0.9))  # x, y, z
 THIN = 0.03  # of an axis or an arrow: its radius
+Colour = tuple[str, str, str]  # of a legend: a colour of CSS, "line", "dot" or "arrow", and what it means
 LARGE = 0.25  # [m] the radius from which on a goal is so translucent that the robot is seen through it
 
 
@@ -83,13 +86,24 @@ def _drawn(path: str, shape: Any, pose: RigidTransform, colour: Rgba, radius: fl
     return Drawn(path, shape, pose, colour, np.asarray(pose.translation()), radius)
 
 
-def meaning_of(goals: Sequence[Goal]) -> list[tuple[str, str, str]]:
-    """What the marks of the `goals` mean, each once: a colour of CSS, "dot" or "arrow", and words."""
+def meaning_of(goals: Sequence[Goal]) -> list[Colour]:
+    """What the marks of the `goals` mean, each once."""
     marks = [mark for goal in goals for mark in goal.marks() if mark.shape != "axes"]
     rows = [(css(Rgba(*mark.colour)), "arrow" if mark.shape == "arrow" else "dot", mark.label) for mark in marks]
     if any(mark.shape == "axes" for goal in goals for mark in goal.marks()):
         rows.append((css(AXES[2]), "line", "axes of a target: x red, y green, z blue"))
     return list(dict.fromkeys(rows))
+
+
+def colours_of(*, plan: bool, contacts: bool, thrusts: bool) -> list[Colour]:
+    """What is drawn of a motion beside the robot: its path, and where there are any a ghost and forces."""
+    found = [(css(BLUE), "dot", "the plan, where the motion is elsewhere")] if plan else []
+    found.append((css(TRAIL), "line", "path of the centre of mass of the body that moves most"))
+    if contacts:
+        found.append((css(RED), "arrow", "contact forces: longer is more, and the largest tenth may be cut"))
+    if thrusts:
+        found.append((css(VIOLET), "arrow", "forces of the inputs on bodies"))
+    return found
 
 
 def css(colour: Any) -> str:

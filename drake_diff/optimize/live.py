@@ -1,0 +1,161 @@
+"""What `solve(view=True)` shows: the iterates of a search on a page, and then the motion of its plan."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import DrakeDiffError, InputError
+from drake_diff.model.parameters import applied
+from drake_diff.motion.rollout import STEPS, Rollout
+from drake_diff.optimize.iterate import Iterate
+from drake_diff.optimize.marks import colours_of, drawn_goals, meaning_of
+from drake_diff.optimize.phased import PhasedSolution
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import Iteration, Report
+from drake_diff.optimize.solution import Solution, Status
+from drake_diff.pages.live import LivePage, live_page
+from drake_diff.pages.meshcat import stills_of
+from drake_diff.pages.scene import BLUE, Scene, scene_of
+from drake_diff.pages.shapes import Drawn
+
+SEEN = 1e-3  # of the height of a plot: less than a pixel
+PERIOD = 0.3  # [s] from one drawing to the next, at least
+PART = 0.05  # of the time of a search: more is not spent on drawing it
+TRAIL_POINTS = 60  # of an iterate
+
+
+class LiveSearch:
+    """The page of one `solve`, whose address goes to `tell` when the search begins.
+
+    Raises InputError where `problem` has no robot that could be drawn.
+    """
+
+    def __init__(self, problem: Any, tell: Callable[[str], None]):
+        if not isinstance(problem, Problem) or not problem.has_model:
+            kind = "plain dynamics" if isinstance(problem, Problem) else type(problem).__name__
+            raise InputError(
+                "view", got=f"True, with {kind}", expected="a Problem of a model, which has bodies to draw"
+            )
+        self.problem, self.tell = problem, tell
+        self.page: LivePage | None = None
+        self.number, self.due = 0, 0.0
+        self.marks: tuple[Drawn, ...] = ()
+        self.shapes: tuple[Drawn, ...] = ()
+
+    def begin(self) -> None:
+        """Open the page, with the robot as it stands at first."""
+        problem = self.problem
+        self.page = live_page()
+        self.marks = drawn_goals(problem.model.plant, problem.model.double.context, problem.goals)
+        first, none = np.tile(problem.x0, (2, 1)), np.zeros((1, problem.nu))
+        scene = scene_of(problem.model, np.array([0.0, problem.time_step]), first, us=none, marks=self.marks)
+        self.shapes = scene.shapes
+        touches = bool(problem.model.contract.contact.collision_pairs)
+        colours = colours_of(plan=False, contacts=touches, thrusts=any(scene.thrusts))
+        self.number = self.page.begin(problem.name, [*colours, *meaning_of(problem.goals)])
+        self.page.show(self.number, scene)
+        self.tell(self.page.address)
+
+    def beside(self, report: Report) -> Report:
+        """A report that shows here what it hands on."""
+
+        def row(row: Iteration) -> None:
+            self.row(row)
+            if report.callback is not None:
+                report.callback(row)
+
+        def line(text: str) -> None:
+            self._told(line=text)
+            report.say(text)
+
+        def plan(plan: Any) -> None:
+            self._told(state="measuring", line="a search has ended, and its plan is measured")
+            if report.plan is not None:
+                report.plan(plan)
+
+        return Report(line, row, plan)
+
+    def row(self, row: Iteration) -> None:
+        """Add a row to the plots, and draw its motion if it is time to: at most for a PART of the time."""
+        if self.page is None:
+            return
+        self.page.add(self.number, row.iteration, row.objective, row.primal_infeasibility)
+        self._told(state="searching")
+        begin = time.monotonic()
+        if begin < self.due or self.page.is_busy or len(row.motions) != 1 or not np.all(np.isfinite(row.motions[0].xs)):
+            return
+        self.page.show(self.number, self._scene(row.motions[0]))
+        end = time.monotonic()
+        self.due = end + max(PERIOD, (end - begin) / PART)
+
+    def _scene(self, motion: Iterate) -> Scene:
+        """Of some of its states, which are enough to see it by."""
+        count, own = len(motion.us), self.problem.design.own(motion.vector.values)
+        kept = np.unique(np.round(np.linspace(0, count, min(count, TRAIL_POINTS) + 1)).astype(int))
+        seen = stills_of(len(kept))[:-1]
+        contacts: list[Any] = [()] * (len(kept) - 1)
+        if motion.problem.motion == STEPS:
+            try:
+                for place, found in zip(seen, motion.contacts_in(kept[seen].tolist()), strict=True):
+                    contacts[place] = found
+            except DrakeDiffError as error:
+                self._told(line=f"contact forces are not drawn: {error}")
+        with applied(self.problem.parameters.at(own)) as model:
+            xs, us, shown = motion.xs[kept], motion.us[kept[:-1]], dict[str, Any](marks=self.marks, shapes=self.shapes)
+            return scene_of(model, motion.times[kept], xs, us=us, contacts=contacts, **shown)
+
+    @contextmanager
+    def running(self, started: Callable[[], None] | None) -> Iterator[Callable[[], None]]:
+        """What to call when the work begins, for as long as it goes on; the page says so if an error ends it."""
+
+        def start() -> None:
+            if started is not None:
+                started()
+            self.begin()
+
+        try:
+            yield start
+        except BaseException as error:
+            self._told(state="ended by an error", verdict="fail", message=f"{type(error).__name__}: {error}")
+            raise
+
+    def end(self, solution: Solution | PhasedSolution) -> None:
+        """Show the motion of the plan, and what became of it."""
+        if self.page is None or not isinstance(solution, Solution):
+            return
+        judged = solution.judged_replay if "replays" in vars(solution) else None
+        motion = solution.replay if judged is None or judged.motion is None else judged.motion
+        self.page.show(self.number, scene_of_plan(solution, motion), end=True)
+        state = solution.status
+        open_ = (Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT, Status.ITERATION_LIMIT)
+        verdict = "pass" if solution.success else "open" if state in open_ else "fail"
+        self._told(state=state.value, verdict=verdict, message=solution.message)
+        self.page.wait()
+
+    def _told(self, **facts: Any) -> None:
+        if self.page is not None:
+            self.page.tell(self.number, **facts)
+
+
+def scene_of_plan(solution: Solution, motion: Rollout | None) -> Scene:
+    """A `motion` of the plant beside the plan that it follows, or where there is none the plan alone."""
+    problem, xs = solution.problem, solution.xs[solution.knots]
+    model = problem.model
+    marks = drawn_goals(model.plant, model.double.context, problem.goals)
+    if motion is None:  # states of the plan that are not finite are drawn at x0
+        xs = np.where(np.all(np.isfinite(xs), axis=1)[:, None], xs, problem.x0)
+        return scene_of(model, solution.times[solution.knots], xs, marks=marks)
+    planned = solution.plan.sample((len(motion.xs) - 1) // (len(xs) - 1))[0]
+    ghosts = {"plan": (planned, BLUE)} if np.all(np.isfinite(planned)) and differ(motion.xs, planned) else None
+    return scene_of(model, motion.times, motion.xs, us=motion.us, contacts=motion.contacts, ghosts=ghosts, marks=marks)
+
+
+def differ(motion: Array, plan: Array) -> bool:
+    """Whether a reader could tell a motion (n, m) from its plan: by SEEN of what a column moves, 1e-3 at least."""
+    moved = np.ptp(motion, axis=0)
+    apart = np.max(np.abs(motion - plan), axis=0)
+    return not bool(np.all(apart <= SEEN * np.maximum(moved, 1e-3)))  # what is not finite differs

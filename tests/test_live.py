@@ -1,0 +1,316 @@
+"""The page of a search while it runs: what it is told, who may read it, and that nothing of what is found changes."""
+
+import base64
+import http.client
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.browser import browsing, errors
+from helpers.models import MODELS
+from pydrake.geometry import Meshcat, MeshcatParams, Rgba
+from pydrake.math import RigidTransform
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError
+from drake_diff.model.triangles import Triangles
+from drake_diff.pages.live import live_page
+from drake_diff.pages.meshcat import STILLS, Stills, stills_of
+from drake_diff.pages.scene import Scene, scene_of
+from drake_diff.pages.shapes import Drawn
+
+HOSTILE = "<img src=x onerror=alert(1)>"
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch):
+    """Every iterate is drawn whose predecessor is."""
+    monkeypatch.setattr("drake_diff.optimize.live.PERIOD", 0.0)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    far = dd.SphereObstacle([3.0, 0, 3.0], 0.1, name=HOSTILE)
+    return dd.Problem(model, x0=[0, 0], x_goal=[1.0, 0], num_steps=20, running_cost=EFFORT, goals=[far])
+
+
+def pushed():
+    """A ball of 1 kg on the ground, pushed forward."""
+    push = dd.model.BodyForce("push", "ball", direction=(1, 0, 0))
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01, body_forces=[push])
+    x0 = np.array(model.default_state)
+    x0[6] = 0.0995  # [m] of a radius of 0.1
+    final = lambda x: 1e4 * (x[4] - 0.005) ** 2  # noqa: E731
+    return dd.Problem(model, x0=x0, num_steps=3, running_cost=EFFORT, final_cost=final)
+
+
+def port_of(address):
+    return int(address.rstrip("/").rpartition(":")[2])
+
+
+def watched(problem, **options):
+    """The solution, the address of its page, and what that says at the end."""
+    addresses = []
+    solution = dd.solve(problem, view=addresses.append, **options)
+    (address,) = addresses
+    with urllib.request.urlopen(f"{address}news", timeout=10) as answer:
+        return solution, address, json.load(answer)
+
+
+@pytest.mark.parametrize("method", ["ilqr", "shooting", "collocation", "contact"])
+def test_to_look_changes_not_a_bit_and_every_row_is_told(swing, method):
+    problem, method = (pushed(), "ilqr") if method == "contact" else (swing, method)
+    rows = []
+    alone = dd.solve(problem, method=method)
+    solution, _, news = watched(problem, method=method, callback=rows.append)
+    for name in ("xs", "us"):
+        assert getattr(solution, name).tobytes() == getattr(alone, name).tobytes()
+    assert (solution.status, solution.iterations) == (alone.status, alone.iterations)
+    assert (news["state"], news["message"]) == (solution.status.value, solution.message)
+    told = [[row.objective, row.primal_infeasibility] for row in rows]
+    np.testing.assert_allclose(news["rows"], told, rtol=1e-7)  # eight digits are told
+    assert news["starts"] == [0] * bool(rows)
+
+
+def test_the_page_and_its_viewer_listen_to_this_machine_alone(swing):
+    """By what the kernel says of the two ports: 127.0.0.1, and nothing of IPv6."""
+    watched(swing, method="ilqr")
+    page = live_page()
+    ports = {port_of(page.address), port_of(page.viewer)}
+    assert len(ports) == 2
+    listening = []
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        if Path(table).exists():
+            lines = [line.split() for line in Path(table).read_text().splitlines()[1:]]
+            listening += [line[1].split(":") for line in lines if line[3] == "0A"]
+    found = [host for host, port in listening if int(port, 16) in ports]
+    assert [socket.inet_ntoa(struct.pack("<I", int(host, 16))) for host in found] == ["127.0.0.1"] * 2
+
+
+def test_a_strangers_name_for_this_machine_is_refused(swing):
+    """A page elsewhere can give its own name the address 127.0.0.1: its browser says which name it asked for."""
+    address = watched(swing, method="ilqr")[1].removeprefix("http://").rstrip("/")
+    for host, status in (("evil.example", 403), (address, 200), ("", 403)):
+        asking = http.client.HTTPConnection(address, timeout=10)
+        asking.request("GET", "/news", headers={"Host": host})
+        assert asking.getresponse().status == status
+    for path, status in (("elsewhere", 404), ("news?number=x", 400), ("../../etc/passwd", 404)):
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(f"http://{address}/{path}", timeout=10)
+        assert refused.value.code == status
+
+
+def test_names_of_models_and_goals_are_no_part_of_the_page(swing):
+    _, address, news = watched(swing, method="ilqr")
+    with urllib.request.urlopen(address, timeout=10) as answer:
+        page, policy = answer.read().decode(), answer.headers["Content-Security-Policy"]
+    assert any(HOSTILE in words for _, _, words in news["colours"])
+    assert HOSTILE not in page
+    assert "script-src 'sha256-" in policy
+    assert "unsafe-inline'; script" not in policy
+
+
+def test_a_browser_that_reads_nothing_holds_up_no_search(swing, monkeypatch):
+    """Drake waits until all browsers have what it sends: in a thread that nobody waits for."""
+    monkeypatch.setattr("drake_diff.pages.live.PATIENCE", 0.1)
+    alone, page = dd.solve(swing, method="ilqr"), live_page()
+    viewer = page.viewer.removeprefix("http://").rstrip("/")
+    key = base64.b64encode(os.urandom(16)).decode()
+    upgrade = f"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13"
+    vertices = np.random.default_rng(0).normal(size=(300_000, 3))
+    large = Triangles(vertices, np.arange(300_000).reshape(-1, 3))  # more than a connection's buffers take
+    shape = Drawn("", large, RigidTransform(), Rgba(1, 0, 0, 1), np.zeros(3), 1.0)
+    poses = {"ball": [RigidTransform()] * 2}
+    scene = Scene((shape,), np.array([0.0, 1.0]), poses, (), contacts=((),), trail=np.zeros((2, 3)))
+    with socket.create_connection(("127.0.0.1", port_of(page.viewer))) as hanging:
+        hanging.sendall(f"GET / HTTP/1.1\r\nHost: {viewer}\r\n{upgrade}\r\n\r\n".encode())
+        hanging.recv(1)  # it is a browser now
+        page.show(page.begin("large", []), scene, end=True)
+        assert not page.wait(0.5)
+        solution, _, news = watched(swing, method="ilqr")
+        assert page.is_busy  # still with the large one
+    assert (solution.us.tobytes(), news["state"]) == (alone.us.tobytes(), "converged")
+    assert page.wait(20)
+
+
+def test_a_browser_that_leaves_is_no_error(swing, capfd):
+    page = live_page()
+
+    def leave(row):
+        leaving = socket.create_connection(("127.0.0.1", port_of(page.address)))
+        leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset
+        leaving.sendall(f"GET / HTTP/1.1\r\nHost: {page.address[7:-1]}\r\n\r\n".encode())
+        leaving.close()
+
+    assert watched(swing, method="ilqr", callback=leave)[2]["state"] == "converged"
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_an_error_ends_the_search_on_the_page_too(swing):
+    addresses = []
+
+    def stop(row):
+        raise RuntimeError(HOSTILE)
+
+    with pytest.raises(RuntimeError, match="onerror"):
+        dd.solve(swing, method="ilqr", view=addresses.append, callback=stop)
+    with urllib.request.urlopen(f"{addresses[0]}news", timeout=10) as answer:
+        news = json.load(answer)
+    assert (news["state"], news["message"]) == ("ended by an error", f"RuntimeError: {HOSTILE}")
+
+
+def test_one_page_shows_one_search_after_the_other_and_sends_what_is_new(swing):
+    first, second = (watched(swing, method="ilqr", max_iterations=most) for most in (50, 3))
+    assert first[1] == second[1]
+    number, count = second[2]["number"], len(second[2]["rows"])
+    assert (number, count) == (first[2]["number"] + 1, 3)
+    assert second[2]["verdict"] == "open"
+    page = live_page()
+    assert page.news(number, 2)["rows"] == second[2]["rows"][2:]
+    assert page.news(number - 1, 2)["rows"] == second[2]["rows"]  # of an earlier search nothing is known
+    page.add(number - 1, 7, 1.0, 1.0)  # one that still runs elsewhere
+    assert len(page.news(number, 0)["rows"]) == count
+
+
+@pytest.mark.parametrize(
+    ("problem", "view", "told"),
+    [
+        (None, 3, "True, False or a function"),
+        (dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1), True, "plain dynamics"),
+        ("phases", True, "PhasedProblem"),
+    ],
+    ids=["number", "dynamics", "phases"],
+)
+def test_what_cannot_be_shown_is_refused_before_the_search(swing, problem, view, told):
+    if problem is not None:
+        block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+        plain = dd.Problem(block, x0=[0, 0], x_goal=[1, 0], num_steps=4, horizon=1.0, running_cost=EFFORT)
+        problem = dd.optimize.PhasedProblem([plain, plain]) if problem == "phases" else plain
+    with pytest.raises(InputError, match=told):
+        dd.solve(problem or swing, view=view)
+
+
+def test_the_solid_robot_is_the_last_state_and_the_others_lie_between():
+    assert stills_of(61) == [0, 10, 20, 30, 40, 50, 60]
+    assert stills_of(2) == [0, 1]
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    meshcat = Meshcat(MeshcatParams(host="127.0.0.1", show_stats_plot=False))
+    seen = []
+    for end in (1.0, 2.0):
+        xs = np.linspace([0, 0], [end, 0], 61)
+        scene = scene_of(model, np.arange(61.0), xs)
+        if not seen:
+            drawn = Stills(meshcat, scene)
+        drawn.show(scene)
+        (path,) = scene.poses
+        found = [meshcat._GetPackedTransform(f"stills/{i}/{path}") for i in range(STILLS - 1)]
+        expected = [RigidTransform(scene.poses[path][10 * i]) for i in range(STILLS - 1)]
+        other = Meshcat(MeshcatParams(host="127.0.0.1", show_stats_plot=False))
+        for i, pose in enumerate([*expected, scene.poses[path][-1]]):
+            other.SetTransform(f"stills/{i}/{path}" if i < STILLS - 1 else f"motion/{path}", pose)
+        wanted = [other._GetPackedTransform(f"stills/{i}/{path}") for i in range(STILLS - 1)]
+        assert found == wanted
+        last = meshcat._GetPackedTransform(f"motion/{path}")
+        assert last == other._GetPackedTransform(f"motion/{path}")
+        seen.append(last)
+    assert seen[0] != seen[1]
+
+
+def test_contact_forces_of_an_iterate_are_drawn_where_they_push():
+    """At each of the states that are seen: as many arrows as there are contacts, along the ball's way."""
+    problem, scenes = pushed(), []
+    page = live_page()
+    show = page.show
+    page.show = lambda number, scene, end=False: (scenes.append((scene, end)), show(number, scene, end=end))
+    try:
+        rows = []
+        dd.solve(
+            problem, method="ilqr", view=lambda address: None, callback=lambda row: rows.append((row, row.contacts))
+        )
+    finally:
+        del page.show
+    (_, first_end), *later = scenes
+    assert not first_end
+    assert later[-1][1]
+    for scene, _ in later[:-1]:
+        forces = [one.force for step in scene.contacts for one in step]
+        wanted = [[p.force for step in contacts for p in step] for row, contacts in rows]
+        assert any(len(w) == len(forces) and np.array_equal(w, forces) for w in wanted)
+    assert len(later) > 1
+
+
+@pytest.mark.slow
+def test_a_run_is_shown_until_ctrl_c(tmp_path):
+    script = tmp_path / "swing.py"
+    script.write_text(
+        "import drake_diff as dd\n\ndef problem():\n"
+        "    model = dd.example_model('pendulum', time_step=0.05)\n"
+        "    effort = dd.QuadraticCost(R=[[1.0]])\n"
+        "    return dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=effort)\n"
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "drake_diff.cli.main",
+        "run",
+        str(script),
+        "--view",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    lines = []
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        for line in process.stdout:
+            lines.append(line)
+            if "Ctrl-C" in line:
+                address = line.split()[4]
+                with urllib.request.urlopen(f"{address}news", timeout=10) as answer:
+                    news = json.load(answer)
+                process.send_signal(signal.SIGINT)
+    assert lines[-1] == "ended\n"
+    assert f"the search is shown at {address}\n" in lines
+    assert (process.returncode, news["state"]) == (0, "converged")
+    assert (tmp_path / "run" / "record.json").is_file()
+
+
+@pytest.fixture
+def connected(browser):
+    """The browser, which is offline in all other tests."""
+    told = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+    browser.execute_cdp_cmd("Network.emulateNetworkConditions", {"offline": False, **told})
+    yield browser
+    browser.get("about:blank")
+    browser.execute_cdp_cmd("Network.emulateNetworkConditions", {"offline": True, **told})
+
+
+@browsing
+def test_a_browser_shows_rows_names_as_text_and_the_end(swing, connected):
+    """In one tab that is open before the search ends: no script of a name runs, and the viewer is in its frame."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    browser = connected
+    browser.get_log("browser")
+    solution = dd.solve(swing, method="ilqr", view=browser.get)
+    state = "return document.getElementById('state').textContent"
+    WebDriverWait(browser, 20).until(lambda b: b.execute_script(state) == "converged")
+    assert (
+        browser.execute_script("return Number(document.documentElement.dataset.rows)") == len(solution.iterations) - 1
+    )
+    assert HOSTILE in browser.execute_script("return document.getElementById('colours').textContent")
+    assert browser.execute_script("return document.querySelectorAll('img').length") == 0
+    assert browser.execute_script("return document.querySelectorAll('.u-over').length") == 2
+    browser.switch_to.frame("view")
+    WebDriverWait(browser, 20).until(lambda b: b.execute_script("return Boolean(viewer.animator.duration)"))
+    browser.switch_to.default_content()
+    assert errors(browser) == []
