@@ -11,19 +11,29 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
+from urllib.request import urlopen
 
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.geometry import HalfSpace, Meshcat, MeshcatParams, Rgba
 
-from drake_diff.pages.html import asset, numbers, render, script_hashes
+from drake_diff.pages.html import asset, numbers
 from drake_diff.pages.meshcat import Stills, draw
 from drake_diff.pages.scene import Scene
 
 HOST = "127.0.0.1"
 PATIENCE = 5.0  # [s] that a search which has ended waits until its motion is drawn
-SCRIPTS = ("uPlot.iife.min.js", "live.js")
+GROUND = Rgba(0.867, 0.882, 0.902, 1)  # as on other pages: most robots are grey
+ASSETS = {
+    "uPlot.iife.min.js": "text/javascript",
+    "live.js": "text/javascript",
+    "uPlot.min.css": "text/css",
+    "report.css": "text/css",
+    "live.css": "text/css",
+}
+POLICY = "default-src 'self'; img-src data:; object-src 'none'; base-uri 'none'; form-action 'none'"
 
 
 class LivePage:
@@ -38,7 +48,7 @@ class LivePage:
         made = threading.Event()
         threading.Thread(target=self._draw, args=[made], name="drake_diff live view", daemon=True).start()
         made.wait()
-        self._server = _Server((HOST, 0), _handler_of(self))
+        self._server = _Server(self)
         threading.Thread(target=self._server.serve_forever, name="drake_diff live page", daemon=True).start()
 
     @property
@@ -50,6 +60,14 @@ class LivePage:
     def is_busy(self) -> bool:
         """Whether a scene waits to be drawn, or is drawn."""
         return self._next is not None or self._drawing
+
+    def viewer_page(self) -> str:
+        """Meshcat's page for our frame: from here, so that our slider reaches into it, and connected to Meshcat."""
+        with urlopen(self.viewer, timeout=10) as answer:
+            page = str(answer.read().decode())
+        there = self.viewer.rstrip("/") + "/"
+        socket = f"class extends WebSocket {{ constructor() {{ super({there.replace('http', 'ws', 1)!r}); }} }}"
+        return page.replace("<head>", f'<head><base href="{there}"><script>WebSocket = {socket};</script>', 1)
 
     def begin(self, title: str, colours: Sequence[tuple[str, str, str]]) -> int:
         """Show another search from now on; the number that tells its scenes and rows from those of others.
@@ -105,6 +123,8 @@ class LivePage:
         stills: tuple[int, Stills] | None = None
         while True:
             number, scene, end = self._taken()
+            paved = [replace(s, colour=GROUND) if isinstance(s.shape, HalfSpace) else s for s in scene.shapes]
+            scene = replace(scene, shapes=tuple(paved))
             try:
                 if end:
                     stills = None
@@ -146,44 +166,52 @@ def live_page() -> LivePage:
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
+    def __init__(self, page: LivePage):
+        self.page = page
+        super().__init__((HOST, 0), _Handler)
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         if not isinstance(sys.exception(), ConnectionError):  # a browser that was closed is no error
             super().handle_error(request, client_address)
 
 
-def _handler_of(page: LivePage) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            asked, port = urlsplit(self.path), self.server.server_port  # type: ignore[attr-defined]
-            if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
-                self.send_error(403)  # a stranger's page whose name leads here
-            elif asked.path == "/":
-                scripts = [asset(name) for name in SCRIPTS]
-                allowed = " ".join(f"'sha256-{h}'" for h in script_hashes(*(f"<script>{s}</script>" for s in scripts)))
-                policy = f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; connect-src 'self'; "
-                policy += f"frame-src {page.viewer}; img-src data:; base-uri 'none'; form-action 'none'"
-                text = render("live.html.j2", viewer=page.viewer, scripts=scripts)
-                self._send("text/html", text, {"Content-Security-Policy": policy})
-            elif asked.path == "/news":
-                try:
-                    known = [int(parse_qs(asked.query).get(name, ["0"])[0]) for name in ("number", "known")]
-                except ValueError:
-                    self.send_error(400)
-                    return
-                self._send("application/json", json.dumps(page.news(known[0], max(0, known[1]))), {})
-            else:
-                self.send_error(404)
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
 
-        def _send(self, kind: str, text: str, headers: dict[str, str]) -> None:
-            data = text.encode()
-            self.send_response(200)
-            more = {"Content-Length": str(len(data)), "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
-            for name, value in {"Content-Type": f"{kind}; charset=utf-8", **more, **headers}.items():
-                self.send_header(name, value)
-            self.end_headers()
-            self.wfile.write(data)
+    def do_GET(self) -> None:
+        port = self.server.server_port
+        if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
+            self.send_error(403)  # a stranger's page whose name leads here
+            return
+        asked = urlsplit(self.path)
+        name = asked.path[1:]
+        if name == "":
+            self._send("text/html", asset("live.html"), {"Content-Security-Policy": POLICY})
+        elif name in ASSETS:
+            self._send(ASSETS[name], asset(name), {})
+        elif name == "viewer":
+            self._send("text/html", self.server.page.viewer_page(), {})
+        elif name == "news":
+            self._send_news(parse_qs(asked.query))
+        else:
+            self.send_error(404)
 
-        def log_message(self, format: str, *args: Any) -> None:
-            """A page that asks for news twice a second is nothing to tell."""
+    def _send_news(self, asked: dict[str, list[str]]) -> None:
+        try:
+            number, known = (int(asked.get(name, ["0"])[0]) for name in ("number", "known"))
+        except ValueError:
+            self.send_error(400)
+            return
+        self._send("application/json", json.dumps(self.server.page.news(number, max(0, known))), {})
 
-    return Handler
+    def _send(self, kind: str, text: str, headers: dict[str, str]) -> None:
+        data = text.encode()
+        self.send_response(200)
+        more = {"Content-Length": str(len(data)), "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+        for name, value in {"Content-Type": f"{kind}; charset=utf-8", **more, **headers}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """A page that asks for news twice a second is nothing to tell."""

@@ -4,7 +4,7 @@
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
   const SEEN = {
     searching: "Some states of the motion that the search stands at. The solid robot is the last of them.",
-    ended: "The motion, to be played: the time is under Animations, in Open Controls.",
+    ended: "The motion of the plan, as it was simulated.",
   };
   const PILLS = { pass: "pass", fail: "fail" };
   let known = { number: 0 }, rows = [], starts = [], plots = [];
@@ -92,6 +92,38 @@
     known = told;
     document.documentElement.dataset.rows = rows.length;
   }
+  // The motion, which the viewer in the frame plays
+  const animator = () => { const v = byId("view").contentWindow.viewer; return known.verdict && v && v.animator && v.animator.duration ? v.animator : null; };
+  let playing = true, dragged = false;
+  function setPlaying(on) {
+    playing = on;
+    byId("play").textContent = on ? "❚❚" : "▶";
+    byId("play").setAttribute("aria-label", on ? "pause" : "play");
+    const a = animator();
+    if (a) { if (on) a.play(); else a.pause(); }
+  }
+  function follow() {
+    const a = animator();
+    byId("player").hidden = !a;
+    if (a) {
+      byId("time").max = a.duration;
+      if (!dragged) byId("time").value = Math.min(a.time, a.duration);
+      byId("now").textContent = Number(byId("time").value).toFixed(3) + " s";
+    }
+    requestAnimationFrame(follow);
+  }
+  byId("play").addEventListener("click", () => setPlaying(!playing));
+  byId("time").addEventListener("input", () => {
+    const a = animator();
+    if (!a) return;
+    setPlaying(false);
+    dragged = true;
+    a.seek(Math.min(Number(byId("time").value), a.duration - 1e-6));
+    byId("view").contentWindow.viewer.render();
+  });
+  byId("time").addEventListener("change", () => { dragged = false; });
+  requestAnimationFrame(follow);
+
   let timer = 0;
   async function ask() {
     try {
