@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import re
 import warnings
 from pathlib import Path
 
@@ -268,3 +269,21 @@ def test_the_policy_lands_and_rests_at_its_height_and_its_plan_can_be_verified(t
     assert own.contacts[-1]  # and stands
     dd.save(solution, tmp_path / "run")
     assert dd.verify(tmp_path / "run").verdict == "holds"
+
+
+@pytest.mark.slow
+def test_the_tossed_cube_has_its_published_size_and_is_predicted_better_than_by_hand(tmp_path, monkeypatch, capsys):
+    """Half of 104.8 mm to 1 %, as a caliper would say, from tosses whose fall says how long the cameras' metre is."""
+    monkeypatch.chdir(tmp_path)
+    module = example("tossed_cube")
+    module.main()
+    text = capsys.readouterr().out
+    assert float(re.search(r"Half its width is ([\d.]+) mm", text)[1]) == pytest.approx(52.4, rel=0.01)
+    metre = float(re.search(r"a recorded metre is ([\d.]+) m", text)[1])
+    assert metre == pytest.approx(52.4 / 51.24, abs=0.01)  # by the height of its centre where it lies still
+    by_hand, identified = (float(e) for e in re.findall(r"Tosses not used, .*?: ([\d.]+) %", text))
+    assert identified < by_hand
+    record = dd.load_record(tmp_path / "artifacts" / "tossed_cube" / "impacts")
+    assert record.inputs.motion == "impacts"
+    assert record.verdict == "fail"  # no cube of rigid spheres explains real impacts to the noise of the cameras
+    assert dd.verify(tmp_path / "artifacts" / "tossed_cube" / "fall").holds

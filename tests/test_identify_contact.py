@@ -9,7 +9,11 @@ import pytest
 import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.identification import first_state, identify_contact
+from drake_diff.identification.chart import Chart
 from drake_diff.identification.cloud import shrink_to
+from drake_diff.identification.flights import start_of
+from drake_diff.identification.measured import read_pieces
+from drake_diff.mechanics.description import coordinates_of
 
 TOSSES = Path(__file__).parent / "benchmarks" / "cube_tosses.py"
 
@@ -92,9 +96,63 @@ def test_a_plane_follows_what_a_ragged_function_does_on_the_whole():
         ragged = np.sin(300 * w[0] + np.arange(40)) * 20  # has a minimum every 0.02
         return np.concatenate([100 * (w[0] - 0.7) + ragged, [50 * (w[1] + 0.4)] * 40])
 
-    w = shrink_to(residual, np.zeros(2), (1.0, 0.5, 0.25), np.random.default_rng(0))
+    w = shrink_to(residual, np.zeros(2), (1.0, 0.5, 0.25), np.random.default_rng(0)).w
     # What is ragged counts 20 / sqrt(2 * 40 * 8) of 100: a hundredth.
     np.testing.assert_allclose(w, [0.7, -0.4], atol=0.03)
+
+
+def noisy(ball, friction, seed):
+    """Five throws, the last of which may have another friction; noise of 0.1 mm and 0.2 mrad in every pose."""
+    random, found = np.random.default_rng(seed), []
+    for k in range(5):
+        own = friction[k == 4]
+        x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.15, 4.0 - k, 6.0 * k - 12, 0.5, 0.4 + 0.1 * k, 0.2, 0.3])
+        xs = dd.rollout(ball, x0, np.zeros((60, 0)), parameters={"ball.friction": own}).xs.copy()
+        xs[:, 1:] += np.repeat([1e-4, 0.02], [6, 6]) * random.standard_normal((61, 12))
+        xs[:, :4] /= np.linalg.norm(xs[:, :4], axis=1)[:, None]
+        found.append(dd.Recording(f"throw {k}", "1", 0.005 * np.arange(61), xs, np.zeros((60, 0))))
+    return found
+
+
+def test_identify_goes_through_impacts_and_says_whether_they_are_explained(ball):
+    def fit(friction, **more):
+        logs = noisy(ball, friction, 1)
+        return dd.identify(ball, logs, ["ball.friction"], motion="impacts", held_out="throw 4", **more)
+
+    right = fit((0.25, 0.25))
+    assert right.explained, right.reason
+    assert right.values["ball.friction"] == pytest.approx(0.25, rel=0.02)  # of noise, its interval's half width
+    # What is left has the size that noise and the first states' uncertainty explain.
+    assert 0.6 < right.error_after < 1.4
+    wrong = fit((0.25, 0.1))  # what is predicted is another ball
+    assert not wrong.explained
+    assert "held out" in wrong.reason
+    with pytest.raises(InputError, match="priors and bounds"):
+        fit((0.25, 0.25), bounds={"ball.friction": (0, 1)})
+
+
+@pytest.mark.slow
+def test_an_identification_through_impacts_can_be_kept_and_comes_out_again(ball, tmp_path):
+    found = dd.identify(ball, noisy(ball, (0.25, 0.25), 2), ["ball.friction"], motion="impacts", held_out="throw 4")
+    record = dd.save(found, tmp_path / "run")
+    assert (record.verdict, record.inputs.motion) == ("pass", "impacts")
+    assert dd.verify(tmp_path / "run").holds
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "through impacts" in page
+
+
+def test_the_spread_of_a_first_state_is_that_of_first_states_by_other_noise(ball):
+    """By the same flight measured again and again, which is what the spread speaks of."""
+    chart, found, told = Chart(coordinates_of(ball)), [], []
+    for seed in range(20):
+        piece = read_pieces(ball, noisy(ball, (0.25, 0.25), seed)[2], 0.0)[0].part(0, 15)
+        start = start_of(ball, chart, piece, np.full(6, 1e-4))
+        found.append(start.x)
+        told.append(np.sqrt(np.sum(start.spread**2, axis=1)))
+    scattered = np.std(chart.minus(np.array(found), np.mean(found, axis=0)), axis=0, ddof=1)
+    # Of 20 flights, the root of chi^2 / 19 is within 0.55 and 1.55 for 12 numbers together, 1 in 100 times not.
+    ratio = scattered / np.sqrt(np.mean(np.square(told), axis=0))
+    assert np.all((ratio > 0.55) & (ratio < 1.55)), ratio
 
 
 @pytest.mark.slow

@@ -172,7 +172,7 @@ def identify(
         str,
         typer.Option(metavar="PART|NAME", help="The part at the end of each recording, or a recording, to predict."),
     ] = "0.2",
-    motion: Annotated[str, typer.Option(help="auto, continuous or steps")] = "auto",
+    motion: Annotated[str, typer.Option(help="auto, continuous, steps or impacts")] = "auto",
     prior: Annotated[
         list[str] | None,
         typer.Option(metavar="PARAMETER=MEAN,DEVIATION", help="What is known of a parameter. Can be given again."),

@@ -54,19 +54,30 @@ def plane_at(residual: Callable[[Array], Array], w: Array, width: float, random:
     return Plane(C[0], C[1:].T / width, scatter + 1)
 
 
+@dataclass(frozen=True, eq=False)
+class Shrunk:
+    """Where steps led."""
+
+    w: Array  # (n,)
+    rounds: int  # planes that were laid
+    converged: bool  # whether the last step was within the narrowest cloud
+
+
 def shrink_to(
     residual: Callable[[Array], Array], w: Array, widths: Sequence[float], random: np.random.Generator
-) -> Array:
-    """(n,) where steps lead, some for each width of the cloud, from w (n,).
+) -> Shrunk:
+    """Where steps lead, some for each width of the cloud, from w (n,).
 
     Residuals are in units of what they are uncertain by at best.
     """
+    rounds, within = 0, False
     for width in widths:
         most = FAR * width * float(np.sqrt(len(w)))
         for _ in range(AGAIN):
             d = plane_at(residual, w, width, random).step()
             length = float(np.linalg.norm(d))
             w = w + d * min(1.0, most / max(length, 1e-300))
-            if length <= most / 2:
+            rounds, within = rounds + 1, length <= most / 2
+            if within:
                 break
-    return w
+    return Shrunk(w, rounds, within)

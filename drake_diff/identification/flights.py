@@ -5,6 +5,7 @@ of them is far better known than any single velocity, which is a difference of n
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,10 +43,23 @@ def flights_of(model: Model, xs: Array) -> list[tuple[int, int]]:
     return found
 
 
-def start_of(model: Model, chart: Chart, piece: Piece, scale: Array) -> Array:
-    """(nx,) the state whose motion goes through the positions of a piece in which nothing touches.
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A first state, and what measured positions leave open of it."""
 
-    By least squares, each position in units of its `scale` (nv,). Parameters that are applied act.
+    x: Array  # (nx,)
+    spread: Array  # (2 nv, k): small motions from x, of one standard deviation each
+
+    def others(self, chart: Chart, count: int, random: np.random.Generator) -> list[Array]:
+        """First states (nx,) that the same positions could have had."""
+        return [chart.plus(self.x, self.spread @ random.standard_normal(self.spread.shape[1])) for _ in range(count)]
+
+
+def start_of(model: Model, chart: Chart, piece: Piece, scale: Array) -> Start:
+    """The state whose motion goes through the positions of a piece in which nothing touches.
+
+    By least squares, each position in units of its `scale` (nv,). Its spread is that of the scatter of what is left.
+    Parameters that are applied act.
     """
     each, nv = steps_between(model, piece), model.nv
     us, x, none = np.repeat(piece.us, each, axis=0), piece.ys[0], select(model, ())
@@ -60,9 +74,11 @@ def start_of(model: Model, chart: Chart, piece: Piece, scale: Array) -> Array:
         slopes.append(by_start)
         J = (chart.to_motion(xs) @ np.array(slopes))[:, :nv] / scale[:, None]
         e = chart.minus(piece.ys, xs)[:, :nv] / scale
-        d = np.linalg.lstsq(J.reshape(-1, 2 * nv), e.ravel(), rcond=None)[0]
-        x = chart.plus(x, np.asarray(d, dtype=float))
-    return np.asarray(x)
+        inverse = np.linalg.pinv(J.reshape(-1, 2 * nv))
+        d = np.asarray(inverse @ e.ravel(), dtype=float)
+        x = chart.plus(x, d)
+    left = np.sqrt(np.sum((e - J @ d) ** 2, axis=0) / (len(e) - 2))  # a place and a velocity of each are fitted
+    return Start(np.asarray(x), inverse * np.tile(left, len(e)))
 
 
 def steps_between(model: Model, piece: Piece) -> int:
@@ -117,4 +133,4 @@ def first_state(model: Model, recording: Recording, *, parameters: Mapping[str, 
     if not found or found[0][0] > 0:
         return np.array(piece.ys[0])
     with applied(vector) as own:
-        return start_of(own, chart, piece.part(*found[0]), millisecond(chart, [piece]))
+        return start_of(own, chart, piece.part(*found[0]), millisecond(chart, [piece])).x

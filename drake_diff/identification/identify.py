@@ -12,7 +12,7 @@ from drake_diff._base.arrays import Array, frozen, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
-from drake_diff.exceptions import ModelError, UnknownNameError
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.fit import Fit, Law, Solved, growth_cuts
 from drake_diff.identification.flow import ContinuousMotion
@@ -39,6 +39,7 @@ from drake_diff.identification.measured import (
 )
 from drake_diff.identification.sensors import Sensors, choose_sensors
 from drake_diff.identification.steps import discrete_motion
+from drake_diff.identification.through_impacts import judged
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
@@ -46,7 +47,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
-MOTIONS = ("auto", "continuous", "steps")
+MOTIONS = ("auto", "continuous", "steps", "impacts")
 LONGEST, SHORTEST = 0.02, 1e-4  # [s] of the steps of Runge and Kutta
 STEP_ERROR = 1e-3  # of the noise: what a step of half the length may change over a segment
 ROUNDS = 5  # of estimating the noise
@@ -142,8 +143,10 @@ def identify(
 
             - "continuous": the model's equations of motion in continuous time, without contact, limits and controllers;
             - "steps": the model's own discrete steps with all that acts in them, contact parameters included;
+            - "impacts": the model's own steps through impacts, by `identify_contact`'s search: contact parameters,
+              centres of mass and biases, of motions with every position and velocity measured;
             - "auto": continuous, but steps where bodies touch, a joint is beyond its limit, or the model has no other.
-        max_iterations: How many steps of Gauss and Newton the fit may take.
+        max_iterations: How many steps of Gauss and Newton the fit may take; through impacts there are 32 at most.
         priors: What is known of parameters beside the recordings: mean and standard deviation, by name. It counts as
             one measurement more; without it the file's value only decides where the data say nothing.
         bounds: Lower and upper bound of parameters, by name.
@@ -190,13 +193,18 @@ def identify(
     stated = given_noise(model, chart, noise, columns)
     scatter = noise_by_differences(chart, pieces)
     problem = Problem(model, chart, unknowns, pieces, stated, scatter, outputs)
-    law: Law = (
-        discrete_motion(model, unknowns, pieces)
-        if own_tree is None
-        else ContinuousMotion(model, own_tree, chart, unknowns, LONGEST)
-    )
-    fit, solved = problem.solve(law, max_iterations)
-    found = problem.judged(fit, solved, why if motion == "auto" else "")
+    if motion == "impacts":
+        if priors or bounds:
+            raise InputError("priors and bounds", got="some", expected='none with motion="impacts"')
+        found = _through_impacts(problem, parameters)
+    else:
+        law: Law = (
+            discrete_motion(model, unknowns, pieces)
+            if own_tree is None
+            else ContinuousMotion(model, own_tree, chart, unknowns, LONGEST)
+        )
+        fit, solved = problem.solve(law, max_iterations)
+        found = problem.judged(fit, solved, why if motion == "auto" else "")
     names = parameters if isinstance(parameters, str) else tuple(parameters)
     asked = Asked(
         model,
@@ -433,6 +441,46 @@ class Problem:
         if p < FALSE_ALARM:
             return f"what is left of {name} is not noise: it hangs together over time (probability {p:.1g})"
         return why_not
+
+
+def _through_impacts(problem: Problem, names: Sequence[str] | str) -> Identification:
+    """What the search through impacts finds; intervals are by the scatter between recordings."""
+    nv, noise = problem.model.nv, problem.first_noise
+    j = judged(problem.model, problem.pieces, names, noise[: 2 * nv])
+    search, found, h = j.search, j.found, j.search.law.model.time_step
+    unknowns, values, intervals = search.unknowns, search.values(found.w), search.intervals(found)
+    limits = np.concatenate([np.reshape(intervals[one.name], (-1, 2)) for one in unknowns.each])
+    deviations = (limits[:, 1] - limits[:, 0]) / (2 * 1.96)
+    known = np.isfinite(deviations)
+    covariance = np.where(np.outer(known, known), found.correlation * np.outer(deviations, deviations), 0.0)
+    covariance[~known, ~known] = np.inf
+    every = np.concatenate(j.fitted)[:, :nv]
+    motions = [Followed(p, frozen(a), frozen(b)) for p, a, b in zip(problem.pieces, j.after, j.before, strict=True)]
+    result = Identification(
+        values=unknowns.named(values),
+        start=unknowns.named(unknowns.start),
+        intervals=intervals,
+        units={one.name: one.unit for one in unknowns.each},
+        unidentifiable=search.open(found),
+        explained=not j.reason,
+        reason=j.reason or "what is left is like noise, and what was held out is predicted",
+        sentence="",
+        noise={name: float(s) for name, s in zip(problem.entries[:nv], noise[:nv], strict=True)},
+        error_before=j.error_before,
+        error_after=j.error_after,
+        residuals=tuple(frozen(each) for each in j.fitted),
+        columns=unknowns.columns,
+        entries=problem.entries,
+        covariance=frozen(covariance),
+        score=float(np.sum(every**2)) + 2 * len(every) * float(np.sum(np.log(noise[:nv]))),
+        count=every.size,
+        converged=found.converged,
+        steps=found.rounds,
+        motion=f"the model's own steps of {1e3 * h:.4g} ms through impacts, slopes from clouds of values",
+        motions=tuple(sorted(motions, key=lambda motion: motion.piece.held_out)),
+    )
+    object.__setattr__(result, "sentence", _sentence(result, limits, unknowns, values))
+    return result
 
 
 def _sentence(e: Identification, intervals: Array, unknowns: Unknowns, values: Array) -> str:

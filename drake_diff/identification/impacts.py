@@ -16,17 +16,17 @@ from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_float
 from drake_diff.comparison.recordings import Recording
-from drake_diff.derivatives.steps import take_steps
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.cloud import Plane, plane_at, shrink_to
-from drake_diff.identification.flights import flights_of, millisecond, start_of, steps_between
-from drake_diff.identification.measured import read_pieces
+from drake_diff.identification.flights import Start, flights_of, millisecond, start_of, steps_between
+from drake_diff.identification.measured import Piece, read_pieces
 from drake_diff.identification.steps import DiscreteMotion, discrete_motion
 from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
+from drake_diff.model.step import advance
 
 # [s] how long segments go on after a flight, and the widths of the clouds of each stage.
 STAGES = (
@@ -62,28 +62,42 @@ class ContactIdentification:
 
 
 @dataclass(frozen=True)
-class _Segment:
+class Segment:
+    """A stretch of a recording, and where its motion begins."""
+
     piece: int
     first: int
     last: int  # the last sample
     x0: Array  # (nx,)
 
 
-class _Search:
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where a search ended."""
+
+    w: Array  # (n,)
+    spread: Array  # (n,) half widths of 95 % intervals
+    correlation: Array  # (n, n); NaN where nothing is known
+    costs: tuple[float, float]  # soft-L1 mean over whole recordings, before and after
+    flights: int
+    converged: bool
+    rounds: int  # planes that were laid
+
+
+class Search:
     """Segments of all recordings, and the coordinates w in which the unknowns are sought: 0 at the model's values."""
 
     def __init__(
-        self, model: Model | Build, recordings: Sequence[Recording], names: Sequence[str], lengths: Mapping[str, float]
+        self,
+        model: Model,
+        pieces: Sequence[Piece],
+        names: Sequence[str] | str,
+        lengths: Mapping[str, float] | None = None,
+        build: Build | None = None,
     ):
-        if isinstance(model, Model) == bool(lengths):
-            got = "a model" if lengths else "a function"
-            expected = "a function that makes a model of `lengths`" if lengths else "a model, or `lengths` too"
-            raise InputError("model", got=got, expected=expected)
-        self.build = None if isinstance(model, Model) else model
-        self.lengths = {name: positive_float(name, value) for name, value in lengths.items()}
-        self.model = model if isinstance(model, Model) else model(**self.lengths)
+        self.model, self.build, self.lengths = model, build, dict(lengths or {})
         self.chart = Chart(coordinates_of(self.model))
-        self.pieces = read_pieces(self.model, recordings, 0.0)
+        self.pieces = list(pieces)
         for piece in self.pieces:
             if np.any(np.isnan(piece.ys)):
                 raise InputError(f"recording {piece.name}", got="NaN", expected="every position and velocity measured")
@@ -91,7 +105,7 @@ class _Search:
         self.law: DiscreteMotion = discrete_motion(self.model, self.unknowns, self.pieces)
         self.begin = np.concatenate([self.unknowns.start, list(self.lengths.values())])
         self.scale, self.by_log = self._scales()
-        self.unit = millisecond(self.chart, self.pieces)
+        self.unit = millisecond(self.chart, [piece for piece in self.pieces if not piece.held_out])
         self.taken = 0
 
     def _scales(self) -> tuple[Array, Array]:
@@ -121,6 +135,21 @@ class _Search:
         count = len(self.unknowns.start)
         return self.unknowns.named(values[:count]) | dict(zip(self.lengths, values[count:].tolist(), strict=True))
 
+    def intervals(self, found: Found) -> dict[str, Array]:
+        """By name (2,) or (k, 2)."""
+        wide = np.stack([self.values(found.w + s * found.spread) for s in (-1, 1)], axis=1)
+        of_parameters = {
+            one.name: frozen(wide[s][0] if len(one.start) == 1 else wide[s])
+            for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)
+        }
+        return of_parameters | dict(zip(self.lengths, map(frozen, wide[len(self.unknowns.start) :]), strict=True))
+
+    def open(self, found: Found) -> tuple[str, ...]:
+        """What the recordings leave open: entries whose interval is wider than a factor of 3, 10 mm or 10 mrad."""
+        wide = np.where(self.by_log, self.scale * found.spread > np.log(3.0), self.scale * found.spread > 0.01)
+        columns = [*self.unknowns.columns, *self.lengths]
+        return tuple(column for column, open_ in zip(columns, wide, strict=True) if open_)
+
     def vector(self, values: Array) -> ParameterVector:
         """The model's parameters at values (n,), of a model of its own where there are lengths."""
         own = values[self.law.own]
@@ -131,30 +160,49 @@ class _Search:
             model = model.at_time_step(self.law.model.time_step)
         return select(model, self.law.vector.to_dict()).at(own)
 
-    def segments(self, w: Array, length: float) -> tuple[list[_Segment], int]:
-        """From the first sample of each recording and the start of each flight; and how many start by a flight.
+    def segments(self, w: Array, length: float) -> tuple[list[Segment], int]:
+        """From the first sample of each fitted recording and the start of each flight; how many start by a flight.
 
         Each goes on for `length` [s] after its flight. The end of each recording is one more.
         """
         found, known, vector = [], 0, self.vector(self.values(w))
         with applied(vector) as model:
             for p, piece in enumerate(self.pieces):
+                if piece.held_out:
+                    continue
                 last, period = len(piece.times) - 1, float(np.median(np.diff(piece.times)))
                 count = last if np.isinf(length) else max(5, round(length / period))
                 flights = flights_of(model, piece.ys)
                 known += len(flights) if np.isfinite(length) else bool(flights and flights[0][0] == 0)
                 if not flights or flights[0][0] > 0:
-                    found.append(_Segment(p, 0, min(count, last), piece.ys[0]))
+                    found.append(Segment(p, 0, min(count, last), piece.ys[0]))
                 for a, b in flights:
                     if a == 0 or np.isfinite(length):
-                        x0 = start_of(model, self.chart, piece.part(a, b), self.unit)
-                        found.append(_Segment(p, a, min(b + count, last), x0))
+                        start = start_of(model, self.chart, piece.part(a, b), self.unit)
+                        found.append(Segment(p, a, min(b + count, last), start.x))
                 rest = max(0, last - max(5, round(REST / period)))
-                found.append(_Segment(p, rest, last, piece.ys[rest]))
+                found.append(Segment(p, rest, last, piece.ys[rest]))
         return found, known
 
-    def errors(self, w: Array, segments: Sequence[_Segment]) -> list[Array]:
-        """Of each segment (samples, nv): measured minus simulated positions."""
+    def starts(self, w: Array, noise: Array) -> list[Start]:
+        """Of each recording, those held out too, by its first flight; else as measured, with `noise` (2 nv,)."""
+        found = []
+        with applied(self.vector(self.values(w))) as model:
+            for piece in self.pieces:
+                flights = flights_of(model, piece.ys)
+                if flights and flights[0][0] == 0:
+                    found.append(start_of(model, self.chart, piece.part(*flights[0]), self.unit))
+                else:
+                    found.append(Start(piece.ys[0], np.diag(noise)))
+        return found
+
+    def whole(self, w: Array, starts: Sequence[Array]) -> list[Array]:
+        """(n, nx) the motion of each recording, from starts (nx,)."""
+        segments = [Segment(p, 0, len(self.pieces[p].times) - 1, x0) for p, x0 in enumerate(starts)]
+        return [np.concatenate([x0[None], xs]) for x0, xs in zip(starts, self.motions(w, segments), strict=True)]
+
+    def motions(self, w: Array, segments: Sequence[Segment]) -> list[Array]:
+        """Of each segment (samples - 1, nx) after its first, as they would be measured; NaN where Drake cannot step."""
         values = self.values(w)
         shift = np.zeros(self.model.nx)
         names = self.model.state_names
@@ -166,21 +214,40 @@ class _Search:
             for segment in segments:
                 piece = self.pieces[segment.piece].part(segment.first, segment.last)
                 each = steps_between(model, piece)
-                us = np.repeat(piece.us, each, axis=0)
-                self.taken += len(us)
+                self.taken += each * len(piece.us)
                 try:
-                    xs = take_steps(model, vector, segment.x0 - shift, us).x_next[each - 1 :: each] + shift
-                    e = self.chart.minus(piece.ys[1:], xs)[:, : self.model.nv]
+                    found.append(_sampled(model, segment.x0 - shift, piece.us, each) + shift)
                 except SimulationError:
-                    e = np.full((len(piece.us), self.model.nv), np.nan)
-                found.append(e)
+                    found.append(np.full((len(piece.us), self.model.nx), np.nan))
         return found
 
-    def residual(self, w: Array, segments: Sequence[_Segment]) -> Array:
-        """Of every third sample of all segments, one after the other."""
-        found = [(e / self.unit)[SAMPLES - 1 :: SAMPLES].ravel() for e in self.errors(w, segments)]
+    def residual(self, w: Array, segments: Sequence[Segment]) -> Array:
+        """Measured minus simulated positions of every third sample of all segments, one after the other."""
+        found = []
+        for segment, xs in zip(segments, self.motions(w, segments), strict=True):
+            e = self.chart.minus(self.pieces[segment.piece].ys[segment.first + 1 : segment.last + 1], xs)
+            found.append((e[:, : self.model.nv] / self.unit)[SAMPLES - 1 :: SAMPLES].ravel())
         r = np.concatenate(found)
         return np.asarray(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
+
+    def run(self, seed: int) -> Found:
+        """Through all `STAGES`, with clouds drawn by `seed`."""
+        w, random, flights, rounds, converged = np.zeros(len(self.scale)), np.random.default_rng(seed), 0, 0, True
+        for length, widths in STAGES:
+            segments, known = self.segments(w, length)
+            flights = max(flights, known)
+
+            def residual(w: Array, segments: list[Segment] = segments) -> Array:
+                return self.residual(w, segments)
+
+            shrunk = shrink_to(residual, w, widths, random)
+            w, rounds, converged = shrunk.w, rounds + shrunk.rounds, shrunk.converged
+        plane = plane_at(residual, w, STAGES[-1][1][-1], random)
+        taken = self.taken
+        before, after = (float(np.mean(2 * (np.sqrt(1 + residual(at) ** 2) - 1))) for at in (np.zeros(len(w)), w))
+        self.taken = taken
+        count = sum(not piece.held_out for piece in self.pieces)
+        return Found(w, *_between(plane, segments, count), (before, after), flights, converged, rounds + 1)
 
 
 def identify_contact(
@@ -220,56 +287,56 @@ def identify_contact(
         >>> print(round(found.values["ball.friction"], 3))
         0.2
     """
-    search = _Search(model, recordings, parameters, lengths or {})
-    w, random, flights = np.zeros(len(search.scale)), np.random.default_rng(seed), 0
-    for length, widths in STAGES:
-        segments, known = search.segments(w, length)
-        flights = max(flights, known)
-
-        def residual(w: Array, segments: list[_Segment] = segments) -> Array:
-            return search.residual(w, segments)
-
-        w = shrink_to(residual, w, widths, random)
-    plane = plane_at(residual, w, STAGES[-1][1][-1], random)
-    taken = search.taken
-    costs = [float(np.mean(2 * (np.sqrt(1 + residual(at) ** 2) - 1))) for at in (np.zeros(len(w)), w)]
-    spread = _between(plane, segments, len(search.pieces))
-    values, ends = search.values(w), [search.values(w + s * spread) for s in (-1, 1)]
-    wide = np.stack(ends, axis=1)
-    open_ = np.where(search.by_log, search.scale * spread > np.log(3.0), search.scale * spread > 0.01)
-    intervals = {
-        one.name: frozen(wide[s][0] if len(one.start) == 1 else wide[s])
-        for one, s in zip(search.unknowns.each, search.unknowns.slices, strict=True)
-    }
-    intervals |= dict(zip(search.lengths, map(frozen, wide[len(search.unknowns.start) :]), strict=True))
-    columns = [*search.unknowns.columns, *search.lengths]
+    if isinstance(model, Model) == bool(lengths):
+        got = "a model" if lengths else "a function"
+        expected = "a function that makes a model of `lengths`" if lengths else "a model, or `lengths` too"
+        raise InputError("model", got=got, expected=expected)
+    begin = {name: positive_float(name, value) for name, value in (lengths or {}).items()}
+    own, build = (model, None) if isinstance(model, Model) else (model(**begin), model)
+    search = Search(own, read_pieces(own, recordings, 0.0), parameters, begin, build)
+    found = search.run(seed)
     return ContactIdentification(
-        values=search.named(values),
+        values=search.named(search.values(found.w)),
         start=search.named(search.begin),
-        intervals=intervals,
-        unidentifiable=tuple(c for c, o in zip(columns, open_, strict=True) if o),
-        cost_before=costs[0],
-        cost_after=costs[1],
-        flights=flights,
-        steps=taken,
+        intervals=search.intervals(found),
+        unidentifiable=search.open(found),
+        cost_before=found.costs[0],
+        cost_after=found.costs[1],
+        flights=found.flights,
+        steps=search.taken,
         time_step=search.law.model.time_step,
     )
 
 
-def _between(plane: Plane, segments: Sequence[_Segment], count: int) -> Array:
-    """(n,) half widths of 95 % intervals of w: each recording counts as one observation, however it hangs together."""
+def _sampled(model: Model, x0: Array, us: Array, each: int) -> Array:
+    """(n, nx) after every `each` steps under each of us (n, nu); which of them touched takes time, and is not asked."""
+    xs, x = np.empty((len(us), model.nx)), x0
+    for k, u in enumerate(us):
+        for _ in range(each):
+            x = advance(model.double, x, u)
+        xs[k] = x
+    return xs
+
+
+def _between(plane: Plane, segments: Sequence[Segment], count: int) -> tuple[Array, Array]:
+    """(n,) half widths of 95 % intervals of w, and their correlation (n, n).
+
+    Each recording counts as one observation, however it hangs together.
+    """
     n, begin = plane.J.shape[1], 0
     if count <= n:
-        return np.full(n, np.inf)
+        return np.full(n, np.inf), np.full((n, n), np.nan)
     weighted = plane.J * plane.weights(np.zeros(n))[:, None]
-    bread, scores = weighted.T @ plane.J, np.zeros((count, n))
+    bread, scores = weighted.T @ plane.J, np.zeros((max(s.piece for s in segments) + 1, n))
     nv = len(plane.r) // sum((s.last - s.first) // SAMPLES for s in segments)
     for segment in segments:
         end = begin + (segment.last - segment.first) // SAMPLES * nv
         scores[segment.piece] += weighted[begin:end].T @ plane.r[begin:end]
         begin = end
     inverse = np.linalg.pinv(bread)
-    meat = scores.T @ scores * count / (count - n)
+    covariance = inverse @ scores.T @ scores @ inverse * count / (count - n)
     lost = np.diag(bread) <= 0
-    spread = np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), 0.0))
-    return np.asarray(np.where(lost, np.inf, spread * float(stats.t.ppf(0.975, count - n))))
+    spread = np.where(lost, np.inf, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = np.where(np.isfinite(spread), covariance / np.outer(spread, spread), np.nan)
+    return np.asarray(spread * float(stats.t.ppf(0.975, count - n))), np.asarray(correlation)
