@@ -9,13 +9,18 @@ import pytest
 from helpers.pendulum import GRAVITY, LEVER, MASS, swing
 from helpers.robots import example_robot
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ModelError, UnknownNameError
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.flow import ContinuousMotion
+from drake_diff.identification.frozen import FrozenMotion, exponential
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns, set_numbers
+from drake_diff.mechanics.description import coordinates_of
 from drake_diff.record.comparison import ComparisonRecord
 
 
@@ -108,6 +113,27 @@ def test_a_centre_of_mass_moves_as_in_a_file(tmp_path):
     np.testing.assert_allclose(numbers.inertial, changed.numbers.inertial, atol=1e-12)
     other = set_numbers(models[0], tree, Unknowns(one), np.array([0.1, 0.0, -0.4]))
     assert np.max(np.abs(other.inertial - changed.numbers.inertial)) > 0.05  # [kg m^2]
+
+
+def test_steps_frozen_halfway_have_the_derivatives_of_the_motion():
+    """Of matrices SciPy's exponential; of an arm, those of Dormand and Prince's steps, to the third order."""
+    X = 4 * np.random.default_rng(0).standard_normal((3, 5, 5))
+    whole, phi = exponential(X)
+    for x, e, p in zip(X, whole, phi, strict=True):
+        np.testing.assert_allclose(e, expm(x), rtol=0, atol=1e-9 * np.max(np.abs(expm(x))))
+        np.testing.assert_allclose(x @ p, e - np.eye(5), rtol=0, atol=1e-9 * np.max(np.abs(e)))
+    model = example_robot("ur5_robot.urdf")
+    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    unknowns = choose_unknowns(model, tree, ["forearm_link.mass", "elbow_joint.damping"])
+    starts, us = 0.3 * np.random.default_rng(1).standard_normal((4, model.nx)), np.full((4, 1, model.nu), 5.0)
+    errors = []
+    for h in (0.01, 0.005):
+        exact, hs = ContinuousMotion(model, tree, chart, unknowns, h), np.full((4, 1), h)
+        args = unknowns.z_start, exact.run(unknowns.start, starts, hs, us), hs, us
+        pairs = zip(FrozenMotion(model, tree, chart, unknowns, h).slopes(*args), exact.slopes(*args), strict=True)
+        errors.append([np.max(np.abs(quick - true)) / np.max(np.abs(true)) for quick, true in pairs])
+    np.testing.assert_array_less(errors[1], 1e-3)
+    assert errors[1][0] < errors[0][0] / 6  # the third order would be 8
 
 
 @pytest.mark.slow

@@ -32,6 +32,7 @@ from drake_diff.identification.chart import Chart
 from drake_diff.identification.euler import EulerMotion
 from drake_diff.identification.fit import Fit, Law, Solved
 from drake_diff.identification.flow import ContinuousMotion
+from drake_diff.identification.frozen import FrozenMotion
 from drake_diff.identification.identify import LONGEST, Problem, what_acts
 from drake_diff.identification.judge import freedom_of, intervals_of, known_of, noise_of
 from drake_diff.identification.measured import Piece, given_noise, noise_by_differences, read_pieces
@@ -210,8 +211,12 @@ class _Search:
         return Problem(self.model, self.chart, unknowns, list(pieces), self.stated, self.scatter)
 
     def law(self, unknowns: Unknowns, longest: float) -> ContinuousMotion:
-        kind = ContinuousMotion if self.step is None else EulerMotion
-        return kind(self.model, self.tree, self.chart, unknowns, longest if self.step is None else self.step)
+        own = self.model, self.tree, self.chart, unknowns
+        if self.step is not None:
+            return EulerMotion(*own, self.step)
+        # Dry friction turns within less than a step, which halfway says nothing of.
+        turns = unknowns is not self.unknowns and any(one.quantity == COULOMB for one in unknowns.each)
+        return ContinuousMotion(*own, longest) if turns else FrozenMotion(*own, longest)
 
     def law_of(self, unknowns: Unknowns, z: Array) -> ContinuousMotion:
         """With dry friction that holds as firmly as short steps can follow, where it is of this size."""
@@ -236,7 +241,7 @@ class _Search:
         longest = fit.law.longest if isinstance(fit.law, ContinuousMotion) else LONGEST
         self.longest, self.cut, self.starts = longest, list(fit.segments.pieces), starts
         found, base, alone, runners = self.by_one()
-        if found is None and self.steps and not base.explains:
+        if found is None and not base.explains and self.may_be_steps(runners):
             found = self.by_steps(base)
         if found is None and not base.explains:
             found = self.by_two(alone, runners, base)
@@ -273,6 +278,27 @@ class _Search:
         if self.chart.coordinates.free or np.ptp(period) > 1e-6 * np.mean(period):
             return []
         return [float(np.mean(period)) / n for n in PARTS]
+
+    def may_be_steps(self, runners: Sequence[_Runner]) -> bool:
+        """Whether Euler steps leave clearly less than continuous time, of the model or of a change that left least."""
+        whole = [one for one in runners if not one.special and np.isfinite(one.left)][:BESIDE]
+        nothing = self.of(())
+        each = [((), nothing, nothing.z_start, self.starts)]
+        each += [(one.names, one.fit.unknowns, one.z, one.starts) for one in whole]
+        for names, unknowns, z, starts in each:
+            before = self.left_by(None, names, unknowns, z, starts)
+            after = min((self.left_by(step, names, unknowns, z, starts) for step in self.steps), default=np.inf)
+            if after < FALLS * before or not self.is_hopeless(after):
+                return True
+        return False
+
+    def left_by(self, step: float | None, names: tuple[str, ...], unknowns: Unknowns, z: Array, starts: Array) -> float:
+        """What a step of Gauss and Newton leaves of the squares by Euler steps of this length."""
+        self.step = step
+        one = self.running(names, unknowns, self.cut, starts, z, Promise((), np.inf, 0.0, np.zeros(0)))
+        left = one.left if one.step() else np.inf
+        self.step = None
+        return left
 
     def by_steps(self, base: _Tried) -> Explanation | None:
         """By Euler steps of a length, with one other change or none."""

@@ -6,9 +6,11 @@ some of them leave is then a problem of a few numbers, in their own columns of R
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.fit import Fit, Reduced
@@ -91,14 +93,21 @@ class View:
     most: float  # what is left where nothing changes
     freedoms: tuple[float, ...]
 
+    @cached_property
+    def _places(self) -> list[NDArray[np.intp]]:
+        return [np.arange(s.start, s.stop) for s in self.unknowns.slices]
+
+    @cached_property
+    def _lower(self) -> Array:
+        return self.unknowns.bounds[0] - self.z
+
     def promise(self, members: tuple[int, ...]) -> Promise | None:
         """The best step of some members; None where it leads out of bounds."""
-        s = self.unknowns.slices
-        at = np.concatenate([np.arange(s[i].start, s[i].stop) for i in members])
+        at = np.concatenate([self._places[i] for i in members])
         H, g = self.matrix[np.ix_(at, at)], self.right[at]
         scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
         step = scale * np.linalg.lstsq(H * np.outer(scale, scale), g * scale, rcond=1e-12)[0]
-        lower = (self.unknowns.bounds[0] - self.z)[at]
+        lower = self._lower[at]
         if np.any(step < lower):
             if len(at) > 1:
                 return None

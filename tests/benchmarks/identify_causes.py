@@ -31,10 +31,27 @@ from drake_diff.model.step import set_state
 
 OURS = Path(__file__).parents[2] / "models"
 ROBOTS = (
-    "ur5_robot", "z1", "so100", "panda", "kinova", "double_pendulum", "talos_left_arm", "solo", "bolt", "xarm7",
-    "ur3_robot", "TwoDofs", "models/cart_pole", "quadruped", "so101", "borinot_flying_arm_2", "ur10_robot",
-    "models/double_pendulum", "hextilt_flying_arm_5", "a1",
-)  # fmt: skip
+    "ur5_robot",
+    "z1",
+    "so100",
+    "panda",
+    "kinova",
+    "double_pendulum",
+    "talos_left_arm",
+    "solo",
+    "go2",
+    "solo12",
+    "ur3_robot",
+    "TwoDofs",
+    "models/quadruped",
+    "quadruped",
+    "so101",
+    "borinot_flying_arm_2",
+    "ur10_robot",
+    "double_pendulum_simple",
+    "hextilt_flying_arm_5",
+    "a1",
+)  # of which MuJoCo takes the inertias; fmt: skip
 KINDS = ("mass", "damping", "center_of_mass", "coulomb_friction", "strength", "input_delay", "bias", "gravity")
 FINER = 4  # parts of a sample, of which delays are whole numbers
 SEEN = 5  # times the noise that a change moves some joint by
@@ -122,6 +139,8 @@ class Truth:
                 for _ in range(round(base.PERIOD / FINER / base.STEP)):
                     mujoco.mj_step(engine, data)
             qs.append(data.qpos[q] + self.bias)
+        if any(warning.number for warning in data.warning):
+            raise RuntimeError("MuJoCo found no motion of this robot")
         return np.array(qs), np.array(us)
 
 
