@@ -30,7 +30,7 @@ from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.euler import EulerMotion
-from drake_diff.identification.fit import Fit, Law, Solved
+from drake_diff.identification.fit import Fit, Law, Point, Solved
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.frozen import FrozenMotion
 from drake_diff.identification.identify import LONGEST, Problem, what_acts
@@ -51,6 +51,8 @@ BESIDE, LOOKED_AT_BESIDE = 3, 4  # changes beside which a second one is sought, 
 PARTS = (1, 2, 4, 5, 10, 20)  # of a sample: Euler steps that are tried
 TIME_STEP = "time_step"
 STEPS, ROUNDS = 8, 4  # of Gauss and Newton, and of estimating the noise
+SETTLING, SETTLES = 8, 0.8  # steps by which segments settle, and the part of what was left that each must leave at most
+CALM = 3e-3  # of a small motion over a segment: by how much derivatives frozen halfway may miss it
 SAME_NOISE = 0.03  # what is left of its error changes a score by less than 0.001 of how many numbers were measured
 HOPELESS = 3.0  # times the noise: residuals that no better weights make good
 SAME = 6.0  # of a score: evidence of 20 to 1, below which two changes are not told apart
@@ -164,6 +166,8 @@ class _Runner:
         if point is None:
             return False
         found = self.fit.reduce(point)
+        if not np.all(np.isfinite(found.R)) or not np.all(np.isfinite(found.b)):
+            return False
         dz = self.fit.step_of(self.z, found)
         self.starts = self.fit.moved(self.starts, found, dz, 1.0)
         self.z = self.z + dz
@@ -181,6 +185,7 @@ class _Search:
     stated: Array
     evidence: dict[str, float] = field(default_factory=dict)
     nearest: _Tried | None = None
+    calm: bool = False  # whether steps frozen halfway have the derivatives of the motion
     step: float | None = None  # [s] of the Euler steps that stand for the motion; None for continuous time
 
     @cached_property
@@ -216,7 +221,7 @@ class _Search:
             return EulerMotion(*own, self.step)
         # Dry friction turns within less than a step, which halfway says nothing of.
         turns = unknowns is not self.unknowns and any(one.quantity == COULOMB for one in unknowns.each)
-        return ContinuousMotion(*own, longest) if turns else FrozenMotion(*own, longest)
+        return FrozenMotion(*own, longest) if self.calm and not turns else ContinuousMotion(*own, longest)
 
     def law_of(self, unknowns: Unknowns, z: Array) -> ContinuousMotion:
         """With dry friction that holds as firmly as short steps can follow, where it is of this size."""
@@ -239,13 +244,56 @@ class _Search:
         nothing = self.of(())
         fit, starts = self.problem(nothing, self.pieces).prepared(self.law(nothing, LONGEST))
         longest = fit.law.longest if isinstance(fit.law, ContinuousMotion) else LONGEST
-        self.longest, self.cut, self.starts = longest, list(fit.segments.pieces), starts
+        self.longest, self.cut = longest, list(fit.segments.pieces)
+        self.starts = self.settled(fit, starts)
+        self.calm = self.is_calm(fit)
         found, base, alone, runners = self.by_one()
         if found is None and not base.explains and self.may_be_steps(runners):
             found = self.by_steps(base)
         if found is None and not base.explains:
             found = self.by_two(alone, runners, base)
         return found or (self.right() if base.explains else self.unexplained(base))
+
+    def settled(self, fit: Fit, starts: Array) -> Array:
+        """Starts of the segments from which the motion is nearer to what each of them measured, by itself.
+
+        A guess by cubics knows nothing of inputs, which may change a velocity within a few samples.
+        """
+        s = fit.segments
+        last = [len(s.pieces[p].times) - 1 for p in s.of_piece]
+        ends = [int(b) if p == q else n for b, p, q, n in zip(s.first[1:], s.of_piece, s.of_piece[1:], last)]
+        parts = [s.pieces[p].part(int(a), b) for a, b, p in zip(s.first, [*ends, last[-1]], s.of_piece, strict=True)]
+        own = Fit(self.model, fit.law, self.chart, fit.unknowns, parts, fit.noise, fixed=True)
+        z, left = fit.unknowns.z_start, np.inf
+        for _ in range(SETTLING):
+            here = own.at(z, starts)
+            if here is None or here.value > SETTLES * left:
+                break
+            found, left = own.reduce(here), here.value
+            best = _each_left(here)
+            for part in (1.0, 0.3):
+                moved = own.moved(here.starts, found, np.zeros_like(z), part)
+                there = own.at(z, moved)
+                if there is not None:
+                    better = _each_left(there) < best
+                    starts, best = np.where(better[:, None], moved, starts), np.where(better, _each_left(there), best)
+        return starts
+
+    def is_calm(self, fit: Fit) -> bool:
+        """Whether a small motion goes through segments alike by steps frozen halfway, and by the method's own."""
+        s, z = fit.segments, fit.unknowns.z_start
+        some = slice(None, None, 2)  # of the segments
+        xs = fit.law.run(fit.unknowns.values(z), self.starts[some], s.hs[some], s.us[some])
+        frozen = FrozenMotion(self.model, self.tree, self.chart, fit.unknowns, self.longest)
+        whole = []
+        for law in (fit.law, frozen):
+            steps, _ = law.slopes(z, xs, s.hs[some], s.us[some])
+            through = self.chart.from_motion(xs[:, 0])
+            for m in range(steps.shape[1]):
+                through = steps[:, m] @ through
+            whole.append(self.chart.to_motion(xs[:, -1]) @ through * fit.gap_scale / fit.gap_scale[:, None])
+        off, size = (np.linalg.norm(each, axis=(1, 2)) for each in (whole[0] - whole[1], whole[0]))
+        return bool(np.all(off <= CALM * size))
 
     def by_one(self) -> tuple[Explanation | None, _Tried, View, list[_Runner]]:
         nothing = self.of(())
@@ -652,3 +700,8 @@ class _Search:
         near = f"with {' and '.join(nearest.names)}" if nearest.names else "as the model is"
         sentence = f"Not explained: no change of one or two quantities explains the recording; {near}, {nearest.doubt}."
         return Explanation((), {}, {}, (), False, sentence, self.evidence)
+
+
+def _each_left(point: Point) -> Array:
+    """(K,) of the squares, of each segment."""
+    return np.array([float(np.nansum(r**2)) for r in point.residuals])
