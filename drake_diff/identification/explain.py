@@ -152,7 +152,6 @@ class _Runner:
 
     names: tuple[str, ...]
     fit: Fit
-    firm: Fit  # after the first step: with dry friction that holds
     z: Array
     starts: Array
     left: float  # of the squares, after the next step
@@ -244,7 +243,7 @@ class _Search:
         nothing = self.of(())
         fit, starts = self.problem(nothing, self.pieces).prepared(self.law(nothing, LONGEST))
         longest = fit.law.longest if isinstance(fit.law, ContinuousMotion) else LONGEST
-        self.longest, self.cut = longest, list(fit.segments.pieces)
+        self.longest, self.segments, self.cut = longest, fit.segments, list(fit.segments.pieces)
         self.starts = self.settled(fit, starts)
         self.calm = self.is_calm(fit)
         found, base, alone, runners = self.by_one()
@@ -261,7 +260,10 @@ class _Search:
         """
         s = fit.segments
         last = [len(s.pieces[p].times) - 1 for p in s.of_piece]
-        ends = [int(b) if p == q else n for b, p, q, n in zip(s.first[1:], s.of_piece, s.of_piece[1:], last)]
+        ends = [
+            int(b) if p == q else n
+            for b, p, q, n in zip(s.first[1:], s.of_piece[:-1], s.of_piece[1:], last[:-1], strict=True)
+        ]
         parts = [s.pieces[p].part(int(a), b) for a, b, p in zip(s.first, [*ends, last[-1]], s.of_piece, strict=True)]
         own = Fit(self.model, fit.law, self.chart, fit.unknowns, parts, fit.noise, fixed=True)
         z, left = fit.unknowns.z_start, np.inf
@@ -278,6 +280,16 @@ class _Search:
                     better = _each_left(there) < best
                     starts, best = np.where(better[:, None], moved, starts), np.where(better, _each_left(there), best)
         return starts
+
+    def settled_at(self, fit: Fit) -> Array:
+        """Of pieces whose inputs act otherwise, the same starts where their segments start at the same times."""
+        times = [
+            [one.pieces[p].times[k] for p, k in zip(one.of_piece, one.first, strict=True)]
+            for one in (fit.segments, self.segments)
+        ]
+        return (
+            self.starts if times[0] == times[1] else self.settled(fit, self.problem(fit.unknowns, self.cut).guess(fit))
+        )
 
     def is_calm(self, fit: Fit) -> bool:
         """Whether a small motion goes through segments alike by steps frozen halfway, and by the method's own."""
@@ -331,7 +343,7 @@ class _Search:
         """Whether Euler steps leave clearly less than continuous time, of the model or of a change that left least."""
         whole = [one for one in runners if not one.special and np.isfinite(one.left)][:BESIDE]
         nothing = self.of(())
-        each = [((), nothing, nothing.z_start, self.starts)]
+        each: list[tuple[tuple[str, ...], Unknowns, Array, Array]] = [((), nothing, nothing.z_start, self.starts)]
         each += [(one.names, one.fit.unknowns, one.z, one.starts) for one in whole]
         for names, unknowns, z, starts in each:
             before = self.left_by(None, names, unknowns, z, starts)
@@ -464,10 +476,15 @@ class _Search:
     ) -> _Runner:
         problem = self.problem(unknowns, pieces)
         fit = problem.fit(self.law(unknowns, self.longest), pieces, problem.first_noise)
-        law = self.law_of(unknowns, z)
-        firm = fit if law.longest == self.longest else problem.fit(law, pieces, problem.first_noise)
-        starts = problem.guess(fit) if starts is None else starts
-        return _Runner(names, fit, firm, z, starts, promise.left, promise.freedom)
+        starts = self.settled_at(fit) if starts is None else starts
+        return _Runner(names, fit, z, starts, promise.left, promise.freedom)
+
+    def firm(self, one: _Runner) -> Fit:
+        """With dry friction that holds, of the size that it has by now."""
+        unknowns, pieces = one.fit.unknowns, one.fit.segments.pieces
+        if all(each.quantity != COULOMB for each in unknowns.each):
+            return one.fit
+        return self.problem(unknowns, pieces).fit(self.law_of(unknowns, one.z), pieces, one.fit.noise)
 
     def raced(self, runners: list[_Runner], base: _Tried) -> tuple[list[_Tried], list[_Runner]]:
         alive, there = list(runners), []
@@ -476,7 +493,7 @@ class _Search:
             alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
             there += [one for one in alive if not self.is_hopeless(one.left)]
             for one in alive:
-                one.fit = one.firm
+                one.fit = self.firm(one)
             alive = [
                 one
                 for one in alive[:most]
@@ -497,7 +514,10 @@ class _Search:
             enough = any(each.explains for each in found) and behind > TOLD_APART * max(1.0, alive[0].left / self.count)
             if enough or self.is_hopeless(one.left) or one.fit.at(one.z, one.starts) is None:
                 continue
-            found.append(self.ended(one))
+            try:
+                found.append(self.ended(one))
+            except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
+                continue
             self.evidence[" and ".join(one.names)] = base.score - found[-1].score
         return found, every
 
