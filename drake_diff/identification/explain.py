@@ -44,7 +44,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
 
 FALSE_NAME = 0.003  # of right models in which some change is named
-LOOKED_AT = 8  # changes that enter the race, of those that promise most
+LOOKED_AT = 8  # changes that enter the race, of those that promise most: of those of one number, and of others
 RACE = (5, 4, 3, 2, 2, 1)  # so many stay after each step of Gauss and Newton
 FALLS = 0.7  # what does not fall to this part of what was left before is out of the race, after its first step
 BESIDE, LOOKED_AT_BESIDE = 3, 4  # changes beside which a second one is sought, and how many of these go on
@@ -328,8 +328,22 @@ class _Search:
         count = len(alone.freedoms)
         pairs = self.paired(alone, runners, base)
         named = self.enough(base, pairs, count * (count - 1) // 2)
+        if named:
+            named = self.enough(base, [*self.halves(named), *named], count * (count - 1) // 2)
         self.nearest = min([self.nearest or base, *pairs], key=self.bic)
         return self.said(named) if named else None
+
+    def halves(self, pairs: Sequence[_Tried]) -> list[_Tried]:
+        """Each change of some pairs alone, from where the pair was: the other one may do nothing."""
+        found: dict[str, _Tried] = {}
+        for pair in pairs:
+            unknowns = self.of(pair.names)
+            for one, s in self.each_of(unknowns) if len(unknowns.each) == 2 else []:
+                if one.name not in found:
+                    alone = self.of([one.name])
+                    law = self.law_of(alone, pair.z[s])
+                    found[one.name] = self.solved((one.name,), alone, law, self.cut, pair.starts, pair.z[s])
+        return list(found.values())
 
     @property
     def steps(self) -> list[float]:
@@ -446,14 +460,20 @@ class _Search:
         self, seen: View, changes: Iterable[tuple[int, ...]], base: _Tried, most: int = LOOKED_AT
     ) -> tuple[list[_Tried], list[_Runner]]:
         """(those that are fitted, all that stayed in the race, best first) of those that promise most."""
-        names = [one.name for one in self.unknowns.each]
+        each = self.unknowns.each
         chosen: dict[tuple[str, ...], Promise] = {}
+        places = {True: most, False: most}  # what has more numbers bends to more, and promises more than it keeps
         for promise in seen.promises(changes, float(np.log(self.count))):
-            if len(chosen) == most:
-                break
-            own = tuple(self.plain(names[i]) for i in promise.members)
-            if len(set(own)) == len(own) and sum(map(self.is_of_inputs, own)) <= 1:
-                chosen.setdefault(own, promise)
+            small = all(len(each[i].start) == 1 for i in promise.members)
+            own = tuple(self.plain(each[i].name) for i in promise.members)
+            if (
+                places[small]
+                and own not in chosen
+                and len(set(own)) == len(own)
+                and sum(map(self.is_of_inputs, own)) <= 1
+            ):
+                chosen[own] = promise
+                places[small] -= 1
         return self.raced([self.runner(seen, promise, own) for own, promise in chosen.items()], base)
 
     def runner(self, seen: View, promise: Promise, names: tuple[str, ...]) -> _Runner:
