@@ -242,6 +242,7 @@ def in_log(folder):
     return [line.split() for line in path.read_text().splitlines()] if path.exists() else []
 
 
+@pytest.mark.slow
 def test_a_node_that_is_killed_takes_no_trial_with_it(tmp_path, machines):
     """Two nodes with nothing in common but the folder and a cable: every trial ends once, and the table is the same."""
     names, inside = machines
