@@ -49,6 +49,7 @@ def test_parameters_that_are_only_given_keep_no_method_away():
     assert methods_in(to_try(solution)) == {"collocation", "ilqr"}
 
 
+@pytest.mark.slow
 def test_a_continuation_is_named_until_it_was_tried(two_spheres):
     model = two_spheres()
     told = to_try(dd.solve(push(model, gap=0.4, goal=1.0), method="ilqr"))

@@ -20,6 +20,7 @@ from drake_diff.model.step import set_state
 NAMES = sorted(path.name for path in MODELS.iterdir())
 
 
+@pytest.mark.slow
 @each_row("name", NAMES)
 def test_every_model_here_is_certified_at_every_sampled_state(load, name):
     """Eight models of 20 states, contact among them: the good states of the zoo."""

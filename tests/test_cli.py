@@ -175,6 +175,7 @@ def test_what_is_interrupted_stays_beside_an_earlier_run(tmp_path, number):
     assert {line.name: line.verdict for line in list_runs(runs)} == {"task": before.verdict, left.name: "incomplete"}
 
 
+@pytest.mark.slow
 @each_row("delay", [0.0, 0.3, 1.0, 1.5])
 def test_a_killed_run_never_looks_finished(tmp_path, delay):
     running = start(script(tmp_path, num_steps=60), tmp_path)

@@ -66,6 +66,7 @@ CHANGED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @each_row("change", CHANGED)
 def test_a_changed_contact_is_another_model_and_its_line_says_so(ball, tmp_path, change):
     pattern, new, quantity, word = CHANGED[change]

@@ -112,6 +112,7 @@ def thrown(model, **more):
     return dd.Problem(model, optimize="initial_state", initial_state_mask=mask, motion="continuous", **asked | more)
 
 
+@pytest.mark.slow
 def test_a_ball_is_thrown_to_bounce_into_its_target():
     """Down at v it comes to the ground at V, is there for 2 (pi - atan(omega V / g)) / omega, and leaves at V."""
     solution = dd.solve(thrown(ball_on_rails(gravity=9.81, time_step=0.02)))

@@ -91,6 +91,7 @@ def test_what_cannot_be_told_apart_is_named_together(pendulum):
     assert w.values["hinge.damping"] == pytest.approx(0.15, rel=0.02)
 
 
+@pytest.mark.slow
 def test_dry_friction_is_named(pendulum):
     w = dd.explain(pendulum, swing(friction=0.08, noise=1e-4))
     assert w.names == ("hinge.coulomb_friction",)

@@ -146,6 +146,7 @@ def to(key, value):
     return change
 
 
+@pytest.mark.slow
 @each_row(
     "change, words",
     [

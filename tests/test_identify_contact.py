@@ -34,6 +34,7 @@ def ball(load):
     return load("sphere_on_ground.sdf", time_step=0.005)
 
 
+@pytest.mark.slow
 def test_friction_of_a_ball_that_slides_is_that_of_the_closed_form(load):
     ball = load("sphere_on_ground.sdf", time_step=0.001)
     friction, gravity, radius, depth = 0.25, 9.81, 0.1, 9.81 / 1e4
@@ -53,6 +54,7 @@ def test_friction_of_a_ball_that_slides_is_that_of_the_closed_form(load):
     assert 2 * own * 0.5 / (own + 0.5) == pytest.approx(friction, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_truth_of_the_same_steps_is_found(ball):
     truth = {"ball.friction": 0.25, "ball.radius": 0.103}
     found = identify_contact(ball, throws(ball, truth, height=0.002), ["ball.friction", "ball.radius", "ball_z.bias"])

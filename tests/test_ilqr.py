@@ -588,6 +588,7 @@ def test_no_riccati_problem_is_solved_twice(monkeypatch):
     assert len(seen) >= len(solution.iterations) - 1
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_iterations():
     """Of steps that regularization keeps short, 100 more leave rows, 0.2 kB each; a motion of 40 knots is 1 kB.
 

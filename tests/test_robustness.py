@@ -296,6 +296,7 @@ def planted(cart, kind, random):
     return run_trial(Task(good, make, loop), {"mass": 0.05} if kind == "wrong sign" else plain, seed).label
 
 
+@pytest.mark.slow
 def test_each_kind_of_failure_that_is_planted_gets_its_label(cart):
     """Rows are what was planted, columns the labels: all on the diagonal, but for what succeeds anyway."""
     expected = dict.fromkeys(("wrong sign", "no number", "saturates", "does nothing", "too slow"), "control_error")

@@ -225,6 +225,7 @@ def test_discrete_plans_keep_what_holds_them(write_urdf):
             assert np.abs(found.xs[0, 1]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_a_mass_that_the_plan_chooses_moves_with_the_goal(write_urdf):
     """Effort k m^2 d^2: the least at the bound of m; with 20 / m besides it is inside, and d cost / dd = 2 k m^2 d."""
     model = write_urdf(mass=1.0, time_step=0.1)

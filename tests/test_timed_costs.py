@@ -53,6 +53,7 @@ def test_an_input_that_is_asked_for_in_time_is_given(write_urdf, method):
     np.testing.assert_allclose(solution.us[:, 0], np.sin(3 * at), atol=1e-6)
 
 
+@pytest.mark.slow
 @each_row("method", METHODS)
 def test_steps_of_many_segments_know_their_time(write_urdf, method):
     """A waypoint in time without a waypoint: the cost is there in the second half alone."""

@@ -1,6 +1,7 @@
 """Models whose gradient is wrong, refused, or not there, each flagged for the right reason; and good ones."""
 
 import numpy as np
+import pytest
 from helpers.models import Plant, contact_properties
 from helpers.plants import offset_pendulum, pair, pd_pendulum
 from helpers.table import each_row
@@ -154,6 +155,7 @@ def _plain_ball(tmp_path):
     return path
 
 
+@pytest.mark.slow
 @each_row("name", ZOO)
 def test_every_animal_is_flagged_for_the_right_reason(name, tmp_path):
     assert ZOO[name](tmp_path)
