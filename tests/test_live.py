@@ -11,6 +11,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,9 @@ from pydrake.math import RigidTransform
 import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.model.triangles import Triangles
+from drake_diff.optimize.iterate import Iterate
+from drake_diff.optimize.live import LiveSearch
+from drake_diff.optimize.program import Iteration
 from drake_diff.pages.html import asset
 from drake_diff.pages.live import live_page
 from drake_diff.pages.meshcat import STILLS, Stills, stills_of
@@ -35,8 +39,9 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch):
-    """Every iterate is drawn whose predecessor is."""
+    """Every iterate is drawn whose predecessor is, whatever part of the time that takes."""
     monkeypatch.setattr("drake_diff.optimize.live.PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.optimize.live.PART", 1e9)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +147,7 @@ def test_a_browser_that_reads_nothing_holds_up_no_search(swing, monkeypatch):
         solution, _, news = watched(swing, method="ilqr")
         assert page.is_busy  # still with the large one
     assert (solution.us.tobytes(), news["state"]) == (alone.us.tobytes(), "converged")
-    assert page.wait(20)
+    assert page.wait(60)
 
 
 def test_a_browser_that_leaves_is_no_error(swing, capfd):
@@ -229,26 +234,44 @@ def test_the_solid_robot_is_the_last_state_and_the_others_lie_between():
 
 
 def test_contact_forces_of_an_iterate_are_drawn_where_they_push():
-    """At each of the states that are seen: as many arrows as there are contacts, along the ball's way."""
-    problem, scenes = pushed(), []
-    page = live_page()
+    """Of every iterate, where the page is waited for: those of the states that are seen, here of all."""
+    page, scenes, rows = live_page(), [], []
     show = page.show
-    page.show = lambda number, scene, end=False: (scenes.append((scene, end)), show(number, scene, end=end))
+
+    def seen(number, scene, *, end=False):
+        scenes.append((scene, end))
+        show(number, scene, end=end)
+
+    def look(row):
+        rows.append(row)
+        page.wait(60)
+
+    page.show = seen
     try:
-        rows = []
-        dd.solve(
-            problem, method="ilqr", view=lambda address: None, callback=lambda row: rows.append((row, row.contacts))
-        )
+        dd.solve(pushed(), method="ilqr", view=lambda address: page.wait(60), callback=look)
     finally:
         del page.show
-    (_, first_end), *later = scenes
-    assert not first_end
-    assert later[-1][1]
-    for scene, _ in later[:-1]:
-        forces = [one.force for step in scene.contacts for one in step]
-        wanted = [[p.force for step in contacts for p in step] for row, contacts in rows]
-        assert any(len(w) == len(forces) and np.array_equal(w, forces) for w in wanted)
-    assert len(later) > 1
+    assert [end for _, end in scenes] == [False] * (len(rows) + 1) + [True]
+    for (scene, _), row in zip(scenes[1:], rows, strict=False):
+        found, wanted = ([one.force for step in each.contacts for one in step] for each in (scene, row))
+        assert len(found) == 3
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_a_motion_that_cannot_be_drawn_ends_no_search():
+    """Drake refuses a quaternion of zeros, and no camera sees 1e300 m."""
+    problem, page = pushed(), live_page()
+    search = LiveSearch(problem, lambda address: page.wait(60))
+    search.begin()
+    for entry, value, told in ((0, 0.0, "cannot be drawn"), (4, 1e300, "")):
+        xs = np.tile(problem.x0, (4, 1))
+        xs[1:, entry] = value
+        motion = Iterate(problem, 0.01 * np.arange(4), xs, np.zeros((3, 1)), problem.parameters, by_steps=False)
+        search.row(Iteration(1, 0.0, 0.0, 0.0, 0.0, motions=(motion,)))
+        assert page.wait(60)
+        assert told in page.news(search.number, 0)["line"]
+    search.row(Iteration(2, 0.0, 0.0, 0.0, 0.0, motions=(replace(motion, xs=np.tile(problem.x0, (4, 1))),)))
+    assert page.wait(60)  # it draws again
 
 
 @pytest.mark.slow

@@ -77,7 +77,11 @@ class LiveSearch:
             if report.plan is not None:
                 report.plan(plan)
 
-        return Report(line, row, plan)
+        return Report(line, row, plan, self.is_due if report.callback is None else report.looks)
+
+    def is_due(self) -> bool:
+        """Whether it is time to draw again."""
+        return self.page is not None and time.monotonic() >= self.due and not self.page.is_busy
 
     def row(self, row: Iteration) -> None:
         """Add a row to the plots, and draw its motion if it is time to: at most for a PART of the time."""
@@ -85,12 +89,22 @@ class LiveSearch:
             return
         self.page.add(self.number, row.iteration, row.objective, row.primal_infeasibility)
         self._told(state="searching")
-        begin = time.monotonic()
-        if begin < self.due or self.page.is_busy or len(row.motions) != 1 or not np.all(np.isfinite(row.motions[0].xs)):
+        if not self.is_due() or len(row.motions) != 1 or not np.all(np.isfinite(row.motions[0].xs)):
             return
-        self.page.show(self.number, self._scene(row.motions[0]))
+        begin = time.monotonic()
+        self._show(lambda: self._scene(row.motions[0]))
         end = time.monotonic()
         self.due = end + max(PERIOD, (end - begin) / PART)
+
+    def _show(self, scene: Callable[[], Scene], *, end: bool = False) -> None:
+        """Draw a scene; where it cannot be made, as of a quaternion of zeros, the page says so and all goes on."""
+        if self.page is None:
+            return
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # of motions that leave every finite number
+                self.page.show(self.number, scene(), end=end)
+        except Exception as error:  # whatever Drake says of a state: nobody asked for a search to end by it
+            self._told(line=f"the motion cannot be drawn: {type(error).__name__}: {error}")
 
     def _scene(self, motion: Iterate) -> Scene:
         """Of some of its states, which are enough to see it by."""
@@ -127,9 +141,7 @@ class LiveSearch:
         """Show the motion of the plan, and what became of it."""
         if self.page is None or not isinstance(solution, Solution):
             return
-        judged = solution.judged_replay if "replays" in vars(solution) else None
-        motion = solution.replay if judged is None or judged.motion is None else judged.motion
-        self.page.show(self.number, scene_of_plan(solution, motion), end=True)
+        self._show(lambda: scene_of_plan(solution, _shown(solution)), end=True)
         state = solution.status
         open_ = (Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT, Status.ITERATION_LIMIT)
         verdict = "pass" if solution.success else "open" if state in open_ else "fail"
@@ -139,6 +151,12 @@ class LiveSearch:
     def _told(self, **facts: Any) -> None:
         if self.page is not None:
             self.page.tell(self.number, **facts)
+
+
+def _shown(solution: Solution) -> Rollout | None:
+    """The motion that the verdict rests on, the open-loop one where none does; no replay is made for it."""
+    judged = solution.judged_replay if "replays" in vars(solution) else None
+    return solution.replay if judged is None or judged.motion is None else judged.motion
 
 
 def scene_of_plan(solution: Solution, motion: Rollout | None) -> Scene:

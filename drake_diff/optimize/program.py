@@ -87,8 +87,10 @@ class Report:
         line: Callable[[str], None] | None = None,
         callback: Callable[[Iteration], None] | None = None,
         plan: Callable[[Any], None] | None = None,
+        looks: Callable[[], bool] = lambda: True,
     ):
         self.line, self.callback, self.plan = line, callback, plan
+        self.looks = looks  # whether the callback looks at the motions of a row
         self.asked: Any = None  # the `Search` that is reported on
 
     def found(self, plan: Any) -> None:
@@ -99,7 +101,7 @@ class Report:
     def row(self, row: Iteration, motions: Callable[[], tuple[Iterate, ...]], *, printed: bool = True) -> None:
         """Hand on `row` with its `motions`, which are made only where somebody gets them, and print it."""
         if self.callback is not None:
-            self.callback(replace(row, motions=motions()))
+            self.callback(replace(row, motions=motions()) if self.looks() else row)
         if printed:
             self.say(str(row))
 

@@ -17,6 +17,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import urlopen
 
+import numpy as np
 from pydrake.geometry import HalfSpace, Meshcat, MeshcatParams, Rgba
 
 from drake_diff.pages.html import asset, numbers
@@ -126,16 +127,17 @@ class LivePage:
             paved = [replace(s, colour=GROUND) if isinstance(s.shape, HalfSpace) else s for s in scene.shapes]
             scene = replace(scene, shapes=tuple(paved))
             try:
-                if end:
-                    stills = None
-                    meshcat.Delete()
-                    meshcat.DeleteRecording()
-                    draw(meshcat, scene)
-                elif stills is None or stills[0] != number:
-                    meshcat.DeleteRecording()
-                    stills = number, Stills(meshcat, scene)
-                else:
-                    stills[1].show(scene)
+                with np.errstate(over="ignore", invalid="ignore"):  # of motions that leave every finite number
+                    if end:
+                        stills = None
+                        meshcat.Delete()
+                        meshcat.DeleteRecording()
+                        draw(meshcat, scene)
+                    elif stills is None or stills[0] != number:
+                        meshcat.DeleteRecording()
+                        stills = number, Stills(meshcat, scene)
+                    else:
+                        stills[1].show(scene)
             except Exception as error:  # whatever Drake says of a shape: the search is not to end by it
                 self.tell(number, line=f"the motion cannot be drawn: {type(error).__name__}: {error}")
             with self._changed:
