@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "drake_diff"
 NAME = re.compile(r"^from \.([\w.]+) import (\w+) as \w+$", re.MULTILINE)
-NOTEBOOKS = ROOT / "docs/notebooks"
+NOTEBOOKS, GALLERY = ROOT / "docs/notebooks", ROOT / "docs/gallery"
 TOP = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
 
 
@@ -75,7 +75,19 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Put the table of a room's modules where a page asks for it."""
     if page.file.src_uri == "notebooks/index.md":
         return _to_pages(markdown)
+    if page.file.src_uri == "gallery/index.md":
+        return with_reports(markdown, GALLERY)
     return re.sub(r"<!-- modules of (\w+) -->", lambda found: modules_of(found[1]), markdown)
+
+
+def with_reports(text: str, gallery: Path) -> str:
+    """The gallery with each picture opening its report, of those that docs/gallery.py has made here."""
+
+    def linked(found: re.Match[str]) -> str:
+        picture, report = found.groups()
+        return f"[{picture}]({report})" if (gallery / report).is_file() else picture
+
+    return re.sub(r"(!\[[^]]*\]\([^)]*\))<!-- (\S+) -->", linked, text)
 
 
 def modules_of(room: str) -> str:

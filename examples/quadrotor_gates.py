@@ -25,24 +25,20 @@ solve_options = {"method": "collocation"}
 
 def rotors() -> list[BodyForce]:
     """One at the end of each arm, neighbours turning opposite ways."""
-    found = []
-    for i, (x, y) in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)]):
-        point, ratio = (ARM * x, ARM * y, 0.0), MOMENT_RATIO * (-1) ** i
-        found.append(BodyForce(f"rotor_{i + 1}", "body", point, moment_ratio=ratio, upper=MOST))
-    return found
+    points = [(ARM, 0, 0), (0, ARM, 0), (-ARM, 0, 0), (0, -ARM, 0)]
+    ratios = [MOMENT_RATIO, -MOMENT_RATIO] * 2
+    return [BodyForce(f"rotor_{i + 1}", "body", points[i], moment_ratio=ratios[i], upper=MOST) for i in range(4)]
 
 
 def problem(num_steps: int = NUM_STEPS) -> dd.Problem:
     model = dd.load_model(MODEL, time_step=HORIZON / num_steps, body_forces=rotors())
     start = model.default_state
     start[6] = 1.0
-    end = np.full(model.nx, np.nan)
-    end[model.nq :] = 0.0  # at rest
     weights = np.diag([0.0] * model.nq + [0.1] * 3 + [0.02] * 3)
     return dd.Problem(
         model,
         x0=start,
-        x_goal=end,
+        x_goal=dict.fromkeys(model.state_names[model.nq :], 0.0),  # at rest
         num_steps=num_steps,
         goals=[
             *(dd.FrameGoal("body", position=gate, tolerance=OPENING, knots=[knot]) for knot, gate in GATES.items()),
@@ -53,12 +49,10 @@ def problem(num_steps: int = NUM_STEPS) -> dd.Problem:
 
 
 def main() -> None:
-    """Solve it, and say where it is at the gates."""
     solution = dd.solve(problem(), **solve_options)
     print(f"{solution.status.value}: {solution.message}")
     for knot, gate in GATES.items():
-        x, y, z = solution.xs[knot, 4:7]
-        print(f"at {knot * HORIZON / NUM_STEPS:.2f} s at ({x:.2f}, {y:.2f}, {z:.2f}) m, the gate at {gate}")
+        print(f"at {knot * HORIZON / NUM_STEPS:.2f} s at {solution.xs[knot, 4:7].round(2)} m, the gate at {gate}")
 
 
 if __name__ == "__main__":

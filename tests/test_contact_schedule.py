@@ -1,10 +1,13 @@
 """Which foot stands when: the soles, the forces and the guess by closed form, what a schedule refuses, and plans."""
 
+import json
+
 import numpy as np
 import pytest
 from helpers.legged import LEGGED, SOLO_FEET, legged_model, rest, robot_on_feet
 
 import drake_diff as dd
+from drake_diff.artifact.sections import rebuild_goal
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.parameters import select
 from drake_diff.model.step import advance
@@ -38,6 +41,18 @@ def posed(model, seed):
     x[4 : model.nq] = random.uniform(-1, 1, model.nq - 4)
     x[model.nq :] = random.standard_normal(model.nv)
     return x
+
+
+def test_a_schedule_comes_back_from_what_a_record_tells_of_it():
+    """So that `verify` can make the run of a robot on legs again; what is no schedule is refused by name."""
+    schedule = dd.optimize.ContactSchedule(HOP, feet=SOLO_FEET, clearance=0.01, slip=0.3, touch=0.004)
+    told = json.loads(json.dumps(schedule.to_dict()))
+    again = rebuild_goal(told)
+    assert again == schedule
+    assert (again.phases, again.clearance, again.slip, again.touch) == (schedule.phases, 0.01, 0.3, 0.004)
+    told["ContactSchedule"]["phases"] = [[20]]
+    with pytest.raises(InputError, match=r"ContactSchedule\.phases"):
+        rebuild_goal(told)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -161,6 +161,64 @@ def test_a_quadrotor_flies_through_its_gates_and_its_record_holds(tmp_path):
     assert dd.verify(tmp_path / "run").verdict == "holds"
 
 
+def test_the_acrobot_stands_and_its_elbow_keeps_its_limit():
+    """The plan itself; on the plant it is followed under feedback, in the shortest steps within 5 % of a turn."""
+    module = example("acrobot_swing_up")
+    solution = dd.solve(module.problem(), **module.solve_options)
+    assert solution.success, solution.message
+    assert solution.xs[-1] == pytest.approx(module.UPRIGHT, abs=1e-6)
+    assert np.all(np.abs(solution.inputs_at_knots) <= module.STRONGEST)
+    followed = max((r for r in solution.replays if r.control != "open loop"), key=lambda r: len(r.motion.us))
+    assert followed.holds
+    assert np.abs(followed.motion.xs[-1] - module.UPRIGHT)[:2].max() < 0.05 * 2 * np.pi
+
+
+def test_the_load_of_the_crane_sways_no_more_than_it_may():
+    """In every open-loop replay too; without the limit it sways more, and the same way costs less."""
+    module = example("crane_without_sway")
+    solution, free = dd.solve(module.problem()), dd.solve(module.problem(np.pi))
+    assert solution.success, solution.message
+    assert free.success, free.message
+    for replay in solution.replays:
+        assert np.abs(replay.motion.xs[:, 1]).max() < module.SWAY + 2e-3  # [rad] what steps of 20 ms are off
+        assert replay.motion.xs[-1] == pytest.approx([1, 0, 0, 0], abs=0.01)
+    assert np.abs(free.xs[:, 1]).max() > 1.5 * module.SWAY
+    assert free.cost < solution.cost
+
+
+@pytest.mark.slow
+def test_the_hand_of_the_panda_reaches_its_target_around_the_ball():
+    """By Drake's own kinematics: where the hand is in the end, and where the links' frames are on the way."""
+    module = example("panda_around_a_ball")
+    solution = dd.solve(module.problem())
+    assert solution.success, solution.message
+    model = solution.problem.model
+    context = model.plant.CreateDefaultContext()
+    near = module.BALL.radius + module.BALL.margin
+    for x in solution.xs:
+        model.plant.SetPositions(context, x[: model.nq])
+        for i in range(1, 8):
+            at = model.plant.GetBodyByName(f"panda_link{i}").EvalPoseInWorld(context).translation()
+            assert np.linalg.norm(at - module.BALL.center) > near
+    hand = model.plant.GetBodyByName("panda_hand").EvalPoseInWorld(context).translation()
+    assert hand == pytest.approx(module.TARGET, abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_pushed_cart_pole_stands_again():
+    module = example("pushed_cart_pole")
+    problem = module.problem()
+    solution = dd.solve(problem, **module.solve_options)
+    assert solution.success, solution.message
+    stands = solution.xs[module.UP :] - [1, np.pi, 0, 0]
+    assert np.abs(stands).max() < 0.05  # [m, rad, m/s, rad/s] it falls a little and comes back, for no force at all
+    controller = dd.loop.MPC(problem, horizon=30, plan=solution)
+    push = dd.loop.Push("pole", [0.3, 0, 0], 1.0)
+    run = dd.loop.closed_loop(problem.model, controller, problem.x0, problem.num_steps, dd.loop.Loop(pushes=[push]))
+    assert [event.kind for event in run.events if event.kind == "push"] == ["push"]
+    assert np.abs(problem.goal_error(run.motion.xs[-1])).max() < 0.05
+
+
 def test_the_ball_bounces_into_its_target(capsys):
     module = example("bounce_into_target")
     module.main()

@@ -28,6 +28,7 @@ from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, Sp
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.rates import InputRate, Jerk
 from drake_diff.optimize.problem.rigid import RIGID_QUANTITIES, RigidQuantity, rigid_quantity
+from drake_diff.optimize.problem.schedule import ContactSchedule
 from drake_diff.optimize.problem.terminal import TerminalSet
 from drake_diff.optimize.problem.timed import SumOfCosts, TrackingCost
 from drake_diff.optimize.replay import deciding
@@ -102,10 +103,11 @@ COSTS = ("running_cost", "final_cost", "trajectory_cost", "parameter_cost")
 LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
 GAPS = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
 GUESS = ("initial_guess", "initial_guess_sha256")
-KINDS_OF_GOALS = (FrameGoal, FrameVelocityGoal, JointGoal, CenterOfMassGoal, KeepLevel, Dwell, TerminalSet)
+KINDS_OF_GOALS = (FrameGoal, FrameVelocityGoal, JointGoal, CenterOfMassGoal, KeepLevel)
+KINDS_OVER_TIME = (Dwell, TerminalSet, ContactSchedule)
 KINDS_OF_OBSTACLES = (SphereObstacle, BoxObstacle, SelfCollision)
 # By the names that a record has.
-GOALS: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS_OF_GOALS, *KINDS_OF_OBSTACLES)}
+GOALS: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS_OF_GOALS, *KINDS_OVER_TIME, *KINDS_OF_OBSTACLES)}
 
 COUPLINGS: dict[str, Any] = {kind.__name__: kind for kind in (Periodic, InputRate, Jerk)}
 

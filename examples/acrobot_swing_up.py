@@ -1,0 +1,44 @@
+"""Swing up an acrobot: two links, and a motor at the elbow only.
+
+The plan is in continuous time. On the plant it holds under feedback, better in shorter steps.
+
+    drake-diff run examples/acrobot_swing_up.py     writes artifacts/acrobot_swing_up
+    python examples/acrobot_swing_up.py             prints what the plan does, and its replays under feedback
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+import drake_diff as dd
+
+MODEL = Path(__file__).parent.parent / "models" / "acrobot.xml"
+HORIZON, NUM_STEPS, STRONGEST = 4.0, 200, 20.0  # [s], steps, [N m]
+UPRIGHT = np.array([np.pi, 0, 0, 0])
+solve_options = {"method": "collocation"}
+
+
+def problem() -> dd.Problem:
+    """From hanging at rest to standing at rest, with little torque."""
+    return dd.Problem(
+        dd.load_model(MODEL, time_step=HORIZON / NUM_STEPS),
+        x0=[0, 0, 0, 0],
+        x_goal=UPRIGHT,
+        num_steps=NUM_STEPS,
+        running_cost=dd.QuadraticCost(R=[[1.0]]),
+        bounds={"elbow_motor": (-STRONGEST, STRONGEST)},
+    )
+
+
+def main() -> None:
+    solution = dd.solve(problem(), **solve_options)
+    print(f"{solution.status.value}: {solution.message}")
+    print(f"the elbow gives {np.abs(solution.us).max():.1f} N m at most, {STRONGEST:.0f} allowed")
+    for replay in solution.replays:
+        if replay.control != "open loop" and replay.motion is not None:
+            off = np.abs(replay.motion.xs[-1] - UPRIGHT).max()
+            print(f"  {replay.control} in {replay.motion.us.shape[0]} steps: ends {off:.3f} from upright")
+
+
+if __name__ == "__main__":
+    main()

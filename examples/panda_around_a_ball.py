@@ -1,0 +1,41 @@
+"""A Panda arm takes its hand around a ball that hangs in its way.
+
+No link may come nearer to the ball than 3 cm, between the knots of the plan too.
+
+    drake-diff run examples/panda_around_a_ball.py  writes artifacts/panda_around_a_ball
+    python examples/panda_around_a_ball.py          prints how near it comes, and how near if nobody told it of the ball
+"""
+
+import numpy as np
+
+import drake_diff as dd
+
+TIME_STEP, NUM_STEPS = 0.04, 50  # [s], steps
+START = {"panda_joint1": -0.7, "panda_joint2": 0.3, "panda_joint4": -2.0, "panda_joint6": 2.3, "panda_joint7": 0.8}
+TARGET = [0.45, 0.35, 0.45]  # [m]
+BALL = dd.SphereObstacle([0.6, 0.0, 0.45], 0.1, margin=0.03, name="ball")  # [m]
+
+
+def problem(goals: tuple[dd.SphereObstacle, ...] = (BALL,)) -> dd.Problem:
+    """From rest to rest in 2 s, the hand at its target in the end."""
+    model = dd.example_model("panda", time_step=TIME_STEP)
+    return dd.Problem(
+        model,
+        x0=START,
+        x_goal=dict.fromkeys(model.state_names[model.nq :], 0.0),
+        num_steps=NUM_STEPS,
+        goals=[dd.FrameGoal("panda_hand", TARGET, tolerance=0.01), *goals],
+        running_cost=dd.QuadraticCost(Q=np.diag([0.0] * 7 + [1.0] * 7), R=1e-3 * np.eye(7)),
+    )
+
+
+def main() -> None:
+    _, clear = problem().kept_goals
+    for name, goals in {"with the ball": (BALL,), "without": ()}.items():
+        solution = dd.solve(problem(goals))
+        print(f"{name}: {solution.status.value}, {solution.message}")
+        print(f"  at its knots it comes within {np.min(clear.clearance.values(solution.xs)):.3f} m of the ball's place")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""The gallery: its page, its scripts and pictures, and the command that runs, verifies and draws each example."""
+
+import importlib.util
+import re
+import shutil
+
+import pytest
+from helpers.browser import browsing, colours
+from helpers.models import ROOT
+from helpers.table import each_row
+
+DOCS = ROOT / "docs"
+LONGEST_SCRIPT, LARGEST_PICTURE = 60, 60_000  # lines, bytes
+
+
+def module(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    found = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(found)
+    return found
+
+
+gallery = module("gallery")
+
+
+def test_the_page_is_what_the_command_writes():
+    assert (DOCS / "gallery/index.md").read_text() == gallery.page()
+
+
+@each_row("entry", gallery.ENTRIES, ids=lambda entry: entry.name)
+def test_an_entry_has_a_short_script_and_a_small_picture(entry):
+    script, picture = ROOT / f"examples/{entry.name}.py", DOCS / f"gallery/{entry.name}.jpg"
+    assert len(script.read_text().splitlines()) <= LONGEST_SCRIPT
+    assert 1000 < picture.stat().st_size <= LARGEST_PICTURE
+
+
+def test_a_picture_opens_its_report_where_there_is_one(tmp_path):
+    pytest.importorskip("mkdocs")
+    site = module("site")
+    entry, other = gallery.ENTRIES[:2]
+    report = tmp_path / entry.report
+    report.parent.mkdir(parents=True)
+    report.touch()
+    text = site.with_reports(gallery.page(), tmp_path)
+    assert f"[![{entry.title}]({entry.name}.jpg)]({entry.report})\n" in text
+    assert f"-   ![{other.title}]({other.name}.jpg)\n" in text
+
+
+@pytest.mark.slow
+@browsing
+def test_the_command_runs_verifies_and_draws_an_example(tmp_path, capsys):
+    import matplotlib.image
+
+    entry = gallery.Entry("arm_around_a_ball", "Arm", "", 0.5)
+    gallery.build(entry, tmp_path)
+    assert capsys.readouterr().out.startswith("arm_around_a_ball: holds")
+    assert (tmp_path / entry.report).is_file()
+    drawn = matplotlib.image.imread(tmp_path / "arm_around_a_ball.jpg")
+    assert drawn.shape == (400, 640, 3)
+    assert colours(drawn / 255) > 1000
+
+
+@pytest.mark.slow
+def test_a_run_that_is_no_success_has_no_picture(tmp_path, monkeypatch):
+    """The same arm in a fifteenth of the time: `solve` finds nothing that it can verify."""
+    (tmp_path / "examples").mkdir()
+    shutil.copytree(ROOT / "models", tmp_path / "models")
+    script = (ROOT / "examples/arm_around_a_ball.py").read_text()
+    weak, count = re.subn(r"num_steps=30", "num_steps=2", script)
+    assert count == 1
+    (tmp_path / "examples/arm_around_a_ball.py").write_text(weak)
+    monkeypatch.setattr(gallery, "ROOT", tmp_path)
+    with pytest.raises(RuntimeError, match="arm_around_a_ball"):
+        gallery.build(gallery.Entry("arm_around_a_ball", "Arm", "", 0.5), tmp_path / "out")
+    assert not list((tmp_path / "out").glob("*.jpg"))
