@@ -141,12 +141,18 @@ class LiveSearch:
         """Show the motion of the plan, and what became of it."""
         if self.page is None or not isinstance(solution, Solution):
             return
-        self._show(lambda: scene_of_plan(solution, _shown(solution)), end=True)
+        self._show(lambda: self._scene_at_the_end(solution), end=True)
         state = solution.status
         open_ = (Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT, Status.ITERATION_LIMIT)
         verdict = "pass" if solution.success else "open" if state in open_ else "fail"
         self._told(state=state.value, verdict=verdict, message=solution.message)
         self.page.wait()
+
+    def _scene_at_the_end(self, solution: Solution) -> Scene:
+        scene = scene_of_plan(solution, _shown(solution))
+        colours = colours_of(plan=bool(scene.ghosts), contacts=any(scene.contacts), thrusts=any(scene.thrusts))
+        self._told(colours=[*colours, *meaning_of(self.problem.goals)])
+        return scene
 
     def _told(self, **facts: Any) -> None:
         if self.page is not None:

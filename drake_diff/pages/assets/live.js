@@ -57,7 +57,7 @@
       }, found, plot.place);
     }
   }
-  function restart(told) {
+  function restart() {
     rows = []; plots = [];
     byId("plots").replaceChildren();
     for (const [column, title, note, log] of [[0, "Cost", "", false], [1, "Violation", "the largest of any bound, goal or constraint; 0 is not on a log scale", true]]) {
@@ -65,7 +65,9 @@
       byId("plots").append(make("div", { class: "plot" }, make("div", { class: "head" }, make("h4", {}, title), value), place, make("p", { class: "note" }, note)));
       plots.push({ column, value, place, log });
     }
-    byId("colours").replaceChildren(...told.colours.map(([css, kind, words]) => {
+  }
+  function explain(colours) {
+    byId("colours").replaceChildren(...colours.map(([css, kind, words]) => {
       const sign = make("i", { class: kind });
       sign.style.color = css;
       return make("li", {}, sign, words);
@@ -73,7 +75,8 @@
   }
   function show(told) {
     const isNew = told.number !== known.number;
-    if (isNew) restart(told);
+    if (isNew) restart();
+    if (told.colours && String(told.colours) !== String(known.colours)) explain(told.colours);
     starts = told.starts;
     rows = rows.slice(0, told.first).concat(told.rows);
     const words = told.verdict ? told.state.replaceAll("_", " ") : told.state;
@@ -86,54 +89,54 @@
     byId("more").hidden = !others.length;
     byId("more").lastElementChild.replaceChildren(...others.map((words) => make("li", {}, words)));
     const past = told.seconds === undefined ? "" : `${told.seconds.toFixed(1)} s`;
-    byId("line").textContent = told.verdict ? `${rows.length} iterations, ${past}` : [past, told.line].filter(Boolean).join("  ·  ");
+    byId("line").textContent = told.verdict ? `${rows.length} iterations in all, ${past}` : [past, told.line].filter(Boolean).join("  ·  ");
     byId("seen").textContent = told.verdict ? SEEN.ended : SEEN.searching;
     if (isNew || told.rows.length) draw();
     known = told;
     document.documentElement.dataset.rows = rows.length;
   }
-  // The motion, which the viewer in the frame plays
+  // The motion at the end, in the viewer's frame
   const animator = () => { const v = byId("view").contentWindow.viewer; return known.verdict && v && v.animator && v.animator.duration ? v.animator : null; };
-  let playing = true, dragged = false;
+  let shown = null, time = 0, last = 0, playing = true;
+  function setTime(t) {
+    time = t > shown.duration ? 0 : t;
+    byId("time").value = time;
+    byId("now").textContent = time.toFixed(3) + " s";
+    shown.seek(Math.min(time, shown.duration - 1e-6));
+    byId("view").contentWindow.viewer.render();
+  }
   function setPlaying(on) {
     playing = on;
     byId("play").textContent = on ? "❚❚" : "▶";
     byId("play").setAttribute("aria-label", on ? "pause" : "play");
-    const a = animator();
-    if (a) { if (on) a.play(); else a.pause(); }
   }
-  function follow() {
-    const a = animator();
-    byId("player").hidden = !a;
-    if (a) {
-      byId("time").max = a.duration;
-      if (!dragged) byId("time").value = Math.min(a.time, a.duration);
-      byId("now").textContent = Number(byId("time").value).toFixed(3) + " s";
+  function advance(stamp) {
+    const found = animator();
+    byId("player").hidden = !found;
+    if (found && (found !== shown || byId("time").max !== String(found.duration))) {
+      byId("time").max = found.duration;
+      shown = found; time = 0;
+      setPlaying(!matchMedia("(prefers-reduced-motion: reduce)").matches);
     }
-    requestAnimationFrame(follow);
+    if (found) { found.pause(); if (playing) setTime(time + (stamp - last) / 1000); }
+    last = stamp;
+    requestAnimationFrame(advance);
   }
   byId("play").addEventListener("click", () => setPlaying(!playing));
-  byId("time").addEventListener("input", () => {
-    const a = animator();
-    if (!a) return;
-    setPlaying(false);
-    dragged = true;
-    a.seek(Math.min(Number(byId("time").value), a.duration - 1e-6));
-    byId("view").contentWindow.viewer.render();
-  });
-  byId("time").addEventListener("change", () => { dragged = false; });
-  requestAnimationFrame(follow);
+  byId("time").addEventListener("input", () => { setPlaying(false); if (shown) setTime(Number(byId("time").value)); });
+  requestAnimationFrame(advance);
 
-  let timer = 0;
   async function ask() {
+    let wait = PERIOD;
     try {
       const answer = await fetch(`news?number=${known.number}&known=${rows.length}`, { cache: "no-store" });
       show(await answer.json());
     } catch {
       if (!(known.verdict)) byId("state").textContent = "the process has ended";
       byId("line").textContent = "The process that searched has ended: this is what it showed last.";
+      wait = 10 * PERIOD;
     }
-    timer = setTimeout(ask, PERIOD);
+    setTimeout(ask, wait);
   }
   addEventListener("resize", () => { for (const plot of plots) if (plot.u) plot.u.setSize({ width: plot.place.clientWidth, height: 190 }); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { for (const plot of plots) if (plot.u) { plot.u.destroy(); plot.u = null; } draw(); });
