@@ -5,7 +5,8 @@ falls by 2 % less than 9.81 of them per s^2. How it bounces, slides and comes to
 dissipation and size.
 
     python examples/tossed_cube.py    two minutes; writes artifacts/tossed_cube/fall and artifacts/tossed_cube/impacts,
-                                      each with a report.html, which drake-diff verify can fit again
+                                      each with a report.html
+    drake-diff verify --time-limit 600 artifacts/tossed_cube/impacts    fits again what is kept there
 """
 
 from pathlib import Path

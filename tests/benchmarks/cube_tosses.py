@@ -6,8 +6,12 @@ TOSSES.npz has `length` and `state` of real tosses at 148 Hz (ContactNets, BSD-3
 velocity in the body's frame and velocity. Each toss that was held out is simulated from its first state; its error is
 the mean distance of the centre over time, in % of the cube's width. First states are those measured, or those whose
 motion goes through the positions before the first contact. Lengths are put right by gravity: in the air these cubes
-fall by less than 9.81 m/s^2. Drake fits eight corner spheres; --mujoco gives the same simulated steps to MuJoCo's sysid
-toolbox (pip install mujoco[sysid]).
+fall by less than 9.81 m/s^2. Drake fits eight corner spheres; --mujoco gives the same simulated steps to MuJoCo's
+sysid toolbox (pip install mujoco[sysid]).
+
+Where errors come from: the error of a model that is right is that of its first states, how far apart motions end that
+begin at states which the measured positions allow. Beside it stands how far apart they end where friction is 5 %
+larger, and the friction of impacts and of slides, by the motion alone.
 """
 
 import argparse
@@ -15,7 +19,7 @@ import os
 import sys
 import tempfile
 import time
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
@@ -26,14 +30,18 @@ import numpy as np  # noqa: E402
 import drake_diff as dd  # noqa: E402
 from drake_diff._base.arrays import Array  # noqa: E402
 from drake_diff.identification import first_state, identify_contact  # noqa: E402
-from drake_diff.identification.flights import flights_of  # noqa: E402
+from drake_diff.identification.chart import Chart  # noqa: E402
+from drake_diff.identification.flights import flights_of, millisecond, start_of  # noqa: E402
+from drake_diff.identification.measured import read_pieces  # noqa: E402
+from drake_diff.mechanics.description import coordinates_of  # noqa: E402
+from drake_diff.model.parameters import applied, select  # noqa: E402
 
 RATE, WIDTH, MASS, INERTIA = 148.0, 0.1048, 0.37, 0.00081  # [Hz, m, kg, kg m^2] as published with the tosses
 INSET = 0.0024  # [m] by hand, radius of a corner sphere: its centre is so far inside of three faces
 GYRATION = (INERTIA / MASS) ** 0.5  # [m]
 LENGTHS = {"half_width": WIDTH / 2, "corner": INSET, "gyration": GYRATION}
 BY_HAND = {"friction": 0.15, "stiffness": 2e4, "relaxation_time": 0.005}  # [1, N/m, s]
-NAMES = ("cube.friction", "cube.stiffness", "cube.relaxation_time", "cube.center_of_mass")
+NAMES = ("cube.friction", "cube.stiffness", "cube.relaxation_time")
 
 
 def sdf(half_width: float, corner: float, gyration: float) -> str:
@@ -97,16 +105,57 @@ def model_of(steps: int, half_width: float = WIDTH / 2, corner: float = INSET, g
         return dd.load_model(path, time_step=1 / RATE / steps)
 
 
-def fall_of(tosses: list[Array], model: dd.Model) -> float:
-    """[m/s^2] how fast they fall before the first contact, on average."""
-    found = []
+def in_the_air(tosses: list[Array], model: dd.Model) -> tuple[Array, Array]:
+    """Gravity [m/s^2] and centre of mass [m] (6,) before the first contact, and their standard errors.
+
+    Each toss has p = p0 + v0 t + g t^2 / 2 - R c: least squares, with p0 and v0 taken out of each. Errors are by the
+    scatter between tosses.
+    """
+    each = []
     for xs in tosses:
         flights = flights_of(model, xs)
-        if flights and flights[0][0] == 0 and flights[0][1] >= 8:
-            t = np.arange(flights[0][1] + 1) / RATE
-            A = np.stack([np.ones_like(t), t, -(t**2) / 2], axis=1)
-            found.append(np.linalg.lstsq(A, xs[: len(t), 6], rcond=None)[0][2])
-    return float(np.mean(found))
+        if flights and flights[0][0] == 0 and flights[0][1] >= 9:
+            flown = xs[: flights[0][1] + 1]
+            t = np.arange(len(flown)) / RATE
+            A = np.concatenate([t[:, None, None] ** 2 / 2 * np.eye(3), -rotations(flown[:, :4])], axis=2)
+            Q = np.linalg.qr(np.stack([np.ones_like(t), t], axis=1))[0]
+            rest = np.eye(len(t)) - Q @ Q.T
+            each.append((np.einsum("st,tij->sij", rest, A).reshape(-1, 6), (rest @ flown[:, 4:7]).ravel()))
+    H = sum(A.T @ A for A, _ in each)
+    found = np.linalg.solve(H, sum(A.T @ y for A, y in each))
+    scores = np.array([A.T @ (y - A @ found) for A, y in each])
+    return found, np.sqrt(np.diag(np.linalg.solve(H, np.linalg.solve(H, scores.T @ scores).T)))
+
+
+def frictions(tosses: list[Array], model: dd.Model, g: Array) -> tuple[Array, Array]:
+    """Tangential over normal: of impulses (n,) between flights, and speed and that of forces (m, 2) in flat slides.
+
+    An impulse is the change of velocity from one flight to the next, where contact lasts for 8 samples at most. A cube
+    slides flat where a face is within 0.01 rad of the ground and the centre within 0.6 mm of its height at rest.
+    """
+    impulses, slides = [], []
+    for xs in tosses:
+        flights = flights_of(model, xs)
+        for (a, b), (c, d) in pairwise(flights):
+            if c - b > 8:
+                continue
+            when, speeds = (b + c) / 2 / RATE, []
+            for first, last in ((a, b), (c, d)):
+                t = np.arange(first, last + 1) / RATE - when
+                A = np.stack([np.ones_like(t), t], axis=1)
+                speeds.append(np.linalg.lstsq(A, xs[first : last + 1, 4:7] - np.outer(t**2 / 2, g), rcond=None)[0][1])
+            change = speeds[1] - speeds[0]
+            impulses.append(np.linalg.norm(change[:2]) / change[2])
+        rest = np.median(xs[-5:, 6])
+        flat = (np.max(np.abs(rotations(xs[:, :4])[:, 2]), axis=1) > np.cos(0.01)) & (np.abs(xs[:, 6] - rest) < 6e-4)
+        t = np.arange(-3, 4) / RATE
+        A = np.stack([np.ones(7), t, t**2 / 2], axis=1)
+        for k in range(3, len(xs) - 3, 3):
+            if np.all(flat[k - 3 : k + 4]) and abs(xs[k, 9]) < 1:
+                _, v, acc = np.linalg.lstsq(A, xs[k - 3 : k + 4, 4:6], rcond=None)[0]
+                if (speed := np.linalg.norm(v)) > 0.08:
+                    slides.append((speed, -acc @ v / speed / -g[2]))
+    return np.array(impulses), np.array(slides)
 
 
 def scaled(tosses: list[Array], by: float) -> list[Array]:
@@ -122,6 +171,30 @@ def errors_of(model: dd.Model, tosses: list[Array], starts: list[Array], values:
     for xs, x0 in zip(tosses, starts, strict=True):
         motion = dd.rollout(model, x0, np.zeros(((len(xs) - 1) * each, 0)), parameters=values).xs[::each, 4:7]
         found.append(np.mean(np.linalg.norm(motion - xs[:, 4:7], axis=1)) / WIDTH * 100)
+    return np.array(found)
+
+
+def spread_of(model: dd.Model, tosses: list[Array], values: dict[str, object], more: dict[str, object]) -> Array:
+    """[% of the width] how far motions are from that of the best first state, on average over each toss.
+
+    They begin at four other first states that the measured positions allow, and have the parameters `more`.
+    """
+    found, each, random = [], round(1 / RATE / model.time_step), np.random.default_rng(0)
+    chart = Chart(coordinates_of(model))
+    for xs in tosses:
+        flights = flights_of(model, xs)
+        if not flights or flights[0][0] > 0:
+            continue
+        (piece,) = read_pieces(model, recording("toss", xs), 0.0)
+        with applied(select(model, values)) as own:
+            start = start_of(own, chart, piece.part(*flights[0]), millisecond(chart, [piece]))
+        starts, us = [start.x, *start.others(chart, 4, random)], np.zeros(((len(xs) - 1) * each, 0))
+        motions = [
+            dd.rollout(model, x0, us, parameters=values if k == 0 else {**values, **more}).xs[::each, 4:7]
+            for k, x0 in enumerate(starts)
+        ]
+        apart = [np.mean(np.linalg.norm(one - motions[0], axis=1)) for one in motions[1:]]
+        found.append(np.mean(apart) / WIDTH * 100)
     return np.array(found)
 
 
@@ -142,9 +215,20 @@ def main() -> int:
     tosses = read_tosses(given.tosses)
     order = np.random.default_rng(given.seed).permutation(len(tosses))
     fitted = [tosses[i] for i in order[: given.fit]]
-    held = [tosses[i] for i in order[len(order) - given.held_out :]]
-    fall = fall_of(fitted, model_of(given.steps))
-    print(f"the tosses that are fitted fall by {fall:.3f} m/s^2: lengths are taken times {9.81 / fall:.4f}", flush=True)
+    others, held = ([tosses[i] for i in part] for part in np.split(order, [len(order) - given.held_out]))
+    (g, center), (g_off, center_off) = (np.split(v, 2) for v in in_the_air(others, model_of(given.steps)))
+    fall = float(np.linalg.norm(g))
+    print(f"{len(others)} tosses that were not held out fall by {np.round(g, 4)} +- {np.round(g_off, 4)} m/s^2:")
+    print(f"lengths are taken times {9.81 / fall:.4f}")
+    print(f"their centre of mass is at {np.round(1e3 * center, 2)} +- {np.round(1e3 * center_off, 2)} mm", flush=True)
+    impulses, slides = frictions(others, model_of(given.steps), g)
+    low, middle, high = np.percentile(impulses, [25, 50, 75])
+    print(
+        f"friction of {len(impulses)} impacts {middle:.3f} (half of them from {low:.3f} to {high:.3f}), and of slides:"
+    )
+    for slow, fast in pairwise((0.08, 0.15, 0.3, 0.5, 2.0)):  # [m/s]
+        part = slides[(slides[:, 0] >= slow) & (slides[:, 0] < fast), 1]
+        print(f"  from {slow} to {fast} m/s {np.median(part):.3f}, {len(part)} of them")
     fitted, held = (scaled(each, 9.81 / fall) for each in (fitted, held))
     logs = [recording(f"toss {i}", x) for i, x in enumerate(fitted)]
     begun = time.process_time()
@@ -164,6 +248,9 @@ def main() -> int:
     for tag, starts in (("measured first states", measured), ("first states by flight", flown)):
         print(told(f"Drake, by hand, {tag}", errors_of(by_hand, held, starts, {})))
         print(told(f"Drake, identified, {tag}", errors_of(identified, held, starts, dict(values))), flush=True)
+    first, slippery = (spread_of(identified, held, values, more) for more in ({}, {"cube.friction": 1.1 * own}))
+    print(told("A model that is right, from first states as uncertain as these", first))
+    print(told("The same with 10 % more friction of the cube's side, 5 % of the pair", slippery), flush=True)
     if given.mujoco:
         from cube_tosses_mujoco import fit_by_sysid
 
