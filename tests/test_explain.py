@@ -1,11 +1,13 @@
 """What is wrong in a model, by name: recordings of equations of motion that SciPy integrates."""
 
 import html
+import sys
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.chance import chance_of_a_name
 from helpers.pendulum import GRAVITY, LEVER, MASS, swing
 from helpers.robots import example_robot
 from scipy.integrate import solve_ivp
@@ -16,12 +18,15 @@ import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
+from drake_diff.identification.explain import FALSE_NAME
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.frozen import FrozenMotion, exponential
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.record.comparison import ComparisonRecord
+
+sys.path.append(str(Path(__file__).parent / "benchmarks"))
 
 
 @pytest.fixture
@@ -154,6 +159,32 @@ def test_of_a_right_model_nothing_is_said(pendulum, seed):
         assert w.names == ()
         assert w.explained
         assert w.sentence == "Nothing: the model explains it."
+
+
+def test_chance_names_a_change_of_a_right_arm_in_less_than_0_3_percent():
+    """The limit holds what FALSE_NAME says; the penalty of BIC alone would not, of so many changes."""
+    model = example_robot("ur5_robot.urdf")
+    tree, chart, period = tree_for_identification(model), Chart(coordinates_of(model)), 0.01
+    us = np.random.default_rng(0).uniform(-3, 3, (40, model.nu))
+    law = ContinuousMotion(model, tree, chart, Unknowns(()), period)
+    xs = law.run(np.zeros(0), model.default_state[None], np.full((1, 40), period), us[None])[0]
+    xs[:, : model.nq] += 2e-4 * np.random.default_rng(1).standard_normal((41, model.nq))
+    xs[:, model.nq :] = np.nan
+    log = dd.Recording("lab", "1", period * np.arange(41), xs, us)
+    named, by_bic = chance_of_a_name(model, log, 50_000)
+    assert named < FALSE_NAME + 4 * np.sqrt(FALSE_NAME / 50_000)  # four standard deviations of the draws
+    assert by_bic > 0.01
+
+
+@pytest.mark.slow
+def test_of_an_arm_that_another_engine_moved_a_right_model_is_silent_and_an_error_is_named():
+    """MuJoCo with an encoder's noise, by the benchmark: nothing is changed, or a joint's damping is."""
+    pytest.importorskip("mujoco")
+    import identify_causes
+
+    assert identify_causes.measure("ur5_robot", (), 41)["verdict"] == "right"
+    assert identify_causes.measure("ur5_robot", ("damping",), 42)["verdict"] == "named"
+    assert identify_causes.measure("panda", ("mass",), 105)["verdict"] == "named"  # torques jump between their limits
 
 
 @pytest.mark.parametrize(("step", "names"), [(0.005, ()), (0.0025, ("model.time_step",))])

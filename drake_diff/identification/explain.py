@@ -239,13 +239,17 @@ class _Search:
     def each_of(unknowns: Unknowns) -> list[tuple[Unknown, slice]]:
         return list(zip(unknowns.each, unknowns.slices, strict=True))
 
-    def found(self) -> Explanation:
+    def prepare(self) -> None:
+        """Steps, pieces and starts of segments with which the model as it is follows what was measured."""
         nothing = self.of(())
         fit, starts = self.problem(nothing, self.pieces).prepared(self.law(nothing, LONGEST))
         longest = fit.law.longest if isinstance(fit.law, ContinuousMotion) else LONGEST
         self.longest, self.segments, self.cut = longest, fit.segments, list(fit.segments.pieces)
         self.starts = self.settled(fit, starts)
         self.calm = self.is_calm(fit)
+
+    def found(self) -> Explanation:
+        self.prepare()
         found, base, alone, runners = self.by_one()
         if found is None and not base.explains and self.may_be_steps(runners):
             found = self.by_steps(base)

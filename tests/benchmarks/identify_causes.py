@@ -2,6 +2,7 @@
 
     pip install -e '.[test]'
     python tests/benchmarks/identify_causes.py [--seed 0] [--count 60] [--changes 0 1 2] [--out FILE.json]
+    python tests/benchmarks/identify_causes.py --chance 100000 [--seed 0] [--count 20]
 
 Each case is a robot of example-robot-data or of models/, on its base for 2 s at 100 Hz. A controller leads it along
 sums of sines within its joints' ranges, by torques that are held for 10 ms and recorded. Positions have the noise of an
@@ -9,6 +10,9 @@ encoder, 0.2 mrad; velocities are not recorded. In turn nothing is changed, and 
 one thing is; or two are: a mass with its inertia, a centre of mass, a damping, the dry friction of a joint, the
 strength of an input, a delay of all inputs, the bias of an encoder, or gravity. A change that moves no joint by more
 than five times the noise, in MuJoCo and under the same torques, is drawn anew.
+
+With --chance, nothing is changed, and noise is drawn so often for each robot: in which share of the draws some change
+passes the limit, and in which it passes the penalty of BIC alone.
 """
 
 import argparse
@@ -23,6 +27,7 @@ from pathlib import Path
 import identify as base
 import mujoco
 import numpy as np
+from helpers.chance import chance_of_a_name
 from helpers.models import robot_file
 
 import drake_diff as dd
@@ -291,8 +296,20 @@ def main():
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--changes", type=int, nargs="+", default=[0, 1, 2], choices=(0, 1, 2))
+    parser.add_argument("--chance", type=int, metavar="DRAWS")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
+    if given.chance:
+        each = []
+        for i, robot in enumerate(ROBOTS[: given.count]):
+            model, recording, _ = recorded(robot, (), 10000 * given.seed + i)
+            each.append(chance_of_a_name(model, recording, given.chance, given.seed))
+            named, by_bic = each[-1]
+            print(f"{robot:22} named {100 * named:.3g} %, by BIC alone {100 * by_bic:.3g} %", flush=True)
+        named, by_bic = 100 * np.mean(each, axis=0)
+        worst = 100 * np.max([one for one, _ in each])
+        print(f"mean: named {named:.3g} %, at most {worst:.3g} %; by BIC alone {by_bic:.3g} %")
+        return
     cases = []
     for i in range(given.first, given.first + given.count):
         robot = ROBOTS[i // len(given.changes) % len(ROBOTS)]

@@ -1,0 +1,39 @@
+"""How often chance alone makes `dd.explain` name a change of a right model, as far as its motion is linear."""
+
+import numpy as np
+
+from drake_diff.comparison.recordings import Recording
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.explain import _Search
+from drake_diff.identification.measured import given_noise, read_pieces
+from drake_diff.identification.tree import tree_for_identification
+from drake_diff.mechanics.description import coordinates_of
+
+
+def chance_of_a_name(model, recording: Recording, draws: int, seed: int = 0) -> tuple[float, float]:
+    """(share of draws of noise in which some change passes the limit, and in which one passes BIC's penalty alone).
+
+    Where the model is right and residuals are white, R' b of the least squares |b - R dz|^2 has independent normal b,
+    and a change alone lowers them by what b has in its own columns.
+    """
+    chart = Chart(coordinates_of(model))
+    search = _Search(
+        model,
+        tree_for_identification(model),
+        chart,
+        read_pieces(model, recording, 0.0),
+        given_noise(model, chart, None),
+    )
+    search.prepare()
+    view = search.view(search.cut, search.unknowns.z_start, search.starts)
+    pulled = np.random.default_rng(seed).standard_normal((draws, len(view.reduced.b))) @ view.reduced.R
+    named, by_bic = np.zeros((2, draws), dtype=bool)
+    for s, freedom in zip(view.unknowns.slices, view.freedoms, strict=True):
+        H = view.matrix[s, s]
+        scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        sizes, directions = np.linalg.eigh(H * np.outer(scale, scale))
+        kept = sizes > 1e-12 * np.max(sizes)
+        falls = np.sum(((pulled[:, s] * scale) @ directions[:, kept]) ** 2 / sizes[kept], axis=1)
+        named |= falls > search.least(max(freedom, 1.0), len(view.freedoms))
+        by_bic |= falls > max(freedom, 1.0) * np.log(search.count)
+    return float(np.mean(named)), float(np.mean(by_bic))
