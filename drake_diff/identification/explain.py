@@ -478,7 +478,14 @@ class _Search:
             ):
                 chosen[own] = promise
                 places[small] -= 1
-        return self.raced([self.runner(seen, promise, own) for own, promise in chosen.items()], base)
+        plain = {own: promise for own, promise in chosen.items() if not any(map(self.is_of_inputs, own))}
+        found, every = self.raced([self.runner(seen, promise, own) for own, promise in plain.items()], base)
+        if any(one.explains for one in found):  # a search for a delay or a limit takes longer than the others together
+            first = min(promise.left for promise in chosen.values())
+            chosen = {own: promise for own, promise in chosen.items() if not self.is_behind(promise.left, first)}
+        others = [self.runner(seen, promise, own) for own, promise in chosen.items() if own not in plain]
+        more, rest = self.raced(others, base)
+        return [*found, *more], sorted([*every, *rest], key=lambda one: one.left)
 
     def runner(self, seen: View, promise: Promise, names: tuple[str, ...]) -> _Runner:
         special = next((name for name in names if self.is_of_inputs(name)), None)
@@ -523,19 +530,23 @@ class _Search:
                 for one in alive[:most]
                 if self.is_hopeless(one.left) and (most == RACE[0] or one.left < FALLS * before[one.names])
             ]
-        for one in there:
+        best = np.inf
+        for one in sorted(there, key=lambda one: one.left):
             for _ in range(STEPS):
                 last = one.left
                 if not one.step() or last - one.left < CLOSE:
                     break
+                if one.left > FALLS * last and self.is_behind(one.left, best):
+                    break
+            best = min(best, one.left)
         every = sorted(runners, key=lambda one: one.left)
         alive = there + alive
         price = float(np.log(self.count))
         alive.sort(key=lambda one: one.left + price * one.freedom)
         found: list[_Tried] = []
         for one in alive:
-            behind = one.left + price * one.freedom - (alive[0].left + price * alive[0].freedom)
-            enough = any(each.explains for each in found) and behind > TOLD_APART * max(1.0, alive[0].left / self.count)
+            first = alive[0].left + price * alive[0].freedom
+            enough = any(each.explains for each in found) and self.is_behind(one.left + price * one.freedom, first)
             if enough or self.is_hopeless(one.left) or one.fit.at(one.z, one.starts) is None:
                 continue
             try:
@@ -544,6 +555,10 @@ class _Search:
                 continue
             self.evidence[" and ".join(one.names)] = base.score - found[-1].score
         return found, every
+
+    def is_behind(self, left: float, best: float) -> bool:
+        """Whether a change that leaves so much is told from the one that leaves least."""
+        return left - best > TOLD_APART * max(1.0, best / self.count)
 
     def is_hopeless(self, left: float) -> bool:
         return left > HOPELESS**2 * self.count
