@@ -615,3 +615,9 @@ def test_a_bag_without_what_the_model_has_is_refused(load, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ArtifactError, match="not a ROS 2 bag"):
         dd.comparison.read_recording(Path(tmp_path / "empty"), load("projectile.sdf"))
+
+
+def test_a_recording_shows_in_jupyter_with_its_name_escaped():
+    shown = dd.Recording("<script>", "1", np.array([0.0, 0.1]), np.zeros((2, 2)), np.zeros((1, 1)))._repr_html_()
+    assert "&lt;script&gt; 1: 2 samples over 0.1 s" in shown
+    assert "<script>" not in shown

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.comparison.recordings_ros2 import is_ros2, read_ros2
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.logs.mcap_file import read_mcap
@@ -29,7 +30,7 @@ CLOCK_TOLERANCE = 1e-3  # of a time step: printed times and nanoseconds are with
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Recording:
+class Recording(ShowsItsRepr):
     """A motion of a model that was recorded elsewhere, for `dd.compare`.
 
     Args:

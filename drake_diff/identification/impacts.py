@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_float
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.identification.chart import Chart
@@ -42,7 +43,7 @@ Build = Callable[..., Model]
 
 
 @dataclass(frozen=True, eq=False)
-class ContactIdentification:
+class ContactIdentification(ShowsItsRepr):
     """What motions through impacts say of a model's parameters; `identify_contact` makes one."""
 
     values: Mapping[str, float | Array]  # by name
