@@ -170,7 +170,8 @@ def solve(
         on_plan: gets what each search comes to, a `Solution` or `PhasedSolution` that is not measured yet.
         view: True serves a page for browsers on this machine and prints its address, a function gets the address: the
             iterates in Drake's Meshcat beside their cost and violation, and at the end the motion of the plan, to be
-            played. It changes nothing of what is found, but takes time. It is served until the process ends.
+            played. It changes nothing of what is found, but takes time. It is served until the process ends. Plain
+            dynamics and phases have no such page.
 
     Returns:
         A `Solution`, whatever happened: how the solve ended is its `status` and `message`.
