@@ -143,6 +143,18 @@ def test_an_identification_through_impacts_can_be_kept_and_comes_out_again(ball,
     assert "through impacts" in page
 
 
+def test_a_fall_by_less_than_gravity_is_told_without_bounds_that_there_are_not(ball):
+    """As where the cameras' metre is too long: z = 1 - 9.6 t^2 / 2, with 0.1 mm of noise."""
+    times, xs = 0.005 * np.arange(41), np.full((41, 13), np.nan)
+    xs[:, :7] = [1.0, 0, 0, 0, 0, 0, 1.0]
+    xs[:, 6] -= 9.6 * times**2 / 2
+    xs[:, 4:7] += 1e-4 * np.random.default_rng(0).standard_normal((41, 3))
+    found = dd.identify(ball, dd.Recording("fall", "1", times, xs, np.zeros((40, 0))), ["model.gravity"])
+    # 33 samples that are fitted know 9.6 to 0.1 mm * sqrt(720 / 33) / (0.16 s)^2 = 0.02.
+    assert found.values["model.gravity"][2] == pytest.approx(-9.6, abs=0.06)
+    assert "bound" not in found.sentence
+
+
 def test_the_spread_of_a_first_state_is_that_of_first_states_by_other_noise(ball):
     """By the same flight measured again and again, which is what the spread speaks of."""
     chart, found, told = Chart(coordinates_of(ball)), [], []
