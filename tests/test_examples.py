@@ -273,7 +273,7 @@ def test_the_ball_flies_out_of_the_cup_into_its_target():
 
 @pytest.mark.slow
 @each_row("name, way", [("quadruped_jump", 0.06), ("quadruped_trot", 0.12)])
-def test_the_quadruped_goes_as_its_schedule_says(name, way):
+def test_the_quadruped_goes_as_its_schedule_says_and_its_record_holds(name, way, tmp_path):
     """Where a foot is said to stand it is on the ground, where not over it, by Drake's own kinematics."""
     module = example(name)
     with warnings.catch_warnings():
@@ -291,6 +291,8 @@ def test_the_quadruped_goes_as_its_schedule_says(name, way):
             body = model.plant.GetBodyByName(foot)
             height = model.plant.EvalBodyPoseInWorld(context, body).translation()[2] - 0.025  # its radius
             assert (height < 1e-6) == (foot in standing)
+    dd.save(solution, tmp_path / name)
+    assert dd.verify(tmp_path / name, time_limit=600).verdict == "holds"
 
 
 @pytest.mark.slow
