@@ -115,7 +115,8 @@ def _source_if_unchanged(given: ModelInput, source: Path, models: Path | None) -
         raise ModelError(
             f"the model {what}: models=FOLDER, or --models, lets them be read below a folder that you give"
         )
-    source = models / source  # where it was given by a relative path, it is looked for below that folder
+    below = models / source  # a relative path is looked for below that folder, then from the working directory
+    source = below if below.is_file() else source
     if not source.resolve().is_relative_to(models.resolve()):
         raise ModelError(f"the model's file {source} is not below {models}, the folder of models that was given")
     if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
