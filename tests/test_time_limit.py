@@ -3,6 +3,7 @@
 The clock is ours: it stands still but where a test lets time pass.
 """
 
+import signal
 import time
 
 import numpy as np
@@ -11,6 +12,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.clock import Pace, TimeIsUpError, check_time, until
+from drake_diff.model import twin
 from drake_diff.optimize import run
 
 STATUS = dd.Status.TIME_LIMIT
@@ -125,3 +127,49 @@ def test_no_other_method_is_begun_after_the_limit(monkeypatch):
     found = dd.solve(problem, time_limit=10.0)
     assert found.status is dd.Status.CONVERGED_NOT_VERIFIED
     assert [link["ended"] for link in found.options["chain"]] == ["converged_not_verified", "not begun: time limit"]
+
+
+@each_row("method, solver", METHODS[1:])
+def test_a_signal_in_the_middle_of_an_evaluation_ends_it(monkeypatch, method, solver):
+    """Not at the next iteration, which may take seconds: what follows it is one rollout of what was best."""
+    calls, plans, signalled = [], [], 200
+
+    def counted():
+        calls.append(1)
+        if len(calls) == signalled:
+            signal.raise_signal(signal.SIGINT)
+        check_time()
+
+    monkeypatch.setattr(twin, "check_time", counted)
+
+    def on_plan(plan):
+        plans.append((plan.status, len(calls) - signalled))
+
+    found = dd.solve(swing(), method=method, solver=solver, tolerance=1e-14, on_plan=on_plan)
+    assert found.status is dd.Status.INTERRUPTED
+    ((status, after),) = plans
+    assert status is dd.Status.INTERRUPTED
+    assert after <= 2 * found.problem.num_steps + 10
+
+
+@each_row("method", ["collocation", "shooting", "ilqr"])
+def test_a_signal_while_the_guess_is_certified_leaves_the_guess(monkeypatch, method):
+    plans, begun = [], []
+
+    def interrupted():
+        if not begun:
+            begun.append(signal.raise_signal(signal.SIGINT))
+        check_time()
+
+    def certify(*words, **more):
+        monkeypatch.setattr(twin, "check_time", interrupted)
+        return real(*words, **more)
+
+    name = "certify_equations" if method == "collocation" else "certify_steps"
+    real = getattr(run, name)
+    monkeypatch.setattr(run, name, certify)
+    found = dd.solve(swing(), method=method, on_plan=plans.append)
+    assert found.status is dd.Status.INTERRUPTED
+    assert "not made before that: certificates of the guess, the search" in found.message
+    assert [plan.status for plan in plans] == [dd.Status.INTERRUPTED]
+    assert np.array_equal(found.xs[0], [0, 0])

@@ -1,5 +1,6 @@
-"""Until when what runs here may go on: a limit that holds in whatever is called, however deep."""
+"""Until when what runs here may go on: a limit, or a signal, that holds in whatever is called, however deep."""
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,8 +10,15 @@ LONGEST_PIECE = 0.4  # of what the pieces before it took, as CasADi's take on ch
 DEADLINE: ContextVar[float | None] = ContextVar("DEADLINE", default=None)  # of the monotonic clock
 
 
+STOP: ContextVar[threading.Event | None] = ContextVar("STOP", default=None)
+
+
 class TimeIsUpError(Exception):
     """The time that was given is over; whoever gave it tells what was not done."""
+
+
+class StoppedError(TimeIsUpError):
+    """A signal ends what runs here, as a limit would."""
 
 
 @contextmanager
@@ -24,9 +32,21 @@ def until(deadline: float) -> Iterator[None]:
         DEADLINE.reset(token)
 
 
+@contextmanager
+def until_set(flag: threading.Event) -> Iterator[None]:
+    """`check_time` raises once `flag` is set, as a signal does, in the place of the flag of a block around this one."""
+    token = STOP.set(flag)
+    try:
+        yield
+    finally:
+        STOP.reset(token)
+
+
 def check_time(ahead: float = 0.0) -> None:
     """Raise TimeIsUpError where the time is over, or will be before what comes next, that takes `ahead` [s]."""
-    deadline = DEADLINE.get()
+    stop, deadline = STOP.get(), DEADLINE.get()
+    if stop is not None and stop.is_set():
+        raise StoppedError("interrupted")
     if deadline is not None and time.monotonic() + ahead > deadline:
         raise TimeIsUpError("the time is up")
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.clock import until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
@@ -155,7 +156,8 @@ class _Stages:
             self.log(soft.reach, stiffness, found.ended, found.iterations, found.cost, miss, None, kind="relaxed")
 
         try:
-            self.xs, self.us = solve_relaxed(problem, plant, xs, is_over=self.is_over, log=log, tell=tell)
+            with until_set(self.interrupted):
+                self.xs, self.us = solve_relaxed(problem, plant, xs, is_over=self.is_over, log=log, tell=tell)
         except SimulationError as error:
             self.log(None, None, f"refused: {error}", 0, None, None, None, kind="relaxed")
             self.xs, self.us = roll_states(problem.model, problem.x0, us), us

@@ -12,7 +12,7 @@ from pydrake import solvers
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolutionResult
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.clock import TimeIsUpError
+from drake_diff._base.clock import TimeIsUpError, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
 from drake_diff.optimize.iterate import Iterate
@@ -52,7 +52,8 @@ def solve_program(
         callback = _Callback(program, watch, report, motions)
         program.AddVisualizationCallback(callback, program.decision_variables())
         try:
-            result = engine.Solve(program, guess, _options(solver, limits, print_file, longest))
+            with until_set(interrupted):
+                result = engine.Solve(program, guess, _options(solver, limits, print_file, longest))
         except (DrakeDiffError, RuntimeError, _Stop, TimeIsUpError) as error:
             outcome, message = _explain_exception(watch, error)
             callback.look_back()
@@ -130,6 +131,8 @@ def _options(solver: str, limits: Limits, print_file: Path, longest: float) -> s
 
 def _explain_exception(watch: Watch, error: Exception) -> tuple[Outcome, str]:
     """IPOPT hands our exceptions on, SNOPT wraps them in a RuntimeError: flags and names tell, not types."""
+    if watch.stopped_by is None and watch.interrupted.is_set():  # in the middle of an evaluation
+        watch.stopped_by = Outcome.INTERRUPTED
     if watch.stopped_by is not None:
         return watch.stopped_by, f"stopped: {watch.stopped_by.value}"
     text = f"{type(error).__name__}: {error}"

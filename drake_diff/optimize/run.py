@@ -1,6 +1,7 @@
 """One solve by one method: certify at the guess, search, certify at the result, measure, judge."""
 
 import dataclasses
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.clock import TimeIsUpError, until
+from drake_diff._base.clock import StoppedError, TimeIsUpError, until, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.steps import certify_steps
@@ -84,8 +85,8 @@ class Run:
         try:
             with until(self.start + (1 + GRACE) * self.limits.time_limit):
                 return search()
-        except TimeIsUpError:
-            return self._cut(self.reached[-1])
+        except TimeIsUpError as error:
+            return self._cut(self.reached[-1], interrupted=isinstance(error, StoppedError))
 
     def _of_guess(self, guess: Guess) -> Solution:
         """The draft of a solve that found nothing: its guess, by collocation with an input at the last knot."""
@@ -94,10 +95,15 @@ class Run:
         last = guess.us[-1] if guess.u_final is None else np.ravel(guess.u_final)
         return self._draft(guess.xs, guess.us, u_final=last)
 
-    def _cut(self, reached: _SoFar) -> Solution:
+    def _cut(self, reached: _SoFar, *, interrupted: bool) -> Solution:
         if reached.judged is not None:
             return reached.judged.told(message=f"{reached.judged.message}; no finer mesh: the time limit came first")
         result, cut = reached.result, f"not made within the time limit: {', '.join(STAGES[reached.stage :])}"
+        if interrupted:  # which is looked for before a search alone
+            plan = ended(reached.draft, Status.INTERRUPTED, cut.replace("within the time limit", "before that"))
+            if self.report is not None:
+                self.report.found(plan)
+            return plan
         if result is None:
             return ended(reached.draft, Status.TIME_LIMIT, cut)
         status, table = status_of(result.outcome) or Status.TIME_LIMIT, result.iterations
@@ -118,16 +124,17 @@ class Run:
             return self._collocate_in_drake(guess)
         problem, report = self.problem, self.report
         transcription = Transcription(self.searched or problem, self.scheme)
-        with noted_interrupts():  # one that comes before the search ends it at its start
+        with noted_interrupts() as interrupted:  # one that comes before the search ends it at its start
             try:
-                before = certify_equations(
-                    self.problem,
-                    transcription.jacobian,
-                    guess.xs,
-                    guess.us,
-                    transcription.task,
-                    knots=first_knots(guess.us),
-                )
+                with until_set(interrupted):
+                    before = certify_equations(
+                        self.problem,
+                        transcription.jacobian,
+                        guess.xs,
+                        guess.us,
+                        transcription.task,
+                        knots=first_knots(guess.us),
+                    )
             except (GradientError, SimulationError) as error:
                 return refused(self._of_guess(guess), error)
             self._reach(1)
@@ -302,8 +309,8 @@ class Run:
         """See `_searched`; a signal that comes before the search ends that at its start, with what it begins with."""
         options = {"segmented": segmented, "may_be_blind": may_be_blind, "around": around}
         with ExitStack() as until_found:
-            until_found.enter_context(noted_interrupts())
-            return self._searched(xs, us, search, guess, until_found.close, **options)
+            interrupted = until_found.enter_context(noted_interrupts())
+            return self._searched(xs, us, search, guess, interrupted, until_found.close, **options)
 
     def _searched(
         self,
@@ -311,6 +318,7 @@ class Run:
         us: Array,
         search: Searcher,
         guess: Guess,
+        interrupted: threading.Event,
         found: Callable[[], None],
         *,
         segmented: bool,
@@ -324,7 +332,8 @@ class Run:
         given, values = xs if segmented or around else None, self._first_values(guess)
         variables = ShootingVariables(self.problem, around=given)
         try:
-            xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values), found=False)
+            with until_set(interrupted):
+                xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values), found=False)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us), error)
         if blindness and not may_be_blind:

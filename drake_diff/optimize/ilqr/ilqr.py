@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.clock import TimeIsUpError
+from drake_diff._base.clock import TimeIsUpError, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
@@ -236,11 +236,8 @@ class _Search:
 
         Where that leads elsewhere, the search goes on from there with Drake's own step alone.
         """
-        try:
-            outcome = self._search(interrupted)
-        except TimeIsUpError:  # in the middle of a step: what was found before it stays
-            return Outcome.TIME_LIMIT
-        if self.tried_by is None or self.policy is None:
+        outcome = self._stoppable(interrupted)
+        if self.tried_by is None or self.policy is None or outcome is Outcome.TIME_LIMIT:
             return outcome
         self.tried_by = None
         try:
@@ -253,7 +250,15 @@ class _Search:
         if same:
             return outcome
         self.jacobians = None
-        return self._search(interrupted)
+        return self._stoppable(interrupted)
+
+    def _stoppable(self, interrupted: threading.Event) -> Outcome:
+        """Search; what ends it in the middle of a step leaves what was found before that step."""
+        try:
+            with until_set(interrupted):
+                return self._search(interrupted)
+        except TimeIsUpError:
+            return Outcome.INTERRUPTED if interrupted.is_set() else Outcome.TIME_LIMIT
 
     def _search(self, interrupted: threading.Event) -> Outcome:
         """Minimize once; if there are constraints, again and again for better multipliers."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.clock import TimeIsUpError
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
@@ -95,21 +96,24 @@ def solve_relaxed(
     q[0] = problem.x0[: problem.model.nq]
     for i, _ in plant.coordinates.free:
         q[:, i : i + 4] /= np.linalg.norm(q[:, i : i + 4], axis=1, keepdims=True)
-    for softness in relaxed_schedule(problem, plant):
-        found = search.run(q, softness, ITERATIONS, is_over, tell)
-        q = found.motion.q
-        log(softness, found)
-        for weight in WEIGHTS:
-            followed = follow(problem, found.motion.xs, found.motion.us, weight)
-            if followed is not None:
-                apart = (followed[0] - found.motion.xs) / problem.ranges(found.motion.xs)
-                starts.append((float(np.mean(apart**2)) + found.gap + found.violation, *followed))
-        if is_over():
-            break
-        if found.ended != "inaccurate":
-            closed = q, search.learned
-        elif closed is not None:  # the next one begins where the last that closed ended
-            q, search.learned = closed
+    try:
+        for softness in relaxed_schedule(problem, plant):
+            found = search.run(q, softness, ITERATIONS, is_over, tell)
+            q = found.motion.q
+            log(softness, found)
+            for weight in WEIGHTS:
+                followed = follow(problem, found.motion.xs, found.motion.us, weight)
+                if followed is not None:
+                    apart = (followed[0] - found.motion.xs) / problem.ranges(found.motion.xs)
+                    starts.append((float(np.mean(apart**2)) + found.gap + found.violation, *followed))
+            if is_over():
+                break
+            if found.ended != "inaccurate":
+                closed = q, search.learned
+            elif closed is not None:  # the next one begins where the last that closed ended
+                q, search.learned = closed
+    except TimeIsUpError:  # while the true plant follows one: what has followed before that stays
+        tell("the true plant follows no more relaxed stages")
     if not starts:
         raise SimulationError("the true plant can follow none of the relaxed stages")
     _, xs, us = min(starts, key=lambda start: start[0])

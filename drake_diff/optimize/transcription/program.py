@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
-from drake_diff._base.clock import Pace, TimeIsUpError
+from drake_diff._base.clock import Pace, TimeIsUpError, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.optimize.iterate import Iterate
@@ -423,14 +423,16 @@ def solve_ipopt(
         solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
         lower, upper = program.sides
         known = {} if begun is None else {"lam_x0": begun.variables, "lam_g0": begun.rows}
-        found = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper, **known)
+        with until_set(interrupted):
+            found = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper, **known)
         stats = solver.stats()
     columns = [stats.get("iterations", {}).get(name, ()) for name in ("obj", "inf_pr", "inf_du", "alpha_pr")]
     table = tuple(Iteration(i, *map(float, row)) for i, row in enumerate(zip(*columns, strict=True)))
     error = callback.error or program.functions.error
     if error is not None:
         if isinstance(error, TimeIsUpError):
-            return NlpResult(watch.best_of(guess), Outcome.TIME_LIMIT, f"stopped: {error}", table)
+            ended = Outcome.INTERRUPTED if interrupted.is_set() else Outcome.TIME_LIMIT
+            return NlpResult(watch.best_of(guess), ended, f"stopped: {error}", table)
         if not isinstance(error, DrakeDiffError):
             raise error
         outcome = Outcome.NO_GRADIENT if isinstance(error, GradientError) else Outcome.FAILED
