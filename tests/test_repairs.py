@@ -334,8 +334,6 @@ def test_a_run_of_a_repaired_model_is_made_again_with_its_repairs(tmp_path, monk
     visual = '<visual><geometry><mesh filename="package://shapes/tri.obj"/></geometry></visual></link>'
     text = robot(SHOULDER, ELBOW).replace("</link>", visual, 1) if "packages" in options else robot(SHOULDER, ELBOW)
     (tmp_path / "arm.urdf").write_text(text)
-    if "packages" in options:
-        options = {**options, "packages": {"shapes": str(tmp_path / "shapes")}}
     model, _ = load("arm.urdf", time_step=0.02, **options)
     cost = dd.QuadraticCost(Q=np.eye(model.nx), R=0.01 * np.eye(model.nu))
     problem = dd.Problem(model, x0=np.full(model.nx, 0.1), num_steps=4, running_cost=cost)

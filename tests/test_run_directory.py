@@ -35,6 +35,7 @@ from drake_diff.artifact.listing import list_runs
 from drake_diff.artifact.save import begin, keep_plan
 from drake_diff.cli import main as cli
 from drake_diff.exceptions import ArtifactError, InputError, ModelError, WriteError
+from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.record.directory import RECORDS, writing, written_whole
 from drake_diff.record.read import KINDS
 
@@ -409,6 +410,11 @@ def test_a_plan_that_was_kept_is_measured_as_it_would_have_been(run, solutions):
     assert names(run.parent) == ["expected", "run"]
     assert (record.verdict, record.name) == ("pass", "run")
     assert record.metrics == expected.metrics
+    tables = [
+        read_mcap(folder / "trace.mcap").arrays("/solver/iterations") for folder in (run, run.parent / "expected")
+    ]
+    assert all(np.array_equal(tables[0][name], tables[1][name], equal_nan=True) for name in tables[1])
+    assert len(tables[1]["iteration"]) == expected.solver.iterations > 0
     assert record.replays == expected.replays
     assert record.gradient == expected.gradient
     assert goal_of(run) == NEW

@@ -11,8 +11,10 @@ from helpers.models import MODELS
 from helpers.plants import block
 from helpers.problems import DOUBLE_INTEGRATOR, lqr
 from helpers.table import each_row
+from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 
 import drake_diff as dd
+from drake_diff._base.autodiff import WIDE, chain, chain_rows
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.shooting import (
@@ -361,3 +363,15 @@ def test_a_guess_without_a_derivative_is_the_end(monkeypatch, solver):
     result = solve_shooting(pendulum(num_steps=10), *guess, solver=solver, limits=limits, report=None)[0]
     assert result.outcome is Outcome.NO_GRADIENT
     assert "no derivative here" in result.message
+
+
+@each_row("count", [3, WIDE + 1])
+def test_the_chain_rule_by_few_and_many_variables(count):
+    """Of many the identity is told row by row; what is nearly the identity must not be taken for it."""
+    rows = np.arange(2.0 * count).reshape(2, count)
+    nearly = np.eye(count)
+    nearly[-1, 0] = 0.5
+    for seed in (np.eye(count), nearly, 2 * np.eye(count), np.ones((count, 1))):
+        z = InitializeAutoDiff(value=np.zeros((count, 1)), gradient=seed).ravel()
+        assert np.array_equal(ExtractGradient(chain_rows(np.zeros(2), rows, z).reshape(-1, 1)), rows @ seed)
+        assert np.array_equal(chain(1.0, rows[1], z).derivatives(), rows[1] @ seed)

@@ -11,9 +11,10 @@ import pytest
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base.clock import Pace, TimeIsUpError, check_time, until
+from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, until, until_set
+from drake_diff._base.signals import noted_interrupts
 from drake_diff.model import twin
-from drake_diff.optimize import run
+from drake_diff.optimize import run, shooting
 
 STATUS = dd.Status.TIME_LIMIT
 METHODS = [("collocation", None), ("shooting", "snopt"), ("shooting", "ipopt"), ("ilqr", None)]
@@ -129,6 +130,22 @@ def test_no_other_method_is_begun_after_the_limit(monkeypatch):
     assert [link["ended"] for link in found.options["chain"]] == ["converged_not_verified", "not begun: time limit"]
 
 
+@each_row("solver", ["snopt", "ipopt"])
+def test_no_evaluation_is_begun_that_would_end_after_the_limit(monkeypatch, solver):
+    """A derivative by thousands of variables takes seconds, and nothing can interrupt it."""
+    clock, real, each = stopped(monkeypatch), shooting.RolloutCost.__call__, 3.0
+
+    def slow(self, z):
+        clock.now += each if z.dtype == object else 0.0
+        return real(self, z)
+
+    monkeypatch.setattr(shooting.RolloutCost, "__call__", slow)
+    begun = clock.now
+    found = dd.solve(swing(), method="shooting", solver=solver, time_limit=10.0, tolerance=1e-14)
+    assert found.status is STATUS
+    assert each < clock.now - begun <= 10.0  # a fourth evaluation would end after 12 s
+
+
 @each_row("method, solver", METHODS[1:])
 def test_a_signal_in_the_middle_of_an_evaluation_ends_it(monkeypatch, method, solver):
     """Not at the next iteration, which may take seconds: what follows it is one rollout of what was best."""
@@ -173,3 +190,15 @@ def test_a_signal_while_the_guess_is_certified_leaves_the_guess(monkeypatch, met
     assert "not made before that: certificates of the guess, the search" in found.message
     assert [plan.status for plan in plans] == [dd.Status.INTERRUPTED]
     assert np.array_equal(found.xs[0], [0, 0])
+
+
+def test_a_signal_ends_a_compilation_at_once():
+    """Numba's own code is on the stack while it compiles, for seconds in which it looks at no flag."""
+    numba_s = {"__name__": "numba.core.compiler", "signal": signal}
+    exec("def compile_it(): signal.raise_signal(signal.SIGINT)", numba_s)
+    with noted_interrupts() as flag:
+        with until_set(flag), pytest.raises(StoppedError):
+            numba_s["compile_it"]()
+        flag.clear()
+        numba_s["compile_it"]()  # outside a search it is noted alone
+        assert flag.is_set()

@@ -11,6 +11,7 @@ from drake_diff.exceptions import GradientError, InputError
 
 # AutoDiffXd carries a whole row of derivatives with every number; this many at a time keeps memory flat.
 DIRECTIONS = 128
+WIDE = 1000  # variables: the identity of more is told row by row, where two matrices of n^2 numbers take seconds
 
 
 def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
@@ -60,9 +61,22 @@ def plain(values: Any) -> Array:
     return np.array([getattr(v, "value", lambda v=v: v)() for v in array.ravel()]).reshape(array.shape)
 
 
+def _seed(z: Any) -> Array | None:
+    """(n, m) the derivatives that `z` (n,) carries; None where they are the identity, as solvers seed it."""
+    if len(z) > WIDE and all(_is_unit(entry.derivatives(), i, len(z)) for i, entry in enumerate(z)):
+        return None
+    seed = np.asarray(ExtractGradient(z.reshape(-1, 1)))
+    return None if len(z) <= WIDE and np.array_equal(seed, np.eye(len(z))) else seed
+
+
+def _is_unit(row: Array, i: int, n: int) -> bool:
+    return len(row) == n and row[i] == 1.0 and np.count_nonzero(row) == 1
+
+
 def chain(value: float, gradient: Array, z: Any) -> AutoDiffXd:
     """The AutoDiffXd of a scalar of `z` (n,) whose value and gradient (n,) by z are known."""
-    return AutoDiffXd(value, gradient @ ExtractGradient(z.reshape(-1, 1)))
+    seed = _seed(z)
+    return AutoDiffXd(value, gradient if seed is None else gradient @ seed)
 
 
 def chain_rows(values: Array, jacobian: Array, z: Any) -> Any:
@@ -71,6 +85,6 @@ def chain_rows(values: Array, jacobian: Array, z: Any) -> Any:
     Solvers seed z with the identity, and the product with it is left out: for it BLAS starts threads, which on a busy
     machine costs more than all the rest.
     """
-    seed = ExtractGradient(z.reshape(-1, 1))
-    gradient = jacobian if np.array_equal(seed, np.eye(len(z))) else jacobian @ seed
+    seed = _seed(z)
+    gradient = jacobian if seed is None else jacobian @ seed
     return InitializeAutoDiff(value=values.reshape(-1, 1), gradient=gradient).ravel()

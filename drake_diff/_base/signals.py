@@ -6,7 +6,10 @@ import stat
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any
+
+from drake_diff._base.clock import STOP, StoppedError
 
 INTERRUPTED = 130  # the exit status, as shells have it after Ctrl-C
 ALIKE = (signal.SIGTERM, signal.SIGHUP)
@@ -19,11 +22,18 @@ def interrupt(number: int, frame: Any) -> None:
 
 
 class _Flag(threading.Event):
-    """A handler that notes that a signal came."""
+    """A handler that notes that a signal came; where `check_time` would end what runs, it ends a compilation at once.
 
-    def __call__(self, number: int, frame: Any) -> None:
+    Numba compiles for seconds, once on a machine, and looks at no flag; what is half compiled is thrown away.
+    """
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
         _hush(number)
         self.set()
+        while STOP.get() is self and frame is not None:
+            if frame.f_globals.get("__name__", "").startswith("numba."):
+                raise StoppedError("interrupted")
+            frame = frame.f_back
 
 
 def interrupt_alike() -> None:

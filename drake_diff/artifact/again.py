@@ -21,6 +21,7 @@ from drake_diff.artifact.save import REPLAY, REPORT, record_of, write_files
 from drake_diff.artifact.sections import COSTS, unknown_functions
 from drake_diff.model.model import Model
 from drake_diff.optimize.solution import Solution, Status
+from drake_diff.record.parts import ModelInput
 from drake_diff.record.solve import EvidenceRecord
 
 # What a record says of itself and of where it was made: nothing can make it again.
@@ -141,9 +142,16 @@ def _but_for_simulators(again: EvidenceRecord, record: EvidenceRecord) -> tuple[
 
 def _as_given(again: EvidenceRecord, record: EvidenceRecord) -> EvidenceRecord:
     """With what nothing can make again as `record` says it."""
-    contract = contract_as(again.contract, record.contract)
+    contract, model = contract_as(again.contract, record.contract), model_as(again.model, record.model)
     given = {name: getattr(record, name) for name in (*GIVEN, "files", "record_sha256")}
-    return again.model_copy(update={**given, "contract": contract})
+    return again.model_copy(update={**given, "contract": contract, "model": model})
+
+
+def model_as(again: ModelInput, recorded: ModelInput) -> ModelInput:
+    """The input of a model that was loaded again, with the folders of its packages as they were given."""
+    if again.options is None or recorded.options is None or "packages" not in recorded.options:
+        return again
+    return again.model_copy(update={"options": {**again.options, "packages": recorded.options["packages"]}})
 
 
 def contract_as(again: Mapping[str, Any], recorded: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from drake_diff._base.files import remove_folder
 from drake_diff.artifact.measurement import measure
-from drake_diff.artifact.rerun import PLAN, read_plan, rebuilt, resolve
+from drake_diff.artifact.rerun import ANYWHERE, PLAN, read_plan, rebuilt, resolve, rows_of
 from drake_diff.artifact.save import record_of, write_files
 from drake_diff.artifact.sections import unknown_functions
 from drake_diff.exceptions import ArtifactError, InputError
@@ -15,14 +15,14 @@ from drake_diff.record.read import load_record
 from drake_diff.record.sealed import SealedRecord, files_below
 from drake_diff.record.solve import EvidenceRecord
 
-TOLD = "recovered from what a run left that did not end: its search was not recorded, and is not made again"
+TOLD = "recovered from what a run left that did not end: its search is not made again"
 
 
 def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecord:
     """Complete a run from the directory NAME.partial-... that it left, as far as that can be done.
 
     What was written whole takes its place. Of a solve whose plan is there, the plan is measured again and all files are
-    written; the table of the search's iterations is lost.
+    written. Its search is not made again, by `verify` either: whoever ran it had not told all that it came to.
 
     Args:
         directory: What the run left.
@@ -74,10 +74,10 @@ def _measured(folder: Path, record: EvidenceRecord, target: Path) -> EvidenceRec
         names = ", ".join((*costs, *constraints))
         told = f"{names}: a user's function, which no directory holds; start the script again from the plan in {PLAN}"
         raise ArtifactError(f"{folder}: {told}")
-    plan = read_plan(folder / PLAN)
-    source, anywhere = record.contract.get("source"), Path("/")  # what a run left is one's own
-    with rebuilt(record.model, source, None, anywhere) as model, written_whole(target) as whole:
-        measurement = measure(resolve(record, model, plan))
+    plan = read_plan(folder / PLAN, partial=True)
+    source = record.contract.get("source")
+    with rebuilt(record.model, source, None, ANYWHERE) as model, written_whole(target) as whole:
+        measurement = measure(resolve(record, model, plan).told(iterations=rows_of(plan)))
         made = _with_the_search(record_of(measurement, whole), record)
         write_files(whole, measurement, made)
         return made.write(whole)

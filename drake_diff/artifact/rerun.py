@@ -26,23 +26,29 @@ from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.soft_contact import SoftContact
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Multipliers
+from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.solve import solve
 from drake_diff.record.parts import ModelInput
 from drake_diff.record.provenance import file_evidence, named_files, names_in
 from drake_diff.record.solve import EvidenceRecord
 
+ANYWHERE = Path("/")  # the folder of models of a directory that is one's own
 PLAN = "plan.npz"
 TRACE = "trace.mcap"
 REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "free_horizon")  # of a Solution
+ROWS = "iterations"  # the solver's table, of a run that is not measured yet: later trace.mcap has it
+COLUMNS = ("iteration", "objective", "primal_infeasibility", "dual_infeasibility", "step")  # of that
 START = "start_us"  # the first guess of the inputs that the problem has
 GUESS = "guess_"  # before the name of an array of the guess that `solve` was given
 GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps", "multipliers", "row_multipliers")
 
 
-def write_plan(path: Path, solution: Solution) -> None:
-    """Write the arrays of `solution` and those that its search started from: the same ones give the same bytes."""
+def write_plan(path: Path, solution: Solution, *, partial: bool = False) -> None:
+    """Write the arrays of `solution` and those that its search started from: the same ones give the same bytes.
+
+    Of a `partial` run, of which nothing else has it yet, the table of the search's iterations too.
+    """
     problem = solution.problem
     given: dict[str, Any] = {"xs": solution.xs, "us": solution.us, "parameters": solution.vector.values}
     given |= {name: getattr(solution, name) for name in OPTIONAL}
@@ -56,19 +62,30 @@ def write_plan(path: Path, solution: Solution) -> None:
     else:
         found = {} if guess is None else dict(zip(("xs", "us", "horizon"), guess, strict=False))
     given |= {GUESS + name: value for name, value in found.items()}
+    if partial and solution.iterations:
+        given[ROWS] = [[getattr(row, name) for name in COLUMNS] for row in solution.iterations]
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(v, dtype=float) for name, v in sorted(given.items()) if v is not None}
     np.savez(buffer, **arrays)
     write_whole(path, buffer.getvalue())
 
 
-def read_plan(path: Path) -> dict[str, Array]:
-    """The arrays in `path`, by their names. ArtifactError where it is missing or not such a file."""
+def read_plan(path: Path, *, partial: bool = False) -> dict[str, Array]:
+    """The arrays in `path`, of a `partial` run or a whole one, by name. ArtifactError where it is no such file."""
     found, known = arrays_of(path), {*REQUIRED, *OPTIONAL, START, *(GUESS + name for name in GUESSED)}
+    known |= {ROWS} if partial else set()
     unknown, missing = found.keys() - known, set(REQUIRED) - found.keys()
     if unknown or missing:
         raise ArtifactError(f"{path}: unknown arrays {sorted(unknown)}, missing {sorted(missing)}")
     return found
+
+
+def rows_of(plan: dict[str, Array]) -> tuple[Iteration, ...]:
+    """The search's iterations in the plan of a partial run; none where it is not such a table."""
+    rows = plan.get(ROWS, np.zeros((0, len(COLUMNS))))
+    if rows.shape[1:] != (len(COLUMNS),) or not np.isfinite(rows[:, 0]).all():
+        raise ArtifactError(f"{PLAN}: {ROWS} is no table of iterations: its shape is {rows.shape}")
+    return tuple(Iteration(int(row[0]), *map(float, row[1:])) for row in rows)
 
 
 def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
@@ -93,7 +110,7 @@ def rebuilt(
     if given.file is None or given.options is None:
         raise ModelError("the system is a user's own diagram or function, which no artifact can hold")
     if given.named or attachments is None:
-        yield _load(_source_if_unchanged(given, Path(str(source)), models), given.options)
+        yield _load(*_source_if_unchanged(given, str(source), models))
         return
     name, data = given.file.path, attachments.get(given.file.path)
     if data is None or sha256(data).hexdigest() != given.file.sha256:
@@ -105,30 +122,38 @@ def rebuilt(
         path.write_bytes(data)
         if names_in(path):
             raise ArtifactError(f"record.json: it does not list the files that {name} names")
-        yield _load(path, given.options)
+        yield _load(path, {**given.options, "packages": None})
 
 
-def _source_if_unchanged(given: ModelInput, source: Path, models: Path | None) -> Path:
-    """The model file where it stood; ModelError where it or a file that it names is not the recorded one."""
+def _source_if_unchanged(given: ModelInput, place: str, models: Path | None) -> tuple[Path, dict[str, Any]]:
+    """The model file where it stood, and its options; ModelError where a file is not the recorded one."""
     if models is None:
         what = f"names {len(given.named)} files, which the artifact does not hold" if given.named else "is not in it"
         raise ModelError(
             f"the model {what}: models=FOLDER, or --models, lets them be read below a folder that you give"
         )
-    below = models / source  # a relative path is looked for below that folder, then from the working directory
-    source = below if below.is_file() else source
-    if not source.resolve().is_relative_to(models.resolve()):
-        raise ModelError(f"the model's file {source} is not below {models}, the folder of models that was given")
+    source, options = _below(models, place, "the model's file"), dict(given.options or {})
     if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
         raise ModelError(f"the model's file {source} is gone, and the artifact has no copy that could be used")
     if file_evidence(source, given.file.path) != given.file:
         raise ModelError(f"the model's file {source} is not what it was")
-    packages = (given.options or {}).get("packages")
+    packages = options.get("packages")
+    if isinstance(packages, dict):
+        packages = {name: str(_below(models, str(folder), "the package's folder")) for name, folder in packages.items()}
+        options["packages"] = packages
     now = named_files(source, packages if isinstance(packages, dict) else None)
     changed = [was.path for was in given.named if was not in now]
     if changed:
         raise ModelError(f"the model names {changed[0]}, which is not what it was")
-    return source
+    return source, options
+
+
+def _below(models: Path, place: str, what: str) -> Path:
+    """A path that a record has, a relative one in `models` or else from here; ModelError where it is not below that."""
+    found = models / place if (models / place).exists() else Path(place)
+    if not found.resolve().is_relative_to(models.resolve()):
+        raise ModelError(f"{what} {found} is not below {models}, the folder of models that was given")
+    return found
 
 
 def _load(path: Path, options: dict[str, Any]) -> Model:

@@ -135,7 +135,7 @@ def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
             phases_record(folder, solution.problem, "incomplete", sentence).begin(folder)
             return
         make_folder(folder)
-        write_plan(folder / PLAN, solution)
+        write_plan(folder / PLAN, solution, partial=True)
         sections = asked(solution.problem, solution) | found(solution, measured=False)
         _record(folder, solution.wall_time, verdict="incomplete", sentence=sentence, **sections).begin(folder)
 
@@ -156,7 +156,7 @@ def _has_plan(folder: Path, solution: Solution | PhasedSolution) -> bool:
     if isinstance(solution, PhasedSolution):
         return all(_has_plan(folder / directory_of(i), phase) for i, phase in enumerate(solution.phases))
     try:
-        plan = read_plan(folder / PLAN)
+        plan = read_plan(folder / PLAN, partial=True)
     except ArtifactError:
         return False
     return all(np.array_equal(plan[name], getattr(solution, name), equal_nan=True) for name in ("xs", "us"))

@@ -13,7 +13,16 @@ import numpy as np
 from drake_diff._base.arrays import positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.strangers import MOST_TEXT, files_in, read_plain, sha256_of
-from drake_diff.artifact.again import SAME_PLAN, SEARCH_TOPICS, SEARCHED, Again, contract_as, is_below, made_again
+from drake_diff.artifact.again import (
+    SAME_PLAN,
+    SEARCH_TOPICS,
+    SEARCHED,
+    Again,
+    contract_as,
+    is_below,
+    made_again,
+    model_as,
+)
 from drake_diff.artifact.apart import call_on, first_look
 from drake_diff.artifact.claim import claims_of
 from drake_diff.artifact.differences import (
@@ -26,7 +35,7 @@ from drake_diff.artifact.differences import (
 )
 from drake_diff.artifact.panel_again import odd_panel, odd_trial
 from drake_diff.artifact.phases_again import PhasesAgain, inconsistencies, phases_again
-from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, rebuilt, resolve
+from drake_diff.artifact.rerun import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve
 from drake_diff.artifact.save import FILES
 from drake_diff.artifact.trace import CONFIGURATION, Trace, read_trace
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, MissingDependencyError, ModelError
@@ -53,6 +62,7 @@ UNCHECKED = (
     "provenance: the versions, the commit, the machine and the command that made it",
     "name and contract.source: what it was called, and where the model file was",
 )
+WAITED = 60.0  # [s] for a run to be made again, where nobody says else
 GIVEN = "problem, model and inputs.search: they are what was asked; a record that asks for less can be just as true"
 GIVEN_IN_PHASES = "in each phase's record problem and model, and here links and search: they are what was asked"
 WITHIN_PHASES = "the record does not say what solve was called with"  # of a phase: that of all says it
@@ -170,7 +180,7 @@ class Verification(ShowsItsRepr):
 
 
 def verify(
-    directory: str | Path, *, models: str | Path | None = None, time_limit: float = 60.0, memory_limit: float = 1.0
+    directory: str | Path, *, models: str | Path | None = None, time_limit: float = WAITED, memory_limit: float = 1.0
 ) -> Verification:
     """Check a directory's schema, hashes and files, then make it again and compare all of it.
 
@@ -183,7 +193,7 @@ def verify(
     "intact". Of a panel, and of the record of one trial of it, what follows from its journal is made again. What
     cannot be run again (a model that came from a diagram, a user's functions, a search that a time limit ended) makes
     the verdict "undecided", and so does another version of Drake where numbers differ. It takes as long as the solve
-    did.
+    did, of which it waits for 60 seconds where `time_limit` says nothing else.
 
     The directory may be a stranger's. Its model is read and run in a process of its own, which has limits of time and
     memory, no network, and no file to open but those of the directory, of Python and below `models`. Where that process
@@ -237,7 +247,7 @@ def verify_own(directory: Path) -> Verification:
     found = _looked_at(directory)
     if found.complaints or found.undecided or found.record is None:
         return found
-    return _run_again(found, found.record, Path("/"))
+    return _run_again(found, found.record, ANYWHERE)
 
 
 def _apart(directory: str, models: str | None) -> dict[str, Any]:
@@ -541,7 +551,7 @@ def _certify_again(found: Verification, record: CertificationRecord, models: Pat
     given = {name: getattr(record, name) for name in ("name", "provenance", "wall_clock", "files", "record_sha256")}
     contract = contract_as(again.contract, record.contract)
     fields = Compared(record.FILE)
-    made = again.model_copy(update={**given, "contract": contract})
+    made = again.model_copy(update={**given, "contract": contract, "model": model_as(again.model, record.model)})
     compare_fields(fields, record.model_dump(mode="json"), made.model_dump(mode="json"))
     problems = [*_odd_schema(record), *(str(d) for d in fields.differing if not d.allowed)]
     unchecked = (*UNCHECKED, *_others(record, (carried,)))
@@ -554,7 +564,8 @@ def _identify_again(found: Verification, record: IdentificationRecord, models: P
     from drake_diff.artifact.identified import MADE, identified_again, write_made
 
     made, identification = identified_again(found.directory, record, models)
-    again = made.model_copy(update={"contract": contract_as(made.contract, record.contract)})
+    contract, model = contract_as(made.contract, record.contract), model_as(made.model, record.model)
+    again = made.model_copy(update={"contract": contract, "model": model})
     fields = Compared(record.FILE)
     compare_fields(fields, record.model_dump(mode="json"), again.model_dump(mode="json"))
     compared = [fields]

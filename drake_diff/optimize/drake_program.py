@@ -3,6 +3,7 @@
 import math
 import re
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from pydrake import solvers
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolutionResult
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.clock import TimeIsUpError, until_set
+from drake_diff._base.clock import TimeIsUpError, check_time, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
 from drake_diff.optimize.iterate import Iterate
@@ -74,12 +75,13 @@ class _Callback:
         motions: Callable[[Array], tuple[Iterate, ...]],
     ):
         self.program, self.watch, self.report, self.motions = program, watch, report, motions
-        self.evaluations = 0
+        self.evaluations, self.called = 0, time.monotonic()
         self.current: Array | None = None
         self.before: Array | None = None  # the last point but this at which everything could be evaluated
 
     def __call__(self, z: Array) -> None:
         self.evaluations += 1
+        before, self.called = self.called, time.monotonic()
         if self.current is None or not np.array_equal(z, self.current):
             self.before, self.current = self.current, np.array(z)
         if self.evaluations == 1:
@@ -88,6 +90,8 @@ class _Callback:
             self._look(z)
         if self.watch.stopped_by is not None:
             raise _Stop
+        if self.evaluations > 2:  # the next one takes as long as the last, but for the first, which loads what it needs
+            check_time(ahead=self.called - before)
 
     def look_back(self) -> None:
         """Keep the point before the one that ended the solve, if it is the best."""

@@ -18,6 +18,7 @@ from pydrake.solvers import MathematicalProgram
 
 from drake_diff._base.arrays import Array, frozen, positive_int
 from drake_diff._base.autodiff import chain, chain_rows
+from drake_diff._base.clock import check_time
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.parameters import ParameterVector
@@ -331,6 +332,7 @@ def final_sensitivity(variables: ShootingVariables, z: Array) -> Array:
     steps, nu = variables.linearization(z), variables.shape[1]
     found, after = np.zeros((variables.problem.model.nx, variables.size)), np.eye(variables.problem.model.nx)
     for k in reversed(range(len(steps))):
+        check_time()
         d = steps[k]
         if variables.problem.optimizes_controls:
             start = variables.inputs.start + k * nu
@@ -347,6 +349,7 @@ def _sensitivities(variables: ShootingVariables, z: Array) -> Iterator[Array]:
     sensitivity[variables.free, np.arange(len(variables.free))] = 1.0
     yield sensitivity
     for k, d in enumerate(variables.linearization(z)):
+        check_time()
         sensitivity = d.A @ sensitivity
         if variables.problem.optimizes_controls:
             start = variables.inputs.start + k * nu

@@ -66,9 +66,10 @@ import drake_diff as dd
 
 def problem():
     model = dd.example_model("panda", time_step=0.02)
-    goal = np.concatenate([model.default_state[:model.nq] + 0.3, np.zeros(model.nv)])
+    middle = sum(model.position_limits) / 2
+    x0, goal = (np.concatenate([q, np.zeros(model.nv)]) for q in (middle, middle + 0.3))
     effort = dd.QuadraticCost(R=1e-3 * np.eye(model.nu))
-    return dd.Problem(model, x0=model.default_state, x_goal=goal, num_steps=50, running_cost=effort)
+    return dd.Problem(model, x0=x0, x_goal=goal, num_steps=50, running_cost=effort)
 
 solve_options = {"method": "collocation", "tolerance": 1e-14, "max_iterations": 100000}
 """,
@@ -193,6 +194,8 @@ def told_after(folder, number, seconds):
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     running = subprocess.Popen(words, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, **quiet)
     while not list(folder.glob("runs/run*/record.json")):
+        if running.poll() is not None:
+            raise SystemExit(f"the run ended with status {running.returncode} before it began: {words}")
         time.sleep(0.01)
     time.sleep(seconds)
     begun = time.monotonic()
