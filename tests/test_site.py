@@ -1,5 +1,6 @@
 """The code of the documentation site runs and prints what stands below it. `.ci/run` builds the site."""
 
+import importlib.util
 import re
 import shutil
 
@@ -32,3 +33,26 @@ def test_the_code_of_a_page_runs_and_prints_what_stands_below_it(page, tmp_path,
         exec(compile(shown or hidden, str(page), "exec"), names)
         out = capsys.readouterr().out
         assert not printed or out == printed
+
+
+def test_a_link_that_leads_nowhere_and_what_would_be_fetched_are_found(tmp_path):
+    """A site of two pages: one link holds, and each of the others is told."""
+    spec = importlib.util.spec_from_file_location("links", DOCS / "links.py")
+    links = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(links)
+    (tmp_path / "a.html").write_text('<a href="sub/b.html#here">b</a> <a href="https://drake.mit.edu">Drake</a>')
+    (tmp_path / "sub").mkdir()
+    page = '<h1 id="here">b</h1><a href="../a.html"></a><link rel="next" href="../a.html"><img src="data:x">'
+    (tmp_path / "sub/b.html").write_text(page)
+    assert links.faults(tmp_path) == []
+    wrong = '<a href="c.html"></a><a href="../a.html#no"></a><script src="https://unpkg.com/x"></script>'
+    (tmp_path / "sub/b.html").write_text(
+        page + wrong + '<img src="gone.png"><link rel="stylesheet" href="//x.org/s.css">'
+    )
+    assert links.faults(tmp_path) == [
+        "sub/b.html would fetch //x.org/s.css",
+        "sub/b.html would fetch https://unpkg.com/x",
+        "sub/b.html links to ../a.html#no: that page has no such place",
+        "sub/b.html links to c.html, which is not there",
+        "sub/b.html links to gone.png, which is not there",
+    ]
