@@ -152,6 +152,7 @@ SOURCES = {
         "5": "drake_diff.optimize.replay:STATE_TOLERANCE",
     },
     "docs/index.md": {},
+    "docs/contact_models.md": {},
     "docs/methods.md": {},
     "docs/report.md": {},
     "docs/loop.md": {},

@@ -56,3 +56,15 @@ def test_a_link_that_leads_nowhere_and_what_would_be_fetched_are_found(tmp_path)
         "sub/b.html links to c.html, which is not there",
         "sub/b.html links to gone.png, which is not there",
     ]
+
+
+def test_the_pictures_of_contact_models_are_those_that_the_command_draws(tmp_path):
+    pytest.importorskip("matplotlib")
+    spec = importlib.util.spec_from_file_location("pictures", DOCS / "pictures.py")
+    pictures = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pictures)
+    shown = re.findall(r"\(pictures/(\w+)\.svg\)", (DOCS / "contact_models.md").read_text())
+    assert shown == list(pictures.PICTURES)
+    assert all((DOCS / f"pictures/{name}.svg").is_file() for name in shown)
+    pictures.draw("contact_shapes", tmp_path)  # the one that simulates nothing
+    assert (tmp_path / "contact_shapes.svg").read_text().startswith("<?xml")
