@@ -11,7 +11,6 @@ from helpers.table import each_row
 
 DOCS = ROOT / "docs"
 LONGEST_SCRIPT, LARGEST_PICTURE = 60, 60_000  # lines, bytes
-LONGER = {"tossed_cube": 77}  # lines
 
 
 def module(name):
@@ -31,7 +30,7 @@ def test_the_page_is_what_the_command_writes():
 @each_row("entry", gallery.ENTRIES, ids=lambda entry: entry.name)
 def test_an_entry_has_a_short_script_and_a_small_picture(entry):
     script, picture = ROOT / f"examples/{entry.name}.py", DOCS / f"gallery/{entry.name}.jpg"
-    assert len(script.read_text().splitlines()) <= LONGER.get(entry.name, LONGEST_SCRIPT)
+    assert len(script.read_text().splitlines()) <= LONGEST_SCRIPT
     assert 1000 < picture.stat().st_size <= LARGEST_PICTURE
 
 
