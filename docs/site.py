@@ -12,6 +12,21 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "drake_diff"
 NAME = re.compile(r"^from \.([\w.]+) import (\w+) as \w+$", re.MULTILINE)
 NOTEBOOKS, GALLERY = ROOT / "docs/notebooks", ROOT / "docs/gallery"
+NEXT = {  # of pages of figures, which a benchmark writes: what a reader does with them
+    "impacts.md": "Use this gradient where something hits something: [Choosing a gradient](gradients.md).",
+    "mpc_realtime.md": "Put your own model in the first block of [Model predictive control](mpc.md), and "
+    "print `mpc.latencies`.",
+    "speed.md": "Print `.method` of `dd.differentiate_step` on your own robot: "
+    "[Derivatives](derivatives.md) says which is fast. If a whole solve is slow, [this "
+    "page](questions/slow.md) finds out which part.",
+    "tasks_solved.md": "Find the task that is nearest to yours, and write it as in [Tasks](tasks.md). If it"
+    " is not solved, the message says why: [what each status asks "
+    "for](methods.md#what-the-answer-means).",
+    "trust.md": "Ask for the certificate of your own gradient: [Choosing a gradient](gradients.md). It says"
+    " how small an error it would have noticed on your robot, which no count of others can.",
+    "zoo.md": "Run `drake-diff plan ROBOT` on your own file. If there is no plan, its output says why. "
+    "[Your own robot](models.md) has the argument that mends it.",
+}
 TOP = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
 
 
@@ -77,7 +92,19 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         return _to_pages(markdown)
     if page.file.src_uri == "gallery/index.md":
         return with_reports(markdown, GALLERY)
-    return re.sub(r"<!-- modules of (\w+) -->", lambda found: modules_of(found[1]), markdown)
+    if (room := page.file.src_uri).startswith("inside/") and room != "inside/index.md":
+        return re.sub(r"<!-- modules of (\w+) -->", lambda found: modules_of(found[1]) + after(found[1]), markdown)
+    step = NEXT.get(page.file.src_uri)
+    return f"{markdown}\n\n## What would I do next?\n\n{step}\n" if step else markdown
+
+
+def after(room: str) -> str:
+    """Where a reader of a room's page goes: to its names, if it has some, and to where a change is made."""
+    names = (
+        f"[The public names of this room](../reference/{room}.md). " if f"reference/{room}.md" in reference() else ""
+    )
+    change = "[Contributing](../contributing.md#where-does-a-change-go)"
+    return f"\n\n## What would I do next?\n\n{names}To change something: {change}.\n"
 
 
 def with_reports(text: str, gallery: Path) -> str:
