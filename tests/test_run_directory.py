@@ -27,19 +27,27 @@ from helpers.faults import (
     two_solutions,
 )
 from helpers.models import MODELS
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base import files
+from drake_diff._base.clock import check_time
 from drake_diff.artifact import recover
 from drake_diff.artifact.listing import list_runs
 from drake_diff.artifact.save import begin, keep_plan
 from drake_diff.cli import main as cli
 from drake_diff.exceptions import ArtifactError, InputError, ModelError, WriteError
 from drake_diff.logs.mcap_file import read_mcap
+from drake_diff.optimize.solve import _best_of
 from drake_diff.record.directory import RECORDS, writing, written_whole
 from drake_diff.record.read import KINDS
 
 OLD, NEW = 0.2, 0.3  # the goals of the two runs
+BUILT = {
+    "collocation": "optimize.run.Transcription",
+    "in phases": "optimize.phased.Transcription",
+    "ilqr": "optimize.run.certify_steps",
+}
 
 
 @pytest.fixture(scope="module")
@@ -305,6 +313,41 @@ def test_each_signal_ends_a_search_with_its_best_plan(solutions, tmp_path, numbe
     keep_plan(plan, tmp_path / "run.partial-1-0123abcd")
     assert "the run was interrupted" in dd.load_record(tmp_path / "run.partial-1-0123abcd").sentence
     assert has_plan(tmp_path / "run.partial-1-0123abcd", plan)
+
+
+@each_row("early", ["as the record is begun", "as expressions are built"])
+@each_row("method", ["collocation", "ilqr", "in phases"])
+def test_a_signal_before_the_search_leaves_the_guess_as_a_plan(solutions, tmp_path, monkeypatch, early, method):
+    def interrupted(*_):
+        signal.raise_signal(signal.SIGTERM)
+
+    problem, plans = solutions[1].problem, []
+    words = {"on_plan": plans.append, "method": "collocation" if method == "in phases" else method}
+    if method == "in phases":
+        problem = dd.optimize.PhasedProblem([problem, problem])
+    monkeypatch.setattr(f"drake_diff.{BUILT[method]}", lambda *_, **__: interrupted() or check_time())
+    if early == "as the record is begun":
+        words["on_start"] = interrupted
+    before = signal.getsignal(signal.SIGTERM)
+    solution = dd.solve(problem, **words)
+    assert solution.status is dd.Status.INTERRUPTED
+    assert signal.getsignal(signal.SIGTERM) is before
+    (plan,) = plans
+    keep_plan(plan, tmp_path / "run.partial-1-0123abcd")
+    assert "the run was interrupted" in dd.load_record(tmp_path / "run.partial-1-0123abcd").sentence
+    first = plan.phases[0] if method == "in phases" else plan
+    assert np.array_equal(first.xs[0], [0.0, 0.0])
+    if early == "as the record is begun":
+        quick_pages(monkeypatch)
+        assert "the run was interrupted" in dd.save(solution, tmp_path / "run").sentence
+
+
+def test_where_a_signal_ends_what_is_tried_after_the_best_plan_its_message_says_so(solutions):
+    best, later = solutions[1], solutions[0].told(status=dd.Status.INTERRUPTED)
+    assert _best_of([later, best]) is best
+    found = _best_of([best, later])
+    assert found.status is best.status
+    assert found.message.endswith("what was tried after it: the run was interrupted; this is the best motion so far")
 
 
 def test_a_signal_that_somebody_hears_or_that_is_ignored_is_left_to_them(solutions):

@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
+from drake_diff._base.clock import StoppedError, until_set
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.pickling import PicklesItsFields
+from drake_diff._base.signals import noted_interrupts
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.optimize.certified import certify_equations
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
-from drake_diff.optimize.judge import judged, may_be_too_coarse, status_of, unmeasured
+from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, status_of, unmeasured
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.rigid import RigidReset
@@ -281,8 +283,11 @@ def solve_phased(
     limits, scheme = _checked(problem, arguments)
     guesses = _first_guesses(problem, given, arguments["seed"])
     run = _PhasedRun(problem, scheme, limits, arguments, report, given is None)
-    if on_start is not None:
-        on_start()
+    with noted_interrupts() as interrupted:
+        if on_start is not None:
+            on_start()
+    if interrupted.is_set():
+        return replace(run.not_begun(guesses), search=Search(arguments, given))
     found, chain = [], []
     for number, begun in enumerate(_guesses(problem, guesses, given, arguments["seed"])):
         found.append(run.attempt(begun, other=number > 0))
@@ -400,13 +405,18 @@ class _PhasedRun:
     def attempt(self, guesses: list[Guess], *, other: bool) -> PhasedSolution:
         """From one guess of each phase."""
         most = min(self.limits.max_iterations, 200) if other else self.limits.max_iterations
-        meshes = [t.mesh for t in self.transcriptions]
-        horizons = [t.problem.start_horizon if g.horizon is None else g.horizon for t, g in self._with(guesses)]
-        begun = []
-        for t, guess in self._with(guesses):
-            us_end = guess.us[-1:] if guess.u_final is None else guess.u_final[None]
-            begun.append(t.nodes_at(t.mesh, guess.motion or (guess.xs, np.vstack([guess.us, us_end]))))
-        result, motions, told = self._solve_on(meshes, begun, horizons, most)
+        with noted_interrupts() as interrupted:  # one that comes before the search ends it at its start
+            try:
+                with until_set(interrupted):
+                    meshes = [t.mesh for t in self.transcriptions]
+            except StoppedError:
+                return self.not_begun(guesses)
+            horizons = [t.problem.start_horizon if g.horizon is None else g.horizon for t, g in self._with(guesses)]
+            begun = []
+            for t, guess in self._with(guesses):
+                us_end = guess.us[-1:] if guess.u_final is None else guess.u_final[None]
+                begun.append(t.nodes_at(t.mesh, guess.motion or (guess.xs, np.vstack([guess.us, us_end]))))
+            result, motions, told = self._solve_on(meshes, begun, horizons, most)
         solution = self._judged(result, motions, told)
         rounds = [[len(motion.mesh) - 1 for motion in motions]]
         while len(rounds) <= FINER_ROUNDS and self.asked["refine"] is not False:
@@ -427,6 +437,19 @@ class _PhasedRun:
             result, motions, told = again
             solution = self._judged(result, motions, told)
         return replace(solution, options={**solution.options, "refinements": rounds}) if len(rounds) > 1 else solution
+
+    def not_begun(self, guesses: list[Guess]) -> PhasedSolution:
+        """The guesses, where a signal comes before the search."""
+        phases = []
+        for problem, guess in zip(self.problem.phases, guesses, strict=True):
+            last = guess.us[-1] if guess.u_final is None else np.ravel(guess.u_final)
+            at_end: dict[str, Any] = {} if problem.is_map else {"u_final": frozen(last)}
+            by = problem, "collocation", "ipopt", Status.FAILED, ""
+            draft = Solution(*by, frozen(guess.xs), frozen(guess.us), scheme=self.scheme, **at_end)
+            phases.append(ended(draft, Status.INTERRUPTED, "the search had not begun"))
+        solution = PhasedSolution(self.problem, Status.INTERRUPTED, phases[0].message, tuple(phases))
+        self.report.found(solution)
+        return solution
 
     def _with(self, guesses: list[Guess]) -> Iterator[tuple[Transcription, Guess]]:
         return zip(self.transcriptions, guesses, strict=True)

@@ -79,9 +79,16 @@ class Run:
     certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
     reached: list[_SoFar] = field(default_factory=list)  # the last is where it is
 
-    def within_time(self, search: Callable[[], Solution], guess: Guess) -> Solution:
-        """What `search`, one of the three below, gives; where the time limit comes first, what there is by then."""
+    def within_time(self, search: Callable[[], Solution], guess: Guess, begin: Callable[[], None]) -> Solution:
+        """What `search`, one of the three below, gives; where the time limit comes first, what there is by then.
+
+        `begin` is called before it; a signal that comes meanwhile leaves the guess, as one that comes later does.
+        """
         self.reached.append(_SoFar(0, self._of_guess(guess)))
+        with noted_interrupts() as interrupted:
+            begin()
+        if interrupted.is_set():
+            return self._cut(self.reached[-1], interrupted=True)
         try:
             with until(self.start + (1 + GRACE) * self.limits.time_limit):
                 return search()
@@ -97,7 +104,8 @@ class Run:
 
     def _cut(self, reached: _SoFar, *, interrupted: bool) -> Solution:
         if reached.judged is not None:
-            return reached.judged.told(message=f"{reached.judged.message}; no finer mesh: the time limit came first")
+            why = Status.INTERRUPTED.sentence if interrupted else "the time limit came first"
+            return reached.judged.told(message=f"{reached.judged.message}; no finer mesh: {why}")
         result, cut = reached.result, f"not made within the time limit: {', '.join(STAGES[reached.stage :])}"
         if interrupted:  # which is looked for before a search alone
             plan = ended(reached.draft, Status.INTERRUPTED, cut.replace("within the time limit", "before that"))
@@ -123,10 +131,10 @@ class Run:
         if self.solver == "snopt":
             return self._collocate_in_drake(guess)
         problem, report = self.problem, self.report
-        transcription = Transcription(self.searched or problem, self.scheme)
         with noted_interrupts() as interrupted:  # one that comes before the search ends it at its start
             try:
                 with until_set(interrupted):
+                    transcription = Transcription(self.searched or problem, self.scheme)
                     before = certify_equations(
                         self.problem,
                         transcription.jacobian,
@@ -210,15 +218,17 @@ class Run:
     def _collocate_in_drake(self, guess: Guess) -> Solution:
         """By Drake's own DirectCollocation."""
         jacobian = EquationsOfMotion(self.problem.model).jacobian
-        try:
-            first = first_knots(guess.us)
-            certificates = certify_equations(self.problem, jacobian, guess.xs, guess.us, knots=first)
-        except (GradientError, SimulationError) as error:
-            return refused(self._of_guess(guess), error)
-        self._reach(1)
-        result, xs, us, u_final = solve_collocation(
-            self.problem, guess.xs, guess.us, solver=self.solver, limits=self._left(), report=self.report
-        )
+        with noted_interrupts() as interrupted:
+            try:
+                with until_set(interrupted):
+                    first = first_knots(guess.us)
+                    certificates = certify_equations(self.problem, jacobian, guess.xs, guess.us, knots=first)
+            except (GradientError, SimulationError) as error:
+                return refused(self._of_guess(guess), error)
+            self._reach(1)
+            result, xs, us, u_final = solve_collocation(
+                self.problem, guess.xs, guess.us, solver=self.solver, limits=self._left(), report=self.report
+            )
         self._offer(self._draft(xs, us, u_final=u_final), result)
         self._reach(2, self._draft(xs, us, u_final=u_final, certificates=certificates), result)
         if np.all(np.isfinite(xs)):

@@ -351,6 +351,12 @@ class _Task:
         """Whether the time is over."""
         return time.monotonic() - self.start > self.limits.time_limit
 
+    def begin(self) -> None:
+        """Tell once that the work begins."""
+        on_start, self.on_start = self.on_start, None
+        if on_start is not None:
+            on_start()
+
     def prepare(self, attempt: Attempt, given: Any) -> Callable[[], Solution]:
         """Check that `attempt` can be made from the guess `given`; what is returned makes it."""
         problem, method = self.problem, attempt.method
@@ -383,9 +389,6 @@ class _Task:
         run = Run(problem, method, scheme, solver, limits, options, self.report, searched)
 
         def make() -> Solution:
-            if self.on_start is not None:
-                self.on_start()
-                self.on_start = None
             if method == "collocation":
                 search = partial(run.collocate, guess, attempt.refinement, refine=attempt.refine)
             elif method == "ilqr":
@@ -393,7 +396,7 @@ class _Task:
             else:
                 improve = given is None and attempt.segments == 1 and is_unconstrained(problem)
                 search = partial(run.shoot, guess, attempt.segments, improve=improve)
-            return run.within_time(search, guess)
+            return run.within_time(search, guess, self.begin)
 
         return make
 
@@ -426,12 +429,20 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
         if last.status in ENDED:
             break
 
-    best = min(found, key=_preference) if len(found) > 1 else found[0]
+    best = _best_of(found)
     if asked.method != "auto" and len(chain) == 1:
         return best
     if len(found) > 1 and best.status not in PLANS and all(s.method == "collocation" for s in found):
         best = best.told(message=f"{best.message}; from none of {len(found)} first guesses was a plan found")
     return best.told(options=best.options | {"chain": chain})
+
+
+def _best_of(found: list[Solution]) -> Solution:
+    """The one that is preferred; where a signal ended what was tried after it, its message says so."""
+    best = min(found, key=_preference) if len(found) > 1 else found[0]
+    if found[-1].status is Status.INTERRUPTED and best is not found[-1]:
+        return best.told(message=f"{best.message}; what was tried after it: {Status.INTERRUPTED.sentence}")
+    return best
 
 
 def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> Solution:

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
-from drake_diff._base.clock import Pace, TimeIsUpError, until_set
+from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.optimize.iterate import Iterate
@@ -419,7 +419,11 @@ def solve_ipopt(
     with noted_interrupts() as interrupted:
         watch = Watch(limits, interrupted)
         callback = _IterateCallback(program, watch, report, motions)
-        options |= program.derivatives(exact) | {"iteration_callback": callback}
+        try:
+            with until_set(interrupted):
+                options |= program.derivatives(exact) | {"iteration_callback": callback}
+        except StoppedError as stopped:
+            return NlpResult(guess, Outcome.INTERRUPTED, f"stopped: {stopped}", ())
         solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
         lower, upper = program.sides
         known = {} if begun is None else {"lam_x0": begun.variables, "lam_g0": begun.rows}
