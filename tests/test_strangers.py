@@ -74,6 +74,15 @@ def test_a_run_with_such_a_file_is_broken_and_listed(tmp_path, told, name):
         assert [line.verdict for line in list_runs(tmp_path)] == ["unreadable"]
 
 
+def test_a_run_whose_files_are_too_much_to_read_is_broken(tmp_path, monkeypatch):
+    """A thousand files of 1 GiB that are holes take no room, and an hour."""
+    folder = Path(shutil.copytree(RUN, tmp_path / "run"))
+    monkeypatch.setattr("drake_diff.artifact.verify.MOST_READ", (folder / "plan.npz").stat().st_size)
+    found = dd.verify(folder)
+    assert found.verdict == "broken"
+    assert "and the files before it have more than" in found.sentence
+
+
 def test_a_device_is_not_opened():
     with pytest.raises(ArtifactError, match="got a device"):
         read_plain(Path("/dev/zero"))
@@ -118,7 +127,7 @@ BOMBS = {
     "Bad CRC-32": lambda path: npz(path, {"xs.npy": bytes(64 * MIB)}, lie=1000),
     "of shape": lambda path: npz(path, {"xs.npy": npy("(800000000,)")}),
     "of shape ": lambda path: npz(path, {"xs.npy": npy("(-1, -8)", bytes(64))}),
-    "each once": lambda path: npz(path, {f"{i}.npy": npy("()", bytes(8)) for i in range(200)}),
+    "at most 100 arrays": lambda path: npz(path, {f"{i}.npy": npy("()", bytes(8)) for i in range(200)}),
     "got object": lambda path: np.savez(path, xs=np.array([None])),
     "EOF": lambda path: npz(path, {"xs.npy": npy("()", version=2, length=2**32 - 1)}),
     "a way that NumPy": lambda path: zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA).writestr(
