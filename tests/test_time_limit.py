@@ -3,6 +3,7 @@
 The clock is ours: it stands still but where a test lets time pass.
 """
 
+import contextlib
 import signal
 import time
 
@@ -118,7 +119,7 @@ def test_no_other_method_is_begun_after_the_limit(monkeypatch):
     """A plan that is not verified is followed by others, if there is time."""
     problem, clock = swing(), stopped(monkeypatch)
 
-    def unverified(self, search, guess):
+    def unverified(self, search, guess, begin):
         found = search()
         clock.now += 11.0
         return found.told(status=dd.Status.CONVERGED_NOT_VERIFIED)
@@ -202,3 +203,27 @@ def test_a_signal_ends_a_compilation_at_once():
         flag.clear()
         numba_s["compile_it"]()  # outside a search it is noted alone
         assert flag.is_set()
+
+
+class Destroyed:
+    """What a signal raises in a destructor, Python prints and forgets."""
+
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+
+def called_by_c(function):
+    """What it raises is lost, as in what LLVM calls."""
+    with contextlib.suppress(StoppedError):
+        function()
+
+
+@each_row("what", ["Destroyed()", "called_by_c(lambda: signal.raise_signal(signal.SIGINT))"])
+def test_a_signal_in_what_can_raise_nothing_ends_the_compilation_after_it(what):
+    numba_s = {"__name__": "numba.core.compiler", "signal": signal, "spent": time.process_time}
+    numba_s |= {"Destroyed": Destroyed, "called_by_c": called_by_c}
+    exec(f"def compile_it():\n    {what}\n    end = spent() + 20\n    while spent() < end: pass", numba_s)
+    with noted_interrupts() as flag, until_set(flag), pytest.raises(StoppedError):
+        numba_s["compile_it"]()
+    assert signal.getsignal(signal.SIGVTALRM) is signal.SIG_DFL
+    assert signal.getitimer(signal.ITIMER_VIRTUAL) == (0.0, 0.0)

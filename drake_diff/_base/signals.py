@@ -13,6 +13,17 @@ from drake_diff._base.clock import STOP, StoppedError
 
 INTERRUPTED = 130  # the exit status, as shells have it after Ctrl-C
 ALIKE = (signal.SIGTERM, signal.SIGHUP)
+AGAIN = signal.SIGVTALRM  # of a timer of this process's own work
+UNWOUND = 0.1  # [s] of work in which what is raised has left Numba, if nothing stopped it on its way
+# Called by C or by the garbage collector, which print what is raised in them and go on.
+GOES_NOWHERE = {
+    "__del__",
+    "on_disposal",
+    "_object_compiled_hook",
+    "_object_getbuffer_hook",
+    "_raw_object_cache_notify",
+    "_raw_object_cache_getbuffer",
+}
 
 
 def interrupt(number: int, frame: Any) -> None:
@@ -28,12 +39,31 @@ class _Flag(threading.Event):
     """
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        _hush(number)
-        self.set()
-        while STOP.get() is self and frame is not None:
-            if frame.f_globals.get("__name__", "").startswith("numba."):
-                raise StoppedError("interrupted")
+        if number != AGAIN:
+            _hush(number)
+            self.set()
+        if STOP.get() is self:
+            self._stop_compiling(frame)
+
+    def _stop_compiling(self, frame: FrameType | None) -> None:
+        names, compiles = set(), False
+        while frame is not None:
+            names.add(frame.f_code.co_name)
+            compiles = compiles or frame.f_globals.get("__name__", "").startswith("numba.")
             frame = frame.f_back
+        if not compiles:
+            return
+        if signal.getsignal(AGAIN) in (signal.SIG_DFL, self):  # else somebody's own timer
+            signal.signal(AGAIN, self)
+            signal.setitimer(signal.ITIMER_VIRTUAL, UNWOUND)
+        if names.isdisjoint(GOES_NOWHERE):
+            raise StoppedError("interrupted")
+
+    def end(self) -> None:
+        """Raise nothing any more."""
+        if signal.getsignal(AGAIN) is self:
+            signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+            signal.signal(AGAIN, signal.SIG_DFL)
 
 
 def interrupt_alike() -> None:
@@ -64,6 +94,7 @@ def noted_interrupts() -> Iterator[threading.Event]:
     try:
         yield flag
     finally:
+        flag.end()
         for number in taken:
             signal.signal(number, former[number])
 
