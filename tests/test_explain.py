@@ -2,6 +2,7 @@
 
 import html
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
+from drake_diff.identification.dry import DryMotion
 from drake_diff.identification.explain import FALSE_NAME
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.frozen import FrozenMotion, exponential
@@ -140,6 +142,50 @@ def test_steps_frozen_halfway_have_the_derivatives_of_the_motion():
         errors.append([np.max(np.abs(quick - true)) / np.max(np.abs(true)) for quick, true in pairs])
     np.testing.assert_array_less(errors[1], 1e-3)
     assert errors[1][0] < errors[0][0] / 6  # the third order would be 8
+
+
+def test_dry_friction_stops_and_holds_and_lets_go(load):
+    """A hinge of 0.25 kg m^2 without gravity, in closed form: steps are not cut where it stops or is let go."""
+    model = load("pendulum.urdf")
+    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree = replace(tree, numbers=replace(tree.numbers, gravity=np.zeros(3), damping=np.zeros(1)))
+    unknowns = choose_unknowns(model, tree, ["hinge.coulomb_friction"])
+    law = DryMotion(model, tree, chart, unknowns, 0.04, joints=(0,))
+    times, torques = 0.04 * np.arange(31), np.repeat([0.0, 0.4, -1.0], 10)
+    xs = law.run(np.array([0.5]), np.array([[0.1, 0.7]]), np.full((1, 30), 0.04), torques[None, :, None])[0]
+    slides = np.minimum(times, 0.35)  # by -2 rad/s^2 until 0.7 / 2 s; 0.4 N m do not move it; -1 N m do, by -2 rad/s^2
+    let_go = np.maximum(times - 0.8, 0)
+    np.testing.assert_allclose(xs[:, 0], 0.1 + 0.7 * slides - slides**2 - let_go**2, atol=1e-8)
+    np.testing.assert_allclose(xs[:, 1], 0.7 - 2 * slides - 2 * let_go, atol=1e-8)
+    assert np.all(xs[9:21, 1] == 0)
+
+
+@pytest.mark.parametrize("names", [["elbow.coulomb_friction"], ["shoulder.coulomb_friction", "elbow.coulomb_friction"]])
+def test_derivatives_go_through_stops_and_reversals(load, names):
+    model = load("double_pendulum.urdf")
+    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    unknowns = choose_unknowns(model, tree, names)
+    at = [link.joint.joint for link in tree.links]
+    joints = tuple(at.index(name.split(".")[0]) for name in names)
+    law = DryMotion(model, tree, chart, unknowns, 0.01, joints=joints)
+    k = np.arange(60)[:, None]
+    us = np.array([2 * np.sin(0.11 * k + [0, 1]), np.cos(0.08 * k + [2, 1])])
+    starts, hs, z = (
+        np.array([[0.5, -0.3, 0.2, 0.1], [1.0, 0.5, -1.0, 2.0]]),
+        np.full((2, 60), 0.01),
+        np.full(len(names), 2.0),
+    )
+    xs = law.run(z, starts, hs, us)
+    assert np.sum(xs[..., 3] == 0) > 30  # the elbow is held in half of the samples
+    assert np.any(xs[:, 1:, 2] * xs[:, :-1, 2] < 0)  # and the shoulder turns back
+    by_x, by_z = law.slopes(z, xs, hs, us)
+    found = np.tile(np.eye(4, 4 + len(z)), (2, 1, 1))
+    for m in range(60):
+        found = by_x[:, m] @ found
+        found[..., 4:] += by_z[:, m]
+    for i, step in enumerate(1e-6 * np.eye(4 + len(z))):
+        ends = [law.run(z + s * step[4:], starts + s * step[:4], hs, us)[:, -1] for s in (1, -1)]
+        np.testing.assert_allclose(found[..., i], (ends[0] - ends[1]) / 2e-6, atol=1e-5)  # of up to 11
 
 
 @pytest.mark.slow

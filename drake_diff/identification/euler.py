@@ -11,7 +11,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.flow import ContinuousMotion
-from drake_diff.identification.tree import Numbers
+from drake_diff.identification.tree import Mask, Numbers
 from drake_diff.identification.unknowns import set_numbers
 
 
@@ -49,10 +49,12 @@ class EulerMotion(ContinuousMotion):
     def _damped(self, numbers: Numbers) -> Numbers:
         return replace(numbers, reflected=numbers.reflected + self.longest * numbers.damping)
 
-    def _step_slopes(self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array) -> Array:
+    def _step_slopes(
+        self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array, grip: tuple[Array, Mask] | None = None
+    ) -> Array:
         by = by.copy()
         by[numbers.places("reflected")] += self.longest * by[numbers.places("damping")]
-        _, by_x, by_z = self._rate_slopes(self._damped(numbers), by, x, u)
+        _, by_x, by_z = self._rate_slopes(self._damped(numbers), by, x, u, grip)
         nq, nx, h = self.model.nq, x.shape[1], h[:, None, None]
         after = np.zeros((len(x), nx - nq, nx + by.shape[1]))
         after[..., :nx], after[..., nx:] = h * by_x[:, nq:], h * by_z[:, nq:]

@@ -29,6 +29,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.identification.chart import Chart
+from drake_diff.identification.dry import DryMotion
 from drake_diff.identification.euler import EulerMotion
 from drake_diff.identification.fit import Fit, Law, Point, Solved
 from drake_diff.identification.flow import ContinuousMotion
@@ -41,7 +42,6 @@ from drake_diff.identification.tree import Tree, tree_for_identification
 from drake_diff.identification.unknowns import BIAS, COULOMB, Unknown, Unknowns, choose_unknowns, possible_changes
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
-from drake_diff.model.step import set_state
 
 FALSE_NAME = 0.003  # of right models in which some change is named
 LOOKED_AT = 8  # changes that enter the race, of those that promise most: of those of one number, and of others
@@ -60,8 +60,6 @@ MOTIONS = ("auto", "continuous")
 CLOSE = 1.0  # of the squares: what a step may still gain where two changes are told apart
 TOLD_APART = 40.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
 LONGEST_DELAY = 0.1  # [s]
-LONGEST_DRY = 2.5e-3  # [s] of a step under dry friction, which turns within a small speed
-LEAST_SLIP, FOLLOWED = 5e-4, 2.0  # [rad/s, m/s] that speed; the rate of its decay, in steps, that they follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,18 +220,15 @@ class _Search:
         turns = unknowns is not self.unknowns and any(one.quantity == COULOMB for one in unknowns.each)
         return FrozenMotion(*own, longest) if self.calm and not turns else ContinuousMotion(*own, longest)
 
-    def law_of(self, unknowns: Unknowns, z: Array) -> ContinuousMotion:
-        """With dry friction that holds as firmly as short steps can follow, where it is of this size."""
+    def law_of(self, unknowns: Unknowns) -> ContinuousMotion:
+        """With dry friction that holds."""
         law = self.law(unknowns, self.longest)
-        dry = [(one.label, float(z[s][0])) for one, s in self.each_of(unknowns) if one.quantity == COULOMB]
-        if not dry or self.step is not None:
+        dry = [one.label for one in unknowns.each if one.quantity == COULOMB]
+        if not dry or self.step is not None or self.tree.dynamics.coupling is not None:
             return law
-        set_state(self.model.double, self.starts[0])
-        ease = np.diag(np.linalg.pinv(np.asarray(self.model.double.mass_matrix())))
         at = {link.joint.joint: link.joint.v_start for link in self.tree.links}
-        rate = max(size * float(ease[at[joint]]) for joint, size in dry)
-        slip = float(np.clip(rate * LONGEST_DRY / FOLLOWED, LEAST_SLIP, self.tree.slip))
-        return replace(law, tree=replace(self.tree, slip=slip), longest=min(law.longest, LONGEST_DRY))
+        own = self.model, self.tree, self.chart, unknowns, self.longest
+        return DryMotion(*own, joints=tuple(at[joint] for joint in dry), calm=self.calm)
 
     @staticmethod
     def each_of(unknowns: Unknowns) -> list[tuple[Unknown, slice]]:
@@ -345,7 +340,7 @@ class _Search:
             for one, s in self.each_of(unknowns) if len(unknowns.each) == 2 else []:
                 if one.name not in found:
                     alone = self.of([one.name])
-                    law = self.law_of(alone, pair.z[s])
+                    law = self.law_of(alone)
                     found[one.name] = self.solved((one.name,), alone, law, self.cut, pair.starts, pair.z[s])
         return list(found.values())
 
@@ -515,7 +510,7 @@ class _Search:
         unknowns, pieces = one.fit.unknowns, one.fit.segments.pieces
         if all(each.quantity != COULOMB for each in unknowns.each):
             return one.fit
-        return self.problem(unknowns, pieces).fit(self.law_of(unknowns, one.z), pieces, one.fit.noise)
+        return self.problem(unknowns, pieces).fit(self.law_of(unknowns), pieces, one.fit.noise)
 
     def raced(self, runners: list[_Runner], base: _Tried) -> tuple[list[_Tried], list[_Runner]]:
         alive, there = list(runners), []

@@ -13,7 +13,7 @@ from scipy.integrate import DOP853
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.tree import Numbers, Tree
+from drake_diff.identification.tree import Mask, Numbers, Tree
 from drake_diff.identification.unknowns import Unknowns, by_complex_step, set_numbers
 from drake_diff.model.model import Model
 
@@ -88,7 +88,9 @@ class ContinuousMotion:
         found = found.reshape(K, M, nx, -1)
         return found[..., :nx], found[..., nx:]
 
-    def _step_slopes(self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array) -> Array:
+    def _step_slopes(
+        self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array, grip: tuple[Array, Mask] | None = None
+    ) -> Array:
         nx, h = x.shape[1], h[:, None, None]
         start = np.zeros((*x.shape, nx + by.shape[1]))
         start[:, :, :nx] = np.eye(nx)
@@ -97,7 +99,7 @@ class ContinuousMotion:
         for i, row in enumerate(stages):
             at = x + h[..., 0] * np.tensordot(row, rates[:i], 1)
             moved = start + h * np.tensordot(row, changes[:i], 1)
-            rates[i], by_x, by_z = self._rate_slopes(numbers, by, at, u)
+            rates[i], by_x, by_z = self._rate_slopes(numbers, by, at, u, grip)
             np.matmul(by_x, moved, out=changes[i])
             changes[i, :, :, nx:] += by_z
         return np.asarray(start + h * np.tensordot(weights, changes, 1))
@@ -109,10 +111,12 @@ class ContinuousMotion:
             return np.concatenate([v, a], axis=1)
         return np.concatenate([(self.chart.coordinates.rate(q) @ v[..., None])[..., 0], a], axis=1)
 
-    def _rate_slopes(self, numbers: Numbers, by: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    def _rate_slopes(
+        self, numbers: Numbers, by: Array, x: Array, u: Array, grip: tuple[Array, Mask] | None = None
+    ) -> tuple[Array, Array, Array]:
         nq, chart = self.model.nq, self.chart.coordinates
         q, v = x[:, :nq], x[:, nq:]
-        found = self.tree.slopes(numbers, q, v, u, by)
+        found = self.tree.slopes(numbers, q, v, u, by, grip)
         N, W = chart.rate(q), chart.motion(q)
         by_x = np.zeros((*x.shape, x.shape[1]))
         by_x[:, :nq, :nq], by_x[:, :nq, nq:] = chart.rate_by_position(v), N

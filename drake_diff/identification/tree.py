@@ -2,6 +2,8 @@
 
     M(q) a = B (strength * u) - C(q, v) v + gravity - springs - damping v - coulomb tanh(v / v_s)
 
+where dry friction turns over a small speed; `identification.dry` has the one that holds.
+
 The force of inverse dynamics is linear in each link's ten numbers: mass, mass times centre of mass, inertia about the
 frame's origin. So is it in damping, stiffness, friction and gravity, and
 
@@ -30,6 +32,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators
 
 SLIP_SPEED = 0.02  # v_s [rad/s or m/s] over which dry friction turns: Drake's joints have none, so nothing gives one
+Mask = NDArray[np.bool_]
 _INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz
 
 
@@ -99,18 +102,31 @@ class Tree:
         return self.acceleration(numbers)(q, v, u)
 
     def acceleration(self, numbers: Numbers) -> Callable[[Array, Array, Array], Array]:
-        """`accelerate` with these numbers, for many calls: compiled where Numba is installed."""
-        compiled = self._compiled(numbers)
+        """`accelerate` with these numbers, for many calls."""
+        pushed = self.pushed(numbers)
 
         def of(q: Array, v: Array, u: Array) -> Array:
+            mass, force = pushed(q, v, u, None)
+            return np.asarray(np.linalg.solve(mass, force[..., None])[..., 0])
+
+        return of
+
+    def pushed(self, numbers: Numbers) -> Callable[[Array, Array, Array, Array | None], tuple[Array, Array]]:
+        """(M (N, nv, nv), M a (N, nv)) with these numbers, for many calls: compiled where Numba is installed.
+
+        The last argument is of dry friction, as `slopes` says.
+        """
+        compiled = self._compiled(numbers)
+
+        def of(q: Array, v: Array, u: Array, turn: Array | None) -> tuple[Array, Array]:
             q, v = self._all(q, v)
             if compiled is None:
-                moving, force, mass = self._moved(numbers, q, v, u)
+                moving, force, mass = self._moved(numbers, q, v, u, turn)
                 bias = moving.forces(np.zeros_like(v))[0]
             else:
-                moved, force = compiled(q, v, np.zeros_like(v)), self._force(numbers, q, v, u)
+                moved, force = compiled(q, v, np.zeros_like(v)), self._force(numbers, q, v, u, turn)
                 bias, mass = moved.tau, moved.mass + np.diag(numbers.reflected)
-            return np.asarray(np.linalg.solve(self._own(mass), self._along(force - bias)[..., None])[..., 0])
+            return self._own(mass), self._along(force - bias)
 
         return of
 
@@ -163,21 +179,29 @@ class Tree:
         names = {link.joint.body: i for i, link in enumerate(self.links)}
         return CompiledTree(tuple(whole), names, len(self.dynamics.mass))
 
-    def slopes(self, numbers: Numbers, q: Array, v: Array, u: Array, by: Array) -> Slopes:
-        """The same with derivatives; `by` (count, np) is how the numbers change with each parameter."""
+    def slopes(
+        self, numbers: Numbers, q: Array, v: Array, u: Array, by: Array, grip: tuple[Array, Mask] | None = None
+    ) -> Slopes:
+        """The same with derivatives; `by` (count, np) is how the numbers change with each parameter.
+
+        Of joints without followers, `grip` can say what dry friction does: (which way each slides (N, nv), -1 to 1;
+        which of them it holds (N, nv)).
+        """
         q, v = self._all(q, v)
-        moving, force, mass = self._moved(numbers, q, v, u)
+        turn = None if grip is None else grip[0]
+        moving, force, mass = self._moved(numbers, q, v, u, turn)
         diagonal = np.arange(v.shape[1])
-        inverse = np.asarray(np.linalg.inv(self._own(mass)))
+        inverse = np.asarray(np.linalg.inv(self._own(mass))) if grip is None else held_inverse(mass, grip[1])
         bias = moving.forces(np.zeros_like(v))[0]
         own = (inverse @ self._along(force - bias)[..., None])[..., 0]
         a = self._all(q, own)[1]
         _, by_q, by_v = moving.derivatives(a)
         by_q[:, diagonal, diagonal] += numbers.stiffness
-        by_v[:, diagonal, diagonal] += (
-            numbers.damping + numbers.coulomb / self.slip / np.cosh(np.clip(v / self.slip, -300, 300)) ** 2
-        )
-        change = self._by_numbers(numbers, moving, q, v, u, a, by)
+        by_v[:, diagonal, diagonal] += numbers.damping
+        if turn is None:
+            by_v[:, diagonal, diagonal] += numbers.coulomb / self.slip / np.cosh(np.clip(v / self.slip, -300, 300)) ** 2
+            turn = np.tanh(v / self.slip)
+        change = self._by_numbers(numbers, moving, q, v, u, a, by, turn)
         by_u = inverse @ self._along_columns(self.actuation * numbers.strength * self._passes(u)[:, None, :])
         by_q, by_v = self._own(by_q), self._own(by_v)
         return Slopes(own, -inverse @ by_q, -inverse @ by_v, by_u, -inverse @ self._along_columns(change))
@@ -223,17 +247,19 @@ class Tree:
         coupling = self.dynamics.coupling
         return columns if coupling is None else np.asarray(coupling.spread.T @ columns)
 
-    def _moved(self, numbers: Numbers, q: Array, v: Array, u: Array) -> tuple[Moving, Array, Array]:
+    def _moved(
+        self, numbers: Numbers, q: Array, v: Array, u: Array, turn: Array | None = None
+    ) -> tuple[Moving, Array, Array]:
         """The tree in motion, the force (N, n) that does not come from its links, and M (N, n, n)."""
         moving = self._with(numbers).moving(self.place(numbers, q), v)
-        return moving, self._force(numbers, q, v, u), moving.mass + np.diag(numbers.reflected)
+        return moving, self._force(numbers, q, v, u, turn), moving.mass + np.diag(numbers.reflected)
 
-    def _force(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Array:
+    def _force(self, numbers: Numbers, q: Array, v: Array, u: Array, turn: Array | None = None) -> Array:
         """(N, n) what does not come from links."""
         effort = np.clip(u, -self.limits, self.limits) * numbers.strength
         stretched = np.where(numbers.stiffness != 0, q[:, self.dynamics.positions] - numbers.rest, 0.0)
         force = effort @ self.actuation.T - numbers.stiffness * stretched - numbers.damping * v
-        return np.asarray(force - numbers.coulomb * np.tanh(v / self.slip))
+        return np.asarray(force - numbers.coulomb * (np.tanh(v / self.slip) if turn is None else turn))
 
     def _passes(self, u: Array) -> Array:
         """(N, nu) 1 where an input is within its limits, beyond which it changes nothing."""
@@ -275,7 +301,9 @@ class Tree:
             of_each[:, self.first[i] : self.first[i] + count] = of_links[:, i, None]
         return of_each
 
-    def _by_numbers(self, numbers: Numbers, moving: Moving, q: Array, v: Array, u: Array, a: Array, by: Array) -> Array:
+    def _by_numbers(
+        self, numbers: Numbers, moving: Moving, q: Array, v: Array, u: Array, a: Array, by: Array, turn: Array
+    ) -> Array:
         """(N, n, np) of inverse dynamics less the other forces, at fixed a."""
         found = np.zeros((*v.shape, by.shape[1]))
         _, A, carried = moving.forces(a)
@@ -296,7 +324,7 @@ class Tree:
             ("reflected", a),
             ("stiffness", stretched),
             ("rest", np.broadcast_to(-numbers.stiffness, v.shape)),
-            ("coulomb", np.tanh(v / self.slip)),
+            ("coulomb", turn),
         ):
             rows = by[numbers.places(name)]
             if np.any(rows):
@@ -390,6 +418,13 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
     moves = {body: _moved_by(pose) for body, (_, pose) in placed.items()}
     actuation = model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T).T
     return Tree(links, own, first, np.asarray(actuation), np.asarray(limits), placed, moves, bodies, numbers)
+
+
+def held_inverse(mass: Array, held: Mask) -> Array:
+    """(N, n, n) accelerations by forces where the joints that are held (N, n) do not move, of M (N, n, n)."""
+    free = ~held[:, :, None] & ~held[:, None, :]
+    within = np.where(free, mass, np.eye(mass.shape[1]) * np.max(np.abs(mass)))
+    return np.asarray(np.where(free, np.linalg.inv(within), 0.0))
 
 
 def ten_numbers(mass: Any, center: Any, inertia: Any) -> Any:

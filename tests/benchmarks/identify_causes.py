@@ -1,15 +1,16 @@
 """Whether `dd.explain` names what was changed: 20 robots, recorded by MuJoCo in steps of 0.25 ms.
 
     pip install -e '.[test]'
-    python tests/benchmarks/identify_causes.py [--seed 0] [--count 60] [--changes 0 1 2] [--out FILE.json]
+    python tests/benchmarks/identify_causes.py [--seed 0] [--count 60] [--changes 0 1 2] [--soft] [--out FILE.json]
     python tests/benchmarks/identify_causes.py --chance 100000 [--seed 0] [--count 20]
 
 Each case is a robot of example-robot-data or of models/, on its base for 2 s at 100 Hz. A controller leads it along
 sums of sines within its joints' ranges, by torques that are held for 10 ms and recorded. Positions have the noise of an
 encoder, 0.2 mrad; velocities are not recorded. In turn nothing is changed, and anything that is named is a false alarm;
 one thing is; or two are: a mass with its inertia, a centre of mass, a damping, the dry friction of a joint, the
-strength of an input, a delay of all inputs, the bias of an encoder, or gravity. A change that moves no joint by more
-than five times the noise, in MuJoCo and under the same torques, is drawn anew.
+strength of an input, a delay of all inputs, the bias of an encoder, or gravity. Dry friction stops a joint within two
+of MuJoCo's steps; with --soft it is MuJoCo's by default, which slows a joint down over 10 ms and lets it creep. A
+change that moves no joint by more than five times the noise, in MuJoCo and under the same torques, is drawn anew.
 
 With --chance, nothing is changed, and noise is drawn so often for each robot: in which share of the draws some change
 passes the limit, and in which it passes the penalty of BIC alone.
@@ -75,7 +76,8 @@ def loaded(root, robot):
 class Truth:
     """The robot that is recorded, and the names of what is not the file's."""
 
-    def __init__(self, root, joints, nu):
+    def __init__(self, root, joints, nu, soft=False):
+        self.soft = soft  # whether dry friction is MuJoCo's by default
         self.root, self.joints, self.changes = copy.deepcopy(root), joints, {}
         self.friction, self.strength = np.zeros(len(joints)), np.ones(nu)
         self.late, self.bias, self.gravity = 0, np.zeros(len(joints)), np.array([0, 0, -9.81])
@@ -132,7 +134,8 @@ class Truth:
         ids = [mujoco.mj_name2id(engine, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in self.joints]
         q, v = engine.jnt_qposadr[ids], engine.jnt_dofadr[ids]
         engine.dof_frictionloss[v], engine.opt.gravity[:] = self.friction, self.gravity
-        engine.dof_solimp[v, :2] = 0.9999  # friction that holds where it can
+        if not self.soft:  # friction that stops a joint within two steps, and holds it where it can
+            engine.dof_solimp[v, :2], engine.dof_solref[v] = 0.9999, (2 * base.STEP, 1)
         data = mujoco.MjData(engine)
         data.qpos[q] = q0
         qs, us = [q0 + self.bias], []
@@ -181,7 +184,7 @@ def led(model, random):
     return q0, command, push
 
 
-def recorded(robot, kinds, seed):
+def recorded(robot, kinds, seed, soft=False):
     """(model, recording, truth)."""
     random = np.random.default_rng(seed)
     root = base.bare(OURS / f"{Path(robot).name}.urdf" if robot.startswith("models/") else robot_file(f"{robot}.urdf"))
@@ -189,7 +192,7 @@ def recorded(robot, kinds, seed):
     joints = [name.removesuffix("_q").removesuffix("_x") for name in model.position_names]
     q0, command, push = led(model, random)
     while True:
-        truth = Truth(root, joints, model.nu)
+        truth = Truth(root, joints, model.nu, soft)
         for kind in kinds:
             truth.change(kind, model, push, random)
         qs, us = truth.run(model, q0, command)
@@ -231,8 +234,8 @@ def put_back(changed, root, name):
     mine.remove(old)
 
 
-def measure(robot, kinds, seed):
-    model, recording, truth = recorded(robot, kinds, seed)
+def measure(robot, kinds, seed, soft=False):
+    model, recording, truth = recorded(robot, kinds, seed, soft)
     begin = time.process_time()
     case = {
         "robot": robot,
@@ -296,6 +299,7 @@ def main():
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--changes", type=int, nargs="+", default=[0, 1, 2], choices=(0, 1, 2))
+    parser.add_argument("--soft", action="store_true")
     parser.add_argument("--chance", type=int, metavar="DRAWS")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
@@ -314,7 +318,7 @@ def main():
     for i in range(given.first, given.first + given.count):
         robot = ROBOTS[i // len(given.changes) % len(ROBOTS)]
         kinds = kinds_of(given.seed, i, given.changes[i % len(given.changes)])
-        case = measure(robot, kinds, 10000 * given.seed + i)
+        case = measure(robot, kinds, 10000 * given.seed + i, given.soft)
         cases.append(case)
         changed = "; ".join(f"{name} {np.round(value, 4)}" for name, value in case["changed"].items())
         print(

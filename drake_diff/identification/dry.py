@@ -1,0 +1,235 @@
+"""The motion of a tree in continuous time with dry friction that holds joints still.
+
+A joint slides one way or the other, against a constant torque, or it is held: its acceleration is 0 for as long as the
+torque that this takes is within the friction. Each of these motions is smooth. Within a step the time is sought at
+which one ends, where a velocity is 0 or a torque leaves the friction, and the next one goes on from there.
+
+Derivatives go through such an end as Aizerman and Gantmacher (1958) say: a joint that stops passes on no velocity, and
+where it goes on the other way, what it had is stretched by how its acceleration jumps.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff.identification.flow import CHUNK, ContinuousMotion
+from drake_diff.identification.frozen import exponential
+from drake_diff.identification.tree import Mask, Numbers, held_inverse
+from drake_diff.identification.unknowns import by_complex_step, set_numbers
+
+REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
+MOST_PARTS = 8  # of a step; what is left of it then goes on as it is
+SEARCHED, MET = 12, 1e-9  # steps of the search for an end; [rad/s, m/s] or of the friction: how near it is then
+
+Pushed = Callable[[Array, Array, Array, Array | None], tuple[Array, Array]]
+
+
+class Part(NamedTuple):
+    """Of some steps at once, a part in which joints slide one way or are held."""
+
+    rows: Indices
+    x: Array  # (n, nx) at its start
+    h: Array  # (n,) [s]
+    u: Array
+    turn: Array  # (n, nv) 1 or -1 of a joint that slides; 0 of others
+    held: Mask  # (n, nv) which joints are held
+    before: Array  # (n, nv) which way a joint slid that has just come to 0; 0 of others
+
+    def some(self, s: slice) -> "Part":
+        """Of some of the steps."""
+        return Part(self.rows[s], self.x[s], self.h[s], self.u[s], self.turn[s], self.held[s], self.before[s])
+
+
+@dataclass(frozen=True, eq=False)
+class DryMotion(ContinuousMotion):
+    """As `ContinuousMotion`, with dry friction in some joints; steps may be differentiated frozen halfway."""
+
+    joints: tuple[int, ...] = ()  # degrees of freedom
+    calm: bool = False
+
+    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
+        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
+        numbers = set_numbers(self.model, self.tree, self.unknowns, values)
+        pushed = self.tree.pushed(numbers)
+        xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
+        xs[:, 0] = starts
+        for m in range(hs.shape[1]):
+            xs[:, m + 1], _ = self._steps(pushed, numbers, xs[:, m], hs[:, m], us[:, m])
+        return xs
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
+        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        model, tree, unknowns = self.model, self.tree, self.unknowns
+
+        def flat(z: Array) -> Array:
+            return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
+
+        numbers, by = set_numbers(model, tree, unknowns, unknowns.values(z)), by_complex_step(flat, z)
+        pushed, (K, M), nx = tree.pushed(numbers), hs.shape, xs.shape[2]
+        x, u = xs[:, :-1].reshape(K * M, nx), us.reshape(K * M, -1)
+        _, parts = self._steps(pushed, numbers, x, hs.reshape(-1), u)
+        found = np.zeros((K * M, nx, nx + by.shape[1]))
+        found[:, :, :nx] = np.eye(nx)
+        for part in parts:
+            for k in range(0, len(part.rows), CHUNK):
+                one = part.some(slice(k, k + CHUNK))
+                moved = self._taken_up(pushed, numbers, one) @ found[one.rows]
+                through = self._through(numbers, pushed, by, one)
+                moved = through[:, :, :nx] @ moved
+                moved[:, :, nx:] += through[:, :, nx:]
+                found[one.rows] = moved
+        found = found.reshape(K, M, nx, -1)
+        return found[..., :nx], found[..., nx:]
+
+    def _steps(self, pushed: Pushed, numbers: Numbers, x: Array, h: Array, u: Array) -> tuple[Array, list[Part]]:
+        """Where steps from x (N, nx) of lengths h (N,) end, and their parts."""
+        nv = self.model.nv
+        x, left, parts = x.copy(), h.copy(), list[Part]()
+        released, before = np.zeros((len(x), nv)), np.zeros((len(x), nv))
+        for k in range(MOST_PARTS):
+            rows = np.flatnonzero(left > 0)
+            if not len(rows):
+                break
+            turn, held = self._grip(pushed, numbers, x[rows], u[rows], released[rows])
+            ends = self._moved(pushed, x[rows], left[rows], u[rows], turn, held)
+            over, which = self._within(pushed, numbers, ends, u[rows], turn, held)
+            lengths = left[rows].copy()
+            last = np.flatnonzero(over < 0) if k < MOST_PARTS - 1 else np.zeros(0, dtype=np.intp)
+            if len(last):
+                own = x[rows][last], u[rows][last], turn[last], held[last]
+                lengths[last], ends[last], which[last] = self._end(pushed, numbers, *own, lengths[last], over[last])
+            parts.append(Part(rows, x[rows], lengths, u[rows], turn, held, before[rows]))
+            released[rows], before[rows] = 0.0, 0.0
+            if len(last):
+                j, at = which[last], rows[last]
+                slid = ~held[last, j]
+                ends[last[slid], self.model.nq + j[slid]] = 0.0
+                before[at[slid], j[slid]] = turn[last[slid], j[slid]]
+                _, push = self._pushes(pushed, ends[last], u[at], turn[last], held[last])
+                released[at[~slid], j[~slid]] = np.sign(push[~slid, j[~slid]])
+            x[rows] = ends
+            left[rows] = left[rows] - lengths
+            done = np.ones(len(rows), dtype=bool)
+            done[last] = False
+            left[rows[done]] = 0.0
+        return x, parts
+
+    def _grip(self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, released: Array) -> tuple[Array, Mask]:
+        """(turn, held) of a motion that begins at x; a joint at rest is held where friction can."""
+        v = x[:, self.model.nq :]
+        own = np.zeros(v.shape[1], dtype=bool)
+        own[list(self.joints)] = True
+        turn = np.where(own, np.where(np.abs(v) > REST, np.sign(v), released), 0.0)
+        held = own & (turn == 0)
+        for _ in self.joints:
+            some = np.flatnonzero(np.any(held, axis=1))
+            if not len(some):
+                break
+            _, push = self._pushes(pushed, x[some], u[some], turn[some], held[some])
+            beyond = np.where(held[some], np.abs(push) - numbers.coulomb, -np.inf)
+            j = np.argmax(beyond, axis=1)
+            let = beyond[np.arange(len(some)), j] > 0
+            if not np.any(let):
+                break
+            turn[some[let], j[let]] = np.sign(push[let, j[let]])
+            held[some[let], j[let]] = False
+        return turn, held
+
+    def _pushes(self, pushed: Pushed, x: Array, u: Array, turn: Array, held: Mask) -> tuple[Array, Array]:
+        """(accelerations (N, nv), what pushes joints that are held (N, nv))."""
+        nq = self.model.nq
+        mass, force = pushed(x[:, :nq], x[:, nq:], u, turn)
+        if not np.any(held):
+            return np.asarray(np.linalg.solve(mass, force[..., None])[..., 0]), np.zeros_like(force)
+        a = (held_inverse(mass, held) @ force[..., None])[..., 0]
+        return a, np.where(held, force - (mass @ a[..., None])[..., 0], 0.0)
+
+    def _moved(self, pushed: Pushed, x: Array, h: Array, u: Array, turn: Array, held: Mask) -> Array:
+        """The states (N, nx) after h (N,)."""
+
+        def accelerate(q: Array, v: Array, u: Array) -> Array:
+            return self._pushes(pushed, np.concatenate([q, v], axis=1), u, turn, held)[0]
+
+        x = x.copy()
+        x[:, self.model.nq :][held] = 0.0
+        stages, weights = self.method
+        slopes = np.empty((len(weights), *x.shape))
+        for i, row in enumerate(stages):
+            slopes[i] = self._rates(accelerate, x + h[:, None] * np.tensordot(row, slopes[:i], 1), u)
+        return np.asarray(x + h[:, None] * np.tensordot(weights, slopes, 1))
+
+    def _within(
+        self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, turn: Array, held: Mask
+    ) -> tuple[Array, Indices]:
+        """(by how much joints slide or are held as they should at x (N,), negative beyond; which is the least (N,))."""
+        room = np.where(turn != 0, turn * x[:, self.model.nq :], np.inf)
+        some = np.flatnonzero(np.any(held, axis=1))
+        if len(some):
+            _, push = self._pushes(pushed, x[some], u[some], turn[some], held[some])
+            size = np.maximum(numbers.coulomb, 1e-300)
+            room[some] = np.where(held[some], 1 - np.abs(push) / size, room[some])
+        which = np.argmin(room, axis=1)
+        return room[np.arange(len(x)), which], which
+
+    def _end(
+        self,
+        pushed: Pushed,
+        numbers: Numbers,
+        x: Array,
+        u: Array,
+        turn: Array,
+        held: Mask,
+        h: Array,
+        beyond: Array,
+    ) -> tuple[Array, Array, Indices]:
+        """(when a motion ends that would be beyond at h (N,), where, and by which joint): regula falsi of Illinois."""
+        low, high = np.zeros(len(x)), h.copy()
+        at_low, at_high = np.maximum(self._within(pushed, numbers, x, u, turn, held)[0], 0.0), beyond.copy()
+        side = np.zeros(len(x))  # the end that moved last
+        for k in range(SEARCHED):
+            t = low + (high - low) * np.where(at_low > 0, at_low / np.maximum(at_low - at_high, 1e-300), 0.5)
+            ends = self._moved(pushed, x, t, u, turn, held)
+            room, which = self._within(pushed, numbers, ends, u, turn, held)
+            if k == SEARCHED - 1 or np.all(np.abs(room) < MET):
+                break
+            above = room > 0
+            at_high = np.where(above, np.where(side > 0, at_high / 2, at_high), room)
+            at_low = np.where(above, room, np.where(side < 0, at_low / 2, at_low))
+            low, high, side = np.where(above, t, low), np.where(above, high, t), np.where(above, 1.0, -1.0)
+        return t, ends, which
+
+    def _taken_up(self, pushed: Pushed, numbers: Numbers, part: Part) -> Array:
+        """(n, nx, nx) what becomes of a small change of the state where the part begins."""
+        nq, nx = self.model.nq, part.x.shape[1]
+        found = np.tile(np.eye(nx), (len(part.rows), 1, 1))
+        some = np.flatnonzero(np.any(part.held, axis=1))
+        x, u = part.x, part.u
+        if len(some):
+            mass, _ = pushed(x[some, :nq], x[some, nq:], u[some], part.turn[some])
+            found[some, nq:, nq:] = held_inverse(mass, part.held[some]) @ mass
+        back = (part.before != 0) & (part.turn == -part.before)
+        for k in np.flatnonzero(np.any(back, axis=1)):
+            j, own = int(np.argmax(back[k])), slice(k, k + 1)
+            turn = part.turn[own].copy()
+            after, _ = self._pushes(pushed, x[own], u[own], turn, part.held[own])
+            turn[0, j] = part.before[k, j]
+            begun, _ = self._pushes(pushed, x[own], u[own], turn, part.held[own])
+            if begun[0, j] != 0:
+                found[k, nq:, nq + j] += (after - begun)[0] / begun[0, j]
+        return found
+
+    def _through(self, numbers: Numbers, pushed: Pushed, by: Array, part: Part) -> Array:
+        """(n, nx, nx + np) the end of a part by its start and by z."""
+        grip = part.turn, part.held
+        x = part.x.copy()
+        x[:, self.model.nq :][part.held] = 0.0
+        if not self.calm:
+            return self._step_slopes(numbers, by, x, part.h, part.u, grip)
+        halfway = self._moved(pushed, x, part.h / 2, part.u, *grip)
+        _, J, C = self._rate_slopes(numbers, by, halfway, part.u, grip)
+        h = part.h[:, None, None]
+        whole, phi = exponential(h * J)
+        return np.concatenate([whole, h * (phi @ C)], axis=2)
