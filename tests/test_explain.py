@@ -24,7 +24,7 @@ from drake_diff.identification.explain import FALSE_NAME
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.frozen import FrozenMotion, exponential
 from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.unknowns import Unknowns, choose_unknowns, set_numbers
+from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.record.comparison import ComparisonRecord
 
@@ -158,6 +158,31 @@ def test_dry_friction_stops_and_holds_and_lets_go(load):
     np.testing.assert_allclose(xs[:, 0], 0.1 + 0.7 * slides - slides**2 - let_go**2, atol=1e-8)
     np.testing.assert_allclose(xs[:, 1], 0.7 - 2 * slides - 2 * let_go, atol=1e-8)
     assert np.all(xs[9:21, 1] == 0)
+
+
+def test_dry_friction_can_give_way_where_it_holds(load):
+    """Of 0.5 N m on a hinge of 0.25 kg m^2, as by 2.25 kg m^2 and 25 N m s/rad more.
+
+    It slides by -2 rad/s^2 until 0.2 rad/s, and from there its speed decays by 10 a second; under 0.4 N m it creeps.
+    """
+    model = load("pendulum.urdf")
+    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree = replace(tree, numbers=replace(tree.numbers, gravity=np.zeros(3), damping=np.zeros(1)))
+    by = {"hinge.held_inertia": 2.25, "hinge.held_damping": 25.0}
+    held = [Unknown(name, "", np.array([value]), 0.0, value) for name, value in by.items()]
+    unknowns = Unknowns((*choose_unknowns(model, tree, ["hinge.coulomb_friction"]).each, *held))
+    law = DryMotion(model, tree, chart, unknowns, 0.04, joints=(0,), gives=True)
+    z, starts, hs = unknowns.z_start + np.array([0.5, 0, 0]), np.array([[0.1, 0.7], [0.1, 0.0]]), np.full((2, 20), 0.04)
+    us = np.repeat([0.0, 0.4], 20).reshape(2, 20, 1)
+    xs, t = law.run(unknowns.values(z), starts, hs, us), 0.04 * np.arange(21)
+    slides, after, decays = np.minimum(t, 0.25), np.maximum(t - 0.25, 0), 0.4 / 25 * (1 - np.exp(-10 * t))
+    stops = 0.1 + 0.7 * slides - slides**2 + 0.02 * (1 - np.exp(-10 * after))
+    np.testing.assert_allclose(xs[0, :, 0], stops, atol=1e-8)
+    np.testing.assert_allclose(xs[1, :, 0], 0.1 + 0.4 / 25 * t - decays / 10, atol=1e-8)
+    _, by_z = law.slopes(z, xs[:, 6:8], hs[:, 6:7], us[:, 6:7])  # the step in which it is caught
+    for i, step in enumerate(1e-6 * np.eye(3)):
+        ends = [law.run(unknowns.values(z + s * step), xs[:, 6], hs[:, 6:7], us[:, 6:7])[:, -1] for s in (1, -1)]
+        np.testing.assert_allclose(by_z[:, 0, :, i], (ends[0] - ends[1]) / 2e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("names", [["elbow.coulomb_friction"], ["shoulder.coulomb_friction", "elbow.coulomb_friction"]])

@@ -4,6 +4,10 @@ A joint slides one way or the other, against a constant torque, or it is held: i
 torque that this takes is within the friction. Each of these motions is smooth. Within a step the time is sought at
 which one ends, where a velocity is 0 or a torque leaves the friction, and the next one goes on from there.
 
+Friction can also give way: what it holds moves as with an inertia g and a damping d more, for as long as the torque
+|g a + d v| that this takes is within the friction. Simulators hold joints so: by MuJoCo's `frictionloss` 1/g is its R,
+and d/g the rate by which its reference slows a joint down. This force has no jumps.
+
 Derivatives go through such an end as Aizerman and Gantmacher (1958) say: a joint that stops passes on no velocity, and
 where it goes on the other way, what it had is stretched by how its acceleration jumps.
 """
@@ -17,7 +21,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.identification.flow import CHUNK, ContinuousMotion
 from drake_diff.identification.frozen import exponential
-from drake_diff.identification.tree import Mask, Numbers, held_inverse
+from drake_diff.identification.tree import Mask, Numbers, caught, held_inverse
 from drake_diff.identification.unknowns import by_complex_step, set_numbers
 
 REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
@@ -48,6 +52,7 @@ class DryMotion(ContinuousMotion):
     """As `ContinuousMotion`, with dry friction in some joints; steps may be differentiated frozen halfway."""
 
     joints: tuple[int, ...] = ()  # degrees of freedom
+    gives: bool = False  # whether friction gives way; of one joint only
     calm: bool = False
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
@@ -88,13 +93,13 @@ class DryMotion(ContinuousMotion):
         """Where steps from x (N, nx) of lengths h (N,) end, and their parts."""
         nv = self.model.nv
         x, left, parts = x.copy(), h.copy(), list[Part]()
-        released, before = np.zeros((len(x), nv)), np.zeros((len(x), nv))
+        released, before, stays = np.zeros((len(x), nv)), np.zeros((len(x), nv)), np.zeros((len(x), nv), dtype=bool)
         for k in range(MOST_PARTS):
             rows = np.flatnonzero(left > 0)
             if not len(rows):
                 break
-            turn, held = self._grip(pushed, numbers, x[rows], u[rows], released[rows])
-            ends = self._moved(pushed, x[rows], left[rows], u[rows], turn, held)
+            turn, held = self._grip(pushed, numbers, x[rows], u[rows], released[rows], stays[rows])
+            ends = self._moved(pushed, numbers, x[rows], left[rows], u[rows], turn, held)
             over, which = self._within(pushed, numbers, ends, u[rows], turn, held)
             lengths = left[rows].copy()
             last = np.flatnonzero(over < 0) if k < MOST_PARTS - 1 else np.zeros(0, dtype=np.intp)
@@ -102,13 +107,16 @@ class DryMotion(ContinuousMotion):
                 own = x[rows][last], u[rows][last], turn[last], held[last]
                 lengths[last], ends[last], which[last] = self._end(pushed, numbers, *own, lengths[last], over[last])
             parts.append(Part(rows, x[rows], lengths, u[rows], turn, held, before[rows]))
-            released[rows], before[rows] = 0.0, 0.0
+            released[rows], before[rows], stays[rows] = 0.0, 0.0, False
             if len(last):
                 j, at = which[last], rows[last]
                 slid = ~held[last, j]
-                ends[last[slid], self.model.nq + j[slid]] = 0.0
-                before[at[slid], j[slid]] = turn[last[slid], j[slid]]
-                _, push = self._pushes(pushed, ends[last], u[at], turn[last], held[last])
+                if self.gives:
+                    stays[at[slid], j[slid]] = True
+                else:
+                    ends[last[slid], self.model.nq + j[slid]] = 0.0
+                    before[at[slid], j[slid]] = turn[last[slid], j[slid]]
+                _, push = self._pushes(pushed, numbers, ends[last], u[at], turn[last], held[last])
                 released[at[~slid], j[~slid]] = np.sign(push[~slid, j[~slid]])
             x[rows] = ends
             left[rows] = left[rows] - lengths
@@ -117,19 +125,24 @@ class DryMotion(ContinuousMotion):
             left[rows[done]] = 0.0
         return x, parts
 
-    def _grip(self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, released: Array) -> tuple[Array, Mask]:
+    @property
+    def own(self) -> Mask:
+        """(nv,) which joints have dry friction."""
+        return np.isin(np.arange(self.model.nv), self.joints)
+
+    def _grip(
+        self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, released: Array, stays: Mask
+    ) -> tuple[Array, Mask]:
         """(turn, held) of a motion that begins at x; a joint at rest is held where friction can."""
-        v = x[:, self.model.nq :]
-        own = np.zeros(v.shape[1], dtype=bool)
-        own[list(self.joints)] = True
-        turn = np.where(own, np.where(np.abs(v) > REST, np.sign(v), released), 0.0)
+        v, own = x[:, self.model.nq :], self.own
+        turn = np.where(own, released if self.gives else np.where(np.abs(v) > REST, np.sign(v), released), 0.0)
         held = own & (turn == 0)
         for _ in self.joints:
             some = np.flatnonzero(np.any(held, axis=1))
             if not len(some):
                 break
-            _, push = self._pushes(pushed, x[some], u[some], turn[some], held[some])
-            beyond = np.where(held[some], np.abs(push) - numbers.coulomb, -np.inf)
+            _, push = self._pushes(pushed, numbers, x[some], u[some], turn[some], held[some])
+            beyond = np.where(held[some] & ~stays[some], np.abs(push) - numbers.coulomb, -np.inf)
             j = np.argmax(beyond, axis=1)
             let = beyond[np.arange(len(some)), j] > 0
             if not np.any(let):
@@ -138,23 +151,30 @@ class DryMotion(ContinuousMotion):
             held[some[let], j[let]] = False
         return turn, held
 
-    def _pushes(self, pushed: Pushed, x: Array, u: Array, turn: Array, held: Mask) -> tuple[Array, Array]:
+    def _pushes(
+        self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, turn: Array, held: Mask
+    ) -> tuple[Array, Array]:
         """(accelerations (N, nv), what pushes joints that are held (N, nv))."""
         nq = self.model.nq
         mass, force = pushed(x[:, :nq], x[:, nq:], u, turn)
-        if not np.any(held):
-            return np.asarray(np.linalg.solve(mass, force[..., None])[..., 0]), np.zeros_like(force)
+        if self.gives:
+            mass, force = caught(numbers, mass, force, x[:, nq:], held)
+        if self.gives or not np.any(held):
+            a = np.linalg.solve(mass, force[..., None])[..., 0]
+            push = numbers.held_inertia * a + numbers.held_damping * x[:, nq:]
+            return np.asarray(a), np.where(held, push, 0.0)
         a = (held_inverse(mass, held) @ force[..., None])[..., 0]
         return a, np.where(held, force - (mass @ a[..., None])[..., 0], 0.0)
 
-    def _moved(self, pushed: Pushed, x: Array, h: Array, u: Array, turn: Array, held: Mask) -> Array:
+    def _moved(self, pushed: Pushed, numbers: Numbers, x: Array, h: Array, u: Array, turn: Array, held: Mask) -> Array:
         """The states (N, nx) after h (N,)."""
 
         def accelerate(q: Array, v: Array, u: Array) -> Array:
-            return self._pushes(pushed, np.concatenate([q, v], axis=1), u, turn, held)[0]
+            return self._pushes(pushed, numbers, np.concatenate([q, v], axis=1), u, turn, held)[0]
 
         x = x.copy()
-        x[:, self.model.nq :][held] = 0.0
+        if not self.gives:
+            x[:, self.model.nq :][held] = 0.0
         stages, weights = self.method
         slopes = np.empty((len(weights), *x.shape))
         for i, row in enumerate(stages):
@@ -165,11 +185,14 @@ class DryMotion(ContinuousMotion):
         self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, turn: Array, held: Mask
     ) -> tuple[Array, Indices]:
         """(by how much joints slide or are held as they should at x (N,), negative beyond; which is the least (N,))."""
-        room = np.where(turn != 0, turn * x[:, self.model.nq :], np.inf)
+        room, size = np.where(turn != 0, turn * x[:, self.model.nq :], np.inf), np.maximum(numbers.coulomb, 1e-300)
         some = np.flatnonzero(np.any(held, axis=1))
-        if len(some):
-            _, push = self._pushes(pushed, x[some], u[some], turn[some], held[some])
-            size = np.maximum(numbers.coulomb, 1e-300)
+        if self.gives:
+            every = np.broadcast_to(self.own, held.shape)
+            _, push = self._pushes(pushed, numbers, x, u, np.zeros_like(turn), every)
+            room = np.where(every, np.where(held, 1 - np.abs(push) / size, turn * push / size - 1), np.inf)
+        elif len(some):
+            _, push = self._pushes(pushed, numbers, x[some], u[some], turn[some], held[some])
             room[some] = np.where(held[some], 1 - np.abs(push) / size, room[some])
         which = np.argmin(room, axis=1)
         return room[np.arange(len(x)), which], which
@@ -191,7 +214,7 @@ class DryMotion(ContinuousMotion):
         side = np.zeros(len(x))  # the end that moved last
         for k in range(SEARCHED):
             t = low + (high - low) * np.where(at_low > 0, at_low / np.maximum(at_low - at_high, 1e-300), 0.5)
-            ends = self._moved(pushed, x, t, u, turn, held)
+            ends = self._moved(pushed, numbers, x, t, u, turn, held)
             room, which = self._within(pushed, numbers, ends, u, turn, held)
             if k == SEARCHED - 1 or np.all(np.abs(room) < MET):
                 break
@@ -207,16 +230,16 @@ class DryMotion(ContinuousMotion):
         found = np.tile(np.eye(nx), (len(part.rows), 1, 1))
         some = np.flatnonzero(np.any(part.held, axis=1))
         x, u = part.x, part.u
-        if len(some):
+        if len(some) and not self.gives:
             mass, _ = pushed(x[some, :nq], x[some, nq:], u[some], part.turn[some])
             found[some, nq:, nq:] = held_inverse(mass, part.held[some]) @ mass
         back = (part.before != 0) & (part.turn == -part.before)
         for k in np.flatnonzero(np.any(back, axis=1)):
             j, own = int(np.argmax(back[k])), slice(k, k + 1)
             turn = part.turn[own].copy()
-            after, _ = self._pushes(pushed, x[own], u[own], turn, part.held[own])
+            after, _ = self._pushes(pushed, numbers, x[own], u[own], turn, part.held[own])
             turn[0, j] = part.before[k, j]
-            begun, _ = self._pushes(pushed, x[own], u[own], turn, part.held[own])
+            begun, _ = self._pushes(pushed, numbers, x[own], u[own], turn, part.held[own])
             if begun[0, j] != 0:
                 found[k, nq:, nq + j] += (after - begun)[0] / begun[0, j]
         return found
@@ -225,10 +248,11 @@ class DryMotion(ContinuousMotion):
         """(n, nx, nx + np) the end of a part by its start and by z."""
         grip = part.turn, part.held
         x = part.x.copy()
-        x[:, self.model.nq :][part.held] = 0.0
+        if not self.gives:
+            x[:, self.model.nq :][part.held] = 0.0
         if not self.calm:
             return self._step_slopes(numbers, by, x, part.h, part.u, grip)
-        halfway = self._moved(pushed, x, part.h / 2, part.u, *grip)
+        halfway = self._moved(pushed, numbers, x, part.h / 2, part.u, *grip)
         _, J, C = self._rate_slopes(numbers, by, halfway, part.u, grip)
         h = part.h[:, None, None]
         whole, phi = exponential(h * J)

@@ -12,6 +12,7 @@ chi^2 of as many numbers as the change has; the limit is its quantile at FALSE_N
 tried, and no less than the penalty of BIC. Of changes that are named, the one with the least BIC is the smallest.
 """
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -39,7 +40,16 @@ from drake_diff.identification.judge import freedom_of, intervals_of, known_of, 
 from drake_diff.identification.measured import Piece, given_noise, noise_by_differences, read_pieces
 from drake_diff.identification.screen import DELAY, LEVELS, LIMIT, Inputs, Promise, View, changes_of_inputs, view
 from drake_diff.identification.tree import Tree, tree_for_identification
-from drake_diff.identification.unknowns import BIAS, COULOMB, Unknown, Unknowns, choose_unknowns, possible_changes
+from drake_diff.identification.unknowns import (
+    BIAS,
+    COULOMB,
+    HELD_DAMPING,
+    HELD_INERTIA,
+    Unknown,
+    Unknowns,
+    choose_unknowns,
+    possible_changes,
+)
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 
@@ -50,6 +60,9 @@ FALLS = 0.7  # what does not fall to this part of what was left before is out of
 BESIDE, LOOKED_AT_BESIDE = 3, 4  # changes beside which a second one is sought, and how many of these go on
 PARTS = (1, 2, 4, 5, 10, 20)  # of a sample: Euler steps that are tried
 TIME_STEP = "time_step"
+HELD_BY, CAUGHT = 10.0, 100.0  # times its own inertia; [1/s]: friction that gives way, where its search begins
+MOST_OF_IT = 0.999  # of the squares that the model leaves: a change that takes them away is told though more is left
+LONGEST_SEARCH = 45.0  # [s] of processor time, after which no further change is tried
 STEPS, ROUNDS = 8, 4  # of Gauss and Newton, and of estimating the noise
 SETTLING, SETTLES = 8, 0.8  # steps by which segments settle, and the part of what was left that each must leave at most
 CALM = 3e-3  # of a small motion over a segment: by how much derivatives frozen halfway may miss it
@@ -182,6 +195,10 @@ class _Search:
     stated: Array
     evidence: dict[str, float] = field(default_factory=dict)
     nearest: _Tried | None = None
+    alone: _Tried | None = None  # the change that left least by itself
+    share: float = 0.0  # of the squares, that it takes away
+    begun: float = field(default_factory=time.process_time)
+    ended_early: bool = False
     calm: bool = False  # whether steps frozen halfway have the derivatives of the motion
     step: float | None = None  # [s] of the Euler steps that stand for the motion; None for continuous time
 
@@ -228,7 +245,8 @@ class _Search:
             return law
         at = {link.joint.joint: link.joint.v_start for link in self.tree.links}
         own = self.model, self.tree, self.chart, unknowns, self.longest
-        return DryMotion(*own, joints=tuple(at[joint] for joint in dry), calm=self.calm)
+        gives = any(one.quantity == HELD_INERTIA for one in unknowns.each)
+        return DryMotion(*own, joints=tuple(at[joint] for joint in dry), gives=gives, calm=self.calm)
 
     @staticmethod
     def each_of(unknowns: Unknowns) -> list[tuple[Unknown, slice]]:
@@ -246,9 +264,11 @@ class _Search:
     def found(self) -> Explanation:
         self.prepare()
         found, base, alone, runners = self.by_one()
-        if found is None and not base.explains and self.may_be_steps(runners):
-            found = self.by_steps(base)
         if found is None and not base.explains:
+            found = self.by_friction_that_gives(runners, base)
+        if found is None and not base.explains and not self.is_late and self.may_be_steps(runners):
+            found = self.by_steps(base)
+        if found is None and not base.explains and not self.is_late:
             found = self.by_two(alone, runners, base)
         return found or (self.right() if base.explains else self.unexplained(base))
 
@@ -321,7 +341,54 @@ class _Search:
         singles, runners = self.tried(alone, [(i,) for i in range(count)], base)
         named = self.enough(base, singles, count)
         self.nearest = min([self.nearest or base, base, *singles], key=self.bic)
+        best = min(singles, key=self.bic, default=None)
+        if self.step is None and best is not None:
+            left = next(one.left for one in runners if one.names == best.names)
+            self.alone, self.share = best, 1 - left / alone.most
         return self.said(named) if named else None, base, alone, runners
+
+    @property
+    def is_late(self) -> bool:
+        """Whether no further change is tried."""
+        self.ended_early = self.ended_early or time.process_time() - self.begun > LONGEST_SEARCH
+        return self.ended_early
+
+    def by_friction_that_gives(self, runners: Sequence[_Runner], base: _Tried) -> Explanation | None:
+        """Where dry friction of a joint left least, and not noise: the same, which gives way where it holds."""
+        if not runners or self.is_late or self.tree.dynamics.coupling is not None:
+            return None
+        one = runners[0]
+        if len(one.names) > 1 or not one.names[0].endswith(f".{COULOMB}"):
+            return None
+        label, nq = one.names[0].rsplit(".", 1)[0], self.model.nq
+        x = one.starts[:1]
+        mass, _ = self.tree.pushed(self.tree.numbers)(x[:, :nq], x[:, nq:], np.zeros((1, self.model.nu)), None)
+        j = next(link.joint.v_start for link in self.tree.links if link.joint.joint == label)
+        inertia = HELD_BY / float(np.linalg.inv(mass)[0, j, j])
+        held = [
+            Unknown(f"{label}.{quantity}", unit, np.array([start]), 0.0, start)
+            for quantity, unit, start in ((HELD_INERTIA, "", inertia), (HELD_DAMPING, "", CAUGHT * inertia))
+        ]
+        unknowns = Unknowns((*self.of(one.names).each, *held), as_in_files=True)
+        z = np.concatenate([one.z, unknowns.z_start[1:]])
+        try:
+            found = self.solved(one.names, unknowns, self.law_of(unknowns), self.cut, one.starts, z)
+        except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
+            return None
+        self.nearest = min([self.nearest or base, found], key=self.bic)
+        named = self.enough(base, [found], len(self.unknowns.each))
+        if not named:
+            return None
+        more, slower = (float(found.values[each.name]) for each in held)
+        own = {name: found.values[name] for name in one.names}, {name: found.intervals[name] for name in one.names}
+        said = self.said([found._replace(values=own[0], intervals=own[1])])
+        way = f"as if by {more:.3g} more of inertia and {slower:.3g} of damping"
+        return self.ended_with(said, f"with friction that gives way where it holds, {way}")
+
+    def ended_with(self, said: Explanation, words: str) -> Explanation:
+        """With these words at the end of its sentence."""
+        before = said.sentence.removesuffix(self.end).removesuffix(".")
+        return replace(said, sentence=f"{before}, {words}.{self.end}")
 
     def by_two(self, alone: View, runners: Sequence[_Runner], base: _Tried) -> Explanation | None:
         count = len(alone.freedoms)
@@ -406,12 +473,11 @@ class _Search:
             within = {} if own else {name: frozen([step, step])}
             return Explanation(more, values, within, (), True, sentence, self.evidence)
         return replace(
-            found,
+            self.ended_with(found, f"by {steps}"),
             names=(*found.names, *more),
             values={**found.values, **({} if own else {name: step})},
             intervals={**found.intervals, **({} if own else {name: frozen([step, step])})},
             alternatives=tuple((*names, *more) for names in found.alternatives),
-            sentence=f"{found.sentence.removesuffix('.')}, by {steps}.",
         )
 
     def paired(self, alone: View, runners: Sequence[_Runner], base: _Tried) -> list[_Tried]:
@@ -420,7 +486,7 @@ class _Search:
         found, _ = self.tried(alone, combinations(range(count), 2), base)
         names = [one.name for one in self.unknowns.each]
         for runner in runners[:BESIDE]:
-            if any(one.explains for one in found):
+            if any(one.explains for one in found) or self.is_late:
                 break
             if runner.special:
                 found += self.beside_inputs(runner, base)
@@ -515,6 +581,8 @@ class _Search:
     def raced(self, runners: list[_Runner], base: _Tried) -> tuple[list[_Tried], list[_Runner]]:
         alive, there = list(runners), []
         for most in RACE:
+            if most < RACE[0] and self.is_late:
+                break
             before = {one.names: one.left for one in alive}
             alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
             there += [one for one in alive if not self.is_hopeless(one.left)]
@@ -525,15 +593,7 @@ class _Search:
                 for one in alive[:most]
                 if self.is_hopeless(one.left) and (most == RACE[0] or one.left < FALLS * before[one.names])
             ]
-        best = np.inf
-        for one in sorted(there, key=lambda one: one.left):
-            for _ in range(STEPS):
-                last = one.left
-                if not one.step() or last - one.left < CLOSE:
-                    break
-                if one.left > FALLS * last and self.is_behind(one.left, best):
-                    break
-            best = min(best, one.left)
+        self.improve(there)
         every = sorted(runners, key=lambda one: one.left)
         alive = there + alive
         price = float(np.log(self.count))
@@ -542,6 +602,7 @@ class _Search:
         for one in alive:
             first = alive[0].left + price * alive[0].freedom
             enough = any(each.explains for each in found) and self.is_behind(one.left + price * one.freedom, first)
+            enough = enough or (bool(found) and self.is_late)
             if enough or self.is_hopeless(one.left) or one.fit.at(one.z, one.starts) is None:
                 continue
             try:
@@ -550,6 +611,18 @@ class _Search:
                 continue
             self.evidence[" and ".join(one.names)] = base.score - found[-1].score
         return found, every
+
+    def improve(self, there: Sequence[_Runner]) -> None:
+        """Steps of those that came near the noise, for as long as these help."""
+        best = np.inf
+        for one in sorted(there, key=lambda one: one.left):
+            for _ in range(STEPS):
+                last = one.left
+                if self.is_late or not one.step() or last - one.left < CLOSE:
+                    break
+                if one.left > FALLS * last and self.is_behind(one.left, best):
+                    break
+            best = min(best, one.left)
 
     def is_behind(self, left: float, best: float) -> bool:
         """Whether a change that leaves so much is told from the one that leaves least."""
@@ -723,7 +796,7 @@ class _Search:
             intervals={name: value for one in reversed(named) for name, value in one.intervals.items()},
             alternatives=tuple(one.names for one in named[1:]),
             explained=True,
-            sentence=f"{', or '.join(texts)}{tail}.",
+            sentence=f"{', or '.join(texts)}{tail}.{self.end}",
             evidence=self.evidence,
         )
 
@@ -746,13 +819,25 @@ class _Search:
             for column, v, (low, high), was in zip(columns, value, interval, start, strict=True)
         )
 
+    @property
+    def end(self) -> str:
+        return f" The search was ended after {LONGEST_SEARCH:.3g} s of processor time." if self.ended_early else ""
+
     def right(self) -> Explanation:
         return Explanation((), {}, {}, (), True, "Nothing: the model explains it.", self.evidence)
 
     def unexplained(self, base: _Tried) -> Explanation:
         nearest = self.nearest or base
+        if self.alone is not None and self.share > MOST_OF_IT:
+            one, share = self.alone, 100 * (1 - float(f"{1 - self.share:.1g}"))
+            most = " and ".join(self.words(one, name) for name in one.names)
+            tail = f"{one.doubt}, and no second change that was tried explains that"
+            sentence = f"Not explained, but {share:.10g} % of the squares: {most}; {tail}.{self.end}"
+            return Explanation((), {}, {}, (), False, sentence, self.evidence)
         near = f"with {' and '.join(nearest.names)}" if nearest.names else "as the model is"
-        sentence = f"Not explained: no change of one or two quantities explains the recording; {near}, {nearest.doubt}."
+        tried = "no change that was tried" if self.ended_early else "no change of one or two quantities"
+        sentence = f"Not explained: {tried} explains the recording;"
+        sentence = f"{sentence} {near}, {nearest.doubt}.{self.end}"
         return Explanation((), {}, {}, (), False, sentence, self.evidence)
 
 

@@ -48,6 +48,8 @@ class Numbers:
     stiffness: Any  # (n,)
     rest: Any  # (n,)
     coulomb: Any  # (n,) dry friction [N or N m]
+    held_inertia: Any  # (n,) by which dry friction holds a joint, beside a damping; 0 where it holds it still
+    held_damping: Any  # (n,)
     strength: Any  # (nu,) what an input is multiplied by
 
     @property
@@ -188,20 +190,24 @@ class Tree:
         which of them it holds (N, nv)).
         """
         q, v = self._all(q, v)
-        turn = None if grip is None else grip[0]
+        turn, held = (None, np.zeros(v.shape, dtype=bool)) if grip is None else grip
         moving, force, mass = self._moved(numbers, q, v, u, turn)
         diagonal = np.arange(v.shape[1])
-        inverse = np.asarray(np.linalg.inv(self._own(mass))) if grip is None else held_inverse(mass, grip[1])
+        if grip is None:
+            inverse = np.asarray(np.linalg.inv(self._own(mass)))
+        else:
+            mass, force = caught(numbers, mass, force, v, held)
+            inverse = held_inverse(mass, held & (numbers.held_inertia == 0))
         bias = moving.forces(np.zeros_like(v))[0]
         own = (inverse @ self._along(force - bias)[..., None])[..., 0]
         a = self._all(q, own)[1]
         _, by_q, by_v = moving.derivatives(a)
         by_q[:, diagonal, diagonal] += numbers.stiffness
-        by_v[:, diagonal, diagonal] += numbers.damping
+        by_v[:, diagonal, diagonal] += numbers.damping + numbers.held_damping * held
         if turn is None:
             by_v[:, diagonal, diagonal] += numbers.coulomb / self.slip / np.cosh(np.clip(v / self.slip, -300, 300)) ** 2
             turn = np.tanh(v / self.slip)
-        change = self._by_numbers(numbers, moving, q, v, u, a, by, turn)
+        change = self._by_numbers(numbers, moving, q, v, u, a, by, turn, held)
         by_u = inverse @ self._along_columns(self.actuation * numbers.strength * self._passes(u)[:, None, :])
         by_q, by_v = self._own(by_q), self._own(by_v)
         return Slopes(own, -inverse @ by_q, -inverse @ by_v, by_u, -inverse @ self._along_columns(change))
@@ -302,7 +308,16 @@ class Tree:
         return of_each
 
     def _by_numbers(
-        self, numbers: Numbers, moving: Moving, q: Array, v: Array, u: Array, a: Array, by: Array, turn: Array
+        self,
+        numbers: Numbers,
+        moving: Moving,
+        q: Array,
+        v: Array,
+        u: Array,
+        a: Array,
+        by: Array,
+        turn: Array,
+        held: Mask,
     ) -> Array:
         """(N, n, np) of inverse dynamics less the other forces, at fixed a."""
         found = np.zeros((*v.shape, by.shape[1]))
@@ -325,6 +340,8 @@ class Tree:
             ("stiffness", stretched),
             ("rest", np.broadcast_to(-numbers.stiffness, v.shape)),
             ("coulomb", turn),
+            ("held_inertia", a * held),
+            ("held_damping", v * held),
         ):
             rows = by[numbers.places(name)]
             if np.any(rows):
@@ -409,6 +426,8 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         stiffness=np.array(dynamics.stiffness),
         rest=np.array(dynamics.rest),
         coulomb=np.zeros(n),
+        held_inertia=np.zeros(n),
+        held_damping=np.zeros(n),
         strength=np.ones(model.nu),
     )
     limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in actuators(model.plant)])
@@ -418,6 +437,12 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
     moves = {body: _moved_by(pose) for body, (_, pose) in placed.items()}
     actuation = model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T).T
     return Tree(links, own, first, np.asarray(actuation), np.asarray(limits), placed, moves, bodies, numbers)
+
+
+def caught(numbers: Numbers, mass: Array, force: Array, v: Array, held: Mask) -> tuple[Array, Array]:
+    """M (N, n, n) and M a (N, n) with what dry friction that gives way does to joints that it holds (N, n)."""
+    own = np.where(held, numbers.held_inertia, 0.0)
+    return mass + own[:, :, None] * np.eye(len(numbers.coulomb)), force - np.where(held, numbers.held_damping * v, 0.0)
 
 
 def held_inverse(mass: Array, held: Mask) -> Array:

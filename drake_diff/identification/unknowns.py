@@ -29,7 +29,18 @@ from drake_diff.model.plant import actuators, bodies, joints, labelled
 
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
+HELD_INERTIA, HELD_DAMPING = "held_inertia", "held_damping"  # by which dry friction that gives way holds a joint
+LOGARITHMS = (MASS, HELD_INERTIA, HELD_DAMPING)
 DELAY = "input_delay"  # [s] of all inputs
+OF_JOINTS = {  # one number of a joint, as `tree.Numbers` calls it
+    "damping": "damping",
+    COULOMB: "coulomb",
+    HELD_INERTIA: "held_inertia",
+    HELD_DAMPING: "held_damping",
+    "spring_stiffness": "stiffness",
+    "spring_rest_angle": "rest",
+    "spring_rest_length": "rest",
+}
 OF_TREE = (
     MASS, CENTER, INERTIA, "damping", "offset", "spring_stiffness", "spring_rest_angle", "spring_rest_length",
     "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH,
@@ -100,7 +111,7 @@ class Unknowns:
     def z_start(self) -> Array:
         z = self.start.copy()
         for one, s in zip(self.each, self.slices, strict=True):
-            if one.quantity == MASS:
+            if one.quantity in LOGARITHMS:
                 z[s] = np.log(one.start)
             elif one.quantity == INERTIA:
                 z[s] = to_log_cholesky(one.start)
@@ -112,7 +123,7 @@ class Unknowns:
         """(np,) in z, how far the data may move it before they must say more than the file; infinite without a size."""
         widths = np.empty(len(self.start))
         for one, s in zip(self.each, self.slices, strict=True):
-            relative = one.quantity in (MASS, INERTIA)
+            relative = one.quantity in (*LOGARITHMS, INERTIA)
             widths[s] = 1.0 if relative else one.size or np.inf
         return FAR * widths
 
@@ -139,7 +150,7 @@ class Unknowns:
         """Lower and upper z (np,)."""
         lower, upper = np.full(len(self.start), -np.inf), np.full(len(self.start), np.inf)
         for one, s in zip(self.each, self.slices, strict=True):
-            if one.quantity == MASS:
+            if one.quantity in LOGARITHMS:
                 lower[s] = np.log(one.lower) if one.lower > 0 else -np.inf
                 upper[s] = np.log(one.upper)
             elif one.quantity != INERTIA:
@@ -160,7 +171,7 @@ class Unknowns:
         """(np,) of z (np,), complex or float."""
         values = np.array(z)
         for one, s in zip(self.each, self.slices, strict=True):
-            if one.quantity == MASS:
+            if one.quantity in LOGARITHMS:
                 values[s] = np.exp(z[s])
             elif one.quantity == INERTIA:
                 own = np.array(z[s])
@@ -364,12 +375,8 @@ def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Nu
     at = {link.joint.joint: i for i, link in enumerate(tree.links)}
     for name, value in given.items():
         label, quantity = name.rsplit(".", 1)
-        if quantity in ("damping", COULOMB):
-            own["damping" if quantity == "damping" else "coulomb"][by_joint[label].v_start] = value
-        elif quantity == "spring_stiffness":
-            own["stiffness"][by_joint[label].v_start] = value
-        elif quantity in ("spring_rest_angle", "spring_rest_length"):
-            own["rest"][by_joint[label].v_start] = value
+        if quantity in OF_JOINTS:
+            own[OF_JOINTS[quantity]][by_joint[label].v_start] = value
         elif quantity == "offset":
             pose = tree.placed[by_joint[label].parent][1]
             own["offset"][at[label]] = pose.rotation().matrix() @ value + pose.translation()
