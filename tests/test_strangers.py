@@ -24,7 +24,7 @@ from drake_diff._base.confined import memory_at_most
 from drake_diff._base.strangers import arrays_of, files_in, read_plain
 from drake_diff.artifact import list_runs
 from drake_diff.exceptions import ArtifactError
-from drake_diff.logs.mcap_file import recover_mcap
+from drake_diff.logs.mcap_file import read_mcap, recover_mcap
 
 RUN = ROOT / "artifacts" / "pendulum_swing_up"
 MIB = 2**20
@@ -81,6 +81,14 @@ def test_a_run_whose_files_are_too_much_to_read_is_broken(tmp_path, monkeypatch)
     found = dd.verify(folder)
     assert found.verdict == "broken"
     assert "and the files before it have more than" in found.sentence
+
+
+def test_a_log_of_more_messages_than_there_is_memory_for_is_refused_before_it_is_used_up(tmp_path, monkeypatch):
+    """Protobuf's C ends the process where it gets no memory: by SIGSEGV, of 4.9 million messages and 4 GiB."""
+    monkeypatch.setattr("drake_diff._base.confined.NEARLY", 1e-9)
+    with memory_at_most(2**40), pytest.raises(MemoryError):
+        read_mcap(RUN / "trace.mcap")
+    assert read_mcap(RUN / "trace.mcap").messages
 
 
 def test_a_device_is_not_opened():

@@ -26,6 +26,8 @@ EXECUTE, WRITE_FILE, READ_FILE, READ_DIR, REFER, TRUNCATE, IOCTL = 1, 1 << 1, 1 
 ALL_OF_1 = (1 << 13) - 1  # what the first version of Landlock knows, to run a file among it
 CONNECT = 2  # by TCP, since version 4; a page is drawn by a server that binds a port
 SIGNALS_AND_SOCKETS = 3  # to processes outside, since version 6
+USED = "/proc/self/statm"  # in pages; the sixth number is that of data and stack
+NEARLY = 0.9  # of the memory that a process may have
 LARGEST_FILE = 2**30  # bytes that are written into one
 LOADERS = "/lib*/ld-*", "/lib/*/ld-*"  # what starts a program
 SYSTEM = (
@@ -62,6 +64,22 @@ def memory_at_most(bytes_: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def check_memory() -> None:
+    """MemoryError where this process has used nearly all that it may have: libraries in C end it where they get none.
+
+    One that is confined cannot look; who started it tells of its end.
+    """
+    most, _ = resource.getrlimit(resource.RLIMIT_DATA)
+    if most == resource.RLIM_INFINITY:
+        return
+    try:
+        pages = int(Path(USED).read_text().split()[5])
+    except OSError:
+        return
+    if pages * resource.getpagesize() > NEARLY * most:
+        raise MemoryError
 
 
 def confine(readable: Iterable[Path], own: Path) -> list[str]:

@@ -26,6 +26,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from drake_diff._base.confined import check_memory
 from drake_diff._base.files import whole_file
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.strangers import GIB, MIB, read_plain
@@ -37,6 +38,7 @@ RECOVERED = "recovered"  # the name of the metadata record that a recovered file
 MOST_UNPACKED = GIB  # of all chunks of a file
 PACKED_AT_MOST, PACKED_APART = 100, 16 * MIB  # what unpacks to more times its size, and this, is a bomb: ours 20 times
 MOST_MESSAGES = 5_000_000
+BETWEEN_LOOKS = 10_000  # messages: at memory that is nearly used up, where protobuf ends the process
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, CRC of the summary
 DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of all before it
@@ -164,6 +166,8 @@ def read_mcap(path: str | Path, *, links: bool = True) -> McapLog:
     try:
         _check_crcs(data)
         _collect(data, log)
+    except MemoryError:
+        raise
     except Exception as error:  # a damaged file makes the reader fail in many ways; none of them is ours
         raise ArtifactError(f"{path} is no whole MCAP file of this project: {type(error).__name__}: {error}") from error
     return log
@@ -290,6 +294,8 @@ def _collect(data: bytes, log: McapLog) -> None:
     for count, (_, channel, message, decoded) in enumerate(reader().iter_decoded_messages()):
         if count >= MOST_MESSAGES:
             raise ValueError(f"it holds more than {MOST_MESSAGES} messages")
+        if count % BETWEEN_LOOKS == 0:
+            check_memory()
         log.messages[channel.topic].append((message.log_time, decoded))
     log.metadata.update({record.name: dict(record.metadata) for record in reader().iter_metadata()})
     log.attachments.update({a.name: bytes(a.data) for a in reader().iter_attachments()})
