@@ -38,11 +38,19 @@ from drake_diff.artifact.save import begin, keep_plan
 from drake_diff.cli import main as cli
 from drake_diff.exceptions import ArtifactError, InputError, ModelError, WriteError
 from drake_diff.logs.mcap_file import read_mcap
+from drake_diff.optimize import phased
+from drake_diff.optimize import run as optimize_run
 from drake_diff.optimize.solve import _best_of
+from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.record.directory import RECORDS, writing, written_whole
 from drake_diff.record.read import KINDS
 
 OLD, NEW = 0.2, 0.3  # the goals of the two runs
+SEARCHES = {
+    "collocation": (Transcription, "solve"),
+    "in phases": (phased._PhasedRun, "_solve_on"),
+    "shooting": (optimize_run, "solve_shooting"),
+}
 BUILT = {
     "collocation": "optimize.run.Transcription",
     "in phases": "optimize.phased.Transcription",
@@ -340,6 +348,25 @@ def test_a_signal_before_the_search_leaves_the_guess_as_a_plan(solutions, tmp_pa
     if early == "as the record is begun":
         quick_pages(monkeypatch)
         assert "the run was interrupted" in dd.save(solution, tmp_path / "run").sentence
+
+
+@each_row("method", ["collocation", "shooting", "in phases"])
+def test_a_signal_as_a_search_ends_is_not_lost(solutions, monkeypatch, method):
+    """It would be noted by what looks at it no more, and the run would go on as if nobody had pressed Ctrl-C."""
+    owner, name = SEARCHES[method]
+    real = getattr(owner, name)
+
+    def search(*given, **options):
+        found = real(*given, **options)
+        signal.raise_signal(signal.SIGINT)
+        return found
+
+    monkeypatch.setattr(owner, name, search)
+    problem = solutions[1].problem
+    problem = dd.optimize.PhasedProblem([problem, problem]) if method == "in phases" else problem
+    found = dd.solve(problem, method="collocation" if method == "in phases" else method)
+    assert found.status is dd.Status.INTERRUPTED
+    assert "then interrupted" in found.message
 
 
 def test_where_a_signal_ends_what_is_tried_after_the_best_plan_its_message_says_so(solutions):

@@ -26,7 +26,7 @@ from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, status_o
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.rigid import RigidReset
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report, heard
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Search, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
@@ -417,6 +417,7 @@ class _PhasedRun:
                 us_end = guess.us[-1:] if guess.u_final is None else guess.u_final[None]
                 begun.append(t.nodes_at(t.mesh, guess.motion or (guess.xs, np.vstack([guess.us, us_end]))))
             result, motions, told = self._solve_on(meshes, begun, horizons, most)
+            result = heard(result, interrupted)
         solution = self._judged(result, motions, told)
         rounds = [[len(motion.mesh) - 1 for motion in motions]]
         while len(rounds) <= FINER_ROUNDS and self.asked["refine"] is not False:

@@ -163,6 +163,13 @@ class NlpResult:
     multipliers: Multipliers | None = None  # where the solver has them
 
 
+def heard(result: NlpResult, interrupted: threading.Event) -> NlpResult:
+    """A result that says that it was interrupted where a signal came when the search had just ended, too."""
+    if not interrupted.is_set() or result.outcome is Outcome.INTERRUPTED:
+        return result
+    return replace(result, outcome=Outcome.INTERRUPTED, message=f"{result.message}; then interrupted")
+
+
 class Watch:
     """What is kept of a solve while it runs: the best iterate, and whether a signal or the clock ends it."""
 

@@ -28,7 +28,7 @@ from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused,
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
+from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report, heard
 from drake_diff.optimize.reach import out_of_reach, why_blind
 from drake_diff.optimize.shooting import ShootingVariables, roll_segments, solve_shooting
 from drake_diff.optimize.slope import HOLDS, doubt_of_the_slope
@@ -158,6 +158,7 @@ class Run:
                 far=guess.line,
                 **self._known(transcription, guess, finer=refine is not False),
             )
+            motion = motion.told(result=heard(motion.result, interrupted))
         if refine:
             self.options["refinements"] = [list(each) for each in motion.refinements]
         if motion.cleared:
@@ -354,6 +355,7 @@ class Run:
             self._reach(2, self._draft(xs, us, certificates=before, multipliers=result.multipliers), result)
             variables = ShootingVariables(self.problem, around=xs if segmented else None)
             z = variables.pack(xs[0], us, result.parameters)
+            result = heard(result, interrupted)
             if self.method == "shooting" and len(result.z) == variables.size:
                 z = np.clip(result.z, *variables.limits())  # which solvers keep within their tolerance
             if self.report is not None and self.report.plan is not None:  # else it need not be rolled out

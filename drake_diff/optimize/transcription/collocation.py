@@ -453,6 +453,8 @@ class Transcription:
         first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
         begun = self.nodes_at(mesh, guess)
         motion = self.solve_on(mesh, begun, first, limits, report, parameters, multipliers, far=far)
+        if motion.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):  # there is no time to measure it
+            return motion
         tolerance, most = (np.inf, MOST_INTERVALS) if refinement is None else (refinement.tolerance, refinement.most)
         rounds, near = [(len(mesh) - 1, motion.largest_error)], [_nearer(motion)]
         while motion.result.outcome in FOUND:
