@@ -256,6 +256,11 @@ def test_of_an_arm_that_another_engine_moved_a_right_model_is_silent_and_an_erro
     assert identify_causes.measure("ur5_robot", (), 41)["verdict"] == "right"
     assert identify_causes.measure("ur5_robot", ("damping",), 42)["verdict"] == "named"
     assert identify_causes.measure("panda", ("mass",), 105)["verdict"] == "named"  # torques jump between their limits
+    two = identify_causes.measure("double_pendulum_simple", ("damping", "input_delay"), 230017)
+    assert two["verdict"] == "named", two
+    gives = identify_causes.measure("double_pendulum_simple", ("coulomb_friction",), 210037, soft=True)
+    assert gives["verdict"] == "named", gives
+    assert "gives way" in gives["said"]
 
 
 @pytest.mark.parametrize(("step", "names"), [(0.005, ()), (0.0025, ("model.time_step",))])

@@ -73,6 +73,7 @@ MOTIONS = ("auto", "continuous")
 CLOSE = 1.0  # of the squares: what a step may still gain where two changes are told apart
 TOLD_APART = 40.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
 LONGEST_DELAY = 0.1  # [s]
+DELAYS = (0.25, 0.75, 1.5, 3, 5.5, 8)  # of a sample, from which other changes are looked for beside a delay
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,7 +404,7 @@ class _Search:
         """Each change of some pairs alone, from where the pair was: the other one may do nothing."""
         found: dict[str, _Tried] = {}
         for pair in pairs:
-            unknowns = self.of(pair.names)
+            unknowns = self.of([name for name in pair.names if not self.is_of_inputs(name)])
             for one, s in self.each_of(unknowns) if len(unknowns.each) == 2 else []:
                 if one.name not in found:
                     alone = self.of([one.name])
@@ -483,11 +484,16 @@ class _Search:
     def paired(self, alone: View, runners: Sequence[_Runner], base: _Tried) -> list[_Tried]:
         """Pairs that promise most at the model, or beside a change that left least."""
         count = len(alone.freedoms)
-        found, _ = self.tried(alone, combinations(range(count), 2), base)
         names = [one.name for one in self.unknowns.each]
+        own = [i for i, name in enumerate(names) if not self.is_of_inputs(self.plain(name))]
+        found, _ = self.tried(alone, combinations(own, 2), base)
+        if not any(one.explains for one in found) and not self.is_late:
+            found += self.beside_a_delay(base)
         for runner in runners[:BESIDE]:
             if any(one.explains for one in found) or self.is_late:
                 break
+            if f"model.{DELAY}" in runner.special:
+                continue
             if runner.special:
                 found += self.beside_inputs(runner, base)
                 continue
@@ -501,8 +507,35 @@ class _Search:
                 found += more
         return found
 
+    def beside_a_delay(self, base: _Tried) -> list[_Tried]:
+        """A change beside a delay: what each promises together with some more delay, from several delays."""
+        special, each = f"model.{DELAY}", [one.name for one in self.unknowns.each]
+        if special not in each:
+            return []
+        last, price, nothing = each.index(special), float(np.log(self.count)), self.of(())
+        others = [i for i, name in enumerate(each) if not self.is_of_inputs(self.plain(name))]
+        best: dict[str, tuple[float, float, Promise]] = {}
+        period = float(np.median(np.diff(self.pieces[0].times)))
+        for delay in period * np.array(DELAYS):
+            if delay > LONGEST_DELAY or (best and self.is_late):
+                break
+            pieces = [self.acted(piece, special, float(delay)) for piece in self.cut]
+            one = self.running((), nothing, pieces, None, nothing.z_start, Promise((), np.inf, 0.0, np.zeros(0)))
+            seen = self.view(pieces, self.unknowns.z_start, one.starts)
+            for promise in [] if seen is None else seen.promises([(i, last) for i in others], price)[:LOOKED_AT]:
+                name, cost = each[promise.members[0]], promise.left + price * promise.freedom
+                if name not in best or cost < best[name][0]:
+                    best[name] = cost, min(float(delay + promise.step[-1]), LONGEST_DELAY), promise
+        runners: list[_Runner] = []
+        for name in sorted(best, key=lambda name: best[name][0])[:LOOKED_AT_BESIDE]:
+            if runners and self.is_late:
+                break
+            _, near, promise = best[name]
+            runners.append(self.searched(special, (name, special), self.of([name]), promise, near))
+        return self.raced(runners, base)[0]
+
     def beside_inputs(self, runner: _Runner, base: _Tried) -> list[_Tried]:
-        """A change beside a delay or limit that is about what it is alone."""
+        """A change beside a limit that is about what it is alone."""
         ((special, value),) = runner.special.items()
         pieces = runner.fit.segments.pieces
         seen = self.view(pieces, self.unknowns.z_start, runner.starts)
@@ -510,8 +543,10 @@ class _Search:
             return []
         each = [one.name for one in self.unknowns.each]
         others = [(i,) for i, name in enumerate(each) if not self.is_of_inputs(self.plain(name))]
-        runners = []
+        runners: list[_Runner] = []
         for promise in seen.promises(others, float(np.log(self.count)))[:LOOKED_AT_BESIDE]:
+            if runners and self.is_late:
+                break
             name = each[promise.members[0]]
             runners.append(self.searched(special, (name, special), self.of([name]), promise, value))
         return self.raced(runners, base)[0]
@@ -544,7 +579,11 @@ class _Search:
         if any(one.explains for one in found):  # a search for a delay or a limit takes longer than the others together
             first = min(promise.left for promise in chosen.values())
             chosen = {own: promise for own, promise in chosen.items() if not self.is_behind(promise.left, first)}
-        others = [self.runner(seen, promise, own) for own, promise in chosen.items() if own not in plain]
+        others: list[_Runner] = []
+        for own, promise in chosen.items():
+            if own in plain or (others and self.is_late):
+                continue
+            others.append(self.runner(seen, promise, own))
         more, rest = self.raced(others, base)
         return [*found, *more], sorted([*every, *rest], key=lambda one: one.left)
 
