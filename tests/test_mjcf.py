@@ -162,6 +162,14 @@ def test_a_spring_pulls_to_its_rest_in_the_step(tmp_path):
     assert "attribute 'stiffness' found in a 'joint' tag is" in str(load(write(tmp_path, ball)).notes)
 
 
+@each_row("spring", ['stiffness="nan"', 'stiffness="-1"', 'stiffness="inf"', 'stiffness="8" springref="nan"'])
+def test_a_spring_of_no_number_is_refused(tmp_path, spring):
+    """Drake ends the process on these."""
+    body = f'<body><joint name="j" type="slide" axis="1 0 0" {spring}/><geom size="0.1" mass="2"/></body>'
+    with pytest.raises(ModelError, match="j: expected a spring of finite stiffness"):
+        load(write(tmp_path, body))
+
+
 def test_what_is_included_is_read_and_other_lines_keep_their_numbers(tmp_path):
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "arm.xml").write_text(

@@ -278,6 +278,10 @@ def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
         if says is None or says.spring is None or not can_be_driven(joint):
             continue
         stiffness, rest = says.spring
+        if not (np.isfinite(rest) and 0 <= stiffness < np.inf):  # Drake ends the process on others
+            raise ModelError(
+                f"{name}: expected a spring of finite stiffness, 0 or more, got {stiffness:g} about {rest:g}"
+            )
         spring = RevoluteSpring if isinstance(joint, RevoluteJoint) else PrismaticSpring
         plant.AddForceElement(spring(joint, rest, stiffness))
         told.append(f"{name} ({stiffness:g} about {rest:g})")

@@ -371,6 +371,7 @@ class _Task:
             given_too = "with parameters or a horizon"
             raise InputError("continuation", got=given_too, expected="none of them: leave the continuation out")
         stages = () if attempt.continuation is None else check_schedule(problem, attempt.continuation)
+        searched = kept_apart(problem) if attempt.apart else None
         left = self.limits.time_limit - (time.monotonic() - self.start)
         most = min(attempt.max_iterations or self.limits.max_iterations, self.limits.max_iterations)
         limits = dataclasses.replace(self.limits, time_limit=max(left, 0.0), max_iterations=most)
@@ -384,7 +385,6 @@ class _Task:
             "initial_guess": "default" if given is None else "given",
             "initial_guess_sha256": sha256(xs.tobytes() + us.tobytes()).hexdigest(),
         }
-        searched = kept_apart(problem) if attempt.apart else None
         solver = attempt.solver or DEFAULT_SOLVERS[method]
         run = Run(problem, method, scheme, solver, limits, options, self.report, searched)
 
