@@ -7,6 +7,7 @@ The plan is in continuous time. On the plant it holds under feedback, better in 
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ import drake_diff as dd
 MODEL = Path(__file__).parent.parent / "models" / "acrobot.xml"
 HORIZON, NUM_STEPS, STRONGEST = 4.0, 200, 20.0  # [s], steps, [N m]
 UPRIGHT = np.array([np.pi, 0, 0, 0])
-solve_options = {"method": "collocation"}
+solve_options: dict[str, Any] = {"method": "collocation"}
 
 
 def problem() -> dd.Problem:

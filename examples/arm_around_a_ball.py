@@ -4,6 +4,7 @@ drake-diff run examples/arm_around_a_ball.py       writes artifacts/arm_around_a
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def problem() -> dd.Problem:
 
 def main() -> None:
     solution = dd.solve(problem())
-    (clear,) = solution.problem.kept_goals
+    clear: Any = solution.problem.kept_goals[0]
     print(
         f"{solution.status.value}; at its knots the arm stays {np.min(clear.clearance.values(solution.xs)):.4f} m away"
     )

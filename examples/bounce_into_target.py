@@ -39,6 +39,8 @@ def problem() -> dd.Problem:
 
 def main() -> None:
     solution = dd.solve(problem())
+    if solution.replay is None:
+        raise SystemExit(solution.message)
     contacts = solution.replay.contacts
     touched = [k * TIME_STEP for k, now in enumerate(contacts) if now]
     print(f"{solution.status.value}: {solution.message}")

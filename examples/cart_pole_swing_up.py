@@ -8,6 +8,7 @@ to upright at rest 1 m to the right in 2 s, least integral of the squared force.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ import drake_diff as dd
 
 MODEL = Path(__file__).parent.parent / "models" / "cart_pole.urdf"
 HORIZON = 2.0  # [s]
-solve_options = {"method": "shooting", "solver": "ipopt"}
+solve_options: dict[str, Any] = {"method": "shooting", "solver": "ipopt"}
 
 
 def problem(num_steps: int = 100) -> dd.Problem:
@@ -35,6 +36,8 @@ def main() -> None:
     for num_steps in (50, 100):
         for method in ("collocation", "shooting"):
             solution = dd.solve(problem(num_steps), method=method, solver="ipopt")
+            if solution.replay is None:
+                raise SystemExit(solution.message)
             gap = np.abs(solution.replay.xs[-1] - solution.xs[-1]).max()
             print(
                 f"{method:11s} {num_steps:4d} steps  J = {solution.cost:.4f}  {solution.status.value}  "

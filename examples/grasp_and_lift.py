@@ -8,6 +8,7 @@ with contact at a distance, of a shorter reach in each; the last one is on the t
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,12 @@ def guess() -> tuple[np.ndarray, np.ndarray]:
     return np.hstack([q, np.vstack([0 * q[:1], np.diff(q, axis=0) / TIME_STEP])]), np.tile(EFFORT, (NUM_STEPS, 1))
 
 
-solve_options = {"method": "ilqr", "continuation": "relaxed", "tolerance": 3e-2, "initial_guess": guess()}
+solve_options: dict[str, Any] = {
+    "method": "ilqr",
+    "continuation": "relaxed",
+    "tolerance": 3e-2,
+    "initial_guess": guess(),
+}
 
 
 def problem() -> dd.Problem:
@@ -50,10 +56,9 @@ def main() -> None:
         reach = "" if stage["distance"] is None else f" {1000 * stage['distance']:.1f} mm"
         print(f"  stage {stage['number']}  {stage['kind'] + reach:18s}  {stage['status']}, {stage['iterations']} steps")
     print(f"{solution.status.value}: {solution.message}")
-    ground = [k for k, found in enumerate(solution.replay.contacts) if any("ground" in str(c) for c in found)]
-    print(
-        f"off the ground from {(max(ground) + 1) * TIME_STEP:.2f} s; at the end z = {solution.replay.xs[-1][1]:.4f} m"
-    )
+    motion: Any = solution.replay  # None only of a search without a plan
+    ground = [k for k, found in enumerate(motion.contacts) if any("ground" in str(c) for c in found)]
+    print(f"off the ground from {(max(ground) + 1) * TIME_STEP:.2f} s; at the end z = {motion.xs[-1][1]:.4f} m")
 
 
 if __name__ == "__main__":

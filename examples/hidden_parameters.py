@@ -8,6 +8,7 @@ differences of the double step for what it does not (friction), as the printed s
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +51,7 @@ def problem(
 
 
 def main() -> None:
-    cases = (
+    cases: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
         (
             swinging(),
             {"upper.mass": 1.3, "lower.mass": 0.55, "elbow.offset": [0, 0, -0.72]},

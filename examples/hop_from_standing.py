@@ -8,6 +8,7 @@ with contact at a distance, of a shorter reach in each; the last one is on the t
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ MODEL = Path(__file__).parent.parent / "models" / "hopper.sdf"
 TIME_STEP, NUM_STEPS, WAY, CLEARANCE = 0.01, 100, 0.5, 0.05
 HEIGHT, LEG = 0.5, 0.45 + 12 / 2e4  # [m] the foot is pressed 0.6 mm into the ground, which carries 12 N
 
-solve_options = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 100}
+solve_options: dict[str, Any] = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 100}
 
 
 def problem() -> dd.Problem:
@@ -39,8 +40,9 @@ def main() -> None:
         reach = "" if stage["distance"] is None else f" {1000 * stage['distance']:.1f} mm"
         print(f"  stage {stage['number']}  {stage['kind'] + reach:18s}  {stage['status']}, {stage['iterations']} steps")
     print(f"{solution.status.value}: {solution.message}")
-    flight = [k * TIME_STEP for k, contacts in enumerate(solution.replay.contacts) if not contacts]
-    print(f"in the air from {flight[0]:.2f} s to {flight[-1]:.2f} s; at the end x = {solution.replay.xs[-1][0]:.6f} m")
+    motion: Any = solution.replay  # None only of a search without a plan
+    flight = [k * TIME_STEP for k, contacts in enumerate(motion.contacts) if not contacts]
+    print(f"in the air from {flight[0]:.2f} s to {flight[-1]:.2f} s; at the end x = {motion.xs[-1][0]:.6f} m")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ one, a fast gear, damping takes the motor's work. So the best design lies in bet
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ BOUNDS = {  # [m], along z of the link before; [N m/rad]
     "hip.offset": ([0, 0, 0.05], [0, 0, 0.8]),
     "knee.spring_stiffness": (0.1, 30.0),
 }
-solve_options = {"method": "shooting", "tolerance": 1e-6, "max_iterations": 600}
+solve_options: dict[str, Any] = {"method": "shooting", "tolerance": 1e-6, "max_iterations": 600}
 
 
 def problem() -> dd.Problem:
@@ -46,7 +47,7 @@ def main() -> None:
         plan = dd.solve(problem(), **solve_options)
     other = dd.studies.without_derivatives(problem(), count.steps)
     print(f"{count.steps} simulated steps each; the foot at its lowest in the replays; shank, thigh, spring")
-    for name, found in {"gradients": plan, "evolution": other}.items():
+    for name, found in dict[str, Any](gradients=plan, evolution=other).items():
         tried = [replay for replay in found.replays if replay.control == "open loop"]
         height, hold = min(replay.motion.xs[-1][0] for replay in tried), sum(replay.holds for replay in tried)
         verdicts = ", ".join(sorted({certificate.verdict for certificate in found.certificates})) or "none"

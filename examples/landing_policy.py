@@ -6,6 +6,7 @@ python examples/landing_policy.py            beside Powell's search, by values a
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -19,20 +20,20 @@ model = dd.load_model(Path(__file__).parent.parent / "models/hopper.sdf", time_s
 miss = dd.QuadraticCost(Q=np.diag([1, 0, 0.05, 0]), x_ref=[HEIGHT, 0, 0, 0])  # at rest at the height after 0.8 s
 
 
-def network(x, t, weights):
+def network(x: np.ndarray, t: float, weights: np.ndarray) -> np.ndarray:
     """The force of the leg [N] (1,): a spring, a damper and a network on top."""
     inner, bias, outer = np.split(weights, [4 * HIDDEN, 5 * HIDDEN])
     hidden = np.tanh(inner.reshape(HIDDEN, 4) @ ((x - [0.6, 0.5, 0, 0]) * [3, 3, 0.5, 0.5]) + bias)
     return np.array([12 - 100 * (x[1] - 0.45) - 3 * x[3] + 30 * (outer @ hidden)])
 
 
-def fall(function, weights, height, *loss):
+def fall(function: Any, weights: np.ndarray, height: float, *loss: Any) -> Any:
     asked = {"policy": dd.motion.ParametricPolicy(network, weights), "num_steps": 40, "method": "continuous"}
     return function(model, [height, 0.45, 0, 0], None, *loss, **asked)
 
 
 def train(evaluations: int, *, gradients: bool = True) -> np.ndarray:
-    def mean(weights):
+    def mean(weights: np.ndarray) -> Any:
         if not gradients:
             return np.mean([miss(fall(dd.rollout, weights, z).xs[-1]) for z in DROPS])
         found = [fall(dd.differentiate_rollout, weights, z, lambda x: miss(x)) for z in DROPS]
@@ -42,7 +43,7 @@ def train(evaluations: int, *, gradients: bool = True) -> np.ndarray:
     return minimize(mean, FIRST, jac=gradients, method=how[0], options=how[1]).x
 
 
-def problem(weights=None) -> dd.Problem:
+def problem(weights: np.ndarray | None = None) -> dd.Problem:
     """The policy's motion after the first drop, to be followed: its own inputs do that at no cost."""
     motion = fall(dd.rollout, train(16) if weights is None else weights, DROPS[0])
     table = motion.times, motion.xs, np.vstack([motion.us, motion.us[-1:]])

@@ -20,14 +20,14 @@ SPREAD = np.array([0.2, 0.2, 0.2, 0.4])  # initial states are within this of upr
 LIMITS = np.array([2.0, 0.5])  # of cart [m] and angle [rad]: beyond is fallen
 
 
-def network(x, t, parameters):
+def network(x: np.ndarray, t: float, parameters: np.ndarray) -> np.ndarray:
     """The force [N] (1,) at state x (4,); floats or AutoDiffXd."""
     w1, b1, w2, b2 = np.split(parameters, np.cumsum([4 * HIDDEN, HIDDEN, HIDDEN]))
     hidden = np.tanh(w1.reshape(HIDDEN, 4) @ (x - UPRIGHT) + b1)
     return 10 * w2.reshape(1, HIDDEN) @ hidden + b2
 
 
-def loss(xs, us):
+def loss(xs: np.ndarray, us: np.ndarray) -> float:
     """The mean over the motion of the weighted squared distance from upright, and a little for the force."""
     e = xs - UPRIGHT
     return ((e**2) @ [1.0, 10.0, 0.1, 0.1]).mean() + 1e-3 * (us**2).mean()

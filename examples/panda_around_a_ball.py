@@ -6,6 +6,8 @@ No link may come nearer to the ball than 3 cm, between the knots of the plan too
     python examples/panda_around_a_ball.py          prints how near it comes, and how near if nobody told it of the ball
 """
 
+from typing import Any
+
 import numpy as np
 
 import drake_diff as dd
@@ -30,7 +32,7 @@ def problem(goals: tuple[dd.SphereObstacle, ...] = (BALL,)) -> dd.Problem:
 
 
 def main() -> None:
-    _, clear = problem().kept_goals
+    clear: Any = problem().kept_goals[1]
     for name, goals in {"with the ball": (BALL,), "without": ()}.items():
         solution = dd.solve(problem(goals))
         print(f"{name}: {solution.status.value}, {solution.message}")

@@ -9,6 +9,7 @@ a force at a distance between the two, of a shorter reach in each stage, and in 
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ MODEL = Path(__file__).parent.parent / "models" / "two_spheres.sdf"
 TIME_STEP, NUM_STEPS, GAP, DIAMETER, GOAL = 0.02, 50, 0.3, 0.2, 1.0
 PUSHER, BALL = 0, 1  # in Drake's state: both positions, both velocities
 
-solve_options = {"method": "ilqr", "continuation": "auto", "max_iterations": 100}
+solve_options: dict[str, Any] = {"method": "ilqr", "continuation": "auto", "max_iterations": 100}
 
 
 def problem() -> dd.Problem:
@@ -48,9 +49,10 @@ def main() -> None:
             f"cost {stage['cost']:.6f}  goal error {stage['goal_error']:.1e}"
         )
     print(f"{solution.status.value}: {solution.message}")
-    end = solution.replay.xs[-1]
-    touches = [k for k, contacts in enumerate(solution.replay.contacts) if contacts]
-    print(f"the true plant under these inputs: the ball is at x = {end[BALL]:.9f} m; it is touched in {len(touches)}")
+    motion: Any = solution.replay  # None only of a search without a plan
+    touches = [k for k, contacts in enumerate(motion.contacts) if contacts]
+    x = motion.xs[-1][BALL]
+    print(f"the true plant under these inputs: the ball is at x = {x:.9f} m; it is touched in {len(touches)}")
     print(f"of {NUM_STEPS} steps, first at t = {touches[0] * TIME_STEP:.2f} s")
 
 

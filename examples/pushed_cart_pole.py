@@ -7,6 +7,7 @@ The plan is a run of its own, which `drake-diff verify` makes again; the trials 
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ import drake_diff as dd
 MODEL = Path(__file__).parent.parent / "models" / "cart_pole.urdf"
 TIME_STEP, UP, STAY, TRIALS = 0.02, 100, 50, 10  # [s], steps to swing up and to stand, trials at each strength
 PUSHES = (0.1, 0.3, 1.0, 3.0)  # [N s]
-solve_options = {"method": "collocation"}
+solve_options: dict[str, Any] = {"method": "collocation"}
 
 
 def problem() -> dd.Problem:

@@ -8,6 +8,7 @@ its thrust. From hovering to hovering 6 m further in 3 s, through gates to the l
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ ARM, MOMENT_RATIO, MOST = 0.15, 0.0245, 5.0  # [m], [m], [N]
 HOVER = 0.775 * 9.81 / 4  # [N] of each rotor
 GATES = {25: (1.5, 0.8, 1.5), 50: (3.0, -0.8, 1.0), 75: (4.5, 0.5, 1.8)}  # [m] by knot
 OPENING = 0.15  # [m] how far from a gate's middle the quadrotor may pass
-solve_options = {"method": "collocation"}
+solve_options: dict[str, Any] = {"method": "collocation"}
 
 
 def rotors() -> list[BodyForce]:

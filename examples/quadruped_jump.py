@@ -9,6 +9,7 @@ schedule is a goal too: the plan and its replays are held to it.
 """
 
 from pathlib import Path
+from typing import Any
 
 import drake_diff as dd
 
@@ -18,7 +19,7 @@ BENT = {"hip_pitch": 0.8, "knee": -1.6}  # [rad]
 TIME_STEP, WAY = 0.01, 0.06  # [s], [m] forward
 
 schedule = dd.optimize.ContactSchedule([(40, FEET), (16, ()), (50, FEET)])
-solve_options = {"method": "ilqr", "tolerance": 1e-4}
+solve_options: dict[str, Any] = {"method": "ilqr", "tolerance": 1e-4}
 
 
 def problem() -> dd.Problem:
@@ -40,7 +41,7 @@ def main() -> None:
     solution = dd.solve(task, **solve_options)
     print(f"{solution.status.value} after {len(solution.iterations) - 1} iterations: {solution.message}")
     z, x = (solution.xs[:, task.state_names.index(f"trunk_{axis}")] for axis in "zx")
-    print(f"the trunk rises by {1e3 * (z.max() - z[0]):.0f} mm and ends {1e3 * (x[-1] - x[0]):.0f} mm further on")
+    print(f"the trunk rises by {1e3 * (np.max(z) - z[0]):.0f} mm and ends {1e3 * (x[-1] - x[0]):.0f} mm further on")
 
 
 if __name__ == "__main__":

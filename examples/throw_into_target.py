@@ -8,6 +8,7 @@ the ball flies on. The first stages make a motion of it with contact at a distan
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ TIME_STEP, SWING, FLY, STOP = 0.005, 70, 90, 30  # [s], and steps
 START, TARGET = np.array([0.3, -0.15]), np.array([1.3, 0.1])  # x and z [m] of the ball
 LINK, SEAT, GRAVITY = 0.35, 0.0875, 9.81  # [m], [m] from the wrist to a ball in the cup, [m/s^2]
 
-solve_options = {"method": "ilqr", "continuation": "relaxed", "tolerance": 1e-2}
+solve_options: dict[str, Any] = {"method": "ilqr", "continuation": "relaxed", "tolerance": 1e-2}
 
 
 def guess() -> np.ndarray:
@@ -52,7 +53,8 @@ def problem() -> dd.Problem:
 
 def main() -> None:
     solution = dd.solve(problem(), **solve_options)
-    last = max(k for k, contacts in enumerate(solution.replay.contacts) if contacts)
+    motion: Any = solution.replay  # None only of a search without a plan
+    last = max(k for k, contacts in enumerate(motion.contacts) if contacts)
     print(f"{solution.message}\nit leaves the cup at {last * TIME_STEP:.2f} s, ends at {solution.xs[-1][3:5]} m")
 
 
