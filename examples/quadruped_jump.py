@@ -41,7 +41,7 @@ def main() -> None:
     solution = dd.solve(task, **solve_options)
     print(f"{solution.status.value} after {len(solution.iterations) - 1} iterations: {solution.message}")
     z, x = (solution.xs[:, task.state_names.index(f"trunk_{axis}")] for axis in "zx")
-    print(f"the trunk rises by {1e3 * (np.max(z) - z[0]):.0f} mm and ends {1e3 * (x[-1] - x[0]):.0f} mm further on")
+    print(f"the trunk rises by {1e3 * (max(z) - z[0]):.0f} mm and ends {1e3 * (x[-1] - x[0]):.0f} mm further on")
 
 
 if __name__ == "__main__":
