@@ -2,6 +2,7 @@
 
 import os
 import re
+import subprocess
 import sys
 
 import pytest
@@ -90,6 +91,12 @@ WRONG_INDEX = {
 }
 
 
+def ends_a_process(path):
+    read = "import sys; from pydrake.all import AddMultibodyPlantSceneGraph, DiagramBuilder, Parser\n"
+    read += "plant = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.01)[0]; Parser(plant).AddModels(sys.argv[1])\n"
+    return subprocess.run([sys.executable, "-c", read, str(path)], capture_output=True, check=False).returncode < 0
+
+
 @each_row(
     "command, ending",
     [("audit", "obj"), ("audit", "vtk"), ("certify", "vtk"), ("plan", "obj"), ("plan", "vtk")],
@@ -104,6 +111,9 @@ def test_a_command_survives_a_file_that_ends_drakes_process(command, ending, tmp
     with pytest.raises(SystemExit) as end:
         cli.main()
     told = capfd.readouterr().err
+    if ending == "obj" and not ends_a_process(path):  # of Drake 1.51, not of 1.58
+        assert end.value.code == 0
+        return
     assert end.value.code == 1
     assert told.startswith(
         f"drake-diff: ModelError: {path}: the model cannot be read: the process that tried to ended by"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import permutations, product
 from math import factorial
+from tokenize import TokenError
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -420,5 +421,5 @@ def _source_hash(function: Any) -> str | None:
     shown = function if inspect.isroutine(function) else type(function)
     try:
         return sha256(inspect.getsource(shown).encode()).hexdigest()
-    except (OSError, TypeError):
+    except (OSError, TypeError, SyntaxError, TokenError):  # the file is not there, or holds other text
         return None
