@@ -92,7 +92,6 @@ SOURCES = {
         "60": "drake_diff.artifact.verify:WAITED",
     },
     "CONTRIBUTING.md": {},
-    "docs/benchmarks.md": {},
     "docs/certificates.md": {
         **dict.fromkeys(("13", "1e-2", "1e-8"), "drake_diff.certificates.neighbourhood:STEPS"),
         "1e-9": "drake_diff.certificates.certificate:JITTER",
@@ -202,6 +201,7 @@ FIGURES = (
     "zoo.md",
     "impacts.md",
     "continuous_plans.md",
+    "benchmarks.md",
     "tasks_solved.md",
     "contact_plans.md",
     "mpc_realtime.md",
