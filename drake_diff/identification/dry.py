@@ -22,7 +22,7 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff.identification.flow import CHUNK, ContinuousMotion
 from drake_diff.identification.frozen import exponential
 from drake_diff.identification.tree import Mask, Numbers, caught, held_inverse
-from drake_diff.identification.unknowns import by_complex_step, set_numbers
+from drake_diff.identification.unknowns import numbers_at, set_numbers
 
 REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
 MOST_PARTS = 8  # of a step; what is left of it then goes on as it is
@@ -67,13 +67,8 @@ class DryMotion(ContinuousMotion):
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
-        model, tree, unknowns = self.model, self.tree, self.unknowns
-
-        def flat(z: Array) -> Array:
-            return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
-
-        numbers, by = set_numbers(model, tree, unknowns, unknowns.values(z)), by_complex_step(flat, z)
-        pushed, (K, M), nx = tree.pushed(numbers), hs.shape, xs.shape[2]
+        numbers, by = numbers_at(self.model, self.tree, self.unknowns, z)
+        pushed, (K, M), nx = self.tree.pushed(numbers), hs.shape, xs.shape[2]
         x, u = xs[:, :-1].reshape(K * M, nx), us.reshape(K * M, -1)
         _, parts = self._steps(pushed, numbers, x, hs.reshape(-1), u)
         found = np.zeros((K * M, nx, nx + by.shape[1]))
@@ -175,11 +170,7 @@ class DryMotion(ContinuousMotion):
         x = x.copy()
         if not self.gives:
             x[:, self.model.nq :][held] = 0.0
-        stages, weights = self.method
-        slopes = np.empty((len(weights), *x.shape))
-        for i, row in enumerate(stages):
-            slopes[i] = self._rates(accelerate, x + h[:, None] * np.tensordot(row, slopes[:i], 1), u)
-        return np.asarray(x + h[:, None] * np.tensordot(weights, slopes, 1))
+        return self._stepped(accelerate, x, h, u)
 
     def _within(
         self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, turn: Array, held: Mask

@@ -25,7 +25,7 @@ from drake_diff.exceptions import SimulationError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.measured import LEAST, Piece
 from drake_diff.identification.sensors import Sensors
-from drake_diff.identification.unknowns import BIAS, Unknowns, by_complex_step, set_numbers
+from drake_diff.identification.unknowns import BIAS, Unknowns, numbers_at, set_numbers
 from drake_diff.model.model import Model
 
 SEGMENT_SAMPLES = 5  # of a segment at least
@@ -262,13 +262,8 @@ class Fit:
 
     def _read_slopes(self, z: Array, s: Segments, xs: Array) -> list[tuple[Array, Array]]:
         """Of each segment (samples, m, 2 nv) by the state, and (samples, m, np) by z."""
-        model, tree, unknowns = self.model, self.sensors.known, self.unknowns
-
-        def flat(z: Array) -> Array:
-            return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
-
-        numbers = set_numbers(model, tree, unknowns, unknowns.values(z))
-        by_x, by_z = self.sensors.slopes(numbers, *self._samples(s, xs), by_complex_step(flat, z))
+        numbers, by = numbers_at(self.model, self.sensors.known, self.unknowns, z)
+        by_x, by_z = self.sensors.slopes(numbers, *self._samples(s, xs), by)
         return list(zip(self._split(s, by_x), self._split(s, by_z), strict=True))
 
     def _shift(self, values: Array) -> Array:

@@ -14,7 +14,7 @@ from scipy.integrate import DOP853
 from drake_diff._base.arrays import Array
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.tree import Mask, Numbers, Tree
-from drake_diff.identification.unknowns import Unknowns, by_complex_step, set_numbers
+from drake_diff.identification.unknowns import Unknowns, numbers_at, set_numbers
 from drake_diff.model.model import Model
 
 CHUNK = 128  # steps that are differentiated in one call
@@ -55,16 +55,19 @@ class ContinuousMotion:
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
         accelerate = self.tree.acceleration(set_numbers(self.model, self.tree, self.unknowns, values))
-        stages, weights = self.method
         xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
         xs[:, 0] = starts
         for m in range(hs.shape[1]):
-            h, u, x = hs[:, m, None], us[:, m], xs[:, m]
-            slopes = np.empty((len(weights), *x.shape))
-            for i, row in enumerate(stages):
-                slopes[i] = self._rates(accelerate, x + h * np.tensordot(row, slopes[:i], 1), u)
-            xs[:, m + 1] = x + h * np.tensordot(weights, slopes, 1)
+            xs[:, m + 1] = self._stepped(accelerate, xs[:, m], hs[:, m], us[:, m])
         return xs
+
+    def _stepped(self, accelerate: Callable[[Array, Array, Array], Array], x: Array, h: Array, u: Array) -> Array:
+        """The states (N, nx) after one step from x (N, nx) of h (N,) [s] under u (N, nu)."""
+        stages, weights = self.method
+        slopes = np.empty((len(weights), *x.shape))
+        for i, row in enumerate(stages):
+            slopes[i] = self._rates(accelerate, x + h[:, None] * np.tensordot(row, slopes[:i], 1), u)
+        return np.asarray(x + h[:, None] * np.tensordot(weights, slopes, 1))
 
     def rates(self, values: Array, x: Array, u: Array) -> Array:
         """(N, nx) by time, of states (N, nx) under u (N, nu)."""
@@ -72,12 +75,7 @@ class ContinuousMotion:
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
-        model, tree, unknowns = self.model, self.tree, self.unknowns
-
-        def flat(z: Array) -> Array:
-            return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
-
-        numbers, by = set_numbers(model, tree, unknowns, unknowns.values(z)), by_complex_step(flat, z)
+        numbers, by = numbers_at(self.model, self.tree, self.unknowns, z)
         K, M = hs.shape
         x, h, u = xs[:, :-1].reshape(K * M, -1), hs.reshape(-1), us.reshape(K * M, -1)
         nx = x.shape[1]

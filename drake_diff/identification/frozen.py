@@ -15,7 +15,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.flow import CHUNK, ContinuousMotion
-from drake_diff.identification.unknowns import by_complex_step, set_numbers
+from drake_diff.identification.unknowns import numbers_at
 
 ORDER = 8  # of the series of phi
 SMALL = 0.5  # the norm of X up to which it is summed; 0.5^9 / 10! is 5e-10
@@ -27,15 +27,10 @@ class FrozenMotion(ContinuousMotion):
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
-        model, tree, unknowns = self.model, self.tree, self.unknowns
-
-        def flat(z: Array) -> Array:
-            return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
-
-        numbers, by = set_numbers(model, tree, unknowns, unknowns.values(z)), by_complex_step(flat, z)
+        numbers, by = numbers_at(self.model, self.tree, self.unknowns, z)
         (K, M), nx = hs.shape, xs.shape[2]
         h, u = hs.reshape(-1), us.reshape(K * M, -1)
-        halfway = self.run(unknowns.values(z), xs[:, :-1].reshape(K * M, nx), h[:, None] / 2, u[:, None])[:, 1]
+        halfway = self.run(self.unknowns.values(z), xs[:, :-1].reshape(K * M, nx), h[:, None] / 2, u[:, None])[:, 1]
         by_x, by_z = np.empty((K * M, nx, nx)), np.empty((K * M, nx, by.shape[1]))
         for k in range(0, K * M, CHUNK):
             part = slice(k, k + CHUNK)

@@ -363,6 +363,15 @@ def _central(tree: Tree, label: str, given: dict[str, Any], *, as_in_files: bool
     return mass, center, mass * (unit - shift)
 
 
+def numbers_at(model: Model, tree: Tree, unknowns: Unknowns, z: Array) -> tuple[Numbers, Array]:
+    """(the tree's numbers at z (np,), how all of them in a row change with it (count, np))."""
+
+    def flat(z: Array) -> Array:
+        return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
+
+    return set_numbers(model, tree, unknowns, unknowns.values(z)), by_complex_step(flat, z)
+
+
 def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Numbers:
     """The tree's numbers where the unknowns have `values` (np,), complex or float."""
     given: dict[str, Any] = {}
