@@ -56,6 +56,14 @@ def test_a_link_that_leads_nowhere_and_what_would_be_fetched_are_found(tmp_path)
         "sub/b.html links to c.html, which is not there",
         "sub/b.html links to gone.png, which is not there",
     ]
+    (tmp_path / "sub/b.html").write_text(page + '<img srcset="//x.org/2.png 2x"><p style="background:url(//x.org/p)">')
+    (tmp_path / "s.css").write_text('@import "https://x.org/t.css"; a { src: url("data:x") url( \'//x.org/f\') }')
+    assert links.faults(tmp_path) == [
+        "sub/b.html would fetch //x.org/p",
+        "s.css would fetch //x.org/f",
+        "s.css would fetch https://x.org/t.css",
+        "sub/b.html would fetch //x.org/2.png",
+    ]
 
 
 def test_the_pictures_of_contact_models_are_those_that_the_command_draws(tmp_path):
