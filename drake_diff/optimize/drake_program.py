@@ -5,8 +5,9 @@ import re
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from pydrake import solvers
@@ -14,13 +15,21 @@ from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, Solut
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.clock import TimeIsUpError, check_time, until_set
+from drake_diff._base.forked import can_fork, forked
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
+from drake_diff.model.counted import count_steps, stepped
 from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch
 
 SOLVERS = ("ipopt", "snopt")
+# Entries, see `_size_of`, from which on a solver may work for seconds between two evaluations, as IPOPT does in 20
+# steps of a chain of 30 joints (1.1 million). Those of a Panda have 0.1 million.
+LARGE = 300_000
 SNOPT_STEP_LIMIT = 2.0  # its own default: by how much of itself the point may change in a step
+
+
+_Tell = Callable[[Iteration, Array, float], None]  # gets a row, the point (n,), and the seconds until then
 
 
 class _Stop(Exception):  # noqa: N818  (a signal, not an error)
@@ -36,11 +45,13 @@ def solve_program(
     report: Report | None = None,
     longest: float = 1.0,
     motions: Callable[[Array], tuple[Iterate, ...]] = lambda z: (),
+    refusal: Callable[[], str] = lambda: "",
 ) -> NlpResult:
     """Solve `program` from `guess` (n,) with "ipopt" or "snopt", which takes steps of at most `longest` its default.
 
-    `report` gets a line of progress a few times a second, with what `motions` makes of the point. Ctrl-C ends the solve
-    with the best iterate so far.
+    `report` gets a line of progress a few times a second, with what `motions` makes of the point. Ctrl-C and the time
+    limit end the solve with the best iterate so far; a large one in the middle of the solver's own work too, for which
+    that has a process of its own. `refusal` says why a point could not be evaluated, the last one, for the result.
     """
     if solver not in SOLVERS:
         raise UnknownNameError("solver", got=solver, known=SOLVERS)
@@ -48,33 +59,83 @@ def solve_program(
     if not (engine.available() and engine.enabled()):
         raise MissingDependencyError(f"the solver {solver} is not in this Drake: take another one, or Drake's wheel")
     with tempfile.TemporaryDirectory() as folder, noted_interrupts() as interrupted:
-        print_file = Path(folder) / "log"
-        watch = Watch(limits, interrupted)
-        callback = _Callback(program, watch, report, motions)
-        program.AddVisualizationCallback(callback, program.decision_variables())
-        try:
-            with until_set(interrupted):
-                result = engine.Solve(program, guess, _options(solver, limits, print_file, longest))
-        except (DrakeDiffError, RuntimeError, _Stop, TimeIsUpError) as error:
-            outcome, message = _explain_exception(watch, error)
-            callback.look_back()
-            return NlpResult(watch.best_of(guess), outcome, message, _read_table(solver, print_file))
-        outcome, message = _explain(solver, result)
-        z = result.GetSolution(program.decision_variables())
-        return NlpResult(np.asarray(z), outcome, message, _read_table(solver, print_file))
+        watch, print_file = Watch(limits, interrupted), Path(folder) / "log"
+        options = _options(solver, limits, print_file, longest)
+
+        def solved(tell: _Tell) -> NlpResult:
+            callback = _Callback(program, watch, tell)
+            program.AddVisualizationCallback(callback, program.decision_variables())
+            try:
+                with until_set(interrupted):
+                    result = engine.Solve(program, guess, options)
+            except (DrakeDiffError, RuntimeError, _Stop, TimeIsUpError) as error:
+                outcome, message = _explain_exception(watch, error)
+                callback.look_back()
+                return NlpResult(watch.best_of(guess), outcome, message, (), refusal=refusal())
+            outcome, message = _explain(solver, result)
+            z = np.asarray(result.GetSolution(program.decision_variables()))
+            return NlpResult(z, outcome, message, (), refusal=refusal())
+
+        def tell(row: Iteration, z: Array, spent: float) -> None:
+            if report is not None:
+                report.row(row, lambda: motions(z), printed=False)
+                cost, violation = f"cost {row.objective:12.6g}", f"violation {row.primal_infeasibility:9.2e}"
+                report.say(f"evaluation {row.iteration:5d}  {cost}  {violation}  {spent:6.1f} s")
+
+        if _size_of(program) >= LARGE and can_fork():
+            result = _solved_apart(solved, tell, watch, guess, solver, refusal)
+        else:
+            result = solved(tell)
+        return replace(result, iterations=_read_table(solver, print_file))
+
+
+def _size_of(program: MathematicalProgram) -> int:
+    """The entries of all rows' derivatives, and of a matrix of the variables."""
+    rows = (len(each.variables()) * each.evaluator().num_constraints() for each in program.GetAllConstraints())
+    return int(program.num_vars() ** 2 + sum(rows))
+
+
+def _solved_apart(
+    solved: Callable[[_Tell], NlpResult],
+    tell: _Tell,
+    watch: Watch,
+    guess: Array,
+    solver: str,
+    refusal: Callable[[], str],
+) -> NlpResult:
+    """What `solved(tell)` gives, in a process that can be ended while the solver hears nothing."""
+    best, why, steps = guess, "", 0
+
+    def work(send: Callable[[Any], None]) -> tuple[NlpResult, int]:
+        with count_steps() as count:
+            result = solved(lambda *row: send((row, watch.best_of(guess), refusal(), count.steps)))
+            return result, count.steps
+
+    def heard(message: Any) -> None:
+        nonlocal best, why, steps
+        before = steps
+        row, best, why, steps = message
+        stepped(steps - before)
+        tell(*row)
+
+    ended = forked(work, heard, watch.interrupted, watch.start + watch.limits.time_limit)
+    if ended.returned is not None:
+        result, taken = cast(tuple[NlpResult, int], ended.returned)
+        stepped(taken - steps)
+        return result
+    if ended.crashed:
+        message = f"the process of {solver.upper()} ended by {ended.crashed}"
+        return NlpResult(best, Outcome.FAILED, message, (), refusal=why)
+    outcome = Outcome.INTERRUPTED if watch.interrupted.is_set() else Outcome.TIME_LIMIT
+    message = f"stopped: {outcome.value}, in the middle of {solver.upper()}'s own work"
+    return NlpResult(best, outcome, message, (), refusal=why)
 
 
 class _Callback:
     """Called by the solver at every evaluation: reports, keeps the best iterate, raises to stop."""
 
-    def __init__(
-        self,
-        program: MathematicalProgram,
-        watch: Watch,
-        report: Report | None,
-        motions: Callable[[Array], tuple[Iterate, ...]],
-    ):
-        self.program, self.watch, self.report, self.motions = program, watch, report, motions
+    def __init__(self, program: MathematicalProgram, watch: Watch, tell: _Tell):
+        self.program, self.watch, self.tell = program, watch, tell
         self.evaluations, self.called = 0, time.monotonic()
         self.current: Array | None = None
         self.before: Array | None = None  # the last point but this at which everything could be evaluated
@@ -110,11 +171,8 @@ class _Callback:
             violations.append(float(np.max(beyond, initial=0)))
         violation = max(violations, default=0.0)
         self.watch.offer(z, cost, violation)
-        if self.report:
-            row = Iteration(self.evaluations, cost, violation, math.nan, math.nan)
-            self.report.row(row, lambda: self.motions(z), printed=False)
-            spent = f"violation {violation:9.2e}  {self.watch.elapsed:6.1f} s"
-            self.report.say(f"evaluation {self.evaluations:5d}  cost {cost:12.6g}  {spent}")
+        row = Iteration(self.evaluations, cost, violation, math.nan, math.nan)
+        self.tell(row, np.array(z), self.watch.elapsed)
 
 
 def _options(solver: str, limits: Limits, print_file: Path, longest: float) -> solvers.SolverOptions:

@@ -161,6 +161,7 @@ class NlpResult:
     parameters: Array | None = None  # (np,) of iLQR: those of discrete steps that it found
     stationarity: float = math.nan
     multipliers: Multipliers | None = None  # where the solver has them
+    refusal: str = ""  # why a point could not be evaluated, the last one
 
 
 def heard(result: NlpResult, interrupted: threading.Event) -> NlpResult:

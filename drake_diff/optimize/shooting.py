@@ -8,6 +8,7 @@ what a late input does need not be seen through all the steps before it. One seg
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -78,10 +79,11 @@ def solve_shooting(
             limits, time_limit=limits.time_limit - spent, max_iterations=max(1, limits.max_iterations - len(table))
         )
         options: dict[str, Any] = {"solver": solver, "limits": left, "longest": SHORTER**-backed}
-        result = solve_program(motion.program(), start, report=report, motions=motion.iterates, **options)
+        options |= {"motions": motion.iterates, "refusal": partial(getattr, motion, "refusal")}
+        result = solve_program(motion.program(), start, report=report, **options)
         table += result.iterations
-        why = motion.refusal or why
-        refused = (Outcome.NO_GRADIENT, Outcome.DIVERGED, *[Outcome.FAILED] * bool(motion.refusal))
+        why = result.refusal or why
+        refused = (Outcome.NO_GRADIENT, Outcome.DIVERGED, *[Outcome.FAILED] * bool(result.refusal))
         if result.outcome not in refused or backed == BACK_OFFS:
             break
         known = _towards(problem, segments, start, result.z)

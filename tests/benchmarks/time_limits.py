@@ -2,8 +2,8 @@
 
     OPENBLAS_NUM_THREADS=1 python tests/benchmarks/time_limits.py [LIMIT [CASE ...]]
 
-The clock is that of this process's own work, for the limit and for what is measured, so that what else a machine does
-is no part of it. All modules are loaded before. Each solve has a process of its own; a case is a word of its name.
+By the clock on the wall, as the limit is. All modules are loaded before. Each solve has a process of its own; a case is
+a word of its name.
 """
 
 import subprocess
@@ -11,12 +11,10 @@ import sys
 import time
 import warnings
 
-time.monotonic = time.process_time  # before anything takes it
+import memory
+import numpy as np
 
-import memory  # noqa: E402
-import numpy as np  # noqa: E402
-
-import drake_diff as dd  # noqa: E402
+import drake_diff as dd
 
 METHODS = (("collocation", None), ("shooting", "snopt"), ("shooting", "ipopt"), ("ilqr", None))
 CHAINS = (10, 30, 100)
