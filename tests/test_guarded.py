@@ -47,6 +47,10 @@ def give(value):
     return value
 
 
+def has_loaded(module):
+    return module in sys.modules
+
+
 def end():
     os.abort()
 
@@ -113,6 +117,13 @@ def test_what_a_call_does_is_told_and_the_next_one_is_answered(function, kind, t
     assert told in getattr(found, kind)
     assert (found.value, bool(found.sentence)) == (None, True)
     assert ask(give, value=[1, "a"]).value == [1, "a"]
+
+
+def test_what_every_call_loads_is_loaded_once_from_the_second_call_on():
+    """And what is not installed is not asked for again."""
+    loads = ("no_such_module", "wave")
+    found = [call("test_guarded:has_loaded", {"module": "wave"}, Limits(), loads).value for _ in range(3)]
+    assert found == [False, True, True]
 
 
 def test_a_call_that_never_ends_is_ended():

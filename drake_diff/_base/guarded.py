@@ -1,7 +1,8 @@
 """Call a function in a process that a stranger's file may crash, fill or hang, and that can reach nothing else.
 
 A keeper is started once, imports what is asked for, and forks a process for each call: that costs milliseconds, where
-an import of Drake costs a second. The keeper itself never reads what a stranger wrote.
+an import of Drake costs a second. The keeper itself never reads what a stranger wrote. Of a function that is called a
+second time it imports also what each call of it would load for itself.
 """
 
 import atexit
@@ -146,10 +147,14 @@ def _forget() -> None:
 os.register_at_fork(after_in_child=_forget)
 
 
-def call(function: str, arguments: Mapping[str, Any], limits: Limits) -> Answer:
-    """Call `function`, "module:name", with arguments and a value that JSON has, in a process of its own."""
+def call(function: str, arguments: Mapping[str, Any], limits: Limits, loads: Iterable[str] = ()) -> Answer:
+    """Call `function`, "module:name", with arguments and a value that JSON has, in a process of its own.
+
+    `loads` are modules that most calls of it load, where they are installed.
+    """
     request = {
         "function": function,
+        "loads": list(loads),
         "arguments": dict(arguments),
         "seconds": limits.seconds,
         "memory": int(limits.memory * GIB),
@@ -205,9 +210,14 @@ def keep() -> None:
     nothing = os.open(os.devnull, os.O_RDWR)
     os.dup2(nothing, 1)
     os.dup2(nothing, 2)
+    called = set()
     while line := _line():
         request = json.loads(line)
         import_module(request["function"].partition(":")[0])
+        for module in request["loads"] if request["function"] in called else ():
+            with suppress(ImportError):
+                import_module(module)
+        called.add(request["function"])
         answer = json.dumps(_forked(request)).encode() + b"\n"
         with os.fdopen(os.dup(answers), "wb") as file:
             file.write(answer)
