@@ -1,4 +1,4 @@
-"""Swing-ups from 100 random states each: nearly all verified, and none said to be right that is not.
+"""Swing-ups from random states: nearly all verified, and none said to be right that is not.
 
 The referee is the textbook's equations written out here, integrated between the knots; it knows nothing of Drake.
 """
@@ -11,7 +11,7 @@ import drake_diff as dd
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 COUNT, H = 100, 0.02
-TRIALS, ENOUGH = 100, 99
+TRIALS = {"pendulum.urdf": 100, "cart_pole.urdf": 40}  # of which one may fail
 
 
 def pendulum(x, u):
@@ -57,7 +57,7 @@ def test_swing_ups_from_random_states(name):
     rates, goal, spread, bounds = CASES[name]
     model, random = dd.load_model(MODELS / name, time_step=H), np.random.default_rng(2026)
     verified = []
-    for _ in range(TRIALS):
+    for _ in range(TRIALS[name]):
         x0 = random.uniform(-1, 1, model.nx) * spread
         problem = dd.Problem(model, x0=x0, x_goal=goal, num_steps=COUNT, running_cost=EFFORT, bounds=bounds)
         solution = dd.solve(problem, max_iterations=200)
@@ -69,4 +69,4 @@ def test_swing_ups_from_random_states(name):
             b = problem.bounds
             assert np.all((solution.us >= b.u_lower - 1e-5) & (solution.us <= b.u_upper + 1e-5))
             assert np.all((solution.xs[1:] >= b.x_lower - 1e-5) & (solution.xs[1:] <= b.x_upper + 1e-5))
-    assert sum(verified) >= ENOUGH, f"not verified: {np.flatnonzero(~np.array(verified))}"
+    assert sum(verified) >= TRIALS[name] - 1, f"not verified: {np.flatnonzero(~np.array(verified))}"
