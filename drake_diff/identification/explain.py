@@ -30,6 +30,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.identification.chart import Chart
+from drake_diff.identification.columns import Mistaken, mistaken_in_the_air
 from drake_diff.identification.dry import DryMotion
 from drake_diff.identification.euler import EulerMotion
 from drake_diff.identification.fit import Fit, Law, Point, Solved
@@ -103,8 +104,9 @@ def explain(
 
     Each parameter is tried alone: masses, centres of mass, inertias, dampings, springs, rotor inertias, offsets of
     joints and gravity; and what is no parameter of a file: dry friction, the strength and the limit of each input, a
-    delay of all inputs, and biases of sensors. Where none of them explains the recordings alone, semi-implicit Euler
-    steps of several lengths are tried, with one change or none, and then pairs.
+    delay of all inputs, and biases of sensors. Before these, mistaken columns are tried: two that are exchanged, one
+    with the other sign, degrees where radians belong. Where none of them explains the recordings alone, semi-implicit
+    Euler steps of several lengths are tried, with one change or none, and then pairs.
 
     Args:
         model: The model.
@@ -139,10 +141,20 @@ def explain(
         raise UnknownNameError("motion", got=motion, known=MOTIONS)
     chart, pieces = Chart(coordinates_of(model)), read_pieces(model, recordings, 0.0)
     tree = tree_for_identification(model)
+    if not isinstance(tree, Refusal):
+        columns = mistaken_in_the_air(model, tree, chart, pieces, given_noise(model, chart, noise))
+        if columns is not None:
+            return explained_by(columns)
     why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces) if motion == "auto" else ""
     if why or isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: causes are looked for in motions in continuous time only, and {why}")
     return _Search(model, tree, chart, pieces, given_noise(model, chart, noise)).found()
+
+
+def explained_by(columns: Mistaken) -> Explanation:
+    """By columns that are mistaken, and nothing else."""
+    others = tuple((words,) for words in columns.alternatives)
+    return Explanation((columns.words,), {}, {}, others, True, columns.sentence, columns.evidence)
 
 
 class _Tried(NamedTuple):

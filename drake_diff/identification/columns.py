@@ -1,0 +1,244 @@
+"""Whether a recording's columns are mistaken: two exchanged, one with the other sign, or degrees where radians belong.
+
+Each mistake is one permutation of the columns with factors, and has no number that is fitted. Short segments of the
+motion say which of them come nearer to the model than the columns as they are. Those few are fitted whole, with
+nothing but their first states, and one is named where it leaves noise and the columns as they are do not.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff.comparison.recordings import CLOCK_TOLERANCE
+from drake_diff.exceptions import DrakeDiffError
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.euler import EulerMotion
+from drake_diff.identification.fit import Fit, Law, Solved
+from drake_diff.identification.flow import ContinuousMotion
+from drake_diff.identification.identify import LONGEST, Problem
+from drake_diff.identification.measured import Piece, guess_states, noise_by_differences
+from drake_diff.identification.tree import Tree
+from drake_diff.identification.unknowns import Unknowns
+from drake_diff.model.model import Model
+from drake_diff.model.plant import joints
+
+SEGMENTS = 12  # of the recording, by which mistakes are compared
+FITTED = 3  # mistakes that are fitted whole, of those that come nearest
+NEARER = 0.5  # of what the columns as they are leave: a mistake that leaves more is not fitted
+FAR = (
+    3.0  # more than a mistake that explains leaves: columns as they are that leave 20 times its squares are not fitted
+)
+EVIDENCE = 20.0  # by which -2 log of the likelihood must fall: of 100 mistakes, by chance in 0.5 % of recordings
+SAME = 6.0  # of the same: evidence of 20 to 1, below which two mistakes are not told apart
+STEPS = 20  # of Gauss and Newton
+
+
+@dataclass(frozen=True, eq=False)
+class Mistake:
+    """Columns of states and inputs that are right where they are taken in this order, times these factors."""
+
+    words: str
+    order: Indices  # (nx + nu,)
+    factors: Array  # (nx + nu,)
+
+    def mended(self, piece: Piece) -> Piece:
+        """The piece as it would be without the mistake."""
+        nx = piece.ys.shape[1]
+        us = piece.us[:, self.order[nx:] - nx] * self.factors[nx:]
+        return replace(piece, ys=piece.ys[:, self.order[:nx]] * self.factors[:nx], us=us)
+
+
+Fitted = Callable[[Sequence[Piece]], tuple[float, bool]]  # (-2 log of the likelihood, whether noise is left)
+
+
+@dataclass(frozen=True)
+class Mistaken:
+    """The mistake that explains a recording, others that it cannot be told from, and the evidence for each."""
+
+    words: str
+    alternatives: tuple[str, ...]
+    evidence: Mapping[str, float]
+
+    @property
+    def sentence(self) -> str:
+        tail = ": the recording cannot tell" if self.alternatives else ": this explains the recording"
+        return f"{', or '.join((self.words, *self.alternatives))}{tail}."
+
+
+def mistakes(model: Model, chart: Chart, pieces: Sequence[Piece]) -> list[Mistake]:
+    """Everything that is tried; of what was not measured, nothing."""
+    seen = np.any([np.isfinite(piece.ys).any(axis=0) for piece in pieces], axis=0)
+    return list(_columns(model, chart, seen).every())
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """The columns of a model's recordings, and which of them were measured."""
+
+    names: tuple[str, ...]  # of states, then of inputs
+    inputs: range
+    seen: Array
+    along: list[tuple[int, int]]  # position and velocity of what moves along lines
+    turning: list[tuple[int, int]]  # of what turns
+    rates: list[int]  # velocities of what turns, those of free bodies too
+
+    def every(self) -> Iterator[Mistake]:
+        yield from self.exchanges()
+        yield from self.mirrors()
+        yield from self.degrees()
+
+    def exchanges(self) -> Iterator[Mistake]:
+        for alike in (self.along, self.turning):
+            for one, other in combinations(alike, 2):
+                pairs = [pair for pair in zip(one, other, strict=True) if self.seen[list(pair)].all()]
+                yield from (self.exchanged(pair) for pair in pairs)
+                if len(pairs) > 1:
+                    yield self.exchanged(*pairs)
+        yield from map(self.exchanged, combinations(self.inputs, 2))
+
+    def mirrors(self) -> Iterator[Mistake]:
+        for own in (*self.along, *self.turning):
+            both = tuple(column for column in own if self.seen[column])
+            yield from (self.scaled(one, "the other sign", -1.0) for one in _parts(both, *((i,) for i in both)))
+        yield from (self.scaled((i,), "the other sign", -1.0) for i in self.inputs)
+
+    def degrees(self) -> Iterator[Mistake]:
+        angles = tuple(i for i, _ in self.turning if self.seen[i])
+        rates = tuple(i for i in self.rates if self.seen[i])
+        for columns in _parts(angles + rates, angles, rates):
+            yield self.scaled(columns, "degrees, not radians", np.pi / 180)
+
+    def made(self, words: str, columns: Sequence[int], sources: Sequence[int], factor: float) -> Mistake:
+        order, factors = np.arange(len(self.names)), np.ones(len(self.names))
+        order[list(columns)], factors[list(columns)] = sources, factor
+        return Mistake(words, order, factors)
+
+    def exchanged(self, *pairs: tuple[int, int]) -> Mistake:
+        words = " and ".join(f"{self.names[i]} and {self.names[k]}" for i, k in pairs)
+        columns, sources = [i for pair in pairs for i in pair], [i for a, b in pairs for i in (b, a)]
+        return self.made(f"columns {words} are exchanged", columns, sources, 1.0)
+
+    def scaled(self, columns: Sequence[int], what: str, factor: float) -> Mistake:
+        return self.made(f"{_listed([self.names[i] for i in columns])} {what}", columns, columns, factor)
+
+
+def _parts(*each: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Each set of columns once, without those that have none."""
+    return [columns for columns in dict.fromkeys(each) if columns]
+
+
+def _columns(model: Model, chart: Chart, seen: Array) -> _Columns:
+    """Those of quaternions are in no group."""
+    nq, nx = model.nq, model.nx
+    sliding = {model.places(one)[0].start for one in joints(model.plant) if one.type_name() == "prismatic"}
+    along = [(i, nq + j) for i, j in chart.coordinates.single if i in sliding]
+    along += [(i + 4 + k, nq + j + 3 + k) for i, j in chart.coordinates.free for k in range(3)]
+    turning = [(i, nq + j) for i, j in chart.coordinates.single if i not in sliding]
+    rates = [j for _, j in turning] + [nq + j + k for _, j in chart.coordinates.free for k in range(3)]
+    names = (*model.state_names, *model.input_names)
+    return _Columns(names, range(nx, nx + model.nu), seen, along, turning, rates)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """What has something, and has it or have it: "column a has", "columns a and b have"."""
+    if len(names) == 1:
+        return f"column {names[0]} has"
+    if len(names) > 4:
+        return f"{len(names)} columns of angles, {names[0]} to {names[-1]}, have"
+    return f"columns {', '.join(names[:-1])} and {names[-1]} have"
+
+
+def mistaken_columns(
+    model: Model, chart: Chart, pieces: Sequence[Piece], law: Law, fits: Sequence[Fitted]
+) -> Mistaken | None:
+    """The mistake of columns that alone explains recordings; None where they are explained as they are, or by none.
+
+    `law` moves short segments. Each of `fits` says how well the model, as it is, goes through whole recordings.
+    """
+    left = _left(model, law, chart, pieces)
+    nearer = _nearer(model, law, chart, pieces, mistakes(model, chart, pieces), left)
+    measured = np.isfinite(np.concatenate([piece.ys for piece in pieces])).sum(axis=0)
+    for fitted in fits:
+        found: dict[str, float] = {}
+        for one, _ in nearer:
+            score, explains = fitted([one.mended(piece) for piece in pieces])
+            if explains:  # in the columns' own units
+                found[one.words] = score - 2 * float(measured @ np.log(np.abs(one.factors[: model.nx])))
+        if not found:
+            continue
+        before, explains = (np.inf, False) if left - nearer[0][1] > FAR else fitted(pieces)
+        falls = {words: before - score for words, score in found.items() if before - score > EVIDENCE}
+        if explains or not falls:
+            return None
+        first, *rest = sorted(falls, key=lambda words: found[words])
+        return Mistaken(first, tuple(words for words in rest if found[words] - found[first] < SAME), falls)
+    return None
+
+
+def mistaken_in_the_air(
+    model: Model, tree: Tree, chart: Chart, pieces: Sequence[Piece], stated: Array
+) -> Mistaken | None:
+    """The same of motions in which nothing touches, in continuous time or by the model's own Euler steps.
+
+    `stated` (2 nv,) is the noise, NaN where it is not known.
+    """
+    own = model, tree, chart, Unknowns((), as_in_files=True)
+    periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
+    whole = np.round(periods)
+    steps = not chart.coordinates.free and np.all(whole > 0) and np.all(np.abs(periods - whole) < CLOCK_TOLERANCE)
+    law = ContinuousMotion(*own, LONGEST)
+    laws: list[Law] = [law, *([EulerMotion(*own, model.time_step)] if steps else [])]
+    return mistaken_columns(model, chart, pieces, law, [partial(_fitted, model, one, chart, stated) for one in laws])
+
+
+def _nearer(
+    model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], every: Sequence[Mistake], before: float
+) -> list[tuple[Mistake, float]]:
+    """The mistakes that leave clearly less than what the columns as they are leave, and what; nearest first."""
+    left = [_left(model, law, chart, [one.mended(piece) for piece in pieces]) for one in every]
+    order = np.argsort(left, kind="stable")[:FITTED]
+    return [(every[int(i)], left[int(i)]) for i in order if left[int(i)] < NEARER * before]
+
+
+def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece]) -> float:
+    """What some short segments leave, from states that are guessed: the mean logarithm of 1 and the square."""
+    noise = noise_by_differences(chart, pieces)
+    s = Fit(model, law, chart, Unknowns((), as_in_files=True), pieces, noise).segments
+    some = np.unique(np.linspace(0, len(s.first) - 1, SEGMENTS).round().astype(int))
+    starts = np.concatenate(
+        [guess_states(model, chart, s.pieces[s.of_piece[k]], np.array([s.first[k]], dtype=np.intp)) for k in some]
+    )
+    with np.errstate(all="ignore"):
+        xs = law.run(np.zeros(0), starts, s.hs[some], s.us[some])
+        each = [
+            chart.minus(s.pieces[s.of_piece[k]].ys[s.samples[k]], xs[i, s.at[k]]) / noise for i, k in enumerate(some)
+        ]
+        squares = np.concatenate(each) ** 2
+    known = np.log1p(squares[np.isfinite(squares)])
+    return float(np.mean(known)) if len(known) else np.inf
+
+
+def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequence[Piece]) -> tuple[float, bool]:
+    """(-2 log of the likelihood with the noise that is left, whether what is left is noise)."""
+    nothing = Unknowns((), as_in_files=True)
+    problem = Problem(model, chart, nothing, list(pieces), stated, noise_by_differences(chart, pieces))
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            fit, solved = problem.solve(law, STEPS)
+    except (DrakeDiffError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
+        return np.inf, False
+    return _score(problem, fit, solved), not problem.doubt(fit, solved, "")
+
+
+def _score(problem: Problem, fit: Fit, solved: Solved) -> float:
+    every = np.concatenate(solved.reduced.residuals)
+    numbers = np.isfinite(every).sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = fit.noise * np.sqrt(np.nansum(every**2, axis=0) / numbers)
+        noise = np.where(np.isfinite(problem.stated), problem.stated, np.fmax(size, 1e-3 * problem.scatter))
+        each = numbers * ((size / noise) ** 2 + 2 * np.log(noise))
+    return float(np.sum(each[numbers > 0]))

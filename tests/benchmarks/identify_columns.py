@@ -1,0 +1,87 @@
+"""Whether `dd.explain` names columns of a recording that are exchanged, have the other sign, or are in degrees.
+
+    pip install -e '.[test]'
+    python tests/benchmarks/identify_columns.py [--seed 0] [--count 40]
+
+The recordings are those of `identify_causes.py` in which nothing is changed: robots that MuJoCo moved for 2 s, with the
+noise of an encoder and no velocities. In each, in turn, nothing is mistaken, and anything that is named is a false
+alarm; or two positions or two inputs are exchanged, a position or an input has the other sign, or angles are degrees.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+
+import identify_causes as causes
+import numpy as np
+
+import drake_diff as dd
+from drake_diff._base.statistics import success_rate
+
+ROBOTS = ("ur5_robot", "double_pendulum", "panda", "z1", "so100", "kinova", "models/quadruped", "TwoDofs")
+KINDS = ("nothing", "positions exchanged", "inputs exchanged", "position mirrored", "input mirrored", "degrees")
+
+
+def mistaken(model, log, kind, random):
+    """(the recording with the mistake, the names of its columns)."""
+    xs, us = log.xs.copy(), log.us.copy()
+    values, names = (us, model.input_names) if kind.startswith("input") else (xs[:, : model.nq], model.position_names)
+    some = [int(i) for i in sorted(random.choice(values.shape[1], 2, replace=False))]
+    if kind.endswith("exchanged"):
+        values[:, some] = values[:, some[::-1]]
+    elif kind.endswith("mirrored"):
+        some = some[:1]
+        values[:, some] *= -1
+    elif kind == "degrees":
+        angles = [i for i, name in enumerate(names) if name.endswith("_q")]
+        values[:, angles] = np.degrees(values[:, angles])
+        some = angles if len(angles) <= 4 else [angles[0], angles[-1]]
+    return replace(log, xs=xs, us=us), [names[i] for i in some] if kind != "nothing" else []
+
+
+def verdict(model, log, kind, columns):
+    try:
+        w = dd.explain(model, log, motion="continuous")
+    except dd.exceptions.DrakeDiffError as error:
+        return "refused", str(error)
+    ends = {"exchanged": "exchanged", "mirrored": "the other sign", "degrees": "degrees, not radians"}
+    end = ends.get(kind.split()[-1], "")
+    each = [[words.endswith(end) and all(name in words for name in columns) for words in names]
+            for names in (w.names, *w.alternatives)]  # fmt: skip
+    if kind == "nothing":
+        return ("right" if w.explained and not w.names else "alarm"), w.sentence
+    if each[0] == [True]:
+        return "named", w.sentence
+    if [True] in each:
+        return "among", w.sentence
+    return ("another" if w.names else "right as it is" if w.explained else "unexplained"), w.sentence
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--count", type=int, default=40)
+    given = parser.parse_args()
+    found = {}
+    for i in range(given.count):
+        robot, kind = ROBOTS[i // len(KINDS) % len(ROBOTS)], KINDS[i % len(KINDS)]
+        random = np.random.default_rng([given.seed, i])
+        model, log, _ = causes.recorded(robot, (), 10000 * given.seed + i)
+        log, columns = mistaken(model, log, kind, random)
+        begin = time.process_time()
+        said, sentence = verdict(model, log, kind, columns)
+        found.setdefault(kind != "nothing", []).append(said)
+        print(
+            f"{i:3} {robot:18} {time.process_time() - begin:5.1f} s {said:14} {kind}: {columns} -> {sentence}",
+            flush=True,
+        )
+    for is_mistaken, each in sorted(found.items()):
+        for said in sorted(set(each)):
+            rate = success_rate(each.count(said), len(each))
+            what = "mistaken" if is_mistaken else "right"
+            within = f"{100 * rate.lower:.3g} to {100 * rate.upper:.3g} %"
+            print(f"{what} columns, {said}: {each.count(said)} of {len(each)} ({within})")
+
+
+if __name__ == "__main__":
+    main()

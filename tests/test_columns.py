@@ -1,0 +1,90 @@
+"""Mistaken columns of a recording are named: exchanged, with the other sign, or in degrees. The truth is hidden."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+
+sys.path.append(str(Path(__file__).parent / "benchmarks"))
+PERIOD = 0.01
+
+
+def recorded(model, q0, us, noise=1e-3, velocities=False, seed=0):
+    """Drake's motion by steps of 0.1 ms under inputs (n, nu) held for 10 ms, as encoders would say it."""
+    fine, start = model.at_time_step(PERIOD / 100), np.append(q0, np.zeros(model.nv))
+    xs = dd.rollout(fine, start, np.repeat(us, 100, axis=0)).xs
+    xs = xs[::100] + noise * np.random.default_rng(seed).standard_normal((len(us) + 1, model.nx))
+    xs[:, model.nq :] += 9 * noise * np.random.default_rng(seed + 1).standard_normal((len(us) + 1, model.nv))
+    if not velocities:
+        xs[:, model.nq :] = np.nan
+    return xs
+
+
+def said(model, xs, us):
+    return dd.explain(model, dd.Recording("lab", "1", PERIOD * np.arange(len(xs)), xs, us))
+
+
+@pytest.fixture
+def swung(load):
+    """A double pendulum, its motion with velocities, and its inputs."""
+    model, times = load("double_pendulum.urdf", time_step=0.005), PERIOD * np.arange(80)
+    us = np.stack([1.5 * np.sin(5 * times + 0.5), 0.8 * np.cos(8 * times + 1)], axis=1)
+    return model, recorded(model, [0.5, -0.3], us, velocities=True), us
+
+
+def test_exchanged_and_mirrored_columns_and_degrees_are_named(swung):
+    model, xs, us = swung
+    q, v, u = (*model.position_names,), (*model.velocity_names,), (*model.input_names,)
+    other, degrees = np.array([1, -1, 1, -1]), np.array([180 / np.pi] * 2 + [1, 1])
+    for mistaken, inputs, words in (
+        (xs[:, [1, 0, 2, 3]], us, f"columns {q[0]} and {q[1]} are exchanged"),
+        (xs[:, [1, 0, 3, 2]], us, f"columns {q[0]} and {q[1]} and {v[0]} and {v[1]} are exchanged"),
+        (xs, us[:, ::-1], f"columns {u[0]} and {u[1]} are exchanged"),
+        (xs * other, us, f"columns {q[1]} and {v[1]} have the other sign"),
+        (xs * degrees, us, f"columns {q[0]} and {q[1]} have degrees, not radians"),
+    ):
+        w = said(model, mistaken, inputs)
+        assert w.names == (words,), w
+        assert w.explained
+        assert w.alternatives == ()
+        assert w.sentence == f"{words}: this explains the recording."
+
+
+def test_right_columns_are_not_named(swung):
+    assert said(*swung).sentence == "Nothing: the model explains it."
+
+
+def test_what_a_mirror_does_not_change_is_told_as_it_is(load):
+    """A pendulum swings to both sides alike: its mirrored angle is right too, and a mirrored torque is one of both."""
+    model, us = load("pendulum.urdf", time_step=0.005), np.zeros((100, 1))
+    w = said(model, -recorded(model, [1.0], us), us)
+    assert w.names == ()
+    assert w.explained
+    us = 3 * np.sin(0.05 * np.arange(100))[:, None]
+    w = said(model, recorded(model, [1.0], us), -us)
+    assert {w.names, *w.alternatives} == {
+        (f"column {name} has the other sign",) for name in (model.position_names[0], model.input_names[0])
+    }
+    assert w.sentence.endswith("the recording cannot tell.")
+
+
+@pytest.mark.slow
+def test_mistaken_columns_of_an_arm_that_another_engine_moved_are_named():
+    """MuJoCo with an encoder's noise, by the benchmark of causes."""
+    pytest.importorskip("mujoco")
+    import identify_causes
+
+    model, log, _ = identify_causes.recorded("ur5_robot", (), 41)
+    q, u = model.position_names, model.input_names
+    swapped, mirrored, inputs = log.xs.copy(), log.xs.copy(), log.us.copy()
+    swapped[:, [1, 2]], mirrored[:, 3], inputs[:, [0, 1]] = log.xs[:, [2, 1]], -log.xs[:, 3], log.us[:, [1, 0]]
+    for xs, us, words in (
+        (swapped, log.us, f"columns {q[1]} and {q[2]} are exchanged"),
+        (mirrored, log.us, f"column {q[3]} has the other sign"),
+        (log.xs, inputs, f"columns {u[0]} and {u[1]} are exchanged"),
+        (np.degrees(log.xs), log.us, f"6 columns of angles, {q[0]} to {q[5]}, have degrees, not radians"),
+    ):
+        assert said(model, xs, us).names == (words,)
