@@ -3,10 +3,12 @@
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from importlib import metadata
 
 import pytest
@@ -16,9 +18,13 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff._base.compiled import has_numba
 from drake_diff.artifact.listing import list_runs
+from drake_diff.artifact.recover import recover
 from drake_diff.cli import main as cli
 from drake_diff.cli.text import as_options
 from drake_diff.derivatives.methods import METHODS
+from drake_diff.exceptions import ArtifactError
+from drake_diff.optimize import solve as solving
+from drake_diff.record import directory as directories
 
 PENDULUM = f"""
 import numpy as np
@@ -154,6 +160,60 @@ def test_ctrl_c_ends_the_run_with_the_best_motion_so_far(tmp_path):
     assert found.state == "complete"
     assert found.solver.status == "interrupted"
     assert found.failures[0].code == "interrupted"
+
+
+@each_row(
+    "place, told",
+    [
+        ("import numpy as np", "while its problem was set up, before the search began"),
+        ("def problem():", "while its problem was set up, before the search began"),
+        ("the search", "interrupted before the search began: there is no plan"),
+    ],
+)
+def test_a_signal_before_the_search_leaves_a_record_that_says_so(tmp_path, monkeypatch, place, told):
+    """Raised by the script itself, while it is loaded and in problem(), and by what `solve` does first."""
+    path = script(tmp_path, num_steps=5)
+    signalled = "import signal; signal.raise_signal(signal.SIGTERM)"
+    indent = "\n    " if place.startswith("def") else "\n"
+    path.write_text(path.read_text().replace(place, f"{place}{indent}{signalled}"))
+    if place == "the search":
+        monkeypatch.setattr(solving, "first_guess", lambda *_: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.chdir(tmp_path)
+    with kept_handlers():
+        assert exit_of(monkeypatch, "run", path) == 130
+    (left,) = (tmp_path / "artifacts").glob("task.partial-*")
+    found = dd.load_record(left)
+    assert found.state == "incomplete"
+    assert told in found.sentence
+    assert not (tmp_path / "artifacts" / "task").exists()
+    (line,) = list_runs(tmp_path / "artifacts")
+    assert line.verdict == "incomplete"
+    (undecided,) = dd.verify(left).undecided
+    assert told in undecided
+    with pytest.raises(ArtifactError, match="there is no plan of a solve in it"):
+        recover(left)
+    shutil.rmtree(left)
+
+
+def test_a_signal_before_the_directory_is_opened_writes_nothing_and_says_so(tmp_path, monkeypatch, capsys):
+    path = script(tmp_path, num_steps=5)
+    monkeypatch.setattr(directories, "check_place", lambda _: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.chdir(tmp_path)
+    with kept_handlers():
+        assert exit_of(monkeypatch, "run", path) == 130
+    assert "nothing is written" in capsys.readouterr().out
+    assert [each.name for each in tmp_path.iterdir()] == ["task.py"]
+
+
+@contextmanager
+def kept_handlers():
+    """What the command does at a signal is undone at the end."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from drake_diff.record.directory import name_of, partial_of, written_whole
 from drake_diff.record.parts import Event
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.provenance import provenance_of, written_now
-from drake_diff.record.read import load_record
+from drake_diff.record.read import kind_of, load_record
 from drake_diff.record.sealed import WallClock, canonical, reproducible
 from drake_diff.record.solve import EvidenceRecord
 
@@ -38,16 +38,17 @@ if TYPE_CHECKING:
 
 REPLAY, REPORT = "replay.html", "report.html"
 UNDER_WAY = "the run has started and not finished: it is still running, or it was killed or broke off"
+BEFORE_THE_SEARCH = "the run was interrupted before the search began: there is no plan"
 NOT_MEASURED = "the search has ended, and its plan is not measured yet"
 FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record and its schema
 
 
-def begin(folder: Path, problem: Problem | PhasedProblem) -> None:
+def begin(folder: Path, problem: Problem | PhasedProblem, sentence: str = UNDER_WAY) -> None:
     """Mark `folder` as a run that is under way: whatever happens next, its record says "incomplete"."""
     if isinstance(problem, PhasedProblem):
-        phases_record(folder, problem, "incomplete", UNDER_WAY).begin(folder)
+        phases_record(folder, problem, "incomplete", sentence).begin(folder)
         return
-    _record(folder, verdict="incomplete", sentence=UNDER_WAY, **asked(problem)).begin(folder)
+    _record(folder, verdict="incomplete", sentence=sentence, **asked(problem)).begin(folder)
 
 
 @overload
@@ -186,8 +187,11 @@ def write_files(folder: Path, measurement: Measurement, record: EvidenceRecord) 
     write_pages(folder / REPLAY, folder / REPORT, measurement, fields)
 
 
-def begin_interrupted(folder: Path) -> None:
-    """Say in the record of a run that is under way in `folder` that it was interrupted."""
+def begin_interrupted(folder: Path, problem: Problem | PhasedProblem) -> None:
+    """Say in the record of a run in `folder` that it was interrupted, before the search where there is none yet."""
+    if kind_of(folder) is None:
+        begin(folder, problem, BEFORE_THE_SEARCH)
+        return
     record = load_record(folder)
     record.model_copy(update={"sentence": f"the run was interrupted; {record.sentence}"}).begin(folder)
 

@@ -5,7 +5,6 @@ import inspect
 import shlex
 import sys
 import threading
-from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -13,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from drake_diff._base.confined import memory_at_most
-from drake_diff._base.signals import INTERRUPTED
+from drake_diff._base.signals import INTERRUPTED, held_interrupts
 from drake_diff.cli.text import ModelFolder, RunDirectory, judged, out_option, plain, progress_line, show, table
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, WriteError
 
@@ -52,12 +51,52 @@ def run(
     SCRIPT may also define solve_options, a dictionary of arguments of drake_diff.solve. With --elsewhere the plan is
     followed in other plants too, and the record says where it holds; the exit status does not depend on that.
     Exit status 0 only if the solution passes every check. Ctrl-C, SIGTERM and SIGHUP end the search: its best plan is
-    written. One that comes later, while it is measured, ends the run (exit status 130), which `recover` completes.
+    written. One that comes later, while it is measured, ends the run (exit status 130), which `recover` completes; one
+    that comes before the search leaves a record that says so (130 too).
     """
+    if not script.is_file():
+        raise InputError("SCRIPT", got=str(script), expected="a Python file that exists")
+    directory = out or Path("artifacts") / script.stem
+    shown: list[str] = []  # the address of the page
+
+    def show_address(address: str) -> None:
+        shown.append(address)
+        typer.echo(f"the search is shown at {address}")
+
+    claimed: list[Path] = []
+    try:
+        # Only here: a script that is missing is refused before Drake is loaded.
+        from drake_diff.record.directory import written_whole
+        from drake_diff.record.solve import record_without_problem
+
+        with written_whole(directory) as folder:
+            claimed.append(folder)
+            try:
+                problem, options = _asked(script, elsewhere)
+            except KeyboardInterrupt:
+                sentence = "the run was interrupted while its problem was set up, before the search began"
+                with held_interrupts():
+                    record_without_problem(directory.name, sentence).begin(folder)
+                show(f"{sentence}; a record that says so is in {folder}")
+                raise typer.Exit(INTERRUPTED) from None
+            told: dict[str, Any] = {"view": show_address} if view else {}
+            record = _solved_into(directory, folder, problem, options | told, elsewhere)
+    except KeyboardInterrupt:
+        if claimed:
+            raise
+        show(f"interrupted before {directory} was opened: nothing is written")
+        raise typer.Exit(INTERRUPTED) from None
+    (_show_phases if record.kind == "phases" else _show_record)(record)
+    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
+    if shown:
+        _wait_at(f"the plan is at {shown[0]}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def _asked(script: Path, elsewhere: bool) -> tuple[Any, dict[str, Any]]:
+    """The problem that a script defines, and its options of `solve`."""
     module = _loaded(script)
     problem, options = module.problem(), getattr(module, "solve_options", {})
-    directory = out or Path("artifacts") / script.stem
-    # Only here: a script that is missing or wrong is refused before Drake is loaded.
     from drake_diff.optimize.problem.phases import PhasedProblem
     from drake_diff.optimize.problem.problem import Problem
     from drake_diff.optimize.solve import solve
@@ -73,19 +112,7 @@ def run(
         raise UnknownNameError("solve_options", got=name, known=known)
     parts = problem.phases if isinstance(problem, PhasedProblem) else (problem,)
     show(plain(script.name, "bold"), "; ".join(f"{part.system}, {part.num_steps} steps" for part in parts))
-    shown: list[str] = []  # the address of the page
-
-    def show_address(address: str) -> None:
-        shown.append(address)
-        typer.echo(f"the search is shown at {address}")
-
-    told: dict[str, Any] = {"view": show_address} if view else {}
-    record = _solved_into(directory, problem, options | told, elsewhere)
-    (_show_phases if isinstance(problem, PhasedProblem) else _show_record)(record)
-    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
-    if shown:
-        _wait_at(f"the plan is at {shown[0]}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
+    return problem, options
 
 
 def _wait_at(place: str) -> None:
@@ -98,46 +125,46 @@ def _wait_at(place: str) -> None:
         typer.echo("ended")
 
 
-def _solved_into(directory: Path, problem: Any, options: dict[str, Any], elsewhere: bool) -> Any:
-    """Solve, measure and write `directory`; what is interrupted takes no other run's place."""
+def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str, Any], elsewhere: bool) -> Any:
+    """Solve, measure and write `folder`, which is to be `directory`; what is interrupted takes no other run's place."""
     from drake_diff.artifact.other_plants import elsewhere as follow_elsewhere
     from drake_diff.artifact.save import begin, begin_failure, begin_interrupted, keep_plan, plan_kept, write_run
     from drake_diff.optimize.solve import solve
-    from drake_diff.record.directory import is_taken, written_whole
+    from drake_diff.record.directory import is_taken
 
-    folders: list[Path] = []
+    begun: list[Any] = []
 
     def on_start() -> None:
-        folders.append(stack.enter_context(written_whole(directory)))
-        begin(folders[0], problem)
+        begun.append(problem)
+        begin(folder, problem)
 
     def on_plan(plan: Any) -> None:
-        with plan_kept(plan, directory.name, folders[0]):
-            keep_plan(plan, folders[0])
+        with plan_kept(plan, directory.name, folder):
+            keep_plan(plan, folder)
 
-    with ExitStack() as stack:
-        try:
-            with progress_line("solving") as report:
-                solution: Any = solve(problem, progress=report, on_start=on_start, on_plan=on_plan, **options)
-            if elsewhere:
-                with progress_line("following it elsewhere"):
-                    solution = follow_elsewhere(solution)
-            with plan_kept(solution, directory.name, folders[0]):
-                record = write_run(solution, folders[0])
-        except KeyboardInterrupt:
-            if folders:
-                begin_interrupted(folders[0])
-                show(f"interrupted: what there is of the run is in {folders[0]}")
-                show(plain(f"drake-diff recover {shlex.quote(str(folders[0]))} measures its plan, if there is one"))
-            raise typer.Exit(INTERRUPTED) from None
-        except Exception as error:
-            if folders and not isinstance(error, WriteError):
-                begin_failure(error, folders[0], problem)
-            raise
-        if record.solver.status == "interrupted" and is_taken(directory):
-            show(judged(record.verdict), f" interrupted: {record.sentence}")
-            show(f"{directory} has an earlier run, which stays; this one is in {folders[0]}")
-            raise typer.Exit(1)
+    try:
+        with progress_line("solving") as report:
+            solution: Any = solve(problem, progress=report, on_start=on_start, on_plan=on_plan, **options)
+        if elsewhere:
+            with progress_line("following it elsewhere"):
+                solution = follow_elsewhere(solution)
+        with plan_kept(solution, directory.name, folder):
+            record = write_run(solution, folder)
+    except KeyboardInterrupt:
+        with held_interrupts():
+            begin_interrupted(folder, problem)
+        show(f"interrupted: what there is of the run is in {folder}")
+        if begun:
+            show(plain(f"drake-diff recover {shlex.quote(str(folder))} measures its plan, if there is one"))
+        raise typer.Exit(INTERRUPTED) from None
+    except Exception as error:
+        if begun and not isinstance(error, WriteError):
+            begin_failure(error, folder, problem)
+        raise
+    if record.solver.status == "interrupted" and is_taken(directory):
+        show(judged(record.verdict), f" interrupted: {record.sentence}")
+        show(f"{directory} has an earlier run, which stays; this one is in {folder}")
+        raise typer.Exit(1)
     return record
 
 
@@ -155,8 +182,6 @@ def _show_phases(record: Any) -> None:
 
 def _loaded(script: Path) -> ModuleType:
     """The script as a module; its `if __name__ == "__main__"` part does not run."""
-    if not script.is_file():
-        raise InputError("SCRIPT", got=str(script), expected="a Python file that exists")
     spec = importlib.util.spec_from_file_location("drake_diff_script", script)
     if spec is None or spec.loader is None:
         raise InputError("SCRIPT", got=str(script), expected="a Python file, its name ending in .py")

@@ -12,10 +12,14 @@ from drake_diff.record.parts import (
     Failure,
     FiniteTable,
     Metric,
+    ModelInput,
     Part,
     Quantity,
 )
-from drake_diff.record.sealed import SealedRecord, canonical
+from drake_diff.record.provenance import provenance_of, written_now
+from drake_diff.record.sealed import SealedRecord, WallClock, canonical
+
+NO_PROBLEM = "there was no problem yet"
 
 METRIC_WRONG = "metric_wrong"  # the code of a failure: a metric is not what it is by a second measurement
 
@@ -289,3 +293,26 @@ class EvidenceRecord(SealedRecord):
         if self.failures:
             told["failures"] = "; ".join(f"{f.label}: {f.code}" for f in self.failures)
         return told | super().facts()
+
+
+def record_without_problem(name: str, sentence: str) -> EvidenceRecord:
+    """The record of a run that ended before there was a problem: it says that, when and with which versions."""
+    none = Quantity(value=None, unit="s", reason=NO_PROBLEM)
+    return EvidenceRecord(
+        name=name,
+        verdict="incomplete",
+        sentence=sentence,
+        model=ModelInput(file=None, options=None),
+        provenance=provenance_of(),
+        wall_clock=WallClock(written_utc=written_now()),
+        claim=Claim(statement=f"nothing: {NO_PROBLEM}", limitations=[]),
+        inputs=Inputs(initial_guess=NO_PROBLEM, initial_guess_sha256=None, seed=None),
+        problem={},
+        contract={},
+        units={},
+        observation=Observation(variables=[], clock=NO_PROBLEM, start_s=0.0, period_s=0.0, count=0),
+        action=ActionInterface(
+            command_type=NO_PROBLEM, commands=[], update_rate=none, latency_budget=none, safety_fallback=NO_PROBLEM
+        ),
+        events=[Event(t_s=None, kind="failure", message=sentence)],
+    )
