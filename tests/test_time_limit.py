@@ -12,7 +12,8 @@ import pytest
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, until, until_set
+from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, uncounted, until, until_set
+from drake_diff._base.compiled import time_compilations
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.model import twin
 from drake_diff.optimize import run, shooting
@@ -219,6 +220,35 @@ def test_a_signal_ends_a_compilation_at_once():
         flag.clear()
         numba_s["compile_it"]()  # outside a search it is noted alone
         assert flag.is_set()
+
+
+@each_row("method, solver", METHODS)
+def test_what_numba_compiles_is_told_and_no_limit_counts_it(monkeypatch, method, solver):
+    """A year by the clock, of which the limit of 10 s leaves all to the search."""
+    numba = pytest.importorskip("numba")
+    clock, lines, problem = stopped(monkeypatch), [], swing()
+    monkeypatch.setattr("drake_diff._base.clock._uncounted", 0.0)  # which is taken back at the end
+    time_compilations()
+    before = uncounted()
+    numba.njit(lambda x: 2 * x)(1.0)
+    assert uncounted() == before  # the clock stands still here
+
+    def compiling(*arguments, **options):
+        with numba.core.event.trigger_event("numba:compile"), numba.core.event.trigger_event("numba:compile"):
+            clock.now += 3e7
+        return real(*arguments, **options)
+
+    name = "certify_equations" if method == "collocation" else "certify_steps"
+    real = getattr(run, name)
+    monkeypatch.setattr(run, name, compiling)
+    found = dd.solve(problem, method=method, solver=solver, time_limit=10.0, progress=lines.append)
+    assert found.success
+    assert uncounted() - before == pytest.approx(6e7)  # certificates of the guess, and of the result
+    assert lines[-1] == "Numba compiled for 6e+07 s, once on this machine, which no time limit counts"
+    monkeypatch.setattr(run, "judged", late(clock, run.judged, from_call=1))
+    found = dd.solve(problem, method=method, solver=solver, time_limit=10.0)
+    assert found.status is STATUS
+    assert found.message.endswith(lines[-1])
 
 
 class Destroyed:

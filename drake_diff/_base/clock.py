@@ -7,10 +7,25 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 LONGEST_PIECE = 0.4  # of what the pieces before it took, as CasADi's take on chains of 20, 50 and 100 joints
-DEADLINE: ContextVar[float | None] = ContextVar("DEADLINE", default=None)  # of the monotonic clock
+DEADLINE: ContextVar[float | None] = ContextVar("DEADLINE", default=None)  # of `now`
 
 
 STOP: ContextVar[threading.Event | None] = ContextVar("STOP", default=None)
+
+
+_uncounted = 0.0  # [s]
+
+
+def uncounted(seconds: float = 0.0) -> float:
+    """[s] that no limit counts, in all: what Numba compiled, once on a machine. `seconds` are added to it."""
+    global _uncounted
+    _uncounted += seconds
+    return _uncounted
+
+
+def now() -> float:
+    """[s] of the clock that limits go by: the monotonic one, which stands still while Numba compiles."""
+    return time.monotonic() - _uncounted
 
 
 class TimeIsUpError(Exception):
@@ -23,7 +38,7 @@ class StoppedError(TimeIsUpError):
 
 @contextmanager
 def until(deadline: float) -> Iterator[None]:
-    """`check_time` raises after `deadline`, a time of `time.monotonic()`, or that of a block around this one."""
+    """`check_time` raises after `deadline`, a time of `now()`, or that of a block around this one."""
     outer = DEADLINE.get()
     token = DEADLINE.set(deadline if outer is None else min(outer, deadline))
     try:
@@ -47,7 +62,7 @@ def check_time(ahead: float = 0.0) -> None:
     stop, deadline = STOP.get(), DEADLINE.get()
     if stop is not None and stop.is_set():
         raise StoppedError("interrupted")
-    if deadline is not None and time.monotonic() + ahead > deadline:
+    if deadline is not None and now() + ahead > deadline:
         raise TimeIsUpError("the time is up")
 
 
@@ -55,8 +70,8 @@ class Pace:
     """Looks at the clock between pieces of work none of which can be interrupted, such as a call of CasADi."""
 
     def __init__(self) -> None:
-        self.start = time.monotonic()
+        self.start = now()
 
     def go_on(self) -> None:
         """Raise TimeIsUpError where the next piece may end too late: see LONGEST_PIECE."""
-        check_time(ahead=LONGEST_PIECE * (time.monotonic() - self.start))
+        check_time(ahead=LONGEST_PIECE * (now() - self.start))

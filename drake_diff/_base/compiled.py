@@ -6,12 +6,15 @@ compiles once on a machine, after which the result is read from the cache beside
 
 import os
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, TypeVar, cast
+
+from drake_diff._base.clock import uncounted
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -28,6 +31,7 @@ def compiled(function: Function) -> Function:
     """The function, of numbers and arrays alone, compiled; a division by zero gives what NumPy's does."""
     from numba import njit
 
+    time_compilations()
     if not _saves:
         from numba.core import caching
 
@@ -37,6 +41,28 @@ def compiled(function: Function) -> Function:
             return cast(Function, njit(cache=True, error_model="numpy")(function))
         return cast(Function, njit(error_model="numpy")(function))
     return cast(Function, njit(cache=True, error_model="numpy")(function))
+
+
+@cache
+def time_compilations() -> None:
+    """From now on tell the clock that limits go by how long Numba compiles."""
+    from numba.core import event
+
+    class Timer(event.Listener):  # type: ignore[misc]  # Numba has no types
+        def __init__(self) -> None:
+            self.depth, self.start = 0, 0.0
+
+        def on_start(self, _: Any) -> None:
+            if self.depth == 0:
+                self.start = time.monotonic()
+            self.depth += 1
+
+        def on_end(self, _: Any) -> None:
+            self.depth -= 1
+            if self.depth == 0:
+                uncounted(time.monotonic() - self.start)
+
+    event.register("numba:compile", Timer())
 
 
 def _find_cache(locator: Any) -> None:

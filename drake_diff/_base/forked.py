@@ -8,12 +8,12 @@ import signal
 import struct
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
+from drake_diff._base.clock import now
 from drake_diff._base.confined import DIE_WITH_PARENT
 
 LOOK = 0.02  # [s] from one look at what ends the work to the next
@@ -46,7 +46,7 @@ def can_fork() -> bool:
 def forked(work: Callable[[Send], Any], heard: Send, interrupted: threading.Event, deadline: float) -> Ended:
     """`work(send)` in a forked process; what it sends goes to `heard` here, and what it raises is raised here.
 
-    It is ended at `deadline`, a time of `time.monotonic()`; where `interrupted` is set, soon after a signal of its own;
+    It is ended at `deadline`, a time of `now`; where `interrupted` is set, soon after a signal of its own;
     and where `heard` raises. Nothing but what it sends and returns, all of which is pickled, comes back.
     """
     end, begin = os.pipe()
@@ -74,10 +74,10 @@ def forked(work: Callable[[Send], Any], heard: Send, interrupted: threading.Even
                 _, status = os.waitpid(child, 0)
                 ended_by = os.waitstatus_to_exitcode(status)
                 return Ended(crashed=signal.Signals(-ended_by).name if ended_by < 0 else f"status {ended_by}")
-            if interrupted.is_set() and deadline > time.monotonic() + TO_HEAR:
+            if interrupted.is_set() and deadline > now() + TO_HEAR:
                 os.kill(child, signal.SIGINT)
-                deadline = time.monotonic() + TO_HEAR
-            if time.monotonic() > deadline:
+                deadline = now() + TO_HEAR
+            if now() > deadline:
                 return Ended(stopped=True)
     finally:
         if status is None:

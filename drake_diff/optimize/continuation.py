@@ -7,7 +7,6 @@ A stage only warms up the next: the schedule goes on if it fails.
 
 import math
 import threading
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.clock import until_set
+from drake_diff._base.clock import now, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
@@ -107,7 +106,7 @@ class _Stages:
 
     def __init__(self, problem: Problem, limits: Limits, report: Report | None, interrupted: threading.Event):
         self.problem, self.limits, self.report, self.interrupted = problem, limits, report, interrupted
-        self.deadline, self.logs = time.monotonic() + limits.time_limit, list[StageLog]()
+        self.deadline, self.logs = now() + limits.time_limit, list[StageLog]()
         self.xs, self.us, self.ended = np.empty(0), np.empty(0), None
 
     xs: Array
@@ -115,7 +114,7 @@ class _Stages:
     ended: Outcome | None
 
     def is_over(self) -> bool:
-        return self.interrupted.is_set() or time.monotonic() > self.deadline
+        return self.interrupted.is_set() or now() > self.deadline
 
     def log(self, *entries: Any, kind: str = "true plant") -> None:
         self.logs.append(StageLog(kind, len(self.logs) + 1, *entries))
@@ -128,7 +127,7 @@ class _Stages:
         for contact in stages:
             softer = replace(problem, system=softened(problem.model, contact))
             iterations, tolerance = min(STAGE_ITERATIONS, limits.max_iterations), max(STAGE_TOLERANCE, limits.tolerance)
-            short = Limits(iterations, self.deadline - time.monotonic(), tolerance)
+            short = Limits(iterations, self.deadline - now(), tolerance)
             told: tuple[Any, ...]
             try:
                 xs = roll_states(softer.model, x0, us)
@@ -167,7 +166,7 @@ class _Stages:
     def on_the_true_plant(self) -> NlpResult:
         """The stage whose result is told; what is found is `xs`, `us`."""
         problem, limits = self.problem, self.limits
-        left = replace(limits, time_limit=self.deadline - time.monotonic())
+        left = replace(limits, time_limit=self.deadline - now())
         try:
             result, xs, us = solve_through_jumps(problem, self.xs, self.us, limits=left, report=self.report)
         except (GradientError, SimulationError) as error:

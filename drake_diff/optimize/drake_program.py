@@ -3,7 +3,6 @@
 import math
 import re
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from pydrake import solvers
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolutionResult
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.clock import TimeIsUpError, check_time, until_set
+from drake_diff._base.clock import TimeIsUpError, check_time, now, until_set
 from drake_diff._base.forked import can_fork, forked
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
@@ -136,13 +135,13 @@ class _Callback:
 
     def __init__(self, program: MathematicalProgram, watch: Watch, tell: _Tell):
         self.program, self.watch, self.tell = program, watch, tell
-        self.evaluations, self.called = 0, time.monotonic()
+        self.evaluations, self.called = 0, now()
         self.current: Array | None = None
         self.before: Array | None = None  # the last point but this at which everything could be evaluated
 
     def __call__(self, z: Array) -> None:
         self.evaluations += 1
-        before, self.called = self.called, time.monotonic()
+        before, self.called = self.called, now()
         if self.current is None or not np.array_equal(z, self.current):
             self.before, self.current = self.current, np.array(z)
         if self.evaluations == 1:

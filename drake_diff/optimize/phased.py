@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
-from drake_diff._base.clock import StoppedError, until_set
+from drake_diff._base.clock import StoppedError, now, until_set
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.pickling import PicklesItsFields
 from drake_diff._base.signals import noted_interrupts
@@ -390,7 +390,8 @@ class _PhasedRun:
     asked: dict[str, Any]
     report: Report
     by_default: bool
-    start: float = field(default_factory=time.monotonic)
+    start: float = field(default_factory=now)
+    begun: float = field(default_factory=time.monotonic)
 
     @cached_property
     def transcriptions(self) -> list[Transcription]:
@@ -466,7 +467,7 @@ class _PhasedRun:
         program = PhasedProgram(self.problem, programs, self.links)
         inside = [float(np.clip(T, *t.task.horizon)) for T, t in zip(horizons, self.transcriptions, strict=True)]
         guess = np.concatenate([p.pack(z, T) for p, z, T in zip(programs, nodes, inside, strict=True)])
-        left = max(0.0, self.limits.time_limit - (time.monotonic() - self.start))
+        left = max(0.0, self.limits.time_limit - (now() - self.start))
         limits, why = replace(self.limits, time_limit=left, max_iterations=most), program.functions.why_not
         told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
         result = solve_ipopt(program, guess, limits, self.report, exact=not why, motions=program.iterates)
@@ -528,7 +529,7 @@ class _PhasedRun:
             link_certificates=links,
             options=options | {"seed": self.asked["seed"]},
             solver_message=result.message,
-            wall_time=time.monotonic() - self.start,
+            wall_time=time.monotonic() - self.begun,
         )
         solution = judged_phases(draft, result)
         if error is not None and solution.status in PLANS:

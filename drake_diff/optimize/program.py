@@ -3,7 +3,6 @@
 import enum
 import math
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.clock import now
 from drake_diff.model.contact import ContactPoint
 from drake_diff.optimize.iterate import Iterate
 
@@ -176,7 +176,7 @@ class Watch:
 
     def __init__(self, limits: Limits, interrupted: threading.Event):
         self.limits, self.interrupted = limits, interrupted
-        self.start = self.last_report = time.monotonic()
+        self.start = self.last_report = now()
         self.best: Array | None = None
         self.best_merit = math.inf
         self.stopped_by: Outcome | None = None
@@ -184,17 +184,17 @@ class Watch:
     @property
     def elapsed(self) -> float:
         """[s] since the start."""
-        return time.monotonic() - self.start
+        return now() - self.start
 
     def look_up(self) -> bool:
         """Note what ends the solve, if anything does; whether a report is due."""
-        now = time.monotonic()
+        at = now()
         if self.interrupted.is_set():
             self.stopped_by = Outcome.INTERRUPTED
-        elif now - self.start > self.limits.time_limit:
+        elif at - self.start > self.limits.time_limit:
             self.stopped_by = Outcome.TIME_LIMIT
-        due = now - self.last_report > REPORT_PERIOD or self.stopped_by is not None
-        self.last_report = now if due else self.last_report
+        due = at - self.last_report > REPORT_PERIOD or self.stopped_by is not None
+        self.last_report = at if due else self.last_report
         return due
 
     def offer(self, z: Array, cost: float, violation: float) -> None:

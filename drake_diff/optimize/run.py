@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.clock import StoppedError, TimeIsUpError, until, until_set
+from drake_diff._base.clock import StoppedError, TimeIsUpError, now, until, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.steps import certify_steps
@@ -75,7 +75,8 @@ class Run:
     options: dict[str, Any]
     report: Report | None
     searched: Problem | None = None  # what is solved where that is more than what is asked
-    start: float = field(default_factory=time.monotonic)
+    start: float = field(default_factory=now)
+    begun: float = field(default_factory=time.monotonic)
     certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
     reached: list[_SoFar] = field(default_factory=list)  # the last is where it is
 
@@ -120,7 +121,7 @@ class Run:
 
     def _left(self) -> Limits:
         """The limits of a search that begins now."""
-        left = self.limits.time_limit - (time.monotonic() - self.start)
+        left = self.limits.time_limit - (now() - self.start)
         return dataclasses.replace(self.limits, time_limit=max(left, 0.0))
 
     def collocate(self, guess: Guess, refinement: MeshRefinement | None, *, refine: bool | None) -> Solution:
@@ -448,7 +449,7 @@ class Run:
     def _draft(self, xs: Array, us: Array, **found: Any) -> Solution:
         arrays = ("u_final", "us_mid", "mesh")
         found |= {name: frozen(found[name]) for name in arrays if found.get(name) is not None}
-        found |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.start}
+        found |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.begun}
         return Solution(self.problem, self.method, self.solver, Status.FAILED, "", frozen(xs), frozen(us), **found)
 
     def _look_at(

@@ -5,7 +5,6 @@ In multiple shooting (Bock and Plitt, "A multiple shooting algorithm for direct 
 what a late input does need not be seen through all the steps before it. One segment is single shooting.
 """
 
-import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,7 +18,7 @@ from pydrake.solvers import MathematicalProgram
 
 from drake_diff._base.arrays import Array, frozen, positive_int
 from drake_diff._base.autodiff import chain, chain_rows
-from drake_diff._base.clock import check_time
+from drake_diff._base.clock import check_time, now
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.parameters import ParameterVector
@@ -69,12 +68,12 @@ def solve_shooting(
     best point before it with shorter ones, which the message counts. Raises GradientError or SimulationError if the
     motion that it ends with is such a point.
     """
-    begin, start, backed, why = time.monotonic(), SegmentedMotion(problem, segments).pack(xs, us, values), 0, ""
+    begin, start, backed, why = now(), SegmentedMotion(problem, segments).pack(xs, us, values), 0, ""
     table: list[Iteration] = []
     while True:
         # IPOPT shortens a step whose end it cannot evaluate; SNOPT, in Drake, has no way to be told.
         motion = SegmentedMotion(problem, segments, tolerate_failure=solver == "ipopt", careful=backed > 0)
-        spent = time.monotonic() - begin
+        spent = now() - begin
         left = replace(
             limits, time_limit=limits.time_limit - spent, max_iterations=max(1, limits.max_iterations - len(table))
         )

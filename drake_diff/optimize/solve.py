@@ -1,10 +1,8 @@
 """The door: check what is asked, choose a method or a chain of them, search, measure the result again, judge it."""
 
-import dataclasses
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from hashlib import sha256
 from typing import Any, overload
@@ -12,6 +10,7 @@ from typing import Any, overload
 import numpy as np
 
 from drake_diff._base.arrays import LARGEST_SEED, count, positive_float, positive_int
+from drake_diff._base.clock import now, uncounted
 from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import penetration
 from drake_diff.model.parameters import applied
@@ -41,6 +40,7 @@ from drake_diff.optimize.transcription.collocation import (
 )
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
 
+COMPILED = 0.5  # [s] that are worth a word
 LARGEST_TOLERANCE = 1e3
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
@@ -146,7 +146,7 @@ def solve(
         solver: "ipopt" or "snopt"; the latter with method="shooting", or with scheme="drake", which then is Drake's
             own DirectCollocation.
         max_iterations: of the solver, and of each round of a refinement.
-        time_limit: [s] of the whole solve.
+        time_limit: [s] of the whole solve, but for what Numba compiles, once on a machine; the message says how long.
         tolerance: the solver's, on feasibility and optimality.
         seed: of the noise in a default guess, and of the other first guesses.
         segments: of multiple shooting, whose first states are variables too; 1 is single shooting.
@@ -227,15 +227,29 @@ def solve(
         arguments["restarts"] = int(restarts)
     asked = Attempt(method, "asked for", scheme, solver, segments, continuation, int(seed), refine, refinement)
     options: dict[str, Any] = {"limits": limits, "restarts": restarts}
+    compiled = uncounted()
     if view is False:
-        return _solved(problem, asked, arguments, initial_guess, report, on_start, **options)
+        solution = _solved(problem, asked, arguments, initial_guess, report, on_start, **options)
+        return _with_compilation(solution, uncounted() - compiled, report)
     from drake_diff.optimize.live import LiveSearch  # loads a web server
 
     live = LiveSearch(problem, _print_address if view is True else view)
     with live.running(on_start) as start:
         solution = _solved(problem, asked, arguments, initial_guess, live.beside(report), start, **options)
         live.end(solution)
-    return solution
+    return _with_compilation(solution, uncounted() - compiled, report)
+
+
+def _with_compilation(solution: Solution | PhasedSolution, seconds: float, report: Report) -> Solution | PhasedSolution:
+    """Say for how long Numba compiled, where that is worth a word; the message of a solve that the limit ended does."""
+    if seconds < COMPILED:
+        return solution
+    told = f"Numba compiled for {seconds:.2g} s, once on this machine, which no time limit counts"
+    report.say(told)
+    if solution.status is not Status.TIME_LIMIT:
+        return solution
+    message = f"{solution.message}; {told}"
+    return solution.told(message=message) if isinstance(solution, Solution) else replace(solution, message=message)
 
 
 def _print_address(address: str) -> None:
@@ -262,7 +276,7 @@ def _solved(
     task = _Task(problem, limits, asked.seed, report, on_start)
     method, segments, continuation = asked.method, asked.segments, asked.continuation
     if method == "auto" and continuation is not None:
-        asked = dataclasses.replace(asked, method="ilqr", reason="a continuation is asked for")
+        asked = replace(asked, method="ilqr", reason="a continuation is asked for")
     initial_guess = sampled(problem, asked.method, initial_guess)
     in_chain = asked.method in ("auto", "collocation") and segments == 1
     make = partial(_solve_in_chain, task, asked, initial_guess) if in_chain else task.prepare(asked, initial_guess)
@@ -344,12 +358,12 @@ class _Task:
     seed: int
     report: Report
     on_start: Callable[[], None] | None
-    start: float = field(default_factory=time.monotonic)
+    start: float = field(default_factory=now)
 
     @property
     def is_late(self) -> bool:
         """Whether the time is over."""
-        return time.monotonic() - self.start > self.limits.time_limit
+        return now() - self.start > self.limits.time_limit
 
     def begin(self) -> None:
         """Tell once that the work begins."""
@@ -372,9 +386,9 @@ class _Task:
             raise InputError("continuation", got=given_too, expected="none of them: leave the continuation out")
         stages = () if attempt.continuation is None else check_schedule(problem, attempt.continuation)
         searched = kept_apart(problem) if attempt.apart else None
-        left = self.limits.time_limit - (time.monotonic() - self.start)
+        left = self.limits.time_limit - (now() - self.start)
         most = min(attempt.max_iterations or self.limits.max_iterations, self.limits.max_iterations)
-        limits = dataclasses.replace(self.limits, time_limit=max(left, 0.0), max_iterations=most)
+        limits = replace(self.limits, time_limit=max(left, 0.0), max_iterations=most)
         options = {
             "max_iterations": limits.max_iterations,
             "time_limit": None if np.isinf(self.limits.time_limit) else self.limits.time_limit,
@@ -454,13 +468,13 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> S
     chain = list(first.options.get("chain", (told,)))
     used = sum(OTHER_GUESS in link["reason"] for link in chain)
     solver = asked.solver if first.method == asked.method else None
-    base = dataclasses.replace(asked, method=first.method, solver=solver, continuation=None)
+    base = replace(asked, method=first.method, solver=solver, continuation=None)
     found = [(first, f"that of {len(chain)} in the chain" if len(chain) > 1 else "the first")]
     for number in range(1, restarts + 1):
         if found[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
             break
         which = f"{OTHER_GUESS}, number {used + number} of seed {asked.seed}"
-        attempt = dataclasses.replace(base, reason=f"restart {number} of {restarts}: {which}")
+        attempt = replace(base, reason=f"restart {number} of {restarts}: {which}")
         if first.method == "collocation":
             begun = another_guess(task.problem, asked.seed, used + number)
         else:
@@ -501,11 +515,11 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         return
     method, reason = choose_method(problem)
     if problem.motion == CONTINUOUS:
-        yield from _in_continuous_time(problem, dataclasses.replace(asked, method=method, reason=reason), given, found)
+        yield from _in_continuous_time(problem, replace(asked, method=method, reason=reason), given, found)
         return
-    first = dataclasses.replace(asked, method=method, reason=reason, solver=None if method == "ilqr" else asked.solver)
+    first = replace(asked, method=method, reason=reason, solver=None if method == "ilqr" else asked.solver)
     told = "nothing touches at first, and every coordinate is driven"
-    free = dataclasses.replace(asked, method="collocation", reason=told)
+    free = replace(asked, method="collocation", reason=told)
     by_steps = method == "ilqr" or (method == "shooting" and problem.couplings)
     if by_steps and _is_free_at_first(problem) and _is_possible(problem, free):
         yield free, given
@@ -527,7 +541,7 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         if problem.design.vector.parameters:
             begun = found[-1]
         after = "collocation" if method == "collocation" else "shooting"
-        yield dataclasses.replace(asked, method=after, reason="from the motion that iLQR found"), begun
+        yield replace(asked, method=after, reason="from the motion that iLQR found"), begun
 
 
 def _in_continuous_time(
@@ -538,12 +552,12 @@ def _in_continuous_time(
     Shooting is by IPOPT where no solver is asked for: a juggling paddle takes it a tenth of SNOPT's time.
     """
     solver = None if first.method == "ilqr" else first.solver or "ipopt"
-    first = dataclasses.replace(first, solver=solver)
+    first = replace(first, solver=solver)
     yield first, given
     for number in range(OTHER_GUESSES + 1):
         if number:
             reason = f"no plan was found: {OTHER_GUESS} ({number} of {OTHER_GUESSES})"
-            yield dataclasses.replace(first, reason=reason), _rolled_guess(problem, first.seed, number)
+            yield replace(first, reason=reason), _rolled_guess(problem, first.seed, number)
         last = found[-1]
         if (
             first.method == "ilqr"
@@ -552,7 +566,7 @@ def _in_continuous_time(
             and np.all(np.isfinite(last.xs))
         ):
             reason = "from the motion that iLQR found"
-            yield dataclasses.replace(first, method="shooting", solver="ipopt", reason=reason), last
+            yield replace(first, method="shooting", solver="ipopt", reason=reason), last
 
 
 def _rolled_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
@@ -576,7 +590,7 @@ def _other_guesses(
             return
         reason = f"no motion was found: {OTHER_GUESS} ({number} of {OTHER_GUESSES})"
         begun = another_guess(problem, attempt.seed, number)
-        yield dataclasses.replace(attempt, reason=reason, max_iterations=OTHER_ITERATIONS), begun
+        yield replace(attempt, reason=reason, max_iterations=OTHER_ITERATIONS), begun
 
 
 def _kept_apart(problem: Problem, attempt: Attempt, found: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
@@ -585,7 +599,7 @@ def _kept_apart(problem: Problem, attempt: Attempt, found: list[Solution]) -> It
     if attempt.solver == "snopt" or last.status is not Status.CONVERGED_NOT_VERIFIED or is_kept_apart(problem):
         return
     if overlaps(last):
-        yield dataclasses.replace(attempt, reason="links overlapped: they are kept apart", apart=True), last
+        yield replace(attempt, reason="links overlapped: they are kept apart", apart=True), last
 
 
 def _touches_at_first(problem: Problem) -> bool:

@@ -58,12 +58,22 @@ def written_whole(directory: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(target: Path) -> Iterator[None]:
-    """While nobody else writes the directory `target`; ArtifactError where somebody does."""
+    """While nobody else writes the directory `target`; ArtifactError where somebody does.
+
+    The folders that it is to be in are made; where the block raises, those that are still empty are not left.
+    """
+    new = [folder for folder in target.parents if not folder.exists()]
     make_folder(target.parent)
-    with locked(target.with_name(f".{target.name}.lock")) as held:
-        if not held:
-            raise ArtifactError(f"{target}: another run is being written there; choose another directory, or wait")
-        yield
+    try:
+        with locked(target.with_name(f".{target.name}.lock")) as held:
+            if not held:
+                raise ArtifactError(f"{target}: another run is being written there; choose another directory, or wait")
+            yield
+    except BaseException:
+        with suppress(OSError):  # one has something in it
+            for folder in new:
+                folder.rmdir()
+        raise
 
 
 def check_place(target: Path) -> None:

@@ -9,7 +9,6 @@ motion converges slowly (`expansion`).
 
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -17,7 +16,7 @@ from functools import cache
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.clock import TimeIsUpError, until_set
+from drake_diff._base.clock import TimeIsUpError, now, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
@@ -209,7 +208,7 @@ class _Search:
         self.constraints = AugmentedLagrangian(problem)
         lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
         self.inner = lower * (1 + BESIDE * np.sign(lower)), upper * (1 - BESIDE * np.sign(upper))
-        self.start, self.design = time.monotonic(), problem.design
+        self.start, self.design = now(), problem.design
         begin = self.design.start if values is None else self.design.of_values(values)
         self.motion = self._take_in(xs, us, np.clip(begin, *self.design.limits))
         self.guess, self.tried_by = self.motion, _smooth_roll(problem)
@@ -292,7 +291,7 @@ class _Search:
                 return Outcome.INACCURATE
             if interrupted.is_set():
                 return Outcome.INTERRUPTED
-            if time.monotonic() - self.start > self.limits.time_limit:
+            if now() - self.start > self.limits.time_limit:
                 return Outcome.TIME_LIMIT
 
     def _expand(self) -> LinearQuadratic:

@@ -7,7 +7,6 @@ compared with that of the sequence beyond it, where the touch begins a knot earl
 """
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +16,7 @@ from pydrake.autodiffutils import ExtractValue
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
+from drake_diff._base.clock import now
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.model.model import Model
@@ -123,7 +123,7 @@ class _Sequences:
     def __init__(self, problem: Problem, limits: Limits, report: Report | None, values: Array | None):
         self.problem, self.limits, self.report = problem, limits, report
         self.values = values  # of the problem's design, as the last search left them
-        self.deadline, self.rows = time.monotonic() + limits.time_limit, list[Iteration]()
+        self.deadline, self.rows = now() + limits.time_limit, list[Iteration]()
         self.costs = dict[tuple[ContactHold, ...], float]()  # of each sequence's minimum; infinite if none was found
         self.ended = False  # by Ctrl-C or the clock
 
@@ -146,7 +146,7 @@ class _Sequences:
         """Cross what holds the motion while that is cheaper."""
         told, left = list[str](), self._pressing(best[1])
         while left and len(self.costs) < MOST_SEQUENCES and not interrupted.is_set():
-            if time.monotonic() > self.deadline or len(self.rows) > self.limits.max_iterations:
+            if now() > self.deadline or len(self.rows) > self.limits.max_iterations:
                 break
             hold, self.values = left.pop(), best[0].parameters
             cost = cost_of(self.problem, *best)
@@ -191,7 +191,7 @@ class _Sequences:
     ) -> Minimum:
         """One search under `holds`, of `most` iterations, within what is left of the limits."""
         more = int(min(most, max(self.limits.max_iterations - max(len(self.rows) - 1, 0), 1)))
-        limits = replace(self.limits, time_limit=self.deadline - time.monotonic(), max_iterations=more)
+        limits = replace(self.limits, time_limit=self.deadline - now(), max_iterations=more)
         rows = [hold.constraint(self.problem.model) for hold in holds]
         held = replace(self.problem, constraints=(*self.problem.constraints, *rows))
         if holds:

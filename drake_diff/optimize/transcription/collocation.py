@@ -6,7 +6,6 @@
 too coarse for the best input, only a finer one tells.
 """
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
+from drake_diff._base.clock import now
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
@@ -448,7 +448,7 @@ class Transcription:
         A refinement splits the intervals whose error is above its tolerance and solves again from what was found.
         Intervals that come nearer to an obstacle than a plan may are split in any case, up to CLEARANCE_ROUNDS times.
         """
-        start, mesh = time.monotonic(), self.mesh if mesh is None else mesh
+        start, mesh = now(), self.mesh if mesh is None else mesh
         coarse = mesh
         first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
         begun = self.nodes_at(mesh, guess)
@@ -473,8 +473,8 @@ class Transcription:
                 report.say(f"{told} with {count} intervals: refined to {len(mesh) - 1}")
             left, last = _left(limits, start), motion
             if entered:  # what goes through an obstacle is no place to go on from
-                now, then = (self.task.scheme.node_fractions(each) for each in (mesh, coarse))
-                nodes = np.array([np.interp(now, then, column) for column in begun.T]).T
+                these, then = (self.task.scheme.node_fractions(each) for each in (mesh, coarse))
+                nodes = np.array([np.interp(these, then, column) for column in begun.T]).T
                 motion = self.solve_on(mesh, nodes, first, left, report, parameters, far=far)
             else:
                 values = motion.task.parameters
@@ -525,7 +525,7 @@ class Transcription:
         moved = None if parameters is None else self.task.at(self._inside(parameters)).coordinates
         guess = program.pack(nodes, horizon, moved)
         told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-        start = time.monotonic()
+        start = now()
         sizes = len(program.lower), len(program.sides[0])
         begun = multipliers if multipliers and multipliers.sizes == sizes else None
         options: dict[str, Any] = {"more": FAR if far and program.free else None, "motions": program.iterates}
@@ -564,7 +564,7 @@ def finer_mesh(motion: Transcribed, exceeded: Sequence[int], most: int) -> Array
 
 def _left(limits: Limits, start: float) -> Limits:
     """What is left of `limits` of a solve that began at `start`, of the monotonic clock."""
-    return replace(limits, time_limit=max(0.0, limits.time_limit - (time.monotonic() - start)))
+    return replace(limits, time_limit=max(0.0, limits.time_limit - (now() - start)))
 
 
 def kept(last: Transcribed, failed: Transcribed) -> Transcribed:

@@ -10,7 +10,6 @@ linear ones. Path constraints add rows to g and terms to the blocks of their nod
 """
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any, Protocol
@@ -19,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
-from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, until_set
+from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, now, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.optimize.iterate import Iterate
@@ -491,7 +490,7 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
         size = len(program.lower)
         self.sizes = {"x": size, "f": 1, "g": program.nlp["g"].numel(), "lam_x": size}
         self.sizes |= {"lam_g": self.sizes["g"], "lam_p": 0}
-        self.iterates, self.called = 0, time.monotonic()
+        self.iterates, self.called = 0, now()
         self.error: Exception | None = None
         self.construct("callback", {})
 
@@ -519,7 +518,7 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
                 row = Iteration(self.iterates, float(f[0]), violation, math.nan, math.nan)
                 self.report.row(row, lambda: self.motions(x), printed=due)
             self.iterates += 1
-            before, self.called = self.called, time.monotonic()
+            before, self.called = self.called, now()
             if self.iterates > 2:  # the next one takes as long as the last, but for the first, which begins the solver
                 check_time(ahead=self.called - before)
         except Exception as error:  # of `report`; must not go through C++, the solve raises it
