@@ -124,9 +124,16 @@ def pushed(tmp_path_factory):
     return model, motion, folder
 
 
+@pytest.fixture
+def browser(one_browser):
+    """Of all tests: each loads its page anew, and leaves none, which would be drawn beside the tests that follow."""
+    yield one_browser
+    one_browser.get("about:blank")
+
+
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory):
-    """One browser for all tests: each loads its page anew."""
+def one_browser(tmp_path_factory):
+    """A browser without a network."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (the test extra has it)")
     from selenium.webdriver.chrome.service import Service
 

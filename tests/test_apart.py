@@ -40,6 +40,7 @@ def distance(xs, height):
     return np.sqrt(xs[:, 0] ** 2 + xs[:, 1] ** 2 + height**2)
 
 
+@pytest.mark.slow
 def test_balls_that_met_pass_each_other(crossing):
     problem = crossing()
     solution = dd.solve(problem)

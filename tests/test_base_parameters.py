@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers.robots import example_robot, state_in_range
-from helpers.table import each_row
+from helpers.table import slow_after
 from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
 
 import drake_diff as dd
@@ -32,7 +32,9 @@ def test_two_rods_have_the_textbooks_sums(load):
     }  # with the upper one known, the lower one's mass is seen by itself
 
 
-@each_row("name, count", [("ur5_robot.urdf", 36), ("solo12.urdf", None), ("so100.urdf", None)])
+@pytest.mark.parametrize(
+    ("name", "count"), slow_after(1, [("ur5_robot.urdf", 36), ("solo12.urdf", None), ("so100.urdf", None)])
+)
 def test_numbers_that_leave_the_sums_leave_the_motion(name, count):
     """A UR5 has 36 of them, as is published of its kind. Drake's inverse dynamics cannot tell the changed robot."""
     model, random = example_robot(name), np.random.default_rng(0)

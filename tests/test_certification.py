@@ -34,7 +34,7 @@ def test_every_model_here_is_certified_at_every_sampled_state(load, name):
     [
         ("panda.urdf", "panda_link0"),
         pytest.param("ur5_robot.urdf", None, marks=pytest.mark.slow),
-        ("solo12.urdf", None),
+        pytest.param("solo12.urdf", None, marks=pytest.mark.slow),
     ],
 )
 def test_real_robots_are_certified(name, base):

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from helpers.models import MODELS, Plant, contact_properties, robot_file
 from helpers.robots import example_robot, state_in_range
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from pydrake.autodiffutils import InitializeAutoDiff
 from pydrake.geometry import (
     AddContactMaterial,
@@ -142,7 +142,7 @@ def test_two_segments_are_as_near_as_a_search_over_both_finds():
         assert best - 1e-3 <= found <= best + 1e-9, k  # the grid is that much too far at most
 
 
-@each_row("robot", ROBOTS)
+@pytest.mark.parametrize("robot", slow_after(1, ROBOTS))
 def test_distances_of_a_robot_have_exact_derivatives(robot):
     model, random = example_robot(robot, 0.02), np.random.default_rng(4)
     links = placing_of(model)

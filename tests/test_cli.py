@@ -60,7 +60,7 @@ def test_a_run_that_holds_prints_its_checks_and_exits_with_0(tmp_path):
     assert dd.load_record(tmp_path / "artifacts" / "task").verdict == "pass"
 
 
-def test_a_script_may_define_plain_dynamics(tmp_path):
+def test_a_script_may_define_plain_dynamics(tmp_path, monkeypatch, capsys):
     """A block that is pushed from rest to rest over 1 m in 1 s, at a least effort of 12."""
     text = """import drake_diff as dd
 def problem():
@@ -69,15 +69,17 @@ def problem():
     return dd.Problem(block, **ends, num_steps=10, horizon=1.0, running_cost=dd.QuadraticCost(R=[[1.0]]))
 """
     (tmp_path / "block.py").write_text(text)
-    done = drake_diff("run", tmp_path / "block.py", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "Dynamics of the states x0, x1 under the inputs u0, 10 steps" in done.stdout
-    assert re.search(r"cost +12 ", done.stdout)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    assert exit_of(monkeypatch, "run", tmp_path / "block.py") == 0
+    shown = capsys.readouterr().out
+    assert "Dynamics of the states x0, x1 under the inputs u0, 10 steps" in shown
+    assert re.search(r"cost +12 ", shown)
 
 
-def test_out_names_the_run_directory(tmp_path):
-    done = drake_diff("run", script(tmp_path), "--out", tmp_path / "elsewhere", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_out_names_the_run_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert exit_of(monkeypatch, "run", script(tmp_path, num_steps=20), "--out", tmp_path / "elsewhere") == 0
     assert (tmp_path / "elsewhere" / "record.json").is_file()
     assert not (tmp_path / "artifacts").exists()
 
@@ -122,16 +124,17 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
         (("{'method'", "{'metod'"), "solve_options: expected one of"),
     ],
 )
-def test_bad_input_exits_with_2_a_named_error_and_no_artifact(tmp_path, edit, words):
+def test_bad_input_exits_with_2_a_named_error_and_no_artifact(tmp_path, monkeypatch, capsys, edit, words):
+    monkeypatch.chdir(tmp_path)
     path = script(tmp_path)
     text = path.read_text()
     assert edit[0] in text
     path.write_text(text.replace(*edit))
-    done = drake_diff("run", path, cwd=tmp_path)
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert "Error: " in done.stderr
-    assert "Traceback" not in done.stderr
+    assert exit_of(monkeypatch, "run", path) == cli.USAGE
+    shown = capsys.readouterr().err
+    assert words in shown
+    assert "Error: " in shown
+    assert "Traceback" not in shown
     assert not (tmp_path / "artifacts").exists()
 
 
@@ -141,12 +144,12 @@ def test_a_missing_script_exits_with_2(tmp_path):
     assert "nothing.py" in done.stderr
 
 
-def test_a_bug_in_the_script_exits_with_4_and_its_traceback(tmp_path):
+def test_a_bug_in_the_script_exits_with_4_and_its_traceback(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     path = script(tmp_path)
     path.write_text(path.read_text().replace("import numpy as np", "import numpy as np\n1 / 0"))
-    done = drake_diff("run", path, cwd=tmp_path)
-    assert done.returncode == 4
-    assert "ZeroDivisionError" in done.stderr
+    assert exit_of(monkeypatch, "run", path) == cli.INTERNAL
+    assert "ZeroDivisionError" in capsys.readouterr().err
 
 
 def test_ctrl_c_ends_the_run_with_the_best_motion_so_far(tmp_path):

@@ -351,6 +351,7 @@ def test_a_diagram_has_one_length_of_a_step():
             dd.solve(problem, method=method)
 
 
+@pytest.mark.slow
 def test_a_plan_with_a_free_step_is_in_its_record(tmp_path):
     problem = dd.Problem(
         sliding(1.0, 2.0, tmp_path), x0=[0, 0], x_goal=[1, 0], num_steps=6, horizon=(0.5, 10), running_cost=1.0

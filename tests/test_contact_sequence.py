@@ -5,7 +5,7 @@ import signal
 import numpy as np
 import pytest
 from helpers.problems import push
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 
 import drake_diff as dd
 from drake_diff.model.soft_contact import separations
@@ -64,14 +64,17 @@ def test_beginnings_are_where_a_distance_turns_negative(two_spheres):
         assert rows[1] == pytest.approx(np.array([[-1.0, 1, 0, 0, 0]]), abs=1e-12)
 
 
-@each_row(
-    "gap, goal, fields",
-    [
-        (0.15, 0.7, {"damping": 1.0, "ball": 1.2}),
-        (0.3, 1.0, {}),
-        (0.4, 1.2, {"damping": 0.5}),
-        (0.55, 1.1, {"damping": 0.2, "pusher": 1.7, "time_step": 0.025}),
-    ],
+@pytest.mark.parametrize(
+    ("gap", "goal", "fields"),
+    slow_after(
+        1,
+        [
+            (0.15, 0.7, {"damping": 1.0, "ball": 1.2}),
+            (0.3, 1.0, {}),
+            (0.4, 1.2, {"damping": 0.5}),
+            (0.55, 1.1, {"damping": 0.2, "pusher": 1.7, "time_step": 0.025}),
+        ],
+    ),
 )
 def test_pushes_converge(two_spheres, gap, goal, fields):
     model = two_spheres(**fields)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.engines import Doctored, needs
 from helpers.models import ROOT
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -265,25 +265,28 @@ def doctored(case, engine="drake", contact=None, **changes):
     return load
 
 
-@each_row(
-    "kind, changes",
-    [
-        ("rest", {"stiffness": 1.001}),
-        ("rest", {"gravity": 1.01}),
-        ("rest", {"mass": 1.01}),
-        ("stop", {"friction": 1.1}),
-        ("stop", {"gravity": 1.01}),
-        ("slide", {"friction": 1.1}),
-        ("slide", {"gravity": 1.01}),
-        ("slide", {"slope": 1.01}),
-        ("hold", {"friction": 1.1}),
-        ("roll", {"stiffness": 0.5}),
-        ("roll", {"gravity": 1.01}),
-        ("roll", {"friction": 0.1}),
-        ("bounce", {"gravity": 1.01}),
-        ("damped bounce", {"dissipation": 1.1}),
-        ("damped bounce", {"relaxation_time": 1.1}),
-    ],
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    slow_after(
+        7,
+        [
+            ("rest", {"stiffness": 1.001}),
+            ("stop", {"friction": 1.1}),
+            ("slide", {"slope": 1.01}),
+            ("hold", {"friction": 1.1}),
+            ("roll", {"gravity": 1.01}),
+            ("bounce", {"gravity": 1.01}),
+            ("damped bounce", {"relaxation_time": 1.1}),
+            ("rest", {"gravity": 1.01}),
+            ("rest", {"mass": 1.01}),
+            ("stop", {"gravity": 1.01}),
+            ("slide", {"friction": 1.1}),
+            ("slide", {"gravity": 1.01}),
+            ("roll", {"stiffness": 0.5}),
+            ("roll", {"friction": 0.1}),
+            ("damped bounce", {"dissipation": 1.1}),
+        ],
+    ),
 )
 def test_a_doctored_engine_is_off(kind, changes):
     contact = "sap" if "relaxation_time" in changes or kind == "rest" else "lagged"

@@ -198,6 +198,7 @@ def thrown_run(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_in_continuous_time_comes_out_again_and_its_page_says_what_was_checked(thrown_run):
     assert dd.load_record(thrown_run).problem["motion"] == "continuous"
     found = dd.verify(thrown_run)
@@ -226,7 +227,10 @@ def of_less_penetration(folder):
     return {"invariants": tuple(m.model_copy(update={"value": of.get(m.name, 1.0) * m.value}) for m in found)}
 
 
-@pytest.mark.parametrize("forge", [moved, of_the_steps, of_less_penetration])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "forge", [moved, *(pytest.param(forge, marks=pytest.mark.slow) for forge in (of_the_steps, of_less_penetration))]
+)
 def test_a_forged_run_in_continuous_time_is_refused(thrown_run, tmp_path, forge):
     """All hashes are right."""
     folder = tmp_path / "forged"

@@ -10,7 +10,7 @@ import pytest
 from helpers.models import ball_on_ground
 from helpers.plants import pd_pendulum
 from helpers.problems import lqr, pendulum
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -269,12 +269,18 @@ def test_a_record_has_it_and_verify_measures_it_again(pushed, tmp_path):
     assert dd.verify(tmp_path / "run").require().verdict == "holds"
 
 
-@each_row(
-    "change, words",
-    [
-        (lambda part: part["rows"][3].update(goal_error=0.0), "elsewhere.rows[3].goal_error: recorded 0"),
-        (lambda part: part.update(sentence="it holds everywhere"), "elsewhere.sentence: recorded it holds everywhere"),
-    ],
+@pytest.mark.parametrize(
+    ("change", "words"),
+    slow_after(
+        1,
+        [
+            (lambda part: part["rows"][3].update(goal_error=0.0), "elsewhere.rows[3].goal_error: recorded 0"),
+            (
+                lambda part: part.update(sentence="it holds everywhere"),
+                "elsewhere.sentence: recorded it holds everywhere",
+            ),
+        ],
+    ),
 )
 def test_a_record_that_lies_of_it_is_found(pushed, tmp_path, monkeypatch, change, words):
     honest = evidence.record_of

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientWarning, ModelWarning
@@ -34,7 +34,7 @@ def test_the_cart_pole_swings_up_near_the_continuous_optimum():
     assert np.abs(solution.replay.xs[-1] - [1, np.pi, 0, 0]).max() < 1e-8  # the simulator itself arrives
 
 
-@each_row("vx", [0.3, 2.0, 3.7])  # short of the target, on it and beyond
+@pytest.mark.parametrize("vx", slow_after(1, [3.7, 0.3]))  # short of the target and beyond
 def test_the_projectiles_three_gradients_agree(vx):
     """By hand d loss / d vx = (x_T - 6) * 3.0 with x_T = 3 vx."""
     module = example("projectile_hits_target")
@@ -108,6 +108,7 @@ def test_the_hidden_parameters_are_found():
     assert solution.vector.to_dict()["ball.friction"][0] == pytest.approx(0.25, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_cart_pole_stands_again_after_pushes_and_how_fast_is_told():
     """What it takes depends on the machine: only what is said of it is checked, on latencies that are given."""
     module = example("mpc_under_pushes")
@@ -125,6 +126,7 @@ def test_the_cart_pole_stands_again_after_pushes_and_how_fast_is_told():
         assert module.told("cart-pole", made_up, problem).endswith(said)
 
 
+@pytest.mark.slow
 def test_the_panda_arrives_although_it_is_pushed(tmp_path):
     module = example("mpc_under_pushes")
     with warnings.catch_warnings():
@@ -219,6 +221,7 @@ def test_the_pushed_cart_pole_stands_again():
     assert np.abs(problem.goal_error(run.motion.xs[-1])).max() < 0.05
 
 
+@pytest.mark.slow
 def test_the_ball_bounces_into_its_target(capsys):
     module = example("bounce_into_target")
     module.main()

@@ -263,7 +263,9 @@ def test_of_an_arm_that_another_engine_moved_a_right_model_is_silent_and_an_erro
     assert "gives way" in gives["said"]
 
 
-@pytest.mark.parametrize(("step", "names"), [(0.005, ()), (0.0025, ("model.time_step",))])
+@pytest.mark.parametrize(
+    ("step", "names"), [pytest.param(0.005, (), marks=pytest.mark.slow), (0.0025, ("model.time_step",))]
+)
 def test_the_length_of_a_simulators_steps_is_named(load, step, names):
     """Drake's own steps: those of the model are no change of it, and others are told by their length."""
     model = load("double_pendulum.urdf", time_step=0.005)

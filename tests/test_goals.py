@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, ROOT, robot_file
 from helpers.robots import example_robot, state_in_range
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import (
@@ -443,14 +443,17 @@ def test_verify_binds_the_goals_again_and_holds(run):
     assert any("goal" in line and "FrameGoal" in line for line in found.claimed)
 
 
-@each_row(
+@pytest.mark.parametrize(
     "lie",
-    [
-        {"position": [-0.26, None, None]},  # where the hand does not end
-        {"tolerance": 0.5},  # what would take anything: the search then ends elsewhere
-        {"frame": "nowhere"},
-        {"knots": [3]},
-    ],
+    slow_after(
+        2,
+        [
+            {"position": [-0.26, None, None]},  # where the hand does not end
+            {"tolerance": 0.5},  # what would take anything: the search then ends elsewhere
+            {"frame": "nowhere"},
+            {"knots": [3]},
+        ],
+    ),
 )
 def test_a_goal_that_was_moved_is_found_although_the_record_is_whole(run, tmp_path, lie):
     copy = shutil.copytree(run, tmp_path / "copy")

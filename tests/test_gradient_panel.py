@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.browser import browsing
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -58,7 +58,7 @@ VARIANCES = {
 }
 
 
-@pytest.mark.parametrize("case", [QUADRATIC, STEP, ABSOLUTE], ids=lambda c: c.name)
+@pytest.mark.parametrize("case", slow_after(1, [STEP, QUADRATIC, ABSOLUTE]), ids=lambda c: c.name)
 def test_variance_and_bias_are_those_of_the_closed_forms(case):
     """Of 20000 samples in all a variance is known to 3 % or so (their kurtosis is below 20)."""
     panel = dd.studies.gradient_panel([case], samples=2000, seeds=10, budget=50)
@@ -139,14 +139,17 @@ def test_a_mass_on_a_slide_has_the_closed_form_of_its_recursion():
     assert not any(q.biased for q in found.qualities)
 
 
-@each_row(
-    "theta, value, gradient, bias",
-    [
-        (0.3, -0.00307709811, -0.01115833969, 0.0),
-        (0.6, -0.00380439500, -0.00923031040, 0.00904499591),
-        (0.7, -0.00728360895, -0.05318651088, 0.05092558118),
-        (1.0, -0.00852432022, 0.01541917168, -3.2564e-6),
-    ],
+@pytest.mark.parametrize(
+    ("theta", "value", "gradient", "bias"),
+    slow_after(
+        2,
+        [
+            (0.3, -0.00307709811, -0.01115833969, 0.0),
+            (0.7, -0.00728360895, -0.05318651088, 0.05092558118),
+            (0.6, -0.00380439500, -0.00923031040, 0.00904499591),
+            (1.0, -0.00852432022, 0.01541917168, -3.2564e-6),
+        ],
+    ),
 )
 def test_the_wall_has_the_bias_of_its_jumps(theta, value, gradient, bias):
     """F and dF/dx by SciPy's `quad`, split at the jumps; the bias is minus each jump times the density there."""

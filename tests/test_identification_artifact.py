@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.models import MODELS
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from scipy.integrate import solve_ivp
 from typer.testing import CliRunner
 
@@ -204,7 +204,7 @@ def test_a_fit_that_explains_nothing_cannot_be_sold_as_one_that_does(tmp_path):
     assert any("explained: recorded true, again false" in line for line in verified.complaints)
 
 
-@each_row("name", ["report.html", "trace.mcap", "pendulum.urdf"])
+@pytest.mark.parametrize("name", slow_after(1, ["pendulum.urdf", "report.html", "trace.mcap"]))
 def test_another_file_beside_the_record_is_refused(run, tmp_path, name):
     copy = shutil.copytree(run, tmp_path / "copy", dirs_exist_ok=True)
     data = (copy / name).read_bytes()

@@ -213,6 +213,7 @@ def test_steps_have_the_slopes_of_differences_by_unknowns(load):
         np.testing.assert_allclose(by_z[0, 0, :, j], (ends[0] - ends[1]) / 2e-6, atol=1e-8, err_msg=names[0])
 
 
+@pytest.mark.slow
 def test_the_models_own_steps_are_fitted_where_they_are_asked_for_and_are_only_as_good_as_they_are_short(load):
     """Euler's steps of 10 ms put their error into the damping: the interval misses, and the residuals say so."""
     log = swing(damping=0.15)

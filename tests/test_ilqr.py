@@ -457,6 +457,7 @@ def swing_up(**changes):
     return dd.Problem(model, **(given | changes))
 
 
+@pytest.mark.slow
 def test_a_swing_up_converges_as_newtons_method_does():
     """47 steps; more than 190 without the dynamics' curvature by differences."""
     problem = swing_up()
@@ -467,7 +468,13 @@ def test_a_swing_up_converges_as_newtons_method_does():
     assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
 
 
-@pytest.mark.parametrize(("file", "goal"), [("cart_pole.urdf", [0, np.pi, 0, 0]), ("acrobot.xml", [np.pi, 0, 0, 0])])
+@pytest.mark.parametrize(
+    ("file", "goal"),
+    [
+        ("cart_pole.urdf", [0, np.pi, 0, 0]),
+        pytest.param("acrobot.xml", [np.pi, 0, 0, 0], marks=pytest.mark.slow),
+    ],
+)
 def test_a_step_takes_few_rollouts(file, goal, monkeypatch):
     """At most 2.5 for each step that is taken, where full steps are too long: halving from 1 took 3.2."""
     rolled, roll = [], _Search._roll
@@ -512,7 +519,7 @@ def test_a_linear_plant_within_limits_takes_one_step_for_each_update_of_the_mult
     assert len(steps) <= len(updated) + 1
 
 
-@each_row("seed", range(6))
+@each_row("seed", range(3))  # a limit of speed, a corridor, and both
 def test_limits_cost_few_steps(seed):
     """Double pendulums below a speed, in a corridor of positions, or both: at most 60 steps, where cut at each bend
     they took 31 to 156; and what is found is IPOPT's optimum or cheaper, to its 1e-8 of the bounds."""
@@ -722,7 +729,7 @@ def test_where_no_way_goes_on_the_motion_so_far_is_kept_and_the_reason_told(monk
     assert len(solution.iterations) == 1
 
 
-@pytest.mark.parametrize("name", ["finger_edu.urdf", "ur5_robot.urdf"])
+@pytest.mark.parametrize("name", ["finger_edu.urdf", pytest.param("ur5_robot.urdf", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("approximation", ["sap", "lagged"])
 def test_an_arm_that_starts_beside_a_joint_limit_leaves_it(name, approximation):
     """10 mrad from a limit, gravity on: the limit acts on the way, and SAP stops early; the arm is to leave it."""

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers.bounces import RADIUS, Bounce
 from helpers.models import ROOT
-from helpers.table import each_row
 
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
 
@@ -37,7 +36,13 @@ def bounce(law, ball, start, duration):
     )
 
 
-@each_row("law, ball", [("lagged", Bounce(4e4, dissipation=0.4)), ("sap", Bounce(4e4, relaxation_time=2e-3))])
+@pytest.mark.parametrize(
+    ("law", "ball"),
+    [
+        pytest.param("lagged", Bounce(4e4, dissipation=0.4), id="lagged"),
+        pytest.param("sap", Bounce(4e4, relaxation_time=2e-3), marks=pytest.mark.slow, id="sap"),
+    ],
+)
 def test_the_truth_of_a_bounce_is_its_closed_form(law, ball):
     start, duration = (0.4, -1.0), 0.4
     value, slopes = truth(bounce(law, ball, start, duration), columns=(1,))
@@ -47,7 +52,10 @@ def test_the_truth_of_a_bounce_is_its_closed_form(law, ball):
     assert slopes[0].best == pytest.approx(wanted[1], rel=1e-3)  # what the three widths agree to
 
 
-@pytest.mark.parametrize("family", [name for name in FAMILIES if name != "wall"])
+@pytest.mark.parametrize(
+    "family",
+    [pytest.param(n, marks=[pytest.mark.slow] if n == "toss" else []) for n in FAMILIES if n != "wall"],
+)
 def test_the_laws_by_hand_are_drakes_where_they_are_the_same(family):
     """Without damping both laws are k x: friction, the points where forces act and torques are Drake's."""
     one = case(3, 0, family)

@@ -458,7 +458,7 @@ def test_certificates_of_reduced_coordinates_agree_in_motion_and_refuse_a_plante
     assert dd.certify(model, x, u, derivatives=replace(true, A=wrong)).verdict == "disagree"
 
 
-@pytest.mark.parametrize("name", ["panda.urdf", "talos_full_v2.urdf"])
+@pytest.mark.parametrize("name", ["panda.urdf", pytest.param("talos_full_v2.urdf", marks=pytest.mark.slow)])
 def test_steps_of_reduced_robots_have_the_derivative_of_their_own_equation(name):
     """In flight, and on the ground in spheres: AutoDiffXd."""
     ground = (

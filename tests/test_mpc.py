@@ -100,7 +100,7 @@ def test_the_pushed_cart_pole_ends_upright(swung):
 def test_the_same_calls_give_the_same_bytes_and_start_forgets(swung):
     def run(mpc):
         loop = dd.loop.Loop(pushes=[dd.loop.Push("pole", [1.0, 0, 0], 0.1)])
-        return dd.loop.closed_loop(mpc._problem.model, mpc, np.zeros(4), 20, loop).commands.tobytes()
+        return dd.loop.closed_loop(mpc._problem.model, mpc, np.zeros(4), 8, loop).commands.tobytes()
 
     first = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
     other = dd.loop.MPC(swing_up(), horizon=30, plan=swung)

@@ -27,7 +27,15 @@ def pendulum(**changes):
     return dd.Problem(dd.load_model(MODELS / "pendulum.urdf", time_step=0.02), **fields)
 
 
-@each_row("solver, segments", [("ipopt", 2), ("ipopt", 7), ("snopt", 20), ("ipopt", 100)])
+@pytest.mark.parametrize(
+    ("solver", "segments"),
+    [
+        ("ipopt", 7),
+        ("snopt", 20),
+        pytest.param("ipopt", 2, marks=pytest.mark.slow),
+        pytest.param("ipopt", 100, marks=pytest.mark.slow),
+    ],
+)
 def test_a_pendulum_swings_up_with_the_oracles_cost(solver, segments):
     """J = 8.826541704941 by an independent program; 100 segments are direct transcription. The goal is met to 1e-8."""
     solution = shoot(pendulum(), solver=solver, segments=segments)
@@ -39,7 +47,7 @@ def test_a_pendulum_swings_up_with_the_oracles_cost(solver, segments):
 
 
 @each_row("solver", SOLVERS)
-@each_row("segments", [1, 3, 20])
+@each_row("segments", [1, 20])
 def test_lqr_has_the_riccati_recursions_cost_from_states_that_are_no_rollout(solver, segments):
     """The double integrator; the cost is flat at its minimum, but for the defects, which are met to 1e-8."""
     problem = lqr(*DOUBLE_INTEGRATOR)

@@ -20,7 +20,7 @@ from helpers.browser import (
 )
 from helpers.models import MODELS
 from helpers.robots import example_robot, state_in_range
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 
 import drake_diff as dd
 from drake_diff.artifact.runs_page import write_runs_page
@@ -140,7 +140,7 @@ def test_inputs_are_drawn_as_percent_of_their_limit_and_told_in_their_unit(human
 
 
 @browsing
-@each_row("size", [DESK, PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize("size", slow_after(1, [(PHONE,), (DESK,)]), ids=["phone", "desktop"])
 def test_the_replay_stays_in_view_beside_its_plots(humanoid, browser, size):
     open_page(browser, humanoid / "report.html", size=size)
     browser.execute_script("[...document.querySelectorAll('.plot')][34].scrollIntoView({block: 'end'})")
@@ -178,7 +178,9 @@ def open_all(browser):
 
 
 @browsing
-@each_row("size, scheme", [(DESK, "light"), (PHONE, "dark")], ids=["desktop", "phone"])
+@pytest.mark.parametrize(
+    ("size", "scheme"), slow_after(1, [(PHONE, "dark"), (DESK, "light")]), ids=["phone", "desktop"]
+)
 def test_every_text_can_be_read_and_every_control_has_a_name(humanoid, browser, size, scheme):
     open_page(browser, humanoid / "report.html", size=size, scheme=scheme)
     open_all(browser)
@@ -243,6 +245,7 @@ def test_the_speed_of_the_replay_is_chosen(two, browser):
     assert browser.execute_script("return document.getElementById('play').getAttribute('aria-label')") == "pause"
 
 
+@pytest.mark.slow
 @browsing
 def test_the_picture_is_dark_where_the_screen_is(two, browser):
     corner = {}

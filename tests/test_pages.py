@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from helpers.browser import browsing, errors
 from helpers.models import MODELS
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 
 import drake_diff as dd
 from drake_diff.artifact.first_screen import Check
@@ -116,7 +116,7 @@ def test_an_element_that_got_into_a_page_is_noticed(pages):
 
 
 @browsing
-@each_row("name", PAGES)
+@pytest.mark.parametrize("name", slow_after(3, PAGES))
 def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
     from selenium.webdriver.support.ui import WebDriverWait
 
@@ -132,7 +132,7 @@ def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
 
 
 @browsing
-@each_row("name", PAGES)
+@pytest.mark.parametrize("name", slow_after(3, PAGES))
 def test_a_script_that_was_put_into_a_page_is_refused(pages, browser, tmp_path, name):
     page = tmp_path / "page.html"
     page.write_text(pages[name].read_text().replace("</header>", "</header><script>document.title = 'x'</script>", 1))

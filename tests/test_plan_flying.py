@@ -60,7 +60,7 @@ def test_a_goal_of_what_does_not_fly_is_refused(box, tmp_path):
         plan(box, goals={"ground": [0.0, 0.0, 1.0]}, out=tmp_path / "out")
 
 
-@pytest.mark.parametrize("name", ["quadrotor_base.urdf", "iris_simple.urdf"])
+@pytest.mark.parametrize("name", ["quadrotor_base.urdf", pytest.param("iris_simple.urdf", marks=pytest.mark.slow)])
 def test_drones_of_strangers_hover(name, tmp_path):
     done = plan(robot_file(name), out=tmp_path / "out", seed=2)
     assert done.success, done.lines

@@ -437,7 +437,9 @@ def test_a_robot_in_the_air_with_controllers():
 # ---- many robots -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("approximation", ["lagged", "similar", "sap"])
+@pytest.mark.parametrize(
+    "approximation", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("lagged", "similar")), "sap"]
+)
 def test_robots_in_contact_are_never_refused_and_planted_materials_nearly_always(approximation, monkeypatch):
     """288 random states of walking robots: Drake's steps are within its tolerance, and 1 % of stiffness is noticed.
 

@@ -74,6 +74,7 @@ def test_the_reference_takes_as_many_steps_as_lie_between_samples(load):
         compared(model, dropped)
 
 
+@pytest.mark.slow
 def test_the_command_compares_recordings_and_saves_them(load, tmp_path):
     """One as it was, one sampled every fifth step and by another time step: exit status 1, and named."""
     model = load("cart_pole.urdf")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.bounces import RADIUS, Bounce
 from helpers.models import MODELS, Plant, contact_properties
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from pydrake.geometry import Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import PdControllerGains, SpatialInertia
@@ -69,6 +69,7 @@ def test_where_the_step_resolves_the_contact_the_limit_is_the_compliant_closed_f
 DROP, FALL = (0.6, 0.0), 0.5  # touches the floor after 0.319 s at 3.13 m/s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stiffness", "tau", "h"), [(1e4, 0.01, 2e-3), pytest.param(1e4, 0.005, 1e-3, marks=pytest.mark.slow)]
 )
@@ -218,6 +219,7 @@ def test_a_gradient_of_one_is_compared_with_the_slopes(secant, continuous, sprea
     assert found.converged.all() == (not disagree)
 
 
+@pytest.mark.slow
 def test_stiffening_a_bounce_does_not_converge_at_a_fixed_step(bouncer):
     certificate = dd.certify_rollout(
         bouncer(1e3, 1 / 480), [1.003, -2.0], None, height, num_steps=480, refine_stiffness=True
@@ -232,7 +234,7 @@ def test_stiffening_needs_a_stated_stiffness(load):
         dd.certify_rollout(load("pendulum.urdf"), [0.1, 0], [[0.0]], height, refine_stiffness=True)
 
 
-@pytest.mark.parametrize(("h", "count"), [(0.01, 100), (0.02, 37)])
+@pytest.mark.parametrize(("h", "count"), slow_after(1, [(0.02, 37), (0.01, 100)]))
 def test_the_gradient_of_a_projectile_is_the_same_at_every_step_size(load, h, count):
     """In free fall d z / d v0 = T for every h."""
     model = load("projectile.sdf", time_step=h)

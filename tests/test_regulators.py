@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.loops import tracking
 from helpers.models import MODELS
+from helpers.table import slow_after
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.controllers import (
@@ -99,7 +100,7 @@ def survivors(solution, controller, level, trials):
     return count
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_after(1, NAMES))
 def test_our_gains_are_drakes_on_the_discrete_plant(name):
     """1e-9 of the largest; what is asked is 1e-6. 80 to 100 steps of rounding in two Riccati recursions."""
     solution = swing_up(name)
@@ -111,7 +112,7 @@ def test_our_gains_are_drakes_on_the_discrete_plant(name):
     assert np.abs(drakes - other.gains).max() > 1e-3 * np.abs(ours.gains).max()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_after(1, NAMES))
 def test_in_continuous_time_drakes_gains_are_others(name):
     """So that the survival below compares two regulators: a tenth of the typical gain apart, at most steps."""
     solution = swing_up(name)
@@ -132,7 +133,7 @@ def compare(name, trials):
         assert a >= 0.95 * trials or b < 0.95 * trials, f"{name} at {level}: {a} of {trials} under ours, {b}"
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_after(1, NAMES))
 def test_a_few_starts_survive_under_ours_as_under_drakes(name):
     compare(name, 10)
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers.browser import browsing, colours, errors, move_slider, open_page, set_screen, view_of, wait_for_frame
 from helpers.models import MODELS
-from helpers.table import each_row
+from helpers.table import slow_after
 from pydrake.planning import RobotDiagramBuilder
 
 import drake_diff as dd
@@ -92,7 +92,9 @@ def show_all(browser):
 
 
 @browsing
-@each_row("name", ["swing_up", "thrown", "collocated", "limited", "not_finite", "no_replay"])
+@pytest.mark.parametrize(
+    "name", slow_after(2, ["swing_up", "thrown", "collocated", "limited", "not_finite", "no_replay"])
+)
 def test_a_report_opens_without_a_network_and_without_an_error(runs, browser, tmp_path, name):
     """On a laptop, and on a phone that turns dark while the page is open."""
     open_page(browser, runs / name / "report.html", size=(1440, 900))

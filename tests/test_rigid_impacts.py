@@ -206,7 +206,7 @@ CONTACTS = [
 ]
 
 
-@pytest.mark.parametrize("name", ["solo12.urdf", "bolt.urdf"])
+@pytest.mark.parametrize("name", ["solo12.urdf", pytest.param("bolt.urdf", marks=pytest.mark.slow)])
 def test_the_impacts_of_robots_are_those_of_drakes_terms(name):
     """Values and derivatives of a foot that strikes, beside impulses by another method and their differences."""
     model, random, seen = example_robot(name, feet=True), np.random.default_rng(3), set()

@@ -12,7 +12,7 @@ import pytest
 from helpers.browser import browsing, colours, errors, move_slider, open_page, view_of, wait_for_frame
 from helpers.loops import CART, H, plan, pushed_and_stopped
 from helpers.models import MODELS
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -199,7 +199,9 @@ def test_the_page_says_and_plots_it_and_needs_no_network(result, saved):
 
 
 @browsing
-@pytest.mark.parametrize(("size", "scheme"), [((1440, 900), "light"), ((390, 844), "dark")], ids=["laptop", "phone"])
+@pytest.mark.parametrize(
+    ("size", "scheme"), slow_after(1, [((1440, 900), "light"), ((390, 844), "dark")]), ids=["laptop", "phone"]
+)
 def test_the_page_opens_without_a_network_and_without_an_error(saved, browser, tmp_path, size, scheme):
     page = tmp_path / "report.html"
     shutil.copy(saved[0] / "robustness.html", page)

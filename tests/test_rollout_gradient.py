@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from helpers.models import Plant, contact_properties
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 
 import drake_diff as dd
 from drake_diff.derivatives.step import derivatives_along
@@ -128,7 +128,7 @@ def bouncing_ball(k):
     return plant.model()
 
 
-@pytest.mark.parametrize(("k", "at_least"), [(1e3, 0.05), (1e4, 0.5)])
+@pytest.mark.parametrize(("k", "at_least"), slow_after(1, [(1e3, 0.05), (1e4, 0.5)]))
 def test_a_compliant_bounce_does_not_have_the_rigid_gradient(k, at_least):
     """A bounce off the ground without loss has dy/dy0 = dy/dv0 = -1. That of Drake's discrete contact is
     10 to 400 % off, the more the stiffer, although differences confirm it: not to be optimized with."""
@@ -140,6 +140,7 @@ def test_a_compliant_bounce_does_not_have_the_rigid_gradient(k, at_least):
     dd.certify_rollout(model, start, None, lambda x: x[0], num_steps=480).require()
 
 
+@pytest.mark.slow
 def test_a_rollout_that_touches_down_exactly_on_a_step_has_no_gradient():
     """The start of the bounce above: 0.9 m at 2 m/s are 216 steps of 1/480 s, after which the ball just touches."""
     certificate = dd.certify_rollout(bouncing_ball(1e3), [1.0, -2.0], None, lambda x: x[0], num_steps=480)

@@ -14,6 +14,7 @@ from helpers.models import MODELS, ROOT
 import drake_diff as dd
 from drake_diff.artifact.listing import compare_runs, list_runs
 from drake_diff.artifact.save import begin, begin_failure
+from drake_diff.cli.main import main
 from drake_diff.cli.text import plain
 from drake_diff.exceptions import ArtifactError
 
@@ -112,20 +113,30 @@ def test_text_of_a_record_changes_nothing_on_a_terminal():
     assert plain("[red]no[/]\x1b[31m\u202e\n").plain == "[red]no[/]\ufffd[31m\ufffd\ufffd"
 
 
-def test_the_commands_print_and_exit_as_they_should(runs, tmp_path):
+def test_the_commands_print_and_exit_as_they_should(runs, tmp_path, monkeypatch, capsys):
+    """The first in a process of its own, as a shell starts it."""
     done = drake_diff("verify", runs / "a", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "values came out; the run's verdict: pass" in " ".join(done.stdout.split())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def told(*words):
+        monkeypatch.setattr(sys, "argv", ["drake-diff", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code, capsys.readouterr().out
+
     copy = Path(shutil.copytree(runs / "a", tmp_path / "copy"))
     (copy / "trace.mcap").write_bytes(b"")
-    done = drake_diff("verify", copy, cwd=tmp_path)
-    assert done.returncode == 1
-    assert "trace.mcap: its 0 bytes are not those that record.json describes" in done.stdout
-    assert "verdict: incomplete" in drake_diff("verify", runs / OPEN, cwd=tmp_path).stdout
-    assert drake_diff("verify", runs / "nowhere", cwd=tmp_path).returncode == 2
-    done = drake_diff("list", runs, cwd=tmp_path)
-    assert done.returncode == 0
-    assert [line.split()[:2] for line in done.stdout.splitlines()[1:]] == [
+    status, shown = told("verify", copy)
+    assert status == 1
+    assert "trace.mcap: its 0 bytes are not those that record.json describes" in shown
+    assert "verdict: incomplete" in told("verify", runs / OPEN)[1]
+    assert told("verify", runs / "nowhere")[0] == 2
+    status, shown = told("list", runs)
+    assert status == 0
+    assert [line.split()[:2] for line in shown.splitlines()[1:]] == [
         ["a", "pass"],
         ["b", "pass"],
         [FAILED, "incomplete"],
@@ -133,14 +144,14 @@ def test_the_commands_print_and_exit_as_they_should(runs, tmp_path):
         ["odd", "unreadable"],
         [OPEN, "incomplete"],
     ]
-    assert "\x1b" not in done.stdout
-    done = drake_diff("compare-runs", runs / "a", runs / "b", cwd=tmp_path)
-    assert done.returncode == 0
-    assert "problem.x_goal[0]" in done.stdout
-    done = drake_diff("compare-runs", runs / "a", runs / "b", "--out", "new/both.html", cwd=tmp_path)
-    assert done.returncode == 0
+    assert "\x1b" not in shown
+    status, shown = told("compare-runs", runs / "a", runs / "b")
+    assert status == 0
+    assert "problem.x_goal[0]" in shown
+    status, shown = told("compare-runs", runs / "a", runs / "b", "--out", "new/both.html")
+    assert status == 0
     assert "problem.x_goal[0]" in (tmp_path / "new/both.html").read_text()
-    assert "wrote new/both.html" in done.stdout
+    assert "wrote new/both.html" in shown
 
 
 def test_an_exception_in_the_solve_leaves_a_labelled_record_and_exits_with_4(tmp_path):

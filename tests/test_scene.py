@@ -66,6 +66,7 @@ def test_all_of_a_motion_is_in_view_and_fills_the_picture(seed):
     assert 0.75 * FILLED < most < FILLED + 1e-9
 
 
+@pytest.mark.slow
 @browsing
 def test_the_ground_is_as_dark_as_the_screen(browser, tmp_path):
     """A half space, which has no look of its own: below the middle of the picture there is nothing else."""

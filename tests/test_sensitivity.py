@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.models import MODELS
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, UnknownNameError
@@ -159,7 +159,7 @@ def regulated(write_urdf, x0=(1.0, 0.5), **asked):
     return dd.Problem(model, x0=x0, final_cost=dd.QuadraticCost(Q=np.diag([5.0, 2.0])), **given | asked)
 
 
-@each_row("method", ["ilqr", "shooting"])
+@pytest.mark.parametrize("method", slow_after(1, ["ilqr", "shooting"]))
 def test_a_linear_regulator_has_the_gains_of_its_riccati_equation(write_urdf, method):
     """du_0/dx0 = -K_0, dx_k/dx0 the closed loop, d cost/dx0 = 2 P_0 x0: the discrete Riccati recursion."""
     problem = regulated(write_urdf)
@@ -198,6 +198,7 @@ def test_a_discrete_plan_between_two_states_is_a_least_norm(write_urdf):
     assert by_goal.verdict == by_mass.verdict == "agree"
 
 
+@pytest.mark.slow
 def test_discrete_plans_keep_what_holds_them(write_urdf):
     """A waypoint, a constraint, a coupling, a free entry of the first state, and a bound of the input."""
     model = write_urdf(mass=1.0, time_step=0.1)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.plants import offset_pendulum, pair, pd_pendulum
+from helpers.table import slow_after
 from pydrake.geometry import Box, Cylinder, Sphere
 from pydrake.multibody.tree import PdControllerGains
 
@@ -74,11 +75,14 @@ def test_the_same_sphere_beside_the_axis_is_certified():
 
 @pytest.mark.parametrize(
     ("upper", "lower", "height"),
-    [
-        (Sphere(0.1), Cylinder(0.2, 0.2), 0.095),  # over an untilted cap
-        (Cylinder(0.1, 0.2), Cylinder(0.2, 0.2), 0.095),  # aligned caps
-        (Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995),  # flat faces
-    ],
+    slow_after(
+        1,
+        [
+            (Sphere(0.1), Cylinder(0.2, 0.2), 0.095),  # over an untilted cap
+            (Cylinder(0.1, 0.2), Cylinder(0.2, 0.2), 0.095),  # aligned caps
+            (Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995),  # flat faces
+        ],
+    ),
 )
 def test_aligned_hydroelastic_shapes_are_caught(upper, lower, height):
     assert refuses(*pair(upper, lower, hydroelastic=True, height=height))

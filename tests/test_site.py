@@ -14,7 +14,7 @@ DOCS = ROOT / "docs"
 BLOCK = re.compile(
     r"^(?:```python\n(.*?)^```\n(?:\n```text\n(.*?)^```\n)?|<!-- python\n(.*?)^-->\n)", re.MULTILINE | re.DOTALL
 )
-LONG = ("contact_plans.md", "methods.md", "mpc.md")  # they solve more than a pendulum
+LONG = ("contact_plans.md", "identification.md", "methods.md", "mpc.md")  # they solve more than a pendulum
 PAGES = [
     pytest.param(path, marks=[pytest.mark.slow] if path.name in LONG else [], id=str(path.relative_to(DOCS)))
     for path in sorted(DOCS.rglob("*.md"))

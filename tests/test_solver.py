@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, contact_properties
 from helpers.plants import pd_pendulum
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from pydrake.geometry import Sphere
 
 import drake_diff as dd
@@ -282,9 +282,9 @@ def test_ctrl_c_while_the_guess_is_improved_ends_the_solve(load):
     assert "iLQR: interrupted" in solution.message
 
 
-@each_row(
-    "method, solver",
-    [("collocation", "ipopt"), ("collocation", "snopt"), ("shooting", "ipopt"), ("shooting", "snopt")],
+@pytest.mark.parametrize(
+    ("method", "solver"),
+    slow_after(2, [("collocation", "ipopt"), ("shooting", "snopt"), ("collocation", "snopt"), ("shooting", "ipopt")]),
 )
 def test_the_solvers_own_table_is_kept(load, method, solver):
     scheme = "drake" if (method, solver) == ("collocation", "snopt") else None

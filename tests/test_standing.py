@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers.models import robot_file
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
@@ -160,7 +160,7 @@ def test_a_frame_and_a_joint_go_where_they_are_asked_to(on_feet):
     assert isinstance(sideways, Refusal)  # legs of two joints about y keep the trunk in its plane
 
 
-@each_row("name", ["panda.urdf", "iris.urdf", "allegro_left_hand.urdf", "kinova.urdf"])
+@pytest.mark.parametrize("name", slow_after(1, ["panda.urdf", "iris.urdf", "allegro_left_hand.urdf", "kinova.urdf"]))
 def test_an_arm_a_hand_and_a_drone_have_no_feet(name):
     model = dd.load_model(robot_file(name), time_step=0.005, actuators="all", mimic="reduce", **ON_FEET, **GROUND)
     assert isinstance(find_feet(model, model.default_state[: model.nq]), Refusal)

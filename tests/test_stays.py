@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.models import MODELS
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from scipy.linalg import solve_discrete_are
 
 import drake_diff as dd
@@ -104,7 +104,7 @@ def model_gain(model):
     return dd.step(model, [0, 0], [1.0])[1] / model.time_step
 
 
-@each_row("method", METHODS)
+@pytest.mark.parametrize("method", slow_after(1, METHODS))
 def test_a_pendulum_swings_up_to_where_a_regulator_takes_over(method):
     solution = dd.solve(swung_up(), method=method)
     assert solution.success, solution.message
@@ -119,6 +119,7 @@ def test_a_pendulum_swings_up_to_where_a_regulator_takes_over(method):
     assert np.max(np.abs(x - [np.pi, 0])) < 1e-6
 
 
+@pytest.mark.slow
 def test_where_a_formula_is_too_hopeful_sampling_lowers_the_level():
     """An acrobot falls over long before its torque is at the limit. States of other seeds judge what is given out."""
     problem = swung_up("acrobot.xml", (np.pi, 0, 0, 0), 500.0)

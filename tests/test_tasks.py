@@ -42,6 +42,7 @@ def test_a_double_pendulums_tip_reaches_a_point(method):
     assert solution.cost == pytest.approx(again.cost, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_ur5s_hand_reaches_a_point_by_multiple_shooting():
     """Six joints for three coordinates: where it ends is the cheapest of many postures.
 

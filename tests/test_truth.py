@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.bounces import Bounce
 from helpers.models import Plant, contact_properties
+from helpers.table import slow_after
 
 import drake_diff as dd
 from drake_diff.certificates.truth import TrueSlope, judged, softest_contact
@@ -93,6 +94,7 @@ def test_the_truth_of_a_bounce_is_that_of_its_events_and_the_steps_have_another_
     assert "2 of 2 not ours, first by slide_x[0] the slope is" in str(certificate), str(certificate)
 
 
+@pytest.mark.slow
 def test_the_difference_of_the_laws_is_measured_apart_from_the_error_of_the_step(dropped):
     """`sap` of a relaxation time, and Drake's continuous plant, which has Hunt and Crossley's law of the same file."""
     ball, model = dropped("sap", relaxation_time=0.01, dissipation=0.3)
@@ -108,7 +110,7 @@ def test_the_difference_of_the_laws_is_measured_apart_from_the_error_of_the_step
     assert "difference of the laws, to Hunt-Crossley of Drake's continuous plant: the loss changes by" in str(truth)
 
 
-@pytest.mark.parametrize("approximation", ["sap", "lagged"])
+@pytest.mark.parametrize("approximation", slow_after(1, ["sap", "lagged"]))
 def test_steps_tend_to_the_law_that_is_named(tmp_path, approximation):
     """After a touch of 10 ms the ball's speed tends, at first order in h, to what its own law says."""
     ball, start = Bounce(1e5, relaxation_time=1e-3, dissipation=0.1), (0.1005, -1.0)
@@ -149,7 +151,8 @@ def test_a_graze_has_no_slope_and_that_is_its_own_answer(dropped):
     assert "it has a corner here" in str(certificate)
 
 
-@pytest.mark.parametrize("approximation", ["lagged", pytest.param("sap", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("approximation", ["lagged", "sap"])
 def test_the_gradient_in_continuous_time_is_certified_and_wrong_ones_are_not(dropped, approximation):
     _, model = dropped(approximation, relaxation_time=0.005, dissipation=0.2)
     start, arguments = (0.2, -2.0), {"num_steps": 15, "seconds": 60}

@@ -4,6 +4,8 @@ import contextlib
 import functools
 import inspect
 
+import pytest
+
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
 
@@ -33,6 +35,12 @@ def each_row(names, rows, *, ids=None):
         return test
 
     return decorate
+
+
+def slow_after(count, rows):
+    """The rows of `pytest.mark.parametrize`; those after the first `count` are slow tests."""
+    cells = [row if isinstance(row, tuple) else (row,) for row in rows]
+    return [pytest.param(*row, marks=[pytest.mark.slow] if i >= count else []) for i, row in enumerate(cells)]
 
 
 def named_rows(columns, rows, ids):
