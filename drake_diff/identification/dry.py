@@ -19,10 +19,12 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff.identification.chart import Chart
 from drake_diff.identification.flow import CHUNK, ContinuousMotion
 from drake_diff.identification.frozen import exponential
-from drake_diff.identification.tree import Mask, Numbers, caught, held_inverse
-from drake_diff.identification.unknowns import numbers_at, set_numbers
+from drake_diff.identification.tree import Grip, Mask, Numbers, Tree, caught, held_inverse
+from drake_diff.identification.unknowns import COULOMB, Unknowns, numbers_at, set_numbers
+from drake_diff.model.model import Model
 
 REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
 MOST_PARTS = 8  # of a step; what is left of it then goes on as it is
@@ -51,7 +53,7 @@ class Part(NamedTuple):
 class DryMotion(ContinuousMotion):
     """As `ContinuousMotion`, with dry friction in some joints; steps may be differentiated frozen halfway."""
 
-    joints: tuple[int, ...] = ()  # degrees of freedom
+    joints: tuple[int, ...] = ()  # degrees of freedom; one that others follow has the friction of all of them
     gives: bool = False  # whether friction gives way; of one joint only
     calm: bool = False
 
@@ -64,6 +66,22 @@ class DryMotion(ContinuousMotion):
         for m in range(hs.shape[1]):
             xs[:, m + 1], _ = self._steps(pushed, numbers, xs[:, m], hs[:, m], us[:, m])
         return xs
+
+    def grip_at(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Grip:
+        """(which way joints slide (N, nv), which are held (N, nv)) in states (N, nq), (N, nv) under u (N, nu)."""
+        nothing, pushed = np.zeros(v.shape), self.tree.pushed(numbers)
+        return self._grip(pushed, numbers, np.concatenate([q, v], axis=1), u, nothing, nothing > 0)
+
+    def rates(self, values: Array, x: Array, u: Array) -> Array:
+        """(N, nx) by time, of states (N, nx) under u (N, nu)."""
+        numbers = set_numbers(self.model, self.tree, self.unknowns, values)
+        turn, held = self.grip_at(numbers, x[:, : self.model.nq], x[:, self.model.nq :], u)
+        pushed = self.tree.pushed(numbers)
+
+        def accelerate(q: Array, v: Array, u: Array) -> Array:
+            return self._pushes(pushed, numbers, np.concatenate([q, v], axis=1), u, turn, held)[0]
+
+        return self._rates(accelerate, x, u)
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
@@ -121,15 +139,17 @@ class DryMotion(ContinuousMotion):
         return x, parts
 
     @property
+    def words(self) -> str:
+        return f"{super().words}, with dry friction that holds"
+
+    @property
     def own(self) -> Mask:
         """(nv,) which joints have dry friction."""
         return np.isin(np.arange(self.model.nv), self.joints)
 
-    def _grip(
-        self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, released: Array, stays: Mask
-    ) -> tuple[Array, Mask]:
+    def _grip(self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, released: Array, stays: Mask) -> Grip:
         """(turn, held) of a motion that begins at x; a joint at rest is held where friction can."""
-        v, own = x[:, self.model.nq :], self.own
+        v, own, friction = x[:, self.model.nq :], self.own, self.tree.friction(numbers)
         turn = np.where(own, released if self.gives else np.where(np.abs(v) > REST, np.sign(v), released), 0.0)
         held = own & (turn == 0)
         for _ in self.joints:
@@ -137,7 +157,7 @@ class DryMotion(ContinuousMotion):
             if not len(some):
                 break
             _, push = self._pushes(pushed, numbers, x[some], u[some], turn[some], held[some])
-            beyond = np.where(held[some] & ~stays[some], np.abs(push) - numbers.coulomb, -np.inf)
+            beyond = np.where(held[some] & ~stays[some], np.abs(push) - friction, -np.inf)
             j = np.argmax(beyond, axis=1)
             let = beyond[np.arange(len(some)), j] > 0
             if not np.any(let):
@@ -176,7 +196,8 @@ class DryMotion(ContinuousMotion):
         self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, turn: Array, held: Mask
     ) -> tuple[Array, Indices]:
         """(by how much joints slide or are held as they should at x (N,), negative beyond; which is the least (N,))."""
-        room, size = np.where(turn != 0, turn * x[:, self.model.nq :], np.inf), np.maximum(numbers.coulomb, 1e-300)
+        room = np.where(turn != 0, turn * x[:, self.model.nq :], np.inf)
+        size = np.maximum(self.tree.friction(numbers), 1e-300)
         some = np.flatnonzero(np.any(held, axis=1))
         if self.gives:
             every = np.broadcast_to(self.own, held.shape)
@@ -248,3 +269,13 @@ class DryMotion(ContinuousMotion):
         h = part.h[:, None, None]
         whole, phi = exponential(h * J)
         return np.concatenate([whole, h * (phi @ C)], axis=2)
+
+
+def smooth_or_dry(model: Model, tree: Tree, chart: Chart, unknowns: Unknowns, longest: float) -> ContinuousMotion:
+    """The motion in continuous time, with dry friction that holds in those joints of which it is an unknown."""
+    own, coupling = (model, tree, chart, unknowns, longest), tree.dynamics.coupling
+    dry = {one.label for one in unknowns.each if one.quantity == COULOMB}
+    places = {link.joint.v_start for link in tree.links if link.joint.joint in dry}
+    if coupling is not None:
+        places = {int(coupling.of_v[i]) for i in places}
+    return DryMotion(*own, joints=tuple(sorted(places))) if places else ContinuousMotion(*own)

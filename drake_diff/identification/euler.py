@@ -11,7 +11,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.flow import ContinuousMotion
-from drake_diff.identification.tree import Mask, Numbers
+from drake_diff.identification.tree import Grip, Numbers
 from drake_diff.identification.unknowns import set_numbers
 
 
@@ -50,7 +50,7 @@ class EulerMotion(ContinuousMotion):
         return replace(numbers, reflected=numbers.reflected + self.longest * numbers.damping)
 
     def _step_slopes(
-        self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array, grip: tuple[Array, Mask] | None = None
+        self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array, grip: Grip | None = None
     ) -> Array:
         by = by.copy()
         by[numbers.places("reflected")] += self.longest * by[numbers.places("damping")]

@@ -25,6 +25,7 @@ from drake_diff.exceptions import SimulationError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.measured import LEAST, Piece
 from drake_diff.identification.sensors import Sensors
+from drake_diff.identification.tree import Grip, Numbers
 from drake_diff.identification.unknowns import BIAS, Unknowns, numbers_at, set_numbers
 from drake_diff.model.model import Model
 
@@ -72,6 +73,10 @@ class Law(Protocol):
 
     def rates(self, values: Array, x: Array, u: Array) -> Array:
         """(N, nx) by time, of states (N, nx) under u (N, nu)."""
+        ...
+
+    def grip_at(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Grip | None:
+        """What dry friction does in states; None where there is none."""
         ...
 
 
@@ -258,12 +263,14 @@ class Fit:
             return [np.zeros((len(each), 0)) for each in s.at]
         numbers = set_numbers(self.model, self.sensors.known, self.unknowns, values)
         with np.errstate(over="ignore", invalid="ignore"):
-            return self._split(s, self.sensors.read(numbers, *self._samples(s, xs)))
+            q, v, u = self._samples(s, xs)
+            return self._split(s, self.sensors.read(numbers, q, v, u, self.law.grip_at(numbers, q, v, u)))
 
     def _read_slopes(self, z: Array, s: Segments, xs: Array) -> list[tuple[Array, Array]]:
         """Of each segment (samples, m, 2 nv) by the state, and (samples, m, np) by z."""
         numbers, by = numbers_at(self.model, self.sensors.known, self.unknowns, z)
-        by_x, by_z = self.sensors.slopes(numbers, *self._samples(s, xs), by)
+        q, v, u = self._samples(s, xs)
+        by_x, by_z = self.sensors.slopes(numbers, q, v, u, by, self.law.grip_at(numbers, q, v, u))
         return list(zip(self._split(s, by_x), self._split(s, by_z), strict=True))
 
     def _shift(self, values: Array) -> Array:

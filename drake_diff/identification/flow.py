@@ -13,7 +13,7 @@ from scipy.integrate import DOP853
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.tree import Mask, Numbers, Tree
+from drake_diff.identification.tree import Grip, Numbers, Tree
 from drake_diff.identification.unknowns import Unknowns, numbers_at, set_numbers
 from drake_diff.model.model import Model
 
@@ -73,6 +73,10 @@ class ContinuousMotion:
         """(N, nx) by time, of states (N, nx) under u (N, nu)."""
         return self._rates(self.tree.acceleration(set_numbers(self.model, self.tree, self.unknowns, values)), x, u)
 
+    def grip_at(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Grip | None:
+        """What dry friction does in states (N, nq), (N, nv) under u (N, nu); None where it holds nothing."""
+        return None
+
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
         numbers, by = numbers_at(self.model, self.tree, self.unknowns, z)
@@ -87,7 +91,7 @@ class ContinuousMotion:
         return found[..., :nx], found[..., nx:]
 
     def _step_slopes(
-        self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array, grip: tuple[Array, Mask] | None = None
+        self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array, grip: Grip | None = None
     ) -> Array:
         nx, h = x.shape[1], h[:, None, None]
         start = np.zeros((*x.shape, nx + by.shape[1]))
@@ -110,7 +114,7 @@ class ContinuousMotion:
         return np.concatenate([(self.chart.coordinates.rate(q) @ v[..., None])[..., 0], a], axis=1)
 
     def _rate_slopes(
-        self, numbers: Numbers, by: Array, x: Array, u: Array, grip: tuple[Array, Mask] | None = None
+        self, numbers: Numbers, by: Array, x: Array, u: Array, grip: Grip | None = None
     ) -> tuple[Array, Array, Array]:
         nq, chart = self.model.nq, self.chart.coordinates
         q, v = x[:, :nq], x[:, nq:]

@@ -14,8 +14,8 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
+from drake_diff.identification.dry import smooth_or_dry
 from drake_diff.identification.fit import Fit, Law, Solved, growth_cuts
-from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.judge import (
     FALSE_ALARM,
     Known,
@@ -201,7 +201,7 @@ def identify(
         law: Law = (
             discrete_motion(model, unknowns, pieces)
             if own_tree is None
-            else ContinuousMotion(model, own_tree, chart, unknowns, LONGEST)
+            else smooth_or_dry(model, own_tree, chart, unknowns, LONGEST)
         )
         fit, solved = problem.solve(law, max_iterations)
         found = problem.judged(fit, solved, why if motion == "auto" else "")

@@ -12,7 +12,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, skew
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.tree import SLIP_SPEED, Numbers, Tree
+from drake_diff.identification.tree import Grip, Numbers, Tree
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
 
@@ -149,11 +149,12 @@ class Sensors:
         every = [column for sensor in self.each for column in sensor.columns]
         return [every.index(column) for column in self.columns]
 
-    def read(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Array:
-        """(N, m) at q (N, nq), v (N, nv), under u (N, nu)."""
+    def read(self, numbers: Numbers, q: Array, v: Array, u: Array, grip: Grip | None = None) -> Array:
+        """(N, m) at q (N, nq), v (N, nv), under u (N, nu); `grip` is of dry friction."""
         tree = self._tree
-        a = tree.accelerate(numbers, q, v, u) if self._accelerates else np.zeros_like(v)
-        return np.asarray(self._read(numbers, q, v, a, u).real)
+        a = tree.accelerate(numbers, q, v, u, grip) if self._accelerates else np.zeros_like(v)
+        forces = tree.carried(numbers, q, v, a) if self._forces else None
+        return np.asarray(self._read(numbers, q, v, a, forces).real)
 
     @property
     def known(self) -> Tree:
@@ -170,10 +171,19 @@ class Sensors:
     def _accelerates(self) -> bool:
         return any(sensor.quantity in ("accel", FORCE) for sensor in self.each)
 
-    def slopes(self, numbers: Numbers, q: Array, v: Array, u: Array, by: Array) -> tuple[Array, Array]:
+    @property
+    def _forces(self) -> list[tuple[int, int]]:
+        """(column, degree of freedom) of each force."""
+        tree = self._tree
+        found = [sensor for sensor in self.each if sensor.quantity == FORCE]
+        return [(self.columns.index(sensor.columns[0]), int(tree.first[sensor.link])) for sensor in found]
+
+    def slopes(
+        self, numbers: Numbers, q: Array, v: Array, u: Array, by: Array, grip: Grip | None = None
+    ) -> tuple[Array, Array]:
         """(N, m, 2 nv) by small motions of the state, and (N, m, np) by parameters, of which `by` moves the numbers."""
         tree, nv = self._tree, v.shape[1]
-        moving = tree.slopes(numbers, q, v, u, by) if self._accelerates else None
+        moving = tree.slopes(numbers, q, v, u, by, grip) if self._accelerates else None
         a = np.zeros_like(v) if moving is None else moving.a
         moved = np.zeros((len(q), self.count, 2 * nv))
         by_a = np.zeros((len(q), self.count, nv))
@@ -181,17 +191,22 @@ class Sensors:
         for j in used:
             step = np.zeros(nv, dtype=complex)
             step[j] = 1j * TINY
-            moved[..., j] = self._read(numbers, q, v, a, u, small=step).imag / TINY
-            moved[..., nv + j] = self._read(numbers, q, v + step, a, u).imag / TINY
+            moved[..., j] = self._read(numbers, q, v, a, small=step).imag / TINY
+            moved[..., nv + j] = self._read(numbers, q, v + step, a).imag / TINY
             if moving is not None:
-                by_a[..., j] = self._read(numbers, q, v, a + step, u).imag / TINY
+                by_a[..., j] = self._read(numbers, q, v, a + step).imag / TINY
         found = np.zeros((len(q), self.count, by.shape[1]))
         flat = numbers.flat
         for column in range(by.shape[1]):
             if np.any(by[:, column] != 0):
                 turned = flat + 1j * TINY * by[:, column]
                 parts = {name: turned[numbers.places(name)] for name in Numbers.__dataclass_fields__}
-                found[..., column] = self._read(Numbers(**parts), q, v, a, u).imag / TINY
+                found[..., column] = self._read(Numbers(**parts), q, v, a).imag / TINY
+        if self._forces:
+            by_q, by_v, mass, by_numbers = tree.carried_slopes(numbers, q, v, a, by)
+            for j, k in self._forces:
+                moved[:, j], by_a[:, j] = np.concatenate([by_q[:, k], by_v[:, k]], axis=1), mass[:, k]
+                found[:, j] = by_numbers[:, k]
         if moving is not None:
             moved[..., :nv] += by_a @ moving.by_q
             moved[..., nv:] += by_a @ moving.by_v
@@ -210,14 +225,15 @@ class Sensors:
                 i = tree.links[i].parent
         return seen
 
-    def _read(self, numbers: Numbers, q: Any, v: Any, a: Any, u: Array, small: Any = None) -> Any:
-        """(N, m), complex where anything is; `small` (nv,) is a small motion of the positions."""
+    def _read(self, numbers: Numbers, q: Any, v: Any, a: Any, forces: Array | None = None, small: Any = None) -> Any:
+        """(N, m), complex where anything is; `small` (nv,) is a small motion of the positions. Forces are given."""
         small = np.zeros(v.shape[1]) if small is None else small
         known: dict[int, _At] = {}
         every = []
         for sensor in self.each:
             if sensor.quantity == FORCE:
-                every.append(self._force(numbers, sensor, q, v, a, u, small))
+                k = self._tree.first[sensor.link]
+                every.append(np.zeros((len(q), 1)) if forces is None else forces[:, [k]])
                 continue
             at = self._frame(sensor.link, numbers, q, v, a, small, known).to(sensor.turn, sensor.point)
             if sensor.quantity == "position":
@@ -226,15 +242,6 @@ class Sensors:
                 of = at.w if sensor.quantity == "gyro" else at.a
                 every.append((np.swapaxes(at.R, -1, -2) @ of[..., None])[..., 0])
         return np.concatenate(every, axis=1)[:, self._entries()]
-
-    def _force(self, numbers: Numbers, sensor: Sensor, q: Any, v: Any, a: Any, u: Array, small: Any) -> Any:
-        """(N, 1) what the drive, its rotor, spring and friction give to the link."""
-        tree = self._tree
-        link, k = tree.links[sensor.link], tree.first[sensor.link]
-        effort = np.clip(u, -tree.limits, tree.limits) * numbers.strength
-        stretched = q[:, link.joint.q_start] + small[k] - numbers.rest[k]
-        force = effort @ tree.actuation[k] - numbers.stiffness[k] * stretched - numbers.damping[k] * v[:, k]
-        return (force - numbers.coulomb[k] * np.tanh(v[:, k] / SLIP_SPEED) - numbers.reflected[k] * a[:, k])[:, None]
 
     def _frame(self, i: int, numbers: Numbers, q: Any, v: Any, a: Any, small: Any, known: dict[int, _At]) -> _At:
         """Of link i."""

@@ -11,6 +11,7 @@ from drake_diff.derivatives.step import derivatives_along
 from drake_diff.derivatives.steps import take_steps
 from drake_diff.exceptions import GradientError, InputError, ModelError
 from drake_diff.identification.measured import Piece
+from drake_diff.identification.tree import Numbers
 from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
@@ -56,6 +57,10 @@ class DiscreteMotion:
     def rates(self, values: Array, x: Array, u: Array) -> Array:
         """There are none: whoever needs them is refused."""
         raise ModelError(f"{self.words} have no rates in between: a delay is sought in continuous time")
+
+    def grip_at(self, numbers: Numbers, q: Array, v: Array, u: Array) -> None:
+        """Nothing: Drake's joints have no dry friction."""
+        return
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""

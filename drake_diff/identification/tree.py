@@ -33,6 +33,7 @@ from drake_diff.model.plant import actuators
 
 SLIP_SPEED = 0.02  # v_s [rad/s or m/s] over which dry friction turns: Drake's joints have none, so nothing gives one
 Mask = NDArray[np.bool_]
+Grip = tuple[Array, Mask]  # what dry friction does: which way each coordinate slides, and which of them it holds
 _INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz
 
 
@@ -99,9 +100,13 @@ class Tree:
         """(L,) whether a link is a free body."""
         return np.array([link.free for link in self.links], dtype=bool)
 
-    def accelerate(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Array:
-        """a (N, nv) at q (N, nq), v (N, nv) under u (N, nu)."""
-        return self.acceleration(numbers)(q, v, u)
+    def accelerate(self, numbers: Numbers, q: Array, v: Array, u: Array, grip: Grip | None = None) -> Array:
+        """a (N, nv) at q (N, nq), v (N, nv) under u (N, nu); `grip` as `slopes` says, of friction that holds still."""
+        if grip is None:
+            return self.acceleration(numbers)(q, v, u)
+        turn, held = grip
+        mass, force = self.pushed(numbers)(q, v, u, turn)
+        return np.asarray((held_inverse(mass, held) @ force[..., None])[..., 0])
 
     def acceleration(self, numbers: Numbers) -> Callable[[Array, Array, Array], Array]:
         """`accelerate` with these numbers, for many calls."""
@@ -181,23 +186,23 @@ class Tree:
         names = {link.joint.body: i for i, link in enumerate(self.links)}
         return CompiledTree(tuple(whole), names, len(self.dynamics.mass))
 
-    def slopes(
-        self, numbers: Numbers, q: Array, v: Array, u: Array, by: Array, grip: tuple[Array, Mask] | None = None
-    ) -> Slopes:
+    def slopes(self, numbers: Numbers, q: Array, v: Array, u: Array, by: Array, grip: Grip | None = None) -> Slopes:
         """The same with derivatives; `by` (count, np) is how the numbers change with each parameter.
 
-        Of joints without followers, `grip` can say what dry friction does: (which way each slides (N, nv), -1 to 1;
-        which of them it holds (N, nv)).
+        `grip` can say what dry friction does: (which way each coordinate slides (N, nv), -1 to 1; which of them it
+        holds (N, nv)).
         """
         q, v = self._all(q, v)
         turn, held = (None, np.zeros(v.shape, dtype=bool)) if grip is None else grip
         moving, force, mass = self._moved(numbers, q, v, u, turn)
         diagonal = np.arange(v.shape[1])
-        if grip is None:
+        if turn is None:
             inverse = np.asarray(np.linalg.inv(self._own(mass)))
         else:
+            still = held & (self._along(numbers.held_inertia) == 0)
+            turn, held = self._of_all(turn), self._of_all(held) != 0
             mass, force = caught(numbers, mass, force, v, held)
-            inverse = held_inverse(mass, held & (numbers.held_inertia == 0))
+            inverse = held_inverse(self._own(mass), still)
         bias = moving.forces(np.zeros_like(v))[0]
         own = (inverse @ self._along(force - bias)[..., None])[..., 0]
         a = self._all(q, own)[1]
@@ -211,6 +216,18 @@ class Tree:
         by_u = inverse @ self._along_columns(self.actuation * numbers.strength * self._passes(u)[:, None, :])
         by_q, by_v = self._own(by_q), self._own(by_v)
         return Slopes(own, -inverse @ by_q, -inverse @ by_v, by_u, -inverse @ self._along_columns(change))
+
+    def carried(self, numbers: Numbers, q: Array, v: Array, a: Array) -> Array:
+        """(N, n) what moves each link with all that it carries; of a tree in which no joint follows another."""
+        return self._with(numbers).moving(self.place(numbers, q), v).forces(a)[0]
+
+    def carried_slopes(
+        self, numbers: Numbers, q: Array, v: Array, a: Array, by: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """The same by small motion, by v, by a (N, n, n) and by what moves the numbers by `by` (N, n, np)."""
+        moving = self._with(numbers).moving(self.place(numbers, q), v)
+        _, by_q, by_v = moving.derivatives(a)
+        return by_q, by_v, moving.mass, self._by_links(numbers, moving, q, a, by)
 
     def regressors(self, numbers: Numbers, q: Array, v: Array, a: Array) -> list[Array]:
         """Of each link (N nv, 10): the force of inverse dynamics at q, v and a (N, nv) by its ten numbers."""
@@ -232,6 +249,16 @@ class Tree:
         bias = moving.forces(np.zeros_like(v))[0]
         needed = (self._own(mass) @ a[..., None])[..., 0] + self._along(bias - force)
         return np.asarray(needed @ np.linalg.pinv(self.efforts(numbers)).T)
+
+    def friction(self, numbers: Numbers) -> Array:
+        """(nv,) the most that dry friction pushes along each coordinate: of its joint and of those that follow it."""
+        coupling = self.dynamics.coupling
+        return numbers.coulomb if coupling is None else np.asarray(np.abs(coupling.spread).T @ numbers.coulomb)
+
+    def _of_all(self, turn: Array) -> Array:
+        """(N, n) which way each joint slides, of which way coordinates do (N, nv)."""
+        coupling = self.dynamics.coupling
+        return turn if coupling is None else np.asarray(turn @ np.sign(coupling.spread).T)
 
     def _all(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Positions and velocities of all joints, those that follow another included."""
@@ -265,7 +292,7 @@ class Tree:
         effort = np.clip(u, -self.limits, self.limits) * numbers.strength
         stretched = np.where(numbers.stiffness != 0, q[:, self.dynamics.positions] - numbers.rest, 0.0)
         force = effort @ self.actuation.T - numbers.stiffness * stretched - numbers.damping * v
-        return np.asarray(force - numbers.coulomb * (np.tanh(v / self.slip) if turn is None else turn))
+        return np.asarray(force - numbers.coulomb * (np.tanh(v / self.slip) if turn is None else self._of_all(turn)))
 
     def _passes(self, u: Array) -> Array:
         """(N, nu) 1 where an input is within its limits, beyond which it changes nothing."""
@@ -320,19 +347,7 @@ class Tree:
         held: Mask,
     ) -> Array:
         """(N, n, np) of inverse dynamics less the other forces, at fixed a."""
-        found = np.zeros((*v.shape, by.shape[1]))
-        _, A, carried = moving.forces(a)
-        poses = self.place(numbers, q)
-        for i, places in enumerate(numbers.places("inertial")):
-            used = np.flatnonzero(np.any(by[places] != 0, axis=0))
-            if len(used):
-                found[:, :, used] += self._regressor(i, poses, moving, A) @ by[np.ix_(places, used)]
-        for i, places in enumerate(numbers.places("offset")):
-            used = np.flatnonzero(np.any(by[places] != 0, axis=0))
-            if len(used):
-                found[:, :, used] += self._by_shift(i, poses, moving, A, carried) @ by[np.ix_(places, used)]
-        by_gravity = -(moving.carried_inertia @ moving.S[..., None])[..., 0][..., 3:]
-        found += by_gravity @ by[numbers.places("gravity")]
+        found = self._by_links(numbers, moving, q, a, by)
         stretched = q[:, self.dynamics.positions] - numbers.rest
         for name, value in (
             ("damping", v),
@@ -350,6 +365,23 @@ class Tree:
         if np.any(rows):
             effort = np.clip(u, -self.limits, self.limits)
             found -= (self.actuation * effort[:, None, :]) @ rows
+        return found
+
+    def _by_links(self, numbers: Numbers, moving: Moving, q: Array, a: Array, by: Array) -> Array:
+        """(N, n, np) of inverse dynamics at fixed a."""
+        found = np.zeros((*a.shape, by.shape[1]))
+        _, A, carried = moving.forces(a)
+        poses = self.place(numbers, q)
+        for i, places in enumerate(numbers.places("inertial")):
+            used = np.flatnonzero(np.any(by[places] != 0, axis=0))
+            if len(used):
+                found[:, :, used] += self._regressor(i, poses, moving, A) @ by[np.ix_(places, used)]
+        for i, places in enumerate(numbers.places("offset")):
+            used = np.flatnonzero(np.any(by[places] != 0, axis=0))
+            if len(used):
+                found[:, :, used] += self._by_shift(i, poses, moving, A, carried) @ by[np.ix_(places, used)]
+        by_gravity = -(moving.carried_inertia @ moving.S[..., None])[..., 0][..., 3:]
+        found += by_gravity @ by[numbers.places("gravity")]
         return found
 
     def _regressor(self, i: int, poses: Array, moving: Moving, A: Array) -> Array:

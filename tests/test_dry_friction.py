@@ -1,0 +1,181 @@
+"""Dry friction that holds joints still, in `dd.identify`: closed forms first, then motions that MuJoCo made."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.models import robot_file
+from scipy.integrate import solve_ivp
+
+import drake_diff as dd
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.dry import smooth_or_dry
+from drake_diff.identification.sensors import choose_sensors
+from drake_diff.identification.tree import tree_for_identification
+from drake_diff.identification.unknowns import choose_unknowns, numbers_at, set_numbers
+from drake_diff.mechanics.description import coordinates_of
+
+MASS, FRICTION = 2.0, 0.3 * 2.0 * 9.81  # [kg], [N] of a block on a floor
+H, N = 0.01, 180  # [s] between samples
+NOISE = 1e-4  # [m]
+
+
+def pushes(amplitude):
+    """(N, 1) a sine of 0.9 Hz, held from each sample to the next [N]."""
+    return amplitude * np.sin(2 * np.pi * 0.9 * H * np.arange(N))[:, None]
+
+
+def sticks_and_slips(us, mass=MASS, friction=FRICTION):
+    """(N + 1, 2) of a block from rest: in each sample it slides by a parabola, stops, and stays or goes on."""
+    x, v, found = 0.0, 0.0, [(0.0, 0.0)]
+    for push in us[:, 0]:
+        left = H
+        while left > 0 and (v != 0 or abs(push) > friction):
+            way = np.sign(v) if v != 0 else np.sign(push)
+            a = (push - way * friction) / mass
+            stops = a * way < 0 and -v / a <= left
+            t = -v / a if stops else left
+            x, v, left = x + v * t + a * t**2 / 2, 0.0 if stops else v + a * t, left - t
+        found.append((x, v))
+    return np.array(found)
+
+
+def measured(xs, us, outputs=None, seed=0):
+    """A recording of positions with noise."""
+    seen = np.column_stack(
+        [xs[:, 0] + NOISE * np.random.default_rng(seed).standard_normal(N + 1), np.full(N + 1, np.nan)]
+    )
+    return dd.Recording("lab", "1", H * np.arange(N + 1), seen, us, outputs=outputs or {})
+
+
+def test_a_block_that_sticks_and_slips_has_its_friction(write_urdf):
+    us = pushes(9.0)
+    xs = sticks_and_slips(us)
+    assert np.mean(xs[:, 1] == 0) > 0.2  # it is held in a part of the samples
+    model = write_urdf(mass=MASS)
+    e = dd.identify(model, measured(xs, us), ["slide.coulomb_friction", "slide.damping"])
+    assert e.explained, e.reason
+    low, high = e.intervals["slide.coulomb_friction"]
+    assert low < FRICTION < high < low + 0.02 * FRICTION
+    assert e.intervals["slide.damping"][0] == 0.0  # there is none
+    assert "dry friction that holds" in e.motion
+
+
+def test_a_block_that_comes_to_rest_and_stays_has_its_friction(write_urdf):
+    us = np.where(np.arange(N)[:, None] < 30, 20.0, 0.0)
+    us[120:] = 0.9 * FRICTION  # which does not move it
+    xs = sticks_and_slips(us)
+    assert np.all(xs[-70:, 1] == 0)
+    e = dd.identify(write_urdf(mass=MASS), measured(xs, us), ["slide.coulomb_friction"], held_out=0)
+    assert e.explained, e.reason
+    low, high = e.intervals["slide.coulomb_friction"]
+    assert low < FRICTION < high < low + 0.01 * FRICTION
+    assert np.all(e.motions[0].xs[-60:, 1] == 0)  # and the fit stays where it is
+
+
+def test_friction_that_creeps_is_not_sold_as_dry_friction(write_urdf):
+    """By c tanh(v / 0.05 m/s) the block creeps where dry friction would hold it."""
+    us, at = pushes(9.0), H * np.arange(N + 1)
+
+    def rates(t, y):
+        push = us[min(int(t / H + 1e-9), N - 1), 0]
+        return [y[1], (push - FRICTION * np.tanh(y[1] / 0.05)) / MASS]
+
+    xs = solve_ivp(rates, (0, at[-1]), (0, 0), t_eval=at, rtol=1e-8, atol=1e-10, max_step=H).y.T
+    e = dd.identify(write_urdf(mass=MASS), measured(xs, us), ["slide.coulomb_friction"])
+    low, high = e.intervals["slide.coulomb_friction"]
+    assert not e.explained or low < FRICTION < high
+    assert not e.explained  # noise of 0.1 mm: the creeping is seen
+
+
+LINK = '<link name="{}"><inertial><mass value="{}"/>{}</inertial></link>'
+JOINT = '<joint name="{}" type="prismatic"><parent link="world"/><child link="{}"/><axis xyz="1 0 0"/>{}</joint>'
+SOLID = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+MOTOR = """<transmission><type>transmission_interface/SimpleTransmission</type><joint name="a">
+  <hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="push"/></transmission>"""
+LIMIT = '<limit effort="1e9"/>'
+
+
+def test_the_friction_of_a_joint_that_follows_another_holds_both(tmp_path):
+    """It acts through the ratio of -0.4, as the mass of its link does: 2 + 0.16 * 3 kg, and 0.4 times its friction."""
+    links = LINK.format("first", 2, SOLID) + LINK.format("second", 3, SOLID)
+    follows = f'{LIMIT}<mimic joint="a" multiplier="-0.4" offset="0"/>'
+    rails = JOINT.format("a", "first", LIMIT) + JOINT.format("b", "second", follows)
+    (tmp_path / "sliders.urdf").write_text(f'<robot name="sliders">{links}{rails}{MOTOR}</robot>')
+    model = dd.load_model(tmp_path / "sliders.urdf", time_step=0.01, mimic="reduce")
+    us = pushes(9.0)
+    xs = sticks_and_slips(us, mass=2 + 0.4**2 * 3)
+    e = dd.identify(model, measured(xs, us), ["b.coulomb_friction"])
+    assert e.explained, e.reason
+    low, high = e.intervals["b.coulomb_friction"]
+    assert low < FRICTION / 0.4 < high < low + 0.02 * FRICTION / 0.4
+
+
+def test_readings_of_held_joints_are_those_of_joints_that_stand(load):
+    """Of two joints: one is held, whose link then gets what its friction and its motor give together."""
+    model = load("double_pendulum.urdf")
+    tree, names = tree_for_identification(model), ["elbow.coulomb_friction", "lower.mass", "elbow.offset"]
+    unknowns = choose_unknowns(model, tree, names)
+    law = smooth_or_dry(model, tree, Chart(coordinates_of(model)), unknowns, 0.01)
+    columns = ("elbow.force", "lower.accel_x", "lower.accel_z", "shoulder.force")
+    sensors = choose_sensors(model, tree, columns, None)
+    q, v, u = np.array([[0.4, -0.3], [0.4, -0.3]]), np.array([[0.7, 0.0], [0.7, -0.9]]), np.array([[0.1, 0.2]] * 2)
+
+    def read(z, q, v):
+        numbers = set_numbers(model, tree, unknowns, unknowns.values(z))
+        return sensors.read(numbers, q, v, u, law.grip_at(numbers, q, v, u))
+
+    z = unknowns.z_start.copy()
+    z[0] = 5.0
+    numbers, by = numbers_at(model, tree, unknowns, z)
+    turn, held = law.grip_at(numbers, q, v, u)
+    assert held.tolist() == [[False, True], [False, False]]
+    assert turn.tolist() == [[0, 0], [0, -1]]
+    by_x, by_z = sensors.slopes(numbers, q, v, u, by, (turn, held))
+    free = np.array([[True, True, True, False], [True] * 4])  # held: no velocity of its own
+    for j, step in enumerate(1e-6 * np.eye(4)):
+        rows = free[:, j]
+        ends = [read(z, q + s * step[:2], v + s * step[2:])[rows] for s in (1, -1)]
+        np.testing.assert_allclose(by_x[rows, :, j], (ends[0] - ends[1]) / 2e-6, atol=1e-7, err_msg=str(j))
+    for j, step in enumerate(1e-6 * np.eye(len(z))):
+        ends = [read(z + s * step, q, v) for s in (1, -1)]
+        np.testing.assert_allclose(by_z[..., j], (ends[0] - ends[1]) / 2e-6, atol=1e-7, err_msg=names[0])
+
+
+def test_the_force_on_a_block_is_what_friction_leaves_of_the_push(write_urdf):
+    model, push = write_urdf(mass=MASS), np.array([[9.0], [3.0], [9.0]])
+    tree = tree_for_identification(model)
+    unknowns = choose_unknowns(model, tree, ["slide.coulomb_friction"])
+    law = smooth_or_dry(model, tree, Chart(coordinates_of(model)), unknowns, 0.01)
+    numbers = set_numbers(model, tree, unknowns, np.array([FRICTION]))
+    q, v = np.zeros((3, 1)), np.array([[0.5], [0.0], [0.0]])
+    sensors = choose_sensors(model, tree, ("slide.force",), None)
+    read = sensors.read(numbers, q, v, push, law.grip_at(numbers, q, v, push))
+    np.testing.assert_allclose(read[:, 0], [9 - FRICTION, 0, 9 - FRICTION], atol=1e-12)  # 3 N do not move it
+
+
+@pytest.mark.slow
+def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(tmp_path):
+    """MuJoCo's `frictionloss`, which stops a joint within two of its steps: all three intervals have the truth."""
+    pytest.importorskip("mujoco")
+    sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+    import identify_causes
+
+    random = np.random.default_rng(7)
+    root = identify_causes.base.bare(robot_file("ur5_robot.urdf"))
+    model = identify_causes.loaded(root, "ur5_robot")
+    joints = [name.removesuffix("_q") for name in model.position_names]
+    q0, command, push = identify_causes.led(model, random)
+    truth = identify_causes.Truth(root, joints, model.nu)
+    truth.friction[:3] = random.uniform(0.1, 0.3, 3) * push[:3]
+    qs, us = truth.run(model, q0, command)
+    xs = np.full((len(qs), model.nx), np.nan)
+    xs[:, : model.nq] = qs + identify_causes.base.NOISE * random.standard_normal(qs.shape)
+    log = dd.Recording("MuJoCo", "3", identify_causes.base.PERIOD * np.arange(len(qs)), xs, us)
+    names = [f"{joint}.coulomb_friction" for joint in joints[:3]]
+    e = dd.identify(model, log, names, motion="continuous")
+    assert e.explained, e.reason
+    for name, value in zip(names, truth.friction, strict=False):
+        low, high = e.intervals[name]
+        assert low < value < high < low + 0.1 * value, (name, value)
