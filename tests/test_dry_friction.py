@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.models import robot_file
+from scipy import stats
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
@@ -54,12 +55,15 @@ def test_a_block_that_sticks_and_slips_has_its_friction(write_urdf):
     xs = sticks_and_slips(us)
     assert np.mean(xs[:, 1] == 0) > 0.2  # it is held in a part of the samples
     model = write_urdf(mass=MASS)
-    e = dd.identify(model, measured(xs, us), ["slide.coulomb_friction", "slide.damping"])
-    assert e.explained, e.reason
-    low, high = e.intervals["slide.coulomb_friction"]
-    assert low < FRICTION < high < low + 0.02 * FRICTION
-    assert e.intervals["slide.damping"][0] == 0.0  # there is none
-    assert "dry friction that holds" in e.motion
+    off = []
+    for seed in range(3):
+        e = dd.identify(model, measured(xs, us, seed=seed), ["slide.coulomb_friction"])
+        assert e.explained, e.reason
+        assert "dry friction that holds" in e.motion
+        low, high = e.intervals["slide.coulomb_friction"]
+        assert high - low < 0.005 * FRICTION
+        off.append((e.values["slide.coulomb_friction"] - FRICTION) / ((high - low) / (2 * 1.96)))
+    assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 3)  # of three standard normal numbers
 
 
 def test_a_block_that_comes_to_rest_and_stays_has_its_friction(write_urdf):
@@ -112,6 +116,29 @@ def test_the_friction_of_a_joint_that_follows_another_holds_both(tmp_path):
     assert low < FRICTION / 0.4 < high < low + 0.02 * FRICTION / 0.4
 
 
+def test_derivatives_go_through_a_stop_that_lets_another_joint_go(load):
+    """Random steps of two joints, whose stops, turns and releases follow each other: as by differences."""
+    model, random, count = load("double_pendulum.urdf"), np.random.default_rng(0), 300
+    tree, names = tree_for_identification(model), ["shoulder.coulomb_friction", "elbow.coulomb_friction"]
+    law = smooth_or_dry(model, tree, Chart(coordinates_of(model)), choose_unknowns(model, tree, names), 0.02)
+    z, hs, us = np.full(2, 2.0), np.full((count, 1), 0.02), random.uniform(-4, 4, (count, 1, 2))
+    starts = random.uniform(-1, 1, (count, 4)) * [1, 1, 0.3, 0.3]
+    starts[::2, 3] = 0.0
+    ends = law.run(z, starts, hs, us)
+    found = np.concatenate(law.slopes(z, ends, hs, us), axis=3)[:, 0]
+    still = np.flatnonzero((ends[:, 1, 3] == 0) & (starts[:, 3] == 0))
+    assert len(still) > 20  # the elbow is held throughout
+    compared = 0
+    for i, step in enumerate(1e-7 * np.eye(6)):
+        one, other = (law.run(z + s * step[4:], starts + s * step[:4], hs, us)[:, -1] for s in (1, -1))
+        ahead, back = (one - ends[:, -1]) / 1e-7, (ends[:, -1] - other) / 1e-7
+        rows = np.max(np.abs(ahead - back), axis=1) < 1e-4  # elsewhere another order of stops is that near
+        rows &= (i != 3) | (starts[:, 3] != 0)  # at rest it slides to one side or the other
+        np.testing.assert_allclose(found[rows, :, i], (ahead + back)[rows] / 2, atol=1e-4)
+        compared += int(np.sum(rows))
+    assert compared > 0.9 * 5.5 * count
+
+
 def test_readings_of_held_joints_are_those_of_joints_that_stand(load):
     """Of two joints: one is held, whose link then gets what its friction and its motor give together."""
     model = load("double_pendulum.urdf")
@@ -156,12 +183,16 @@ def test_the_force_on_a_block_is_what_friction_leaves_of_the_push(write_urdf):
 
 
 @pytest.mark.slow
-def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(tmp_path):
-    """MuJoCo's `frictionloss`, which stops a joint within two of its steps: all three intervals have the truth."""
+def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(monkeypatch):
+    """MuJoCo's `frictionloss`, which stops a joint within two of its steps: all three intervals have the truth.
+
+    By steps of 0.25 ms, and so stops of 0.5 ms, its friction is 0.05 % less: it takes longer to stop.
+    """
     pytest.importorskip("mujoco")
     sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
     import identify_causes
 
+    monkeypatch.setattr(identify_causes.base, "STEP", 5e-5)
     random = np.random.default_rng(7)
     root = identify_causes.base.bare(robot_file("ur5_robot.urdf"))
     model = identify_causes.loaded(root, "ur5_robot")

@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 from helpers.models import MODELS
+from helpers.table import each_row
 from scipy import stats
+from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.cli.main import app
+from drake_diff.exceptions import DrakeDiffError, InputError, UnknownNameError
 
 
 def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motion_gives(write_urdf):
@@ -53,6 +56,61 @@ def test_what_no_motion_tells_stays_open(load):
     assert np.isinf(e.deviations["pole.center_of_mass"][1])
     assert np.isfinite(e.deviations["hinge.damping"])
     assert "Open: pole.center_of_mass[1]" in e.sentence
+
+
+def test_what_is_promised_of_friction_is_what_its_sign_does(write_urdf):
+    """From a friction of 0 a block moves by minus the double integral of the sign of its speed, over its mass."""
+    model, sigma = write_urdf(mass=2.0), 0.002
+    limits = {"slide_x": 0.5, "slide_v": 2.0, "push": 3.0}
+    given = {"duration": 1.0, "period": 0.02, "noise": {"slide_x": sigma}, "limits": limits, "harmonics": 2}
+    e = dd.excite(model, ["slide.coulomb_friction"], **given, max_iterations=0)
+    fine = np.linspace(0, 1, 50 * 400 + 1)
+    slows = np.sign(np.interp(fine, e.times, e.xs[:, 1]))  # the speed is linear between samples
+    speed = np.concatenate([[0.0], np.cumsum((slows[1:] + slows[:-1]) / 2)]) * (fine[1] - fine[0]) / 2.0
+    moved = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2)])[::400] * (fine[1] - fine[0])
+    X = np.column_stack([np.ones(51), e.times, moved])
+    # The sum over 50 us misses a turn by at most half of that, in motions of some 0.1 s to either side.
+    wanted = sigma * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
+    assert e.deviations["slide.coulomb_friction"] == pytest.approx(wanted, rel=1e-3)
+
+
+def command(*words):
+    return CliRunner().invoke(app, ["excite", str(MODELS / "pendulum.urdf"), *map(str, words)])
+
+
+QUICK = ("--parameters", "hinge.damping", "--duration", 1, "--max-iterations", 0, "--limit", "hinge_q=-1,1.5")
+
+
+def test_the_command_prints_the_sentence_and_writes_a_recording(load, tmp_path):
+    out = tmp_path / "made" / "motor.csv"
+    result = command(*QUICK, "--limit", "motor=4", "--out", out)
+    assert result.exit_code == 0, result.output
+    model = load("pendulum.urdf")
+    limits = {"hinge_q": (-1, 1.5), "motor": 4.0}
+    e = dd.excite(model, ["hinge.damping"], duration=1.0, max_iterations=0, limits=limits)
+    assert e.sentence in result.output
+    read = dd.comparison.read_recording(out, model)
+    for one, other in ((read.times, e.times), (read.xs, e.xs), (read.us, e.us)):
+        np.testing.assert_array_equal(one, other)  # printed to the last bit
+    assert np.max(np.abs(read.us)) <= 4
+
+
+@each_row(
+    "words, expected",
+    [
+        (("--limit", "motor"), "NAME=MOST or NAME=LOWER,UPPER"),
+        (("--limit", "motor=1,2,3"), "NAME=MOST or NAME=LOWER,UPPER"),
+        (("--limit", "moter=1"), "limit of"),
+        (("--noise", "hinge_q"), "STATE=DEVIATION"),
+        (("--x0", "0.1;0"), "numbers with commas between"),
+        (("--duration", "0.1"), "periods"),
+        (("--out", "motor.txt"), "a .csv file"),
+    ],
+)
+def test_the_command_refuses_what_makes_no_sense(words, expected):
+    result = command(*QUICK, *words)
+    assert isinstance(result.exception, DrakeDiffError), result.output  # of which the entry point makes status 2
+    assert expected in str(result.exception)
 
 
 def test_what_makes_no_sense_is_refused(load, write_urdf):

@@ -1,14 +1,17 @@
-"""Commands on a model file: audit, certify, compare, identify, export-model."""
+"""Commands on a model file: audit, certify, compare, identify, excite, export-model."""
 
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from drake_diff.cli.text import (
     Seed,
     as_options,
+    floats_in,
     judged,
+    limits_in,
     names_in,
     names_option,
     numbers_in,
@@ -22,6 +25,7 @@ from drake_diff.cli.text import (
     takes_model,
 )
 from drake_diff.derivatives.methods import METHODS
+from drake_diff.exceptions import InputError
 
 GAPS = {"same": "green", "other law": "yellow", "other model": "red", "unexplained": "red"}
 FINDINGS = {"error": "bold red", "warning": "bold yellow", "info": "bold dim"}
@@ -29,7 +33,7 @@ FINDINGS = {"error": "bold red", "warning": "bold yellow", "info": "bold dim"}
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to `app`."""
-    for command in (audit, certify, compare, identify):
+    for command in (audit, certify, compare, identify, excite):
         app.command()(takes_model(command))
     app.command("export-model")(takes_model(export))
 
@@ -228,6 +232,67 @@ def identify(
     show(f"fitted: {record.motion}")
     show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def excite(
+    model: Any,
+    file: Path,
+    parameters: Annotated[str | None, names_option("Parameters to be told", "all")] = None,
+    duration: Annotated[float, typer.Option(help="Of the motion [s].")] = 5.0,
+    period: Annotated[float, typer.Option(help="Between samples [s], at which inputs change too.")] = 0.01,
+    x0: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NUMBERS", show_default="the model's", help="The first state, at rest, with commas between."
+        ),
+    ] = None,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(metavar="STATE=DEVIATION", help="What is measured, and how well. Can be given again."),
+    ] = None,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=MOST|LOWER,UPPER", help="Of a state or an input. Can be given again."),
+    ] = None,
+    harmonics: Annotated[int, typer.Option(help="Frequencies of the series.")] = 4,
+    max_iterations: Annotated[int, typer.Option(min=0, help="Of the search; 0: the best of random motions.")] = 20,
+    seed: Seed = 0,
+    out: Annotated[Path | None, typer.Option(dir_okay=False, help="A CSV file to write, of motion and inputs.")] = None,
+) -> None:
+    """Find inputs for MODEL whose recording tells its parameters, and say how well it will tell each.
+
+    The file has the columns of a recording: time, states, inputs. What it has of states is how the model moves.
+    """
+    from drake_diff.comparison.recordings import write_csv
+    from drake_diff.identification.excite import excite as design
+
+    if out is not None and out.suffix != ".csv":
+        raise InputError("--out", got=str(out), expected="a .csv file")
+    names: Any = "all" if parameters is None else names_in(parameters)
+    asked: dict[str, Any] = {
+        "x0": None if x0 is None else floats_in("--x0", x0, "numbers with commas between"),
+        "noise": numbers_in("--noise", noise or (), "STATE=DEVIATION") or None,
+        "limits": limits_in("--limit", limit or (), "NAME=MOST or NAME=LOWER,UPPER") or None,
+        "harmonics": harmonics,
+        "max_iterations": max_iterations,
+        "seed": seed,
+    }
+    with progress_line("searching"):
+        found = design(model, names, duration=duration, period=period, **asked)
+    show(found.sentence)
+    rows = table("parameter", "known to", "random", "at rest", "unit", left=1)
+    for name, value in found.deviations.items():
+        each = [np.atleast_1d(one) for one in (value, found.random[name], found.rest[name])]
+        for k, numbers in enumerate(zip(*each, strict=True)):
+            label = name if len(each[0]) == 1 else f"{name}[{k}]"
+            told = (plain(float(number) if np.isfinite(number) else "not known") for number in numbers)
+            rows.add_row(plain(label), *told, plain(found.units[name]))
+    show(rows)
+    for line in found.unidentifiable:
+        show(plain("left open", "bold dim"), line)
+    if out is not None:
+        write_csv(found.recording(), model, out)
+        show(f"wrote {out}")
 
 
 def export(

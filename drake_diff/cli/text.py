@@ -189,6 +189,23 @@ def pairs_in(option: str, words: Iterable[str], expected: str) -> dict[str, tupl
     return found
 
 
+def floats_in(option: str, words: str, expected: str) -> list[float]:
+    """The numbers in "1, 2"."""
+    return [_number(option, word, expected) for word in words.split(",")]
+
+
+def limits_in(option: str, words: Iterable[str], expected: str) -> dict[str, float | tuple[float, float]]:
+    """By name, of "NAME=NUMBER" or "NAME=NUMBER,NUMBER" each, one number or two."""
+    found: dict[str, float | tuple[float, float]] = {}
+    for word in words:
+        name, value = _split(option, word, expected)
+        numbers = floats_in(option, value, expected)
+        if len(numbers) > 2:
+            raise InputError(option, got=repr(word), expected=expected)
+        found[name] = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+    return found
+
+
 def poses_in(option: str, words: Iterable[str], expected: str) -> dict[str, tuple[str, list[float]]]:
     """A body and numbers by name, of "NAME=BODY:NUMBER,NUMBER,..." each."""
     found = {}

@@ -1,6 +1,7 @@
 """Motions recorded elsewhere, by engines that cannot be loaded here, from CSV, MCAP and ROS 2 files."""
 
 import csv
+import io
 import json
 import math
 import re
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.files import make_folder, write_whole
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.comparison.recordings_ros2 import is_ros2, read_ros2
 from drake_diff.exceptions import InputError, UnknownNameError
@@ -163,6 +165,20 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
     if not gaps:
         check_recording(recording, model)
     return recording
+
+
+def write_csv(recording: Recording, model: Model, path: Path) -> None:
+    """Write times, states and inputs as `read_recording` reads them; no input begins at the last sample."""
+    if np.shape(recording.xs)[1] != model.nx or np.shape(recording.us)[1] != model.nu:
+        got = f"{np.shape(recording.xs)[1]} states and {np.shape(recording.us)[1]} inputs"
+        raise InputError(f"recording {recording.name}", got=got, expected=f"{model.nx} and {model.nu}")
+    text = io.StringIO()
+    rows = csv.writer(text)
+    rows.writerow(["time", *model.state_names, *model.input_names])
+    for k, (t, x) in enumerate(zip(recording.times.tolist(), recording.xs.tolist(), strict=True)):
+        rows.writerow([t, *x, *(recording.us[k].tolist() if k < len(recording.us) else [""] * model.nu)])
+    make_folder(path.parent)
+    write_whole(path, text.getvalue().encode())
 
 
 def _told(path: Path) -> dict[str, str]:

@@ -27,8 +27,9 @@ from drake_diff.identification.unknowns import COULOMB, Unknowns, numbers_at, se
 from drake_diff.model.model import Model
 
 REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
-MOST_PARTS = 8  # of a step; what is left of it then goes on as it is
-SEARCHED, MET = 12, 1e-9  # steps of the search for an end; [rad/s, m/s] or of the friction: how near it is then
+MOST_PARTS = 60  # of a step: one with more has no end that could be told, and none is
+SEARCHED, MET = 99, 1e-9  # steps of the search for an end; [rad/s, m/s] or of the friction: how near it is then
+SHORT = 1e-13  # [s] between which an end is known well enough, however steep it is there
 
 Pushed = Callable[[Array, Array, Array, Array | None], tuple[Array, Array]]
 
@@ -42,11 +43,13 @@ class Part(NamedTuple):
     u: Array
     turn: Array  # (n, nv) 1 or -1 of a joint that slides; 0 of others
     held: Mask  # (n, nv) which joints are held
-    before: Array  # (n, nv) which way a joint slid that has just come to 0; 0 of others
+    stopped: Indices  # (n,) the joint that slid and has just come to 0; -1 where none has
+    turned: Array  # (n, nv) which way joints slid before that,
+    holding: Mask  # (n, nv) and which of them were held
 
     def some(self, s: slice) -> "Part":
         """Of some of the steps."""
-        return Part(self.rows[s], self.x[s], self.h[s], self.u[s], self.turn[s], self.held[s], self.before[s])
+        return Part(*(each[s] for each in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,21 +109,23 @@ class DryMotion(ContinuousMotion):
         """Where steps from x (N, nx) of lengths h (N,) end, and their parts."""
         nv = self.model.nv
         x, left, parts = x.copy(), h.copy(), list[Part]()
-        released, before, stays = np.zeros((len(x), nv)), np.zeros((len(x), nv)), np.zeros((len(x), nv), dtype=bool)
-        for k in range(MOST_PARTS):
+        released, stays = np.zeros((len(x), nv)), np.zeros((len(x), nv), dtype=bool)
+        stopped, turned, holding = np.full(len(x), -1), np.zeros((len(x), nv)), np.zeros((len(x), nv), dtype=bool)
+        for _ in range(MOST_PARTS):
             rows = np.flatnonzero(left > 0)
             if not len(rows):
                 break
             turn, held = self._grip(pushed, numbers, x[rows], u[rows], released[rows], stays[rows])
             ends = self._moved(pushed, numbers, x[rows], left[rows], u[rows], turn, held)
-            over, which = self._within(pushed, numbers, ends, u[rows], turn, held)
-            lengths = left[rows].copy()
-            last = np.flatnonzero(over < 0) if k < MOST_PARTS - 1 else np.zeros(0, dtype=np.intp)
+            room = self._room(pushed, numbers, ends, u[rows], turn, held)
+            lengths, which = left[rows].copy(), np.zeros(len(rows), dtype=np.intp)
+            last = np.flatnonzero(np.any(room < 0, axis=1))
             if len(last):
                 own = x[rows][last], u[rows][last], turn[last], held[last]
-                lengths[last], ends[last], which[last] = self._end(pushed, numbers, *own, lengths[last], over[last])
-            parts.append(Part(rows, x[rows], lengths, u[rows], turn, held, before[rows]))
-            released[rows], before[rows], stays[rows] = 0.0, 0.0, False
+                lengths[last], ends[last], which[last] = self._end(pushed, numbers, *own, lengths[last], room[last])
+            parts.append(Part(rows, x[rows], lengths, u[rows], turn, held, stopped[rows], turned[rows], holding[rows]))
+            released[rows], stopped[rows], stays[rows] = 0.0, -1, False
+            turned[rows], holding[rows] = turn, held
             if len(last):
                 j, at = which[last], rows[last]
                 slid = ~held[last, j]
@@ -128,7 +133,7 @@ class DryMotion(ContinuousMotion):
                     stays[at[slid], j[slid]] = True
                 else:
                     ends[last[slid], self.model.nq + j[slid]] = 0.0
-                    before[at[slid], j[slid]] = turn[last[slid], j[slid]]
+                    stopped[at[slid]] = j[slid]
                 _, push = self._pushes(pushed, numbers, ends[last], u[at], turn[last], held[last])
                 released[at[~slid], j[~slid]] = np.sign(push[~slid, j[~slid]])
             x[rows] = ends
@@ -136,7 +141,13 @@ class DryMotion(ContinuousMotion):
             done = np.ones(len(rows), dtype=bool)
             done[last] = False
             left[rows[done]] = 0.0
+        x[left > 0] = np.nan
         return x, parts
+
+    @property
+    def kinks(self) -> bool:
+        """Whether derivatives say little of larger changes."""
+        return True
 
     @property
     def words(self) -> str:
@@ -192,22 +203,19 @@ class DryMotion(ContinuousMotion):
             x[:, self.model.nq :][held] = 0.0
         return self._stepped(accelerate, x, h, u)
 
-    def _within(
-        self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, turn: Array, held: Mask
-    ) -> tuple[Array, Indices]:
-        """(by how much joints slide or are held as they should at x (N,), negative beyond; which is the least (N,))."""
+    def _room(self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, turn: Array, held: Mask) -> Array:
+        """(N, nv) by how much each joint slides or is held as it should at x, negative beyond."""
         room = np.where(turn != 0, turn * x[:, self.model.nq :], np.inf)
         size = np.maximum(self.tree.friction(numbers), 1e-300)
         some = np.flatnonzero(np.any(held, axis=1))
         if self.gives:
             every = np.broadcast_to(self.own, held.shape)
             _, push = self._pushes(pushed, numbers, x, u, np.zeros_like(turn), every)
-            room = np.where(every, np.where(held, 1 - np.abs(push) / size, turn * push / size - 1), np.inf)
-        elif len(some):
+            return np.where(every, np.where(held, 1 - np.abs(push) / size, turn * push / size - 1), np.inf)
+        if len(some):
             _, push = self._pushes(pushed, numbers, x[some], u[some], turn[some], held[some])
             room[some] = np.where(held[some], 1 - np.abs(push) / size, room[some])
-        which = np.argmin(room, axis=1)
-        return room[np.arange(len(x)), which], which
+        return room
 
     def _end(
         self,
@@ -218,42 +226,59 @@ class DryMotion(ContinuousMotion):
         turn: Array,
         held: Mask,
         h: Array,
-        beyond: Array,
+        room: Array,
     ) -> tuple[Array, Array, Indices]:
-        """(when a motion ends that would be beyond at h (N,), where, and by which joint): regula falsi of Illinois."""
-        low, high = np.zeros(len(x)), h.copy()
-        at_low, at_high = np.maximum(self._within(pushed, numbers, x, u, turn, held)[0], 0.0), beyond.copy()
+        """(when a motion ends that has this room (N, nv) at h (N,), where, by which joint): regula falsi of Illinois.
+
+        Looked at are the joints that are beyond at h; every third step halves what is left.
+        """
+
+        def least(x: Array, i: Indices) -> tuple[Array, Indices]:
+            each = np.where(sought[i], self._room(pushed, numbers, x, u[i], turn[i], held[i]), np.inf)
+            which = np.argmin(each, axis=1)
+            return each[np.arange(len(i)), which], which
+
+        sought, every = room < 0, np.arange(len(x))
+        low, high, t = np.zeros(len(x)), h.copy(), h.copy()
+        at_low, at_high = np.maximum(least(x, every)[0], 0.0), np.min(room, axis=1)
+        ends, which = x.copy(), np.argmin(room, axis=1)
         side = np.zeros(len(x))  # the end that moved last
+        i = every
         for k in range(SEARCHED):
-            t = low + (high - low) * np.where(at_low > 0, at_low / np.maximum(at_low - at_high, 1e-300), 0.5)
-            ends = self._moved(pushed, numbers, x, t, u, turn, held)
-            room, which = self._within(pushed, numbers, ends, u, turn, held)
-            if k == SEARCHED - 1 or np.all(np.abs(room) < MET):
+            secant = (at_low[i] > 0) & (k % 3 < 2)
+            part = np.where(secant, at_low[i] / np.maximum(at_low[i] - at_high[i], 1e-300), 0.5)
+            t[i] = low[i] + (high[i] - low[i]) * part
+            ends[i] = self._moved(pushed, numbers, x[i], t[i], u[i], turn[i], held[i])
+            found, which[i] = least(ends[i], i)
+            above = found > 0
+            at_high[i] = np.where(above, np.where(side[i] > 0, at_high[i] / 2, at_high[i]), found)
+            at_low[i] = np.where(above, found, np.where(side[i] < 0, at_low[i] / 2, at_low[i]))
+            low[i], high[i] = np.where(above, t[i], low[i]), np.where(above, high[i], t[i])
+            side[i] = np.where(above, 1.0, -1.0)
+            i = i[(np.abs(found) >= MET) & (high[i] - low[i] > SHORT)]
+            if not len(i):
                 break
-            above = room > 0
-            at_high = np.where(above, np.where(side > 0, at_high / 2, at_high), room)
-            at_low = np.where(above, room, np.where(side < 0, at_low / 2, at_low))
-            low, high, side = np.where(above, t, low), np.where(above, high, t), np.where(above, 1.0, -1.0)
         return t, ends, which
 
     def _taken_up(self, pushed: Pushed, numbers: Numbers, part: Part) -> Array:
-        """(n, nx, nx) what becomes of a small change of the state where the part begins."""
+        """(n, nx, nx) what becomes of a small change of the state where the part begins.
+
+        Of a joint that has come to 0 it has changed when: what is accelerated otherwise from then on is moved by that.
+        """
         nq, nx = self.model.nq, part.x.shape[1]
         found = np.tile(np.eye(nx), (len(part.rows), 1, 1))
-        some = np.flatnonzero(np.any(part.held, axis=1))
         x, u = part.x, part.u
+        some = np.flatnonzero(np.any(part.held, axis=1) & (part.stopped < 0))
         if len(some) and not self.gives:
             mass, _ = pushed(x[some, :nq], x[some, nq:], u[some], part.turn[some])
             found[some, nq:, nq:] = held_inverse(mass, part.held[some]) @ mass
-        back = (part.before != 0) & (part.turn == -part.before)
-        for k in np.flatnonzero(np.any(back, axis=1)):
-            j, own = int(np.argmax(back[k])), slice(k, k + 1)
-            turn = part.turn[own].copy()
-            after, _ = self._pushes(pushed, numbers, x[own], u[own], turn, part.held[own])
-            turn[0, j] = part.before[k, j]
-            begun, _ = self._pushes(pushed, numbers, x[own], u[own], turn, part.held[own])
-            if begun[0, j] != 0:
-                found[k, nq:, nq + j] += (after - begun)[0] / begun[0, j]
+        some = np.flatnonzero(part.stopped >= 0)
+        if len(some):
+            j, own = part.stopped[some], np.arange(len(some))
+            before, _ = self._pushes(pushed, numbers, x[some], u[some], part.turned[some], part.holding[some])
+            after, _ = self._pushes(pushed, numbers, x[some], u[some], part.turn[some], part.held[some])
+            slowed = before[own, j]
+            found[some, nq:, nq + j] += (after - before) / np.where(slowed != 0, slowed, np.inf)[:, None]
         return found
 
     def _through(self, numbers: Numbers, pushed: Pushed, by: Array, part: Part) -> Array:

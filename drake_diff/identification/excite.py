@@ -20,6 +20,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
+from drake_diff.identification.dry import smooth_or_dry
 from drake_diff.identification.fit import Fit, growth_cuts
 from drake_diff.identification.flow import ROUGH, ContinuousMotion
 from drake_diff.identification.identify import LONGEST
@@ -184,7 +185,7 @@ class _Design:
 
     @cached_property
     def law(self) -> ContinuousMotion:
-        return ContinuousMotion(self.model, self.tree, self.chart, self.unknowns, LONGEST)
+        return smooth_or_dry(self.model, self.tree, self.chart, self.unknowns, LONGEST)
 
     @cached_property
     def rough(self) -> ContinuousMotion:

@@ -33,8 +33,12 @@ SEGMENT_SAMPLES = 5  # of a segment at least
 GROWTH = 1e6  # of a small motion within a piece, beyond which its end says nothing of its start: it is cut in two
 LARGEST = 1.0  # the largest change of an unknown in one step, in widths / FAR
 SETTLED = 1e-5  # of |r|^2, in units of the noise: what a last step may still gain
+KINKED = (
+    1e-2  # the same where motion kinks, as a slope then promises more than there is: a tenth of a standard deviation
+)
 CLOSED = 1e-3  # of the noise: how far gaps may stand open at the end
 HALVINGS = 8
+NEAR = 10.0  # times how well a velocity is known from the samples around: about how far a step leads where motion kinks
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
 
 
@@ -49,6 +53,11 @@ class Law(Protocol):
     @property
     def segment(self) -> float:
         """[s] how long a segment is."""
+        ...
+
+    @property
+    def kinks(self) -> bool:
+        """Whether derivatives say little of larger changes: of a joint that stops and stays, no velocity is left."""
         ...
 
     def cut(self, period: float) -> tuple[float, ...]:
@@ -342,6 +351,8 @@ class Fit:
             by_piece.append(found)
             ridge = np.zeros((nt, nt + nz + 1))
             ridge[:, :nt] = NO_PRIOR * np.eye(nt)
+            if self.law.kinks:
+                ridge[nt // 2 :, nt // 2 : nt] = np.diag(1 / (NEAR * self.gap_scale[nt // 2 :]))
             R = _triangle(np.vstack([*rows, ridge]))
             own.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
             rows_z.append(R[nt : nt + nz, nt:])
@@ -393,7 +404,8 @@ class Fit:
             dz = self.step_of(here.z, found)
             now = sum(float(np.nansum(r**2)) for r in found.residuals) + self._pull(here.z)
             then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(here.z + dz)
-            if now - then <= SETTLED * (1 + SETTLED * now) and here.gap <= CLOSED:
+            settled = KINKED if self.law.kinks else SETTLED * (1 + SETTLED * now)
+            if now - then <= settled and here.gap <= CLOSED:
                 return Solved(here.z, here.starts, found, True, steps, "")
             if steps == most:
                 break

@@ -36,6 +36,11 @@ class ContinuousMotion:
     method: tuple[tuple[Array, ...], Array] = (STAGES, WEIGHTS)
 
     @property
+    def kinks(self) -> bool:
+        """Whether derivatives say little of larger changes."""
+        return False
+
+    @property
     def words(self) -> str:
         return f"continuous time, by steps of order 8 of at most {1e3 * self.longest:.3g} ms"
 

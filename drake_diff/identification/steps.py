@@ -27,6 +27,7 @@ class DiscreteMotion:
     own: Indices  # where the vector's entries stand among the unknowns
     segment: float = np.inf  # [s] a whole piece: where bodies touch, a state from noisy samples is no start of a motion
     differenced: list[str] = field(default_factory=list)  # says where Drake's own derivatives were refused
+    kinks: bool = False
 
     @property
     def words(self) -> str:
