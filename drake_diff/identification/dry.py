@@ -49,7 +49,17 @@ class Part(NamedTuple):
 
     def some(self, s: slice) -> "Part":
         """Of some of the steps."""
-        return Part(*(each[s] for each in self))
+        return Part(
+            self.rows[s],
+            self.x[s],
+            self.h[s],
+            self.u[s],
+            self.turn[s],
+            self.held[s],
+            self.stopped[s],
+            self.turned[s],
+            self.holding[s],
+        )
 
 
 @dataclass(frozen=True, eq=False)

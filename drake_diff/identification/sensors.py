@@ -204,9 +204,9 @@ class Sensors:
                 found[..., column] = self._read(Numbers(**parts), q, v, a).imag / TINY
         if self._forces:
             by_q, by_v, mass, by_numbers = tree.carried_slopes(numbers, q, v, a, by)
-            for j, k in self._forces:
-                moved[:, j], by_a[:, j] = np.concatenate([by_q[:, k], by_v[:, k]], axis=1), mass[:, k]
-                found[:, j] = by_numbers[:, k]
+            for i, k in self._forces:
+                moved[:, i], by_a[:, i] = np.concatenate([by_q[:, k], by_v[:, k]], axis=1), mass[:, k]
+                found[:, i] = by_numbers[:, k]
         if moving is not None:
             moved[..., :nv] += by_a @ moving.by_q
             moved[..., nv:] += by_a @ moving.by_v
@@ -232,7 +232,7 @@ class Sensors:
         every = []
         for sensor in self.each:
             if sensor.quantity == FORCE:
-                k = self._tree.first[sensor.link]
+                k = int(self._tree.first[sensor.link])
                 every.append(np.zeros((len(q), 1)) if forces is None else forces[:, [k]])
                 continue
             at = self._frame(sensor.link, numbers, q, v, a, small, known).to(sensor.turn, sensor.point)

@@ -200,7 +200,7 @@ class Tree:
             inverse = np.asarray(np.linalg.inv(self._own(mass)))
         else:
             still = held & (self._along(numbers.held_inertia) == 0)
-            turn, held = self._of_all(turn), self._of_all(held) != 0
+            turn, held = self._of_all(turn), self._of_all(held.astype(float)) != 0
             mass, force = caught(numbers, mass, force, v, held)
             inverse = held_inverse(self._own(mass), still)
         bias = moving.forces(np.zeros_like(v))[0]
