@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from drake_diff.cli.text import (
@@ -263,6 +262,8 @@ def excite(
 
     The file has the columns of a recording: time, states, inputs. What it has of states is how the model moves.
     """
+    import numpy as np
+
     from drake_diff.comparison.recordings import write_csv
     from drake_diff.identification.excite import excite as design
 
