@@ -12,10 +12,12 @@ import tracemalloc
 import numpy as np
 import pytest
 from helpers.forks import fork, status_of
+from helpers.table import each_row
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
+from drake_diff.logs import mcap_file
 from drake_diff.logs.mcap_file import CHUNK_SIZE, Channel, read_mcap, recover_mcap, write_mcap
 from drake_diff.logs.messages import MESSAGES, TYPES
 
@@ -294,3 +296,28 @@ def _write_until_killed(path, *, after):
     os.kill(child, signal.SIGKILL)
     assert status_of(child) == -signal.SIGKILL
     return struct.unpack("<q", count[:8])[0]
+
+
+def test_a_file_that_says_that_it_holds_too_much_is_refused_before_it_is_decoded(tmp_path, monkeypatch):
+    path, state = tmp_path / "log.mcap", TYPES["State"].cls
+    write_mcap(path, [Channel(f"/{i}", state, [(0, state(time=1.0))]) for i in range(3)], {}, {})
+    assert len(read_mcap(path).messages) == 3
+    for name, told in (("MOST_CHANNELS", "3 channels: at most 2"), ("MOST_MESSAGES", "3 messages: at most 2")):
+        with monkeypatch.context() as patch:
+            patch.setattr(mcap_file, name, 2)
+            patch.setattr(mcap_file, "_unpacked", None)  # which nobody calls
+            with pytest.raises(ArtifactError, match=told):
+                read_mcap(path)
+
+
+@each_row("what", ["messages", "channels"])
+def test_a_file_that_holds_more_than_it_says_is_refused(tmp_path, monkeypatch, what):
+    path, state = tmp_path / "log.mcap", TYPES["State"].cls
+    write_mcap(path, [Channel(f"/{i}", state, [(0, state(time=1.0))]) for i in range(3)], {}, {})
+    if what == "messages":
+        monkeypatch.setattr(mcap_file, "_declared", lambda *_: 2)
+    else:
+        monkeypatch.setattr(mcap_file, "_declared", lambda *_: 3)
+        monkeypatch.setattr(mcap_file, "MOST_CHANNELS", 2)
+    with pytest.raises(ArtifactError, match=f"more (messages than its statistics say, 2|than 2 {what})"):
+        read_mcap(path)

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from heapq import merge
 from io import BytesIO
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,7 @@ import zstandard
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap import records as kinds
 from mcap.data_stream import ReadDataStream
-from mcap.reader import NonSeekingReader
-from mcap.stream_reader import breakup_chunk
+from mcap.stream_reader import breakup_chunk, get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -37,7 +37,7 @@ LIBRARY = "drake_diff"
 RECOVERED = "recovered"  # the name of the metadata record that a recovered file gets
 MOST_UNPACKED = GIB  # of all chunks of a file
 PACKED_AT_MOST, PACKED_APART = 100, 16 * MIB  # what unpacks to more times its size, and this, is a bomb: ours 20 times
-MOST_MESSAGES = 5_000_000
+MOST_MESSAGES, MOST_CHANNELS = 5_000_000, 10_000
 BETWEEN_LOOKS = 10_000  # messages: at memory that is nearly used up, where protobuf ends the process
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, CRC of the summary
@@ -45,6 +45,8 @@ DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of all before it
 RECORD = struct.Struct("<BQ")  # opcode, length
 CRC = struct.Struct("<I")
 FOOTER_OPCODE, CHUNK, ATTACHMENT, METADATA, DATA_END_OPCODE = 0x02, 0x06, 0x09, 0x0C, 0x0F
+SCHEMA, CHANNEL, MESSAGE_OPCODE, STATISTICS = 0x03, 0x04, 0x05, 0x0B
+MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 READERS: dict[int, Any] = {CHUNK: kinds.Chunk, ATTACHMENT: kinds.Attachment, METADATA: kinds.Metadata}
 
 
@@ -164,8 +166,7 @@ def read_mcap(path: str | Path, *, links: bool = True) -> McapLog:
     data = read_plain(path, links=links)
     log = McapLog({}, {}, {}, {}, {})
     try:
-        _check_crcs(data)
-        _collect(data, log)
+        _collect(data, _check_crcs(data), log)
     except MemoryError:
         raise
     except Exception as error:  # a damaged file makes the reader fail in many ways; none of them is ours
@@ -254,8 +255,10 @@ def _unpacked_size(body: bytes, most: int) -> int:
     return int(chunk.uncompressed_size)
 
 
-def _check_crcs(data: bytes) -> None:
-    """The checksums of the data section and of the summary; between them they cover every byte but the last magic.
+def _check_crcs(data: bytes) -> int:
+    """Check the checksums of the data section and of the summary, and return where the summary begins.
+
+    Between them they cover every byte but the last magic.
 
     The format allows a file without them, the reader does not check them, and ours always has them.
     """
@@ -271,37 +274,103 @@ def _check_crcs(data: bytes) -> None:
         raise ValueError("the checksum of its data does not match")
     if zlib.crc32(data[summary_start : len(data) - len(MAGIC) - 4]) != summary_crc:
         raise ValueError("the checksum of its summary does not match")
-    for _ in records(data):  # which checks those of the attachments
-        pass
+    return int(summary_start)
 
 
-def _collect(data: bytes, log: McapLog) -> None:
-    decoders = DecoderFactory()
+def _collect(data: bytes, summary_start: int, log: McapLog) -> None:
+    """Everything in the file, in one pass; what its own statistics say is too much is refused before that."""
+    reading = _Reading(log, _declared(data, summary_start))
+    for opcode, body in _unpacked(data):
+        if opcode == MESSAGE_OPCODE:
+            reading.message(body)
+        elif opcode in (SCHEMA, CHANNEL, ATTACHMENT, METADATA):
+            reading.other(opcode, ReadDataStream(BytesIO(body)))
+    for messages in log.messages.values():
+        messages.sort(key=itemgetter(0))
+    if reading.counted != reading.declared:
+        raise ValueError(f"it holds {reading.counted} messages, its statistics say {reading.declared}")
 
-    def reader() -> NonSeekingReader:
-        return NonSeekingReader(BytesIO(data), validate_crcs=True, decoder_factories=[decoders])
 
-    summary = reader().get_summary()
-    if summary is None or summary.statistics is None:
-        raise ValueError("it has no summary: it was cut short")
-    for channel in summary.channels.values():
-        decode = decoders.decoder_for(channel.message_encoding, summary.schemas[channel.schema_id])
-        if decode is None:
-            raise ValueError(f"channel {channel.topic} is encoded as {channel.message_encoding!r}, not as protobuf")
-        log.message_types[channel.topic] = type(decode(b""))
-        log.messages[channel.topic] = []
-        log.channel_metadata[channel.topic] = {key: json.loads(text) for key, text in channel.metadata.items()}
-    for count, (_, channel, message, decoded) in enumerate(reader().iter_decoded_messages()):
-        if count >= MOST_MESSAGES:
-            raise ValueError(f"it holds more than {MOST_MESSAGES} messages")
-        if count % BETWEEN_LOOKS == 0:
+class _Reading:
+    """Takes in the records of a file, one after the other."""
+
+    def __init__(self, log: McapLog, declared: int):
+        self.log, self.declared, self.counted = log, declared, 0
+        self.schemas: dict[int, Any] = {}
+        self.channels: dict[int, tuple[list[tuple[int, Any]], Any]] = {}  # the messages, and what decodes one
+        self.decoders = DecoderFactory()
+
+    def message(self, body: bytes) -> None:
+        number, _, time, _ = MESSAGE.unpack_from(body)
+        if self.counted >= self.declared:
+            raise ValueError(f"it holds more messages than its statistics say, {self.declared}")
+        if self.counted % BETWEEN_LOOKS == 0:
             check_memory()
-        log.messages[channel.topic].append((message.log_time, decoded))
-    log.metadata.update({record.name: dict(record.metadata) for record in reader().iter_metadata()})
-    log.attachments.update({a.name: bytes(a.data) for a in reader().iter_attachments()})
-    counted = sum(len(messages) for messages in log.messages.values())
-    if counted != summary.statistics.message_count:
-        raise ValueError(f"it holds {counted} messages, its statistics say {summary.statistics.message_count}")
+        self.counted += 1
+        if number not in self.channels:
+            raise ValueError(f"a message is of channel {number}, which there is not")
+        messages, decode = self.channels[number]
+        messages.append((time, decode(body[MESSAGE.size :])))
+
+    def other(self, opcode: int, stream: Any) -> None:
+        if opcode == SCHEMA:
+            schema = kinds.Schema.read(stream)
+            self.schemas[schema.id] = schema
+        elif opcode == METADATA:
+            metadata = kinds.Metadata.read(stream)
+            self.log.metadata[metadata.name] = dict(metadata.metadata)
+        elif opcode == ATTACHMENT:
+            attachment = kinds.Attachment.read(stream)
+            self.log.attachments[attachment.name] = bytes(attachment.data)
+        else:
+            channel = kinds.Channel.read(stream)
+            if channel.id not in self.channels:  # the summary repeats them
+                self.channels[channel.id] = self._begin(channel)
+
+    def _begin(self, channel: Any) -> tuple[list[tuple[int, Any]], Any]:
+        """Where the messages of a channel go, and what decodes one."""
+        topic, log = channel.topic, self.log
+        if len(self.channels) >= MOST_CHANNELS:
+            raise ValueError(f"it has more than {MOST_CHANNELS} channels")
+        if channel.schema_id not in self.schemas:
+            raise ValueError(f"channel {topic} has schema {channel.schema_id}, which there is not")
+        decode: Any = self.decoders.decoder_for(channel.message_encoding, self.schemas[channel.schema_id])
+        if decode is None:
+            raise ValueError(f"channel {topic} is encoded as {channel.message_encoding!r}, not as protobuf")
+        log.message_types[topic] = type(decode(b""))
+        log.channel_metadata[topic] = {key: json.loads(text) for key, text in channel.metadata.items()}
+        return log.messages.setdefault(topic, []), decode
+
+
+def _unpacked(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Those of `records`, and in the place of each chunk what is in it."""
+    for opcode, body in records(data):
+        if opcode != CHUNK:
+            yield opcode, body
+            continue
+        stream, size = get_chunk_data_stream(kinds.Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
+        inner, at = stream.read(size), 0
+        while at < size:
+            opcode, length = RECORD.unpack_from(inner, at)
+            at += RECORD.size + length
+            if at > size:
+                raise ValueError("a record in a chunk is cut short")
+            yield opcode, inner[at - length : at]
+
+
+def _declared(data: bytes, at: int) -> int:
+    """How many messages the statistics say there are, in the summary that begins at `at`; ValueError if too many."""
+    while at + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, at)
+        at += RECORD.size + length
+        if opcode == STATISTICS:
+            found = kinds.Statistics.read(ReadDataStream(BytesIO(data[at - length : at])))
+            most = {"messages": (found.message_count, MOST_MESSAGES), "channels": (found.channel_count, MOST_CHANNELS)}
+            for what, (count, limit) in most.items():
+                if count > limit:
+                    raise ValueError(f"it says that it holds {count} {what}: at most {limit} are read")
+            return int(found.message_count)
+    raise ValueError("it has no statistics: it was cut short")
 
 
 def _column(field: Any, values: list[Any], width: int) -> Any:
