@@ -1,9 +1,11 @@
 """A run is written beside its directory and takes its place whole: nothing that was there is lost, whatever fails."""
 
 import errno
+import json
 import os
 import pickle
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -44,6 +46,7 @@ from drake_diff.optimize.solve import _best_of
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.record.directory import RECORDS, writing, written_whole
 from drake_diff.record.read import KINDS
+from drake_diff.record.sealed import canonical, own_sha256
 
 OLD, NEW = 0.2, 0.3  # the goals of the two runs
 SEARCHES = {
@@ -490,6 +493,15 @@ def test_a_plan_that_was_kept_is_measured_as_it_would_have_been(run, solutions):
     assert goal_of(run) == NEW
     found = dd.verify(run)
     assert (found.verdict, found.complaints) == ("undecided", ()), found
+    assert "was recovered from one that was killed or failed" in found.undecided[0]
+    assert re.search(r"what holds: .* all \d+ other values of record.json, trace.mcap came out", found.undecided[1])
+    fields = json.loads((run / "record.json").read_text())
+    fields["metrics"][0]["value"] = 1.0
+    fields["record_sha256"] = own_sha256(fields)
+    (run / "record.json").write_text(canonical(fields))
+    found = dd.verify(run)
+    assert found.verdict == "broken"
+    assert not any("what holds" in line for line in found.undecided)
 
 
 def test_what_cannot_be_recovered_is_said(run, solutions, tmp_path):

@@ -33,6 +33,11 @@ SEARCH_TOPICS = ("/solver/", "/gradient/", "/events", "/replays")
 CONSTRAINED = ("metrics[constraint violation]", "problem.constraints", "problem.couplings")
 JUDGED = ("holds", "failures")  # of each replay
 SAME_PLAN = 1e-6  # of the largest number of its array: plans that are no further apart are the same
+RECOVERED = "recovered from what a run left that did not end: its search is not made again"  # of such a run's sentence
+OF_RECOVERED = (
+    "the run was recovered from one that was killed or failed, so whether a search ends at this plan, and what it told "
+    "of itself, cannot be judged"
+)
 NOT_REPEATED = {
     Status.TIME_LIMIT: "how far a search gets within its time limit is another on every run",
     Status.INTERRUPTED: "the search was interrupted, at no moment that could be found again",
@@ -62,7 +67,8 @@ def why_not_repeated(record: EvidenceRecord) -> tuple[str, ...]:
     found = [f"{cost} is a user's function" for cost in costs]
     found += [f"constraint {name} is a user's function" for name in constraints]
     if record.inputs.search is None:
-        found.append("the record does not say what solve was called with")
+        recovered = record.sentence.endswith(RECOVERED)
+        found.append(OF_RECOVERED if recovered else "the record does not say what solve was called with")
     status = None if record.solver is None else Status(record.solver.status)
     return (*found, *([NOT_REPEATED[status]] if status in NOT_REPEATED else []))
 

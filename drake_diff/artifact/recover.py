@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_diff._base.files import remove_folder
+from drake_diff.artifact.again import RECOVERED
 from drake_diff.artifact.measurement import measure
 from drake_diff.artifact.rerun import ANYWHERE, PLAN, read_plan, rebuilt, resolve, rows_of
 from drake_diff.artifact.save import record_of, write_files
@@ -14,8 +15,6 @@ from drake_diff.record.directory import is_partial, is_taken, name_of, place, wr
 from drake_diff.record.read import load_record
 from drake_diff.record.sealed import SealedRecord, files_below
 from drake_diff.record.solve import EvidenceRecord
-
-TOLD = "recovered from what a run left that did not end: its search is not made again"
 
 
 def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecord:
@@ -86,7 +85,7 @@ def _measured(folder: Path, record: EvidenceRecord, target: Path) -> EvidenceRec
 def _with_the_search(made: EvidenceRecord, record: EvidenceRecord) -> EvidenceRecord:
     """With what `record` says of the search, which only who ran it knew."""
     told: dict[str, Any] = {
-        "sentence": f"{made.sentence}; {TOLD}",
+        "sentence": f"{made.sentence}; {RECOVERED}",
         "solver": record.solver,
         "data": record.data,
         "inputs": record.inputs.model_copy(update={"search": None}),

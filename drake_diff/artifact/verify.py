@@ -14,6 +14,7 @@ from drake_diff._base.arrays import positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.strangers import MOST_READ, MOST_TEXT, files_in, read_plain, sha256_of
 from drake_diff.artifact.again import (
+    OF_RECOVERED,
     SAME_PLAN,
     SEARCH_TOPICS,
     SEARCHED,
@@ -524,6 +525,9 @@ def _told_of_a_solve(
         else:
             problems.append(str(d))
     checked = sum(one.count for one in compared)
+    if OF_RECOVERED in again.unrepeated and not problems:
+        files = ", ".join(one.file for one in compared)
+        undecided.append(f"what holds: measured again from the plan, all {checked} other values of {files} came out")
     told = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
     return _judged(told, problems, undecided)
 

@@ -235,6 +235,7 @@ class _Search:
 
         Where that leads elsewhere, the search goes on from there with Drake's own step alone.
         """
+        self._report()
         outcome = self._stoppable(interrupted)
         if self.tried_by is None or self.policy is None or outcome is Outcome.TIME_LIMIT:
             return outcome
@@ -427,9 +428,12 @@ class _Search:
         self.motion, self.cost, self.jacobians, self.policy = motion, cost, jacobians, policy
         self.gains = self.gains[1], merit - found
         self.rows.append(Iteration(len(self.rows), cost, self._infeasibility(), policy.gradient, size))
+        self._report()
+        return None
+
+    def _report(self) -> None:
         if self.report:
             self.report.row(self.rows[-1], self._iterates)
-        return None
 
     def _iterates(self) -> tuple[Iterate, ...]:
         """The motion, for callbacks."""
