@@ -317,6 +317,8 @@ def _not_run_again(found: Verification, record: SealedRecord) -> Verification:
     for e in record.engines if isinstance(record, ComparisonRecord) else ():
         if e.function is not None:
             told.append(f"{e.engine}: a user's function ({e.function.name}), whose code the record does not hold")
+        if e.cause is not None:
+            told.append(f"{e.engine}: its cause was not looked for again")
     return replace(found, unchecked=tuple(told))
 
 
