@@ -66,7 +66,7 @@ def test_a_block_that_sticks_and_slips_has_its_friction(write_urdf):
     assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 3)  # of three standard normal numbers
 
 
-def test_a_block_that_comes_to_rest_and_stays_has_its_friction(write_urdf):
+def test_a_block_that_comes_to_rest_and_stays_has_its_friction(write_urdf, tmp_path):
     us = np.where(np.arange(N)[:, None] < 30, 20.0, 0.0)
     us[120:] = 0.9 * FRICTION  # which does not move it
     xs = sticks_and_slips(us)
@@ -76,6 +76,8 @@ def test_a_block_that_comes_to_rest_and_stays_has_its_friction(write_urdf):
     low, high = e.intervals["slide.coulomb_friction"]
     assert low < FRICTION < high < low + 0.01 * FRICTION
     assert np.all(e.motions[0].xs[-60:, 1] == 0)  # and the fit stays where it is
+    dd.save(e, tmp_path / "run")
+    assert dd.verify(tmp_path / "run").holds  # which fits again
 
 
 def test_friction_that_creeps_is_not_sold_as_dry_friction(write_urdf):
