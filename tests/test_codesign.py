@@ -296,6 +296,7 @@ def test_a_time_that_is_weighed_against_effort(method, segments, tmp_path):
     assert solution.horizon == pytest.approx((effort / weight) ** 0.25, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_mass_and_time_by_sweeps_through_discrete_steps(tmp_path):
     """Both at once: for any T the best mass is that of the price, and the best T of it is where the slopes meet."""
     price, heaviest, weight, steps, way = 8.0, 2.0, 3.0, 20, 1.0

@@ -154,6 +154,14 @@ def test_the_saltation_is_what_the_drops_own_differences_say():
 # ---- the engines ------------------------------------------------------------------------------------------------
 
 
+def test_what_drake_does_is_its_laws_answer():
+    """Of two cases; the tests of `found` have them all, and other engines."""
+    few = contact_table(("drake", "drake:lagged"), (CASES["rest"], CASES["slide"]))
+    assert few.off == ()
+    assert [row.law_gap <= TOLERANCES[row.case].value for row in few.rows] == [True] * 4
+
+
+@pytest.mark.slow
 def test_every_engine_has_a_row_in_every_case(found):
     assert found.engines == (*DRAKES, "mujoco")
     assert len(found.rows) == 4 * len(CASES)
@@ -165,6 +173,7 @@ def test_every_engine_has_a_row_in_every_case(found):
         assert row.tolerance == tolerance
 
 
+@pytest.mark.slow
 def test_values_by_hand_and_by_drake_alone(found):
     """Stop and slide as Drake alone gave them, stepped without this package; rest m g / k and roll by formula."""
     stop = {SAP: (0.0967120, 0.1926076), SIMILAR: (0.0967701, 0.1951943), LAGGED: (0.0969954306, 0.2000252)}
@@ -181,6 +190,7 @@ def test_values_by_hand_and_by_drake_alone(found):
         assert found.row("roll", engine).value == pytest.approx(rolls, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_verdicts_on_gradients(found):
     """Sliding: right or the law's. A bounce: wrong in all, where the force jumps at touch even in its sign."""
     verdicts = {(row.case, row.engine): row.gradient_verdict for row in found.rows}
@@ -196,6 +206,7 @@ def test_verdicts_on_gradients(found):
     assert "at touch the force jumps" in sap.gradient_why
 
 
+@pytest.mark.slow
 def test_wrong_gradients_are_those_without_the_jump(found):
     """MuJoCo's to the h of an explicit step, Drake's with the damper k h that an implicit step is."""
     for kind in ("bounce", "damped bounce"):
@@ -242,6 +253,7 @@ def test_who_has_no_contact_falls_through():
     assert found.off == ()
 
 
+@pytest.mark.slow
 def test_the_hand_calculation_is_drakes_sap_where_there_is_one(found):
     hand = contact_table(("numpy",))
     assert {row.case for row in hand.rows} == {"rest", "bounce", "damped bounce"}
@@ -384,9 +396,13 @@ def test_an_engine_that_breaks_off_says_so():
     assert "the solver gave up" in row.why
 
 
-def test_bad_input_is_named(found):
+@pytest.mark.slow
+def test_a_row_that_is_not_there_is_named(found):
     with pytest.raises(UnknownNameError, match="slide of mujoco"):
         found.row("fly", "mujoco")
+
+
+def test_bad_input_is_named():
     with pytest.raises(UnknownNameError, match="mujoco"):
         contact_table(("bullet-proof",))
     with pytest.raises(InputError, match="slope"):
@@ -412,6 +428,7 @@ def test_the_rebound_is_read_at_any_step_of_the_flight():
 # ---- words and the command --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_sentences_and_json(found):
     said = " ".join(lines_of(found, SAP))
     assert "rigid answer (rest, bounce)" in said
@@ -465,6 +482,7 @@ SMALLEST_TOLD = (
 )
 
 
+@pytest.mark.slow
 def test_the_table_in_the_documents_is_this_table(found):
     text = (ROOT / "docs" / "contact.md").read_text()
     table = [line.split("|")[2:-1] for line in text.splitlines() if re.match(r"\| [\w ]", line)][:8]

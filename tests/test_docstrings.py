@@ -57,7 +57,12 @@ def test_a_function_names_each_argument_and_what_it_returns(name):
     assert "Returns:" in text or inspect.signature(function).return_annotation is None
 
 
-@pytest.mark.parametrize("name", PUBLIC)
+LONG = ("drake_diff.identification.identify_contact", "dd.excite", "drake_diff.identification.write_model")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in PUBLIC]
+)
 def test_the_example_runs(name, monkeypatch, tmp_path):
     (tmp_path / "artifacts").mkdir()
     for folder in ("models", "examples", "artifacts/pendulum_swing_up"):

@@ -67,6 +67,7 @@ def test_the_sphere_has_no_gradient_where_it_touches_and_one_elsewhere():
     assert dd.certify(model, module.ball(module.RADIUS, vx=1, vz=-1)).verdict == "discontinuous"
 
 
+@pytest.mark.slow
 def test_the_sphere_rolls_to_where_it_is_sent():
     module = example("sphere_on_ground")
     solution = dd.solve(module.problem())
@@ -75,6 +76,7 @@ def test_the_sphere_rolls_to_where_it_is_sent():
     assert 0 < solution.replay.penetration.max() < 0.02
 
 
+@pytest.mark.slow
 def test_the_ball_is_pushed_from_a_guess_that_never_touches_it():
     """The goal is hard: 1e-8 of the solver, 1e-5 the package's measure, here on the true plant's own rollout."""
     module = example("push_without_touching")
@@ -163,6 +165,7 @@ def test_a_quadrotor_flies_through_its_gates_and_its_record_holds(tmp_path):
     assert dd.verify(tmp_path / "run").verdict == "holds"
 
 
+@pytest.mark.slow
 def test_the_acrobot_stands_and_its_elbow_keeps_its_limit():
     """The plan itself; on the plant it is followed under feedback, in the shortest steps within 5 % of a turn."""
     module = example("acrobot_swing_up")
@@ -175,6 +178,7 @@ def test_the_acrobot_stands_and_its_elbow_keeps_its_limit():
     assert np.abs(followed.motion.xs[-1] - module.UPRIGHT)[:2].max() < 0.05 * 2 * np.pi
 
 
+@pytest.mark.slow
 def test_the_load_of_the_crane_sways_no_more_than_it_may():
     """In every open-loop replay too; without the limit it sways more, and the same way costs less."""
     module = example("crane_without_sway")

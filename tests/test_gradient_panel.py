@@ -161,6 +161,7 @@ def test_the_wall_has_the_bias_of_its_jumps(theta, value, gradient, bias):
     assert q.biased == (abs(bias) > 1e-3)
 
 
+@pytest.mark.slow
 def test_over_the_wall_only_zeroth_order_finds_the_way():
     panel = dd.studies.gradient_panel(["wall"], samples=100, seeds=10)
     found = panel.case("wall")
@@ -172,6 +173,7 @@ def test_over_the_wall_only_zeroth_order_finds_the_way():
     assert "zeroth order shows no bias" in found.verdict
 
 
+@pytest.mark.slow
 def test_a_push_below_friction_has_no_derivative_to_follow():
     """A second engine: Coulomb's x = max(0, u - mu m g) h^2 N (N + 1) / 2 m, smoothed by quadrature."""
     case, h, steps, sigma = push(), 0.02, 20, 2.0
@@ -208,6 +210,7 @@ def test_stiffness_makes_first_order_vary_and_zeroth_no_more_than_before():
     assert stiff[0] > stiff[1]
 
 
+@pytest.mark.slow
 def test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order():
     """The truth by the trapezoid rule over 401 heights, which needs neither derivatives nor samples."""
     case, sigma = bounce(1e5), 0.01

@@ -99,6 +99,7 @@ def test_a_pendulum_is_known_by_an_accelerometer_and_a_gyro_on_it(load):
     assert not wrong.explained
 
 
+@pytest.mark.slow
 def test_a_sensor_file_is_kept_and_comes_out_again(tmp_path):
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
     log = swing(damping=0.15, times=np.linspace(0, 1, 81))

@@ -235,6 +235,7 @@ def test_a_folded_arm_is_refused_by_self_collision():
         dd.Problem(model, x0=folded, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[dd.SelfCollision()])
 
 
+@pytest.mark.slow
 def test_obstacles_are_recorded_drawn_and_made_again(tmp_path):
     turned = RigidTransform().rotation().matrix().tolist()
     post = dd.BoxObstacle([0.0, 0.0, -1.25], [0.1, 0.4, 0.2], rotation=turned, name="post", links=["lower"])

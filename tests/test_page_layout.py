@@ -158,6 +158,7 @@ def test_the_replay_stays_in_view_beside_its_plots(humanoid, browser, size):
     assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
 
 
+@pytest.mark.slow
 @browsing
 def test_tables_scroll_in_their_own_box(humanoid, browser):
     open_page(browser, humanoid / "report.html", size=PHONE)
@@ -259,6 +260,7 @@ def test_the_picture_is_dark_where_the_screen_is(two, browser):
     assert max(corner["dark", page] for page in ("report.html", "replay.html")) < 0.3
 
 
+@pytest.mark.slow
 @browsing
 def test_two_runs_share_a_replay_and_plots(two, browser, tmp_path):
     page = tmp_path / "report.html"
@@ -307,6 +309,7 @@ def test_goals_are_in_the_replay(two, browser):
     assert "target of pole" in (two / "long" / "report.html").read_text()
 
 
+@pytest.mark.slow
 @browsing
 def test_a_goal_is_seen_through_the_robot_and_the_plan_behind_it(browser, tmp_path):
     """The target is inside the cart where the motion ends, the plan 0.3 rad and 5 cm from the motion."""

@@ -60,6 +60,7 @@ def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
     assert end[:2] == pytest.approx([0.0, 0.5], abs=0.025)  # what a replay in other steps may be off: 5 % of its way
 
 
+@pytest.mark.slow
 def test_on_a_terminal_the_stages_are_a_live_table(arm, tmp_path):
     """A table that is written again and again, which no pipe ever sees."""
     ours, theirs = pty.openpty()

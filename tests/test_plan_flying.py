@@ -48,6 +48,7 @@ def test_a_box_is_lifted_out_of_the_ground_and_flown(box, tmp_path):
     assert dd.verify(tmp_path / "out").holds
 
 
+@pytest.mark.slow
 def test_a_drone_goes_where_it_is_asked_to(tmp_path):
     done = plan(MODELS / "quadrotor.urdf", goals={"body": [1.0, -0.5, 2.0]}, out=tmp_path / "out")
     assert done.success, done.lines

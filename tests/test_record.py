@@ -1,7 +1,6 @@
 """The record's fields: what they refuse, that they come back as they were, and that they say what is true."""
 
 import dataclasses
-import doctest
 import math
 import subprocess
 import sys
@@ -12,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.models import MODELS, ROOT
+from helpers.models import MODELS
 from helpers.table import each_row
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, JsonValue, ValidationError
 
 import drake_diff as dd
-from drake_diff import artifact
 from drake_diff.artifact import measure
 from drake_diff.artifact.sections import describe_problem, rebuild_problem
 from drake_diff.exceptions import ArtifactError
@@ -411,17 +409,3 @@ def test_records_print_in_a_few_lines_and_their_text_is_escaped(record):
     assert "&lt;script&gt;" in evil._repr_html_()
     certified = dd.record.certify_model(pendulum().model, states=2)
     assert "states: 2 agree" in repr(certified)
-
-
-EXAMPLES = [dd.save, dd.load_record, dd.verify, dd.read_trace, dd.record.certify_model]
-EXAMPLES += [getattr(artifact, name) for name in artifact.__all__]
-
-
-@each_row("documented", EXAMPLES, ids=lambda documented: documented.__name__)
-def test_the_example_of_every_public_name_runs(documented, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
-    found = doctest.DocTestFinder(recurse=False).find(documented, globs={"dd": dd, "np": np})
-    assert sum(len(example.examples) for example in found) > 0
-    for example in found:
-        assert runner.run(example).failed == 0

@@ -46,6 +46,7 @@ def test_through_a_bounce_the_gradient_does_not_converge_and_is_called_that(boun
         certificate.require()
 
 
+@pytest.mark.slow
 def test_without_the_second_layer_the_same_gradient_agrees(bouncer):
     certificate = dd.certify_rollout(bouncer(1e4, 1 / 480), [1.003, -2.0], None, height, num_steps=480)
     assert certificate.verdict in {"agree", "undecided"}  # with differences, which are as wrong

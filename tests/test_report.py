@@ -110,7 +110,7 @@ def test_a_report_opens_without_a_network_and_without_an_error(runs, browser, tm
 
 
 @browsing
-@pytest.mark.parametrize("name", ["swing_up", "thrown"])
+@pytest.mark.parametrize("name", slow_after(1, ["swing_up", "thrown"]))
 def test_the_slider_moves_the_view_and_the_cursors_together(runs, browser, tmp_path, name):
     open_page(browser, runs / name / "report.html")
     show_all(browser)
@@ -140,6 +140,7 @@ def test_the_replay_page_is_posed_before_play_and_moves(runs, browser, tmp_path)
     assert errors(browser) == []
 
 
+@pytest.mark.slow
 @browsing
 def test_an_arrow_is_as_long_as_its_force(runs, browser, thrown):
     """At the end the ball rests: the force is its weight, 9.81 N, and the arrow's length that over the reference."""
@@ -299,6 +300,7 @@ def test_the_live_view_is_at_loopback_only(runs):
         assert b"meshcat" in page.read()
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_address_and_ends_by_ctrl_c(runs):
     command = [sys.executable, "-m", "drake_diff.cli.main", "view", str(runs / "swing_up")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

@@ -42,6 +42,7 @@ def test_cart_pole_swing_up_by_collocation(load, count, cost, running_cost):
     assert solution.cost == pytest.approx(cost, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_snopt_finds_the_same_swing_up(load):
     solution = dd.solve(swing_up(load, 20), method="collocation", scheme="drake", solver="snopt")
     assert solution.cost == pytest.approx(62.58516350539, rel=1e-8)
@@ -58,7 +59,7 @@ SOFT = {
 }
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
+@pytest.mark.parametrize("solver", slow_after(1, ["ipopt", "snopt"]))
 def test_pendulum_with_a_hard_goal_by_shooting(load, solver):
     """J = 8.826541704941 by a solve of the same steps beside Drake; inputs to the digits that a tolerance leaves."""
     solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting", solver=solver)
@@ -310,6 +311,7 @@ def test_the_same_seed_gives_the_same_bits(load):
     assert repr(a.iterations) == repr(b.iterations)  # a blank cell is NaN, which equals nothing
 
 
+@pytest.mark.slow
 def test_a_solution_is_a_warm_start(load):
     first = dd.solve(swing_up(load, 40), method="shooting", solver="snopt")
     again = dd.solve(swing_up(load, 40), method="shooting", solver="snopt", initial_guess=first)
@@ -503,6 +505,7 @@ def test_a_motion_that_leaves_every_finite_number_is_no_success(load):
     assert np.all(np.isfinite(solution.xs))
 
 
+@pytest.mark.slow
 def test_ipopt_shortens_a_step_that_cannot_be_simulated(load):
     solution = dd.solve(acrobot_swing_up(load), method="shooting", solver="ipopt", max_iterations=20)
     assert solution.status is Status.ITERATION_LIMIT

@@ -73,6 +73,7 @@ def _final_multipliers(model, solution):
     return np.linalg.lstsq(sensitivity.T, wanted, rcond=None)[0]
 
 
+@pytest.mark.slow
 @by_each_method
 def test_a_box_is_pressed_as_deep_as_a_contact_force_allows(method):
     """F_k = k (d_k + (h + tau) w_(k+1)) with d_(k+1) = d_k + h w_(k+1), of SAP's linear law, k = 4e4 N/m, tau = 0.2 s.

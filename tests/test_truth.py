@@ -35,7 +35,7 @@ def test_the_implicit_step_is_of_order_five_and_follows_what_is_stiff():
     assert x[0] == pytest.approx(np.sin(1.0), abs=1e-8)
 
 
-@pytest.mark.parametrize("approximation", ["sap", "lagged"])
+@pytest.mark.parametrize("approximation", slow_after(1, ["sap", "lagged"]))
 def test_a_motion_of_several_bounces_is_known_to_what_the_slopes_need(tmp_path, approximation):
     """A hundredth of 0.1 % of a slope of 1 over the narrowest width of 1e-4; another way, event by event."""
     ball = Bounce(2e3, relaxation_time=4e-3, dissipation=0.2, mass=0.7)
@@ -201,6 +201,7 @@ def test_a_slope_exists_where_the_narrow_ones_agree_and_the_wide_one_as_on_a_cur
     assert judged(over(1.0, 1.0, 1.0, 9.0), noise, 1e-3).exists is False
 
 
+@pytest.mark.slow
 def test_the_truth_goes_into_a_record_and_back(dropped, tmp_path):
     """One slope is not ours; one is not measured; the steps' gradient is refused, and the record says so."""
     _, model = dropped("sap", relaxation_time=0.005, dissipation=0.2)

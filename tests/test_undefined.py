@@ -154,6 +154,7 @@ def test_where_all_is_well_it_takes_six_rollouts(monkeypatch):
     assert len(taken) == 6
 
 
+@pytest.mark.slow
 def test_a_smoothed_step_has_the_slope_of_its_closed_form_where_first_order_has_none():
     """Whether the ball has turned by the end: half a period after it touches. Derivatives are 0 on both sides.
 

@@ -106,6 +106,7 @@ def test_a_run_that_began_with_multipliers_comes_out_again(tmp_path):
     assert "differ" not in found.sentence
 
 
+@pytest.mark.slow
 def test_ilqr_goes_on_from_its_multipliers():
     """Its own optimum takes no more than a step, and a task that changed a little fewer than from the motion alone."""
     model = dd.example_model("double_pendulum", time_step=0.02)
