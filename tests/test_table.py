@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 
 TABLES = """
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 
 @each_row("a, b", [(1, 1), (2, 3), (4, 5)])
 @each_row("c", "xy", ids=["ex", "why"])
@@ -46,3 +46,8 @@ def test_a_table_that_checks_nothing_or_fits_nothing_is_refused():
         each_row("a", [pytest.param(1, marks=pytest.mark.slow)])
     with pytest.raises(TypeError, match="takes no"):
         each_row("a", [1])(lambda b: None)
+
+
+def test_rows_after_the_first_ones_are_slow():
+    rows = slow_after(1, [3, (4, 5)])
+    assert [(row.values, [mark.name for mark in row.marks]) for row in rows] == [((3,), []), ((4, 5), ["slow"])]
