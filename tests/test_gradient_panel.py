@@ -201,6 +201,7 @@ def qualities(case, sigma, samples, seeds):
     return [found.cases[0].at(order, sigma).trace for order in ("first", "zeroth")]
 
 
+@pytest.mark.slow
 def test_stiffness_makes_first_order_vary_and_zeroth_no_more_than_before():
     """A slope of the contact grows with its stiffness; the loss, and what zeroth order varies by, does not."""
     soft, stiff = (qualities(bounce(k), 0.03, 100, 1) for k in (1e3, 1e5))
@@ -227,6 +228,7 @@ def test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order():
     assert (zeroth.biased, found.least_error(sigma)) == (False, "zeroth")
 
 
+@pytest.mark.slow
 def test_a_long_chaotic_horizon_makes_first_order_vary_and_zeroth_hardly():
     short, long = (qualities(double_pendulum(num_steps=n), 0.3, 30, 1) for n in (25, 150))
     assert long[0] > 1000 * short[0]

@@ -258,6 +258,7 @@ def test_the_command_prints_the_values_and_exits_with_0_where_they_explain(log, 
     assert dd.verify(out).holds
 
 
+@pytest.mark.slow
 def test_the_command_exits_with_1_where_nothing_explains(tmp_path):
     log = write_swing(tmp_path / "dry.csv", friction=0.1)
     result = command("--recording", log, "--parameters", "hinge.damping", "--out", tmp_path / "run")

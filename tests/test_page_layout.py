@@ -296,6 +296,7 @@ def test_a_page_of_two_runs_says_where_they_are_furthest_apart(two, tmp_path):
         write_runs_page(page, two / "short", tmp_path)
 
 
+@pytest.mark.slow
 @browsing
 def test_goals_are_in_the_replay(two, browser):
     """In the plane x = 0.3 m, through the world's origin in y and z: green pixels, which no other run has."""

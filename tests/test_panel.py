@@ -302,6 +302,7 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
     assert 3 <= len(finished(out / "trials.jsonl")) < 500
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_guard_around_its_panel(write, tmp_path):
     """Workers do not import the script that started them: without `if __name__ == "__main__"` it would start again."""
     script = tmp_path / "script.py"

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, add_slide, contact_properties, random_state
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddRigidHydroelasticProperties,
@@ -965,7 +965,7 @@ def certifiable(model):
     return found
 
 
-@pytest.mark.parametrize("method", ["auto", "autodiff", "implicit"])
+@pytest.mark.parametrize("method", slow_after(1, ["auto", "autodiff", "implicit"]))
 def test_every_parameter_of_an_arm_is_certified(method):
     model = arm()
     names = certifiable(model)

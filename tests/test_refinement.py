@@ -169,6 +169,7 @@ def test_a_smooth_motion_has_all_three_slopes_and_says_them(load):
     assert "the continuous motion's slope is" in str(certificate)
 
 
+@pytest.mark.slow
 def test_where_there_is_no_continuous_motion_it_is_said_why(tmp_path):
     gains = '<actuator name="motor"><drake:controller_gains p="2" d="0.2"/></actuator>'
     text = (MODELS / "pendulum.urdf").read_text().replace('<actuator name="motor"/>', gains)

@@ -127,6 +127,7 @@ def test_the_slider_moves_the_view_and_the_cursors_together(runs, browser, tmp_p
     assert errors(browser) == []
 
 
+@pytest.mark.slow
 @browsing
 def test_the_replay_page_is_posed_before_play_and_moves(runs, browser, tmp_path):
     open_page(browser, runs / "swing_up" / "replay.html")

@@ -316,6 +316,7 @@ def test_a_wheel_whose_feet_never_slip_has_two_answers():
         rigid_motion(model, [0, 1, 0, 1.5, 0, 1.5], contact, num_steps=2)
 
 
+@pytest.mark.slow
 def test_newtons_restitution_with_friction_may_add_energy_and_is_told():
     """Kane's paradox: a rod at an angle that slides back. Poisson's law takes energy from the same impact."""
     model, angle = falling_rod(), 0.9

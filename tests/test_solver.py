@@ -33,8 +33,8 @@ def swing_up(load, count, cost=EFFORT, **changes):
     return dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=count, running_cost=cost, **changes)
 
 
+@pytest.mark.parametrize("running_cost", slow_after(1, [EFFORT, lambda x, u: u[0] ** 2]))
 @each_row("count, cost", [(20, 62.58516350539), (40, 59.79288912066)])
-@each_row("running_cost", [EFFORT, lambda x, u: u[0] ** 2])
 def test_cart_pole_swing_up_by_collocation(load, count, cost, running_cost):
     """The optima that Drake's DirectCollocation finds with SNOPT."""
     solution = dd.solve(swing_up(load, count, running_cost), method="collocation", scheme="drake")

@@ -234,7 +234,7 @@ def test_a_whole_artifact_that_lies_is_found_by_running_it_again(
     assert any(words in complaint for complaint in found.complaints), found.complaints
 
 
-@pytest.mark.parametrize("row", [0, 7, 20])
+@pytest.mark.parametrize("row", slow_after(1, [0, 7, 20]))
 def test_a_forged_motion_in_the_trace_is_found_although_all_hashes_are_right(solution, copy, row):
     record, measurement = dd.load_record(copy), measure(solution)
     xs = np.array(measurement.motion.xs)
@@ -414,6 +414,7 @@ def test_an_incomplete_run_is_undecided_and_a_failed_one_is_true(solution, tmp_p
     assert dd.verify(tmp_path / "b").holds
 
 
+@pytest.mark.slow
 @each_row(
     "key, value",
     [
@@ -511,6 +512,7 @@ def test_a_certification_that_lies_is_found_by_certifying_again(kinds, tmp_path)
         assert any("certification.json" in complaint and words in complaint for complaint in found.complaints)
 
 
+@pytest.mark.slow
 def test_a_certification_carries_its_model_and_one_whose_mesh_changed_is_undecided(tmp_path):
     path = Path(shutil.copy(MODELS / "pendulum.urdf", tmp_path))
     dd.record.certify_model(dd.load_model(path, time_step=0.02), states=1, directory=tmp_path / "certified")
@@ -598,6 +600,7 @@ def test_quantities_of_the_toolkit_are_recorded_and_run_again(tmp_path):
     assert not dd.verify(tmp_path / "run").holds
 
 
+@pytest.mark.slow
 def test_a_function_that_wraps_a_quantity_is_a_users(tmp_path):
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     tip = dd.quantities.frame_position(model, "pole")
