@@ -1,6 +1,6 @@
 """Identify a real cube's contact from motion-captured tosses, and predict tosses that were not used.
 
-How it falls says where its centre of mass is and how long the cameras' metre is; how it bounces, its contact and size.
+How it falls says how long the cameras' metre is; how it bounces, its contact and size (docs/identification.md).
 
     python examples/tossed_cube.py    two minutes; writes artifacts/tossed_cube/fall and artifacts/tossed_cube/impacts
     drake-diff verify --time-limit 600 artifacts/tossed_cube/impacts    fits again what is kept there

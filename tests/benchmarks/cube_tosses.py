@@ -6,8 +6,10 @@ TOSSES.npz has `length` and `state` of real tosses at 148 Hz (ContactNets, BSD-3
 velocity in the body's frame and velocity. Each toss that was held out is simulated from its first state; its error is
 the mean distance of the centre over time, in % of the cube's width. First states are those measured, or those whose
 motion goes through the positions before the first contact. Lengths are put right by gravity: in the air these cubes
-fall by less than 9.81 m/s^2. Drake fits eight corner spheres; --mujoco gives the same simulated steps to MuJoCo's
-sysid toolbox (pip install mujoco[sysid]).
+fall by less than 9.81 m/s^2. The centre of mass is off the middle, and the recorded axes of the cube are turned from
+one set of throws to the next: cube_tosses_axes.py puts that right, by the motion before the first contact. Drake fits
+eight corner spheres, and pads on the faces with a friction of their own; --mujoco gives the same simulated steps to
+MuJoCo's sysid toolbox (pip install mujoco[sysid]), with the corners alone.
 
 Where errors come from: the error of a model that is right is that of its first states, how far apart motions end that
 begin at states which the measured positions allow. Beside it stands how far apart they end where friction is 5 %
@@ -26,10 +28,11 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
 
 import numpy as np  # noqa: E402
+from cube_tosses_axes import axes_of, rotations, turned  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
 from drake_diff._base.arrays import Array  # noqa: E402
-from drake_diff.identification import first_state, identify_contact  # noqa: E402
+from drake_diff.identification import ContactIdentification, first_state, identify_contact  # noqa: E402
 from drake_diff.identification.chart import Chart  # noqa: E402
 from drake_diff.identification.flights import flights_of, millisecond, start_of  # noqa: E402
 from drake_diff.identification.measured import read_pieces  # noqa: E402
@@ -41,12 +44,17 @@ INSET = 0.0024  # [m] by hand, radius of a corner sphere: its centre is so far i
 GYRATION = (INERTIA / MASS) ** 0.5  # [m]
 LENGTHS = {"half_width": WIDTH / 2, "corner": INSET, "gyration": GYRATION}
 BY_HAND = {"friction": 0.15, "stiffness": 2e4, "relaxation_time": 0.005}  # [1, N/m, s]
-NAMES = ("cube.friction", "cube.stiffness", "cube.relaxation_time")
+NAMES = ("cube.friction", "pads.friction", "cube.stiffness", "cube.relaxation_time")
+PAD, APART, RECESS = 0.005, 0.03, 1e-4  # [m] radius of a pad, how far from the middle of its face, and corners below it
 
 
-def sdf(half_width: float, corner: float, gyration: float) -> str:
-    """The cube above the plane z = 0, as by hand; the plane is much stiffer, with the same friction."""
-    at, inertia = half_width - corner, MASS * gyration**2
+def sdf(half_width: float, corner: float, gyration: float, center: Array) -> str:
+    """The cube above z = 0, as by hand; the board is much stiffer, with the same friction.
+
+    Eight spheres are its corners, and four on each face, which lie a little further out, carry it where it lies flat.
+    The board is a thick box, since Drake's query for overlaps ended the process with pads above a plane.
+    """
+    at, inertia = half_width - corner - RECESS, MASS * gyration**2
 
     def properties(stiffness: float, friction: float, relaxation_time: float) -> str:
         return (
@@ -58,30 +66,29 @@ def sdf(half_width: float, corner: float, gyration: float) -> str:
         )
 
     own = properties(BY_HAND["stiffness"], BY_HAND["friction"], BY_HAND["relaxation_time"])
-    corners = "".join(
-        f'<collision name="corner{i}"><pose>{a * at} {b * at} {c * at} 0 0 0</pose>'
-        f"<geometry><sphere><radius>{corner}</radius></sphere></geometry>{own}</collision>"
-        for i, (a, b, c) in enumerate(product((-1, 1), repeat=3))
-    )
+
+    def spheres(name: str, radius: float, places: list[tuple[float, ...]]) -> str:
+        return "".join(
+            f'<collision name="{name}{i}"><pose>{a} {b} {c} 0 0 0</pose>'
+            f"<geometry><sphere><radius>{radius}</radius></sphere></geometry>{own}</collision>"
+            for i, (a, b, c) in enumerate(places)
+        )
+
+    corners = spheres("corner", corner, [(a * at, b * at, c * at) for a, b, c in product((-1, 1), repeat=3)])
+    face = [(side * (half_width - PAD), a * APART, b * APART) for side, a, b in product((-1, 1), repeat=3)]
+    pads = spheres("pad", PAD, [place[k:] + place[:k] for place in face for k in range(3)])
     moments = f"<ixx>{inertia}</ixx><iyy>{inertia}</iyy><izz>{inertia}</izz><ixy>0</ixy><ixz>0</ixz><iyz>0</iyz>"
     return (
         '<sdf version="1.9" xmlns:drake="drake.mit.edu"><world name="toss"><model name="board"><static>true</static>'
-        '<link name="board"><collision name="board"><geometry><plane><normal>0 0 1</normal></plane></geometry>'
+        '<link name="board"><collision name="board"><pose>0 0 -1 0 0 0</pose>'
+        "<geometry><box><size>20 20 2</size></box></geometry>"
         f"{properties(1e12, BY_HAND['friction'], 0.0)}</collision></link></model>"
-        f'<model name="cube"><link name="cube"><inertial><mass>{MASS}</mass><inertia>{moments}</inertia></inertial>'
-        f"{corners}</link></model></world></sdf>"
+        f'<model name="cube"><link name="cube"><inertial><pose>{center[0]} {center[1]} {center[2]} 0 0 0</pose>'
+        f"<mass>{MASS}</mass><inertia>{moments}</inertia></inertial>{corners}</link>"
+        '<link name="pads"><inertial><mass>1e-9</mass><inertia><ixx>1e-12</ixx><iyy>1e-12</iyy><izz>1e-12</izz>'
+        f"<ixy>0</ixy><ixz>0</ixz><iyz>0</iyz></inertia></inertial>{pads}</link>"
+        '<joint name="glued" type="fixed"><parent>cube</parent><child>pads</child></joint></model></world></sdf>'
     )
-
-
-def rotations(quaternions: Array) -> Array:
-    """(n, 3, 3) of (n, 4) w, x, y, z."""
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1)[:, None]).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def read_tosses(path: Path) -> list[Array]:
@@ -97,53 +104,69 @@ def recording(name: str, xs: Array) -> dd.Recording:
     return dd.Recording(name, "1", np.arange(len(xs)) / RATE, xs, np.zeros((len(xs) - 1, 0)))
 
 
-def model_of(steps: int, half_width: float = WIDTH / 2, corner: float = INSET, gyration: float = GYRATION) -> dd.Model:
-    """By so many steps between two samples."""
+def model_of(
+    steps: int,
+    center: Array,
+    *,
+    half_width: float = WIDTH / 2,
+    corner: float = INSET,
+    gyration: float = GYRATION,
+) -> dd.Model:
+    """With its centre of mass there [m], by so many steps between two samples."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cube.sdf"
-        path.write_text(sdf(half_width, corner, gyration))
+        path.write_text(sdf(half_width, corner, gyration, center))
         return dd.load_model(path, time_step=1 / RATE / steps)
 
 
-def in_the_air(tosses: list[Array], model: dd.Model) -> tuple[Array, Array]:
+def flights(tosses: list[Array], model: dd.Model) -> dict[int, Array]:
+    """What each toss (n, 13) is before the first contact, where that is 6 samples or more."""
+    found = {}
+    for i, xs in enumerate(tosses):
+        spans = flights_of(model, xs)
+        if spans and spans[0][0] == 0:
+            found[i] = xs[: spans[0][1] + 1]
+    return found
+
+
+def in_the_air(flown: list[Array]) -> tuple[Array, Array]:
     """Gravity [m/s^2] and centre of mass [m] (6,) before the first contact, and their standard errors.
 
     Each toss has p = p0 + v0 t + g t^2 / 2 - R c: least squares, with p0 and v0 taken out of each. Errors are by the
     scatter between tosses.
     """
     each = []
-    for xs in tosses:
-        flights = flights_of(model, xs)
-        if flights and flights[0][0] == 0 and flights[0][1] >= 9:
-            flown = xs[: flights[0][1] + 1]
-            t = np.arange(len(flown)) / RATE
-            A = np.concatenate([t[:, None, None] ** 2 / 2 * np.eye(3), -rotations(flown[:, :4])], axis=2)
+    for xs in flown:
+        if len(xs) >= 10:
+            t = np.arange(len(xs)) / RATE
+            A = np.concatenate([t[:, None, None] ** 2 / 2 * np.eye(3), -rotations(xs[:, :4])], axis=2)
             Q = np.linalg.qr(np.stack([np.ones_like(t), t], axis=1))[0]
             rest = np.eye(len(t)) - Q @ Q.T
-            each.append((np.einsum("st,tij->sij", rest, A).reshape(-1, 6), (rest @ flown[:, 4:7]).ravel()))
+            each.append((np.einsum("st,tij->sij", rest, A).reshape(-1, 6), (rest @ xs[:, 4:7]).ravel()))
     H = sum(A.T @ A for A, _ in each)
     found = np.linalg.solve(H, sum(A.T @ y for A, y in each))
     scores = np.array([A.T @ (y - A @ found) for A, y in each])
     return found, np.sqrt(np.diag(np.linalg.solve(H, np.linalg.solve(H, scores.T @ scores).T)))
 
 
-def frictions(tosses: list[Array], model: dd.Model, g: Array) -> tuple[Array, Array]:
+def frictions(tosses: list[Array], model: dd.Model, g: Array, center: Array) -> tuple[Array, Array]:
     """Tangential over normal: of impulses (n,) between flights, and speed and that of forces (m, 2) in flat slides.
 
-    An impulse is the change of velocity from one flight to the next, where contact lasts for 8 samples at most. A cube
+    An impulse is the change of velocity of the centre of mass from one flight to the next, where contact lasts for 8
+    samples at most. A cube
     slides flat where a face is within 0.01 rad of the ground and the centre within 0.6 mm of its height at rest.
     """
     impulses, slides = [], []
     for xs in tosses:
-        flights = flights_of(model, xs)
-        for (a, b), (c, d) in pairwise(flights):
+        at, spans = xs[:, 4:7] + rotations(xs[:, :4]) @ center, flights_of(model, xs)
+        for (a, b), (c, d) in pairwise(spans):
             if c - b > 8:
                 continue
             when, speeds = (b + c) / 2 / RATE, []
             for first, last in ((a, b), (c, d)):
                 t = np.arange(first, last + 1) / RATE - when
                 A = np.stack([np.ones_like(t), t], axis=1)
-                speeds.append(np.linalg.lstsq(A, xs[first : last + 1, 4:7] - np.outer(t**2 / 2, g), rcond=None)[0][1])
+                speeds.append(np.linalg.lstsq(A, at[first : last + 1] - np.outer(t**2 / 2, g), rcond=None)[0][1])
             change = speeds[1] - speeds[0]
             impulses.append(np.linalg.norm(change[:2]) / change[2])
         rest = np.median(xs[-5:, 6])
@@ -156,6 +179,15 @@ def frictions(tosses: list[Array], model: dd.Model, g: Array) -> tuple[Array, Ar
                 if (speed := np.linalg.norm(v)) > 0.08:
                     slides.append((speed, -acc @ v / speed / -g[2]))
     return np.array(impulses), np.array(slides)
+
+
+def tell_frictions(tosses: list[Array], model: dd.Model, g: Array, center: Array) -> None:
+    impulses, slides = frictions(tosses, model, g, center)
+    low, half, high = np.percentile(impulses, [25, 50, 75])
+    print(f"friction of {len(impulses)} impacts {half:.3f} (half of them from {low:.3f} to {high:.3f}), and of slides:")
+    for slow, fast in pairwise((0.08, 0.15, 0.3, 0.5, 2.0)):  # [m/s]
+        part = slides[(slides[:, 0] >= slow) & (slides[:, 0] < fast), 1]
+        print(f"  from {slow} to {fast} m/s {np.median(part):.3f}, {len(part)} of them")
 
 
 def scaled(tosses: list[Array], by: float) -> list[Array]:
@@ -203,6 +235,17 @@ def told(name: str, each: Array) -> str:
     return f"{name}: mean {np.mean(each):.1f} %, median {np.median(each):.1f} %, {below}"
 
 
+def tell(found: ContactIdentification) -> None:
+    print(f"{found}\n{found.steps} simulated steps")
+    for name, interval in found.intervals.items():
+        print(f"  {name}: {np.round(found.values[name], 6)} in {np.round(interval, 6).tolist()}")
+    half = float(str(found.values["half_width"]))
+    print(f"half width {1e3 * half:.2f} mm, published {1e3 * WIDTH / 2:.2f} mm: {100 * (2 * half / WIDTH - 1):+.2f} %")
+    for body in ("cube", "pads"):
+        own, other = float(np.asarray(found.values[f"{body}.friction"])), BY_HAND["friction"]
+        print(f"friction of the pair {2 * own * other / (own + other):.4f} ({body}), published about 0.15")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tosses", type=Path)
@@ -214,49 +257,49 @@ def main() -> int:
     given = parser.parse_args()
     tosses = read_tosses(given.tosses)
     order = np.random.default_rng(given.seed).permutation(len(tosses))
-    fitted = [tosses[i] for i in order[: given.fit]]
-    others, held = ([tosses[i] for i in part] for part in np.split(order, [len(order) - given.held_out]))
-    (g, center), (g_off, center_off) = (np.split(v, 2) for v in in_the_air(others, model_of(given.steps)))
-    fall = float(np.linalg.norm(g))
+    parts = order[: given.fit], order[: len(order) - given.held_out], order[len(order) - given.held_out :]
+    middle = model_of(given.steps, np.zeros(3))
+    axes = axes_of(flights(tosses, middle), len(tosses), RATE, set(parts[1].tolist()))
+    print(
+        f"{axes.sets} sets of throws; axes are {np.bincount(axes.quarter).tolist()} times turned by so many quarters;"
+    )
+    print(f"of the {len(parts[2])} held out {np.sum(axes.sure[parts[2]] > 0.95)} are sure to 95 %", flush=True)
+    tosses = [turned(xs, quarter) for xs, quarter in zip(tosses, axes.quarter, strict=True)]
+    fitted, others, held = ([tosses[i] for i in part] for part in parts)
+    g, g_off = (v[:3] for v in in_the_air(list(flights(others, middle).values())))
+    center, fall = axes.center, float(np.linalg.norm(g))
     print(f"{len(others)} tosses that were not held out fall by {np.round(g, 4)} +- {np.round(g_off, 4)} m/s^2:")
     print(f"lengths are taken times {9.81 / fall:.4f}")
-    print(f"their centre of mass is at {np.round(1e3 * center, 2)} +- {np.round(1e3 * center_off, 2)} mm", flush=True)
-    impulses, slides = frictions(others, model_of(given.steps), g)
-    low, middle, high = np.percentile(impulses, [25, 50, 75])
-    print(
-        f"friction of {len(impulses)} impacts {middle:.3f} (half of them from {low:.3f} to {high:.3f}), and of slides:"
-    )
-    for slow, fast in pairwise((0.08, 0.15, 0.3, 0.5, 2.0)):  # [m/s]
-        part = slides[(slides[:, 0] >= slow) & (slides[:, 0] < fast), 1]
-        print(f"  from {slow} to {fast} m/s {np.median(part):.3f}, {len(part)} of them")
+    print(f"their centre of mass is at {np.round(1e3 * center, 2)} +- {np.round(1e3 * axes.errors, 2)} mm", flush=True)
+    tell_frictions(others, middle, g, center)
     fitted, held = (scaled(each, 9.81 / fall) for each in (fitted, held))
     logs = [recording(f"toss {i}", x) for i, x in enumerate(fitted)]
+    center = center * 9.81 / fall
     begun = time.process_time()
-    found = identify_contact(lambda **lengths: model_of(given.steps, **lengths), logs, NAMES, lengths=LENGTHS)
-    print(f"{found}\n{found.steps} simulated steps, {time.process_time() - begun:.0f} s of CPU", flush=True)
-    for name, interval in found.intervals.items():
-        print(f"  {name}: {np.round(found.values[name], 6)} in {np.round(interval, 6).tolist()}")
+    found = identify_contact(lambda **lengths: model_of(given.steps, center, **lengths), logs, NAMES, lengths=LENGTHS)
+    print(f"{time.process_time() - begun:.0f} s of CPU")
+    tell(found)
     values = dict(found.values)
     lengths = {name: float(str(values.pop(name))) for name in LENGTHS}
-    half = lengths["half_width"]
-    print(f"half width {1e3 * half:.2f} mm, published {1e3 * WIDTH / 2:.2f} mm: {100 * (2 * half / WIDTH - 1):+.2f} %")
-    own, other = float(np.asarray(found.values["cube.friction"])), BY_HAND["friction"]
-    print(f"friction of the pair {2 * own * other / (own + other):.4f}, published about 0.15")
-    by_hand, identified = model_of(given.steps), model_of(given.steps, **lengths)
-    measured = [x[0] for x in held]
-    flown = [first_state(by_hand, recording("toss", x)) for x in held]
-    for tag, starts in (("measured first states", measured), ("first states by flight", flown)):
-        print(told(f"Drake, by hand, {tag}", errors_of(by_hand, held, starts, {})))
-        print(told(f"Drake, identified, {tag}", errors_of(identified, held, starts, dict(values))), flush=True)
-    first, slippery = (spread_of(identified, held, values, more) for more in ({}, {"cube.friction": 1.1 * own}))
+    identified, measured = model_of(given.steps, center, **lengths), [x[0] for x in held]
+    by_hand = [first_state(middle, recording("toss", x)) for x in held]
+    flown = [first_state(identified, recording("toss", x)) for x in held]
+    print(told("Drake, by hand, first states by flight", errors_of(middle, held, by_hand, {})))
+    print(told("Drake, identified, measured first states", errors_of(identified, held, measured, dict(values))))
+    errors = errors_of(identified, held, flown, dict(values))
+    print(told("Drake, identified, first states by flight", errors))
+    sure = axes.sure[parts[2]] > 0.95
+    print(told("  those of them whose axes are sure to 95 %", errors[sure]), flush=True)
+    more = {f"{body}.friction": 1.1 * float(np.asarray(values[f"{body}.friction"])) for body in ("cube", "pads")}
+    first, slippery = (spread_of(identified, held, values, other) for other in ({}, more))
     print(told("A model that is right, from first states as uncertain as these", first))
     print(told("The same with 10 % more friction of the cube's side, 5 % of the pair", slippery), flush=True)
     if given.mujoco:
         from cube_tosses_mujoco import fit_by_sysid
 
         # MuJoCo's velocity of a flight is that of Drake's steps: both take v + g h first, and then x + v h.
-        begins = [first_state(by_hand, log) for log in logs]
-        for line in fit_by_sysid(fitted, held, begins, flown, found.steps, given.steps):
+        begins = [first_state(identified, log) for log in logs]
+        for line in fit_by_sysid(fitted, held, begins, flown, center, found.steps, given.steps):
             print(line)
     return 0
 

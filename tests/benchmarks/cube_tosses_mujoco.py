@@ -18,7 +18,7 @@ AT = WIDTH / 2 - INSET
 SPAN = 0.1  # [m] ground and centre are sought as 1 + place / SPAN: scipy's differences are relative
 
 
-def model_text(steps: int) -> str:
+def model_text(steps: int, center: Array) -> str:
     """By so many steps between two samples. MuJoCo's defaults for solref, and the friction that was published."""
     corners = "".join(
         f'<geom name="corner{i}" type="sphere" size="{INSET}" pos="{a * AT} {b * AT} {c * AT}" priority="1"/>'
@@ -27,7 +27,8 @@ def model_text(steps: int) -> str:
     return (
         f'<mujoco><option timestep="{1 / RATE / steps}" cone="elliptic"/><default><geom friction="0.15 0 0"/></default>'
         '<worldbody><geom name="board" type="plane" size="0 0 1"/><body name="cube"><freejoint/>'
-        f'<inertial pos="0 0 0" mass="{MASS}" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>{corners}'
+        f'<inertial pos="{center[0]} {center[1]} {center[2]}" mass="{MASS}" '
+        f'diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>{corners}'
         '<site name="center"/><site name="x" pos="0.05 0 0"/><site name="y" pos="0 0.05 0"/></body></worldbody><sensor>'
         '<framepos name="center" objtype="site" objname="center"/><framepos name="x" objtype="site" objname="x"/>'
         '<framepos name="y" objtype="site" objname="y"/></sensor></mujoco>'
@@ -49,7 +50,7 @@ def _state(x: Array) -> tuple[Array, Array]:
     return np.concatenate([x[4:7], x[:4]]), np.concatenate([x[10:13], w])
 
 
-def _parameters(sysid: Any) -> Any:
+def _parameters(sysid: Any, center: Array) -> Any:
     def corners(spec: Any, change: Any) -> None:
         for i in range(8):
             change(spec.geom(f"corner{i}"))
@@ -74,21 +75,28 @@ def _parameters(sysid: Any) -> Any:
     found.add(sysid.Parameter("friction", 0.15, 0.01, 1.0, modifier=set_friction))
     found.add(sysid.Parameter("solref", [0.02, 1.0], [0.0075, 0.05], [0.1, 3.0], modifier=set_law))
     found.add(sysid.Parameter("ground", 1.0, 0.9, 1.1, modifier=set_ground))
-    found.add(sysid.Parameter("center", [1.0] * 3, [0.9] * 3, [1.1] * 3, modifier=set_center))
+    found.add(sysid.Parameter("center", (1 + center / SPAN).tolist(), [0.9] * 3, [1.1] * 3, modifier=set_center))
     return found
 
 
 def fit_by_sysid(
-    fitted: list[Array], held: list[Array], begins: list[Array], starts: list[Array], most: int, steps: int
+    fitted: list[Array],
+    held: list[Array],
+    begins: list[Array],
+    starts: list[Array],
+    center: Array,
+    most: int,
+    steps: int,
 ) -> list[str]:
     """Lines with what it found by at most so many simulated steps, and its errors on tosses that were held out.
 
-    Those that are fitted begin at `begins`, those held out at `starts`; there are `steps` between two samples.
+    Those that are fitted begin at `begins`, those held out at `starts`; there are `steps` between two samples. The
+    search for the centre of mass begins at `center` [m].
     """
     import mujoco
     from mujoco import sysid
 
-    spec = mujoco.MjSpec.from_string(model_text(steps))
+    spec = mujoco.MjSpec.from_string(model_text(steps, center))
     model = spec.compile()
     firsts, controls, sensors = [], [], []
     for xs, x0 in zip(fitted, begins, strict=True):
@@ -105,7 +113,7 @@ def fit_by_sysid(
     each = sum(len(xs) - 1 for xs in fitted) * steps
     lines = [_told("MuJoCo, by hand", [_error(model, xs, x0, steps) for xs, x0 in zip(held, starts, strict=True)])]
     for name, options in OPTIMIZERS.items():
-        parameters = _parameters(sysid)
+        parameters = _parameters(sysid, center)
         search = _Counted(residual, most, each)
         with contextlib.suppress(_SpentError):  # the best so far counts
             sysid.optimize(parameters, search, verbose=False, max_iters=most, x_scale="jac", **options)
