@@ -10,6 +10,7 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
+from drake_diff.identification import dry
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.dry import smooth_or_dry
 from drake_diff.identification.sensors import choose_sensors
@@ -182,6 +183,19 @@ def test_the_force_on_a_block_is_what_friction_leaves_of_the_push(write_urdf):
     sensors = choose_sensors(model, tree, ("slide.force",), None)
     read = sensors.read(numbers, q, v, push, law.grip_at(numbers, q, v, push))
     np.testing.assert_allclose(read[:, 0], [9 - FRICTION, 0, 9 - FRICTION], atol=1e-12)  # 3 N do not move it
+
+
+def test_a_step_with_more_stops_than_are_looked_for_has_no_end(write_urdf, monkeypatch):
+    """It does not go on as if nothing had stopped."""
+    model = write_urdf(mass=MASS)
+    chart, tree = Chart(coordinates_of(model)), tree_for_identification(model)
+    law = smooth_or_dry(model, tree, chart, choose_unknowns(model, tree, ["slide.coulomb_friction"]), 0.02)
+    given = np.array([FRICTION]), np.array([[0.0, 0.02], [0.0, 1.0]]), np.full((2, 1), 0.02), np.zeros((2, 1, 1))
+    stopped, slides = law.run(*given)[:, 1]
+    np.testing.assert_allclose(stopped, [0.02**2 / 2 / (FRICTION / MASS), 0.0], atol=1e-12)
+    monkeypatch.setattr(dry, "MOST_PARTS", 1)
+    assert np.all(np.isnan(law.run(*given)[0, 1]))
+    np.testing.assert_array_equal(law.run(*given)[1, 1], slides)
 
 
 @pytest.mark.slow
