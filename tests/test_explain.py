@@ -23,6 +23,7 @@ from drake_diff.identification.dry import DryMotion
 from drake_diff.identification.explain import FALSE_NAME
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.frozen import FrozenMotion, exponential
+from drake_diff.identification.screen import Inputs
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
@@ -121,6 +122,20 @@ def test_a_centre_of_mass_moves_as_in_a_file(tmp_path):
     np.testing.assert_allclose(numbers.inertial, changed.numbers.inertial, atol=1e-12)
     other = set_numbers(models[0], tree, Unknowns(one), np.array([0.1, 0.0, -0.4]))
     assert np.max(np.abs(other.inertial - changed.numbers.inertial)) > 0.05  # [kg m^2]
+
+
+def test_a_mass_promises_what_it_does_with_its_inertia():
+    """As in a file. UR5's first link turns about its own axis, so that nothing but its inertia acts."""
+    model = example_robot("ur5_robot.urdf")
+    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    each = choose_unknowns(model, tree, ["shoulder_link.mass", "shoulder_link.inertia"]).each
+    both, alone = Unknowns(each, as_in_files=True), Unknowns(each[:1], as_in_files=True)
+    starts, us = 0.3 * np.random.default_rng(1).standard_normal((4, model.nx)), np.full((4, 1, model.nu), 5.0)
+    law, hs = ContinuousMotion(model, tree, chart, alone, 0.01), np.full((4, 1), 0.01)
+    before, xs, after = (law.run(np.exp(alone.z_start + s), starts, hs, us) for s in (-1e-3, 0, 1e-3))
+    _, by_z = Inputs(ContinuousMotion(model, tree, chart, both, 0.01), both, []).slopes(both.z_start, xs, hs, us)
+    true = (after - before)[:, -1] / 2e-3
+    np.testing.assert_allclose(by_z[:, 0, :, 0], true, atol=1e-5 * np.max(np.abs(true)))
 
 
 def test_steps_frozen_halfway_have_the_derivatives_of_the_motion():
@@ -258,6 +273,8 @@ def test_of_an_arm_that_another_engine_moved_a_right_model_is_silent_and_an_erro
     assert identify_causes.measure("panda", ("mass",), 105)["verdict"] == "named"  # torques jump between their limits
     two = identify_causes.measure("double_pendulum_simple", ("damping", "input_delay"), 230017)
     assert two["verdict"] == "named", two
+    arm = identify_causes.measure("kinova", ("input_delay", "strength"), 330004)
+    assert arm["verdict"] == "named", arm
     gives = identify_causes.measure("double_pendulum_simple", ("coulomb_friction",), 210037, soft=True)
     assert gives["verdict"] == "named", gives
     assert "gives way" in gives["said"]

@@ -34,12 +34,22 @@ from drake_diff.identification.columns import Mistaken, mistaken_in_the_air
 from drake_diff.identification.dry import DryMotion
 from drake_diff.identification.euler import EulerMotion
 from drake_diff.identification.fit import Fit, Law, Point, Solved
-from drake_diff.identification.flow import ContinuousMotion
+from drake_diff.identification.flow import ROUGH, ContinuousMotion
 from drake_diff.identification.frozen import FrozenMotion
 from drake_diff.identification.identify import LONGEST, Problem, what_acts
-from drake_diff.identification.judge import freedom_of, intervals_of, known_of, noise_of
+from drake_diff.identification.judge import freedom_of, intervals_of, known_of, most_scatter, noise_of
 from drake_diff.identification.measured import Piece, given_noise, noise_by_differences, read_pieces
-from drake_diff.identification.screen import DELAY, LEVELS, LIMIT, Inputs, Promise, View, changes_of_inputs, view
+from drake_diff.identification.screen import (
+    DELAY,
+    LEVELS,
+    LIMIT,
+    LONGEST_DELAY,
+    Inputs,
+    Promise,
+    View,
+    changes_of_inputs,
+    view,
+)
 from drake_diff.identification.tree import Tree, tree_for_identification
 from drake_diff.identification.unknowns import (
     BIAS,
@@ -69,11 +79,14 @@ SETTLING, SETTLES = 8, 0.8  # steps by which segments settle, and the part of wh
 CALM = 3e-3  # of a small motion over a segment: by how much derivatives frozen halfway may miss it
 SAME_NOISE = 0.03  # what is left of its error changes a score by less than 0.001 of how many numbers were measured
 HOPELESS = 3.0  # times the noise: residuals that no better weights make good
+PLAUSIBLE = 1.5  # times the squares that can be noise: what leaves more is not fitted to its end beside another
 SAME = 6.0  # of a score: evidence of 20 to 1, below which two changes are not told apart
 MOTIONS = ("auto", "continuous")
 CLOSE = 1.0  # of the squares: what a step may still gain where two changes are told apart
 TOLD_APART = 40.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
-LONGEST_DELAY = 0.1  # [s]
+DELAYS_SEEN, NEAR = 4, 0.02  # passes of derivatives beside a delay, and of it how near two of them are at the end
+BEHIND = 4.0  # times the least that is promised: of what is beyond, LOOKED_AT_BESIDE enter the race
+SHORTEST_DELAY = 1e-4  # [s] beside which another change is looked for
 DELAYS = (0.25, 0.75, 1.5, 3, 5.5, 8)  # of a sample, from which other changes are looked for beside a delay
 
 
@@ -180,7 +193,7 @@ class _Runner:
     starts: Array
     left: float  # of the squares, after the next step
     freedom: float
-    special: dict[str, float] = field(default_factory=dict)  # the delay or limit that its pieces have
+    special: dict[str, float] = field(default_factory=dict)  # the limit that its pieces have
     interval: dict[str, Array] = field(default_factory=dict)
 
     def step(self) -> bool:
@@ -212,6 +225,7 @@ class _Search:
     share: float = 0.0  # of the squares, that it takes away
     begun: float = field(default_factory=time.process_time)
     ended_early: bool = False
+    by_delay: dict[float, Array] = field(default_factory=dict)
     calm: bool = False  # whether steps frozen halfway have the derivatives of the motion
     step: float | None = None  # [s] of the Euler steps that stand for the motion; None for continuous time
 
@@ -237,7 +251,9 @@ class _Search:
         return Unknowns((*each, *changes_of_inputs(self.model.input_names, self.pieces)), as_in_files=True)
 
     def of(self, names: Sequence[str]) -> Unknowns:
-        return Unknowns(tuple(one for one in self.unknowns.each if one.name in names), as_in_files=True)
+        """Those called so; where inputs act later, the motion has its steps cut where they change."""
+        each = (one for one in self.unknowns.each if one.name in names)
+        return Unknowns(tuple(replace(one, shifts=one.quantity == DELAY) for one in each), as_in_files=True)
 
     def problem(self, unknowns: Unknowns, pieces: Sequence[Piece]) -> Problem:
         return Problem(self.model, self.chart, unknowns, list(pieces), self.stated, self.scatter)
@@ -271,7 +287,7 @@ class _Search:
         fit, starts = self.problem(nothing, self.pieces).prepared(self.law(nothing, LONGEST))
         longest = fit.law.longest if isinstance(fit.law, ContinuousMotion) else LONGEST
         self.longest, self.segments, self.cut = longest, fit.segments, list(fit.segments.pieces)
-        self.starts = self.settled(fit, starts)
+        self.starts = self.settled(fit, nothing.z_start, starts)
         self.calm = self.is_calm(fit)
 
     def found(self) -> Explanation:
@@ -285,7 +301,7 @@ class _Search:
             found = self.by_two(alone, runners, base)
         return found or (self.right() if base.explains else self.unexplained(base))
 
-    def settled(self, fit: Fit, starts: Array) -> Array:
+    def settled(self, fit: Fit, z: Array, starts: Array) -> Array:
         """Starts of the segments from which the motion is nearer to what each of them measured, by itself.
 
         A guess by cubics knows nothing of inputs, which may change a velocity within a few samples.
@@ -298,7 +314,7 @@ class _Search:
         ]
         parts = [s.pieces[p].part(int(a), b) for a, b, p in zip(s.first, [*ends, last[-1]], s.of_piece, strict=True)]
         own = Fit(self.model, fit.law, self.chart, fit.unknowns, parts, fit.noise, fixed=True)
-        z, left = fit.unknowns.z_start, np.inf
+        left = np.inf
         for _ in range(SETTLING):
             here = own.at(z, starts)
             if here is None or here.value > SETTLES * left:
@@ -313,15 +329,19 @@ class _Search:
                     starts, best = np.where(better[:, None], moved, starts), np.where(better, _each_left(there), best)
         return starts
 
-    def settled_at(self, fit: Fit) -> Array:
-        """Of pieces whose inputs act otherwise, the same starts where their segments start at the same times."""
-        times = [
-            [one.pieces[p].times[k] for p, k in zip(one.of_piece, one.first, strict=True)]
-            for one in (fit.segments, self.segments)
-        ]
-        return (
-            self.starts if times[0] == times[1] else self.settled(fit, self.problem(fit.unknowns, self.cut).guess(fit))
-        )
+    def starts_at(self, delay: float) -> Array:
+        """The starts of segments that settle where inputs act so much later."""
+        known = self.by_delay if self.step is None else {}
+        if delay not in known:
+            late = self.of([f"model.{DELAY}"])
+            law = self.law(late, self.longest)
+            if self.step is None:
+                law = FrozenMotion(self.model, self.tree, self.chart, late, self.longest, method=ROUGH)
+            problem = self.problem(late, self.cut)
+            near = min(known, key=lambda other: abs(other - delay), default=0.0)
+            starts = known[near] if abs(near - delay) < delay else self.starts
+            known[delay] = self.settled(problem.fit(law, self.cut, problem.first_noise), np.array([delay]), starts)
+        return known[delay]
 
     def is_calm(self, fit: Fit) -> bool:
         """Whether a small motion goes through segments alike by steps frozen halfway, and by the method's own."""
@@ -416,7 +436,7 @@ class _Search:
         """Each change of some pairs alone, from where the pair was: the other one may do nothing."""
         found: dict[str, _Tried] = {}
         for pair in pairs:
-            unknowns = self.of([name for name in pair.names if not self.is_of_inputs(name)])
+            unknowns = self.of([name for name in pair.names if not name.endswith(f".{LIMIT}")])
             for one, s in self.each_of(unknowns) if len(unknowns.each) == 2 else []:
                 if one.name not in found:
                     alone = self.of([one.name])
@@ -434,7 +454,8 @@ class _Search:
 
     def may_be_steps(self, runners: Sequence[_Runner]) -> bool:
         """Whether Euler steps leave clearly less than continuous time, of the model or of a change that left least."""
-        whole = [one for one in runners if not one.special and np.isfinite(one.left)][:BESIDE]
+        whole = [one for one in runners if not one.special and one.fit.unknowns.delay is None]
+        whole = [one for one in whole if np.isfinite(one.left)][:BESIDE]
         nothing = self.of(())
         each: list[tuple[tuple[str, ...], Unknowns, Array, Array]] = [((), nothing, nothing.z_start, self.starts)]
         each += [(one.names, one.fit.unknowns, one.z, one.starts) for one in whole]
@@ -504,7 +525,7 @@ class _Search:
         for runner in runners[:BESIDE]:
             if any(one.explains for one in found) or self.is_late:
                 break
-            if f"model.{DELAY}" in runner.special:
+            if runner.fit.unknowns.delay is not None:
                 continue
             if runner.special:
                 found += self.beside_inputs(runner, base)
@@ -521,30 +542,50 @@ class _Search:
 
     def beside_a_delay(self, base: _Tried) -> list[_Tried]:
         """A change beside a delay: what each promises together with some more delay, from several delays."""
-        special, each = f"model.{DELAY}", [one.name for one in self.unknowns.each]
-        if special not in each:
+        each = self.unknowns.each
+        last = next((i for i, one in enumerate(each) if one.quantity == DELAY), None)
+        if last is None:
             return []
-        last, price, nothing = each.index(special), float(np.log(self.count)), self.of(())
-        others = [i for i, name in enumerate(each) if not self.is_of_inputs(self.plain(name))]
-        best: dict[str, tuple[float, float, Promise]] = {}
+        price = float(np.log(self.count))
+        others = [(i, last) for i, one in enumerate(each) if not self.is_of_inputs(self.plain(one.name))]
+        best: dict[int, tuple[float, View, Promise]] = {}
+        name, least = each[last].name, np.inf
+        delay = float(self.delayed((name,), self.of([name]), np.zeros(1), Promise((), np.inf, 0.0, np.zeros(0))).z[0])
+        for _ in range(DELAYS_SEEN):
+            if best and self.is_late:
+                break
+            z = self.unknowns.z_start.copy()
+            delay = max(delay, SHORTEST_DELAY)
+            z[self.unknowns.slices[last]] = delay
+            seen = self.view(self.cut, z, self.starts_at(delay))
+            promises = [] if seen is None else seen.promises(others, price)
+            for promise in promises:
+                i, cost = promise.members[0], promise.left + price * promise.freedom
+                if seen is not None and (i not in best or cost < best[i][0]):
+                    best[i] = cost, seen, promise
+            if not promises or promises[0].left > least:
+                break
+            least, before = promises[0].left, delay
+            delay = min(delay + float(promises[0].step[-1]), LONGEST_DELAY)
+            if abs(delay - before) < NEAR * delay:
+                break
+        order = sorted(best, key=lambda i: best[i][0])
+        groups = [[i for i in order if (len(each[i].start) == 1) == small][:LOOKED_AT] for small in (True, False)]
+        chosen = [
+            i
+            for group in groups
+            for k, i in enumerate(group)
+            if k < LOOKED_AT_BESIDE or best[i][0] < BEHIND * best[group[0]][0]
+        ]
+        names = {i: (each[i].name, each[last].name) for i in chosen}
+        return self.raced([self.runner(*best[i][1:], names[i]) for i in chosen], base)[0]
+
+    @property
+    def delays(self) -> Array:
+        """[s] from which a delay is looked for."""
         period = float(np.median(np.diff(self.pieces[0].times)))
-        for delay in period * np.array(DELAYS):
-            if delay > LONGEST_DELAY or (best and self.is_late):
-                break
-            pieces = [self.acted(piece, special, float(delay)) for piece in self.cut]
-            one = self.running((), nothing, pieces, None, nothing.z_start, Promise((), np.inf, 0.0, np.zeros(0)))
-            seen = self.view(pieces, self.unknowns.z_start, one.starts)
-            for promise in [] if seen is None else seen.promises([(i, last) for i in others], price)[:LOOKED_AT]:
-                name, cost = each[promise.members[0]], promise.left + price * promise.freedom
-                if name not in best or cost < best[name][0]:
-                    best[name] = cost, min(float(delay + promise.step[-1]), LONGEST_DELAY), promise
-        runners: list[_Runner] = []
-        for name in sorted(best, key=lambda name: best[name][0])[:LOOKED_AT_BESIDE]:
-            if runners and self.is_late:
-                break
-            _, near, promise = best[name]
-            runners.append(self.searched(special, (name, special), self.of([name]), promise, near))
-        return self.raced(runners, base)[0]
+        delays = period * np.array(DELAYS)
+        return delays[delays < LONGEST_DELAY]
 
     def beside_inputs(self, runner: _Runner, base: _Tried) -> list[_Tried]:
         """A change beside a limit that is about what it is alone."""
@@ -564,9 +605,13 @@ class _Search:
         return self.raced(runners, base)[0]
 
     def view(self, pieces: Sequence[Piece], z: Array, starts: Array) -> View | None:
-        problem = self.problem(self.unknowns, pieces)
-        law: Law = Inputs(self.law(self.unknowns, self.longest), self.unknowns, pieces)
-        return view(problem.fit(law, pieces, problem.first_noise), self.unknowns, z, starts)
+        """What everything promises there; where z has a delay, inputs act so much later."""
+        unknowns = self.unknowns
+        if any(one.quantity == DELAY and z[s][0] > 0 for one, s in self.each_of(unknowns)):
+            unknowns = self.of([one.name for one in unknowns.each])
+        problem = self.problem(unknowns, pieces)
+        law: Law = Inputs(self.law(self.unknowns, self.longest), unknowns, pieces)
+        return view(problem.fit(law, pieces, problem.first_noise), unknowns, z, starts)
 
     def tried(
         self, seen: View, changes: Iterable[tuple[int, ...]], base: _Tried, most: int = LOOKED_AT
@@ -600,26 +645,44 @@ class _Search:
         return [*found, *more], sorted([*every, *rest], key=lambda one: one.left)
 
     def runner(self, seen: View, promise: Promise, names: tuple[str, ...]) -> _Runner:
-        special = next((name for name in names if self.is_of_inputs(name)), None)
+        special = next((name for name in names if name.endswith(f".{LIMIT}")), None)
         unknowns = self.of([name for name in names if name != special])
+        if special is not None:
+            return self.searched(special, names, unknowns, promise)
         z, starts = seen.ahead(promise)
-        at = [i for one, s in self.each_of(self.unknowns) if one in unknowns.each for i in range(s.start, s.stop)]
-        if special is None:
-            return self.running(names, unknowns, self.cut, starts, np.clip(z[at], *unknowns.bounds), promise)
-        return self.searched(special, names, unknowns, promise)
+        own = [one.name for one in unknowns.each]
+        at = [i for one, s in self.each_of(seen.unknowns) if one.name in own for i in range(s.start, s.stop)]
+        z = np.clip(z[at], *unknowns.bounds)
+        if unknowns.delay is None or seen.unknowns.delay is not None:
+            return self.running(names, unknowns, self.cut, starts, z, promise)
+        return self.delayed(names, unknowns, z, promise)
+
+    def delayed(self, names: tuple[str, ...], unknowns: Unknowns, z: Array, promise: Promise) -> _Runner:
+        """From the delay from which a step leaves least; a step sees only as far as inputs stay the same."""
+        best = self.running(names, unknowns, self.cut, self.starts, z, promise)
+        best.left, worse = np.inf, 0
+        for delay in self.delays:
+            if worse > 1:
+                break
+            at = z.copy()
+            at[unknowns.delay] = delay
+            one = self.running(names, unknowns, self.cut, self.starts_at(float(delay)), at, promise)
+            worse += 1
+            if one.step() and one.left < best.left:
+                best, worse = one, 0
+        return best
 
     def running(
         self,
         names: tuple[str, ...],
         unknowns: Unknowns,
         pieces: list[Piece],
-        starts: Array | None,
+        starts: Array,
         z: Array,
         promise: Promise,
     ) -> _Runner:
         problem = self.problem(unknowns, pieces)
         fit = problem.fit(self.law(unknowns, self.longest), pieces, problem.first_noise)
-        starts = self.settled_at(fit) if starts is None else starts
         return _Runner(names, fit, z, starts, promise.left, promise.freedom)
 
     def firm(self, one: _Runner) -> Fit:
@@ -633,7 +696,7 @@ class _Search:
         alive, there = list(runners), []
         for most in RACE:
             if most < RACE[0] and self.is_late:
-                break
+                most = 1
             before = {one.names: one.left for one in alive}
             alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
             there += [one for one in alive if not self.is_hopeless(one.left)]
@@ -653,7 +716,7 @@ class _Search:
         for one in alive:
             first = alive[0].left + price * alive[0].freedom
             enough = any(each.explains for each in found) and self.is_behind(one.left + price * one.freedom, first)
-            enough = enough or (bool(found) and self.is_late)
+            enough = enough or (bool(found) and (self.is_late or one.left > self.plausible))
             if enough or self.is_hopeless(one.left) or one.fit.at(one.z, one.starts) is None:
                 continue
             try:
@@ -678,6 +741,13 @@ class _Search:
     def is_behind(self, left: float, best: float) -> bool:
         """Whether a change that leaves so much is told from the one that leaves least."""
         return left - best > TOLD_APART * max(1.0, best / self.count)
+
+    @cached_property
+    def plausible(self) -> float:
+        """What a change may leave of the squares that explains, however they are weighted."""
+        numbers = sum(np.isfinite(p.ys).sum(axis=0) for p in self.pieces)
+        seen = numbers[numbers > 0]
+        return PLAUSIBLE * most_scatter(int(np.min(seen)), len(seen)) ** 2 * self.count
 
     def is_hopeless(self, left: float) -> bool:
         return left > HOPELESS**2 * self.count
@@ -767,27 +837,21 @@ class _Search:
     def searched(
         self, special: str, names: tuple[str, ...], unknowns: Unknowns, promise: Promise, near: float | None = None
     ) -> _Runner:
-        """At the delay or limit by which the rest fits best, with its interval by how what is left bends there."""
+        """At the limit by which the rest fits best, with its interval by how what is left bends there."""
         found: dict[float, _Runner] = {}
 
         def left(value: float) -> float:
             if value not in found:
                 pieces = [self.acted(piece, special, value) for piece in self.cut]
-                one = self.running(names, unknowns, pieces, None, unknowns.z_start, promise)
+                one = self.running(names, unknowns, pieces, self.starts, unknowns.z_start, promise)
                 if not all(one.step() for _ in range(2)):
                     one.left = np.inf
                 found[value] = one
             return found[value].left
 
-        period = float(np.median(np.diff(self.pieces[0].times)))
-        if special.endswith(DELAY):
-            grid = np.array([0.5, 1, 2, 4, 7]) * period
-            grid = grid[grid <= LONGEST_DELAY]
-            low, high = 0.0, LONGEST_DELAY
-        else:
-            i = self.model.input_names.index(special.rsplit(".", 1)[0])
-            largest = max(float(np.max(np.abs(p.us[:, i]))) for p in self.pieces)
-            grid, (low, high) = np.array(LEVELS) * largest, (0.0, largest)
+        i = self.model.input_names.index(special.rsplit(".", 1)[0])
+        largest = max(float(np.max(np.abs(p.us[:, i]))) for p in self.pieces)
+        grid, low, high = np.array(LEVELS) * largest, 0.0, largest
         if near is not None:
             grid = near * np.array([0.8, 1.0, 1.25])
             low, high = max(low, 0.5 * near), min(high, 2 * near)
@@ -806,19 +870,11 @@ class _Search:
         return one
 
     def acted(self, piece: Piece, special: str, value: float) -> Piece:
-        """The piece with its inputs later, or cut; an input that changes between samples makes a sample of nothing."""
-        if not special.endswith(DELAY):
-            i = self.model.input_names.index(special.rsplit(".", 1)[0])
-            us = piece.us.copy()
-            us[:, i] = np.clip(us[:, i], -value, value)
-            return replace(piece, us=us)
-        switches = piece.times[:-1] + value
-        near = np.min(np.abs(switches[:, None] - piece.times), axis=1) < 1e-6
-        times = np.union1d(piece.times, switches[(switches < piece.times[-1]) & ~near])
-        ys = np.full((len(times), piece.ys.shape[1]), np.nan)
-        ys[np.searchsorted(times, piece.times)] = piece.ys
-        held = np.clip(np.searchsorted(piece.times[:-1], times[:-1] - value + 1e-6, side="right") - 1, 0, None)
-        return Piece(piece.name, times, ys, piece.us[held], piece.held_out)
+        """The piece with an input that is cut."""
+        i = self.model.input_names.index(special.rsplit(".", 1)[0])
+        us = piece.us.copy()
+        us[:, i] = np.clip(us[:, i], -value, value)
+        return replace(piece, us=us)
 
     def bic(self, one: _Tried) -> float:
         return one.score + one.pull + one.freedom * float(np.log(self.count))
@@ -854,9 +910,7 @@ class _Search:
     def words(self, one: _Tried, name: str) -> str:
         label, quantity = name.rsplit(".", 1)
         value, interval = np.atleast_1d(one.values[name]), np.atleast_2d(one.intervals[name])
-        if quantity == DELAY:
-            start, unit = np.zeros(1), "s"
-        elif quantity == LIMIT:
+        if quantity == LIMIT:
             start, unit = self.tree.limits[[self.model.input_names.index(label)]], ""
         else:
             own = next(each for each in self.unknowns.each if each.name == name)

@@ -16,9 +16,10 @@ from drake_diff._base.arrays import Array
 from drake_diff.identification.fit import Fit, Reduced
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.measured import Piece
-from drake_diff.identification.unknowns import Unknown, Unknowns
+from drake_diff.identification.unknowns import INERTIA, MASS, Unknown, Unknowns
 
-DELAY, LIMIT = "input_delay", "limit"  # changes of how inputs act, found by a search over their one number
+DELAY, LIMIT = "input_delay", "limit"  # changes of how inputs act; a limit is found by a search over its one number
+LONGEST_DELAY = 0.1  # [s]
 LEVELS = (0.85, 0.6, 0.35)  # of an input's largest value: limits that are tried
 
 
@@ -28,7 +29,7 @@ def changes_of_inputs(names: Sequence[str], pieces: Sequence[Piece]) -> list[Unk
     each = [
         Unknown(f"{names[i]}.{LIMIT}{round(100 * part)}", "", np.zeros(1), 0.0, 0.0) for i in moving for part in LEVELS
     ]
-    return [*each, Unknown(f"model.{DELAY}", "s", np.zeros(1), 0.0, 0.0)] if moving else each
+    return [*each, Unknown(f"model.{DELAY}", "s", np.zeros(1), 0.0, 0.0, LONGEST_DELAY)] if moving else each
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +45,13 @@ class Inputs:
         by_x, by_z = self.law.slopes(z, xs, hs, us)
         columns = self.unknowns.columns
         names, nq = self.law.model.input_names, self.law.model.nq
+        places = {one.name: s for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)}
         for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
-            if one.quantity == DELAY:
+            if one.quantity == MASS and f"{one.label}.{INERTIA}" in places:
+                # Alone it takes the inertia along, of which half the logarithm of the second moment's root is z.
+                inertia = places[f"{one.label}.{INERTIA}"]
+                by_z[..., s.start] += by_z[..., inertia] @ (0.5 * np.concatenate([np.ones(3), z[inertia][3:]]))
+            elif one.quantity == DELAY and not one.shifts:
                 accelerate = self.law.tree.acceleration(self.law.tree.numbers)
                 before = np.concatenate([us[:, :1], us[:, :-1]], axis=1)
                 before[1:, 0] = us[:-1, -1]
