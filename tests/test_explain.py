@@ -20,11 +20,11 @@ from drake_diff.cli.main import app
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.dry import DryMotion
-from drake_diff.identification.explain import FALSE_NAME
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.frozen import FrozenMotion, exponential
 from drake_diff.identification.screen import Inputs
 from drake_diff.identification.tree import tree_for_identification
+from drake_diff.identification.trial import FALSE_NAME
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.record.comparison import ComparisonRecord

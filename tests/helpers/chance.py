@@ -4,9 +4,10 @@ import numpy as np
 
 from drake_diff.comparison.recordings import Recording
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.explain import _Search
 from drake_diff.identification.measured import given_noise, read_pieces
+from drake_diff.identification.setting import Setting
 from drake_diff.identification.tree import tree_for_identification
+from drake_diff.identification.trial import Trial
 from drake_diff.mechanics.description import coordinates_of
 
 
@@ -17,15 +18,15 @@ def chance_of_a_name(model, recording: Recording, draws: int, seed: int = 0) -> 
     and a change alone lowers them by what b has in its own columns.
     """
     chart = Chart(coordinates_of(model))
-    search = _Search(
+    setting = Setting(
         model,
         tree_for_identification(model),
         chart,
         read_pieces(model, recording, 0.0),
         given_noise(model, chart, None),
     )
-    search.prepare()
-    view = search.view(search.cut, search.unknowns.z_start, search.starts)
+    setting.prepare()
+    view = setting.view(setting.cut, setting.unknowns.z_start, setting.starts)
     pulled = np.random.default_rng(seed).standard_normal((draws, len(view.reduced.b))) @ view.reduced.R
     named, by_bic = np.zeros((2, draws), dtype=bool)
     for s, freedom in zip(view.unknowns.slices, view.freedoms, strict=True):
@@ -34,6 +35,6 @@ def chance_of_a_name(model, recording: Recording, draws: int, seed: int = 0) -> 
         sizes, directions = np.linalg.eigh(H * np.outer(scale, scale))
         kept = sizes > 1e-12 * np.max(sizes)
         falls = np.sum(((pulled[:, s] * scale) @ directions[:, kept]) ** 2 / sizes[kept], axis=1)
-        named |= falls > search.least(max(freedom, 1.0), len(view.freedoms))
-        by_bic |= falls > max(freedom, 1.0) * np.log(search.count)
+        named |= falls > Trial(setting).least(max(freedom, 1.0), len(view.freedoms))
+        by_bic |= falls > max(freedom, 1.0) * np.log(setting.count)
     return float(np.mean(named)), float(np.mean(by_bic))

@@ -1,0 +1,253 @@
+"""The race of changes: those that promise most go on by steps of Gauss and Newton for as long as these help."""
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.exceptions import SimulationError
+from drake_diff.identification.fit import Fit
+from drake_diff.identification.measured import Piece
+from drake_diff.identification.screen import LEVELS, LIMIT, Promise, View
+from drake_diff.identification.setting import Setting
+from drake_diff.identification.trial import STEPS, Trial, Tried
+from drake_diff.identification.unknowns import COULOMB, Unknowns
+
+LOOKED_AT = 8  # changes that enter the race, of those that promise most: of those of one number, and of others
+RACE = (5, 4, 3, 2, 2, 1)  # so many stay after each step of Gauss and Newton
+FALLS = 0.7  # what does not fall to this part of what was left before is out of the race, after its first step
+LONGEST_SEARCH = 45.0  # [s] of processor time, after which no further change is tried
+CLOSE = 1.0  # of the squares: what a step may still gain where two changes are told apart
+TOLD_APART = 40.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
+
+
+@dataclass(eq=False)
+class Runner:
+    """A change on its way to where it fits best, by whole steps of Gauss and Newton."""
+
+    names: tuple[str, ...]
+    fit: Fit
+    z: Array
+    starts: Array
+    left: float  # of the squares, after the next step
+    freedom: float
+    special: dict[str, float] = field(default_factory=dict)  # the limit that its pieces have
+    interval: dict[str, Array] = field(default_factory=dict)
+
+    def step(self) -> bool:
+        """Whether there is a motion to step from."""
+        point = self.fit.at(self.z, self.starts)
+        if point is None:
+            return False
+        found = self.fit.reduce(point)
+        if not np.all(np.isfinite(found.R)) or not np.all(np.isfinite(found.b)):
+            return False
+        dz = self.fit.step_of(self.z, found)
+        self.starts = self.fit.moved(self.starts, found, dz, 1.0)
+        self.z = self.z + dz
+        pull = float(np.sum(((self.z - self.fit.unknowns.z_start) / self.fit.unknowns.widths) ** 2))
+        self.left = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + pull
+        return True
+
+
+@dataclass(eq=False)
+class Race:
+    """Of changes of a model; it ends after LONGEST_SEARCH."""
+
+    setting: Setting
+    trial: Trial
+    evidence: dict[str, float] = field(default_factory=dict)
+    begun: float = field(default_factory=time.process_time)
+    ended_early: bool = False
+
+    @property
+    def is_late(self) -> bool:
+        """Whether no further change is tried."""
+        self.ended_early = self.ended_early or time.process_time() - self.begun > LONGEST_SEARCH
+        return self.ended_early
+
+    def tried(
+        self, seen: View, changes: Iterable[tuple[int, ...]], base: Tried, most: int = LOOKED_AT
+    ) -> tuple[list[Tried], list[Runner]]:
+        """(those that are fitted, all that stayed in the race, best first) of those that promise most."""
+        each = self.setting.unknowns.each
+        chosen: dict[tuple[str, ...], Promise] = {}
+        places = {True: most, False: most}  # what has more numbers bends to more, and promises more than it keeps
+        for promise in seen.promises(changes, float(np.log(self.setting.count))):
+            small = all(len(each[i].start) == 1 for i in promise.members)
+            own = tuple(self.setting.plain(each[i].name) for i in promise.members)
+            if (
+                places[small]
+                and own not in chosen
+                and len(set(own)) == len(own)
+                and sum(map(self.setting.is_of_inputs, own)) <= 1
+            ):
+                chosen[own] = promise
+                places[small] -= 1
+        plain = {own: promise for own, promise in chosen.items() if not any(map(self.setting.is_of_inputs, own))}
+        found, every = self.raced([self.runner(seen, promise, own) for own, promise in plain.items()], base)
+        if any(one.explains for one in found):  # a search for a delay or a limit takes longer than the others together
+            first = min(promise.left for promise in chosen.values())
+            chosen = {own: promise for own, promise in chosen.items() if not self.is_behind(promise.left, first)}
+        others: list[Runner] = []
+        for own, promise in chosen.items():
+            if own in plain or (others and self.is_late):
+                continue
+            others.append(self.runner(seen, promise, own))
+        more, rest = self.raced(others, base)
+        return [*found, *more], sorted([*every, *rest], key=lambda one: one.left)
+
+    def runner(self, seen: View, promise: Promise, names: tuple[str, ...]) -> Runner:
+        special = next((name for name in names if name.endswith(f".{LIMIT}")), None)
+        unknowns = self.setting.of([name for name in names if name != special])
+        if special is not None:
+            return self.searched(special, names, unknowns, promise)
+        z, starts = seen.ahead(promise)
+        own = [one.name for one in unknowns.each]
+        at = [i for one, s in self.setting.each_of(seen.unknowns) if one.name in own for i in range(s.start, s.stop)]
+        z = np.clip(z[at], *unknowns.bounds)
+        if unknowns.delay is None or seen.unknowns.delay is not None:
+            return self.running(names, unknowns, self.setting.cut, starts, z, promise)
+        return self.delayed(names, unknowns, z, promise)
+
+    def delayed(self, names: tuple[str, ...], unknowns: Unknowns, z: Array, promise: Promise) -> Runner:
+        """From the delay from which a step leaves least; a step sees only as far as inputs stay the same."""
+        best = self.running(names, unknowns, self.setting.cut, self.setting.starts, z, promise)
+        best.left, worse = np.inf, 0
+        for delay in self.setting.delays:
+            if worse > 1:
+                break
+            at = z.copy()
+            at[unknowns.delay] = delay
+            one = self.running(names, unknowns, self.setting.cut, self.setting.starts_at(float(delay)), at, promise)
+            worse += 1
+            if one.step() and one.left < best.left:
+                best, worse = one, 0
+        return best
+
+    def running(
+        self,
+        names: tuple[str, ...],
+        unknowns: Unknowns,
+        pieces: list[Piece],
+        starts: Array,
+        z: Array,
+        promise: Promise,
+    ) -> Runner:
+        problem = self.setting.problem(unknowns, pieces)
+        fit = problem.fit(self.setting.law(unknowns, self.setting.longest), pieces, problem.first_noise)
+        return Runner(names, fit, z, starts, promise.left, promise.freedom)
+
+    def firm(self, one: Runner) -> Fit:
+        """With dry friction that holds, of the size that it has by now."""
+        unknowns, pieces = one.fit.unknowns, one.fit.segments.pieces
+        if all(each.quantity != COULOMB for each in unknowns.each):
+            return one.fit
+        return self.setting.problem(unknowns, pieces).fit(self.setting.law_of(unknowns), pieces, one.fit.noise)
+
+    def raced(self, runners: list[Runner], base: Tried) -> tuple[list[Tried], list[Runner]]:
+        alive, there = list(runners), []
+        for most in RACE:
+            if most < RACE[0] and self.is_late:
+                most = 1
+            before = {one.names: one.left for one in alive}
+            alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
+            there += [one for one in alive if not self.setting.is_hopeless(one.left)]
+            for one in alive:
+                one.fit = self.firm(one)
+            alive = [
+                one
+                for one in alive[:most]
+                if self.setting.is_hopeless(one.left) and (most == RACE[0] or one.left < FALLS * before[one.names])
+            ]
+        self.improve(there)
+        every = sorted(runners, key=lambda one: one.left)
+        alive = there + alive
+        price = float(np.log(self.setting.count))
+        alive.sort(key=lambda one: one.left + price * one.freedom)
+        found: list[Tried] = []
+        for one in alive:
+            first = alive[0].left + price * alive[0].freedom
+            enough = any(each.explains for each in found) and self.is_behind(one.left + price * one.freedom, first)
+            enough = enough or (bool(found) and (self.is_late or one.left > self.setting.plausible))
+            if enough or self.setting.is_hopeless(one.left) or one.fit.at(one.z, one.starts) is None:
+                continue
+            try:
+                found.append(self.ended(one))
+            except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
+                continue
+            self.evidence[" and ".join(one.names)] = base.score - found[-1].score
+        return found, every
+
+    def improve(self, there: Sequence[Runner]) -> None:
+        """Steps of those that came near the noise, for as long as these help."""
+        best = np.inf
+        for one in sorted(there, key=lambda one: one.left):
+            for _ in range(STEPS):
+                last = one.left
+                if self.is_late or not one.step() or last - one.left < CLOSE:
+                    break
+                if one.left > FALLS * last and self.is_behind(one.left, best):
+                    break
+            best = min(best, one.left)
+
+    def is_behind(self, left: float, best: float) -> bool:
+        """Whether a change that leaves so much is told from the one that leaves least."""
+        return left - best > TOLD_APART * max(1.0, best / self.setting.count)
+
+    def ended(self, one: Runner) -> Tried:
+        """The change where it fits best, with the noise estimated anew."""
+        pieces = one.fit.segments.pieces
+        found = self.trial.solved(one.names, one.fit.unknowns, one.fit.law, pieces, one.starts, one.z)
+        if not one.special:
+            return found
+        return found._replace(
+            freedom=found.freedom + 1.0,
+            values={**found.values, **one.special},
+            intervals={**found.intervals, **one.interval},
+        )
+
+    def searched(
+        self, special: str, names: tuple[str, ...], unknowns: Unknowns, promise: Promise, near: float | None = None
+    ) -> Runner:
+        """At the limit by which the rest fits best, with its interval by how what is left bends there."""
+        found: dict[float, Runner] = {}
+
+        def left(value: float) -> float:
+            if value not in found:
+                pieces = [self.acted(piece, special, value) for piece in self.setting.cut]
+                one = self.running(names, unknowns, pieces, self.setting.starts, unknowns.z_start, promise)
+                if not all(one.step() for _ in range(2)):
+                    one.left = np.inf
+                found[value] = one
+            return found[value].left
+
+        i = self.setting.model.input_names.index(special.rsplit(".", 1)[0])
+        largest = max(float(np.max(np.abs(p.us[:, i]))) for p in self.setting.pieces)
+        grid, low, high = np.array(LEVELS) * largest, 0.0, largest
+        if near is not None:
+            grid = near * np.array([0.8, 1.0, 1.25])
+            low, high = max(low, 0.5 * near), min(high, 2 * near)
+        best = min((float(v) for v in grid), key=left)
+        nearby = sorted([low, *map(float, grid), high])
+        k = nearby.index(best)
+        least = minimize_scalar(left, bounds=(nearby[k - 1], nearby[k + 1]), method="bounded",
+                                options={"xatol": 0.01 * best, "maxiter": 8})  # fmt: skip
+        value = float(least.x)
+        width = max(0.02 * value, 1e-12)
+        bend = (left(value + width) + left(value - width) - 2 * left(value)) / width**2
+        noise = left(value) / self.setting.count
+        half = 1.96 * float(np.sqrt(2 * noise / bend)) if bend > 0 else np.inf
+        one = found[value]
+        one.special, one.interval = {special: value}, {special: frozen([max(value - half, 0.0), value + half])}
+        return one
+
+    def acted(self, piece: Piece, special: str, value: float) -> Piece:
+        """The piece with an input that is cut."""
+        i = self.setting.model.input_names.index(special.rsplit(".", 1)[0])
+        us = piece.us.copy()
+        us[:, i] = np.clip(us[:, i], -value, value)
+        return replace(piece, us=us)
