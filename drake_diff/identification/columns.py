@@ -21,7 +21,7 @@ from drake_diff.identification.fit import Fit, Law, Solved
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.identify import LONGEST, Problem
 from drake_diff.identification.measured import Piece, guess_states, noise_by_differences
-from drake_diff.identification.tree import Tree
+from drake_diff.identification.tree import Mask, Tree
 from drake_diff.identification.unknowns import Unknowns
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
@@ -81,7 +81,7 @@ class _Columns:
 
     names: tuple[str, ...]  # of states, then of inputs
     inputs: range
-    seen: Array
+    seen: Mask
     along: list[tuple[int, int]]  # position and velocity of what moves along lines
     turning: list[tuple[int, int]]  # of what turns
     rates: list[int]  # velocities of what turns, those of free bodies too
@@ -131,7 +131,7 @@ def _parts(*each: tuple[int, ...]) -> list[tuple[int, ...]]:
     return [columns for columns in dict.fromkeys(each) if columns]
 
 
-def _columns(model: Model, chart: Chart, seen: Array) -> _Columns:
+def _columns(model: Model, chart: Chart, seen: Mask) -> _Columns:
     """Those of quaternions are in no group."""
     nq, nx = model.nq, model.nx
     sliding = {model.places(one)[0].start for one in joints(model.plant) if one.type_name() == "prismatic"}

@@ -203,7 +203,7 @@ class Setting:
     @cached_property
     def plausible(self) -> float:
         """What a change may leave of the squares that explains, however they are weighted."""
-        numbers = sum(np.isfinite(p.ys).sum(axis=0) for p in self.pieces)
+        numbers = np.isfinite(np.concatenate([piece.ys for piece in self.pieces])).sum(axis=0)
         seen = numbers[numbers > 0]
         return PLAUSIBLE * most_scatter(int(np.min(seen)), len(seen)) ** 2 * self.count
 
