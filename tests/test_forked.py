@@ -98,13 +98,17 @@ def test_what_hears_nothing_is_ended(forks):
 
 
 def test_no_process_is_forked_beside_others_threads(monkeypatch):
-    assert can_fork()
-    until = threading.Event()
+    """Other tests of this process may have left threads, and may have loaded what breaks: those are not looked at."""
+    until, main = threading.Event(), threading.main_thread()
     other = threading.Thread(target=until.wait)
+    monkeypatch.setattr(base, "BREAK", ())
+    monkeypatch.setattr(threading, "enumerate", lambda: [main, *([other] if other.is_alive() else [])])
+    assert can_fork()
     other.start()
     assert not can_fork()
     until.set()
     other.join()
+    assert can_fork()
     monkeypatch.setattr(base, "BREAK", ("numpy",))
     assert not can_fork()
 
@@ -119,6 +123,7 @@ def program(cost):
 def test_a_solver_that_hears_nothing_leaves_its_best_point(forks, monkeypatch, solver, limit):
     """The third evaluation never ends: the limit ends it, or a signal that comes while it runs."""
     monkeypatch.setattr(drake_program, "LARGE", 0)
+    monkeypatch.setattr(drake_program, "can_fork", lambda: True)  # whatever other tests left in this process
     monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     own, calls, rows = os.getpid(), [], []
 
@@ -147,6 +152,8 @@ def test_a_search_in_a_process_of_its_own_finds_the_same(monkeypatch, solver):
         model, x0=[0, 0], x_goal=[0.5, 0], num_steps=10, running_cost=dd.QuadraticCost(R=[[1.0]], Q=np.eye(2))
     )
     found, counts = [], []
+    monkeypatch.setattr(drake_program, "can_fork", lambda: True)
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", math.inf)  # progress evaluates some points again
     for large in (math.inf, 0):
         monkeypatch.setattr(drake_program, "LARGE", large)
         with count_steps() as count:
@@ -157,4 +164,4 @@ def test_a_search_in_a_process_of_its_own_finds_the_same(monkeypatch, solver):
     assert np.array_equal(here.xs, apart.xs)
     assert len(here.iterations) == len(apart.iterations) > 0
     assert apart.message == here.message
-    assert abs(counts[0] - counts[1]) <= 0.1 * counts[0]  # progress, by the clock, evaluates some points again
+    assert 0 <= counts[1] - counts[0] <= 10  # of which the last motion was not kept here: 10 steps again

@@ -11,7 +11,7 @@ import drake_diff as dd
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 COUNT, H = 100, 0.02
-TRIALS = {"pendulum.urdf": 100, "cart_pole.urdf": 40}  # of which one may fail
+TRIALS = {"pendulum.urdf": 100, "cart_pole.urdf": 40}  # of a hundred, one may fail
 
 
 def pendulum(x, u):
@@ -69,4 +69,4 @@ def test_swing_ups_from_random_states(name):
             b = problem.bounds
             assert np.all((solution.us >= b.u_lower - 1e-5) & (solution.us <= b.u_upper + 1e-5))
             assert np.all((solution.xs[1:] >= b.x_lower - 1e-5) & (solution.xs[1:] <= b.x_upper + 1e-5))
-    assert sum(verified) >= TRIALS[name] - 1, f"not verified: {np.flatnonzero(~np.array(verified))}"
+    assert sum(verified) >= TRIALS[name] - TRIALS[name] // 100, f"not verified: {np.flatnonzero(~np.array(verified))}"
