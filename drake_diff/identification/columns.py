@@ -17,7 +17,7 @@ from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.exceptions import DrakeDiffError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.euler import EulerMotion
-from drake_diff.identification.fit import Fit, Law, Solved
+from drake_diff.identification.fit import Fit, Law, Solved, cut_segments
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.identify import LONGEST, Problem
 from drake_diff.identification.measured import Piece, guess_states, noise_by_differences
@@ -27,6 +27,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 
 SEGMENTS = 12  # of the recording, by which mistakes are compared
+AT_ONCE = 64  # mistakes whose segments move side by side
 FITTED = 3  # mistakes that are fitted whole, of those that come nearest
 NEARER = 0.5  # of what the columns as they are leave: a mistake that leaves more is not fitted
 FAR = (
@@ -159,8 +160,10 @@ def mistaken_columns(
 
     `law` moves short segments. Each of `fits` says how well the model, as it is, goes through whole recordings.
     """
-    left = _left(model, law, chart, pieces)
-    nearer = _nearer(model, law, chart, pieces, mistakes(model, chart, pieces), left)
+    every = mistakes(model, chart, pieces)
+    none = Mistake("", np.arange(model.nx + model.nu), np.ones(model.nx + model.nu))
+    left, *others = _left(model, law, chart, pieces, [none, *every])
+    nearer = [(every[i], others[i]) for i in np.argsort(others, kind="stable")[:FITTED] if others[i] < NEARER * left]
     measured = np.isfinite(np.concatenate([piece.ys for piece in pieces])).sum(axis=0)
     for fitted in fits:
         found: dict[str, float] = {}
@@ -195,31 +198,32 @@ def mistaken_in_the_air(
     return mistaken_columns(model, chart, pieces, law, [partial(_fitted, model, one, chart, stated) for one in laws])
 
 
-def _nearer(
-    model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], every: Sequence[Mistake], before: float
-) -> list[tuple[Mistake, float]]:
-    """The mistakes that leave clearly less than what the columns as they are leave, and what; nearest first."""
-    left = [_left(model, law, chart, [one.mended(piece) for piece in pieces]) for one in every]
-    order = np.argsort(left, kind="stable")[:FITTED]
-    return [(every[int(i)], left[int(i)]) for i in order if left[int(i)] < NEARER * before]
-
-
-def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece]) -> float:
-    """What some short segments leave, from states that are guessed: the mean logarithm of 1 and the square."""
-    noise = noise_by_differences(chart, pieces)
-    s = Fit(model, law, chart, Unknowns((), as_in_files=True), pieces, noise).segments
+def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], each: Sequence[Mistake]) -> list[float]:
+    """What some short segments leave without each mistake, from states that are guessed: mean log of 1 + squares."""
+    s, nx = cut_segments(law, pieces, model.nu), model.nx
     some = np.unique(np.linspace(0, len(s.first) - 1, SEGMENTS).round().astype(int))
-    starts = np.concatenate(
-        [guess_states(model, chart, s.pieces[s.of_piece[k]], np.array([s.first[k]], dtype=np.intp)) for k in some]
-    )
-    with np.errstate(all="ignore"):
-        xs = law.run(np.zeros(0), starts, s.hs[some], s.us[some])
-        each = [
-            chart.minus(s.pieces[s.of_piece[k]].ys[s.samples[k]], xs[i, s.at[k]]) / noise for i, k in enumerate(some)
+    found: list[float] = []
+    for first in range(0, len(each), AT_ONCE):
+        part = each[first : first + AT_ONCE]
+        mended = [[one.mended(piece) for piece in pieces] for one in part]
+        starts = [
+            guess_states(model, chart, own[s.of_piece[k]], np.array([s.first[k]], dtype=np.intp))
+            for own in mended
+            for k in some
         ]
-        squares = np.concatenate(each) ** 2
-    known = np.log1p(squares[np.isfinite(squares)])
-    return float(np.mean(known)) if len(known) else np.inf
+        us = [s.us[some][:, :, one.order[nx:] - nx] * one.factors[nx:] for one in part]
+        with np.errstate(all="ignore"):
+            xs = law.run(np.zeros(0), np.concatenate(starts), np.tile(s.hs[some], (len(part), 1)), np.concatenate(us))
+            for own, moved in zip(mended, xs.reshape(len(part), len(some), *xs.shape[1:]), strict=True):
+                noise = noise_by_differences(chart, own)
+                misses = [
+                    chart.minus(own[s.of_piece[k]].ys[s.samples[k]], moved[i, s.at[k]]) / noise
+                    for i, k in enumerate(some)
+                ]
+                squares = np.concatenate(misses) ** 2
+                known = np.log1p(squares[np.isfinite(squares)])
+                found.append(float(np.mean(known)) if len(known) else np.inf)
+    return found
 
 
 def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequence[Piece]) -> tuple[float, bool]:

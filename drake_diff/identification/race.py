@@ -11,7 +11,7 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff.exceptions import SimulationError
 from drake_diff.identification.fit import Fit
 from drake_diff.identification.measured import Piece
-from drake_diff.identification.screen import LEVELS, LIMIT, Promise, View
+from drake_diff.identification.screen import DELAY, LEVELS, LIMIT, Promise, View
 from drake_diff.identification.setting import Setting
 from drake_diff.identification.trial import STEPS, Trial, Tried
 from drake_diff.identification.unknowns import COULOMB, Unknowns
@@ -72,8 +72,8 @@ class Race:
     def tried(
         self, seen: View, changes: Iterable[tuple[int, ...]], base: Tried, most: int = LOOKED_AT
     ) -> tuple[list[Tried], list[Runner]]:
-        """(those that are fitted, all that stayed in the race, best first) of those that promise most."""
-        each = self.setting.unknowns.each
+        """(those that are fitted, all that stayed in the race, best first) of those that promise most, and a delay."""
+        each, changes = self.setting.unknowns.each, list(changes)
         chosen: dict[tuple[str, ...], Promise] = {}
         places = {True: most, False: most}  # what has more numbers bends to more, and promises more than it keeps
         for promise in seen.promises(changes, float(np.log(self.setting.count))):
@@ -87,6 +87,9 @@ class Race:
             ):
                 chosen[own] = promise
                 places[small] -= 1
+        for i, one in enumerate(each):  # none at all promises little of one of several samples
+            if one.quantity == DELAY and (i,) in changes:
+                chosen.setdefault((one.name,), Promise((i,), seen.most, 1.0, np.zeros(1)))
         plain = {own: promise for own, promise in chosen.items() if not any(map(self.setting.is_of_inputs, own))}
         found, every = self.raced([self.runner(seen, promise, own) for own, promise in plain.items()], base)
         if any(one.explains for one in found):  # a search for a delay or a limit takes longer than the others together
@@ -111,10 +114,10 @@ class Race:
         z = np.clip(z[at], *unknowns.bounds)
         if unknowns.delay is None or seen.unknowns.delay is not None:
             return self.running(names, unknowns, self.setting.cut, starts, z, promise)
-        return self.delayed(names, unknowns, z, promise)
+        return self.delayed(names, unknowns, unknowns.z_start, promise)
 
     def delayed(self, names: tuple[str, ...], unknowns: Unknowns, z: Array, promise: Promise) -> Runner:
-        """From the delay from which a step leaves least; a step sees only as far as inputs stay the same."""
+        """From the delay from which steps leave least; a step sees only as far as inputs stay the same."""
         best = self.running(names, unknowns, self.setting.cut, self.setting.starts, z, promise)
         best.left, worse = np.inf, 0
         for delay in self.setting.delays:
@@ -122,9 +125,9 @@ class Race:
                 break
             at = z.copy()
             at[unknowns.delay] = delay
-            one = self.running(names, unknowns, self.setting.cut, self.setting.starts_at(float(delay)), at, promise)
             worse += 1
-            if one.step() and one.left < best.left:
+            one = self.running(names, unknowns, self.setting.cut, self.setting.starts_at(float(delay)), at, promise)
+            if all(one.step() for _ in names) and one.left < best.left:  # two where another change bends as well
                 best, worse = one, 0
         return best
 

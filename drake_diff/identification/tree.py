@@ -131,7 +131,7 @@ class Tree:
                 moving, force, mass = self._moved(numbers, q, v, u, turn)
                 bias = moving.forces(np.zeros_like(v))[0]
             else:
-                moved, force = compiled(q, v, np.zeros_like(v)), self._force(numbers, q, v, u, turn)
+                moved, force = compiled(q, v, np.zeros_like(v), derivatives=False), self._force(numbers, q, v, u, turn)
                 bias, mass = moved.tau, moved.mass + np.diag(numbers.reflected)
             return self._own(mass), self._along(force - bias)
 
@@ -227,7 +227,7 @@ class Tree:
         """The same by small motion, by v, by a (N, n, n) and by what moves the numbers by `by` (N, n, np)."""
         moving = self._with(numbers).moving(self.place(numbers, q), v)
         _, by_q, by_v = moving.derivatives(a)
-        return by_q, by_v, moving.mass, self._by_links(numbers, moving, q, a, by)
+        return by_q, by_v, moving.mass, self._by_links(numbers, moving, a, by)
 
     def regressors(self, numbers: Numbers, q: Array, v: Array, a: Array) -> list[Array]:
         """Of each link (N nv, 10): the force of inverse dynamics at q, v and a (N, nv) by its ten numbers."""
@@ -347,7 +347,7 @@ class Tree:
         held: Mask,
     ) -> Array:
         """(N, n, np) of inverse dynamics less the other forces, at fixed a."""
-        found = self._by_links(numbers, moving, q, a, by)
+        found = self._by_links(numbers, moving, a, by)
         stretched = q[:, self.dynamics.positions] - numbers.rest
         for name, value in (
             ("damping", v),
@@ -367,11 +367,11 @@ class Tree:
             found -= (self.actuation * effort[:, None, :]) @ rows
         return found
 
-    def _by_links(self, numbers: Numbers, moving: Moving, q: Array, a: Array, by: Array) -> Array:
+    def _by_links(self, numbers: Numbers, moving: Moving, a: Array, by: Array) -> Array:
         """(N, n, np) of inverse dynamics at fixed a."""
         found = np.zeros((*a.shape, by.shape[1]))
         _, A, carried = moving.forces(a)
-        poses = self.place(numbers, q)
+        poses = moving.poses
         for i, places in enumerate(numbers.places("inertial")):
             used = np.flatnonzero(np.any(by[places] != 0, axis=0))
             if len(used):

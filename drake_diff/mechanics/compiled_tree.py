@@ -33,13 +33,15 @@ class CompiledTree:
     links: dict[str, int]  # by their bodies' names
     nv: int
 
-    def __call__(self, q: Array, v: Array, a: Array) -> Moved:
-        """At q (N, nq), v and a (each (N, nv)), in Drake's coordinates."""
+    def __call__(self, q: Array, v: Array, a: Array, *, derivatives: bool = True) -> Moved:
+        """At q (N, nq), v and a (each (N, nv)), in Drake's coordinates; `slope`, `by_q` and `by_v` are 0 without."""
         N, n, compiled = len(q), self.nv, kernel(KERNEL)
         point = own_array(q), own_array(v), own_array(a)
         poses, S, tau = np.empty((N, len(self.links), 3, 4)), np.empty((N, n, 6)), np.empty((N, n))
         mass, slope, by_q, by_v = np.empty((4, N, n, n))
-        compiled.differentiate_tree(compiled.Tree(*self.tables), *point, poses, S, mass, slope, tau, by_q, by_v)
+        compiled.differentiate_tree(
+            compiled.Tree(*self.tables), *point, derivatives, poses, S, mass, slope, tau, by_q, by_v
+        )
         return Moved(poses, S, mass, slope, tau, by_q, by_v)
 
 

@@ -68,6 +68,7 @@ class Moving:
     """A tree at N states that move; what is of each degree of freedom is of what its joint carries."""
 
     tree: "TreeDynamics"
+    poses: Array  # (N, n, 3, 4)
     S: Array  # (N, n, 6) the motion of each at unit speed
     v: Array  # (N, n)
     inertia: Array  # (N, n, 6, 6) of the bodies alone
@@ -174,7 +175,7 @@ class TreeDynamics:
         B = force_cross @ inertia - inertia @ motion_cross + _cross_of_force(_times(inertia, V))
         shape, up = inertia.shape, self.ancestors.T.astype(float)
         I_c, B_c = ((up @ each.reshape(*shape[:2], 36)).reshape(shape) for each in (inertia, B))
-        return Moving(self, S, v, inertia, I_c, B_c, V, before, _cross_each(V, S), force_cross)
+        return Moving(self, poses, S, v, inertia, I_c, B_c, V, before, _cross_each(V, S), force_cross)
 
     def _of_all(self, poses: Array, q: Array, v: Array, a: Array) -> InverseDynamics:
         """Of all n degrees of freedom."""

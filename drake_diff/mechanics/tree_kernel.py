@@ -233,6 +233,7 @@ def differentiate_tree(
     q: Array,
     v: Array,
     a: Array,
+    derivatives: bool,
     poses: Array,
     motions: Array,
     mass: Array,
@@ -243,7 +244,8 @@ def differentiate_tree(
 ) -> None:
     """At N states: the links' poses (N, L, 3, 4), S (N, nv, 6), M and d M_kk / d q_j (N, nv, nv) by k and j.
 
-    And the inverse dynamics (N, nv) at the accelerations a (N, nv), with its derivatives by small motion and by v.
+    And the inverse dynamics (N, nv) at the accelerations a (N, nv), with its derivatives by small motion and by v where
+    these are asked for.
     """
     nv, J = v.shape[1], len(t.parent)
     parent, first, size = t.parent, t.first, t.size
@@ -273,7 +275,8 @@ def differentiate_tree(
             _times(own, j, A, j, F, j)
             _times(own, j, V, j, S_I, 0)
             _add_cross_force(V, j, S_I, 0, F, j)
-            _force_rates(own, j, V, S_I, B, work)
+            if derivatives:
+                _force_rates(own, j, V, S_I, B, work)
         for j in range(J - 1, -1, -1):
             up = parent[j]
             if up >= 0:
@@ -281,9 +284,10 @@ def differentiate_tree(
                     carried[up, i] += carried[j, i]
                 for i in range(6):
                     F[up, i] += F[j, i]
-                    for k in range(6):
-                        B[up, i, k] += B[j, i, k]
-        for j in range(J):
+                    if derivatives:
+                        for k in range(6):
+                            B[up, i, k] += B[j, i, k]
+        for j in range(J if derivatives else 0):
             for s in range(first[j], first[j] + size[j]):
                 for i in range(6):
                     P[s, i] = Q[s, i] = 0.0
@@ -297,6 +301,13 @@ def differentiate_tree(
             for s in range(first[j], first[j] + size[j]):
                 tau[n, s] = _dot(S, s, F, j)
                 _times(carried, j, S, s, S_I, 0)
+                if not derivatives:
+                    up = j
+                    while up >= 0:
+                        for k in range(first[up], first[up] + size[up]):
+                            mass[n, s, k] = mass[n, k, s] = _dot(S_I, 0, S, k)
+                        up = parent[up]
+                    continue
                 _times(carried, j, Q, s, of_q, 0)
                 _times(carried, j, T, s, of_v, 0)
                 _add_cross_force(S, s, F, j, of_q, 0)
