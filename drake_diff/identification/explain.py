@@ -24,8 +24,9 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.columns import Mistaken, mistaken_in_the_air
-from drake_diff.identification.identify import what_acts
+from drake_diff.identification.columns import mistaken_in_the_air
+from drake_diff.identification.contact_causes import explain_contact, may_touch
+from drake_diff.identification.identify import TOUCH, what_acts
 from drake_diff.identification.measured import given_noise, read_pieces
 from drake_diff.identification.race import FALLS, LOOKED_AT, Race, Runner
 from drake_diff.identification.screen import DELAY, LIMIT, LONGEST_DELAY, Promise, View
@@ -33,7 +34,7 @@ from drake_diff.identification.setting import Setting
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.trial import STEPS, Trial, Tried
 from drake_diff.identification.unknowns import COULOMB, HELD_DAMPING, HELD_INERTIA, Unknown, Unknowns
-from drake_diff.identification.words import Explanation, Words
+from drake_diff.identification.words import Explanation, Words, explained_by
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 
@@ -66,7 +67,7 @@ def explain(
         recordings: As for `dd.identify`.
         noise: The standard deviation of the noise of states, by name. What is not given is estimated.
         motion: "continuous" looks at motions in which bodies touch or a joint is beyond its limit as if these did
-            nothing; "auto" refuses them.
+            nothing. "auto" looks at motions in which bodies touch by the model's own steps, and refuses limits.
 
     Returns:
         `.names`, `.values` with `.intervals` (95 %), `.alternatives` that the recordings cannot tell from it, and a
@@ -75,8 +76,8 @@ def explain(
 
     Raises:
         InputError, UnknownNameError, ShapeError, NonFiniteError: A recording is not one of this model.
-        ModelError: The model has no motion in continuous time there: bodies touch, a joint is beyond its limit, or
-            controllers or constraints act.
+        ModelError: The model has no motion in continuous time there: a joint is beyond its limit, or controllers or
+            constraints act.
 
     Source:
         BIC: Schwarz, "Estimating the dimension of a model" (1978).
@@ -99,15 +100,15 @@ def explain(
         if columns is not None:
             return explained_by(columns)
     why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces) if motion == "auto" else ""
+    if why == TOUCH:
+        return explain_contact(model, chart, pieces, given_noise(model, chart, noise))
     if why or isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: causes are looked for in motions in continuous time only, and {why}")
-    return _Search(Setting(model, tree, chart, pieces, given_noise(model, chart, noise))).found()
-
-
-def explained_by(columns: Mistaken) -> Explanation:
-    """By columns that are mistaken, and nothing else."""
-    others = tuple((words,) for words in columns.alternatives)
-    return Explanation((columns.words,), {}, {}, others, True, columns.sentence, columns.evidence)
+    found = _Search(Setting(model, tree, chart, pieces, given_noise(model, chart, noise))).found()
+    if found.explained or motion != "auto" or not may_touch(model, chart, pieces):
+        return found
+    touched = explain_contact(model, chart, pieces, given_noise(model, chart, noise))
+    return touched if touched.explained else found
 
 
 @dataclass(eq=False)

@@ -48,6 +48,7 @@ from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
 MOTIONS = ("auto", "continuous", "steps", "impacts")
+TOUCH = "bodies touch"
 LONGEST, SHORTEST = 0.02, 1e-4  # [s] of the steps of Runge and Kutta
 STEP_ERROR = 1e-3  # of the noise: what a step of half the length may change over a segment
 ROUNDS = 5  # of estimating the noise
@@ -235,7 +236,7 @@ def what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
             for x in guess_states(model, chart, piece, np.arange(len(piece.times))):
                 set_state(model.double, x)
                 if model.double.overlaps():
-                    return "bodies touch"
+                    return TOUCH
     return ""
 
 

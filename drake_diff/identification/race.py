@@ -232,7 +232,7 @@ class Race:
         largest = max(float(np.max(np.abs(p.us[:, i]))) for p in self.setting.pieces)
         grid, low, high = np.array(LEVELS) * largest, 0.0, largest
         if near is not None:
-            grid = near * np.array([0.8, 1.0, 1.25])
+            grid = np.minimum(near * np.array([0.8, 1.0, 1.25]), largest)
             low, high = max(low, 0.5 * near), min(high, 2 * near)
         best = min((float(v) for v in grid), key=left)
         nearby = sorted([low, *map(float, grid), high])

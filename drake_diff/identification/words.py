@@ -8,6 +8,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.identification.columns import Mistaken
 from drake_diff.identification.race import LONGEST_SEARCH, Race
 from drake_diff.identification.screen import LIMIT
 from drake_diff.identification.setting import Setting
@@ -30,6 +31,12 @@ class Explanation(ShowsItsRepr):
 
     def __repr__(self) -> str:
         return self.sentence
+
+
+def explained_by(columns: Mistaken) -> Explanation:
+    """By columns that are mistaken, and nothing else."""
+    others = tuple((words,) for words in columns.alternatives)
+    return Explanation((columns.words,), {}, {}, others, True, columns.sentence, columns.evidence)
 
 
 @dataclass(eq=False)
