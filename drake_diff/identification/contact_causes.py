@@ -9,6 +9,7 @@ and what can goes on to the end. Evidence and limit are those of `explain`.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from math import comb
 from typing import NamedTuple
 
@@ -46,7 +47,15 @@ HEIGHT, CENTER_SCALE, PULL = 0.02, 0.3, 3.0  # [m] of a ground; of a radius of g
 NOISY, HOPELESS = 2.0, 3.0  # times the noise: what is left is more than it, and what is given up
 QUIET = 1.15  # times the least that was left so far: what is left is no more than before
 STEPS, TRIES = 8, 5  # of Gauss and Newton; of shortening each
+WIDER = 6  # how often the end of an interval moves out, before it is not known
 GAIN = 0.3  # of the squares, in units of the noise: what a last step may still gain
+STUCK = 20.0  # times the noise, beyond which no other start is tried
+WIDTHS, DRAWS, BEST = (
+    (1.0, 2.0, 1.0, 0.5),
+    24,
+    2,
+)  # times their scatter: how far other starts are, how many, and which are followed
+LEAST_SEEN = 0.03  # of what is seen of one entry: a combination seen less is not moved further
 SLOPE = 3e-3  # of a change's scale: over which slopes are taken
 LOST = 1e4  # times the noise: where a motion cannot be stepped, and at most
 MAD = 1.4826  # of the median of normal deviations: their standard deviation
@@ -96,7 +105,8 @@ class _Fitted(NamedTuple):
     doubt: str
     value: Array
     interval: Array  # (k, 2)
-    starts: tuple[Array, ...] = ()
+    point: _Point
+    half: Array  # (k,) of the interval, in the change's scale, by slopes alone
 
 
 @dataclass(eq=False)
@@ -128,7 +138,8 @@ class _Search:
         fitted = self.all_fitted(tried, stage, point, FOLLOWED)
         if not base.explains and not any(one.explains for one in fitted):
             fitted = self.all_fitted(tried, stage, point, len(BEGIN)) or fitted
-        return self.said(base, self.again(fitted, tried), each)
+        fitted = self.again(fitted, tried)
+        return self.said(self.again_unchanged(base, fitted), fitted, each)
 
     def all_fitted(self, tried: Sequence[Unknown], stage: float, base: _Point, most: int) -> list[_Fitted]:
         """Each change from a stage on, from the `most` values at which it is nearest there."""
@@ -152,11 +163,19 @@ class _Search:
             alike = one.quantity in OF_CONTACT and best.name.endswith(f".{one.quantity}")
             if self.is_late or not alike or (before is not None and before.explains):
                 continue
-            points = [self.at(one, np.array([w]), best.starts, 1.0) for w in AGAIN]
+            points = [self.at(one, np.array([w]), best.point.starts, 1.0) for w in AGAIN]
             point = self.followed(one, min(points, key=lambda point: point.cost), 1.0)
             if self.size(point) < HOPELESS:
                 found[one.name] = self.told(one, point)
         return list(found.values())
+
+    def again_unchanged(self, base: _Fitted, fitted: Sequence[_Fitted]) -> _Fitted:
+        """The model as it is, from the motion of the change that explains best: its own search may have ended short."""
+        best = min((one for one in fitted if one.explains), key=self.bic, default=None)
+        if best is None:
+            return base
+        point = self.followed(None, self.at(None, np.zeros(0), best.point.starts, 1.0), 1.0)
+        return min(base, self.told(None, point), key=lambda one: one.score)
 
     def unchanged(self, pieces: Sequence[Piece]) -> tuple[float, bool]:
         """How well the model as it is goes through other pieces."""
@@ -221,10 +240,10 @@ class _Search:
         point = self.at(None, np.zeros(0), starts, self.stages[0])
         quiet, least = (self.stages[0], point), np.inf
         for stage in self.stages:
-            point = self.followed(None, self.at(None, point.w, point.starts, stage), stage)
+            point = self.further(None, point, quiet[0], stage)
             least = min(least, self.size(point))
             if self.size(point) > NOISY:
-                return _Fitted("", np.inf, 0, False, "", np.zeros(0), np.zeros((0, 2))), *quiet
+                return _Fitted("", np.inf, 0, False, "", np.zeros(0), np.zeros((0, 2)), point, np.zeros(0)), *quiet
             if self.size(point) < QUIET * least:
                 quiet = stage, point
         told = self.told(None, point)
@@ -242,9 +261,8 @@ class _Search:
         points = [self.at(one, w, base.starts, stage) for w in begin]
         points.sort(key=lambda point: point.cost)
         points = [self.followed(one, each, stage) for each in points[:most]]
-        for further in self.stages[self.stages.index(stage) + 1 :]:
-            points = [self.followed(one, self.at(one, p.w, p.starts, further), further) for p in points]
-            points = self.kept(points)
+        for before, further in pairwise(self.stages[self.stages.index(stage) :]):
+            points = self.kept([self.further(one, point, before, further) for point in points])
         return self.told(one, points[0]) if points and self.size(points[0]) < HOPELESS else None
 
     def kept(self, points: Sequence[_Point]) -> list[_Point]:
@@ -256,11 +274,16 @@ class _Search:
                 found.append(point)
         return found
 
-    def followed(self, one: Unknown | None, point: _Point, stage: float) -> _Point:
-        """Where Gauss-Newton steps lead, shortened by Levenberg's damping where they do not help."""
+    def followed(self, one: Unknown | None, point: _Point, stage: float, held: int | None = None) -> _Point:
+        """Where Gauss-Newton steps lead, shortened by Levenberg's damping where they do not help.
+
+        One number of the change may be held.
+        """
         damping = 0.0
         for _ in range(STEPS):
             J = self.slopes(one, point, stage)
+            if held is not None:
+                J[:, J.shape[1] - len(point.w) + held] = 0.0
             norms = np.where((size := np.linalg.norm(J, axis=0)) > 0, size, 1.0)
             U, s, V = np.linalg.svd(J / norms, full_matrices=False)
             before = point.cost
@@ -275,6 +298,28 @@ class _Search:
             if before - point.cost < max(GAIN, 1e-4 * before):
                 break
         return point
+
+    def further(self, one: Unknown | None, point: _Point, before: float, stage: float) -> _Point:
+        """On to the next stage; where more is left there, from the best of motions that the one before allows too.
+
+        Through impacts what is left is ragged ground, on which steps by slopes stop early.
+        """
+        there = self.followed(one, self.at(one, point.w, point.starts, stage), stage)
+        if self.size(there) < QUIET * self.size(point) or self.size(there) > STUCK:
+            return there
+        J = self.slopes(one, point, before)
+        norms = np.where((size := np.linalg.norm(J, axis=0)) > 0, size, np.inf)
+        _, s, V = np.linalg.svd(J / norms, full_matrices=False)
+        random = np.random.default_rng(0)
+        for width in WIDTHS if one is None else WIDTHS[:1]:
+            allowed = random.standard_normal((DRAWS, len(s))) / np.maximum(s, LEAST_SEEN) @ V / norms
+            each = [self.moved(one, point, width * max(1.0, self.size(point)) * p, stage) for p in allowed]
+            each.sort(key=lambda point: point.cost)
+            found = [self.followed(one, other, stage) for other in each[:BEST]]
+            there = min([there, *found], key=lambda point: point.cost)
+            if self.size(there) < QUIET * self.size(point):
+                break
+        return there
 
     def moved(self, one: Unknown | None, point: _Point, p: Array, stage: float) -> _Point:
         size, k = self.chart.size, len(point.w)
@@ -366,19 +411,49 @@ class _Search:
             if chance < FALSE_ALARM:
                 doubt = f"what is left of {entry} is not like noise"
         if one is None:
-            return _Fitted("", score, 0, not doubt, doubt, np.zeros(0), np.zeros((0, 2)))
+            return _Fitted("", score, 0, not doubt, doubt, np.zeros(0), np.zeros((0, 2)), point, np.zeros(0))
         J = self.slopes(one, point, 1.0)
         left = point.cost / free
         R = np.linalg.qr(J)[1]
         own = np.linalg.pinv(R[-k:, -k:])
         half = float(stats.t.ppf(0.975, free)) * np.sqrt(left * np.sum(own**2, axis=1))
         half[np.abs(np.diag(R[-k:, -k:])) <= 1e-6 * np.linalg.norm(J[:, -k:], axis=0)] = np.inf
+        interval = self.interval(one, point.w - half, point.w + half)
+        return _Fitted(one.name, score, k, not doubt, doubt, self.value(one, point.w), interval, point, half)
+
+    def widened(self, one: Unknown, fitted: _Fitted, rounds: int = 2) -> _Fitted:
+        """With an interval that ends where what is left has grown by what it allows, and not within that by slopes.
+
+        A value beside it that leaves less is where it is fitted anew.
+        """
+        point, k = fitted.point, len(fitted.half)
+        free = len(point.r) - self.chart.size * len(self.pieces) - k
+        rise = float(stats.t.ppf(0.975, free)) ** 2 * point.cost / free
+        reach = np.vstack([fitted.half, fitted.half])
+        for i, j in np.ndindex(2, k):
+            for _ in range(WIDER):
+                w = point.w.copy()
+                w[j] += (-1, 1)[i] * reach[i, j]
+                if not np.isfinite(reach[i, j]):
+                    break
+                beside = self.followed(one, self.at(one, w, point.starts, 1.0), 1.0, held=j)
+                more = beside.cost - point.cost
+                if more < -GAIN and rounds:
+                    found = self.told(one, self.followed(one, beside, 1.0))
+                    return self.widened(one, found if found.explains else fitted, rounds - 1)
+                if more >= rise:
+                    break
+                reach[i, j] *= min(2.0, max(1.1, float(np.sqrt(rise / max(more, 1e-9)))))
+            else:
+                reach[i, j] = np.inf
+        return fitted._replace(interval=self.interval(one, point.w - reach[0], point.w + reach[1]))
+
+    def interval(self, one: Unknown, low: Array, high: Array) -> Array:
+        """(k, 2) values of w."""
         scale, by_log = self.scale(one)
         with np.errstate(over="ignore"):
-            ends = [one.start * np.exp(point.w + s * half) if by_log else one.start + scale * (point.w + s * half)
-                    for s in (-1, 1)]  # fmt: skip
-        interval = np.clip(np.column_stack(ends), one.lower, one.upper)
-        return _Fitted(one.name, score, k, not doubt, doubt, self.value(one, point.w), interval, point.starts)
+            ends = [one.start * np.exp(w) if by_log else one.start + scale * w for w in (low, high)]
+        return np.clip(np.column_stack(ends), one.lower, one.upper)
 
     @property
     def count(self) -> int:
@@ -403,6 +478,7 @@ class _Search:
             sentence = f"Not explained: no change that was tried explains the recording; {what}.{end}"
             return Explanation((), {}, {}, (), False, sentence, evidence)
         own = {one.name: one for one in tried}
+        named = [self.widened(own[one.name], one) for one in named]
         texts = [self.words(own[one.name], one) for one in named]
         tail = ": this explains the recording" if len(named) == 1 else ": the recording cannot tell"
         steps = f"by the model's own steps of {1e3 * self.model.time_step:.4g} ms"
