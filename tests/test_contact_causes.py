@@ -9,6 +9,8 @@ import pytest
 import drake_diff as dd
 
 sys.path.append(str(Path(__file__).parent / "benchmarks"))
+import identify_contact_causes
+
 PERIOD = 0.01
 
 
@@ -35,14 +37,25 @@ def test_of_a_right_model_nothing_is_said(ball):
     assert w.explained
 
 
+def test_a_right_model_is_not_blamed_where_its_motion_is_hard_to_find():
+    """Steps from the measured first state of this block end at twice the noise, from which stiffness looked wrong."""
+    model, log, name, _ = identify_contact_causes.recorded("sliding_block", 0.005, False, 50009)
+    w = dd.explain(model, log)
+    assert not name
+    assert w.names == ()
+    assert w.explained
+
+
 @pytest.mark.slow
-def test_friction_and_stiffness_of_a_ball_are_named(ball):
-    """Drake takes one number of both bodies that touch, so that the ground's is told beside the ball's."""
-    for quantity, value in (("friction", 0.3), ("stiffness", 13000.0)):
-        w = dd.explain(ball, thrown(ball, **{f"ball__{quantity}": value}))
-        assert {w.names, *w.alternatives} == {(f"ball.{quantity}",), (f"ground.{quantity}",)}, w
-        assert w.values[f"ball.{quantity}"] == pytest.approx(value, rel=0.03)  # half of its interval is up to 1 %
-        assert w.sentence.endswith("the recording cannot tell, by the model's own steps of 5 ms.")
+@pytest.mark.parametrize(("quantity", "value"), [("friction", 0.3), ("stiffness", 13000.0)])
+def test_a_change_of_a_ball_is_named_beside_the_same_of_the_ground(ball, quantity, value):
+    """Drake makes one number of both bodies that touch."""
+    w = dd.explain(ball, thrown(ball, **{f"ball__{quantity}": value}))
+    assert {w.names, *w.alternatives} == {(f"ball.{quantity}",), (f"ground.{quantity}",)}, w
+    low, high = w.intervals[f"ball.{quantity}"]
+    assert abs(w.values[f"ball.{quantity}"] - value) < high - low  # two intervals of 95 %: four deviations
+    assert high - low < 0.2 * value
+    assert w.sentence.endswith("the recording cannot tell, by the model's own steps of 5 ms.")
 
 
 @pytest.mark.slow
@@ -55,8 +68,6 @@ def test_two_changes_are_not_explained_by_one(ball):
 
 @pytest.mark.slow
 def test_of_a_hopper_a_radius_is_named_beside_the_height_of_the_ground():
-    import identify_contact_causes
-
     model, log, name, truth = identify_contact_causes.recorded("hopper", 0.005, True, 4)
     assert name == "z_x.bias"
     w = dd.explain(model, log)

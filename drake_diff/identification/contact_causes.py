@@ -135,9 +135,10 @@ class _Search:
             if columns is not None:
                 return explained_by(columns)
             tried = each
-        fitted = self.all_fitted(tried, stage, point, FOLLOWED)
+        first = self.without_twins(tried)
+        fitted = self.all_fitted(first, stage, point, FOLLOWED)
         if not base.explains and not any(one.explains for one in fitted):
-            fitted = self.all_fitted(tried, stage, point, len(BEGIN)) or fitted
+            fitted = self.all_fitted(first, stage, point, len(BEGIN)) or fitted
         fitted = self.again(fitted, tried)
         return self.said(self.again_unchanged(base, fitted), fitted, each)
 
@@ -151,6 +152,15 @@ class _Search:
             if found is not None:
                 fitted.append(found)
         return fitted
+
+    @staticmethod
+    def without_twins(tried: Sequence[Unknown]) -> list[Unknown]:
+        """Of a contact's numbers one body's, where only two bodies touch: `again` looks at the other's."""
+        of_contact = [one for one in tried if one.quantity in OF_CONTACT]
+        if len({one.label for one in of_contact}) > 2:
+            return list(tried)
+        first = {one.quantity: one for one in reversed(of_contact)}
+        return [one for one in tried if one.quantity not in first or one is first[one.quantity]]
 
     def again(self, fitted: Sequence[_Fitted], tried: Sequence[Unknown]) -> list[_Fitted]:
         """With those that are like the best one, of the other body that touches, from its motion: it is theirs too."""
@@ -240,7 +250,7 @@ class _Search:
         point = self.at(None, np.zeros(0), starts, self.stages[0])
         quiet, least = (self.stages[0], point), np.inf
         for stage in self.stages:
-            point = self.further(None, point, quiet[0], stage)
+            point = self.further(None, point, quiet[0], stage, WIDTHS)
             least = min(least, self.size(point))
             if self.size(point) > NOISY:
                 return _Fitted("", np.inf, 0, False, "", np.zeros(0), np.zeros((0, 2)), point, np.zeros(0)), *quiet
@@ -262,7 +272,9 @@ class _Search:
         points.sort(key=lambda point: point.cost)
         points = [self.followed(one, each, stage) for each in points[:most]]
         for before, further in pairwise(self.stages[self.stages.index(stage) :]):
-            points = self.kept([self.further(one, point, before, further) for point in points])
+            points = self.kept(
+                [self.further(one, point, before, further, WIDTHS[: int(most > FOLLOWED)]) for point in points]
+            )
         return self.told(one, points[0]) if points and self.size(points[0]) < HOPELESS else None
 
     def kept(self, points: Sequence[_Point]) -> list[_Point]:
@@ -299,19 +311,21 @@ class _Search:
                 break
         return point
 
-    def further(self, one: Unknown | None, point: _Point, before: float, stage: float) -> _Point:
+    def further(
+        self, one: Unknown | None, point: _Point, before: float, stage: float, widths: Sequence[float]
+    ) -> _Point:
         """On to the next stage; where more is left there, from the best of motions that the one before allows too.
 
         Through impacts what is left is ragged ground, on which steps by slopes stop early.
         """
         there = self.followed(one, self.at(one, point.w, point.starts, stage), stage)
-        if self.size(there) < QUIET * self.size(point) or self.size(there) > STUCK:
+        if not widths or self.size(there) < QUIET * self.size(point) or self.size(there) > STUCK:
             return there
-        J = self.slopes(one, point, before)
+        J = self.slopes(one, self.at(one, point.w, point.starts, before), before)
         norms = np.where((size := np.linalg.norm(J, axis=0)) > 0, size, np.inf)
         _, s, V = np.linalg.svd(J / norms, full_matrices=False)
         random = np.random.default_rng(0)
-        for width in WIDTHS if one is None else WIDTHS[:1]:
+        for width in widths:
             allowed = random.standard_normal((DRAWS, len(s))) / np.maximum(s, LEAST_SEEN) @ V / norms
             each = [self.moved(one, point, width * max(1.0, self.size(point)) * p, stage) for p in allowed]
             each.sort(key=lambda point: point.cost)

@@ -139,10 +139,11 @@ def measure(robot, step, is_changed, seed):
         verdict = "named among alternatives"
     else:
         verdict = "another named" if w.names else "nothing" if w.explained else "not explained"
-    inside = None
+    inside = []
     if verdict.startswith("named"):
         within, value = np.atleast_2d(w.intervals[name]), np.atleast_1d(next(iter(truth.values())))
-        inside = bool(np.all((within[:, 0] <= value) & (value <= within[:, 1])))
+        known = np.isfinite(within).all(axis=1)
+        inside = list(((within[:, 0] <= value) & (value <= within[:, 1]))[known])
     return verdict, inside, seconds, name, truth, w.sentence
 
 
@@ -156,10 +157,11 @@ def main():
         robot, step, is_changed = ROBOTS[i % 4], STEPS[i // 4 % 2], i // 4 % 3 != 2
         verdict, inside, seconds, name, truth, said = measure(robot, step, is_changed, 10000 * given.seed + i)
         verdicts.setdefault(is_changed, []).append(verdict)
-        insides += [] if inside is None else [inside]
+        insides += inside
         times.append(seconds)
         told = f"{name} {np.round(next(iter(truth.values())), 5)}" if name else "nothing"
-        print(f"{i:3} {robot:16} {1e3 * step:3g} ms {seconds:5.1f} s {verdict:24} {told} -> {said}", flush=True)
+        missed = f", outside {inside.count(False)} of {len(inside)} intervals" if not all(inside) else ""
+        print(f"{i:3} {robot:16} {1e3 * step:3g} ms {seconds:5.1f} s {verdict}{missed}: {told} -> {said}", flush=True)
     for is_changed, each in sorted(verdicts.items()):
         for verdict in sorted(set(each)):
             rate = success_rate(each.count(verdict), len(each))
