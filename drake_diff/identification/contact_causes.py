@@ -44,6 +44,7 @@ BEGIN = (0.0, 0.1, -0.1, 0.3, -0.3, 0.8, -0.8)  # where a change of one number b
 AGAIN = np.linspace(-1.5, 1.5, 25)  # and where one begins that is like a change that explains
 FOLLOWED = 2  # of these, at first
 HEIGHT, CENTER_SCALE, PULL = 0.02, 0.3, 3.0  # [m] of a ground; of a radius of gyration; [m/s^2]
+LARGER = 1.2  # radii with which bodies are looked at that nearly touch
 NOISY, HOPELESS = 2.0, 3.0  # times the noise: what is left is more than it, and what is given up
 QUIET = 1.15  # times the least that was left so far: what is left is no more than before
 STEPS, TRIES = 8, 5  # of Gauss and Newton; of shortening each
@@ -70,18 +71,20 @@ def explain_contact(model: Model, chart: Chart, pieces: Sequence[Piece], stated:
 
 
 def may_touch(model: Model, chart: Chart, pieces: Sequence[Piece]) -> bool:
-    """Whether bodies would touch with a ground `HEIGHT` higher, in recordings that the model's steps go through."""
+    """Whether bodies would touch with a higher ground and larger spheres, where samples are whole steps apart."""
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
     each = np.round(np.median(periods))
     if not model.contract.contact.collision_pairs or each < 1 or np.any(np.abs(periods - each) > CLOCK_TOLERANCE):
         return False
     lower = [model.position_names.index(name) for name in _heights(model, chart)]
-    for piece in pieces:
-        for x in guess_states(model, chart, piece, np.arange(len(piece.times))):
-            x[lower] -= HEIGHT
-            set_state(model.double, x)
-            if model.double.overlaps():
-                return True
+    radii = {p.name: p.value for p in list_parameters(model) if p.name.endswith(".radius") and "/" not in p.name}
+    with applied(select(model, {name: LARGER * value for name, value in radii.items()})) as larger:
+        for piece in pieces:
+            for x in guess_states(model, chart, piece, np.arange(len(piece.times))):
+                x[lower] -= HEIGHT
+                set_state(larger.double, x)
+                if larger.double.overlaps():
+                    return True
     return False
 
 
