@@ -158,12 +158,9 @@ class _Search:
 
     @staticmethod
     def without_twins(tried: Sequence[Unknown]) -> list[Unknown]:
-        """Of a contact's numbers one body's, where only two bodies touch: `again` looks at the other's."""
-        of_contact = [one for one in tried if one.quantity in OF_CONTACT]
-        if len({one.label for one in of_contact}) > 2:
-            return list(tried)
-        first = {one.quantity: one for one in reversed(of_contact)}
-        return [one for one in tried if one.quantity not in first or one is first[one.quantity]]
+        """Of friction one body's, where only two touch, as Drake makes one number of both: `again` adds the other's."""
+        frictions = [one for one in tried if one.quantity == "friction"]
+        return [one for one in tried if len(frictions) != 2 or one is not frictions[1]]
 
     def again(self, fitted: Sequence[_Fitted], tried: Sequence[Unknown]) -> list[_Fitted]:
         """With those that are like the best one, of the other body that touches, from its motion: it is theirs too."""
@@ -176,7 +173,7 @@ class _Search:
             alike = one.quantity in OF_CONTACT and best.name.endswith(f".{one.quantity}")
             if self.is_late or not alike or (before is not None and before.explains):
                 continue
-            points = [self.at(one, np.array([w]), best.point.starts, 1.0) for w in AGAIN]
+            points = [self.at(one, np.array([w]), best.point.starts, 1.0) for w in (best.point.w[0], *AGAIN)]
             point = self.followed(one, min(points, key=lambda point: point.cost), 1.0)
             if self.size(point) < HOPELESS:
                 found[one.name] = self.told(one, point)
