@@ -174,7 +174,7 @@ def test_a_cubes_half_width_and_friction_are_found_from_tosses_by_the_same_steps
     spec = importlib.util.spec_from_file_location("cube_tosses", TOSSES)
     tosses = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tosses)
-    true = tosses.model_of(1, half_width=0.0534)
+    true = tosses.model_of(1, np.zeros(3), half_width=0.0534)
     truth = {"cube.friction": 0.11, "cube.stiffness": 3e4, "cube.relaxation_time": 0.008}
     rng, recordings = np.random.default_rng(0), []
     for k in range(8):
@@ -186,7 +186,7 @@ def test_a_cubes_half_width_and_friction_are_found_from_tosses_by_the_same_steps
     names = ["cube_z.bias", "cube.friction", "cube.stiffness", "cube.relaxation_time"]
 
     def build(half_width):
-        return tosses.model_of(1, half_width=half_width)
+        return tosses.model_of(1, np.zeros(3), half_width=half_width)
 
     found = identify_contact(build, recordings, names, lengths={"half_width": 0.0524})
     # The half width to 0.5 %, half of what is asked of the real tosses.
