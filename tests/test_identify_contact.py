@@ -1,6 +1,6 @@
 """Contact parameters from motions through impacts: a closed form, then throws and tosses of known truth."""
 
-import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from drake_diff.identification.flights import start_of
 from drake_diff.identification.measured import read_pieces
 from drake_diff.mechanics.description import coordinates_of
 
-TOSSES = Path(__file__).parent / "benchmarks" / "cube_tosses.py"
+sys.path.append(str(Path(__file__).parent / "benchmarks"))
 
 
 def throws(model, truth, *, steps=1, height=0.0):
@@ -171,9 +171,8 @@ def test_the_spread_of_a_first_state_is_that_of_first_states_by_other_noise(ball
 
 @pytest.mark.slow
 def test_a_cubes_half_width_and_friction_are_found_from_tosses_by_the_same_steps():
-    spec = importlib.util.spec_from_file_location("cube_tosses", TOSSES)
-    tosses = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tosses)
+    import cube_tosses as tosses
+
     true = tosses.model_of(1, np.zeros(3), half_width=0.0534)
     truth = {"cube.friction": 0.11, "cube.stiffness": 3e4, "cube.relaxation_time": 0.008}
     rng, recordings = np.random.default_rng(0), []
