@@ -51,11 +51,8 @@ STEPS, TRIES = 8, 5  # of Gauss and Newton; of shortening each
 WIDER = 6  # how often the end of an interval moves out, before it is not known
 GAIN = 0.3  # of the squares, in units of the noise: what a last step may still gain
 STUCK = 20.0  # times the noise, beyond which no other start is tried
-WIDTHS, DRAWS, BEST = (
-    (1.0, 2.0, 1.0, 0.5),
-    24,
-    2,
-)  # times their scatter: how far other starts are, how many, and which are followed
+WIDTHS = (1.0, 2.0, 1.0, 0.5)  # times their scatter: how far other starts are
+DRAWS, BEST = 24, 2  # how many of these, and how many of them are followed
 LEAST_SEEN = 0.03  # of what is seen of one entry: a combination seen less is not moved further
 SLOPE = 3e-3  # of a change's scale: over which slopes are taken
 LOST = 1e4  # times the noise: where a motion cannot be stepped, and at most

@@ -29,7 +29,7 @@ from drake_diff.identification.contact_causes import explain_contact, may_touch
 from drake_diff.identification.identify import TOUCH, what_acts
 from drake_diff.identification.measured import given_noise, read_pieces
 from drake_diff.identification.race import FALLS, LOOKED_AT, Race, Runner
-from drake_diff.identification.screen import DELAY, LIMIT, LONGEST_DELAY, Promise, View
+from drake_diff.identification.screen import DELAY, LIMIT, LONGEST_DELAY, NO_PROMISE, Promise, View
 from drake_diff.identification.setting import Setting
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.trial import STEPS, Trial, Tried
@@ -135,9 +135,7 @@ class _Search:
 
     def by_one(self) -> tuple[Explanation | None, Tried, View, list[Runner]]:
         nothing = self.setting.of(())
-        one = self.race.running(
-            (), nothing, self.setting.cut, self.setting.starts, nothing.z_start, Promise((), np.inf, 0.0, np.zeros(0))
-        )
+        one = self.race.running((), nothing, self.setting.cut, self.setting.starts, nothing.z_start, NO_PROMISE)
         before = np.inf
         while one.step() and self.setting.is_hopeless(one.left) and one.left < FALLS * before:
             before = one.left
@@ -238,7 +236,7 @@ class _Search:
     def left_by(self, step: float | None, names: tuple[str, ...], unknowns: Unknowns, z: Array, starts: Array) -> float:
         """What a step of Gauss and Newton leaves of the squares by Euler steps of this length."""
         self.setting.step = step
-        one = self.race.running(names, unknowns, self.setting.cut, starts, z, Promise((), np.inf, 0.0, np.zeros(0)))
+        one = self.race.running(names, unknowns, self.setting.cut, starts, z, NO_PROMISE)
         left = one.left if one.step() else np.inf
         self.setting.step = None
         return left
@@ -327,9 +325,7 @@ class _Search:
         ]
         best: dict[int, tuple[float, View, Promise]] = {}
         name, least = each[last].name, np.inf
-        delay = float(
-            self.race.delayed((name,), self.setting.of([name]), np.zeros(1), Promise((), np.inf, 0.0, np.zeros(0))).z[0]
-        )
+        delay = float(self.race.delayed((name,), self.setting.of([name]), NO_PROMISE).z[0])
         for _ in range(DELAYS_SEEN):
             if best and self.race.is_late:
                 break

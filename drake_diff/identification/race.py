@@ -108,22 +108,22 @@ class Race:
         unknowns = self.setting.of([name for name in names if name != special])
         if special is not None:
             return self.searched(special, names, unknowns, promise)
+        if unknowns.delay is not None and seen.unknowns.delay is None:
+            return self.delayed(names, unknowns, promise)
         z, starts = seen.ahead(promise)
         own = [one.name for one in unknowns.each]
         at = [i for one, s in self.setting.each_of(seen.unknowns) if one.name in own for i in range(s.start, s.stop)]
         z = np.clip(z[at], *unknowns.bounds)
-        if unknowns.delay is None or seen.unknowns.delay is not None:
-            return self.running(names, unknowns, self.setting.cut, starts, z, promise)
-        return self.delayed(names, unknowns, unknowns.z_start, promise)
+        return self.running(names, unknowns, self.setting.cut, starts, z, promise)
 
-    def delayed(self, names: tuple[str, ...], unknowns: Unknowns, z: Array, promise: Promise) -> Runner:
+    def delayed(self, names: tuple[str, ...], unknowns: Unknowns, promise: Promise) -> Runner:
         """From the delay from which steps leave least; a step sees only as far as inputs stay the same."""
-        best = self.running(names, unknowns, self.setting.cut, self.setting.starts, z, promise)
+        best = self.running(names, unknowns, self.setting.cut, self.setting.starts, unknowns.z_start, promise)
         best.left, worse = np.inf, 0
         for delay in self.setting.delays:
             if worse > 1:
                 break
-            at = z.copy()
+            at = unknowns.z_start.copy()
             at[unknowns.delay] = delay
             worse += 1
             one = self.running(names, unknowns, self.setting.cut, self.setting.starts_at(float(delay)), at, promise)

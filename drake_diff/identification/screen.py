@@ -85,6 +85,9 @@ class Promise:
     step: Array  # of z of the members, one after the other
 
 
+NO_PROMISE = Promise((), np.inf, 0.0, np.zeros(0))
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """The least squares in all changes, linearized at one motion."""
