@@ -14,9 +14,9 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.flow import ContinuousMotion
-from drake_diff.identification.judge import FALSE_ALARM, colour_of, most_scatter
+from drake_diff.identification.judge import FALSE_ALARM, Known, colour_of, most_scatter, unidentifiable
 from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.unknowns import choose_unknowns, set_numbers
+from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.step import set_state
 
@@ -96,6 +96,35 @@ def test_what_is_seen_only_together_is_named(pendulum):
     assert e.intervals["pole.mass"][1] == np.inf
     assert "2 cannot be known from these recordings (hinge.damping and pole.mass" in e.sentence
     assert e.values["hinge.damping"] / e.values["pole.mass"] == pytest.approx(0.1, rel=0.01)
+
+
+@each_row(
+    "names, values, seen, words",
+    [
+        (("a.friction", "b.friction"), (0.5, 0.8), lambda a, b: 2 * a * b / (a + b), "harmonic mean"),
+        (("a.friction", "b.friction"), (0.5, 0.5), lambda a, b: 2 * a * b / (a + b), "harmonic mean"),
+        (("a.stiffness", "b.stiffness"), (1e4, 3e4), lambda a, b: a * b / (a + b), "harmonic mean"),
+        (("a.mass", "b.mass"), (1.0, 2.5), lambda a, b: a + b, "sum"),
+        (("a.mass", "b.mass"), (1.0, 1.0), lambda a, b: a + b, "sum"),
+        (("a.mass", "b.mass"), (1.0, 2.5), lambda a, b: a / b, "quotient"),
+        (("a.gear_ratio", "b.gear_ratio"), (3.0, 4.0), lambda a, b: a * b, "product"),
+        (("a.gear_ratio", "b.gear_ratio"), (3.0, 4.0), lambda a, b: a - b, "difference"),
+        (("a.strength", "a.gear_ratio"), (2.0, 7.0), lambda a, b: a * b, "product"),
+        (("a.strength", "a.gear_ratio"), (2.0, 7.0), lambda a, b: a + b, None),
+        (("a.friction", "b.friction"), (0.5, 0.8), lambda a, b: a + b, None),
+    ],
+)
+def test_what_is_seen_of_two_is_told_as_it_is(names, values, seen, words):
+    """The direction in which a function of two numbers stays as it is, by its derivatives."""
+    each = [Unknown(name, "", np.array([v]), 0.0, v) for name, v in zip(names, values, strict=True)]
+    a, b = np.array(values) * (1 + 1e-6j), np.array(values)
+    by_a, by_b = np.imag(seen(a[0], b[1])) / a[0].imag, np.imag(seen(b[0], a[1])) / a[1].imag
+    unknowns, direction = Unknowns(tuple(each)), np.array([by_b, -by_a])
+    z = unknowns.z_start
+    (told,) = unidentifiable(unknowns, z, Known(np.eye(2), (np.linalg.inv(unknowns.by_z(z)) @ direction,)))
+    ends = "leaves the motion as it is" if words is None else f"only their {words} is seen"
+    assert told.endswith(ends)
+    assert all(name in told for name in names)
 
 
 def test_a_parameter_that_does_nothing_is_named(pendulum):

@@ -18,6 +18,7 @@ UNSEEN = 1.0  # a change by so many times its own size that the data leave open 
 NOTHING = 1e-8  # of a unit's effect: rounding
 PART = 0.03  # of the largest change in a combination: what is not told
 FALSE_ALARM = 0.004  # of all tests of residuals together, where the model is right
+COMBINED = ("friction", "stiffness")  # of two bodies that touch, which Drake makes one of: 2 a b / (a + b), half of it
 LAGS = 10
 MANY = 1000  # samples, from which on Q is nearly as chi-square says
 DRAWN = 2_000_000  # numbers of white noise for each length of a piece
@@ -117,13 +118,10 @@ def _words(unknowns: Unknowns, values: Array, change: Array) -> str:
         if len(told) == 1:
             return f"{names[0]}: a change of it leaves the motion as it is"
         return f"{name}: a change of {_listed(names)} together leaves the motion as it is"
-    relative = change[told] / np.where(values[told] != 0, values[told], np.inf)
-    if len(told) == 2 and np.all(relative != 0):
-        ratio = relative[0] / relative[1]
-        if abs(ratio + 1) < 0.02:
-            return f"{names[0]} and {names[1]}: only their product is seen"
-        if abs(ratio - 1) < 0.02:
-            return f"{names[0]} and {names[1]}: only their quotient is seen"
+    both = {name.rsplit(".", 1)[1] for name in quantities}
+    seen = _seen_of_two(values[told], change[told], both.pop() if len(both) == 1 else "") if len(told) == 2 else ""
+    if seen:
+        return f"{names[0]} and {names[1]}: only their {seen} is seen"
     # Told as what a tenth of the first one's size does.
     factor = 0.1 / parts[told[0]]
     if change[told[0]] < 0:
@@ -133,6 +131,22 @@ def _words(unknowns: Unknowns, values: Array, change: Array) -> str:
     ]
     more = f" and {len(told) - 6} more" if len(told) > 6 else ""
     return f"a change of {' with '.join(each)}{more} leaves the motion as it is"
+
+
+def _seen_of_two(values: Array, change: Array, quantity: str) -> str:
+    """What of two values stays as it is in a small change of both; "" where no word says it.
+
+    `quantity` is what both are, if it is the same. Of equal values several words would be true: the likeliest is told.
+    """
+    if np.any(values * change == 0):
+        return ""
+    absolute, relative = change[0] / change[1], change[0] / change[1] * values[1] / values[0]
+    words = {"product": relative, "quotient": -relative}
+    if quantity in COMBINED:
+        words = {"harmonic mean": relative * values[1] / values[0]}
+    elif quantity:
+        words = {"sum": absolute, "quotient": -relative, "product": relative, "difference": -absolute}
+    return next((word for word, ratio in words.items() if abs(ratio + 1) < 0.02), "")
 
 
 def _owners(unknowns: Unknowns, columns: Sequence[int]) -> set[int]:

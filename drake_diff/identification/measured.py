@@ -22,6 +22,9 @@ WINDOW = 9  # samples that a cubic is laid through, at least
 WINDOW_TIME = 0.05  # [s] and over this time at least
 ORDERS = 8  # of differences of neighbouring samples that tell the noise
 NO_NOISE = 1e-9  # of a column's range: what is recorded without noise is still rounded
+FEWEST = 6  # differences that tell the noise
+FEWEST_WITH_JUMPS = 20  # differences whose median tells it
+MAD = 1.4826  # of the median of normal deviations: their standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +173,11 @@ def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, c
     return found
 
 
-def noise_by_differences(chart: Chart, pieces: Sequence[Piece]) -> Array:
+def noise_by_differences(chart: Chart, pieces: Sequence[Piece], *, jumps: bool = False) -> Array:
     """(2 nv + m,) an upper estimate of the noise of each entry: of differences of orders 1 to ORDERS, the least one.
 
-    White noise s makes the difference of order d vary by s sqrt(binomial(2 d, d)); what moves adds to that.
+    White noise s makes the difference of order d vary by s sqrt(binomial(2 d, d)); what moves adds to that. Where the
+    motion `jumps`, as in impacts, which are few, the median of many differences says how large they are.
     """
     increments = [chart.minus(piece.ys[1:], piece.ys[:-1]) for piece in pieces]
     increments = [
@@ -186,8 +190,12 @@ def noise_by_differences(chart: Chart, pieces: Sequence[Piece]) -> Array:
         for order in range(1, ORDERS + 1):
             parts = [np.diff(each[:, j], n=order - 1) for each in increments]
             known = np.concatenate([part[np.isfinite(part)] for part in parts])
-            if len(known) >= 6:
-                least[j] = min(least[j], float(np.sqrt(np.mean(known**2) / comb(2 * order, order))))
+            size = np.inf
+            if jumps and len(known) >= FEWEST_WITH_JUMPS:
+                size = MAD * float(np.median(np.abs(known)))
+            elif len(known) >= FEWEST:
+                size = float(np.sqrt(np.mean(known**2)))
+            least[j] = min(least[j], size / float(np.sqrt(comb(2 * order, order))))
         travelled = np.concatenate([each[:, j] for each in increments])
         reach[j] = np.nansum(np.abs(travelled)) if np.any(np.isfinite(travelled)) else 0.0
     seen = np.any([np.isfinite(each).any(axis=0) for each in increments], axis=0)

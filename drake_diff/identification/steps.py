@@ -8,13 +8,13 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.derivatives.step import derivatives_along
-from drake_diff.derivatives.steps import take_steps
 from drake_diff.exceptions import GradientError, InputError, ModelError
 from drake_diff.identification.measured import Piece
 from drake_diff.identification.tree import Numbers
 from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
+from drake_diff.model.step import advance
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,8 @@ class DiscreteMotion:
         xs = np.repeat(starts[:, None], hs.shape[1] + 1, axis=1)
         with applied(vector) as model:
             for k, count in enumerate(np.count_nonzero(hs, axis=1)):
-                xs[k, 1 : count + 1] = take_steps(model, vector, starts[k], us[k, :count]).x_next
+                for i in range(count):
+                    xs[k, i + 1] = advance(model.double, xs[k, i], us[k, i])
                 xs[k, count + 1 :] = xs[k, count]
         return xs
 

@@ -39,6 +39,18 @@ def explained_by(columns: Mistaken) -> Explanation:
     return Explanation((columns.words,), {}, {}, others, True, columns.sentence, columns.evidence)
 
 
+def changed_to(name: str, values: Array, intervals: Array, start: Array, unit: str) -> str:
+    """What a quantity (k,) is, with its intervals (k, 2), and what it is in the model."""
+    columns = [name] if len(start) == 1 else [f"{name}[{k}]" for k in range(len(start))]
+    unit = f" {unit}" if unit not in ("", "1") else ""
+    return ", ".join(
+        f"{column} is {v:.4g}{unit} ({low:.4g} to {high:.4g}), not {was:.4g}"
+        if np.isfinite(low) and np.isfinite(high)
+        else f"{column} cannot be known"
+        for column, v, (low, high), was in zip(columns, values, intervals, start, strict=True)
+    )
+
+
 @dataclass(eq=False)
 class Words:
     """The sentence for what a search found."""
@@ -71,14 +83,7 @@ class Words:
         else:
             own = next(each for each in self.setting.unknowns.each if each.name == name)
             start, unit = own.start, own.unit
-        columns = [name] if len(start) == 1 else [f"{name}[{k}]" for k in range(len(start))]
-        unit = f" {unit}" if unit not in ("", "1") else ""
-        return ", ".join(
-            f"{column} is {v:.4g}{unit} ({low:.4g} to {high:.4g}), not {was:.4g}"
-            if np.isfinite(low) and np.isfinite(high)
-            else f"{column} cannot be known"
-            for column, v, (low, high), was in zip(columns, value, interval, start, strict=True)
-        )
+        return changed_to(name, value, interval, start, unit)
 
     @property
     def end(self) -> str:
