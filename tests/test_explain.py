@@ -319,9 +319,6 @@ def test_a_comparison_with_a_recording_names_the_cause(pendulum, tmp_path):
     assert each["brief"].sentence.startswith("No cause was looked for: recording brief: samples")
     for text in (" ".join(done.output.split()), html.unescape((out / "comparison.html").read_text())):
         assert each["lab"].sentence in text
-    told = dd.verify(out)
-    assert told.verdict == "intact"
-    assert any("lab: its cause was not looked for again" in line for line in told.unchecked)
 
 
 def test_a_law_that_no_parameter_has_is_not_explained(pendulum):

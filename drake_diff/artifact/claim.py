@@ -6,6 +6,7 @@ from typing import Any
 from drake_diff.artifact.differences import shown
 from drake_diff.artifact.sections import COSTS, LIMITS
 from drake_diff.record.certification import CertificationRecord
+from drake_diff.record.comparison import ComparisonRecord
 from drake_diff.record.identification import IdentificationRecord
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.sealed import SealedRecord
@@ -32,6 +33,8 @@ def claims_of(record: SealedRecord) -> tuple[str, ...]:
         lines.append(f"certificates at {asked}")
     elif isinstance(record, IdentificationRecord):
         lines += _of_an_identification(record)
+    elif isinstance(record, ComparisonRecord):
+        lines += [f"cause of {e.engine}: {e.cause.sentence}" for e in record.engines if e.cause is not None]
     return tuple(lines)
 
 

@@ -3,7 +3,6 @@
 The recordings are kept as they were read, so that `verify` fits them again.
 """
 
-import io
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
@@ -15,9 +14,10 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import make_folder, write_whole
-from drake_diff._base.strangers import arrays_of, read_plain
+from drake_diff._base.strangers import read_plain
 from drake_diff.artifact.identified_motion import joined
 from drake_diff.artifact.rerun import TRACE, rebuilt
+from drake_diff.comparison.kept import ARRAYS, LARGEST, RECORDINGS, read_arrays, write_arrays
 from drake_diff.comparison.recordings import Recording, read_recording
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.identification.identify import Asked, Identification, identify
@@ -33,10 +33,8 @@ from drake_diff.record.parts import DataBoundary, DataUse
 from drake_diff.record.provenance import model_input, provenance_of, written_now
 from drake_diff.record.sealed import WallClock, canonical, reproducible
 
-OUTPUT = "output "  # before the name of a sensor's column, among the arrays
-REPORT, RECORDINGS, ARRAYS = "report.html", "recordings", "arrays.npz"
+REPORT = "report.html"
 MADE = (TRACE, REPORT)  # what is made again, beside the record
-LARGEST = 64 * 2**20  # bytes of a recording that is kept
 
 
 def save_identification(identification: Identification, directory: str | Path) -> IdentificationRecord:
@@ -83,10 +81,7 @@ def _size(path: Path) -> int:
 def _keep(place: Path, recording: Recording, given: tuple[Path, str] | None) -> None:
     make_folder(place.parent)
     if given is None:
-        buffer = io.BytesIO()
-        outputs: dict[str, Any] = {f"{OUTPUT}{name}": values for name, values in recording.outputs.items()}
-        np.savez(buffer, times=recording.times, xs=recording.xs, us=recording.us, **outputs)
-        write_whole(place, buffer.getvalue())
+        write_arrays(place, recording)
     elif given[0].is_dir():
         for path in sorted(given[0].rglob("*")):
             if path.is_file():
@@ -280,7 +275,7 @@ def identified_again(
                 raise ArtifactError(f"{record.FILE}: recording {kept.name} is not where drake_diff keeps it")
             path = folder / kept.path
             if kept.file is None:
-                given.append(_read_arrays(path, kept))
+                given.append(read_arrays(path, kept.name, kept.version, kept.facts))
                 files.append(None)
             else:
                 if not path.exists() or hash_of(path) != kept.sha256:
@@ -302,13 +297,3 @@ def identified_again(
         made = record_of(found, record.name)
     kept_as = {name: getattr(record, name) for name in ("provenance", "wall_clock", "files", "record_sha256")}
     return made.model_copy(update=kept_as), found
-
-
-def _read_arrays(path: Path, kept: records.RecordingEvidence) -> Recording:
-    found = arrays_of(path)
-    missing = {"times", "xs", "us"} - found.keys()
-    if missing:
-        raise ArtifactError(f"{kept.path} is not a recording: it has no {', '.join(sorted(missing))}")
-    times, xs, us = (found.pop(name) for name in ("times", "xs", "us"))
-    outputs = {name.removeprefix(OUTPUT): values for name, values in found.items() if name.startswith(OUTPUT)}
-    return Recording(kept.name, kept.version, times, xs, us, dict(kept.facts), outputs)

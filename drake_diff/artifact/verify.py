@@ -89,8 +89,8 @@ class Verification(ShowsItsRepr):
     """What `verify` found in a directory.
 
     `verdict` is "holds" where every file is as it was written and all of it came out again; "intact" where every file
-    is as it was written and nothing was made again; "undecided" where what the record's verdict rests on could not be
-    made again; "broken" where something is not what it was.
+    is as it was written, and nothing, or only what rests on recordings, was made again; "undecided" where what the
+    record's verdict rests on could not be made again; "broken" where something is not what it was.
 
     That a record holds says that it is true, not that the run was a success: that is `record.verdict`.
 
@@ -130,7 +130,8 @@ class Verification(ShowsItsRepr):
             return "broken"
         if self.undecided:
             return "undecided"
-        return "holds" if self.checked else "intact"
+        all_of_it = self.record is not None and self.record.kind not in NOT_RERUN
+        return "holds" if self.checked and all_of_it else "intact"
 
     @property
     def holds(self) -> bool:
@@ -143,7 +144,9 @@ class Verification(ShowsItsRepr):
         if self.verdict == "holds":
             return f"run again, all {self.checked} values came out" + (" but for rounding" if self.rounded else "")
         if self.verdict == "intact":
-            return "the files are as they were written; the numbers were not taken again"
+            part = f"all {self.checked} values of the recordings and their causes came out again, "
+            rest = f"{part}and the engines were not run" if self.checked else "the numbers were not taken again"
+            return f"the files are as they were written; {rest}"
         return "; ".join(self.complaints or self.undecided)
 
     @property
@@ -191,10 +194,11 @@ def verify(
     easier task is as true as any: `claimed` says what was asked.
 
     Comparisons, robustness trials, panels and rollouts' certificates are not run again: their verdict is at best
-    "intact". Of a panel, and of the record of one trial of it, what follows from its journal is made again. What
-    cannot be run again (a model that came from a diagram, a user's functions, a search that a time limit ended) makes
-    the verdict "undecided", and so does another version of Drake where numbers differ. It takes as long as the solve
-    did, of which it waits for 60 seconds where `time_limit` says nothing else.
+    "intact". But recordings that were compared are compared again, and their causes looked for. Of a panel, and of the
+    record of one trial of it, what follows from its journal is made again. What cannot be run again (a model that came
+    from a diagram, a user's functions, a search that a time limit ended) makes the verdict "undecided", and so does
+    another version of Drake where numbers differ. It takes as long as the solve or the search for causes did, of which
+    it waits for 60 seconds where `time_limit` says nothing else.
 
     The directory may be a stranger's. Its model is read and run in a process of its own, which has limits of time and
     memory, no network, and no file to open but those of the directory, of Python and below `models`. Where that process
@@ -230,7 +234,7 @@ def verify(
     found = _looked_at(folder)
     if found.complaints or found.undecided or found.record is None:
         return found
-    if found.record.kind in NOT_RERUN:
+    if found.record.kind in NOT_RERUN and not has_recordings(found.record):
         return _run_again(found, found.record, None)
     answer = call_on("drake_diff.artifact.verify:_apart", folder, models, float(time_limit), float(memory_limit))
     found = replace(found, unlimited=answer.unlimited)
@@ -300,6 +304,8 @@ def _run_again(found: Verification, record: SealedRecord, models: Path | None) -
             return _phases_again(found, record, models)
         if isinstance(record, IdentificationRecord):
             return _identify_again(found, record, models)
+        if isinstance(record, ComparisonRecord) and record.recordings:
+            return _recordings_again(found, record, models)
         if isinstance(record, PanelRecord):
             found = _judged(found, odd_panel(found.directory, record), [])
     except (ModelError, MissingDependencyError) as error:
@@ -314,12 +320,37 @@ def _run_again(found: Verification, record: SealedRecord, models: Path | None) -
 
 def _not_run_again(found: Verification, record: SealedRecord) -> Verification:
     told = [f"every number: {NOT_RERUN[record.kind]}"]
+    told += _of_functions(record) if isinstance(record, ComparisonRecord) else ()
     for e in record.engines if isinstance(record, ComparisonRecord) else ():
-        if e.function is not None:
-            told.append(f"{e.engine}: a user's function ({e.function.name}), whose code the record does not hold")
         if e.cause is not None:
-            told.append(f"{e.engine}: its cause was not looked for again")
+            told.append(f"{e.engine}: its cause was not looked for again: its recording is not in the directory")
     return replace(found, unchecked=tuple(told))
+
+
+def has_recordings(record: SealedRecord) -> bool:
+    """Whether it is a comparison with recordings that can be compared again."""
+    return isinstance(record, ComparisonRecord) and bool(record.recordings)
+
+
+def _recordings_again(found: Verification, record: ComparisonRecord, models: Path | None) -> Verification:
+    """The recordings compared again, and their causes looked for; engines are not run."""
+    from drake_diff.artifact.recordings_again import NEVER, WRITTEN, recordings_again
+
+    again = recordings_again(found.directory, record, models)
+    differing = again.compared.differing
+    problems = [*_odd_schema(record), *again.problems, *(str(d) for d in differing if not d.allowed)]
+    carried = "" if record.model.file is None else record.model.file.path
+    kept = (carried, *WRITTEN, *(r.path for r in record.recordings))
+    unchecked = (*UNCHECKED, *NEVER, *again.unchecked, *_of_functions(record), *_others(record, kept))
+    rounded = tuple(str(d) for d in differing if d.allowed)
+    told = replace(found, unchecked=unchecked, rounded=rounded, checked=again.compared.count)
+    return _judged(told, problems, again.undecided)
+
+
+def _of_functions(record: ComparisonRecord) -> Iterator[str]:
+    for e in record.engines:
+        if e.function is not None:
+            yield f"{e.engine}: a user's function ({e.function.name}), whose code the record does not hold"
 
 
 def _without_its_functions(found: Verification, record: SealedRecord, error: Exception) -> Verification:
@@ -625,7 +656,7 @@ def _other_versions(record: SealedRecord) -> tuple[str, ...]:
     used = ["drake", "drake-diff", "numpy", "casadi"]
     if isinstance(record, EvidenceRecord) and record.elsewhere is not None:
         used += record.elsewhere.engines
-    if isinstance(record, IdentificationRecord):
+    if isinstance(record, IdentificationRecord) or has_recordings(record):
         used.append("numba")  # by which the motions are computed, where it is there
     names = [n for n in used if was.get(n) != now.get(n)]
     told = [f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names]

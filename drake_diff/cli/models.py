@@ -120,13 +120,13 @@ def compare(
     status 0 only if every engine agrees with Drake, or differs by a law that its contract states.
     """
     from drake_diff.comparison.files import PAGE, write_comparison
-    from drake_diff.comparison.recordings import read_recording
+    from drake_diff.comparison.recordings import read_recording, with_own_names
     from drake_diff.comparison.side_by_side import compare as compare_engines
     from drake_diff.identification.cause import cause_of
     from drake_diff.record.directory import written_whole
 
     directory = out or Path("artifacts") / f"compare_{file.stem}"
-    recordings = [read_recording(path, model) for path in recording or ()]
+    recordings = with_own_names([read_recording(path, model) for path in recording or ()])
     with written_whole(directory) as folder:
         found = compare_engines(model, names_in(engines), recordings=recordings, num_steps=num_steps, seed=seed)
         apart = {e.engine for e in found.engines if e.verdict != "same"}

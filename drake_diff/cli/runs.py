@@ -229,7 +229,8 @@ def verify(
 
     RUN is what a solve, a comparison, robustness trials or a certification wrote.
     Exit status 0 only if all of it came out again. What was claimed and what was not checked is printed first.
-    Comparisons and robustness trials are not run again: unchanged, they are "intact", with exit status 1.
+    Comparisons and robustness trials are not run again: unchanged, they are "intact", with exit status 1. But what was
+    said of recordings is made again: how they compare, and their causes.
     RUN may be a stranger's: its model is read in a process with limits of time, memory and files, and no network.
     """
     from drake_diff._base.guarded import start

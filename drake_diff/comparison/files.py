@@ -1,4 +1,7 @@
-"""A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page."""
+"""A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page.
+
+With recordings, their arrays and the model file too, so that `verify` compares them and looks for their causes again.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,8 +13,12 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.files import write_whole
 from drake_diff.comparison.attribution import Attribution
+from drake_diff.comparison.kept import LARGEST, place_of, size_of, write_arrays
+from drake_diff.comparison.recordings import Recording
 from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison, slugs
+from drake_diff.exceptions import InputError
 from drake_diff.logs.channels import input_channel, nanoseconds, state_channel, transform_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.logs.messages import TYPES
@@ -24,6 +31,7 @@ from drake_diff.record.parts import DataBoundary, DataUse
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 
 TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
+MOTION = "motion"  # among the data: the name of what every engine was given
 # Of ghosts: the second and further colours of the page's plots, the first being the reference's.
 COLOURS = (
     (0.85, 0.4, 0.04), (0.06, 0.54, 0.42), (0.64, 0.22, 0.61), (0.43, 0.42, 0), (0.32, 0.38, 0.43), (0.76, 0.09, 0.36),
@@ -38,7 +46,8 @@ def save_comparison(
 ) -> ComparisonRecord:
     """Write a comparison as a directory: comparison.json, trace.mcap, replay.html and comparison.html.
 
-    All of it is written beside `directory`, and takes its place at the end.
+    Recordings, where all of them take no more than 64 MiB, are kept in it, and with them the model file. All of it is
+    written beside `directory`, and takes its place at the end.
 
     Args:
         comparison: from `dd.compare`.
@@ -49,7 +58,7 @@ def save_comparison(
         The record in comparison.json, which `dd.verify` checks against the other files.
 
     Raises:
-        InputError: `directory` holds what no run wrote.
+        InputError: `directory` holds what no run wrote, or two recordings with causes have the same name.
         WriteError: the disk is full, or does not let a file be written.
 
     Example:
@@ -70,12 +79,31 @@ def write_comparison(
     from drake_diff.comparison.page import write_comparison_page  # what saves nothing need not load them
     from drake_diff.pages.meshcat import write_replay
 
+    names = [recording.name for recording in comparison.recordings]
+    twice = [name for name in names if names.count(name) > 1 and name in causes]
+    if twice:
+        raise InputError("recordings with causes", got=f"two called {twice[0]}", expected="a name for each")
     _begun(name_of(folder), comparison.model).begin(folder)
     record = record_of(comparison, name_of(folder), causes)
+    _keep(folder, comparison)
     write_comparison_trace(folder / TRACE, comparison)
     write_replay(folder / REPLAY, _scene(comparison), title=f"{record.name}: {record.verdict}")
     write_comparison_page(folder / PAGE, comparison, record, folder / REPLAY)
     return record.write(folder)
+
+
+def _kept(comparison: Comparison) -> tuple[Recording, ...]:
+    """All recordings, or none where they are too large together."""
+    return comparison.recordings if sum(map(size_of, comparison.recordings)) <= LARGEST else ()
+
+
+def _keep(folder: Path, comparison: Comparison) -> None:
+    kept = _kept(comparison)
+    for i, recording in enumerate(kept):
+        write_arrays(folder / place_of(i), recording)
+    source = comparison.model.source
+    if kept and source is not None:
+        write_whole(folder / source.name, source.read_bytes())
 
 
 def record_of(
@@ -86,8 +114,14 @@ def record_of(
         "verdict": "pass" if comparison.holds else "fail",
         "sentence": str(comparison),
         "states": [records.StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
-        "engines": [_engine(e, causes.get(e.engine)) for e in comparison.engines],
+        "engines": [row_of(e, causes.get(e.engine) if e.is_recorded else None) for e in comparison.engines],
         "data": _data(comparison, causes),
+        "recordings": [
+            records.RecordedEvidence(
+                name=r.name, version=r.version, facts=dict(r.facts), path=place_of(i), samples=len(r.times)
+            )
+            for i, r in enumerate(_kept(comparison))
+        ],
         "refused": [records.RefusedEvidence(**vars(refused)) for refused in comparison.refused],
         "wall_clock": records.ComparisonClock(
             written_utc=written_now(),
@@ -113,17 +147,12 @@ def _begun(name: str, model: Model) -> ComparisonRecord:
 
 
 def _data(comparison: Comparison, causes: Mapping[str, records.CauseEvidence]) -> DataBoundary:
-    """What all were given, and the recordings, which have neither Jacobians nor times."""
-
-    def use(name: str, what: str, *arrays: Array) -> DataUse:
-        data = b"".join(np.asarray(array, dtype=float).tobytes() for array in arrays)
-        return DataUse(name=name, what=what, sha256=sha256(data).hexdigest())
-
-    motion = use("motion", "the first state and the inputs that every engine was given", comparison.x0, comparison.us)
-    recorded = [e for e in comparison.engines if not e.jacobians and e.seconds_per_step is None]
+    """What all were given, and the recordings."""
+    motion = _use(MOTION, "the first state and the inputs that every engine was given", comparison.x0, comparison.us)
     recordings = [
-        use(e.engine, f"a recording of {len(e.motion.xs)} states", e.motion.times, e.motion.xs, e.motion.us)
-        for e in recorded
+        _use(e.engine, f"a recording of {len(e.motion.xs)} states", e.motion.times, e.motion.xs, e.motion.us)
+        for e in comparison.engines
+        if e.is_recorded
     ]
     statement = "nothing was fitted: engines are compared by their own steps, recordings as they were made"
     seen = [recording for recording in recordings if recording.name in causes]
@@ -132,7 +161,17 @@ def _data(comparison: Comparison, causes: Mapping[str, records.CauseEvidence]) -
     return DataBoundary(statement=statement, seen=seen, judged_on=[motion, *recordings])
 
 
-def _engine(e: Compared, cause: records.CauseEvidence | None) -> records.EngineEvidence:
+def _use(name: str, what: str, *arrays: Array) -> DataUse:
+    return DataUse(name=name, what=what, sha256=hash_of_arrays(*arrays))
+
+
+def hash_of_arrays(*arrays: Array) -> str:
+    """The hash of their numbers, one after the other."""
+    return sha256(b"".join(np.asarray(array, dtype=float).tobytes() for array in arrays)).hexdigest()
+
+
+def row_of(e: Compared, cause: records.CauseEvidence | None) -> records.EngineEvidence:
+    """What the record says of an engine or a recording."""
     same = ("engine", "version", "precision", "verdict", "sentence", "final_gap", "rollout_gap", "gradient")
     return records.EngineEvidence(
         **{name: getattr(e, name) for name in same}, contract=[records.LineEvidence(**vars(line)) for line in e.lines],

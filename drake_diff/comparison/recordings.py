@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +165,19 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
     if not gaps:
         check_recording(recording, model)
     return recording
+
+
+def with_own_names(recordings: Sequence[Recording]) -> list[Recording]:
+    """The same, those whose name was there before with a number behind it: they come from files called alike."""
+    found: list[Recording] = []
+    for recording in recordings:
+        names, count = [one.name for one in found], 1
+        name = recording.name
+        while name in names:
+            count += 1
+            name = f"{recording.name} {count}"
+        found.append(replace(recording, name=name))
+    return found
 
 
 def write_csv(recording: Recording, model: Model, path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import preformatted
 from drake_diff.comparison.attribution import Attribution
+from drake_diff.comparison.recordings import Recording
 from drake_diff.engines.contract_line import LAWS, UNKNOWN, ContractLine, is_another_model
 from drake_diff.engines.equations import UserFunction
 from drake_diff.engines.interface import Precision
@@ -88,6 +89,11 @@ class Compared:
     seconds_per_step: float | None = None
     seconds_per_jacobian: float | None = None
     function: UserFunction | None = None  # what is known of a user's own equations
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether it is a recording, and no engine."""
+        return not self.jacobians and self.seconds_per_step is None
 
     @property
     def different(self) -> tuple[ContractLine, ...]:
@@ -217,6 +223,7 @@ class Comparison:
         engines: per engine a `verdict` ("same", "other law", "other model", "unexplained"), a `sentence`, `step_gaps`
             (N,), `jacobian_gaps`, and in `first` and `largest` the term that is responsible.
         refused: engines that were not compared, and why.
+        recordings: those that were given.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -233,6 +240,7 @@ class Comparison:
     states: tuple[Probe, ...]
     engines: tuple[Compared, ...]
     refused: tuple[Refused, ...]
+    recordings: tuple[Recording, ...] = ()
 
     @property
     def reference(self) -> Compared:
@@ -292,7 +300,12 @@ def first_above(gaps: Array, precision: Precision) -> int | None:
 
 def slugs(comparison: Comparison) -> list[str]:
     """Names of the engines that can be parts of a topic; the place keeps them apart."""
-    return [f"{i}_" + re.sub(r"[^A-Za-z0-9]+", "_", e.engine).strip("_") for i, e in enumerate(comparison.engines)]
+    return [slug(i, e.engine) for i, e in enumerate(comparison.engines)]
+
+
+def slug(i: int, name: str) -> str:
+    """Such a name, of engine i."""
+    return f"{i}_" + re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
 
 
 def _largest(values: Iterable[float]) -> str:

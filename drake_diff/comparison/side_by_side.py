@@ -79,9 +79,8 @@ def compare(
     for recording in recordings:
         check_recording(recording, model)
     if recordings and x0 is None:
-        first = recordings[0]
-        x0 = first.xs[0]
-        us = np.repeat(first.us, steps_between(first, model.time_step), axis=0) if us is None else us
+        x0, own = _motion_of(recordings[0], model)
+        us = own if us is None else us
     sample = sample_states(model, 1, seed)[0]
     if us is None:
         count = num_steps or min(MOST_STEPS, max(1, round(DURATION / model.time_step)))
@@ -99,15 +98,45 @@ def compare(
             loaded.append(engine)
         except (MissingDependencyError, ModelError) as error:
             refused.append(Refused(str(wanted), str(error), isinstance(error, ModelError)))
-    panel = _Panel(model, reference, start, inputs, seed)
+    panel = _Panel(model, reference, start, inputs)
+    panel.look(seed)
     compared = []
     each: tuple[Engine | Recording, ...] = (reference, *loaded, *recordings)
     for one in each:
         try:
             compared.append(panel.recorded(one) if isinstance(one, Recording) else panel.compared(one))
         except SimulationError as error:
-            refused.append(Refused(one.name, f"it cannot take a step from one of the states: {error}", True))
-    return Comparison(model, start, inputs, tuple(panel.probes), tuple(compared), tuple(refused))
+            refused.append(_stuck(one, error))
+    return Comparison(model, start, inputs, tuple(panel.probes), tuple(compared), tuple(refused), tuple(recordings))
+
+
+def compare_recordings(model: Model, recordings: Sequence[Recording]) -> Comparison:
+    """What `compare` says of the recordings alone, where it was not told how the motion starts.
+
+    No Jacobian is taken: there are no `states`. `engines` and `recordings` are those that could be compared, in order.
+    """
+    for recording in recordings:
+        check_recording(recording, model)
+    start, us = _motion_of(recordings[0], model)
+    inputs = check_inputs(model, us, None)
+    panel = _Panel(model, DrakeEngine(model), start, inputs)
+    compared, refused, kept = [], [], []
+    for one in recordings:
+        try:
+            compared.append(panel.recorded(one))
+            kept.append(one)
+        except SimulationError as error:
+            refused.append(_stuck(one, error))
+    return Comparison(model, start, inputs, (), tuple(compared), tuple(refused), tuple(kept))
+
+
+def _motion_of(recording: Recording, model: Model) -> tuple[Array, Array]:
+    """Its first state (nx,) and its inputs (N, nu), step by step of the model."""
+    return recording.xs[0], np.repeat(recording.us, steps_between(recording, model.time_step), axis=0)
+
+
+def _stuck(one: Engine | Recording, error: SimulationError) -> Refused:
+    return Refused(one.name, f"it cannot take a step from one of the states: {error}", True)
 
 
 def default_engines(model: Model) -> tuple[str, ...]:
@@ -139,18 +168,22 @@ def _check_contact(reference: Engine, engine: Engine) -> None:
 class _Panel:
     """What each engine is asked, at the motion's start and deepest overlap, a state sampled free and one touching."""
 
-    def __init__(self, model: Model, reference: DrakeEngine, x0: Array, us: Array, seed: int):
+    def __init__(self, model: Model, reference: DrakeEngine, x0: Array, us: Array):
         self.space, self.names, self.model = tangent_space(model), model.input_names, model
         self.reference, self.x0, self.us = reference, x0, us
         self.coordinates = coordinates_of(model)
-        self.motion = motion = move(reference, x0, us)
+        self.motion = move(reference, x0, us)
+
+    def look(self, seed: int) -> None:
+        """Choose the states at which Jacobians are compared, and take the reference's: a recording has none."""
+        motion = self.motion
         self.probes = [Probe("start", motion.xs[0], motion.us[0])]
-        self.probes += [Probe(sample.kind, sample.x, sample.u) for sample in sample_states(model, 2, seed + 1)]
+        self.probes += [Probe(sample.kind, sample.x, sample.u) for sample in sample_states(self.model, 2, seed + 1)]
         if motion.depth is not None and np.max(motion.depth[:-1], initial=0.0) > 0:
             k = int(np.argmax(motion.depth[:-1]))
             self.probes.append(Probe("deepest", motion.xs[k], motion.us[k]))
-        self.jacobians = self._jacobians(reference)
-        self.product = rollout_jacobian(reference, self.space, self.motion)
+        self.jacobians = self._jacobians(self.reference)
+        self.product = rollout_jacobian(self.reference, self.space, motion)
 
     def compared(self, engine: Engine) -> Compared:
         is_reference = engine is self.reference

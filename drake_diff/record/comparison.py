@@ -61,6 +61,16 @@ class CauseEvidence(Part):
     sentence: str
 
 
+class RecordedEvidence(Part):
+    """A recording that was compared; its arrays are in the directory, so that it can be compared again."""
+
+    name: str
+    version: str
+    facts: dict[str, str]  # what is known of the engine's contract
+    path: str
+    samples: int
+
+
 class EngineEvidence(Part):
     """One engine beside the reference."""
 
@@ -124,6 +134,7 @@ class ComparisonRecord(SealedRecord):
     states: list[StateEvidence]
     engines: list[EngineEvidence]
     refused: list[RefusedEvidence]
+    recordings: list[RecordedEvidence] = Field(default_factory=list)  # none: none kept, or of before 2.4
     wall_clock: ComparisonClock
 
     @model_validator(mode="after")

@@ -23,7 +23,7 @@ from drake_diff.record.parts import DataBoundary, Embodiment, FileEvidence, Mode
 from drake_diff.record.provenance import file_evidence
 
 # A new major one where a field goes or changes its meaning, a minor one where one is added.
-SCHEMA_VERSION = "2.3.0"
+SCHEMA_VERSION = "2.4.0"
 # How others are read, word for word in every published schema.
 READING = (
     f"This is version {SCHEMA_VERSION}. An earlier minor version of the same major one is read with what it lacks "
