@@ -15,6 +15,8 @@ from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNam
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.judge import FALSE_ALARM, Known, colour_of, most_scatter, unidentifiable
+from drake_diff.identification.judge import FALSE_ALARM, colour_of, most_scatter
+from drake_diff.identification.set_tree import SetTree
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
@@ -185,7 +187,9 @@ def test_a_chaotic_motion_is_fitted(load):
     numbers = set_numbers(model, tree, unknowns, np.array(list(truth.values())))
 
     def rates(t, x):
-        return np.concatenate([x[2:], tree.accelerate(numbers, x[None, :2], x[None, 2:], np.zeros((1, model.nu)))[0]])
+        return np.concatenate(
+            [x[2:], SetTree(tree, numbers).accelerate(x[None, :2], x[None, 2:], np.zeros((1, model.nu)))[0]]
+        )
 
     times = np.linspace(0, 3, 301)
     found = solve_ivp(rates, (0, 3), [2.5, 1.5, 0.0, 0.0], rtol=1e-10, atol=1e-10, t_eval=times)
@@ -209,17 +213,17 @@ def test_accelerations_are_drakes_and_steps_have_the_slopes_of_differences(name)
         model.double.mass_matrix(), model.actuation @ u - model.double.inverse_dynamics(np.zeros(model.nv))
     )
     nq = model.nq
-    found = tree.accelerate(tree.numbers, x[None, :nq], x[None, nq:], u[None])[0]
+    found = SetTree(tree, tree.numbers).accelerate(x[None, :nq], x[None, nq:], u[None])[0]
     np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
     numbers = tree.numbers
     by = np.eye(len(numbers.flat))
-    slopes = tree.slopes(numbers, x[None, :nq], x[None, nq:], u[None], by)
+    slopes = SetTree(tree, numbers).slopes(x[None, :nq], x[None, nq:], u[None], by)
     direction = random.uniform(-1, 1, len(by)) * np.maximum(np.abs(numbers.flat), 1e-3)
 
     def moved(size):
         flat = numbers.flat + size * direction
         parts = {name: flat[numbers.places(name)] for name in type(numbers).__dataclass_fields__}
-        return tree.accelerate(type(numbers)(**parts), x[None, :nq], x[None, nq:], u[None])[0]
+        return SetTree(tree, type(numbers)(**parts)).accelerate(x[None, :nq], x[None, nq:], u[None])[0]
 
     difference = (moved(1e-5) - moved(-1e-5)) / 2e-5
     # Differences over 1e-5 of light links are good to 1e-6 of the largest.

@@ -14,6 +14,7 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.sensors import choose_sensors
+from drake_diff.identification.set_tree import SetTree
 from drake_diff.identification.tree import Numbers, tree_for_identification
 from drake_diff.mechanics.description import coordinates_of
 
@@ -36,7 +37,7 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
     read = sensors.read(numbers, x[None, :nq], x[None, nq:], u[None])[0]
     context = plant.CreateDefaultContext()
     plant.SetPositionsAndVelocities(context, x)
-    a = tree.accelerate(numbers, x[None, :nq], x[None, nq:], u[None])[0]
+    a = SetTree(tree, numbers).accelerate(x[None, :nq], x[None, nq:], u[None])[0]
     frame, world = plant.GetBodyByName(body).body_frame(), plant.world_frame()
     on_body = RigidTransform(RollPitchYaw(*POSE[3:]), POSE[:3])
     pose = frame.CalcPoseInWorld(context) @ on_body
@@ -52,7 +53,7 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
     np.testing.assert_allclose(read[6:9], R @ (acceleration[3:] + 9.81 * np.eye(3)[2]), atol=1e-9 * size)
     # What the links need is what the drive gives: inverse dynamics without rotors, springs and friction.
     k = plant.GetJointByName(joint).velocity_start()
-    moving = tree._with(numbers).moving(tree.place(numbers, x[None, :nq]), x[None, nq:])
+    moving = SetTree(tree, numbers)._moving(x[None, :nq], x[None, nq:])
     assert read[9] == pytest.approx(moving.forces(a[None])[0][0, k], abs=1e-9 * np.abs(a).max())
 
     by = np.eye(len(numbers.flat))

@@ -14,6 +14,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import ModelError, UnknownNameError
+from drake_diff.identification.set_tree import SetTree
 from drake_diff.identification.tree import Tree, ten_numbers, tree_for_identification
 from drake_diff.model.model import Model
 
@@ -107,7 +108,7 @@ def _effects(model: Model, tree: Tree, count: int) -> list[Array]:
     N = max(STATES, 20 * count // max(model.nv, 1) + 1)
     q = random.uniform(-np.pi, np.pi, (N, model.nq))
     v, a = random.standard_normal((2, N, model.nv))
-    return tree.regressors(numbers, q, v, a)
+    return SetTree(tree, numbers).regressors(q, v, a)
 
 
 def _sums(effects: Array, names: Sequence[str], units: Sequence[str], values: Array) -> tuple[BaseParameter, ...]:

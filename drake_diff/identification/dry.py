@@ -12,7 +12,6 @@ Derivatives go through such an end as Aizerman and Gantmacher (1958) say: a join
 where it goes on the other way, what it had is stretched by how its acceleration jumps.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,16 +21,15 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.flow import CHUNK, ContinuousMotion
 from drake_diff.identification.frozen import exponential
-from drake_diff.identification.tree import Grip, Mask, Numbers, Tree, caught, held_inverse
-from drake_diff.identification.unknowns import COULOMB, Unknowns, numbers_at, set_numbers
+from drake_diff.identification.set_tree import SetTree, caught, held_inverse
+from drake_diff.identification.tree import Grip, Mask, Numbers, Tree
+from drake_diff.identification.unknowns import COULOMB, Unknowns
 from drake_diff.model.model import Model
 
 REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
 MOST_PARTS = 60  # of a step: one with more has no end that could be told, and none is
 SEARCHED, MET = 99, 1e-9  # steps of the search for an end; [rad/s, m/s] or of the friction: how near it is then
 SHORT = 1e-13  # [s] between which an end is known well enough, however steep it is there
-
-Pushed = Callable[[Array, Array, Array, Array | None], tuple[Array, Array]]
 
 
 class Part(NamedTuple):
@@ -72,50 +70,48 @@ class DryMotion(ContinuousMotion):
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
-        numbers = set_numbers(self.model, self.tree, self.unknowns, values)
-        pushed = self.tree.pushed(numbers)
+        tree = self.set_tree(values)
         xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
         xs[:, 0] = starts
         for m in range(hs.shape[1]):
-            xs[:, m + 1], _ = self._steps(pushed, numbers, xs[:, m], hs[:, m], us[:, m])
+            xs[:, m + 1], _ = self._steps(tree, xs[:, m], hs[:, m], us[:, m])
         return xs
 
     def grip_at(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Grip:
         """(which way joints slide (N, nv), which are held (N, nv)) in states (N, nq), (N, nv) under u (N, nu)."""
-        nothing, pushed = np.zeros(v.shape), self.tree.pushed(numbers)
-        return self._grip(pushed, numbers, np.concatenate([q, v], axis=1), u, nothing, nothing > 0)
+        nothing, tree = np.zeros(v.shape), SetTree(self.tree, numbers)
+        return self._grip(tree, np.concatenate([q, v], axis=1), u, nothing, nothing > 0)
 
     def rates(self, values: Array, x: Array, u: Array) -> Array:
         """(N, nx) by time, of states (N, nx) under u (N, nu)."""
-        numbers = set_numbers(self.model, self.tree, self.unknowns, values)
-        turn, held = self.grip_at(numbers, x[:, : self.model.nq], x[:, self.model.nq :], u)
-        pushed = self.tree.pushed(numbers)
+        tree = self.set_tree(values)
+        grip = self.grip_at(tree.numbers, x[:, : self.model.nq], x[:, self.model.nq :], u)
+        return self._rates(x, self._accelerations(tree, x, u, grip))
 
-        def accelerate(q: Array, v: Array, u: Array) -> Array:
-            return self._pushes(pushed, numbers, np.concatenate([q, v], axis=1), u, turn, held)[0]
-
-        return self._rates(accelerate, x, u)
+    def _accelerations(self, tree: SetTree, x: Array, u: Array, grip: Grip | None) -> Array:
+        """(N, nv) in states x (N, nx) under u (N, nu)."""
+        return super()._accelerations(tree, x, u, None) if grip is None else self._pushes(tree, x, u, *grip)[0]
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
-        numbers, by = numbers_at(self.model, self.tree, self.unknowns, z)
-        pushed, (K, M), nx = self.tree.pushed(numbers), hs.shape, xs.shape[2]
+        tree, by = self.set_tree_at(z)
+        (K, M), nx = hs.shape, xs.shape[2]
         x, u = xs[:, :-1].reshape(K * M, nx), us.reshape(K * M, -1)
-        _, parts = self._steps(pushed, numbers, x, hs.reshape(-1), u)
+        _, parts = self._steps(tree, x, hs.reshape(-1), u)
         found = np.zeros((K * M, nx, nx + by.shape[1]))
         found[:, :, :nx] = np.eye(nx)
         for part in parts:
             for k in range(0, len(part.rows), CHUNK):
                 one = part.some(slice(k, k + CHUNK))
-                moved = self._taken_up(pushed, numbers, one) @ found[one.rows]
-                through = self._through(numbers, pushed, by, one)
+                moved = self._taken_up(tree, one) @ found[one.rows]
+                through = self._through(tree, by, one)
                 moved = through[:, :, :nx] @ moved
                 moved[:, :, nx:] += through[:, :, nx:]
                 found[one.rows] = moved
         found = found.reshape(K, M, nx, -1)
         return found[..., :nx], found[..., nx:]
 
-    def _steps(self, pushed: Pushed, numbers: Numbers, x: Array, h: Array, u: Array) -> tuple[Array, list[Part]]:
+    def _steps(self, tree: SetTree, x: Array, h: Array, u: Array) -> tuple[Array, list[Part]]:
         """Where steps from x (N, nx) of lengths h (N,) end, and their parts."""
         nv = self.model.nv
         x, left, parts = x.copy(), h.copy(), list[Part]()
@@ -125,14 +121,14 @@ class DryMotion(ContinuousMotion):
             rows = np.flatnonzero(left > 0)
             if not len(rows):
                 break
-            turn, held = self._grip(pushed, numbers, x[rows], u[rows], released[rows], stays[rows])
-            ends = self._moved(pushed, numbers, x[rows], left[rows], u[rows], turn, held)
-            room = self._room(pushed, numbers, ends, u[rows], turn, held)
+            turn, held = self._grip(tree, x[rows], u[rows], released[rows], stays[rows])
+            ends = self._moved(tree, x[rows], left[rows], u[rows], turn, held)
+            room = self._room(tree, ends, u[rows], turn, held)
             lengths, which = left[rows].copy(), np.zeros(len(rows), dtype=np.intp)
             last = np.flatnonzero(np.any(room < 0, axis=1))
             if len(last):
                 own = x[rows][last], u[rows][last], turn[last], held[last]
-                lengths[last], ends[last], which[last] = self._end(pushed, numbers, *own, lengths[last], room[last])
+                lengths[last], ends[last], which[last] = self._end(tree, *own, lengths[last], room[last])
             parts.append(Part(rows, x[rows], lengths, u[rows], turn, held, stopped[rows], turned[rows], holding[rows]))
             released[rows], stopped[rows], stays[rows] = 0.0, -1, False
             turned[rows], holding[rows] = turn, held
@@ -144,7 +140,7 @@ class DryMotion(ContinuousMotion):
                 else:
                     ends[last[slid], self.model.nq + j[slid]] = 0.0
                     stopped[at[slid]] = j[slid]
-                _, push = self._pushes(pushed, numbers, ends[last], u[at], turn[last], held[last])
+                _, push = self._pushes(tree, ends[last], u[at], turn[last], held[last])
                 released[at[~slid], j[~slid]] = np.sign(push[~slid, j[~slid]])
             x[rows] = ends
             left[rows] = left[rows] - lengths
@@ -168,16 +164,16 @@ class DryMotion(ContinuousMotion):
         """(nv,) which joints have dry friction."""
         return np.isin(np.arange(self.model.nv), self.joints)
 
-    def _grip(self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, released: Array, stays: Mask) -> Grip:
+    def _grip(self, tree: SetTree, x: Array, u: Array, released: Array, stays: Mask) -> Grip:
         """(turn, held) of a motion that begins at x; a joint at rest is held where friction can."""
-        v, own, friction = x[:, self.model.nq :], self.own, self.tree.friction(numbers)
+        v, own, friction = x[:, self.model.nq :], self.own, tree.friction()
         turn = np.where(own, released if self.gives else np.where(np.abs(v) > REST, np.sign(v), released), 0.0)
         held = own & (turn == 0)
         for _ in self.joints:
             some = np.flatnonzero(np.any(held, axis=1))
             if not len(some):
                 break
-            _, push = self._pushes(pushed, numbers, x[some], u[some], turn[some], held[some])
+            _, push = self._pushes(tree, x[some], u[some], turn[some], held[some])
             beyond = np.where(held[some] & ~stays[some], np.abs(push) - friction, -np.inf)
             j = np.argmax(beyond, axis=1)
             let = beyond[np.arange(len(some)), j] > 0
@@ -187,50 +183,44 @@ class DryMotion(ContinuousMotion):
             held[some[let], j[let]] = False
         return turn, held
 
-    def _pushes(
-        self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, turn: Array, held: Mask
-    ) -> tuple[Array, Array]:
+    def _pushes(self, tree: SetTree, x: Array, u: Array, turn: Array, held: Mask) -> tuple[Array, Array]:
         """(accelerations (N, nv), what pushes joints that are held (N, nv))."""
         nq = self.model.nq
-        mass, force = pushed(x[:, :nq], x[:, nq:], u, turn)
+        mass, force = tree.pushed(x[:, :nq], x[:, nq:], u, turn)
         if self.gives:
-            mass, force = caught(numbers, mass, force, x[:, nq:], held)
+            mass, force = caught(tree.numbers, mass, force, x[:, nq:], held)
         if self.gives or not np.any(held):
             a = np.linalg.solve(mass, force[..., None])[..., 0]
-            push = numbers.held_inertia * a + numbers.held_damping * x[:, nq:]
+            push = tree.numbers.held_inertia * a + tree.numbers.held_damping * x[:, nq:]
             return np.asarray(a), np.where(held, push, 0.0)
         a = (held_inverse(mass, held) @ force[..., None])[..., 0]
         return a, np.where(held, force - (mass @ a[..., None])[..., 0], 0.0)
 
-    def _moved(self, pushed: Pushed, numbers: Numbers, x: Array, h: Array, u: Array, turn: Array, held: Mask) -> Array:
+    def _moved(self, tree: SetTree, x: Array, h: Array, u: Array, turn: Array, held: Mask) -> Array:
         """The states (N, nx) after h (N,)."""
-
-        def accelerate(q: Array, v: Array, u: Array) -> Array:
-            return self._pushes(pushed, numbers, np.concatenate([q, v], axis=1), u, turn, held)[0]
 
         x = x.copy()
         if not self.gives:
             x[:, self.model.nq :][held] = 0.0
-        return self._stepped(accelerate, x, h, u)
+        return self._stepped(tree, x, h, u, (turn, held))
 
-    def _room(self, pushed: Pushed, numbers: Numbers, x: Array, u: Array, turn: Array, held: Mask) -> Array:
+    def _room(self, tree: SetTree, x: Array, u: Array, turn: Array, held: Mask) -> Array:
         """(N, nv) by how much each joint slides or is held as it should at x, negative beyond."""
         room = np.where(turn != 0, turn * x[:, self.model.nq :], np.inf)
-        size = np.maximum(self.tree.friction(numbers), 1e-300)
+        size = np.maximum(tree.friction(), 1e-300)
         some = np.flatnonzero(np.any(held, axis=1))
         if self.gives:
             every = np.broadcast_to(self.own, held.shape)
-            _, push = self._pushes(pushed, numbers, x, u, np.zeros_like(turn), every)
+            _, push = self._pushes(tree, x, u, np.zeros_like(turn), every)
             return np.where(every, np.where(held, 1 - np.abs(push) / size, turn * push / size - 1), np.inf)
         if len(some):
-            _, push = self._pushes(pushed, numbers, x[some], u[some], turn[some], held[some])
+            _, push = self._pushes(tree, x[some], u[some], turn[some], held[some])
             room[some] = np.where(held[some], 1 - np.abs(push) / size, room[some])
         return room
 
     def _end(
         self,
-        pushed: Pushed,
-        numbers: Numbers,
+        tree: SetTree,
         x: Array,
         u: Array,
         turn: Array,
@@ -244,7 +234,7 @@ class DryMotion(ContinuousMotion):
         """
 
         def least(x: Array, i: Indices) -> tuple[Array, Indices]:
-            each = np.where(sought[i], self._room(pushed, numbers, x, u[i], turn[i], held[i]), np.inf)
+            each = np.where(sought[i], self._room(tree, x, u[i], turn[i], held[i]), np.inf)
             which = np.argmin(each, axis=1)
             return each[np.arange(len(i)), which], which
 
@@ -258,7 +248,7 @@ class DryMotion(ContinuousMotion):
             secant = (at_low[i] > 0) & (k % 3 < 2)
             part = np.where(secant, at_low[i] / np.maximum(at_low[i] - at_high[i], 1e-300), 0.5)
             t[i] = low[i] + (high[i] - low[i]) * part
-            ends[i] = self._moved(pushed, numbers, x[i], t[i], u[i], turn[i], held[i])
+            ends[i] = self._moved(tree, x[i], t[i], u[i], turn[i], held[i])
             found, which[i] = least(ends[i], i)
             above = found > 0
             at_high[i] = np.where(above, np.where(side[i] > 0, at_high[i] / 2, at_high[i]), found)
@@ -270,7 +260,7 @@ class DryMotion(ContinuousMotion):
                 break
         return t, ends, which
 
-    def _taken_up(self, pushed: Pushed, numbers: Numbers, part: Part) -> Array:
+    def _taken_up(self, tree: SetTree, part: Part) -> Array:
         """(n, nx, nx) what becomes of a small change of the state where the part begins.
 
         Of a joint that has come to 0 it has changed when: what is accelerated otherwise from then on is moved by that.
@@ -280,27 +270,27 @@ class DryMotion(ContinuousMotion):
         x, u = part.x, part.u
         some = np.flatnonzero(np.any(part.held, axis=1) & (part.stopped < 0))
         if len(some) and not self.gives:
-            mass, _ = pushed(x[some, :nq], x[some, nq:], u[some], part.turn[some])
+            mass, _ = tree.pushed(x[some, :nq], x[some, nq:], u[some], part.turn[some])
             found[some, nq:, nq:] = held_inverse(mass, part.held[some]) @ mass
         some = np.flatnonzero(part.stopped >= 0)
         if len(some):
             j, own = part.stopped[some], np.arange(len(some))
-            before, _ = self._pushes(pushed, numbers, x[some], u[some], part.turned[some], part.holding[some])
-            after, _ = self._pushes(pushed, numbers, x[some], u[some], part.turn[some], part.held[some])
+            before, _ = self._pushes(tree, x[some], u[some], part.turned[some], part.holding[some])
+            after, _ = self._pushes(tree, x[some], u[some], part.turn[some], part.held[some])
             slowed = before[own, j]
             found[some, nq:, nq + j] += (after - before) / np.where(slowed != 0, slowed, np.inf)[:, None]
         return found
 
-    def _through(self, numbers: Numbers, pushed: Pushed, by: Array, part: Part) -> Array:
+    def _through(self, tree: SetTree, by: Array, part: Part) -> Array:
         """(n, nx, nx + np) the end of a part by its start and by z."""
         grip = part.turn, part.held
         x = part.x.copy()
         if not self.gives:
             x[:, self.model.nq :][part.held] = 0.0
         if not self.calm:
-            return self._step_slopes(numbers, by, x, part.h, part.u, grip)
-        halfway = self._moved(pushed, numbers, x, part.h / 2, part.u, *grip)
-        _, J, C = self._rate_slopes(numbers, by, halfway, part.u, grip)
+            return self._step_slopes(tree, by, x, part.h, part.u, grip)
+        halfway = self._moved(tree, x, part.h / 2, part.u, *grip)
+        _, J, C = self._rate_slopes(tree, by, halfway, part.u, grip)
         h = part.h[:, None, None]
         whole, phi = exponential(h * J)
         return np.concatenate([whole, h * (phi @ C)], axis=2)

@@ -11,8 +11,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.flow import ContinuousMotion
-from drake_diff.identification.tree import Grip, Numbers
-from drake_diff.identification.unknowns import set_numbers
+from drake_diff.identification.set_tree import SetTree
+from drake_diff.identification.tree import Grip
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,28 +33,27 @@ class EulerMotion(ContinuousMotion):
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
-        accelerate = self.tree.acceleration(self._damped(set_numbers(self.model, self.tree, self.unknowns, values)))
+        own = self._damped(self.set_tree(values))
         nq = self.model.nq
         xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
         xs[:, 0] = starts
         for m in range(hs.shape[1]):
             h, q, v = hs[:, m, None], xs[:, m, :nq], xs[:, m, nq:]
-            after = v + h * accelerate(q, v, us[:, m])
+            after = v + h * own.accelerate(q, v, us[:, m])
             xs[:, m + 1] = np.concatenate([q + h * self._rate(q, after), after], axis=1)
         return xs
 
     def _rate(self, q: Array, v: Array) -> Array:
         return np.asarray((self.chart.coordinates.rate(q) @ v[..., None])[..., 0])
 
-    def _damped(self, numbers: Numbers) -> Numbers:
-        return replace(numbers, reflected=numbers.reflected + self.longest * numbers.damping)
+    def _damped(self, own: SetTree) -> SetTree:
+        numbers = own.numbers
+        return SetTree(own.tree, replace(numbers, reflected=numbers.reflected + self.longest * numbers.damping))
 
-    def _step_slopes(
-        self, numbers: Numbers, by: Array, x: Array, h: Array, u: Array, grip: Grip | None = None
-    ) -> Array:
+    def _step_slopes(self, own: SetTree, by: Array, x: Array, h: Array, u: Array, grip: Grip | None = None) -> Array:
         by = by.copy()
-        by[numbers.places("reflected")] += self.longest * by[numbers.places("damping")]
-        _, by_x, by_z = self._rate_slopes(self._damped(numbers), by, x, u, grip)
+        by[own.numbers.places("reflected")] += self.longest * by[own.numbers.places("damping")]
+        _, by_x, by_z = self._rate_slopes(self._damped(own), by, x, u, grip)
         nq, nx, h = self.model.nq, x.shape[1], h[:, None, None]
         after = np.zeros((len(x), nx - nq, nx + by.shape[1]))
         after[..., :nx], after[..., nx:] = h * by_x[:, nq:], h * by_z[:, nq:]

@@ -26,6 +26,7 @@ from drake_diff.identification.flow import ROUGH, ContinuousMotion
 from drake_diff.identification.identify import LONGEST
 from drake_diff.identification.judge import deviations_of, known_of, unidentifiable
 from drake_diff.identification.measured import LEAST, Piece, given_noise
+from drake_diff.identification.set_tree import SetTree
 from drake_diff.identification.tree import Tree, tree_for_identification
 from drake_diff.identification.unknowns import FAR, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
@@ -192,9 +193,13 @@ class _Design:
         return replace(self.law, longest=1.01 * COARSE, method=ROUGH)
 
     @cached_property
+    def own(self) -> SetTree:
+        return SetTree(self.tree, self.tree.numbers)
+
+    @cached_property
     def follows(self) -> bool:
         """Whether any motion of the joints has inputs."""
-        reach = np.linalg.matrix_rank(self.tree.efforts(self.tree.numbers))
+        reach = np.linalg.matrix_rank(self.own.efforts())
         return not self.chart.coordinates.free and self.model.nu > 0 and int(reach) == self.model.nv
 
     @cached_property
@@ -274,8 +279,7 @@ class _Design:
         xs = np.concatenate([q + middle, v], axis=2)
         between = (xs[:, 1:] + xs[:, :-1]) / 2
         flat = between.reshape(-1, self.model.nx)
-        us = self.tree.inputs_for(
-            self.tree.numbers,
+        us = self.own.inputs_for(
             flat[:, : self.model.nq],
             flat[:, self.model.nq :],
             ((a[:, 1:] + a[:, :-1]) / 2).reshape(len(flat), -1),
@@ -287,7 +291,7 @@ class _Design:
         planned, us, a = self.planned(self.law, c[None], self.times)
         if a is None:
             return planned[0], us[0]
-        nq, numbers = self.model.nq, self.tree.numbers
+        nq = self.model.nq
         values = self.unknowns.values(self.unknowns.z_start)
         xs, us = np.empty_like(planned[0]), us[0]
         xs[0] = planned[0, 0]
@@ -295,7 +299,7 @@ class _Design:
             rate = min(FASTEST, 0.2 / h)
             off = planned[0, k] - xs[k]
             wanted = (a[0, k] + a[0, k + 1]) / 2 + rate**2 * off[:nq] + 2 * rate * off[nq:]
-            us[k] = self.tree.inputs_for(numbers, xs[k, None, :nq], xs[k, None, nq:], wanted[None])[0]
+            us[k] = self.own.inputs_for(xs[k, None, :nq], xs[k, None, nq:], wanted[None])[0]
             hs = np.array([self.law.cut(float(h))])
             xs[k + 1] = self.law.run(values, xs[k, None], hs, np.tile(us[k], (1, hs.shape[1], 1)))[0, -1]
         return xs, us

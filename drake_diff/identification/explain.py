@@ -30,6 +30,7 @@ from drake_diff.identification.identify import TOUCH, what_acts
 from drake_diff.identification.measured import given_noise, read_pieces
 from drake_diff.identification.race import FALLS, LOOKED_AT, Race, Runner
 from drake_diff.identification.screen import DELAY, LIMIT, LONGEST_DELAY, NO_PROMISE, Promise, View
+from drake_diff.identification.set_tree import SetTree
 from drake_diff.identification.setting import Setting
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.trial import STEPS, Trial, Tried
@@ -167,9 +168,8 @@ class _Search:
             return None
         label, nq = one.names[0].rsplit(".", 1)[0], self.setting.model.nq
         x = one.starts[:1]
-        mass, _ = self.setting.tree.pushed(self.setting.tree.numbers)(
-            x[:, :nq], x[:, nq:], np.zeros((1, self.setting.model.nu)), None
-        )
+        tree = SetTree(self.setting.tree, self.setting.tree.numbers)
+        mass, _ = tree.pushed(x[:, :nq], x[:, nq:], np.zeros((1, self.setting.model.nu)))
         j = next(link.joint.v_start for link in self.setting.tree.links if link.joint.joint == label)
         inertia = HELD_BY / float(np.linalg.inv(mass)[0, j, j])
         held = [

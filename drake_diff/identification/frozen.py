@@ -15,7 +15,6 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.flow import CHUNK, ContinuousMotion
-from drake_diff.identification.unknowns import numbers_at
 
 ORDER = 8  # of the series of phi
 SMALL = 0.5  # the norm of X up to which it is summed; 0.5^9 / 10! is 5e-10
@@ -27,14 +26,14 @@ class FrozenMotion(ContinuousMotion):
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
-        numbers, by = numbers_at(self.model, self.tree, self.unknowns, z)
+        own, by = self.set_tree_at(z)
         (K, M), nx = hs.shape, xs.shape[2]
         h, u = hs.reshape(-1), us.reshape(K * M, -1)
         halfway = self.run(self.unknowns.values(z), xs[:, :-1].reshape(K * M, nx), h[:, None] / 2, u[:, None])[:, 1]
         by_x, by_z = np.empty((K * M, nx, nx)), np.empty((K * M, nx, by.shape[1]))
         for k in range(0, K * M, CHUNK):
             part = slice(k, k + CHUNK)
-            _, J, C = self._rate_slopes(numbers, by, halfway[part], u[part])
+            _, J, C = self._rate_slopes(own, by, halfway[part], u[part])
             by_x[part], phi = exponential(h[part, None, None] * J)
             by_z[part] = h[part, None, None] * (phi @ C)
         return by_x.reshape(K, M, nx, nx), by_z.reshape(K, M, nx, -1)

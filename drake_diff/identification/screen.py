@@ -16,6 +16,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.identification.fit import Fit, Reduced
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.measured import Piece
+from drake_diff.identification.set_tree import SetTree
 from drake_diff.identification.unknowns import INERTIA, MASS, Unknown, Unknowns
 
 DELAY, LIMIT = "input_delay", "limit"  # changes of how inputs act; a limit is found by a search over its one number
@@ -52,7 +53,7 @@ class Inputs:
                 inertia = places[f"{one.label}.{INERTIA}"]
                 by_z[..., s.start] += by_z[..., inertia] @ (0.5 * np.concatenate([np.ones(3), z[inertia][3:]]))
             elif one.quantity == DELAY and not one.shifts:
-                accelerate = self.law.tree.acceleration(self.law.tree.numbers)
+                accelerate = SetTree(self.law.tree, self.law.tree.numbers).accelerate
                 before = np.concatenate([us[:, :1], us[:, :-1]], axis=1)
                 before[1:, 0] = us[:-1, -1]
                 before[np.all(hs == 0, axis=1)] = 0.0

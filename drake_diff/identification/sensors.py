@@ -12,6 +12,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, skew
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.identification.set_tree import SetTree
 from drake_diff.identification.tree import Grip, Numbers, Tree
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
@@ -152,8 +153,9 @@ class Sensors:
     def read(self, numbers: Numbers, q: Array, v: Array, u: Array, grip: Grip | None = None) -> Array:
         """(N, m) at q (N, nq), v (N, nv), under u (N, nu); `grip` is of dry friction."""
         tree = self._tree
-        a = tree.accelerate(numbers, q, v, u, grip) if self._accelerates else np.zeros_like(v)
-        forces = tree.carried(numbers, q, v, a) if self._forces else None
+        own = SetTree(tree, numbers)
+        a = own.accelerate(q, v, u, grip) if self._accelerates else np.zeros_like(v)
+        forces = own.carried(q, v, a) if self._forces else None
         return np.asarray(self._read(numbers, q, v, a, forces).real)
 
     @property
@@ -183,7 +185,8 @@ class Sensors:
     ) -> tuple[Array, Array]:
         """(N, m, 2 nv) by small motions of the state, and (N, m, np) by parameters, of which `by` moves the numbers."""
         tree, nv = self._tree, v.shape[1]
-        moving = tree.slopes(numbers, q, v, u, by, grip) if self._accelerates else None
+        own = SetTree(tree, numbers)
+        moving = own.slopes(q, v, u, by, grip) if self._accelerates else None
         a = np.zeros_like(v) if moving is None else moving.a
         moved = np.zeros((len(q), self.count, 2 * nv))
         by_a = np.zeros((len(q), self.count, nv))
@@ -203,7 +206,7 @@ class Sensors:
                 parts = {name: turned[numbers.places(name)] for name in Numbers.__dataclass_fields__}
                 found[..., column] = self._read(Numbers(**parts), q, v, a).imag / TINY
         if self._forces:
-            by_q, by_v, mass, by_numbers = tree.carried_slopes(numbers, q, v, a, by)
+            by_q, by_v, mass, by_numbers = own.carried_slopes(q, v, a, by)
             for i, k in self._forces:
                 moved[:, i], by_a[:, i] = np.concatenate([by_q[:, k], by_v[:, k]], axis=1), mass[:, k]
                 found[:, i] = by_numbers[:, k]

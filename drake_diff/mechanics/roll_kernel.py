@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.compiled import compiled
-from drake_diff.mechanics.tree_kernel import Tree, _add_cross, _add_cross_force, _dot, _place, _times
+from drake_diff.mechanics.tree_kernel import Tree, _add_cross, _add_cross_force, _dot, _place, _times, solve
 
 Array = NDArray[np.float64]
 
@@ -103,7 +103,7 @@ def roll(
                     own[up, i] += own[j, i]
                 for i in range(6):
                     F[up, i] += F[j, i]
-        if not _solve(M, a):
+        if not solve(M, a):
             return False
         for s in range(n):
             v = x[n + s] + h * a[s]
@@ -112,33 +112,4 @@ def roll(
         for r in range(n):
             for c in range(n):
                 M[r, c] = 0.0
-    return True
-
-
-@compiled
-def _solve(M: Array, a: Array) -> bool:
-    """a = M^-1 a by L D L', which takes M's place; False if it is not positive definite."""
-    n = len(a)
-    for i in range(n):
-        for j in range(i):
-            total = M[i, j]
-            for k in range(j):
-                total -= M[i, k] * M[j, k]
-            M[i, j] = total  # L times D
-        d = M[i, i]
-        for j in range(i):
-            part = M[i, j]
-            M[i, j] = part / M[j, j]
-            d -= part * M[i, j]
-        if not d > 0:
-            return False
-        M[i, i] = d
-    for i in range(n):
-        for k in range(i):
-            a[i] -= M[i, k] * a[k]
-    for i in range(n):
-        a[i] /= M[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            a[i] -= M[k, i] * a[k]
     return True

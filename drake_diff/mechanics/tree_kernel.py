@@ -336,3 +336,32 @@ def differentiate_tree(
                             _times(carried, j, S, k, work, 1)
                             slope[n, k, s] = -2.0 * _dot(work, 0, work, 1)
                     up = parent[up]
+
+
+@compiled
+def solve(M: Array, a: Array) -> bool:
+    """a = M^-1 a by L D L', which takes M's place; False if it is not positive definite."""
+    n = len(a)
+    for i in range(n):
+        for j in range(i):
+            total = M[i, j]
+            for k in range(j):
+                total -= M[i, k] * M[j, k]
+            M[i, j] = total  # L times D
+        d = M[i, i]
+        for j in range(i):
+            part = M[i, j]
+            M[i, j] = part / M[j, j]
+            d -= part * M[i, j]
+        if not d > 0:
+            return False
+        M[i, i] = d
+    for i in range(n):
+        for k in range(i):
+            a[i] -= M[i, k] * a[k]
+    for i in range(n):
+        a[i] /= M[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            a[i] -= M[k, i] * a[k]
+    return True
