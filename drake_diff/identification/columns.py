@@ -19,7 +19,9 @@ from drake_diff.identification.chart import Chart
 from drake_diff.identification.euler import EulerMotion
 from drake_diff.identification.fit import Fit, Law, Solved, cut_segments
 from drake_diff.identification.flow import ContinuousMotion
+from drake_diff.identification.frozen import FrozenMotion
 from drake_diff.identification.identify import LONGEST, Problem
+from drake_diff.identification.judge import HOPELESS, noise_of
 from drake_diff.identification.measured import Piece, guess_states, noise_by_differences
 from drake_diff.identification.tree import Mask, Tree
 from drake_diff.identification.unknowns import Unknowns
@@ -35,7 +37,7 @@ FAR = (
 )
 EVIDENCE = 20.0  # by which -2 log of the likelihood must fall: of 100 mistakes, by chance in 0.5 % of recordings
 SAME = 6.0  # of the same: evidence of 20 to 1, below which two mistakes are not told apart
-STEPS = 20  # of Gauss and Newton
+STEPS, FEW = 20, 8  # of Gauss and Newton
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +196,11 @@ def mistaken_in_the_air(
     whole = np.round(periods)
     steps = not chart.coordinates.free and np.all(whole > 0) and np.all(np.abs(periods - whole) < CLOCK_TOLERANCE)
     law = ContinuousMotion(*own, LONGEST)
-    laws: list[Law] = [law, *([EulerMotion(*own, model.time_step)] if steps else [])]
-    return mistaken_columns(model, chart, pieces, law, [partial(_fitted, model, one, chart, stated) for one in laws])
+    fits = [partial(_fitted, model, law, FrozenMotion(*own, LONGEST), chart, stated)]
+    if steps:
+        euler = EulerMotion(*own, model.time_step)
+        fits.append(partial(_fitted, model, euler, euler, chart, stated))
+    return mistaken_columns(model, chart, pieces, law, fits)
 
 
 def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], each: Sequence[Mistake]) -> list[float]:
@@ -226,12 +231,21 @@ def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], each: S
     return found
 
 
-def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequence[Piece]) -> tuple[float, bool]:
-    """(-2 log of the likelihood with the noise that is left, whether what is left is noise)."""
+def _fitted(
+    model: Model, law: Law, cheap: Law, chart: Chart, stated: Array, pieces: Sequence[Piece]
+) -> tuple[float, bool]:
+    """(-2 log of the likelihood with the noise that is left, whether what is left is noise).
+
+    Where a few steps by the cheaper derivatives of another law leave far more than noise, no more are taken.
+    """
     nothing = Unknowns((), as_in_files=True)
     problem = Problem(model, chart, nothing, list(pieces), stated, noise_by_differences(chart, pieces))
     try:
         with np.errstate(over="ignore", invalid="ignore"):
+            fit, starts = problem.prepared(cheap)
+            size = noise_of(fit, fit.solve(problem.unknowns.z_first, starts, FEW))
+            if np.any(size[np.isfinite(size)] > HOPELESS * problem.first_noise[np.isfinite(size)]):
+                return np.inf, False
             fit, solved = problem.solve(law, STEPS)
     except (DrakeDiffError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
         return np.inf, False

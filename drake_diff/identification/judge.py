@@ -13,6 +13,7 @@ from drake_diff.identification.fit import NO_PRIOR, Fit, Solved
 from drake_diff.identification.measured import ORDERS
 from drake_diff.identification.unknowns import FAR, MASS, Unknowns
 
+HOPELESS = 3.0  # times the noise: residuals that no better weights make good
 CONFIDENCE = 0.95
 UNSEEN = 1.0  # a change by so many times its own size that the data leave open at one sigma is not determined
 NOTHING = 1e-8  # of a unit's effect: rounding

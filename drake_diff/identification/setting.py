@@ -14,7 +14,7 @@ from drake_diff.identification.fit import Fit, Law, Point
 from drake_diff.identification.flow import ROUGH, ContinuousMotion
 from drake_diff.identification.frozen import FrozenMotion
 from drake_diff.identification.identify import LONGEST, Problem
-from drake_diff.identification.judge import most_scatter
+from drake_diff.identification.judge import HOPELESS, most_scatter
 from drake_diff.identification.measured import Piece, noise_by_differences
 from drake_diff.identification.screen import DELAY, LIMIT, LONGEST_DELAY, Inputs, View, changes_of_inputs, view
 from drake_diff.identification.tree import Tree
@@ -32,7 +32,6 @@ from drake_diff.model.model import Model
 PARTS = (1, 2, 4, 5, 10, 20)  # of a sample: Euler steps that are tried
 SETTLING, SETTLES = 8, 0.8  # steps by which segments settle, and the part of what was left that each must leave at most
 CALM = 3e-3  # of a small motion over a segment: by how much derivatives frozen halfway may miss it
-HOPELESS = 3.0  # times the noise: residuals that no better weights make good
 PLAUSIBLE = 1.5  # times the squares that can be noise: what leaves more is not fitted to its end beside another
 DELAYS = (0.25, 0.75, 1.5, 3, 5.5, 8)  # of a sample, from which other changes are looked for beside a delay
 

@@ -10,9 +10,9 @@ from scipy import stats
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.identification.fit import Fit, Law, Solved
 from drake_diff.identification.identify import Problem
-from drake_diff.identification.judge import freedom_of, intervals_of, known_of, noise_of
+from drake_diff.identification.judge import HOPELESS, freedom_of, intervals_of, known_of, noise_of
 from drake_diff.identification.measured import Piece
-from drake_diff.identification.setting import HOPELESS, Setting
+from drake_diff.identification.setting import Setting
 from drake_diff.identification.unknowns import COULOMB, Unknowns
 
 FALSE_NAME = 0.003  # of right models in which some change is named
