@@ -178,10 +178,13 @@ class _Search:
         ]
         unknowns = Unknowns((*self.setting.of(one.names).each, *held), as_in_files=True)
         z = np.concatenate([one.z, unknowns.z_start[1:]])
+        gives = self.race.running(one.names, unknowns, self.setting.cut, one.starts, z, NO_PROMISE)
+        gives.fit = self.race.firm(gives)
         try:
-            found = self.trial.solved(
-                one.names, unknowns, self.setting.law_of(unknowns), self.setting.cut, one.starts, z
-            )
+            self.race.improve([gives])
+            if gives.left > self.setting.plausible:
+                return None
+            found = self.trial.solved(one.names, unknowns, gives.fit.law, self.setting.cut, gives.starts, gives.z)
         except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
             return None
         self.words.nearest = min([self.words.nearest or base, found], key=self.trial.bic)
@@ -210,15 +213,16 @@ class _Search:
             unknowns = self.setting.of([name for name in pair.names if not name.endswith(f".{LIMIT}")])
             for one, s in self.setting.each_of(unknowns) if len(unknowns.each) == 2 else []:
                 if one.name not in found:
-                    alone = self.setting.of([one.name])
+                    alone, z, cut = self.setting.of([one.name]), pair.z[s], self.setting.cut
+                    runner = self.race.running((one.name,), alone, cut, pair.starts, z, NO_PROMISE)
+                    if not runner.step() or self.setting.is_hopeless(runner.left):
+                        continue
                     law = self.setting.law_of(alone)
-                    found[one.name] = self.trial.solved(
-                        (one.name,), alone, law, self.setting.cut, pair.starts, pair.z[s]
-                    )
+                    found[one.name] = self.trial.solved((one.name,), alone, law, cut, pair.starts, z)
         return list(found.values())
 
     def may_be_steps(self, runners: Sequence[Runner]) -> bool:
-        """Whether Euler steps leave clearly less than continuous time, of the model or of a change that left least."""
+        """Whether Euler steps leave clearly less than continuous time, or less and little, with one change or none."""
         whole = [one for one in runners if not one.special and one.fit.unknowns.delay is None]
         whole = [one for one in whole if np.isfinite(one.left)][:BESIDE]
         nothing = self.setting.of(())
@@ -229,7 +233,7 @@ class _Search:
         for names, unknowns, z, starts in each:
             before = self.left_by(None, names, unknowns, z, starts)
             after = min((self.left_by(step, names, unknowns, z, starts) for step in self.setting.steps), default=np.inf)
-            if after < FALLS * before or not self.setting.is_hopeless(after):
+            if after < FALLS * before or (after < before and not self.setting.is_hopeless(after)):
                 return True
         return False
 

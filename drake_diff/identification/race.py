@@ -152,15 +152,19 @@ class Race:
         return self.setting.problem(unknowns, pieces).fit(self.setting.law_of(unknowns), pieces, one.fit.noise)
 
     def raced(self, runners: list[Runner], base: Tried) -> tuple[list[Tried], list[Runner]]:
-        alive, there = list(runners), []
+        alive, there, turned = list(runners), [], set[tuple[str, ...]]()
         for most in RACE:
             if most < RACE[0] and self.is_late:
                 most = 1
-            before = {one.names: one.left for one in alive}
+            before = {one.names: np.inf if one.names in turned else one.left for one in alive}
             alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
             there += [one for one in alive if not self.setting.is_hopeless(one.left)]
+            turned = set[tuple[str, ...]]()  # whose motion is another from now on
             for one in alive:
-                one.fit = self.firm(one)
+                firm = self.firm(one)
+                if type(firm.law) is not type(one.fit.law):
+                    turned.add(one.names)
+                one.fit = firm
             alive = [
                 one
                 for one in alive[:most]
