@@ -182,7 +182,8 @@ class _Search:
         gives.fit = self.race.firm(gives)
         try:
             self.race.improve([gives])
-            if gives.left > self.setting.plausible:
+            there = gives.fit.at(gives.z, gives.starts)
+            if there is None or there.value + len(held) * float(np.log(self.setting.count)) > one.left:
                 return None
             found = self.trial.solved(one.names, unknowns, gives.fit.law, self.setting.cut, gives.starts, gives.z)
         except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
@@ -308,9 +309,7 @@ class _Search:
                 found += self.beside_inputs(runner, base)
                 continue
             i = names.index(runner.names[0])
-            z = self.setting.unknowns.z_start.copy()
-            z[self.setting.unknowns.slices[i]] = runner.z
-            seen = self.setting.view(self.setting.cut, z, runner.starts)
+            seen = self.setting.view(self.setting.cut, self.setting.with_one(i, runner.z), runner.starts)
             if seen is not None:
                 others = [(i, k) for k in range(count) if k != i]
                 more, _ = self.race.tried(seen, others, base, LOOKED_AT_BESIDE)

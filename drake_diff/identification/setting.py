@@ -22,6 +22,8 @@ from drake_diff.identification.unknowns import (
     BIAS,
     COULOMB,
     HELD_INERTIA,
+    INERTIA,
+    MASS,
     Unknown,
     Unknowns,
     choose_unknowns,
@@ -31,7 +33,7 @@ from drake_diff.model.model import Model
 
 PARTS = (1, 2, 4, 5, 10, 20)  # of a sample: Euler steps that are tried
 SETTLING, SETTLES = 8, 0.8  # steps by which segments settle, and the part of what was left that each must leave at most
-CALM = 3e-3  # of a small motion over a segment: by how much derivatives frozen halfway may miss it
+CALM = 1e-2  # of a small motion over a segment: by how much derivatives frozen halfway may miss it, as of a deviation
 PLAUSIBLE = 1.5  # times the squares that can be noise: what leaves more is not fitted to its end beside another
 DELAYS = (0.25, 0.75, 1.5, 3, 5.5, 8)  # of a sample, from which other changes are looked for beside a delay
 
@@ -107,6 +109,16 @@ class Setting:
         """Those called so; where inputs act later, the motion has its steps cut where they change."""
         each = (one for one in self.unknowns.each if one.name in names)
         return Unknowns(tuple(replace(one, shifts=one.quantity == DELAY) for one in each), as_in_files=True)
+
+    def with_one(self, i: int, own: Array) -> Array:
+        """z of everything where change i is `own`; a mass takes the inertia along, as it does alone."""
+        z, each, slices = self.unknowns.z_start.copy(), self.unknowns.each, self.unknowns.slices
+        z[slices[i]] = own
+        for one, s in self.each_of(self.unknowns):
+            if each[i].quantity == MASS and one.name == f"{each[i].label}.{INERTIA}":
+                along = 0.5 * float(own[0] - self.unknowns.z_start[slices[i]][0])
+                z[s] = np.concatenate([z[s][:3] + along, z[s][3:] * np.exp(along)])
+        return z
 
     def problem(self, unknowns: Unknowns, pieces: Sequence[Piece]) -> Problem:
         return Problem(self.model, self.chart, unknowns, list(pieces), self.stated, self.scatter)
