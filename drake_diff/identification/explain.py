@@ -12,8 +12,9 @@ chi^2 of as many numbers as the change has; the limit is its quantile at FALSE_N
 tried, and no less than the penalty of BIC. Of changes that are named, the one with the least BIC is the smallest.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -150,7 +151,8 @@ class _Search:
         if alone is None:
             raise SimulationError(f"{self.setting.model.name} has no motion near the states that were measured")
         count = len(alone.freedoms)
-        singles, runners = self.race.tried(alone, [(i,) for i in range(count)], base)
+        chosen = self.race.chosen(alone, [(i,) for i in range(count)])
+        singles, runners = self.race.tried(alone, chosen, base)
         named = self.trial.enough(base, singles, count)
         self.words.nearest = min([self.words.nearest or base, base, *singles], key=self.trial.bic)
         best = min(singles, key=self.trial.bic, default=None)
@@ -296,24 +298,31 @@ class _Search:
         """Pairs that promise most at the model, or beside a change that left least."""
         count = len(alone.freedoms)
         names = [one.name for one in self.setting.unknowns.each]
-        own = [i for i, name in enumerate(names) if not self.setting.is_of_inputs(self.setting.plain(name))]
-        found, _ = self.race.tried(alone, combinations(own, 2), base)
+        moving = [i for i, name in enumerate(names) if not self.setting.is_of_inputs(self.setting.plain(name))]
+        found, _ = self.race.tried(alone, self.race.chosen(alone, combinations(moving, 2)), base)
         if not any(one.explains for one in found) and not self.race.is_late:
             found += self.beside_a_delay(base)
+        later: list[Callable[[], list[Tried]]] = []  # searches for a limit or a delay, which take longest
         for runner in runners[:BESIDE]:
             if any(one.explains for one in found) or self.race.is_late:
                 break
             if runner.fit.unknowns.delay is not None:
                 continue
             if runner.special:
-                found += self.beside_inputs(runner, base)
+                later.append(partial(self.beside_inputs, runner, base))
                 continue
             i = names.index(runner.names[0])
             seen = self.setting.view(self.setting.cut, self.setting.with_one(i, runner.z), runner.starts)
             if seen is not None:
                 others = [(i, k) for k in range(count) if k != i]
-                more, _ = self.race.tried(seen, others, base, LOOKED_AT_BESIDE)
-                found += more
+                chosen = self.race.chosen(seen, others, LOOKED_AT_BESIDE)
+                plain = {own: one for own, one in chosen.items() if not any(map(self.setting.is_of_inputs, own))}
+                found += self.race.tried(seen, plain, base)[0]
+                rest = {own: one for own, one in chosen.items() if own not in plain}
+                later.append(partial(lambda *given: self.race.tried(*given)[0], seen, rest, base))
+        for search in later:
+            if not any(one.explains for one in found) and not self.race.is_late:
+                found += search()
         return found
 
     def beside_a_delay(self, base: Tried) -> list[Tried]:

@@ -20,6 +20,7 @@ LOOKED_AT = 8  # changes that enter the race, of those that promise most: of tho
 RACE = (5, 4, 3, 2, 2, 1)  # so many stay after each step of Gauss and Newton
 FALLS = 0.7  # what does not fall to this part of what was left before is out of the race, after its first step
 LONGEST_SEARCH = 45.0  # [s] of processor time, after which no further change is tried
+Chosen = dict[tuple[str, ...], Promise]  # changes by the names of what they change
 CLOSE = 1.0  # of the squares: what a step may still gain where two changes are told apart
 TOLD_APART = 40.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
 
@@ -69,12 +70,10 @@ class Race:
         self.ended_early = self.ended_early or time.process_time() - self.begun > LONGEST_SEARCH
         return self.ended_early
 
-    def tried(
-        self, seen: View, changes: Iterable[tuple[int, ...]], base: Tried, most: int = LOOKED_AT
-    ) -> tuple[list[Tried], list[Runner]]:
-        """(those that are fitted, all that stayed in the race, best first) of those that promise most, and a delay."""
+    def chosen(self, seen: View, changes: Iterable[tuple[int, ...]], most: int = LOOKED_AT) -> Chosen:
+        """Those that promise most, and a delay."""
         each, changes = self.setting.unknowns.each, list(changes)
-        chosen: dict[tuple[str, ...], Promise] = {}
+        chosen: Chosen = {}
         places = {True: most, False: most}  # what has more numbers bends to more, and promises more than it keeps
         for promise in seen.promises(changes, float(np.log(self.setting.count))):
             small = all(len(each[i].start) == 1 for i in promise.members)
@@ -90,6 +89,10 @@ class Race:
         for i, one in enumerate(each):  # none at all promises little of one of several samples
             if one.quantity == DELAY and (i,) in changes:
                 chosen.setdefault((one.name,), Promise((i,), seen.most, 1.0, np.zeros(1)))
+        return chosen
+
+    def tried(self, seen: View, chosen: Chosen, base: Tried) -> tuple[list[Tried], list[Runner]]:
+        """(those that are fitted, all that stayed in the race, best first)."""
         plain = {own: promise for own, promise in chosen.items() if not any(map(self.setting.is_of_inputs, own))}
         found, every = self.raced([self.runner(seen, promise, own) for own, promise in plain.items()], base)
         if any(one.explains for one in found):  # a search for a delay or a limit takes longer than the others together
