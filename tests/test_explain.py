@@ -22,7 +22,9 @@ from drake_diff.identification.chart import Chart
 from drake_diff.identification.dry import DryMotion
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.frozen import FrozenMotion, exponential
+from drake_diff.identification.measured import given_noise, read_pieces
 from drake_diff.identification.screen import Inputs
+from drake_diff.identification.setting import Setting
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.trial import FALSE_NAME
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
@@ -136,6 +138,28 @@ def test_a_mass_promises_what_it_does_with_its_inertia():
     _, by_z = Inputs(ContinuousMotion(model, tree, chart, both, 0.01), both, []).slopes(both.z_start, xs, hs, us)
     true = (after - before)[:, -1] / 2e-3
     np.testing.assert_allclose(by_z[:, 0, :, 0], true, atol=1e-5 * np.max(np.abs(true)))
+
+
+def test_beside_a_mass_the_motion_is_that_of_the_mass_with_its_inertia():
+    """A second change is looked for where the first one was fitted: a mass takes its inertia along there too."""
+    model = example_robot("ur5_robot.urdf")
+    random, times = np.random.default_rng(1), 0.01 * np.arange(20)
+    xs = 0.1 * random.standard_normal((20, model.nx))
+    log = dd.Recording("lab", "1", times, xs, np.full((19, model.nu), 5.0))
+    chart = Chart(coordinates_of(model))
+    setting = Setting(
+        model, tree_for_identification(model), chart, read_pieces(model, log, 0.0), given_noise(model, chart, None)
+    )
+    every, alone = setting.unknowns, setting.of(["forearm_link.mass"])
+    i = [one.name for one in every.each].index("forearm_link.mass")
+    z = setting.with_one(i, alone.z_start + 0.4)
+    starts, hs, us = xs[:3], np.full((3, 4), 0.01), np.full((3, 4, model.nu), 5.0)
+    ends = [
+        setting.law(unknowns, 0.01).run(unknowns.values(at), starts, hs, us)
+        for unknowns, at in ((every, z), (alone, alone.z_start + 0.4), (alone, alone.z_start))
+    ]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
+    assert np.max(np.abs(ends[0] - ends[2])) > 1e-3
 
 
 def test_steps_frozen_halfway_have_the_derivatives_of_the_motion():

@@ -1,5 +1,6 @@
 """Parameters from recordings: closed forms first, then motions integrated by SciPy, which knows nothing of Drake."""
 
+from dataclasses import replace
 from math import comb
 
 import numpy as np
@@ -13,9 +14,9 @@ from scipy.integrate import solve_ivp
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.identification.chart import Chart
+from drake_diff.identification.dry import DryMotion
 from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.judge import FALSE_ALARM, Known, colour_of, most_scatter, unidentifiable
-from drake_diff.identification.judge import FALSE_ALARM, colour_of, most_scatter
 from drake_diff.identification.set_tree import SetTree
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
@@ -228,6 +229,42 @@ def test_accelerations_are_drakes_and_steps_have_the_slopes_of_differences(name)
     difference = (moved(1e-5) - moved(-1e-5)) / 2e-5
     # Differences over 1e-5 of light links are good to 1e-6 of the largest.
     np.testing.assert_allclose(slopes.by_numbers[0] @ direction, difference, atol=1e-6 * np.abs(difference).max())
+
+
+@each_row("name", ["ur5_robot.urdf", "solo12.urdf"])
+def test_what_is_compiled_is_what_numpy_says(name, monkeypatch):
+    """Steps, with joints that slide and that are held, still or as if heavier; and slopes by every number of a tree."""
+    pytest.importorskip("numba")
+    model, random = example_robot(name), np.random.default_rng(1)
+    tree, chart, count = tree_for_identification(model), Chart(coordinates_of(model)), 5
+    x = np.array([state_in_range(model, random) for _ in range(count)])
+    x[:, model.nq :] = random.uniform(-1, 1, (count, model.nv))
+    h, u = random.uniform(0, 0.01, count), random.uniform(-1, 1, (count, model.nu))
+    n = len(tree.numbers.damping)
+    part = {quantity: random.uniform(0.01, 0.1, n) for quantity in ("damping", "coulomb", "held_damping")}
+    heavier = np.where(random.random(n) < 0.5, 0.0, 0.3)
+    hinges = np.isin(np.arange(n), [link.joint.v_start for link in tree.links if not link.free])
+    numbers = replace(tree.numbers, **part, held_inertia=heavier, stiffness=np.where(hinges, 2.0, 0.0))
+    law = ContinuousMotion(model, tree, chart, Unknowns(()), 0.01)
+    turn, held = random.choice([-1.0, 0.0, 1.0], (count, n)), random.random((count, n)) < 0.3
+    still = held & (heavier == 0)
+    x[:, model.nq :][still] = 0.0
+    own, by = SetTree(tree, numbers), np.eye(len(numbers.flat))
+    q, v = x[:, : model.nq], x[:, model.nq :]
+    dry = DryMotion(model, tree, chart, Unknowns(()), 0.01, joints=tuple(range(n)), gives=True)
+    fast = [law._stepped(own, x, h, u), dry._stepped(own, x, h, u, (turn, held & ~still))]
+    frozen = DryMotion(model, tree, chart, Unknowns(()), 0.01, joints=tuple(range(n)))
+    rigid = SetTree(tree, replace(numbers, held_inertia=np.zeros(n), held_damping=np.zeros(n)))
+    fast.append(frozen._stepped(rigid, x, h, u, (turn, still)))
+    slopes = own.slopes(q, v, u, by)
+    monkeypatch.setattr(SetTree, "compiled", None)
+    own, rigid = SetTree(tree, own.numbers), SetTree(tree, rigid.numbers)
+    slow = [law._stepped(own, x, h, u), dry._stepped(own, x, h, u, (turn, held & ~still))]
+    slow.append(frozen._stepped(rigid, x, h, u, (turn, still)))
+    for one, other in zip(fast, slow, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-10 * np.max(np.abs(other)))  # of rounding in 12 stages
+    for one, other in zip(vars(slopes).values(), vars(own.slopes(q, v, u, by)).values(), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9 * np.max(np.abs(other)))
 
 
 def test_steps_have_the_slopes_of_differences_by_unknowns(load):
