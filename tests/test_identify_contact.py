@@ -65,6 +65,18 @@ def test_the_truth_of_the_same_steps_is_found(ball):
     assert found.cost_after < 0.05 * found.cost_before
 
 
+@pytest.mark.slow
+def test_an_interval_includes_what_the_time_step_does(ball):
+    """Recorded by steps a tenth as long: the friction found is too high by ten times what recordings scatter by."""
+    found = identify_contact(ball, throws(ball, {"ball.friction": 0.25}, steps=10), ["ball.friction"])
+    low, high = found.intervals["ball.friction"]
+    assert low < 0.25 < high
+    # Half the step comes nearer, by 0.006 of 0.021; six times that is 0.04.
+    value, half = float(found.values["ball.friction"]), float(found.at_half_step["ball.friction"])
+    assert abs(half - 0.25) < abs(value - 0.25)
+    assert high - value < 0.05
+
+
 def test_bad_input_is_refused_by_name(ball):
     recording = throws(ball, {})[0]
     xs = recording.xs.copy()
@@ -123,7 +135,7 @@ def test_identify_goes_through_impacts_and_says_whether_they_are_explained(ball)
 
     right = fit((0.25, 0.25))
     assert right.explained, right.reason
-    assert right.values["ball.friction"] == pytest.approx(0.25, rel=0.02)  # of noise, its interval's half width
+    assert right.values["ball.friction"] == pytest.approx(0.25, rel=0.02)  # of noise
     # What is left has the size that noise and the first states' uncertainty explain.
     assert 0.6 < right.error_after < 1.4
     wrong = fit((0.25, 0.1))  # what is predicted is another ball

@@ -445,10 +445,11 @@ class Problem:
 
 
 def _through_impacts(problem: Problem, names: Sequence[str] | str) -> Identification:
-    """What the search through impacts finds; intervals are by the scatter between recordings."""
+    """What the search through impacts finds, with its intervals."""
     nv, noise = problem.model.nv, problem.first_noise
     j = judged(problem.model, problem.pieces, names, noise[: 2 * nv])
     search, found, h = j.search, j.found, j.search.law.model.time_step
+    without = "" if found.half is not None else "; intervals leave out what the step does, as a diagram has but one"
     unknowns, values, intervals = search.unknowns, search.values(found.w), search.intervals(found)
     limits = np.concatenate([np.reshape(intervals[one.name], (-1, 2)) for one in unknowns.each])
     deviations = (limits[:, 1] - limits[:, 0]) / (2 * 1.96)
@@ -477,7 +478,7 @@ def _through_impacts(problem: Problem, names: Sequence[str] | str) -> Identifica
         count=every.size,
         converged=found.converged,
         steps=found.rounds,
-        motion=f"the model's own steps of {1e3 * h:.4g} ms through impacts, slopes from clouds of values",
+        motion=f"the model's own steps of {1e3 * h:.4g} ms through impacts, slopes from clouds of values" + without,
         motions=tuple(sorted(motions, key=lambda motion: motion.piece.held_out)),
     )
     object.__setattr__(result, "sentence", _sentence(result, limits, unknowns, values))
