@@ -8,6 +8,12 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.identification import contact_causes
+from drake_diff.identification.chart import Chart
+from drake_diff.identification.measured import read_pieces
+from drake_diff.identification.unknowns import choose_unknowns
+from drake_diff.identification.whole_motions import WholeMotions
+from drake_diff.identification.words import NO_CHANGE, Explanation, also_touching
+from drake_diff.mechanics.description import coordinates_of
 
 sys.path.append(str(Path(__file__).parent / "benchmarks"))
 import identify_contact_causes
@@ -67,6 +73,40 @@ def test_a_change_of_a_ball_is_named(ball, quantity, value, contact_alone):
     assert abs(w.values[f"ball.{quantity}"] - value) < high - low  # two intervals of 95 %: four deviations
     assert high - low < 0.2 * value
     assert w.sentence.endswith("by the model's own steps of 5 ms.")
+
+
+def test_slopes_are_those_of_differences_of_motions():
+    """A hopper that lands, with a ground that is higher than was recorded; differences of 1e-7 of what is left."""
+    model, log, _, _ = identify_contact_causes.recorded("hopper", 0.005, True, 4)
+    chart = Chart(coordinates_of(model))
+    motions = WholeMotions(model, chart, read_pieces(model, log, 0.0), np.full(chart.size, np.nan))
+    (height,) = choose_unknowns(model, None, ["z_x.bias"]).each
+    point = motions.at(height, np.array([0.1]), (log.xs[0],), 0.5)
+    slopes = motions.slopes(height, point, 0.5)
+    for column, step in zip(slopes.T, 1e-7 * np.eye(len(slopes.T)), strict=True):
+        by_differences = (motions.moved(height, point, step, 0.5).r - point.r) / 1e-7
+        np.testing.assert_allclose(column, by_differences, rtol=0, atol=1e-3 * np.linalg.norm(by_differences))
+
+
+@pytest.mark.slow
+def test_a_larger_radius_is_named_though_the_model_touches_nothing(contact_alone):
+    """A pusher of 53.8 mm, not 50: as it was recorded the model's never comes to the box."""
+    model, log, name, truth = identify_contact_causes.recorded("box_push", 0.005, True, 90003)
+    w = dd.explain(model, log)
+    assert w.names == (name,) == ("pusher.radius",)
+    low, high = w.intervals[name]
+    assert abs(w.values[name] - truth[name]) < high - low  # two intervals of 95 %: four deviations
+
+
+def test_what_neither_search_explains_is_said_of_both():
+    in_air = Explanation((), {}, {}, (), False, "Not explained: this; with a, more is left.", {})
+    touching = Explanation((), {}, {}, (), False, f"{NO_CHANGE}; with b, what is left of x is twice the noise.", {})
+    w = also_touching(in_air, touching)
+    assert not w.explained
+    assert w.sentence == (
+        "Not explained: this; with a, more is left. Where bodies touch, none that was tried explains it either; "
+        "with b, what is left of x is twice the noise."
+    )
 
 
 @pytest.mark.slow

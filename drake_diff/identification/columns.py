@@ -218,8 +218,10 @@ def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], each: S
         ]
         us = [s.us[some][:, :, one.order[nx:] - nx] * one.factors[nx:] for one in part]
         with np.errstate(all="ignore"):
-            xs = law.run(np.zeros(0), np.concatenate(starts), np.tile(s.hs[some], (len(part), 1)), np.concatenate(us))
-            for own, moved in zip(mended, xs.reshape(len(part), len(some), *xs.shape[1:]), strict=True):
+            count = len(some)
+            firsts = [np.concatenate(starts[count * i : count * (i + 1)]) for i in range(len(part))]
+            xs = side_by_side(law, firsts, s.hs[some], us)
+            for own, moved in zip(mended, xs, strict=True):
                 noise = noise_by_differences(chart, own)
                 misses = [
                     chart.minus(own[s.of_piece[k]].ys[s.samples[k]], moved[i, s.at[k]]) / noise
@@ -229,6 +231,18 @@ def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], each: S
                 known = np.log1p(squares[np.isfinite(squares)])
                 found.append(float(np.mean(known)) if len(known) else np.inf)
     return found
+
+
+def side_by_side(law: Law, starts: Sequence[Array], hs: Array, us: Sequence[Array]) -> list[Array]:
+    """The motion of each mistake's segments; NaN of those that grow beyond what numbers hold."""
+    try:
+        xs = law.run(np.zeros(0), np.concatenate(starts), np.tile(hs, (len(starts), 1)), np.concatenate(us))
+    except np.linalg.LinAlgError:
+        if len(starts) == 1:
+            return [np.full((*hs.shape[:1], hs.shape[1] + 1, starts[0].shape[1]), np.nan)]
+        half = len(starts) // 2
+        return [*side_by_side(law, starts[:half], hs, us[:half]), *side_by_side(law, starts[half:], hs, us[half:])]
+    return list(xs.reshape(len(starts), len(hs), *xs.shape[1:]))
 
 
 def _fitted(

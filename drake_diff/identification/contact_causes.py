@@ -19,11 +19,11 @@ from drake_diff.exceptions import DrakeDiffError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.columns import mistaken_columns
 from drake_diff.identification.measured import Piece, guess_states
-from drake_diff.identification.race import LONGEST_SEARCH
+from drake_diff.identification.race import LONGEST_SEARCH, LOOKED_AT, TOLD_APART
 from drake_diff.identification.trial import FALSE_NAME, SAME
 from drake_diff.identification.unknowns import BIAS, CENTER, MASS, Unknown, choose_unknowns
-from drake_diff.identification.whole_motions import BEGIN, FOLLOWED, HEIGHT, HOPELESS, Fitted, Point, WholeMotions
-from drake_diff.identification.words import Explanation, changed_to, explained_by
+from drake_diff.identification.whole_motions import HEIGHT, HOPELESS, WIDTHS, Fitted, Point, WholeMotions
+from drake_diff.identification.words import NO_CHANGE, Explanation, changed_to, explained_by
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.model.plant import bodies, labelled
@@ -31,6 +31,7 @@ from drake_diff.model.step import set_state
 
 OF_CONTACT = ("friction", "stiffness", "dissipation", "radius")
 OF_MOTION = (MASS, CENTER, "damping", "gravity")
+FOLLOWED, AGAIN_FOLLOWED = 2, 6  # of where a change may begin, at first and where none explains
 SEGMENT = 0.1  # [s] by which mistakes of columns are compared
 AGAIN = np.linspace(-1.5, 1.5, 25)  # where a change begins that is like one that explains, in its own scale
 LARGER = 1.2  # radii with which bodies are looked at that nearly touch
@@ -75,29 +76,43 @@ class _Search:
         base, stage, point = self.motions.base()
         each = self.changes()
         if base.explains:
-            tried = self.promising(each, point)
+            falls = self.falls(each, 1.0, point)
+            tried = [one for one in each if falls[one.name] > 0.5 * self.limit(len(one.start), len(each))]
         else:
             law = replace(self.motions.law, segment=SEGMENT)
             columns = mistaken_columns(self.model, self.chart, self.pieces, law, [self.unchanged])
             if columns is not None:
                 return explained_by(columns)
             tried = each
-        first = self.without_twins(tried)
-        fitted = self.all_fitted(first, stage, point, FOLLOWED)
+        near = self.near(self.without_twins(tried), stage, point)
+        fitted = self.all_fitted(near, stage, FOLLOWED)
         if not base.explains and not any(one.explains for one in fitted):
-            fitted = self.all_fitted(first, stage, point, len(BEGIN)) or fitted
+            fitted = self.all_fitted(near, stage, AGAIN_FOLLOWED) or fitted
         fitted = self.again(fitted, tried)
         return self.said(self.again_unchanged(base, fitted), fitted, each)
 
-    def all_fitted(self, tried: Sequence[Unknown], stage: float, base: Point, most: int) -> list[Fitted]:
+    def near(self, tried: Sequence[Unknown], stage: float, base: Point) -> list[tuple[Unknown, list[Point]]]:
+        """Changes with where they begin, first those that come nearest in the stage that the model does not explain."""
+        stages = self.motions.stages
+        ahead = stages[min(stages.index(stage) + 1, len(stages) - 1)]
+        start = self.motions.at(None, base.w, base.starts, ahead)
+        J = self.motions.slopes(None, start, ahead)
+        found = [(one, self.motions.near(one, ahead, base, J)) for one in tried]
+        return sorted(found, key=lambda pair: pair[1][0].cost)
+
+    def all_fitted(self, near: Sequence[tuple[Unknown, list[Point]]], stage: float, most: int) -> list[Fitted]:
         """Each change from a stage on, from the `most` values at which it is nearest there."""
         fitted: list[Fitted] = []
-        for one in tried:
+        bars, best = dict[float, float](), np.inf
+        for i, (one, points) in enumerate(near):
             if self.is_late:
                 break
-            found = self.motions.fitted(one, stage, base, most)
+            widths = None if i >= LOOKED_AT else WIDTHS[: int(most > FOLLOWED)]
+            found = self.motions.fitted(one, stage, points[:most], bars, widths)
             if found is not None:
                 fitted.append(found)
+            if found is not None and found.explains and self.bic(found) < best:
+                best, bars = self.bic(found), self.motions.costs(one, found.point, TOLD_APART)
         return fitted
 
     @staticmethod
@@ -136,18 +151,17 @@ class _Search:
         base, _, _ = WholeMotions(self.model, self.chart, pieces, self.motions.stated).base()
         return base.score, base.explains
 
-    def promising(self, each: Sequence[Unknown], base: Point) -> list[Unknown]:
-        """Changes that may lower the squares by more than the limit, by their slopes at the model that explains."""
-        Q = np.linalg.qr(self.motions.slopes(None, base, 1.0))[0]
-        left = base.r - Q @ (Q.T @ base.r)
-        noise, found = left @ left / len(left), []
+    def falls(self, each: Sequence[Unknown], stage: float, base: Point) -> dict[str, float]:
+        """By how much changes may lower the squares up to a stage, in units of what is left, by their slopes."""
+        start = self.motions.at(None, base.w, base.starts, stage)
+        Q = np.linalg.qr(self.motions.slopes(None, start, stage))[0]
+        left = start.r - Q @ (Q.T @ start.r)
+        noise, found = left @ left / len(left), {}
         for one in each:
-            point = self.motions.at(one, np.zeros(len(one.start)), base.starts, 1.0)
-            J = self.motions.slopes(one, point, 1.0, of_states=False)
+            point = self.motions.at(one, np.zeros(len(one.start)), base.starts, stage)
+            J = self.motions.by_change(one, point, stage)
             own = J - Q @ (Q.T @ J)
-            fall = np.linalg.lstsq(own, left, rcond=1e-6)[0] @ (own.T @ left)
-            if fall / noise > 0.5 * self.limit(len(one.start), len(each)):
-                found.append(one)
+            found[one.name] = float(np.linalg.lstsq(own, left, rcond=1e-6)[0] @ (own.T @ left) / noise)
         return found
 
     def limit(self, freedom: int, tried: int) -> float:
@@ -200,8 +214,7 @@ class _Search:
         if not named:
             near = min(fitted, key=self.bic, default=base)
             what = f"with {near.name}, {near.doubt}" if near.name and near.doubt else "none comes near it"
-            sentence = f"Not explained: no change that was tried explains the recording; {what}.{end}"
-            return Explanation((), {}, {}, (), False, sentence, evidence)
+            return Explanation((), {}, {}, (), False, f"{NO_CHANGE}; {what}.{end}", evidence)
         own = {one.name: one for one in tried}
         named = [self.motions.widened(own[one.name], one) for one in named]
         texts = [self.words(own[one.name], one) for one in named]

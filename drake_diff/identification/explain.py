@@ -36,7 +36,7 @@ from drake_diff.identification.setting import Setting
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.trial import STEPS, Trial, Tried
 from drake_diff.identification.unknowns import COULOMB, HELD_DAMPING, HELD_INERTIA, Unknown, Unknowns
-from drake_diff.identification.words import Explanation, Words, explained_by
+from drake_diff.identification.words import Explanation, Words, also_touching, explained_by
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 
@@ -110,7 +110,7 @@ def explain(
     if found.explained or motion != "auto" or not may_touch(model, chart, pieces):
         return found
     touched = explain_contact(model, chart, pieces, given_noise(model, chart, noise))
-    return touched if touched.explained else found
+    return touched if touched.explained else also_touching(found, touched)
 
 
 @dataclass(eq=False)

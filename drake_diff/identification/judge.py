@@ -20,6 +20,7 @@ NOTHING = 1e-8  # of a unit's effect: rounding
 PART = 0.03  # of the largest change in a combination: what is not told
 FALSE_ALARM = 0.004  # of all tests of residuals together, where the model is right
 COMBINED = ("friction", "stiffness")  # of two bodies that touch, which Drake makes one of: 2 a b / (a + b), half of it
+OF_MEDIANS = 0.6  # of the degrees of freedom: drawn, for 40 to 120 samples
 LAGS = 10
 MANY = 1000  # samples, from which on Q is nearly as chi-square says
 DRAWN = 2_000_000  # numbers of white noise for each length of a piece
@@ -187,13 +188,15 @@ def score_of(fit: Fit, solved: Solved) -> float:
     return float(np.nansum(every**2)) + 2 * float(np.sum(logs))
 
 
-def most_scatter(count: int, tests: int) -> float:
+def most_scatter(count: int, tests: int, *, jumps: bool = False) -> float:
     """How many times the scatter of neighbouring samples the residuals of `count` samples may be, of `tests` entries.
 
     The scatter is the least by differences of orders 1 to 8. Of order d it varies as if chi-square had n / C_d degrees
     of freedom, C_d = binomial(4 d, 2 d) / binomial(2 d, d)^2; the mean of squares, by the same samples, leaves C_d - 1.
+    Where the motion `jumps` and medians tell the scatter, it varies as if there were fewer.
     """
     freedom = max(count - ORDERS, 1) / (comb(4 * ORDERS, 2 * ORDERS) / comb(2 * ORDERS, ORDERS) ** 2 - 1)
+    freedom *= OF_MEDIANS if jumps else 1.0
     return max(SCATTER, float(np.sqrt(freedom / stats.chi2.ppf(FALSE_ALARM / tests, freedom))))
 
 

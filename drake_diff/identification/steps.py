@@ -7,7 +7,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
-from drake_diff.derivatives.step import derivatives_along
+from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError, ModelError
 from drake_diff.identification.measured import Piece
 from drake_diff.identification.tree import Numbers
@@ -64,6 +64,14 @@ class DiscreteMotion:
         """Nothing: Drake's joints have no dry friction."""
         return
 
+    def derivatives(self, model: Model, vector: ParameterVector, xs: Array, us: Array) -> Sequence[StepDerivatives]:
+        """Of steps from each of xs (N, nx) under us (N, nu), by the vector's parameters; those applied act."""
+        try:
+            return derivatives_along(model, xs[0], us, vector=vector, xs=xs)
+        except GradientError:
+            self.differenced.append("some derivatives by differences")
+            return derivatives_along(model, xs[0], us, vector=vector, xs=xs, method="finite_difference")
+
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
         vector, by_z = self.vector.at(self.unknowns.values(z)[self.own]), self.unknowns.by_z(z)[self.own]
@@ -71,13 +79,7 @@ class DiscreteMotion:
         by_x, by = np.tile(np.eye(nx), (K, M, 1, 1)), np.zeros((K, M, nx, len(z)))
         taken = hs > 0
         with applied(vector) as model:
-            try:
-                each = derivatives_along(model, xs[0, 0], us[taken], vector=vector, xs=xs[:, :-1][taken])
-            except GradientError:
-                self.differenced.append("some derivatives by differences")
-                each = derivatives_along(
-                    model, xs[0, 0], us[taken], vector=vector, xs=xs[:, :-1][taken], method="finite_difference"
-                )
+            each = self.derivatives(model, vector, xs[:, :-1][taken], us[taken])
         by_x[taken] = np.array([step.A for step in each])
         by[taken] = np.array([step.C for step in each]) @ by_z
         return by_x, by

@@ -1,10 +1,10 @@
 """Whole motions in which bodies touch, of a model with one change, fitted in stages: from a first state to the end.
 
-Slopes are differences of motions, each over a part of what the noise hides. Through impacts what is left is ragged
-ground: where steps by slopes stop early, other first states are tried.
+Slopes by the first state are those of the steps, slopes by the change are differences of motions. Through impacts what
+is left is ragged ground: where steps by slopes stop early, other first states are tried.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -21,22 +21,24 @@ from drake_diff.identification.measured import Piece, guess_states, noise_by_dif
 from drake_diff.identification.steps import DiscreteMotion, discrete_motion
 from drake_diff.identification.unknowns import BIAS, CENTER, Unknown, Unknowns
 from drake_diff.model.model import Model
+from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
 
-FIRST, LONGER = 6, 1.5  # samples of the first stage; how many times as long each is as the one before
+FIRST, LONGER = 3, 1.5  # samples of the first stage; how many times as long each is as the one before
 BEGIN = (0.0, 0.1, -0.1, 0.3, -0.3, 0.8, -0.8)  # where a change of one number begins, in its own scale
-FOLLOWED = 2  # of these, at first
 HEIGHT, CENTER_SCALE, PULL = 0.02, 0.3, 3.0  # [m] of a ground; of a radius of gyration; [m/s^2]
 NOISY, HOPELESS = 2.0, 3.0  # times the noise: what is left is more than it, and what is given up
-QUIET = 1.15  # times the least that was left so far: what is left is no more than before
+QUIET = 1.15  # times the least that was left so far, or the noise: what is left is no more than before
 STEPS, TRIES = 8, 5  # of Gauss and Newton; of shortening each
+AS_PROMISED = 0.7  # of what slopes promise: a step that lowers the squares by less is tried shorter too
+PARTS = (0.5, 0.25, 0.1)  # of it
 WIDER = 6  # how often the end of an interval moves out, before it is not known
 GAIN = 0.3  # of the squares, in units of the noise: what a last step may still gain
 STUCK = 20.0  # times the noise, beyond which no other start is tried
 WIDTHS = (1.0, 2.0, 1.0, 0.5)  # times their scatter: how far other starts are
 DRAWS, BEST = 24, 2  # how many of these, and how many of them are followed
 LEAST_SEEN = 0.03  # of what is seen of one entry: a combination seen less is not moved further
-SLOPE = 3e-3  # of a change's scale: over which slopes are taken
+SLOPE = 1e-4  # of a change's scale: over which slopes are taken
 LOST = 1e4  # times the noise: where a motion cannot be stepped, and at most
 
 
@@ -99,7 +101,7 @@ class WholeMotions:
             least = min(least, self.size(point))
             if self.size(point) > NOISY:
                 return Fitted("", np.inf, 0, False, "", np.zeros(0), np.zeros((0, 2)), point, np.zeros(0)), *quiet
-            if self.size(point) < QUIET * least:
+            if self.size(point) < QUIET * max(least, 1.0):
                 quiet = stage, point
         told = self.told(None, point)
         return told, *((1.0, point) if told.explains else quiet)
@@ -109,32 +111,56 @@ class WholeMotions:
         free = max(len(point.r) - sum(map(len, point.starts)), 1)
         return float(np.sqrt(point.cost / free))
 
-    def fitted(self, one: Unknown, stage: float, base: Point, most: int) -> Fitted | None:
-        """A change where it fits best; None where it does not get far."""
-        k = len(one.start)
-        begin = [np.zeros(k)] if k > 1 else [np.array([w]) for w in BEGIN]
-        points = [self.at(one, w, base.starts, stage) for w in begin]
-        points.sort(key=lambda point: point.cost)
-        points = [self.followed(one, each, stage) for each in points[:most]]
+    def costs(self, one: Unknown, point: Point, more: float) -> dict[float, float]:
+        """What a change leaves up to each stage, and so much more in units of it."""
+        left = point.cost / len(point.r)
+        return {stage: self.at(one, point.w, point.starts, stage).cost + more * left for stage in self.stages}
+
+    def near(self, one: Unknown, stage: float, base: Point, J: Array) -> list[Point]:
+        """Where a change may begin, best first: some values, and a step by slopes, those by first states being J."""
+        zero = self.at(one, np.zeros(len(one.start)), base.starts, stage)
+        points = [zero] if len(one.start) > 1 else [self.at(one, np.array([w]), base.starts, stage) for w in BEGIN]
+        J = np.hstack([J, self.by_change(one, zero, stage)])
+        norms = np.where((size := np.linalg.norm(J, axis=0)) > 0, size, 1.0)
+        p = -np.linalg.lstsq(J / norms, zero.r, rcond=1e-6)[0] / norms
+        points += [self.moved(one, zero, part * p, stage) for part in (1.0, *PARTS)]
+        return sorted(points, key=lambda point: point.cost)
+
+    def fitted(
+        self,
+        one: Unknown,
+        stage: float,
+        points: Sequence[Point],
+        bars: Mapping[float, float],
+        widths: Sequence[float] | None,
+    ) -> Fitted | None:
+        """A change where it fits best, from points at a stage.
+
+        None where it does not get far, or leaves more than `bars` say of a stage.
+        """
+        points = [self.followed(one, self.at(one, each.w, each.starts, stage), stage) for each in points]
+        points = self.kept(points, bars.get(stage, np.inf))
         for before, further in pairwise(self.stages[self.stages.index(stage) :]):
             points = self.kept(
-                [self.further(one, point, before, further, WIDTHS[: int(most > FOLLOWED)]) for point in points]
+                [self.further(one, point, before, further, widths) for point in points],
+                bars.get(further, np.inf),
             )
-        return self.told(one, points[0]) if points and self.size(points[0]) < HOPELESS else None
+        return self.told(one, points[0]) if points else None
 
-    def kept(self, points: Sequence[Point]) -> list[Point]:
-        """Those that are not given up and not where another one is, best first."""
+    def kept(self, points: Sequence[Point], most: float) -> list[Point]:
+        """Those that are not given up, leave no more than `most` and are not where another one is, best first."""
         found: list[Point] = []
         for point in sorted(points, key=lambda point: point.cost):
             near = any(np.all(np.abs(point.w - other.w) < 1e-3) for other in found)
-            if self.size(point) < HOPELESS and not near:
+            if self.size(point) < HOPELESS and point.cost < most and not near:
                 found.append(point)
         return found
 
     def followed(self, one: Unknown | None, point: Point, stage: float, held: int | None = None) -> Point:
         """Where Gauss-Newton steps lead, shortened by Levenberg's damping where they do not help.
 
-        One number of the change may be held.
+        A step that does less than its slopes promise, as where a foot comes to touch a step of time earlier, is as
+        long as helps most. One number of the change may be held.
         """
         damping = 0.0
         for _ in range(STEPS):
@@ -148,6 +174,9 @@ class WholeMotions:
                 inverse = s / (s**2 + damping + 1e-12)
                 p = -(V.T @ (inverse * (U.T @ point.r))) / norms
                 there = self.moved(one, point, p, stage)
+                if before - there.cost < AS_PROMISED * (before - float(np.sum((point.r + J @ p) ** 2))):
+                    shorter = [self.moved(one, point, part * p, stage) for part in PARTS]
+                    there = min([there, *shorter], key=lambda point: point.cost)
                 if there.cost < before:
                     point, damping = there, damping / 10 if damping > 1e-4 else 0.0
                     break
@@ -156,13 +185,37 @@ class WholeMotions:
                 break
         return point
 
-    def further(self, one: Unknown | None, point: Point, before: float, stage: float, widths: Sequence[float]) -> Point:
-        """On to the next stage; where more is left there, from the best of motions that the one before allows too.
+    def further(
+        self, one: Unknown | None, point: Point, before: float, stage: float, widths: Sequence[float] | None
+    ) -> Point:
+        """On to the next stage; where more is left there, by smaller stages, unless there are no `widths`.
 
-        Through impacts what is left is ragged ground, on which steps by slopes stop early.
+        Where more is left one sample further, or still, from the best of motions that the stage before allows too:
+        through impacts what is left is ragged ground, on which steps by slopes stop early.
         """
+        there = self.by_halves(one, point, before, stage, widths)
+        return there if widths is None else self.others(one, point, before, there, stage, widths)
+
+    def by_halves(
+        self, one: Unknown | None, point: Point, before: float, stage: float, widths: Sequence[float] | None
+    ) -> Point:
+        """On to the next stage, and where more is left there, by smaller stages."""
         there = self.followed(one, self.at(one, point.w, point.starts, stage), stage)
-        if not widths or self.size(there) < QUIET * self.size(point) or self.size(there) > STUCK:
+        if widths is None or self.is_quiet(there, point):
+            return there
+        middle = self.between(before, stage)
+        if middle is None:
+            return self.others(one, point, before, there, stage, widths)
+        half = self.by_halves(one, point, before, middle, widths)
+        if not self.is_quiet(half, point):
+            return there
+        return min(there, self.by_halves(one, half, middle, stage, widths), key=lambda point: point.cost)
+
+    def others(
+        self, one: Unknown | None, point: Point, before: float, there: Point, stage: float, widths: Sequence[float]
+    ) -> Point:
+        """The best of motions as far from a point as the stage before allows, where more is left `there`."""
+        if self.is_quiet(there, point) or self.size(there) > STUCK:
             return there
         J = self.slopes(one, self.at(one, point.w, point.starts, before), before)
         norms = np.where((size := np.linalg.norm(J, axis=0)) > 0, size, np.inf)
@@ -174,45 +227,67 @@ class WholeMotions:
             each.sort(key=lambda point: point.cost)
             found = [self.followed(one, other, stage) for other in each[:BEST]]
             there = min([there, *found], key=lambda point: point.cost)
-            if self.size(there) < QUIET * self.size(point):
+            if self.is_quiet(there, point):
                 break
         return there
+
+    def is_quiet(self, there: Point, point: Point) -> bool:
+        """Whether no more is left there than at a point before."""
+        return self.size(there) < QUIET * max(self.size(point), 1.0)
+
+    def between(self, before: float, stage: float) -> float | None:
+        """A stage between two; None where no sample lies between."""
+        longest = max(len(piece.times) for piece in self.pieces)
+        first, last = (max(FIRST, round(part * longest)) for part in (before, stage))
+        return (first + last) // 2 / longest if last - first > 1 else None
 
     def moved(self, one: Unknown | None, point: Point, p: Array, stage: float) -> Point:
         size, k = self.chart.size, len(point.w)
         starts = tuple(self.chart.plus(x, p[i * size : (i + 1) * size]) for i, x in enumerate(point.starts))
         return self.at(one, point.w + p[len(p) - k :], starts, stage)
 
-    def slopes(self, one: Unknown | None, point: Point, stage: float, *, of_states: bool = True) -> Array:
-        """(M, 2 nv pieces + k) by forward differences, each over a part of what the noise hides."""
-        size, k = self.chart.size, len(point.w)
-        nv = size // 2
-        columns = []
-        for i, piece in enumerate(self.pieces if of_states else ()):
-            length = stage * (piece.times[-1] - piece.times[0])
-            places = np.where(np.isfinite(self.noise[:nv]), self.noise[:nv], np.nanmin(self.noise[:nv]))
-            for j in range(size):
-                step = np.zeros(len(self.pieces) * size + k)
-                width = 0.2 * places[j] if j < nv else 0.5 * places[j - nv] / length
-                step[i * size + j] = width
-                columns.append((self.moved(one, point, step, stage).r - point.r) / width)
-        for j in range(k):
-            step = np.zeros(len(self.pieces) * size + k)
-            step[len(step) - k + j] = SLOPE
-            columns.append((self.moved(one, point, step, stage).r - point.r) / SLOPE)
-        return np.column_stack(columns)
+    def slopes(self, one: Unknown | None, point: Point, stage: float) -> Array:
+        """(M, 2 nv pieces + k): by first states through the derivatives of steps, by the change from differences."""
+        size, blocks = self.chart.size, []
+        for i, (piece, each, x) in enumerate(zip(self.pieces, self.each, point.starts, strict=True)):
+            by_start = self.by_start(one, point.w, piece, each, x, stage)
+            block = np.zeros((len(by_start), size * len(self.pieces)))
+            block[:, i * size : (i + 1) * size] = by_start
+            blocks.append(block)
+        return np.hstack([np.vstack(blocks), self.by_change(one, point, stage)])
+
+    def by_start(self, one: Unknown | None, w: Array, piece: Piece, each: int, x: Array, stage: float) -> Array:
+        """(m, 2 nv) how residuals of a piece change with its first state."""
+        law, values, shift = self.changed(one, w)
+        n, us = self.part(piece, each, stage)
+        known = np.isfinite(self.chart.minus(piece.ys[:n], piece.ys[:n]))
+        found = np.zeros((n, self.chart.size, self.chart.size))
+        try:
+            xs = law.run(values, (x - shift)[None], np.full((1, len(us)), self.model.time_step), us[None])[0]
+        except SimulationError:
+            return found[known]
+        with applied(law.vector.at(values[law.own])) as model:
+            steps = law.derivatives(model, select(model, ()), xs[:-1], us)
+        by_start = self.chart.from_motion(x)
+        for k in range(n):
+            found[k] = -self.chart.to_motion((xs[k * each] + shift)[None])[0] @ by_start / self.noise[:, None]
+            for step in steps[k * each : (k + 1) * each]:
+                by_start = step.A @ by_start
+        return found[known]
+
+    def by_change(self, one: Unknown | None, point: Point, stage: float) -> Array:
+        """(M, k) how residuals change with w."""
+        columns = [np.zeros((len(point.r), 0))]
+        for step in SLOPE * np.eye(len(point.w)):
+            columns.append((self.at(one, point.w + step, point.starts, stage).r - point.r)[:, None] / SLOPE)
+        return np.hstack(columns)
 
     def at(self, one: Unknown | None, w: Array, starts: tuple[Array, ...], stage: float) -> Point:
         """The point with its residuals; of a motion that Drake cannot step, ones that are very large."""
-        shift, law, values = np.zeros(self.model.nx), self.law, np.zeros(0)
-        if one is not None:
-            law, values = self.law_of(one), self.value(one, w)
-        if one is not None and one.quantity == BIAS:
-            shift[self.model.state_names.index(one.label)] = values[0]
-        found = []
+        (law, values, shift), found = self.changed(one, w), []
         for piece, each, x in zip(self.pieces, self.each, starts, strict=True):
-            n = min(max(FIRST, round(stage * len(piece.times))), len(piece.times))
-            measured, us = piece.ys[:n], np.repeat(piece.us[: n - 1], each, axis=0)
+            n, us = self.part(piece, each, stage)
+            measured = piece.ys[:n]
             try:
                 xs = law.run(values, (x - shift)[None], np.full((1, len(us)), self.model.time_step), us[None])
                 r = self.chart.minus(measured, xs[0, ::each] + shift) / self.noise
@@ -221,6 +296,22 @@ class WholeMotions:
             r = r[np.isfinite(self.chart.minus(measured, measured))]
             found.append(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
         return Point(w, starts, np.concatenate(found))
+
+    @staticmethod
+    def part(piece: Piece, each: int, stage: float) -> tuple[int, Array]:
+        """(how many samples of a piece are in a stage, the inputs of the steps between them)."""
+        n = min(max(FIRST, round(stage * len(piece.times))), len(piece.times))
+        return n, np.repeat(piece.us[: n - 1], each, axis=0)
+
+    def changed(self, one: Unknown | None, w: Array) -> tuple[DiscreteMotion, Array, Array]:
+        """(the motion with the change, its values, by how much columns are shifted (nx,))."""
+        shift = np.zeros(self.model.nx)
+        if one is None:
+            return self.law, np.zeros(0), shift
+        values = self.value(one, w)
+        if one.quantity == BIAS:
+            shift[self.model.state_names.index(one.label)] = values[0]
+        return self.law_of(one), values, shift
 
     def law_of(self, one: Unknown) -> DiscreteMotion:
         if one.name not in self.laws:
@@ -263,7 +354,7 @@ class WholeMotions:
         size = np.sqrt(squares / numbers[seen] * len(point.r) / free)
         names = [name for name, there in zip(tangent_space(self.model).names, seen, strict=True) if there]
         score = float(np.sum(numbers[seen] * (np.log(squares / numbers[seen]) + 2 * np.log(self.noise[seen]))))
-        doubt, most = "", most_scatter(int(np.min(numbers[seen])), len(names))
+        doubt, most = "", most_scatter(int(np.min(numbers[seen])), len(names), jumps=True)
         worst = int(np.argmax(size))
         if size[worst] > most:
             doubt = f"what is left of {names[worst]} is {size[worst]:.3g} times the noise"

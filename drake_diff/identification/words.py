@@ -16,6 +16,8 @@ from drake_diff.identification.trial import Tried
 
 MOST_OF_IT = 0.999  # of the squares that the model leaves: a change that takes them away is told though more is left
 
+NO_CHANGE = "Not explained: no change that was tried explains the recording"
+
 
 @dataclass(frozen=True, eq=False)
 class Explanation(ShowsItsRepr):
@@ -31,6 +33,12 @@ class Explanation(ShowsItsRepr):
 
     def __repr__(self) -> str:
         return self.sentence
+
+
+def also_touching(found: Explanation, touched: Explanation) -> Explanation:
+    """Not explained by motion in which nothing touches, and not by motion in which bodies do."""
+    rest = touched.sentence.removeprefix(NO_CHANGE)
+    return replace(found, sentence=f"{found.sentence} Where bodies touch, none that was tried explains it either{rest}")
 
 
 def explained_by(columns: Mistaken) -> Explanation:
