@@ -38,7 +38,7 @@ STUCK = 20.0  # times the noise, beyond which no other start is tried
 WIDTHS = (1.0, 2.0, 1.0, 0.5)  # times their scatter: how far other starts are
 DRAWS, BEST = 24, 2  # how many of these, and how many of them are followed
 LEAST_SEEN = 0.03  # of what is seen of one entry: a combination seen less is not moved further
-SLOPE = 1e-4  # of a change's scale: over which slopes are taken
+SLOPE = 1e-4  # of a change's scale: over which slopes are taken; wider, they jump over contacts that begin
 LOST = 1e4  # times the noise: where a motion cannot be stepped, and at most
 
 
