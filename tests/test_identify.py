@@ -161,7 +161,7 @@ def test_of_few_samples_white_ones_are_not_told_to_hang_together(count):
     assert below <= stats.binom.ppf(0.9999, 4_000, 1.5e-3)  # half as many again as should be
 
 
-@pytest.mark.parametrize(("count", "jumps", "most"), [(25, False, 6), (100, False, 1.8), (60, True, 2.8)])
+@pytest.mark.parametrize(("count", "jumps", "most"), [(25, False, 6), (100, False, 1.8), (60, True, 2.9)])  # drawn: 2.7
 def test_few_samples_of_noise_scatter_and_few_are_refused_for_it(count, jumps, most):
     """Of 2,000 times 28 entries of white noise, the share refused is at most what it is said to be."""
     random, trials, entries = np.random.default_rng(count), 2_000, 28
