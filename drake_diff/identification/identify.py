@@ -449,7 +449,7 @@ def _through_impacts(problem: Problem, names: Sequence[str] | str) -> Identifica
     nv, noise = problem.model.nv, problem.first_noise
     j = judged(problem.model, problem.pieces, names, noise[: 2 * nv])
     search, found, h = j.search, j.found, j.search.law.model.time_step
-    without = "" if found.half is not None else "; intervals leave out what the step does, as a diagram has but one"
+    without = "" if found.half is not None else "; intervals leave out what the step does: the model has but one"
     unknowns, values, intervals = search.unknowns, search.values(found.w), search.intervals(found)
     limits = np.concatenate([np.reshape(intervals[one.name], (-1, 2)) for one in unknowns.each])
     deviations = (limits[:, 1] - limits[:, 0]) / (2 * 1.96)

@@ -59,7 +59,7 @@ class ContactIdentification(ShowsItsRepr):
     values: Mapping[str, float | Array]  # by name
     start: Mapping[str, float | Array]
     intervals: Mapping[str, Array]  # (2,) or (k, 2), by the scatter between recordings and by `at_half_step`
-    at_half_step: Mapping[str, float | Array] | None  # values by half the time step; None: a diagram has but one
+    at_half_step: Mapping[str, float | Array] | None  # values by half the time step; None: it cannot be loaded so
     unidentifiable: tuple[str, ...]  # entries whose interval is wider than a factor of 3, or than 10 mm or 10 mrad
     cost_before: float  # soft-L1 mean over whole recordings, in units of the motion of a millisecond
     cost_after: float
@@ -89,7 +89,7 @@ class Found:
 
     w: Array  # (n,)
     spread: Array  # (n,) half widths of 95 % intervals
-    half: Array | None  # (n,) where steps of half the length lead; None of a diagram, which has but one time step
+    half: Array | None  # (n,) where steps of half the length lead; None where the model cannot be had with them
     correlation: Array  # (n, n); NaN where nothing is known
     costs: tuple[float, float]  # soft-L1 mean over whole recordings, before and after
     flights: int
@@ -267,8 +267,9 @@ class Search:
 
     def by_half(self, w: Array, random: np.random.Generator) -> Array | None:
         """(n,) where the search leads from w (n,) over whole recordings by steps of half the length."""
-        if not self.law.model.can_rebuild:
-            return None
+        source = self.law.model.source
+        if not self.law.model.can_rebuild or source is None or not source.exists():
+            return None  # a diagram, or a file that is gone, as a function that makes models may have it
         model = self.law.model.at_time_step(self.law.model.time_step / 2)
         finer = Search(model, self.pieces, self.names, self.lengths, self.build)
         segments, _ = finer.segments(w, np.inf)
