@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.identification import contact_causes
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.measured import read_pieces
-from drake_diff.identification.unknowns import choose_unknowns
-from drake_diff.identification.whole_motions import WholeMotions
+from drake_diff.identification.unknowns import Unknown, choose_unknowns
+from drake_diff.identification.whole_motions import Fitted, Point, WholeMotions
 from drake_diff.identification.words import NO_CHANGE, Explanation, also_touching
 from drake_diff.mechanics.description import coordinates_of
 
@@ -96,6 +97,19 @@ def test_a_larger_radius_is_named_though_the_model_touches_nothing(contact_alone
     assert w.names == (name,) == ("pusher.radius",)
     low, high = w.intervals[name]
     assert abs(w.values[name] - truth[name]) < high - low  # two intervals of 95 %: four deviations
+
+
+@each_row(
+    "start, value, half, nothing",
+    [(1.0, 1.0005, 1e-6, True), (1.0, 1.3, 0.01, False), (1.0, 1.3, 0.4, True), (1.0, 1.3, np.inf, False)],
+)
+def test_a_change_that_is_none_blames_no_model(start, value, half, nothing):
+    w = np.log([value / start])
+    own = Unknown("ball.mass", "kg", np.array([start]), 0.0, start)
+    point = Point(w, (), np.zeros(1))
+    interval = np.array([[value - half, value + half]])
+    each = Fitted("ball.mass", 0.0, 1, True, "", np.array([value]), interval, point, np.array([half]))
+    assert contact_causes.is_nothing(own, each) == nothing
 
 
 def test_what_neither_search_explains_is_said_of_both():

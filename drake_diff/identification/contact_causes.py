@@ -34,6 +34,7 @@ OF_MOTION = (MASS, CENTER, "damping", "gravity")
 FOLLOWED, AGAIN_FOLLOWED = 2, 6  # of where a change may begin, at first and where none explains
 SEGMENT = 0.1  # [s] by which mistakes of columns are compared
 AGAIN = np.linspace(-1.5, 1.5, 25)  # where a change begins that is like one that explains, in its own scale
+NEXT_TO_NOTHING = 2e-3  # of its scale: a change that explains and is no larger leaves the model as it is
 LARGER = 1.2  # radii with which bodies are looked at that nearly touch
 
 
@@ -209,13 +210,15 @@ class _Search:
             if one.explains and evidence[one.name] > self.limit(one.freedom, len(tried)):
                 named.append(one)
         named = [one for one in named if self.bic(one) - self.bic(named[0]) < SAME]
-        if not named and base.explains:
+        own = {one.name: one for one in tried}
+        # Through impacts the model's own search may end short of a motion that one with next to no change finds.
+        as_it_is = base.explains or any(one.explains and is_nothing(own[one.name], one) for one in fitted)
+        if as_it_is and (not named or not base.explains):
             return Explanation((), {}, {}, (), True, f"Nothing: the model explains it.{end}", evidence)
         if not named:
             near = min(fitted, key=self.bic, default=base)
             what = f"with {near.name}, {near.doubt}" if near.name and near.doubt else "none comes near it"
             return Explanation((), {}, {}, (), False, f"{NO_CHANGE}; {what}.{end}", evidence)
-        own = {one.name: one for one in tried}
         named = [self.motions.widened(own[one.name], one) for one in named]
         texts = [self.words(own[one.name], one) for one in named]
         tail = ": this explains the recording" if len(named) == 1 else ": the recording cannot tell"
@@ -234,6 +237,13 @@ class _Search:
     def words(own: Unknown, one: Fitted) -> str:
         unit = "m" if own.quantity == BIAS else own.unit
         return changed_to(own.name, one.value, one.interval, own.start, unit)
+
+
+def is_nothing(own: Unknown, one: Fitted) -> bool:
+    """Whether a change is too small to tell from none: within its interval, or next to nothing of its own scale."""
+    within = bool(np.all((one.interval[:, 0] <= own.start) & (own.start <= one.interval[:, 1])))
+    known = bool(np.all(np.isfinite(one.half)))
+    return (known and within) or (own.size > 0 and bool(np.all(np.abs(one.point.w) < NEXT_TO_NOTHING)))
 
 
 def _heights(model: Model, chart: Chart) -> list[str]:
