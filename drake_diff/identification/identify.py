@@ -17,7 +17,7 @@ from drake_diff.identification.chart import Chart
 from drake_diff.identification.dry import smooth_or_dry
 from drake_diff.identification.fit import Fit, Law, Solved, growth_cuts
 from drake_diff.identification.judge import (
-    FALSE_ALARM,
+    COLOURED,
     Known,
     colour_of,
     freedom_of,
@@ -439,7 +439,7 @@ class Problem:
             elif numbers[j] and size[j] > most_scatter(int(numbers[j]), len(names)) * self.scatter[j]:
                 return f"what is left of {name} is {size[j] / self.scatter[j]:.3g} times the scatter of its samples"
         name, p = colour_of(solved.reduced.residuals, names)
-        if p < FALSE_ALARM:
+        if p < COLOURED:
             return f"what is left of {name} is not noise: it hangs together over time (probability {p:.1g})"
         return why_not
 

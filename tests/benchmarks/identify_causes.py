@@ -10,7 +10,8 @@ encoder, 0.2 mrad; velocities are not recorded. In turn nothing is changed, and 
 one thing is; or two are: a mass with its inertia, a centre of mass, a damping, the dry friction of a joint, the
 strength of an input, a delay of all inputs, the bias of an encoder, or gravity. Dry friction stops a joint within two
 of MuJoCo's steps; with --soft it is MuJoCo's by default, which slows a joint down over 10 ms and lets it creep. A
-change that moves no joint by more than five times the noise, in MuJoCo and under the same torques, is drawn anew.
+change that moves no joint by more than five times the noise, in MuJoCo and under the same torques, is drawn anew. So
+is a bias with which the robot could be where its encoder says that it is.
 
 With --chance, nothing is changed, and noise is drawn so often for each robot: in which share of the draws some change
 passes the limit, and in which it passes the penalty of BIC alone.
@@ -214,8 +215,8 @@ def seen_without(truth, kind, root, model, q0, qs, us):
         other.strength[:] = 1
     elif kind == "input_delay":
         other.late = 0
-    elif kind == "bias":
-        return True
+    elif kind == "bias":  # what is measured could be where the robot is: of an upright first joint that changes nothing
+        q0, other.bias = q0 + truth.bias, np.zeros_like(truth.bias)
     elif kind == "gravity":
         other.gravity = np.array([0, 0, -9.81])
     else:
