@@ -76,9 +76,9 @@ def test_what_a_mirror_does_not_change_is_told_as_it_is(load):
 def test_mistaken_columns_of_an_arm_that_another_engine_moved_are_named():
     """MuJoCo with an encoder's noise, by the benchmark of causes."""
     pytest.importorskip("mujoco")
-    import identify_causes
+    import identify
 
-    model, log, _ = identify_causes.recorded("ur5_robot", (), 41)
+    model, log, _ = identify.recorded("ur5_robot", (), 41)
     q, u = model.position_names, model.input_names
     swapped, mirrored, inputs = log.xs.copy(), log.xs.copy(), log.us.copy()
     swapped[:, [1, 2]], mirrored[:, 3], inputs[:, [0, 1]] = log.xs[:, [2, 1]], -log.xs[:, 3], log.us[:, [1, 0]]

@@ -206,20 +206,20 @@ def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(monkeypatch):
     """
     pytest.importorskip("mujoco")
     sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
-    import identify_causes
+    import identify
 
-    monkeypatch.setattr(identify_causes.base, "STEP", 2e-5)
+    monkeypatch.setattr(identify.base, "STEP", 2e-5)
     random = np.random.default_rng(7)
-    root = identify_causes.base.bare(robot_file("ur5_robot.urdf"))
-    model = identify_causes.loaded(root, "ur5_robot")
+    root = identify.base.bare(robot_file("ur5_robot.urdf"))
+    model = identify.loaded(root, "ur5_robot")
     joints = [name.removesuffix("_q") for name in model.position_names]
-    q0, command, push = identify_causes.led(model, random)
-    truth = identify_causes.Truth(root, joints, model.nu)
+    q0, command, push = identify.led(model, random)
+    truth = identify.Truth(root, joints, model.nu)
     truth.friction[:3] = random.uniform(0.1, 0.3, 3) * push[:3]
     qs, us = truth.run(model, q0, command)
     xs = np.full((len(qs), model.nx), np.nan)
-    xs[:, : model.nq] = qs + identify_causes.base.NOISE * random.standard_normal(qs.shape)
-    log = dd.Recording("MuJoCo", "3", identify_causes.base.PERIOD * np.arange(len(qs)), xs, us)
+    xs[:, : model.nq] = qs + identify.base.NOISE * random.standard_normal(qs.shape)
+    log = dd.Recording("MuJoCo", "3", identify.base.PERIOD * np.arange(len(qs)), xs, us)
     names = [f"{joint}.coulomb_friction" for joint in joints[:3]]
     e = dd.identify(model, log, names, motion="continuous")
     assert e.explained, e.reason

@@ -290,16 +290,16 @@ def test_chance_names_a_change_of_a_right_arm_in_less_than_0_3_percent():
 def test_of_an_arm_that_another_engine_moved_a_right_model_is_silent_and_an_error_is_named():
     """MuJoCo with an encoder's noise, by the benchmark: nothing is changed, or a joint's damping is."""
     pytest.importorskip("mujoco")
-    import identify_causes
+    import identify
 
-    assert identify_causes.measure("ur5_robot", (), 41)["verdict"] == "right"
-    assert identify_causes.measure("ur5_robot", ("damping",), 42)["verdict"] == "named"
-    assert identify_causes.measure("panda", ("mass",), 105)["verdict"] == "named"  # torques jump between their limits
-    two = identify_causes.measure("double_pendulum_simple", ("damping", "input_delay"), 230017)
+    assert identify.measure("ur5_robot", (), 41)["verdict"] == "right"
+    assert identify.measure("ur5_robot", ("damping",), 42)["verdict"] == "named"
+    assert identify.measure("panda", ("mass",), 105)["verdict"] == "named"  # torques jump between their limits
+    two = identify.measure("double_pendulum_simple", ("damping", "input_delay"), 230017)
     assert two["verdict"] == "named", two
-    arm = identify_causes.measure("kinova", ("input_delay", "strength"), 330004)
+    arm = identify.measure("kinova", ("input_delay", "strength"), 330004)
     assert arm["verdict"] == "named", arm
-    gives = identify_causes.measure("double_pendulum_simple", ("coulomb_friction",), 210037, soft=True)
+    gives = identify.measure("double_pendulum_simple", ("coulomb_friction",), 210037, soft=True)
     assert gives["verdict"] == "named", gives
     assert "gives way" in gives["said"]
 

@@ -1,199 +1,340 @@
-"""Whether `dd.identify` finds what was changed: robots of example-robot-data, recorded by MuJoCo in steps of 0.25 ms.
+"""Whether `dd.explain` names what was changed: 20 robots, recorded by MuJoCo in steps of 0.25 ms.
 
     pip install -e '.[test]'
-    python tests/benchmarks/identify.py [--seed 0] [--count 40] [--out FILE.json]
+    python tests/benchmarks/identify.py [--seed 0] [--count 600] [--changes 0 1 2] [--soft]
+    python tests/benchmarks/identify.py --chance 100000 [--seed 0] [--count 20]
 
-Each case is a robot on its base for 2 s at 100 Hz, with torques that weigh it and shake it, and the noise of an
-encoder, 0.2 mrad, on its positions; velocities are not recorded, and joints have no limits. One body's mass (with its
-inertia) and one joint's damping are not the file's. Both are estimated, and the damping of a third joint, which is
-right. In every fourth case nothing is changed, and in every fourth other one the joints have dry friction, which the
-model has not.
+Each case is a robot of example-robot-data or of models/, on its base for 2 s at 100 Hz. A controller leads it along
+sums of sines within its joints' ranges, by torques that are held for 10 ms and recorded. Positions have the noise of an
+encoder, 0.2 mrad; velocities are not recorded. In turn nothing is changed, and anything that is named is a false alarm;
+one thing is; or two are: a mass with its inertia, a centre of mass, a damping, the dry friction of a joint, the
+strength of an input, a delay of all inputs, the bias of an encoder, or gravity. Dry friction stops a joint within two
+of MuJoCo's steps; with --soft it is MuJoCo's by default, which slows a joint down over 10 ms and lets it creep. A
+change that moves no joint by more than five times the noise, in MuJoCo and under the same torques, is drawn anew. So
+is a bias with which the robot could be where its encoder says that it is.
+
+With --chance, nothing is changed, and noise is drawn so often for each robot: in which share of the draws some change
+passes the limit, and in which it passes the penalty of BIC alone.
 """
 
 import argparse
 import copy
 import json
-import os
-import sys
 import tempfile
 import time
 import warnings
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass, field
 from pathlib import Path
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
+import identify_fits as base
+import mujoco
+import numpy as np
+from helpers.chance import chance_of_a_name
+from helpers.models import robot_file
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
+import drake_diff as dd
+from drake_diff._base.statistics import success_rate
+from drake_diff.model.step import set_state
 
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from helpers.models import robot_file  # noqa: E402
-
-import drake_diff as dd  # noqa: E402
-from drake_diff._base.statistics import success_rate  # noqa: E402
-from drake_diff.model.step import set_state  # noqa: E402
-
-ROBOTS = ("ur5_robot.urdf", "z1.urdf", "so100.urdf")
-PERIOD, SAMPLES, STEP, NOISE = 0.01, 200, 2.5e-4, 2e-4  # [s], and [rad]
-DAMPING = 0.05  # [N m s/rad] of joints whose file gives none
-FRICTION = 0.05  # of the largest torque that holds the robot up
-
-
-def bare(path):
-    """The file without shapes, motors, followers and dry friction, and with damping in every joint."""
-    root = ET.parse(path).getroot()
-    for element in list(root.iter()):
-        for child in list(element):
-            if child.tag in ("visual", "collision", "transmission", "gazebo", "sensor", "mimic"):
-                element.remove(child)
-    for joint in moving(root):
-        dynamics = joint.find("dynamics")
-        dynamics = ET.SubElement(joint, "dynamics") if dynamics is None else dynamics
-        dynamics.attrib.pop("friction", None)
-        if float(dynamics.get("damping", 0)) == 0:
-            dynamics.set("damping", str(DAMPING))
-    return root
-
-
-def moving(root):
-    return [joint for joint in root.iter("joint") if joint.get("type") in ("revolute", "continuous", "prismatic")]
-
-
-def scale(root, name, factor):
-    """Change `link.mass`, and the inertia with it, or `joint.damping`."""
-    label, quantity = name.rsplit(".", 1)
-    if quantity == "damping":
-        element = next(joint for joint in moving(root) if joint.get("name") == label).find("dynamics")
-        attributes = [(element, "damping")]
-    else:
-        inertial = next(link for link in root.iter("link") if link.get("name") == label).find("inertial")
-        attributes = [(inertial.find("mass"), "value")]
-        attributes += [(inertial.find("inertia"), key) for key in inertial.find("inertia").attrib]
-    for element, key in attributes:
-        element.set(key, repr(float(float(element.get(key)) * factor)))
+OURS = Path(__file__).parents[2] / "models"
+ROBOTS = (
+    "ur5_robot",
+    "z1",
+    "so100",
+    "panda",
+    "kinova",
+    "double_pendulum",
+    "talos_left_arm",
+    "solo",
+    "go2",
+    "solo12",
+    "ur3_robot",
+    "TwoDofs",
+    "models/quadruped",
+    "quadruped",
+    "so101",
+    "borinot_flying_arm_2",
+    "ur10_robot",
+    "double_pendulum_simple",
+    "hextilt_flying_arm_5",
+    "a1",
+)  # of which MuJoCo takes the inertias; fmt: skip
+KINDS = ("mass", "damping", "center_of_mass", "coulomb_friction", "strength", "input_delay", "bias", "gravity")
+FINER = 4  # parts of a sample, of which delays are whole numbers
+SEEN = 5  # times the noise that a change moves some joint by
+STIFF, DAMPED = 8.0, 0.7  # [rad/s] of the controller
+BEGUN = 0.4  # [s] after which the sines are whole
 
 
-def by_mujoco(root, joints, q0, torques, friction, period=PERIOD, gravity=(0, 0, -9.81)):
-    """(N + 1, 2 n) positions and velocities of `joints`, from rest, under N torques that act for a period each."""
-    root = copy.deepcopy(root)
-    if all(link.get("name") != "world" for link in root.iter("link")):
-        root.insert(0, ET.Element("link", name="world"))
-    model = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode")).compile()
-    model.opt.timestep, model.opt.integrator = STEP, mujoco.mjtIntegrator.mjINT_RK4
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT) | int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in joints]
-    q, v = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
-    model.dof_frictionloss[v], model.opt.gravity[:] = friction, gravity
-    data = mujoco.MjData(model)
-    data.qpos[q] = q0
-    found = [np.concatenate([data.qpos[q], data.qvel[v]])]
-    for torque in torques:
-        data.qfrc_applied[v] = torque
-        for _ in range(round(period / STEP)):
-            mujoco.mj_step(model, data)
-        found.append(np.concatenate([data.qpos[q], data.qvel[v]]))
-    return np.array(found)
-
-
-@dataclass
-class Case:
-    robot: str
-    kind: str  # "changed", "right" or "friction"
-    seed: int
-    explained: bool = False
-    reason: str = ""
-    covered: list = field(default_factory=list)
-    misses: list = field(default_factory=list)
-    alarms: list = field(default_factory=list)  # parameters that are said to differ, and do not
-    widths: list = field(default_factory=list)  # half an interval, in parts of the value
-    seconds: float = 0.0
-
-
-def measure(robot, kind, seed):
-    random = np.random.default_rng(seed)
-    root = bare(robot_file(robot))
+def loaded(root, robot):
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        path = Path(folder) / robot
+        path = Path(folder) / f"{Path(robot).name}.urdf"
         ET.ElementTree(root).write(path)
-        model = dd.load_model(path, time_step=0.005, actuators="all", contact=False, base="weld")
-    joints = [name.removesuffix("_q").removesuffix("_x") for name in model.position_names]
-    start = {p.name: float(p.value[0]) for p in dd.list_parameters(model) if len(p.value) == 1}
-    carried = [joint.find("child").get("link") for joint in moving(root)]
-    masses = {link: start[f"{link}.mass"] for link in carried if start.get(f"{link}.mass", 0) > 0}
-    body = random.choice([link for link, mass in masses.items() if mass > 0.02 * max(masses.values())])
-    one, other = random.choice(joints, 2, replace=False)
-    names = [f"{body}.mass", f"{one}.damping", f"{other}.damping"]
-    factors = (1 + random.choice([-1, 1]) * random.uniform(0.05, 0.4), random.uniform(0.5, 2.0), 1.0)
-    truth = copy.deepcopy(root)
-    values = {name: start[name] * (1.0 if kind == "right" else f) for name, f in zip(names, factors, strict=True)}
-    for name in names:
-        scale(truth, name, values[name] / start[name])
+        return dd.load_model(path, time_step=0.005, actuators="all", contact=False, base="weld")
+
+
+class Truth:
+    """The robot that is recorded, and the names of what is not the file's."""
+
+    def __init__(self, root, joints, nu, soft=False):
+        self.soft = soft  # whether dry friction is MuJoCo's by default
+        self.root, self.joints, self.changes = copy.deepcopy(root), joints, {}
+        self.friction, self.strength = np.zeros(len(joints)), np.ones(nu)
+        self.late, self.bias, self.gravity = 0, np.zeros(len(joints)), np.array([0, 0, -9.81])
+
+    def change(self, kind, model, push, random):
+        factor, j = float(np.exp(random.choice([-1, 1]) * random.uniform(0.15, 0.5))), random.integers(len(self.joints))
+        if kind in ("mass", "center_of_mass"):
+            masses = {p.name: float(p.value[0]) for p in dd.list_parameters(model) if p.name.endswith(".mass")}
+            carried = [joint.find("child").get("link") for joint in base.moving(self.root)]
+            heavy = max(masses.get(f"{link}.mass", 0) for link in carried)
+            body = random.choice([link for link in carried if masses.get(f"{link}.mass", 0) > 0.05 * heavy])
+            if kind == "mass":
+                base.scale(self.root, f"{body}.mass", factor)
+                self.changes[f"{body}.mass"] = factor * masses[f"{body}.mass"]
+                return
+            link = next(link for link in self.root.iter("link") if link.get("name") == body)
+            origin = link.find("inertial").find("origin")
+            origin = ET.SubElement(link.find("inertial"), "origin") if origin is None else origin
+            shift = random.standard_normal(3)
+            shift *= random.uniform(0.01, 0.04) / np.linalg.norm(shift)
+            at = np.array([float(x) for x in origin.get("xyz", "0 0 0").split()]) + shift
+            origin.set("xyz", " ".join(map(repr, map(float, at))))
+            self.changes[f"{body}.center_of_mass"] = list(at)
+        elif kind == "damping":
+            name = f"{self.joints[j]}.damping"
+            base.scale(self.root, name, factor**2)
+            element = next(e for e in base.moving(self.root) if e.get("name") == self.joints[j]).find("dynamics")
+            self.changes[name] = float(element.get("damping"))
+        elif kind == "coulomb_friction":
+            self.friction[j] = random.uniform(0.05, 0.3) * push[j]
+            self.changes[f"{self.joints[j]}.coulomb_friction"] = self.friction[j]
+        elif kind == "strength":
+            i = random.integers(model.nu)
+            self.strength[i] = factor
+            self.changes[f"{model.input_names[i]}.strength"] = factor
+        elif kind == "input_delay":
+            self.late = int(random.integers(1, 9))
+            self.changes["model.input_delay"] = self.late * base.PERIOD / FINER
+        elif kind == "bias":
+            self.bias[j] = random.choice([-1, 1]) * random.uniform(0.01, 0.05)
+            self.changes[f"{model.position_names[j]}.bias"] = self.bias[j]
+        else:
+            self.gravity = self.gravity + np.append(random.uniform(-1, 1, 2), 0.0)
+            self.changes["model.gravity"] = list(self.gravity)
+
+    def run(self, model, q0, command):
+        """(positions (N + 1, n) as encoders without noise say them, inputs (N, nu)); command(k, q, v) is an input."""
+        root = copy.deepcopy(self.root)
+        if all(link.get("name") != "world" for link in root.iter("link")):
+            root.insert(0, ET.Element("link", name="world"))
+        engine = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode")).compile()
+        engine.opt.timestep, engine.opt.integrator = base.STEP, mujoco.mjtIntegrator.mjINT_RK4
+        engine.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT) | int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        ids = [mujoco.mj_name2id(engine, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in self.joints]
+        q, v = engine.jnt_qposadr[ids], engine.jnt_dofadr[ids]
+        engine.dof_frictionloss[v], engine.opt.gravity[:] = self.friction, self.gravity
+        if not self.soft:  # friction that stops a joint within two steps, and holds it where it can
+            engine.dof_solimp[v, :2], engine.dof_solref[v] = 0.9999, (2 * base.STEP, 1)
+        data = mujoco.MjData(engine)
+        data.qpos[q] = q0
+        qs, us = [q0 + self.bias], []
+        for k in range(base.SAMPLES):
+            us.append(command(k, qs[-1], data.qvel[v]))
+            for part in range(FINER):
+                held = us[max(FINER * k + part - self.late, 0) // FINER]
+                data.qfrc_applied[v] = model.actuation @ (self.strength * held)
+                for _ in range(round(base.PERIOD / FINER / base.STEP)):
+                    mujoco.mj_step(engine, data)
+            qs.append(data.qpos[q] + self.bias)
+        if any(warning.number for warning in data.warning):
+            raise RuntimeError("MuJoCo found no motion of this robot")
+        return np.array(qs), np.array(us)
+
+
+def led(model, random):
+    """(first positions, command(k, q, v)): a controller along sines within the joints' ranges."""
     lower, upper = (np.clip(limit, -2, 2) for limit in model.position_limits)
-    q0 = lower + random.uniform(0.3, 0.7, model.nq) * (upper - lower)
-    set_state(model.double, np.concatenate([q0, np.zeros(model.nv)]))
-    weight, inertia = model.double.inverse_dynamics(np.zeros(model.nv)), np.diag(model.double.mass_matrix())
-    t = PERIOD * np.arange(SAMPLES + 1)
-    waves = [
-        sum(a * np.sin(2 * np.pi * f * t[:-1] + p) for a, f, p in random.uniform([0.3, 0.3, 0], [1, 3, 6], (3, 3)))
-        for _ in joints
-    ]
-    us = np.linalg.solve(model.actuation, (weight + 3 * inertia * np.transpose(waves)).T).T
+    lower, upper = np.where(upper - lower > 1e-3, lower, -2.0), np.where(upper - lower > 1e-3, upper, 2.0)
+    q0 = lower + random.uniform(0.35, 0.65, model.nq) * (upper - lower)
+    t = base.PERIOD * np.arange(base.SAMPLES + 1)
+    drawn = random.uniform([0.01, 0.3, 0], [0.04, 1.5, 2 * np.pi], (model.nq, 3, 3))
+    begun = np.clip(t / BEGUN, 0, 1)
+    begun = begun**3 * (10 - 15 * begun + 6 * begun**2)
+    waves = [begun * sum(a * (np.sin(2 * np.pi * f * t + p) - np.sin(p)) for a, f, p in each) for each in drawn]
+    path = q0 + np.transpose(waves) * (upper - lower)
+    speed = np.gradient(path, base.PERIOD, axis=0)
+    rate = np.gradient(speed, base.PERIOD, axis=0)
     limits = np.array(
         [abs(model.plant.get_joint_actuator(i).effort_limit()) for i in model.plant.GetJointActuatorIndices()]
     )
-    us = np.clip(us, -limits, limits)
-    friction = FRICTION * np.abs(weight).max() * inertia / inertia.max() if kind == "friction" else 0.0
-    xs = by_mujoco(truth, joints, q0, us @ model.actuation.T, friction)
-    xs[:, : model.nq] += NOISE * random.standard_normal((SAMPLES + 1, model.nq))
-    xs[:, model.nq :] = np.nan
-    case, begin = Case(robot, kind, seed), time.process_time()
-    e = dd.identify(model, dd.Recording("MuJoCo", mujoco.__version__, t, xs, us), names, motion="continuous")
-    case.seconds, case.explained, case.reason = time.process_time() - begin, e.explained, e.reason
-    if kind != "friction":
-        for name in names:
-            low, high = e.intervals[name]
-            case.covered.append(bool(low <= values[name] <= high))
-            case.widths.append(float((high - low) / 2 / values[name]))
-            if not case.covered[-1]:
-                case.misses.append(f"{name} {values[name]:.6g}: {low:.6g} to {high:.6g}")
-            if values[name] == start[name] and not low <= start[name] <= high:
-                case.alarms.append(name)
-    return case
+    set_state(model.double, np.concatenate([q0, np.zeros(model.nv)]))
+    inertia = np.diag(model.double.mass_matrix()).copy()
+    ahead = []
+    for k in range(base.SAMPLES):
+        set_state(model.double, np.concatenate([path[k], speed[k]]))
+        ahead.append(model.double.inverse_dynamics(rate[k]))
+    back = np.linalg.pinv(model.actuation)
+
+    def command(k, q, v):
+        pull = inertia * (STIFF**2 * (path[k] - q) + 2 * DAMPED * STIFF * (speed[k] - v))
+        return np.clip(back @ (ahead[k] + pull), -limits, limits)
+
+    push = np.std(ahead, axis=0)
+    return q0, command, push
+
+
+def recorded(robot, kinds, seed, soft=False):
+    """(model, recording, truth)."""
+    random = np.random.default_rng(seed)
+    root = base.bare(OURS / f"{Path(robot).name}.urdf" if robot.startswith("models/") else robot_file(f"{robot}.urdf"))
+    model = loaded(root, robot)
+    joints = [name.removesuffix("_q").removesuffix("_x") for name in model.position_names]
+    q0, command, push = led(model, random)
+    while True:
+        truth = Truth(root, joints, model.nu, soft)
+        for kind in kinds:
+            truth.change(kind, model, push, random)
+        qs, us = truth.run(model, q0, command)
+        if len(truth.changes) == len(kinds) and all(
+            seen_without(truth, kind, root, model, q0, qs, us) for kind in kinds
+        ):
+            break
+    xs = np.full((base.SAMPLES + 1, model.nx), np.nan)
+    xs[:, : model.nq] = qs + base.NOISE * random.standard_normal(qs.shape)
+    return model, dd.Recording("MuJoCo", mujoco.__version__, base.PERIOD * np.arange(base.SAMPLES + 1), xs, us), truth
+
+
+def seen_without(truth, kind, root, model, q0, qs, us):
+    """Whether the same torques move the robot otherwise where this change is not made."""
+    other = copy.deepcopy(truth)
+    if kind == "coulomb_friction":
+        other.friction[:] = 0
+    elif kind == "strength":
+        other.strength[:] = 1
+    elif kind == "input_delay":
+        other.late = 0
+    elif kind == "bias":  # what is measured could be where the robot is: of an upright first joint that changes nothing
+        q0, other.bias = q0 + truth.bias, np.zeros_like(truth.bias)
+    elif kind == "gravity":
+        other.gravity = np.array([0, 0, -9.81])
+    else:
+        name = next(name for name in truth.changes if name.endswith(f".{kind}"))
+        put_back(other.root, root, name)
+    again, _ = other.run(model, q0, lambda k, q, v: us[k])
+    return bool(np.max(np.sqrt(np.mean((again - qs) ** 2, axis=0))) > SEEN * base.NOISE)
+
+
+def put_back(changed, root, name):
+    label, quantity = name.rsplit(".", 1)
+    tag, child = ("joint", "dynamics") if quantity == "damping" else ("link", "inertial")
+    mine, file = (next(e for e in each.iter(tag) if e.get("name") == label) for each in (changed, root))
+    old = mine.find(child)
+    mine.insert(list(mine).index(old), copy.deepcopy(file.find(child)))
+    mine.remove(old)
+
+
+def measure(robot, kinds, seed, soft=False):
+    model, recording, truth = recorded(robot, kinds, seed, soft)
+    begin = time.process_time()
+    case = {
+        "robot": robot,
+        "kinds": list(kinds),
+        "seed": seed,
+        "changed": truth.changes,
+        "names": [],
+        "alternatives": [],
+    }
+    try:
+        w = dd.explain(model, recording, motion="continuous")
+    except dd.exceptions.DrakeDiffError as error:
+        return {**case, "verdict": "refused", "covered": [], "seconds": time.process_time() - begin, "said": f"{error}"}
+    wanted = set(truth.changes)
+    every = [set(names) for names in (w.names, *w.alternatives)]
+    if not wanted:
+        verdict = "right" if w.explained and not w.names else "alarm"
+    elif set(w.names) == wanted:
+        verdict = "named"
+    elif wanted in every:
+        verdict = "among"
+    else:
+        verdict = "another" if w.names else "unseen" if w.explained else "unexplained"
+    covered = []
+    if verdict in ("named", "among"):
+        for name, value in truth.changes.items():
+            within = np.atleast_2d(w.intervals[name])
+            told = np.all(np.isfinite(within), axis=1)
+            inside = (within[:, 0] <= value) & (np.atleast_1d(value) <= within[:, 1])
+            covered += [bool(one) for one in inside[told]]
+    return {**case, "names": list(w.names), "alternatives": [list(a) for a in w.alternatives], "verdict": verdict,
+            "covered": covered, "seconds": time.process_time() - begin, "said": w.sentence}  # fmt: skip
+
+
+def kinds_of(seed, i, count):
+    """So many kinds, of which no two are alike; every kind is met by every robot as cases go on."""
+    random = np.random.default_rng([seed, i])
+    return tuple(str(kind) for kind in random.choice(KINDS, count, replace=False))
+
+
+def rates(cases):
+    for number, word in ((1, "single changes"), (2, "changes of two")):
+        of = [case for case in cases if len(case["kinds"]) == number]
+        for verdicts, told in (
+            (("named",), "named first"),
+            (("named", "among"), "named, alone or among those that the recording cannot tell from it"),
+            (("another",), "of which something else is said"),
+            (("unseen",), "of which nothing is said"),
+            (("unexplained", "refused"), "not explained"),
+        ):
+            yield f"{word} {told}", sum(case["verdict"] in verdicts for case in of), len(of)
+    right = [case for case in cases if not case["kinds"]]
+    yield "right models of which something is said", sum(case["verdict"] != "right" for case in right), len(right)
+    covered = [one for case in cases for one in case["covered"]]
+    yield "intervals that have the truth", sum(covered), len(covered)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--count", type=int, default=600)
+    parser.add_argument("--changes", type=int, nargs="+", default=[0, 1, 2], choices=(0, 1, 2))
+    parser.add_argument("--soft", action="store_true")
+    parser.add_argument("--chance", type=int, metavar="DRAWS")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
+    if given.chance:
+        each = []
+        for i, robot in enumerate(ROBOTS[: given.count]):
+            model, recording, _ = recorded(robot, (), 10000 * given.seed + i)
+            each.append(chance_of_a_name(model, recording, given.chance, given.seed))
+            named, by_bic = each[-1]
+            print(f"{robot:22} named {100 * named:.3g} %, by BIC alone {100 * by_bic:.3g} %", flush=True)
+        named, by_bic = 100 * np.mean(each, axis=0)
+        worst = 100 * np.max([one for one, _ in each])
+        print(f"mean: named {named:.3g} %, at most {worst:.3g} %; by BIC alone {by_bic:.3g} %")
+        return
     cases = []
-    for i in range(given.count):
-        kind = ("changed", "right", "changed", "friction")[i % 4]
-        case = measure(ROBOTS[i % len(ROBOTS)], kind, 1000 * given.seed + i)
+    for i in range(given.first, given.first + given.count):
+        robot = ROBOTS[i // len(given.changes) % len(ROBOTS)]
+        kinds = kinds_of(given.seed, i, given.changes[i % len(given.changes)])
+        case = measure(robot, kinds, 10000 * given.seed + i, given.soft)
         cases.append(case)
-        said = "explained" if case.explained else f"not explained: {case.reason}"
-        print(f"{i:3} {case.robot:18} {kind:8} {case.seconds:5.1f} s  {said}  {'; '.join(case.misses)}", flush=True)
-    right = [case for case in cases if case.kind != "friction"]
-    covered = [one for case in right for one in case.covered]
-    wrong = [case for case in cases if case.kind == "friction"]
-    widths = [width for case in right for width in case.widths]
-    for name, found, of in (
-        ("intervals that have the truth", sum(covered), len(covered)),
-        ("right structures that are explained", sum(case.explained for case in right), len(right)),
-        ("dry friction that is not explained", sum(not case.explained for case in wrong), len(wrong)),
-    ):
+        changed = "; ".join(f"{name} {np.round(value, 4)}" for name, value in case["changed"].items())
+        print(
+            f"{i:3} {robot:22} {case['seconds']:5.1f} s {case['verdict']:11} {changed or 'nothing'} -> {case['said']}",
+            flush=True,
+        )
+        if given.out:
+            given.out.write_text(json.dumps(cases, indent=1))
+    for name, found, of in rates(cases):
         if of:
             rate = success_rate(found, of)
-            print(f"{name}: {found} of {of} ({rate.lower:.3f} to {rate.upper:.3f})")
-    print(f"half an interval: {100 * np.median(widths):.2g} % of a value as a rule, {100 * max(widths):.2g} % at most")
-    seconds = [case.seconds for case in cases]
-    print(f"processor time: {np.mean(seconds):.3g} s a fit, {max(seconds):.3g} s at most")
-    if given.out:
-        given.out.write_text(json.dumps([vars(case) for case in cases], indent=1))
+            within = f"{100 * rate.lower:.3g} to {100 * rate.upper:.3g} %"
+            print(f"{name}: {found} of {of} ({100 * found / of:.3g} %; {within})")
+    seconds = [case["seconds"] for case in cases]
+    print(f"processor time: {np.mean(seconds):.3g} s a recording, {max(seconds):.3g} s at most")
 
 
 if __name__ == "__main__":

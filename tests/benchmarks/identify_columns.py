@@ -3,7 +3,7 @@
     pip install -e '.[test]'
     python tests/benchmarks/identify_columns.py [--seed 0] [--count 40]
 
-The recordings are those of `identify_causes.py` in which nothing is changed: robots that MuJoCo moved for 2 s, with the
+The recordings are those of `identify.py` in which nothing is changed: robots that MuJoCo moved for 2 s, with the
 noise of an encoder and no velocities. In each, in turn, nothing is mistaken, and anything that is named is a false
 alarm; or two positions or two inputs are exchanged, a position or an input has the other sign, or angles are degrees.
 """
@@ -12,7 +12,7 @@ import argparse
 import time
 from dataclasses import replace
 
-import identify_causes as causes
+import identify as causes
 import numpy as np
 
 import drake_diff as dd
