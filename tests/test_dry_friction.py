@@ -104,19 +104,34 @@ MOTOR = """<transmission><type>transmission_interface/SimpleTransmission</type><
 LIMIT = '<limit effort="1e9"/>'
 
 
-def test_the_friction_of_a_joint_that_follows_another_holds_both(tmp_path):
-    """It acts through the ratio of -0.4, as the mass of its link does: 2 + 0.16 * 3 kg, and 0.4 times its friction."""
+def sliders(folder):
+    """A slide and another one that follows it by the ratio of -0.4."""
     links = LINK.format("first", 2, SOLID) + LINK.format("second", 3, SOLID)
     follows = f'{LIMIT}<mimic joint="a" multiplier="-0.4" offset="0"/>'
     rails = JOINT.format("a", "first", LIMIT) + JOINT.format("b", "second", follows)
-    (tmp_path / "sliders.urdf").write_text(f'<robot name="sliders">{links}{rails}{MOTOR}</robot>')
-    model = dd.load_model(tmp_path / "sliders.urdf", time_step=0.01, mimic="reduce")
+    (folder / "sliders.urdf").write_text(f'<robot name="sliders">{links}{rails}{MOTOR}</robot>')
+    return dd.load_model(folder / "sliders.urdf", time_step=0.01, mimic="reduce")
+
+
+def test_the_friction_of_a_joint_that_follows_another_holds_both(tmp_path):
+    """It acts through the ratio of -0.4, as the mass of its link does: 2 + 0.16 * 3 kg, and 0.4 times its friction."""
     us = pushes(9.0)
     xs = sticks_and_slips(us, mass=2 + 0.4**2 * 3)
-    e = dd.identify(model, measured(xs, us), ["b.coulomb_friction"])
+    e = dd.identify(sliders(tmp_path), measured(xs, us), ["b.coulomb_friction"])
     assert e.explained, e.reason
     low, high = e.intervals["b.coulomb_friction"]
     assert low < FRICTION / 0.4 < high < low + 0.02 * FRICTION / 0.4
+
+
+def test_friction_that_holds_is_named_where_a_joint_follows_another(tmp_path):
+    """Of either joint: 1 N of the one and 1/0.4 N of the other do the same."""
+    us = pushes(9.0)
+    xs = sticks_and_slips(us, mass=2 + 0.4**2 * 3)
+    w = dd.explain(sliders(tmp_path), measured(xs, us))
+    assert w.names in [("a.coulomb_friction",), ("b.coulomb_friction",)]
+    true = FRICTION if w.names == ("a.coulomb_friction",) else FRICTION / 0.4
+    low, high = w.intervals[w.names[0]]
+    assert low < true < high < low + 0.02 * true
 
 
 def test_derivatives_go_through_a_stop_that_lets_another_joint_go(load):

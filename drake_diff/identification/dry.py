@@ -296,11 +296,17 @@ class DryMotion(ContinuousMotion):
         return np.concatenate([whole, h * (phi @ C)], axis=2)
 
 
-def smooth_or_dry(model: Model, tree: Tree, chart: Chart, unknowns: Unknowns, longest: float) -> ContinuousMotion:
-    """The motion in continuous time, with dry friction that holds in those joints of which it is an unknown."""
-    own, coupling = (model, tree, chart, unknowns, longest), tree.dynamics.coupling
-    dry = {one.label for one in unknowns.each if one.quantity == COULOMB}
+def dry_places(tree: Tree, unknowns: Unknowns) -> tuple[int, ...]:
+    """Of the velocities: those of joints of which dry friction is an unknown."""
+    dry, coupling = {one.label for one in unknowns.each if one.quantity == COULOMB}, tree.dynamics.coupling
     places = {link.joint.v_start for link in tree.links if link.joint.joint in dry}
     if coupling is not None:
         places = {int(coupling.of_v[i]) for i in places}
-    return DryMotion(*own, joints=tuple(sorted(places))) if places else ContinuousMotion(*own)
+    return tuple(sorted(places))
+
+
+def smooth_or_dry(model: Model, tree: Tree, chart: Chart, unknowns: Unknowns, longest: float) -> ContinuousMotion:
+    """The motion in continuous time, with dry friction that holds in those joints of which it is an unknown."""
+    places = dry_places(tree, unknowns)
+    own = (model, tree, chart, unknowns, longest)
+    return DryMotion(*own, joints=places) if places else ContinuousMotion(*own)

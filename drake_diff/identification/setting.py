@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.dry import DryMotion
+from drake_diff.identification.dry import DryMotion, dry_places
 from drake_diff.identification.euler import EulerMotion
 from drake_diff.identification.fit import Fit, Law, Point
 from drake_diff.identification.flow import ROUGH, ContinuousMotion
@@ -134,13 +134,12 @@ class Setting:
     def law_of(self, unknowns: Unknowns) -> ContinuousMotion:
         """With dry friction that holds."""
         law = self.law(unknowns, self.longest)
-        dry = [one.label for one in unknowns.each if one.quantity == COULOMB]
-        if not dry or self.step is not None or self.tree.dynamics.coupling is not None:
+        dry = dry_places(self.tree, unknowns)
+        if not dry or self.step is not None:
             return law
-        at = {link.joint.joint: link.joint.v_start for link in self.tree.links}
         own = self.model, self.tree, self.chart, unknowns, self.longest
         gives = any(one.quantity == HELD_INERTIA for one in unknowns.each)
-        return DryMotion(*own, joints=tuple(at[joint] for joint in dry), gives=gives, calm=self.calm)
+        return DryMotion(*own, joints=dry, gives=gives, calm=self.calm)
 
     @staticmethod
     def each_of(unknowns: Unknowns) -> list[tuple[Unknown, slice]]:
