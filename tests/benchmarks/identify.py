@@ -169,15 +169,16 @@ def led(model, random):
     limits = np.array(
         [abs(model.plant.get_joint_actuator(i).effort_limit()) for i in model.plant.GetJointActuatorIndices()]
     )
-    ahead, inertia = [], []  # the whole matrix: by its diagonal a Panda whose joints 1 and 3 are in line chatters
+    ahead = []
     for k in range(base.SAMPLES):
         set_state(model.double, np.concatenate([path[k], speed[k]]))
         ahead.append(model.double.inverse_dynamics(rate[k]))
-        inertia.append(model.double.mass_matrix().copy())
     back = np.linalg.pinv(model.actuation)
 
     def command(k, q, v):
-        pull = inertia[k] @ (STIFF**2 * (path[k] - q) + 2 * DAMPED * STIFF * (speed[k] - v))
+        set_state(model.double, np.concatenate([q, v]))
+        inertia = model.double.mass_matrix()  # by its diagonal a Panda whose joints 1 and 3 are in line chatters
+        pull = inertia @ (STIFF**2 * (path[k] - q) + 2 * DAMPED * STIFF * (speed[k] - v))
         return np.clip(back @ (ahead[k] + pull), -limits, limits)
 
     push = np.std(ahead, axis=0)
