@@ -185,7 +185,9 @@ class _Search:
         try:
             self.race.improve([gives])
             there = gives.fit.at(gives.z, gives.starts)
-            if there is None or there.value + len(held) * float(np.log(self.setting.count)) > one.left:
+            if there is None or self.setting.is_hopeless(there.value):
+                return None
+            if there.value + len(held) * float(np.log(self.setting.count)) > one.left:
                 return None
             found = self.trial.solved(one.names, unknowns, gives.fit.law, self.setting.cut, gives.starts, gives.z)
         except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
@@ -218,6 +220,7 @@ class _Search:
                 if one.name not in found:
                     alone, z, cut = self.setting.of([one.name]), pair.z[s], self.setting.cut
                     runner = self.race.running((one.name,), alone, cut, pair.starts, z, NO_PROMISE)
+                    runner.fit = self.race.firm(runner)
                     if not runner.step() or self.setting.is_hopeless(runner.left):
                         continue
                     law = self.setting.law_of(alone)

@@ -38,6 +38,7 @@ KINKED = (
 )
 CLOSED = 1e-3  # of the noise: how far gaps may stand open at the end
 HALVINGS = 8
+FARTHER = 3.0  # by which a step may lead farther each time that a whole one did well, where motion kinks
 NEAR = 10.0  # times how well a velocity is known from the samples around: about how far a step leads where motion kinks
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
 
@@ -306,8 +307,11 @@ class Fit:
         weak = np.sum(((z - self.unknowns.z_start) / self.unknowns.pulls) ** 2)
         return float(weak + np.sum(self.unknowns.prior_rows(z)[0] ** 2))
 
-    def reduce(self, point: "Point") -> Reduced:
-        """Linearize, close the gaps to first order, and take the first states out."""
+    @np.errstate(
+        over="ignore", invalid="ignore"
+    )  # of a motion that grows beyond all bounds, which no step leads on from
+    def reduce(self, point: "Point", reach: float = 1.0) -> Reduced:
+        """Linearize, close the gaps to first order, and take the first states out; `reach` lets these move farther."""
         z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
         s, nt, nz = point.segments, self.chart.size, len(z)
         A, C = self.law.slopes(z, xs, s.hs, s.us)
@@ -352,7 +356,7 @@ class Fit:
             ridge = np.zeros((nt, nt + nz + 1))
             ridge[:, :nt] = NO_PRIOR * np.eye(nt)
             if self.law.kinks:
-                ridge[nt // 2 :, nt // 2 : nt] = np.diag(1 / (NEAR * self.gap_scale[nt // 2 :]))
+                ridge[nt // 2 :, nt // 2 : nt] = np.diag(1 / (reach * NEAR * self.gap_scale[nt // 2 :]))
             R = _triangle(np.vstack([*rows, ridge]))
             own.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
             rows_z.append(R[nt : nt + nz, nt:])
@@ -394,13 +398,13 @@ class Fit:
 
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
         """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
-        merit, here = 0.0, self.at(z, starts)
+        merit, reach, here = 0.0, 1.0, self.at(z, starts)
         if here is None:
             raise SimulationError(
                 "the model has no motion from the states that were measured: its steps are not finite"
             )
         for steps in range(most + 1):
-            found = self.reduce(here)
+            found = self.reduce(here, reach)
             dz = self.step_of(here.z, found)
             now = sum(float(np.nansum(r**2)) for r in found.residuals) + self._pull(here.z)
             then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(here.z + dz)
@@ -422,6 +426,7 @@ class Fit:
             else:
                 why = "no part of a step made the motion nearer to what was measured"
                 return Solved(here.z, here.starts, found, False, steps, why)
+            reach = reach * FARTHER if part == 1.0 else max(reach / FARTHER, 1.0)
             here = ahead
         return Solved(here.z, here.starts, found, False, most, "it took too many steps")
 

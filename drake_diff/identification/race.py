@@ -200,7 +200,7 @@ class Race:
                 last = one.left
                 if self.is_late or not one.step() or last - one.left < CLOSE:
                     break
-                if one.left > FALLS * last and self.is_behind(one.left, best):
+                if one.left > FALLS * last and (self.is_behind(one.left, best) or self.setting.is_hopeless(one.left)):
                     break
             best = min(best, one.left)
 

@@ -74,6 +74,10 @@ def loaded(root, robot):
         return dd.load_model(path, time_step=0.005, actuators="all", contact=False, base="weld")
 
 
+class NoMotion(Exception):
+    """The controller does not hold the robot as it was changed."""
+
+
 class Truth:
     """The robot that is recorded, and the names of what is not the file's."""
 
@@ -149,7 +153,7 @@ class Truth:
                     mujoco.mj_step(engine, data)
             qs.append(data.qpos[q] + self.bias)
         if any(warning.number for warning in data.warning):
-            raise RuntimeError("MuJoCo found no motion of this robot")
+            raise NoMotion
         return np.array(qs), np.array(us)
 
 
@@ -196,11 +200,14 @@ def recorded(robot, kinds, seed, soft=False):
         truth = Truth(root, joints, model.nu, soft)
         for kind in kinds:
             truth.change(kind, model, push, random)
-        qs, us = truth.run(model, q0, command)
-        if len(truth.changes) == len(kinds) and all(
-            seen_without(truth, kind, root, model, q0, qs, us) for kind in kinds
-        ):
-            break
+        if len(truth.changes) < len(kinds):
+            continue
+        try:
+            qs, us = truth.run(model, q0, command)
+            if all(seen_without(truth, kind, root, model, q0, qs, us) for kind in kinds):
+                break
+        except NoMotion:
+            continue
     xs = np.full((base.SAMPLES + 1, model.nx), np.nan)
     xs[:, : model.nq] = qs + base.NOISE * random.standard_normal(qs.shape)
     return model, dd.Recording("MuJoCo", mujoco.__version__, base.PERIOD * np.arange(base.SAMPLES + 1), xs, us), truth
