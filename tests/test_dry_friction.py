@@ -13,6 +13,8 @@ import drake_diff as dd
 from drake_diff.identification import dry
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.dry import smooth_or_dry
+from drake_diff.identification.fit import Fit
+from drake_diff.identification.measured import read_pieces
 from drake_diff.identification.sensors import choose_sensors
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns, numbers_at, set_numbers
@@ -244,3 +246,25 @@ def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(monkeypatch):
         assert high - low < 0.01 * value
         off.append((e.values[name] - value) / ((high - low) / (2 * 1.96)))
     assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 3), off  # of three standard normal numbers
+
+
+def test_a_held_joint_that_is_taken_for_moving_at_first_is_found_at_rest_in_a_few_steps(load):
+    """Its way to the stop is as v^2, which says ever less of v: plain steps take up to 15 here."""
+    model, count = load("double_pendulum.urdf"), 100
+    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    unknowns = choose_unknowns(model, tree, ["shoulder.coulomb_friction"])
+    law = smooth_or_dry(model, tree, chart, unknowns, H)
+    times, true = H * np.arange(count + 1), np.array([4.0])
+    us = np.column_stack([6 * np.sin(4.4 * times[:-1]), 0.6 * np.sin(8.2 * times[:-1])])
+    xs = law.run(true, np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), H), us[None])[0]
+    assert np.all(xs[:15, 2] == 0)
+    for seed in range(12):
+        ys = np.hstack([xs[:, :2], np.full((count + 1, 2), np.nan)])
+        ys[:, :2] += NOISE * np.random.default_rng(seed).standard_normal((count + 1, 2))
+        pieces = read_pieces(model, dd.Recording("lab", "1", times, ys, us), 0.0)
+        fit = Fit(model, law, chart, unknowns, pieces, np.array([NOISE, NOISE, np.nan, np.nan]))
+        starts = xs[fit.segments.first].copy()
+        starts[0, 2:] = [0.05, -0.09]  # [rad/s]
+        solved = fit.solve(true, starts, 10)
+        assert solved.converged, (seed, solved.why)
+        assert abs(solved.starts[0, 2]) < 0.04

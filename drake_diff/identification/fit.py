@@ -33,9 +33,7 @@ SEGMENT_SAMPLES = 5  # of a segment at least
 GROWTH = 1e6  # of a small motion within a piece, beyond which its end says nothing of its start: it is cut in two
 LARGEST = 1.0  # the largest change of an unknown in one step, in widths / FAR
 SETTLED = 1e-5  # of |r|^2, in units of the noise: what a last step may still gain
-KINKED = (
-    1e-2  # the same where motion kinks, as a slope then promises more than there is: a tenth of a standard deviation
-)
+PROMISED = 1e-2  # the same where slopes promise more than there is, as by kinks: a tenth of a standard deviation
 CLOSED = 1e-3  # of the noise: how far gaps may stand open at the end
 HALVINGS = 8
 FARTHER = 3.0  # by which a step may lead farther each time that a whole one did well, where motion kinks
@@ -309,7 +307,7 @@ class Fit:
 
     @np.errstate(
         over="ignore", invalid="ignore"
-    )  # of a motion that grows beyond all bounds, which no step leads on from
+    )  # of motions that grow beyond all bounds
     def reduce(self, point: "Point", reach: float = 1.0) -> Reduced:
         """Linearize, close the gaps to first order, and take the first states out; `reach` lets these move farther."""
         z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
@@ -408,7 +406,7 @@ class Fit:
             dz = self.step_of(here.z, found)
             now = sum(float(np.nansum(r**2)) for r in found.residuals) + self._pull(here.z)
             then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(here.z + dz)
-            settled = KINKED if self.law.kinks else SETTLED * (1 + SETTLED * now)
+            settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * now)
             if now - then <= settled and here.gap <= CLOSED:
                 return Solved(here.z, here.starts, found, True, steps, "")
             if steps == most:
@@ -424,8 +422,9 @@ class Fit:
                 if ahead is not None and ahead.value + merit * ahead.gap <= allowed:
                     break
             else:
-                why = "no part of a step made the motion nearer to what was measured"
-                return Solved(here.z, here.starts, found, False, steps, why)
+                ended = now - then <= PROMISED and here.gap <= CLOSED
+                why = "" if ended else "no part of a step made the motion nearer to what was measured"
+                return Solved(here.z, here.starts, found, ended, steps, why)
             reach = reach * FARTHER if part == 1.0 else max(reach / FARTHER, 1.0)
             here = ahead
         return Solved(here.z, here.starts, found, False, most, "it took too many steps")

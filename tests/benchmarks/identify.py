@@ -74,7 +74,7 @@ def loaded(root, robot):
         return dd.load_model(path, time_step=0.005, actuators="all", contact=False, base="weld")
 
 
-class NoMotion(Exception):
+class NoMotionError(Exception):
     """The controller does not hold the robot as it was changed."""
 
 
@@ -153,7 +153,7 @@ class Truth:
                     mujoco.mj_step(engine, data)
             qs.append(data.qpos[q] + self.bias)
         if any(warning.number for warning in data.warning):
-            raise NoMotion
+            raise NoMotionError
         return np.array(qs), np.array(us)
 
 
@@ -206,7 +206,7 @@ def recorded(robot, kinds, seed, soft=False):
             qs, us = truth.run(model, q0, command)
             if all(seen_without(truth, kind, root, model, q0, qs, us) for kind in kinds):
                 break
-        except NoMotion:
+        except NoMotionError:
             continue
     xs = np.full((base.SAMPLES + 1, model.nx), np.nan)
     xs[:, : model.nq] = qs + base.NOISE * random.standard_normal(qs.shape)
