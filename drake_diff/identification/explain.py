@@ -181,7 +181,6 @@ class _Search:
         unknowns = Unknowns((*self.setting.of(one.names).each, *held), as_in_files=True)
         z = np.concatenate([one.z, unknowns.z_start[1:]])
         gives = self.race.running(one.names, unknowns, self.setting.cut, one.starts, z, NO_PROMISE)
-        gives.fit = self.race.firm(gives)
         try:
             self.race.improve([gives])
             there = gives.fit.at(gives.z, gives.starts)
@@ -220,7 +219,6 @@ class _Search:
                 if one.name not in found:
                     alone, z, cut = self.setting.of([one.name]), pair.z[s], self.setting.cut
                     runner = self.race.running((one.name,), alone, cut, pair.starts, z, NO_PROMISE)
-                    runner.fit = self.race.firm(runner)
                     if not runner.step() or self.setting.is_hopeless(runner.left):
                         continue
                     law = self.setting.law_of(alone)

@@ -36,6 +36,7 @@ SETTLED = 1e-5  # of |r|^2, in units of the noise: what a last step may still ga
 PROMISED = 1e-2  # the same where slopes promise more than there is, as by kinks: a tenth of a standard deviation
 CLOSED = 1e-3  # of the noise: how far gaps may stand open at the end
 HALVINGS = 8
+AT_REST = 4.0  # of |r|^2: by how much more may be left for each joint that begins at rest, as by two standard deviations
 FARTHER = 3.0  # by which a step may lead farther each time that a whole one did well, where motion kinks
 NEAR = 10.0  # times how well a velocity is known from the samples around: about how far a step leads where motion kinks
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
@@ -394,7 +395,7 @@ class Fit:
             after[k] = self.chart.plus(starts[k], part * d)
         return after
 
-    def solve(self, z: Array, starts: Array, most: int) -> "Solved":
+    def solve(self, z: Array, starts: Array, most: int, *, from_rest: bool = False) -> "Solved":
         """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
         merit, reach, here = 0.0, 1.0, self.at(z, starts)
         if here is None:
@@ -422,12 +423,36 @@ class Fit:
                 if ahead is not None and ahead.value + merit * ahead.gap <= allowed:
                     break
             else:
+                if reach > 1.0:
+                    reach = 1.0
+                    continue
+                if self.law.kinks and not from_rest:
+                    again = self._from_rest(here, most)
+                    if again is not None:
+                        return again
                 ended = now - then <= PROMISED and here.gap <= CLOSED
                 why = "" if ended else "no part of a step made the motion nearer to what was measured"
                 return Solved(here.z, here.starts, found, ended, steps, why)
             reach = reach * FARTHER if part == 1.0 else max(reach / FARTHER, 1.0)
             here = ahead
         return Solved(here.z, here.starts, found, False, most, "it took too many steps")
+
+    def _from_rest(self, here: "Point", most: int) -> "Solved | None":
+        """Begun anew with joints at rest that stop in the first segment, if that converges and leaves as little.
+
+        Noise lets them move at first, and the order in which they stop has kinks that no step leads out of.
+        """
+        s, nq = here.segments, self.model.nq
+        starts, count = here.starts.copy(), 0
+        for k in np.flatnonzero(np.diff(s.of_piece, prepend=-1)):
+            stops = np.any(here.xs[k, 1:, nq:] == 0, axis=0) & (starts[k, nq:] != 0)
+            starts[k, nq:][stops] = 0.0
+            count += int(np.sum(stops))
+        if not count:
+            return None
+        again = self.solve(here.z, starts, most, from_rest=True)
+        there = self.at(again.z, again.starts)
+        return again if again.converged and there is not None and there.value <= here.value + AT_REST * count else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from drake_diff.identification.measured import Piece
 from drake_diff.identification.screen import DELAY, LEVELS, LIMIT, Promise, View
 from drake_diff.identification.setting import Setting
 from drake_diff.identification.trial import STEPS, Trial, Tried
-from drake_diff.identification.unknowns import COULOMB, Unknowns
+from drake_diff.identification.unknowns import Unknowns
 
 LOOKED_AT = 8  # changes that enter the race, of those that promise most: of those of one number, and of others
 RACE = (5, 4, 3, 2, 2, 1)  # so many stay after each step of Gauss and Newton
@@ -144,30 +144,17 @@ class Race:
         promise: Promise,
     ) -> Runner:
         problem = self.setting.problem(unknowns, pieces)
-        fit = problem.fit(self.setting.law(unknowns, self.setting.longest), pieces, problem.first_noise)
+        fit = problem.fit(self.setting.law_of(unknowns), pieces, problem.first_noise)
         return Runner(names, fit, z, starts, promise.left, promise.freedom)
 
-    def firm(self, one: Runner) -> Fit:
-        """With dry friction that holds, of the size that it has by now."""
-        unknowns, pieces = one.fit.unknowns, one.fit.segments.pieces
-        if all(each.quantity != COULOMB for each in unknowns.each):
-            return one.fit
-        return self.setting.problem(unknowns, pieces).fit(self.setting.law_of(unknowns), pieces, one.fit.noise)
-
     def raced(self, runners: list[Runner], base: Tried) -> tuple[list[Tried], list[Runner]]:
-        alive, there, turned = list(runners), [], set[tuple[str, ...]]()
+        alive, there = list(runners), []
         for most in RACE:
             if most < RACE[0] and self.is_late:
                 most = 1
-            before = {one.names: np.inf if one.names in turned else one.left for one in alive}
+            before = {one.names: one.left for one in alive}
             alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
             there += [one for one in alive if not self.setting.is_hopeless(one.left)]
-            turned = set[tuple[str, ...]]()  # whose motion is another from now on
-            for one in alive:
-                firm = self.firm(one)
-                if type(firm.law) is not type(one.fit.law):
-                    turned.add(one.names)
-                one.fit = firm
             alive = [
                 one
                 for one in alive[:most]
