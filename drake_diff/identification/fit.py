@@ -36,7 +36,7 @@ SETTLED = 1e-5  # of |r|^2, in units of the noise: what a last step may still ga
 PROMISED = 1e-2  # the same where slopes promise more than there is, as by kinks: a tenth of a standard deviation
 CLOSED = 1e-3  # of the noise: how far gaps may stand open at the end
 HALVINGS = 8
-AT_REST = 4.0  # of |r|^2: by how much more may be left for each joint that begins at rest, as by two standard deviations
+AT_REST = 4.0  # of |r|^2: what each joint that begins at rest may leave more, as by two standard deviations
 FARTHER = 3.0  # by which a step may lead farther each time that a whole one did well, where motion kinks
 NEAR = 10.0  # times how well a velocity is known from the samples around: about how far a step leads where motion kinks
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
@@ -306,9 +306,7 @@ class Fit:
         weak = np.sum(((z - self.unknowns.z_start) / self.unknowns.pulls) ** 2)
         return float(weak + np.sum(self.unknowns.prior_rows(z)[0] ** 2))
 
-    @np.errstate(
-        over="ignore", invalid="ignore"
-    )  # of motions that grow beyond all bounds
+    @np.errstate(over="ignore", invalid="ignore")  # of motions that grow beyond all bounds
     def reduce(self, point: "Point", reach: float = 1.0) -> Reduced:
         """Linearize, close the gaps to first order, and take the first states out; `reach` lets these move farther."""
         z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
@@ -395,8 +393,14 @@ class Fit:
             after[k] = self.chart.plus(starts[k], part * d)
         return after
 
-    def solve(self, z: Array, starts: Array, most: int, *, from_rest: bool = False) -> "Solved":
+    def solve(self, z: Array, starts: Array, most: int) -> "Solved":
         """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
+        solved = self._descended(z, starts, most)
+        if solved.converged or solved.steps == most or not self.law.kinks:
+            return solved
+        return self._from_rest(solved, most) or solved
+
+    def _descended(self, z: Array, starts: Array, most: int) -> "Solved":
         merit, reach, here = 0.0, 1.0, self.at(z, starts)
         if here is None:
             raise SimulationError(
@@ -414,45 +418,48 @@ class Fit:
                 break
             if here.gap > 0:
                 merit = max(merit, 2 * max(then - here.value, 0.0) / here.gap + 1.0)
-            gain = here.value - then + merit * here.gap
-            for part in (0.5**k for k in range(HALVINGS + 1)):
-                ahead = self.at(
-                    np.clip(here.z + part * dz, *self.unknowns.bounds), self.moved(here.starts, found, dz, part)
-                )
-                allowed = here.value + merit * here.gap - 1e-4 * part * gain + 1e-9 * (1 + abs(here.value))
-                if ahead is not None and ahead.value + merit * ahead.gap <= allowed:
-                    break
+            part, ahead = self._ahead(here, found, dz, merit, here.value - then + merit * here.gap)
+            if ahead is not None:
+                reach = reach * FARTHER if part == 1.0 else max(reach / FARTHER, 1.0)
+                here = ahead
+            elif reach > 1.0:
+                reach = 1.0
             else:
-                if reach > 1.0:
-                    reach = 1.0
-                    continue
-                if self.law.kinks and not from_rest:
-                    again = self._from_rest(here, most)
-                    if again is not None:
-                        return again
                 ended = now - then <= PROMISED and here.gap <= CLOSED
                 why = "" if ended else "no part of a step made the motion nearer to what was measured"
                 return Solved(here.z, here.starts, found, ended, steps, why)
-            reach = reach * FARTHER if part == 1.0 else max(reach / FARTHER, 1.0)
-            here = ahead
         return Solved(here.z, here.starts, found, False, most, "it took too many steps")
 
-    def _from_rest(self, here: "Point", most: int) -> "Solved | None":
+    def _ahead(
+        self, here: "Point", found: Reduced, dz: Array, merit: float, gain: float
+    ) -> tuple[float, "Point | None"]:
+        """The largest part of a step that does well, halved as often as needed, and where it leads."""
+        for part in (0.5**k for k in range(HALVINGS + 1)):
+            ahead = self.at(
+                np.clip(here.z + part * dz, *self.unknowns.bounds), self.moved(here.starts, found, dz, part)
+            )
+            allowed = here.value + merit * here.gap - 1e-4 * part * gain + 1e-9 * (1 + abs(here.value))
+            if ahead is not None and ahead.value + merit * ahead.gap <= allowed:
+                return part, ahead
+        return 0.0, None
+
+    def _from_rest(self, stuck: "Solved", most: int) -> "Solved | None":
         """Begun anew with joints at rest that stop in the first segment, if that converges and leaves as little.
 
         Noise lets them move at first, and the order in which they stop has kinks that no step leads out of.
         """
-        s, nq = here.segments, self.model.nq
+        here, nq = self.at(stuck.z, stuck.starts), self.model.nq
+        if here is None:
+            return None
         starts, count = here.starts.copy(), 0
-        for k in np.flatnonzero(np.diff(s.of_piece, prepend=-1)):
+        for k in np.flatnonzero(np.diff(here.segments.of_piece, prepend=-1)):
             stops = np.any(here.xs[k, 1:, nq:] == 0, axis=0) & (starts[k, nq:] != 0)
             starts[k, nq:][stops] = 0.0
             count += int(np.sum(stops))
-        if not count:
-            return None
-        again = self.solve(here.z, starts, most, from_rest=True)
-        there = self.at(again.z, again.starts)
-        return again if again.converged and there is not None and there.value <= here.value + AT_REST * count else None
+        again = self._descended(here.z, starts, most) if count else None
+        there = None if again is None else self.at(again.z, again.starts)
+        close = there is not None and there.value <= here.value + AT_REST * count
+        return again if again is not None and again.converged and close else None
 
 
 @dataclass(frozen=True, eq=False)
