@@ -15,7 +15,7 @@ tried, and no less than the penalty of BIC. Of changes that are named, the one w
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 
 import numpy as np
@@ -211,12 +211,12 @@ class _Search:
         return self.words.said(named) if named else None
 
     def halves(self, pairs: Sequence[Tried]) -> list[Tried]:
-        """Each change of some pairs alone, from where the pair was: the other one may do nothing."""
+        """Each change of some pairs alone, from where the pair was, if it was not fitted: the other may do nothing."""
         found: dict[str, Tried] = {}
         for pair in pairs:
             unknowns = self.setting.of([name for name in pair.names if not name.endswith(f".{LIMIT}")])
             for one, s in self.setting.each_of(unknowns) if len(unknowns.each) == 2 else []:
-                if one.name not in found:
+                if one.name not in found and one.name not in self.race.evidence:
                     alone, z, cut = self.setting.of([one.name]), pair.z[s], self.setting.cut
                     runner = self.race.running((one.name,), alone, cut, pair.starts, z, NO_PROMISE)
                     if not runner.step() or self.setting.is_hopeless(runner.left):
@@ -296,35 +296,43 @@ class _Search:
         )
 
     def paired(self, alone: View, runners: Sequence[Runner], base: Tried) -> list[Tried]:
-        """Pairs that promise most at the model, or beside a change that left least."""
-        count = len(alone.freedoms)
-        names = [one.name for one in self.setting.unknowns.each]
-        moving = [i for i, name in enumerate(names) if not self.setting.is_of_inputs(self.setting.plain(name))]
-        found, _ = self.race.tried(alone, self.race.chosen(alone, combinations(moving, 2)), base)
-        if not any(one.explains for one in found) and not self.race.is_late:
-            found += self.beside_a_delay(base)
+        """Pairs beside the change that left least, where that is little; those that promise most; and beside others."""
         later: list[Callable[[], list[Tried]]] = []  # searches for a limit or a delay, which take longest
-        for runner in runners[:BESIDE]:
+        beside = [partial(self.beside, one, base, later) for one in runners[:BESIDE]]
+        first = 1 if runners and not self.setting.is_hopeless(runners[0].left) else 0
+        both: list[Callable[[], list[Tried]]] = [
+            partial(self.at_the_model, alone, base),
+            partial(self.beside_a_delay, base),
+        ]
+        found: list[Tried] = []
+        for search in chain(beside[:first], both, beside[first:], later):
+            found += search()
             if any(one.explains for one in found) or self.race.is_late:
                 break
-            if runner.fit.unknowns.delay is not None:
-                continue
-            if runner.special:
-                later.append(partial(self.beside_inputs, runner, base))
-                continue
-            i = names.index(runner.names[0])
-            seen = self.setting.view(self.setting.cut, self.setting.with_one(i, runner.z), runner.starts)
-            if seen is not None:
-                others = [(i, k) for k in range(count) if k != i]
-                chosen = self.race.chosen(seen, others, LOOKED_AT_BESIDE)
-                plain = {own: one for own, one in chosen.items() if not any(map(self.setting.is_of_inputs, own))}
-                found += self.race.tried(seen, plain, base)[0]
-                rest = {own: one for own, one in chosen.items() if own not in plain}
-                later.append(partial(lambda *given: self.race.tried(*given)[0], seen, rest, base))
-        for search in later:
-            if not any(one.explains for one in found) and not self.race.is_late:
-                found += search()
         return found
+
+    def at_the_model(self, alone: View, base: Tried) -> list[Tried]:
+        names = [one.name for one in self.setting.unknowns.each]
+        moving = [i for i, name in enumerate(names) if not self.setting.is_of_inputs(self.setting.plain(name))]
+        return self.race.tried(alone, self.race.chosen(alone, combinations(moving, 2)), base)[0]
+
+    def beside(self, runner: Runner, base: Tried, later: list[Callable[[], list[Tried]]]) -> list[Tried]:
+        """Beside one change; searches for a limit or a delay are put off till later."""
+        if runner.fit.unknowns.delay is not None:
+            return []
+        if runner.special:
+            later.append(partial(self.beside_inputs, runner, base))
+            return []
+        i = [one.name for one in self.setting.unknowns.each].index(runner.names[0])
+        seen = self.setting.view(self.setting.cut, self.setting.with_one(i, runner.z), runner.starts)
+        if seen is None:
+            return []
+        others = [(i, k) for k in range(len(seen.freedoms)) if k != i]
+        chosen = self.race.chosen(seen, others, LOOKED_AT_BESIDE)
+        plain = {own: one for own, one in chosen.items() if not any(map(self.setting.is_of_inputs, own))}
+        rest = {own: one for own, one in chosen.items() if own not in plain}
+        later.append(lambda: self.race.tried(seen, rest, base)[0])
+        return self.race.tried(seen, plain, base)[0]
 
     def beside_a_delay(self, base: Tried) -> list[Tried]:
         """A change beside a delay: what each promises together with some more delay, from several delays."""

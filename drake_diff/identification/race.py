@@ -22,7 +22,7 @@ FALLS = 0.7  # what does not fall to this part of what was left before is out of
 LONGEST_SEARCH = 45.0  # [s] of processor time, after which no further change is tried
 Chosen = dict[tuple[str, ...], Promise]  # changes by the names of what they change
 CLOSE = 1.0  # of the squares: what a step may still gain where two changes are told apart
-TOLD_APART = 40.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
+TOLD_APART = 20.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
 
 
 @dataclass(eq=False)
