@@ -47,6 +47,7 @@ SHORTEST_DELAY = 1e-4  # [s] beside which another change is looked for
 TIME_STEP = "time_step"
 HELD_BY, CAUGHT = 10.0, 100.0  # times its own inertia; [1/s]: friction that gives way, where its search begins
 MOTIONS = ("auto", "continuous")
+Searching = Callable[[], list[Tried]]
 
 
 def explain(
@@ -297,13 +298,10 @@ class _Search:
 
     def paired(self, alone: View, runners: Sequence[Runner], base: Tried) -> list[Tried]:
         """Pairs beside the change that left least, where that is little; those that promise most; and beside others."""
-        later: list[Callable[[], list[Tried]]] = []  # searches for a limit or a delay, which take longest
-        beside = [partial(self.beside, one, base, later) for one in runners[:BESIDE]]
+        later: list[Searching] = []  # searches for a limit or a delay, which take longest
+        beside: list[Searching] = [partial(self.beside, one, base, later) for one in runners[:BESIDE]]
         first = 1 if runners and not self.setting.is_hopeless(runners[0].left) else 0
-        both: list[Callable[[], list[Tried]]] = [
-            partial(self.at_the_model, alone, base),
-            partial(self.beside_a_delay, base),
-        ]
+        both: list[Searching] = [partial(self.at_the_model, alone, base), partial(self.beside_a_delay, base)]
         found: list[Tried] = []
         for search in chain(beside[:first], both, beside[first:], later):
             found += search()
@@ -316,7 +314,7 @@ class _Search:
         moving = [i for i, name in enumerate(names) if not self.setting.is_of_inputs(self.setting.plain(name))]
         return self.race.tried(alone, self.race.chosen(alone, combinations(moving, 2)), base)[0]
 
-    def beside(self, runner: Runner, base: Tried, later: list[Callable[[], list[Tried]]]) -> list[Tried]:
+    def beside(self, runner: Runner, base: Tried, later: list[Searching]) -> list[Tried]:
         """Beside one change; searches for a limit or a delay are put off till later."""
         if runner.fit.unknowns.delay is not None:
             return []
