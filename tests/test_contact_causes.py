@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -103,13 +104,40 @@ def test_a_larger_radius_is_named_though_the_model_touches_nothing(contact_alone
     "start, value, half, nothing",
     [(1.0, 1.0005, 1e-6, True), (1.0, 1.3, 0.01, False), (1.0, 1.3, 0.4, True), (1.0, 1.3, np.inf, False)],
 )
-def test_a_change_that_is_none_blames_no_model(start, value, half, nothing):
-    w = np.log([value / start])
-    own = Unknown("ball.mass", "kg", np.array([start]), 0.0, start)
-    point = Point(w, (), np.zeros(1))
-    interval = np.array([[value - half, value + half]])
-    each = Fitted("ball.mass", 0.0, 1, True, "", np.array([value]), interval, point, np.array([half]))
+def test_a_change_that_is_none_is_told_from_one(start, value, half, nothing):
+    own, each = mass_of(start, value, half, 0.0)
     assert contact_causes.is_nothing(own, each) == nothing
+
+
+def mass_of(start, value, half, score, name="ball.mass"):
+    """A mass with how a change of it fits."""
+    own = Unknown(name, "kg", np.array([start]), 0.0, start)
+    point = Point(np.log([value / start]), (), np.zeros(1))
+    interval = np.array([[value - half, value + half]])
+    return own, Fitted(name, score, 1, True, "", np.array([value]), interval, point, np.array([half]))
+
+
+@each_row("other, names", [(None, ()), (45.0, ()), (10.0, ("box.mass",))])
+def test_a_change_that_is_none_blames_no_model(other, names):
+    """It finds a better motion than the model's own search; a real change must leave clearly less than that one."""
+    own, none = mass_of(1.0, 1.0005, 1e-6, 50.0)
+    tried, fitted = [own], [none]
+    if other is not None:
+        real = mass_of(1.0, 1.3, 0.01, other, "box.mass")
+        tried.append(real[0])
+        fitted.append(real[1])
+    base = none._replace(name="", score=100.0)
+    search = SimpleNamespace(
+        ended_early=False,
+        model=SimpleNamespace(time_step=0.001),
+        motions=SimpleNamespace(widened=lambda _, one: one),
+        bic=lambda one: one.score,
+        limit=lambda *_: 20.0,
+        words=contact_causes._Search.words,
+    )
+    w = contact_causes._Search.said(search, base, fitted, tried)
+    assert w.explained
+    assert w.names == names
 
 
 def test_what_neither_search_explains_is_said_of_both():

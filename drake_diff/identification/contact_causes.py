@@ -203,17 +203,19 @@ class _Search:
         return one.score + one.freedom * float(np.log(self.count))
 
     def said(self, base: Fitted, fitted: Sequence[Fitted], tried: Sequence[Unknown]) -> Explanation:
-        evidence = {one.name: base.score - one.score for one in fitted}
-        end = f" The search was ended after {LONGEST_SEARCH:.3g} s of processor time." if self.ended_early else ""
-        named = []
-        for one in sorted(fitted, key=self.bic):
-            if one.explains and evidence[one.name] > self.limit(one.freedom, len(tried)):
-                named.append(one)
-        named = [one for one in named if self.bic(one) - self.bic(named[0]) < SAME]
         own = {one.name: one for one in tried}
         # Through impacts the model's own search may end short of a motion that one with next to no change finds.
-        as_it_is = base.explains or any(one.explains and is_nothing(own[one.name], one) for one in fitted)
-        if as_it_is and (not named or not base.explains):
+        none = {one.name: one for one in fitted if one.explains and is_nothing(own[one.name], one)}
+        unchanged = min([base, *none.values()], key=lambda one: (not one.explains, one.score))
+        evidence = {one.name: unchanged.score - one.score for one in fitted}
+        end = f" The search was ended after {LONGEST_SEARCH:.3g} s of processor time." if self.ended_early else ""
+        named = [
+            one
+            for one in sorted(fitted, key=self.bic)
+            if one.explains and one.name not in none and evidence[one.name] > self.limit(one.freedom, len(tried))
+        ]
+        named = [one for one in named if self.bic(one) - self.bic(named[0]) < SAME]
+        if not named and unchanged.explains:
             return Explanation((), {}, {}, (), True, f"Nothing: the model explains it.{end}", evidence)
         if not named:
             near = min(fitted, key=self.bic, default=base)
