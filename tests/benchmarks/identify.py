@@ -62,6 +62,7 @@ ROBOTS = (
 KINDS = ("mass", "damping", "center_of_mass", "coulomb_friction", "strength", "input_delay", "bias", "gravity")
 FINER = 4  # parts of a sample, of which delays are whole numbers
 SEEN = 5  # times the noise that a change moves some joint by
+DRAWS = 100  # after so many changes of a kind that show nothing another kind is drawn
 STIFF, DAMPED = 8.0, 0.7  # [rad/s] of the controller
 BEGUN = 0.4  # [s] after which the sines are whole
 
@@ -76,6 +77,10 @@ def loaded(root, robot):
 
 class NoMotionError(Exception):
     """The controller does not hold the robot as it was changed."""
+
+
+class UnseenError(Exception):
+    """This robot shows nothing of such a change, as of a bias where all axes are vertical."""
 
 
 class Truth:
@@ -196,7 +201,7 @@ def recorded(robot, kinds, seed, soft=False):
     model = loaded(root, robot)
     joints = [name.removesuffix("_q").removesuffix("_x") for name in model.position_names]
     q0, command, push = led(model, random)
-    while True:
+    for _ in range(DRAWS):
         truth = Truth(root, joints, model.nu, soft)
         for kind in kinds:
             truth.change(kind, model, push, random)
@@ -208,6 +213,8 @@ def recorded(robot, kinds, seed, soft=False):
                 break
         except NoMotionError:
             continue
+    else:
+        raise UnseenError
     xs = np.full((base.SAMPLES + 1, model.nx), np.nan)
     xs[:, : model.nq] = qs + base.NOISE * random.standard_normal(qs.shape)
     return model, dd.Recording("MuJoCo", mujoco.__version__, base.PERIOD * np.arange(base.SAMPLES + 1), xs, us), truth
@@ -325,8 +332,14 @@ def main():
     cases = []
     for i in range(given.first, given.first + given.count):
         robot = ROBOTS[i // len(given.changes) % len(ROBOTS)]
-        kinds = kinds_of(given.seed, i, given.changes[i % len(given.changes)])
-        case = measure(robot, kinds, 10000 * given.seed + i, given.soft)
+        case, count = None, given.changes[i % len(given.changes)]
+        for other in range(DRAWS):
+            try:
+                kinds = kinds_of(given.seed, i + 1000 * other, count)
+                case = measure(robot, kinds, 10000 * given.seed + i, given.soft)
+                break
+            except UnseenError:
+                continue
         cases.append(case)
         changed = "; ".join(f"{name} {np.round(value, 4)}" for name, value in case["changed"].items())
         print(
