@@ -217,7 +217,7 @@ class _Search:
         for pair in pairs:
             unknowns = self.setting.of([name for name in pair.names if not name.endswith(f".{LIMIT}")])
             for one, s in self.setting.each_of(unknowns) if len(unknowns.each) == 2 else []:
-                if one.name not in found and one.name not in self.race.evidence:
+                if one.name not in found:
                     alone, z, cut = self.setting.of([one.name]), pair.z[s], self.setting.cut
                     runner = self.race.running((one.name,), alone, cut, pair.starts, z, NO_PROMISE)
                     if not runner.step() or self.setting.is_hopeless(runner.left):
