@@ -12,7 +12,7 @@ Derivatives go through such an end as Aizerman and Gantmacher (1958) say: a join
 where it goes on the other way, what it had is stretched by how its acceleration jumps.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +67,10 @@ class DryMotion(ContinuousMotion):
     joints: tuple[int, ...] = ()  # degrees of freedom; one that others follow has the friction of all of them
     gives: bool = False  # whether friction gives way; of one joint only
     calm: bool = False
+
+    def exact(self) -> "DryMotion | None":
+        """Differentiated by the method's own derivatives; None where it is."""
+        return replace(self, calm=False) if self.calm else None
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""

@@ -208,11 +208,12 @@ class _Search:
         named = self.trial.enough(base, pairs, count * (count - 1) // 2)
         if named:
             named = self.trial.enough(base, [*self.halves(named), *named], count * (count - 1) // 2)
+            named = [one for one in named if not any(set(other.names) < set(one.names) for other in named)]
         self.words.nearest = min([self.words.nearest or base, *pairs], key=self.trial.bic)
         return self.words.said(named) if named else None
 
     def halves(self, pairs: Sequence[Tried]) -> list[Tried]:
-        """Each change of some pairs alone, from where the pair was, if it was not fitted: the other may do nothing."""
+        """Each change of some pairs alone, from where the pair was: the other one may do nothing."""
         found: dict[str, Tried] = {}
         for pair in pairs:
             unknowns = self.setting.of([name for name in pair.names if not name.endswith(f".{LIMIT}")])
@@ -222,7 +223,7 @@ class _Search:
                     runner = self.race.running((one.name,), alone, cut, pair.starts, z, NO_PROMISE)
                     if not runner.step() or self.setting.is_hopeless(runner.left):
                         continue
-                    law = self.setting.law_of(alone)
+                    law = runner.fit.law
                     found[one.name] = self.trial.solved((one.name,), alone, law, cut, pair.starts, z)
         return list(found.values())
 

@@ -12,13 +12,13 @@ data say nothing: it is one standard deviation where a quantity is three times i
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
+from scipy.optimize import lsq_linear, minimize_scalar
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
@@ -39,6 +39,8 @@ HALVINGS = 8
 AT_REST = 4.0  # of |r|^2: what each joint that begins at rest may leave more, as by two standard deviations
 FARTHER = 3.0  # by which a step may lead farther each time that a whole one did well, where motion kinks
 NEAR = 10.0  # times how well a velocity is known from the samples around: about how far a step leads where motion kinks
+SHORT = 0.1  # of a step: a kink is near
+STUCK = "no part of a step made the motion nearer to what was measured"
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
 
 
@@ -66,6 +68,10 @@ class Law(Protocol):
 
     def shorter(self) -> "Law | None":
         """The same by steps of half the length; None where the steps are the model's own."""
+        ...
+
+    def exact(self) -> "Law | None":
+        """The same with the derivatives of its own steps; None where it has these."""
         ...
 
     def is_possible(self, values: Array) -> bool:
@@ -169,6 +175,8 @@ def cut_segments(law: Law, pieces: Sequence[Piece], nu: int, delay: float | None
 class Reduced:
     """The least squares at a point, in z alone: min | b - R dz |^2 + rest, and what first states follow from dz."""
 
+    now: float  # |r|^2 with no step, gaps linearized
+
     R: Array  # (np, np)
     b: Array  # (np,)
     rest: float
@@ -176,6 +184,22 @@ class Reduced:
     nodes: list[tuple[Array, Array]]  # of each segment: D (2 nv, 2 nv + np) and e (2 nv,): its start moves by D d + e
     residuals: list[Array]  # of each piece (n, 2 nv + m), gaps linearized, in units of the noise; NaN where unmeasured
     each: list[Array]  # of each piece by itself, R (np, np)
+
+    def mixed(self, other: "Reduced", share: float) -> "Reduced":
+        """The sum of this least squares and the other one, which has this share of it; starts follow as here."""
+        mine, nz, own = 1 - share, len(self.b), []
+        rows = [_weighed(mine, self.R, self.b), _weighed(share, other.R, other.b)]
+        rest = mine * self.rest + share * other.rest
+        for a, b in zip(self.own, other.own, strict=True):
+            nt = len(a[2])
+            R = _triangle(np.vstack([_weighed(mine, *a), _weighed(share, *b)]))
+            own.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
+            rows.append(R[nt : nt + nz, nt:])
+            rest += float(R[nt + nz, -1] ** 2)
+        R = _triangle(np.vstack(rows))
+        rest += float(R[nz, -1] ** 2)
+        now = mine * self.now + share * other.now
+        return replace(self, now=now, R=R[:nz, :nz], b=R[:nz, -1], rest=rest, own=own)
 
 
 class Fit:
@@ -360,7 +384,9 @@ class Fit:
             rest += float(R[nt + nz, -1] ** 2)
         R = _triangle(np.vstack(rows_z))
         rest += float(R[nz, -1] ** 2)
-        return Reduced(R[:nz, :nz], R[:nz, -1], rest, own, nodes, by_piece, [rows[:, :nz] for rows in rows_z[1:]])
+        now = sum(float(np.nansum(r**2)) for r in by_piece)
+        each = [rows[:, :nz] for rows in rows_z[1:]]
+        return Reduced(now, R[:nz, :nz], R[:nz, -1], rest, own, nodes, by_piece, each)
 
     def step_of(self, z: Array, found: Reduced) -> Array:
         """dz (np,) of the linearized problem, within bounds and not far."""
@@ -396,9 +422,15 @@ class Fit:
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
         """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
         solved = self._descended(z, starts, most)
-        if solved.converged or solved.steps == most or not self.law.kinks:
-            return solved
-        return self._from_rest(solved, most) or solved
+        exact = self.law.exact() if solved.stuck else None
+        if exact is not None:
+            solved = self._by(exact)._descended(solved.z, solved.starts, most)
+        return self._from_rest(solved, most) if solved.stuck and self.law.kinks else solved
+
+    def _by(self, law: Law) -> "Fit":
+        """The same with another law, whose steps are as long."""
+        own = self.model, law, self.chart, self.unknowns, self.segments.pieces, self.noise
+        return Fit(*own, sensors=self.sensors, fixed=self.fixed)
 
     def _descended(self, z: Array, starts: Array, most: int) -> "Solved":
         merit, reach, here = 0.0, 1.0, self.at(z, starts)
@@ -408,27 +440,58 @@ class Fit:
             )
         for steps in range(most + 1):
             found = self.reduce(here, reach)
-            dz = self.step_of(here.z, found)
-            now = sum(float(np.nansum(r**2)) for r in found.residuals) + self._pull(here.z)
-            then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(here.z + dz)
+            dz, promised = self._promised(here, found)
+            now = found.now + self._pull(here.z)
             settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * now)
-            if now - then <= settled and here.gap <= CLOSED:
+            if promised <= settled and here.gap <= CLOSED:
                 return Solved(here.z, here.starts, found, True, steps, "")
             if steps == most:
                 break
+            less = here.value - now + promised
             if here.gap > 0:
-                merit = max(merit, 2 * max(then - here.value, 0.0) / here.gap + 1.0)
-            part, ahead = self._ahead(here, found, dz, merit, here.value - then + merit * here.gap)
-            if ahead is not None:
-                reach = reach * FARTHER if part == 1.0 else max(reach / FARTHER, 1.0)
-                here = ahead
-            elif reach > 1.0:
+                merit = max(merit, 2 * max(-less, 0.0) / here.gap + 1.0)
+            part, ahead = self._ahead(here, found, dz, merit, less + merit * here.gap)
+            if ahead is None and reach > 1.0:
                 reach = 1.0
-            else:
-                ended = now - then <= PROMISED and here.gap <= CLOSED
-                why = "" if ended else "no part of a step made the motion nearer to what was measured"
-                return Solved(here.z, here.starts, found, ended, steps, why)
+                continue
+            if self.law.kinks and part <= SHORT:
+                both = self._both_sides(here, found, dz, max(2 * part, 0.5**HALVINGS))
+                dz, promised = self._promised(here, both)
+                if promised <= PROMISED and here.gap <= CLOSED:
+                    return Solved(here.z, here.starts, both, True, steps, "")
+                along, there = self._ahead(here, both, dz, merit, promised + merit * here.gap)
+                if there is not None and (ahead is None or there.above(merit) < ahead.above(merit)):
+                    part, ahead = along, there
+            if ahead is None:
+                ended = promised <= PROMISED and here.gap <= CLOSED
+                return Solved(here.z, here.starts, found, ended, steps, "" if ended else STUCK)
+            reach = reach * FARTHER if part == 1.0 else max(reach / FARTHER, 1.0)
+            here = ahead
         return Solved(here.z, here.starts, found, False, most, "it took too many steps")
+
+    def _promised(self, here: "Point", found: Reduced) -> tuple[Array, float]:
+        """The step dz (np,), and how much less of |r|^2 it leaves by the linearized motion."""
+        dz = self.step_of(here.z, found)
+        then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(here.z + dz)
+        return dz, found.now + self._pull(here.z) - then
+
+    def _both_sides(self, here: "Point", found: Reduced, dz: Array, part: float) -> Reduced:
+        """The linearized motion at a kink: with that a part of dz farther on, weighed so that it promises least.
+
+        What is left is the larger of the two there. Where even so little is promised, least is left at the kink itself,
+        as where a joint stops just when an input changes.
+        """
+        beyond = self.at(np.clip(here.z + part * dz, *self.unknowns.bounds), self.moved(here.starts, found, dz, part))
+        if beyond is None:
+            return found
+        other = self.reduce(beyond)
+        least = minimize_scalar(
+            lambda share: self._promised(here, found.mixed(other, share))[1],
+            bounds=(0.0, 1.0),
+            method="bounded",
+            options={"xatol": 1e-6},
+        )
+        return found.mixed(other, float(least.x))
 
     def _ahead(
         self, here: "Point", found: Reduced, dz: Array, merit: float, gain: float
@@ -443,23 +506,28 @@ class Fit:
                 return part, ahead
         return 0.0, None
 
-    def _from_rest(self, stuck: "Solved", most: int) -> "Solved | None":
+    def _from_rest(self, stuck: "Solved", most: int) -> "Solved":
         """Begun anew with joints at rest that stop in the first segment, if that converges and leaves as little.
 
         Noise lets them move at first, and the order in which they stop has kinks that no step leads out of.
         """
-        here, nq = self.at(stuck.z, stuck.starts), self.model.nq
-        if here is None:
-            return None
+        here, nq = self._point(stuck), self.model.nq
         starts, count = here.starts.copy(), 0
         for k in np.flatnonzero(np.diff(here.segments.of_piece, prepend=-1)):
             stops = np.any(here.xs[k, 1:, nq:] == 0, axis=0) & (starts[k, nq:] != 0)
             starts[k, nq:][stops] = 0.0
             count += int(np.sum(stops))
-        again = self._descended(here.z, starts, most) if count else None
-        there = None if again is None else self.at(again.z, again.starts)
-        close = there is not None and there.value <= here.value + AT_REST * count
-        return again if again is not None and again.converged and close else None
+        if count == 0 or self.at(here.z, starts) is None:
+            return stuck
+        again = self._descended(here.z, starts, most)
+        close = self._point(again).value <= here.value + AT_REST * count
+        return again if again.converged and close else stuck
+
+    def _point(self, solved: "Solved") -> "Point":
+        """Where it ended, which is where there is a motion."""
+        point = self.at(solved.z, solved.starts)
+        assert point is not None
+        return point
 
 
 @dataclass(frozen=True, eq=False)
@@ -474,6 +542,15 @@ class Point:
     value: float  # |r|^2 with the pull to the file's values
     gap: float  # the size of the gaps
     segments: Segments
+
+    def above(self, merit: float) -> float:
+        """|r|^2 and what gaps count."""
+        return self.value + merit * self.gap
+
+
+def _weighed(share: float, *columns: Array) -> Array:
+    """Rows of a least squares that has this share of another."""
+    return np.asarray(np.sqrt(share) * np.column_stack(columns))
 
 
 def _triangle(matrix: Array) -> Array:
@@ -493,6 +570,11 @@ class Solved:
     converged: bool
     steps: int
     why: str
+
+    @property
+    def stuck(self) -> bool:
+        """Whether no step led on, by the derivatives that there were."""
+        return self.why == STUCK
 
 
 def growth_cuts(fit: Fit, z: Array, starts: Array) -> list[Piece]:

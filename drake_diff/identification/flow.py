@@ -53,6 +53,10 @@ class ContinuousMotion:
         """By steps of half the length."""
         return replace(self, longest=self.longest / 2)
 
+    def exact(self) -> "ContinuousMotion | None":
+        """None: it has the derivatives of its own steps."""
+        return None
+
     def is_possible(self, values: Array) -> bool:
         """Whether there are bodies with these values."""
         return self.unknowns.consistent(values, self.tree)

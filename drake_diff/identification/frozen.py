@@ -9,7 +9,7 @@ wrong by h^3 / 24 of how J bends. So a step costs one evaluation instead of the 
 also where a motion decays within the step. Least squares end where they would: only the way there is another.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -23,6 +23,10 @@ SMALL = 0.5  # the norm of X up to which it is summed; 0.5^9 / 10! is 5e-10
 @dataclass(frozen=True, eq=False)
 class FrozenMotion(ContinuousMotion):
     """As `ContinuousMotion`; each step is differentiated with its equations frozen halfway."""
+
+    def exact(self) -> ContinuousMotion:
+        """Differentiated by the method's own derivatives."""
+        return ContinuousMotion(*(getattr(self, one.name) for one in fields(ContinuousMotion)))
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""

@@ -41,6 +41,10 @@ class DiscreteMotion:
         """There is none: it is the model's step that is fitted."""
         return
 
+    def exact(self) -> None:
+        """None: it has the derivatives of its own steps."""
+        return
+
     def is_possible(self, values: Array) -> bool:
         """Whether there are bodies with these values."""
         return self.unknowns.consistent(values, None)

@@ -65,6 +65,10 @@ class Trial:
             if any(one.quantity == COULOMB for one in unknowns.each) and not problem.follows(fit, z, starts):
                 fit = problem.shortened(fit, pieces, fit.noise)
                 continue
+            shorter = law.shorter() if solved.stuck and unknowns.delay is not None and fit.law is law else None
+            if shorter is not None:  # between two counts of steps that a delay cuts, stiff motions jump
+                fit = problem.fit(shorter, pieces, fit.noise)
+                continue
             noise = np.where(
                 np.isfinite(self.setting.stated), self.setting.stated, np.fmax(size, 1e-3 * self.setting.scatter)
             )
