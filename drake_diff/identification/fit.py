@@ -40,6 +40,7 @@ AT_REST = 4.0  # of |r|^2: what each joint that begins at rest may leave more, a
 FARTHER = 3.0  # by which a step may lead farther each time that a whole one did well, where motion kinks
 NEAR = 10.0  # times how well a velocity is known from the samples around: about how far a step leads where motion kinks
 SHORT = 0.1  # of a step: a kink is near
+TOO_LARGE = 1e100  # of a derivative, in units of the noise: its square is beyond what numbers hold
 STUCK = "no part of a step made the motion nearer to what was measured"
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
 
@@ -184,6 +185,11 @@ class Reduced:
     nodes: list[tuple[Array, Array]]  # of each segment: D (2 nv, 2 nv + np) and e (2 nv,): its start moves by D d + e
     residuals: list[Array]  # of each piece (n, 2 nv + m), gaps linearized, in units of the noise; NaN where unmeasured
     each: list[Array]  # of each piece by itself, R (np, np)
+
+    @property
+    def finite(self) -> bool:
+        """Whether its numbers are small enough to go on with."""
+        return bool(np.all(np.abs(np.column_stack([self.R, self.b])) < TOO_LARGE))
 
     def mixed(self, other: "Reduced", share: float) -> "Reduced":
         """The sum of this least squares and the other one, which has this share of it; starts follow as here."""
@@ -455,13 +461,8 @@ class Fit:
                 reach = 1.0
                 continue
             if self.law.kinks and part <= SHORT:
-                both = self._both_sides(here, found, dz, max(2 * part, 0.5**HALVINGS))
-                dz, promised = self._promised(here, both)
-                if promised <= PROMISED and here.gap <= CLOSED:
-                    return Solved(here.z, here.starts, both, True, steps, "")
-                along, there = self._ahead(here, both, dz, merit, promised + merit * here.gap)
-                if there is not None and (ahead is None or there.above(merit) < ahead.above(merit)):
-                    part, ahead = along, there
+                found = self._both_sides(here, found, dz, max(2 * part, 0.5**HALVINGS))
+                promised, part, ahead = self._along_a_kink(here, found, merit, part, ahead)
             if ahead is None:
                 ended = promised <= PROMISED and here.gap <= CLOSED
                 return Solved(here.z, here.starts, found, ended, steps, "" if ended else STUCK)
@@ -474,6 +475,18 @@ class Fit:
         dz = self.step_of(here.z, found)
         then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(here.z + dz)
         return dz, found.now + self._pull(here.z) - then
+
+    def _along_a_kink(
+        self, here: "Point", both: Reduced, merit: float, part: float, ahead: "Point | None"
+    ) -> "tuple[float, float, Point | None]":
+        """(What both sides promise, part of their step or of the one ahead, whichever does better, where it leads)."""
+        dz, promised = self._promised(here, both)
+        if promised <= PROMISED and here.gap <= CLOSED:
+            return promised, 0.0, None
+        along, there = self._ahead(here, both, dz, merit, promised + merit * here.gap)
+        if there is None or (ahead is not None and ahead.above(merit) <= there.above(merit)):
+            return promised, part, ahead
+        return promised, along, there
 
     def _both_sides(self, here: "Point", found: Reduced, dz: Array, part: float) -> Reduced:
         """The linearized motion at a kink: with that a part of dz farther on, weighed so that it promises least.
@@ -511,7 +524,9 @@ class Fit:
 
         Noise lets them move at first, and the order in which they stop has kinks that no step leads out of.
         """
-        here, nq = self._point(stuck), self.model.nq
+        here, nq = self.at(stuck.z, stuck.starts), self.model.nq
+        if here is None:
+            return stuck
         starts, count = here.starts.copy(), 0
         for k in np.flatnonzero(np.diff(here.segments.of_piece, prepend=-1)):
             stops = np.any(here.xs[k, 1:, nq:] == 0, axis=0) & (starts[k, nq:] != 0)
@@ -520,14 +535,9 @@ class Fit:
         if count == 0 or self.at(here.z, starts) is None:
             return stuck
         again = self._descended(here.z, starts, most)
-        close = self._point(again).value <= here.value + AT_REST * count
+        there = self.at(again.z, again.starts)
+        close = there is not None and there.value <= here.value + AT_REST * count
         return again if again.converged and close else stuck
-
-    def _point(self, solved: "Solved") -> "Point":
-        """Where it ended, which is where there is a motion."""
-        point = self.at(solved.z, solved.starts)
-        assert point is not None
-        return point
 
 
 @dataclass(frozen=True, eq=False)

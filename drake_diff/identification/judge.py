@@ -18,10 +18,8 @@ CONFIDENCE = 0.95
 UNSEEN = 1.0  # a change by so many times its own size that the data leave open at one sigma is not determined
 NOTHING = 1e-8  # of a unit's effect: rounding
 PART = 0.03  # of the largest change in a combination: what is not told
-FALSE_ALARM = 0.004  # of all tests of the scatter of residuals together, where the model is right
-COLOURED = (
-    0.001  # of their tests for whiteness together; of 12 columns of 200 samples it is 0.002, as tails are heavier
-)
+FALSE_ALARM = 0.004  # of all tests of the scatter together, where the model is right; of whole motions of all tests
+COLOURED = 0.001  # of all tests for whiteness together; of 12 columns of 200 samples it is 0.002: tails are heavier
 COMBINED = ("friction", "stiffness")  # of two bodies that touch, which Drake makes one of: 2 a b / (a + b), half of it
 OF_MEDIANS = 0.6  # of the degrees of freedom: drawn, for 40 to 120 samples
 LAGS = 10

@@ -44,7 +44,7 @@ class Runner:
         if point is None:
             return False
         found = self.fit.reduce(point)
-        if not np.all(np.isfinite(found.R)) or not np.all(np.isfinite(found.b)):
+        if not found.finite:
             return False
         dz = self.fit.step_of(self.z, found)
         self.starts = self.fit.moved(self.starts, found, dz, 1.0)

@@ -21,7 +21,6 @@ from drake_diff.identification.unknowns import INERTIA, MASS, Unknown, Unknowns
 
 DELAY, LIMIT = "input_delay", "limit"  # changes of how inputs act; a limit is found by a search over its one number
 LONGEST_DELAY = 0.1  # [s]
-LARGEST = 1e100  # of a derivative, in units of the noise: the squares of larger ones are beyond what numbers hold
 LEVELS = (0.85, 0.6, 0.35)  # of an input's largest value: limits that are tried
 
 
@@ -151,7 +150,7 @@ def view(fit: Fit, unknowns: Unknowns, z: Array, starts: Array) -> View | None:
     if point is None:
         return None
     reduced = fit.reduce(point)
-    if not np.all(np.abs(np.column_stack([reduced.R, reduced.b])) < LARGEST):
+    if not reduced.finite:
         return None
     finite = np.isfinite(unknowns.widths)
     pull = np.where(finite, unknowns.widths, np.inf) ** -2.0

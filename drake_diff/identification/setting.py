@@ -20,7 +20,6 @@ from drake_diff.identification.screen import DELAY, LIMIT, LONGEST_DELAY, Inputs
 from drake_diff.identification.tree import Tree
 from drake_diff.identification.unknowns import (
     BIAS,
-    COULOMB,
     HELD_INERTIA,
     INERTIA,
     MASS,
@@ -127,16 +126,13 @@ class Setting:
         own = self.model, self.tree, self.chart, unknowns
         if self.step is not None:
             return EulerMotion(*own, self.step)
-        # Dry friction turns within less than a step, which halfway says nothing of.
-        turns = unknowns is not self.unknowns and any(one.quantity == COULOMB for one in unknowns.each)
-        return FrozenMotion(*own, longest) if self.calm and not turns else ContinuousMotion(*own, longest)
+        return FrozenMotion(*own, longest) if self.calm else ContinuousMotion(*own, longest)
 
     def law_of(self, unknowns: Unknowns) -> ContinuousMotion:
-        """With dry friction that holds."""
-        law = self.law(unknowns, self.longest)
+        """With dry friction that holds, but by Euler steps."""
         dry = dry_places(self.tree, unknowns)
         if not dry or self.step is not None:
-            return law
+            return self.law(unknowns, self.longest)
         own = self.model, self.tree, self.chart, unknowns, self.longest
         gives = any(one.quantity == HELD_INERTIA for one in unknowns.each)
         return DryMotion(*own, joints=dry, gives=gives, calm=self.calm)

@@ -1,7 +1,7 @@
 """Whether `dd.explain` names what was changed: 20 robots, recorded by MuJoCo in steps of 0.25 ms.
 
     pip install -e '.[test]'
-    python tests/benchmarks/identify.py [--seed 0] [--count 600] [--changes 0 1 2] [--soft]
+    python tests/benchmarks/identify.py [--seed 0] [--count 600] [--changes 0 1 2] [--soft] [--out FILE.json]
     python tests/benchmarks/identify.py --chance 100000 [--seed 0] [--count 20]
 
 Each case is a robot of example-robot-data or of models/, on its base for 2 s at 100 Hz. A controller leads it along
@@ -308,6 +308,16 @@ def rates(cases):
     yield "intervals that have the truth", sum(covered), len(covered)
 
 
+def drawn(robot, count, seed, i, soft):
+    """Of kinds of changes of which the robot shows something."""
+    for other in range(DRAWS):
+        try:
+            return measure(robot, kinds_of(seed, i + 1000 * other, count), 10000 * seed + i, soft)
+        except UnseenError:
+            continue
+    raise UnseenError(f"{robot} shows nothing of {DRAWS} changes")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
@@ -332,14 +342,7 @@ def main():
     cases = []
     for i in range(given.first, given.first + given.count):
         robot = ROBOTS[i // len(given.changes) % len(ROBOTS)]
-        case, count = None, given.changes[i % len(given.changes)]
-        for other in range(DRAWS):
-            try:
-                kinds = kinds_of(given.seed, i + 1000 * other, count)
-                case = measure(robot, kinds, 10000 * given.seed + i, given.soft)
-                break
-            except UnseenError:
-                continue
+        case = drawn(robot, given.changes[i % len(given.changes)], given.seed, i, given.soft)
         cases.append(case)
         changed = "; ".join(f"{name} {np.round(value, 4)}" for name, value in case["changed"].items())
         print(
