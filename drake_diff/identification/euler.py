@@ -27,7 +27,7 @@ class EulerMotion(ContinuousMotion):
         """Lengths of the steps [s] over a time between samples [s]."""
         return (self.longest,) * max(1, round(period / self.longest))
 
-    def shorter(self) -> None:  # type: ignore[override]
+    def shorter(self, than: float) -> None:  # type: ignore[override]
         """There is none: the step is what is looked for."""
         return
 

@@ -67,8 +67,8 @@ class Law(Protocol):
         """Lengths of the steps [s] over a time between samples [s]."""
         ...
 
-    def shorter(self) -> "Law | None":
-        """The same by steps of half the length; None where the steps are the model's own."""
+    def shorter(self, than: float) -> "Law | None":
+        """The same by steps of at most half of a length [s]; None where the steps are the model's own."""
         ...
 
     def exact(self) -> "Law | None":
@@ -237,6 +237,11 @@ class Fit:
     def count(self) -> int:
         """How many numbers were measured."""
         return int(sum(np.isfinite(self._measured(p)).sum() for p in range(len(self.segments.pieces))))
+
+    @property
+    def shorter(self) -> Law | None:
+        """The law by steps of half the length of those that there are; None where they are the model's own."""
+        return self.law.shorter(float(np.max(self.segments.hs)))
 
     def cut(self, values: Array) -> Segments:
         """The segments with the steps that these values make: those of a delay of inputs are its own."""

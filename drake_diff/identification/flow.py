@@ -49,9 +49,9 @@ class ContinuousMotion:
         count = max(1, int(np.ceil(period / self.longest - 1e-9)))
         return (period / count,) * count
 
-    def shorter(self) -> "ContinuousMotion":
-        """By steps of half the length."""
-        return replace(self, longest=self.longest / 2)
+    def shorter(self, than: float) -> "ContinuousMotion":
+        """By steps of at most half of a length [s]."""
+        return replace(self, longest=than / 2)
 
     def exact(self) -> "ContinuousMotion | None":
         """None: it has the derivatives of its own steps."""

@@ -317,7 +317,7 @@ class Problem:
 
     def follows(self, fit: Fit, z: Array, starts: Array) -> bool:
         """Whether steps of half the length lead to the same ends of all segments; the model's own steps need not."""
-        shorter = fit.law.shorter()
+        shorter = fit.shorter
         if shorter is None:
             return True
         ends = []
@@ -331,7 +331,7 @@ class Problem:
         return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= STEP_ERROR)
 
     def shortened(self, fit: Fit, pieces: Sequence[Piece], noise: Array) -> Fit:
-        law = fit.law.shorter()
+        law = fit.shorter
         if law is None or np.max(fit.segments.hs) < SHORTEST:
             raise ModelError(f"{self.model.name}: its motion is too stiff: {fit.law.words} does not follow it")
         return self.fit(law, pieces, noise)

@@ -37,7 +37,7 @@ class DiscreteMotion:
         """Lengths of the steps [s] over a time between samples [s]."""
         return (self.model.time_step,) * round(period / self.model.time_step)
 
-    def shorter(self) -> None:
+    def shorter(self, than: float) -> None:
         """There is none: it is the model's step that is fitted."""
         return
 

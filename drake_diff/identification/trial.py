@@ -13,7 +13,7 @@ from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import HOPELESS, freedom_of, intervals_of, known_of, noise_of
 from drake_diff.identification.measured import Piece
 from drake_diff.identification.setting import Setting
-from drake_diff.identification.unknowns import COULOMB, Unknowns
+from drake_diff.identification.unknowns import Unknowns
 
 FALSE_NAME = 0.003  # of right models in which some change is named
 STEPS, ROUNDS = 8, 4  # of Gauss and Newton, and of estimating the noise
@@ -57,16 +57,18 @@ class Trial:
         for _ in range(ROUNDS):
             solved = fit.solve(z, starts, most)
             z, starts = solved.z, solved.starts
+            shorter = fit.shorter
+            if shorter is not None and not problem.follows(fit, z, starts):
+                solved = replace(solved, converged=False, why=f"{fit.law.words} do not follow it")
+                fit = problem.fit(shorter, pieces, fit.noise)
+                continue
             size = noise_of(fit, solved)
             seen = np.isfinite(size)
             if np.any(size[seen] > HOPELESS * problem.first_noise[seen]):
                 solved = replace(solved, converged=True)
                 break
-            if any(one.quantity == COULOMB for one in unknowns.each) and not problem.follows(fit, z, starts):
-                fit = problem.shortened(fit, pieces, fit.noise)
-                continue
-            shorter = law.shorter() if solved.stuck and unknowns.delay is not None and fit.law is law else None
-            if shorter is not None:  # between two counts of steps that a delay cuts, stiff motions jump
+            jumps = solved.stuck and unknowns.delay is not None and fit.law is law
+            if shorter is not None and jumps:  # stiff motions do, between two counts of steps that a delay cuts
                 fit = problem.fit(shorter, pieces, fit.noise)
                 continue
             noise = np.where(
