@@ -292,6 +292,19 @@ def test_a_fit_of_which_least_is_left_at_a_kink_ends_there(load):
     assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 12)  # of standard normal numbers
 
 
+def test_shorter_steps_are_half_of_those_that_there_are(load):
+    """Where samples are 10 ms apart, steps of at most 20 ms are 10 ms long: halves of these tell whether they do."""
+    model, count = load("double_pendulum.urdf"), 40
+    tree = tree_for_identification(model)
+    unknowns = choose_unknowns(model, tree, ["shoulder.damping"])
+    law = ContinuousMotion(model, tree, Chart(coordinates_of(model)), unknowns, 0.02)
+    times, us = H * np.arange(count + 1), np.zeros((count, 2))
+    xs = law.run(unknowns.start, np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), H), us[None])[0]
+    fit, _ = fit_of(model, law, unknowns, us, xs, times, 0)
+    assert law.cut(H) == (H,)
+    assert fit.shorter.cut(H) == (H / 2, H / 2)
+
+
 def test_a_least_squares_mixed_with_itself_is_the_same(load):
     model, count = load("double_pendulum.urdf"), 40
     tree = tree_for_identification(model)

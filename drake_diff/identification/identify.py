@@ -337,10 +337,15 @@ class Problem:
         return self.fit(law, pieces, noise)
 
     def weighted(self, fit: Fit, z: Array, starts: Array, most: int) -> tuple[Fit, Solved]:
-        """Least squares, weighted anew until the residuals have the noise that they are weighted by."""
+        """Least squares, weighted anew until the residuals have the noise that they are weighted by.
+
+        Or until steps are too long for where it leads: what is left then is no noise.
+        """
         for _ in range(ROUNDS):
             solved = fit.solve(z, starts, most)
             z, starts = solved.z, solved.starts
+            if not self.follows(fit, z, starts):
+                return fit, solved
             found = np.where(np.isfinite(self.stated), self.stated, np.fmax(noise_of(fit, solved), 1e-3 * self.scatter))
             seen = np.isfinite(found)
             if np.max(np.abs(found[seen] / fit.noise[seen] - 1)) < SAME_NOISE:

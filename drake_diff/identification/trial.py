@@ -59,7 +59,7 @@ class Trial:
             z, starts = solved.z, solved.starts
             shorter = fit.shorter
             if shorter is not None and not problem.follows(fit, z, starts):
-                solved = replace(solved, converged=False, why=f"{fit.law.words} do not follow it")
+                solved = replace(solved, converged=False, why="its steps are too long for the motion")
                 fit = problem.fit(shorter, pieces, fit.noise)
                 continue
             size = noise_of(fit, solved)
