@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.models import MODELS
+from helpers.models import MODELS, robot_file
 from helpers.table import each_row
 from scipy import stats
 from typer.testing import CliRunner
@@ -56,6 +56,16 @@ def test_what_no_motion_tells_stays_open(load):
     assert np.isinf(e.deviations["pole.center_of_mass"][1])
     assert np.isfinite(e.deviations["hinge.damping"])
     assert "Open: pole.center_of_mass[1]" in e.sentence
+
+
+def test_a_default_state_at_a_limit_of_a_joint_is_moved_to_the_middle():
+    """As of an arm whose zero is where a joint ends."""
+    model = dd.load_model(robot_file("so100.urdf"), time_step=0.01, base="weld", actuators="all")
+    lower, upper = model.position_limits
+    i = model.position_names.index("shoulder_lift_q")
+    assert model.default_state[i] == lower[i] == 0
+    e = dd.excite(model, ["elbow_flex.damping"], duration=1.0, max_iterations=0)
+    assert e.xs[0, i] == pytest.approx(upper[i] / 2)
 
 
 def test_what_is_promised_of_friction_is_what_its_sign_does(write_urdf):
