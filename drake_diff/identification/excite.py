@@ -96,7 +96,7 @@ def excite(
         parameters: Names as for `dd.identify`.
         duration: Of the motion [s].
         period: Between samples [s], at which inputs change too.
-        x0: (nx,) the first state, at rest; the model's default, in the middle of its limits where that is at or beyond them.
+        x0: (nx,) the first state, at rest; the model's default, and the middle of limits that it is at or beyond.
         noise: What is measured: the standard deviation of states by name. None: 1e-3 rad or m of each position.
         limits: By the name of a state or input: the lower and upper limit, or how far from 0 it may be, within the
             model's own. Needed of inputs without a limit where not every joint has an input, and of slides without one.

@@ -435,11 +435,11 @@ class Fit:
         solved = self._descended(z, starts, most)
         exact = self.law.exact() if solved.stuck else None
         if exact is not None:
-            solved = self._by(exact)._descended(solved.z, solved.starts, most)
+            solved = self.by(exact)._descended(solved.z, solved.starts, most)
         return self._from_rest(solved, most) if solved.stuck and self.law.kinks else solved
 
-    def _by(self, law: Law) -> "Fit":
-        """The same with another law, whose steps are as long."""
+    def by(self, law: Law) -> "Fit":
+        """The same with another law, of segments as long."""
         own = self.model, law, self.chart, self.unknowns, self.segments.pieces, self.noise
         return Fit(*own, sensors=self.sensors, fixed=self.fixed)
 

@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.exceptions import SimulationError
-from drake_diff.identification.fit import Fit
+from drake_diff.identification.fit import Fit, Reduced
 from drake_diff.identification.measured import Piece
 from drake_diff.identification.screen import DELAY, LEVELS, LIMIT, Promise, View
 from drake_diff.identification.setting import Setting
@@ -21,6 +21,7 @@ RACE = (5, 4, 3, 2, 2, 1)  # so many stay after each step of Gauss and Newton
 FALLS = 0.7  # what does not fall to this part of what was left before is out of the race, after its first step
 LONGEST_SEARCH = 45.0  # [s] of processor time, after which no further change is tried
 Chosen = dict[tuple[str, ...], Promise]  # changes by the names of what they change
+HALVED = 3  # times: steps by which a change that makes motion stiff has none
 CLOSE = 1.0  # of the squares: what a step may still gain where two changes are told apart
 TOLD_APART = 20.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
 
@@ -39,12 +40,15 @@ class Runner:
     interval: dict[str, Array] = field(default_factory=dict)
 
     def step(self) -> bool:
-        """Whether there is a motion to step from."""
-        point = self.fit.at(self.z, self.starts)
-        if point is None:
-            return False
-        found = self.fit.reduce(point)
-        if not found.finite:
+        """Whether there is a motion to step from, if need be by steps that are shorter and stay so."""
+        found = self._reduced()
+        for _ in range(HALVED):
+            shorter = self.fit.shorter
+            if found is not None or shorter is None:
+                break
+            self.fit = self.fit.by(shorter)
+            found = self._reduced()
+        if found is None:
             return False
         dz = self.fit.step_of(self.z, found)
         self.starts = self.fit.moved(self.starts, found, dz, 1.0)
@@ -52,6 +56,11 @@ class Runner:
         pull = float(np.sum(((self.z - self.fit.unknowns.z_start) / self.fit.unknowns.widths) ** 2))
         self.left = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + pull
         return True
+
+    def _reduced(self) -> Reduced | None:
+        point = self.fit.at(self.z, self.starts)
+        found = None if point is None else self.fit.reduce(point)
+        return found if found is not None and found.finite else None
 
 
 @dataclass(eq=False)
