@@ -53,7 +53,8 @@ class Trial:
         most: int = STEPS,
     ) -> Tried:
         problem = self.setting.problem(unknowns, pieces)
-        fit = problem.fit(law, pieces, problem.first_noise)
+        fit = self.followed(problem, problem.fit(law, pieces, problem.first_noise), z, starts)
+        law = fit.law
         for _ in range(ROUNDS):
             solved = fit.solve(z, starts, most)
             z, starts = solved.z, solved.starts
@@ -78,6 +79,15 @@ class Trial:
                 break
             fit = problem.fit(fit.law, pieces, noise)
         return self.told(names, problem, fit, solved)
+
+    def followed(self, problem: Problem, fit: Fit, z: Array, starts: Array) -> Fit:
+        """By steps short enough for the motion there: a search by longer ones takes long, and leads nowhere."""
+        for _ in range(ROUNDS):
+            shorter = fit.shorter
+            if shorter is None or problem.follows(fit, z, starts):
+                break
+            fit = fit.by(shorter)
+        return fit
 
     def score(self, fit: Fit, solved: Solved) -> float:
         """-2 log of the likelihood with the noise that the residuals show, where none was given."""
