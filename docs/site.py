@@ -1,6 +1,5 @@
-"""What of the site is written when it is built: reference, tables of modules, notebooks, files of the top folder."""
+"""What of the site is written when it is built: reference, notebooks, files of the top folder."""
 
-import ast
 import json
 import re
 from pathlib import Path
@@ -87,24 +86,13 @@ def _to_pages(text: str) -> str:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put the table of a room's modules where a page asks for it."""
+    """Link notebooks and reports to pages, and end a page of figures with what to do next."""
     if page.file.src_uri == "notebooks/index.md":
         return _to_pages(markdown)
     if page.file.src_uri == "gallery/index.md":
         return with_reports(markdown, GALLERY)
-    if (room := page.file.src_uri).startswith("inside/") and room != "inside/index.md":
-        return re.sub(r"<!-- modules of (\w+) -->", lambda found: modules_of(found[1]) + after(found[1]), markdown)
     step = NEXT.get(page.file.src_uri)
     return f"{markdown}\n\n## What would I do next?\n\n{step}\n" if step else markdown
-
-
-def after(room: str) -> str:
-    """Where a reader of a room's page goes: to its names, if it has some, and to where a change is made."""
-    names = (
-        f"[The public names of this room](../reference/{room}.md). " if f"reference/{room}.md" in reference() else ""
-    )
-    change = "[Contributing](../contributing.md#where-does-a-change-go)"
-    return f"\n\n## What would I do next?\n\n{names}To change something: {change}.\n"
 
 
 def with_reports(text: str, gallery: Path) -> str:
@@ -115,20 +103,3 @@ def with_reports(text: str, gallery: Path) -> str:
         return f"[{picture}]({report})" if (gallery / report).is_file() else picture
 
     return re.sub(r"(!\[[^]]*\]\([^)]*\))<!-- (\S+) -->", linked, text)
-
-
-def modules_of(room: str) -> str:
-    """A row for each module of a room, with the first sentence of what it says of itself."""
-    folder = PACKAGE / room
-    paths = [*folder.glob("*.py"), *folder.glob("*/__init__.py")]
-    rows = [f"| `{_path(path, folder)}` | {_first(path)} |" for path in sorted(paths) if path != folder / "__init__.py"]
-    return "\n".join(["| Module | What it is |", "|---|---|", *rows])
-
-
-def _path(path: Path, folder: Path) -> str:
-    return f"{path.parent.name}/" if path.name == "__init__.py" else path.relative_to(folder).as_posix()
-
-
-def _first(path: Path) -> str:
-    text = ast.get_docstring(ast.parse(path.read_text())) or ""
-    return text.split("\n\n")[0].replace("\n", " ").replace("|", "\\|")
