@@ -7,7 +7,8 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from drake_diff._base.statistics import success_rate
+from rates import success_rate
+
 from drake_diff.artifact import elsewhere
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution

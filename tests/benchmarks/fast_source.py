@@ -37,10 +37,10 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
 
 import numpy as np  # noqa: E402
+from rates import success_rate  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
 from drake_diff._base import compiled  # noqa: E402
-from drake_diff._base.statistics import success_rate  # noqa: E402
 from drake_diff.derivatives.contact.pairs import Touches  # noqa: E402
 from drake_diff.derivatives.contact.touching import AllPairs  # noqa: E402
 from drake_diff.derivatives.implicit import form_of  # noqa: E402

@@ -29,12 +29,10 @@ from pathlib import Path
 import identify_fits as base
 import mujoco
 import numpy as np
-from helpers.chance import chance_of_a_name
 from helpers.models import robot_file
+from rates import success_rate
 
 import drake_diff as dd
-from drake_diff._base.statistics import success_rate
-from drake_diff.model.step import set_state
 
 OURS = Path(__file__).parents[2] / "models"
 ROBOTS = (
@@ -178,15 +176,16 @@ def led(model, random):
     limits = np.array(
         [abs(model.plant.get_joint_actuator(i).effort_limit()) for i in model.plant.GetJointActuatorIndices()]
     )
-    ahead = []
+    ahead, context = [], model.plant.CreateDefaultContext()
     for k in range(base.SAMPLES):
-        set_state(model.double, np.concatenate([path[k], speed[k]]))
-        ahead.append(model.double.inverse_dynamics(rate[k]))
+        ahead.append(base.inverse_dynamics(model.plant, context, path[k], speed[k], rate[k]))
     back = np.linalg.pinv(model.actuation)
 
     def command(k, q, v):
-        set_state(model.double, np.concatenate([q, v]))
-        inertia = model.double.mass_matrix()  # by its diagonal a Panda whose joints 1 and 3 are in line chatters
+        model.plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
+        inertia = model.plant.CalcMassMatrix(
+            context
+        )  # by its diagonal a Panda whose joints 1 and 3 are in line chatters
         pull = inertia @ (STIFF**2 * (path[k] - q) + 2 * DAMPED * STIFF * (speed[k] - v))
         return np.clip(back @ (ahead[k] + pull), -limits, limits)
 
@@ -329,6 +328,8 @@ def main():
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     if given.chance:
+        from helpers.chance import chance_of_a_name
+
         each = []
         for i, robot in enumerate(ROBOTS[: given.count]):
             model, recording, _ = recorded(robot, (), 10000 * given.seed + i)

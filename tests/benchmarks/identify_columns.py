@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import identify as causes
 import numpy as np
+from rates import success_rate
 
 import drake_diff as dd
-from drake_diff._base.statistics import success_rate
 
 ROBOTS = ("ur5_robot", "double_pendulum", "panda", "z1", "so100", "kinova", "models/quadruped", "TwoDofs")
 KINDS = ("nothing", "positions exchanged", "inputs exchanged", "position mirrored", "input mirrored", "degrees")
@@ -57,6 +57,17 @@ def verdict(model, log, kind, columns):
     return ("another" if w.names else "right as it is" if w.explained else "unexplained"), w.sentence
 
 
+def measure(seed, i):
+    """(robot, kind, processor seconds, verdict, columns, sentence) of the i-th case."""
+    robot, kind = ROBOTS[i // len(KINDS) % len(ROBOTS)], KINDS[i % len(KINDS)]
+    random = np.random.default_rng([seed, i])
+    model, log, _ = causes.recorded(robot, (), 10000 * seed + i)
+    log, columns = mistaken(model, log, kind, random)
+    begin = time.process_time()
+    said, sentence = verdict(model, log, kind, columns)
+    return robot, kind, time.process_time() - begin, said, columns, sentence
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
@@ -64,17 +75,9 @@ def main():
     given = parser.parse_args()
     found = {}
     for i in range(given.count):
-        robot, kind = ROBOTS[i // len(KINDS) % len(ROBOTS)], KINDS[i % len(KINDS)]
-        random = np.random.default_rng([given.seed, i])
-        model, log, _ = causes.recorded(robot, (), 10000 * given.seed + i)
-        log, columns = mistaken(model, log, kind, random)
-        begin = time.process_time()
-        said, sentence = verdict(model, log, kind, columns)
+        robot, kind, seconds, said, columns, sentence = measure(given.seed, i)
         found.setdefault(kind != "nothing", []).append(said)
-        print(
-            f"{i:3} {robot:18} {time.process_time() - begin:5.1f} s {said:14} {kind}: {columns} -> {sentence}",
-            flush=True,
-        )
+        print(f"{i:3} {robot:18} {seconds:5.1f} s {said:14} {kind}: {columns} -> {sentence}", flush=True)
     for is_mistaken, each in sorted(found.items()):
         for said in sorted(set(each)):
             rate = success_rate(each.count(said), len(each))

@@ -24,9 +24,9 @@ sys.path.append(str(Path(__file__).parents[1]))  # the robots that the tests hav
 
 import numpy as np
 from helpers.legged import LEGGED, legged_model, rest
+from rates import success_rate
 
 import drake_diff as dd
-from drake_diff._base.statistics import success_rate
 from drake_diff.identification.chart import Chart
 from drake_diff.mechanics.description import coordinates_of
 

@@ -30,10 +30,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from helpers.models import robot_file  # noqa: E402
+from pydrake.multibody.tree import MultibodyForces  # noqa: E402
+from rates import success_rate  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
-from drake_diff._base.statistics import success_rate  # noqa: E402
-from drake_diff.model.step import set_state  # noqa: E402
 
 ROBOTS = ("ur5_robot.urdf", "z1.urdf", "so100.urdf")
 PERIOD, SAMPLES, STEP, NOISE = 0.01, 200, 2.5e-4, 2e-4  # [s], and [rad]
@@ -73,6 +73,14 @@ def scale(root, name, factor):
         attributes += [(inertial.find("inertia"), key) for key in inertial.find("inertia").attrib]
     for element, key in attributes:
         element.set(key, repr(float(float(element.get(key)) * factor)))
+
+
+def inverse_dynamics(plant, context, q, v, rate):
+    """(nv,) the forces of the joints that give the accelerations `rate`, by pydrake: gravity and damping included."""
+    plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
+    forces = MultibodyForces(plant)
+    plant.CalcForceElementsContribution(context, forces)
+    return plant.CalcInverseDynamics(context, rate, forces)
 
 
 def by_mujoco(root, joints, q0, torques, friction, period=PERIOD, gravity=(0, 0, -9.81)):
@@ -133,8 +141,9 @@ def measure(robot, kind, seed):
         scale(truth, name, values[name] / start[name])
     lower, upper = (np.clip(limit, -2, 2) for limit in model.position_limits)
     q0 = lower + random.uniform(0.3, 0.7, model.nq) * (upper - lower)
-    set_state(model.double, np.concatenate([q0, np.zeros(model.nv)]))
-    weight, inertia = model.double.inverse_dynamics(np.zeros(model.nv)), np.diag(model.double.mass_matrix())
+    context, still = model.plant.CreateDefaultContext(), np.zeros(model.nv)
+    weight = inverse_dynamics(model.plant, context, q0, still, still)
+    inertia = np.diag(model.plant.CalcMassMatrix(context))
     t = PERIOD * np.arange(SAMPLES + 1)
     waves = [
         sum(a * np.sin(2 * np.pi * f * t[:-1] + p) for a, f, p in random.uniform([0.3, 0.3, 0], [1, 3, 6], (3, 3)))

@@ -20,10 +20,10 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
 
 import numpy as np  # noqa: E402
+from rates import success_rate  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
-from drake_diff._base.statistics import success_rate  # noqa: E402
 from drake_diff.identification import identify_contact  # noqa: E402
 
 RATE, STEPS, FINER, TOSSES, SAMPLES = 148, 2, 10, 6, 60

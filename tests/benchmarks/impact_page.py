@@ -14,7 +14,7 @@ NAMES = {
 
 def told(found: int, of: int) -> str:
     """A share with its interval."""
-    from drake_diff._base.statistics import success_rate
+    from rates import success_rate
 
     if not of:
         return "none of these"

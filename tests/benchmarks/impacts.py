@@ -31,9 +31,9 @@ import impact_page  # noqa: E402
 import numpy as np  # noqa: E402
 from impact_cases import FAMILIES, Case, case  # noqa: E402
 from impact_truth import Slopes, truth  # noqa: E402
+from rates import success_rate  # noqa: E402
 
 from drake_diff import differentiate_rollout  # noqa: E402
-from drake_diff._base.statistics import success_rate  # noqa: E402
 from drake_diff.exceptions import DrakeDiffError, GradientWarning  # noqa: E402
 from drake_diff.model.parameters import select  # noqa: E402
 from drake_diff.motion.flow.steps import FlowSteps  # noqa: E402

@@ -37,9 +37,9 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant 
 from pydrake.multibody.tree import BodyIndex  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 from pydrake.systems.framework import DiagramBuilder  # noqa: E402
+from rates import success_rate  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
-from drake_diff._base.statistics import success_rate  # noqa: E402
 from drake_diff.loop.mpc import FOLLOWED  # noqa: E402
 
 FINE, TICK, HORIZON, LONG = 1e-3, 0.02, 10, 30  # [s], [s], knots of a quadruped, and of what is pushed

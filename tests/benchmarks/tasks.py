@@ -32,7 +32,7 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np  # noqa: E402
-import task_peers  # noqa: E402
+from rates import success_rate  # noqa: E402
 from referee import judge, judge_phases  # noqa: E402
 from task_cases import FAMILIES, NOT_EXPRESSED, Case  # noqa: E402
 from task_cases_more import MORE  # noqa: E402
@@ -40,7 +40,6 @@ from task_phases import PHASES, PhasedCase  # noqa: E402
 from trust_solve import NAMED, plan_of  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
-from drake_diff._base.statistics import success_rate  # noqa: E402
 from drake_diff.exceptions import DrakeDiffError, ModelWarning  # noqa: E402
 
 TIME_LIMIT, AIM = 60.0, 0.95
@@ -187,6 +186,8 @@ guesses and methods that a solve took.
 """
     text += "\n".join([*(f"- {line}" for line in told(rows, only)), "", *table(rows, only), *optima(rows)]) + "\n"
     if peers:
+        import task_peers
+
         text += f"""
 ## Beside other solvers
 
@@ -212,6 +213,8 @@ def marked() -> Row:
 
 def compared(given: argparse.Namespace, names: list[str]) -> None:
     """Our solves beside those of a peer; in --peers the rows of other tasks and other peers stay."""
+    import task_peers
+
     rows: list[Row] = []
     mark, old = marked(), json.loads(given.peers.read_text()) if given.peers and given.peers.is_file() else []
     kept = [row for row in old if row["peer"] != given.beside or row["name"] not in names]
@@ -235,7 +238,7 @@ def main() -> None:
     parser.add_argument("--wall", type=float, default=TIME_LIMIT, help=help_wall)
     parser.add_argument("--out", type=Path, help="a JSON file; what is in it already is not run again")
     parser.add_argument("--markdown", type=Path, help="write the table there")
-    parser.add_argument("--beside", choices=list(task_peers.PEERS), help="time the solves beside a peer's instead")
+    parser.add_argument("--beside", help="a peer of task_peers.PEERS to time the solves beside, instead")
     parser.add_argument("--python", default=sys.executable, help="of the peer's environment, with --beside")
     help_peers = "a JSON file of --beside, which adds to it; --markdown writes it into the page"
     parser.add_argument("--peers", type=Path, help=help_peers)

@@ -24,7 +24,7 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
-from drake_diff._base.statistics import success_rate  # noqa: E402
+from rates import success_rate  # noqa: E402
 
 # Each is a module trust_NAME beside this file, with `measure(seed, count)` and its usual COUNT.
 PARTS = (
