@@ -2,6 +2,7 @@
 
 import signal
 import sys
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from helpers.loops import CART, H  # noqa: E402
 from helpers.models import MODELS  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
+from drake_diff._base.sandbox import Outcome  # noqa: E402
+from drake_diff.artifact import verify as verify_module  # noqa: E402
 
 # A shell starts what runs in the background with Ctrl-C ignored, nohup with SIGHUP ignored, and what tests start and
 # interrupt would inherit that.
@@ -23,6 +26,21 @@ if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
 
 for public in dd.__all__:  # a module that is first loaded while a test has patched another would keep the patch
     getattr(dd, public)
+
+
+@pytest.fixture(autouse=True)
+def verify_in_this_process(request, monkeypatch):
+    """A child process imports Drake for two seconds; `test_sandbox` and the commands that tests start use one."""
+    if request.module.__name__ != "test_sandbox":
+        monkeypatch.setattr(verify_module, "call", call_here)
+
+
+def call_here(function, arguments, *_):
+    module, _, name = function.partition(":")
+    try:
+        return Outcome(value=getattr(import_module(module), name)(**arguments))
+    except Exception as error:
+        return Outcome(error=f"{type(error).__name__}: {error}")
 
 
 # The quadruped's file has neither motors nor a ground, as most files of robots on legs.

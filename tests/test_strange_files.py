@@ -10,7 +10,7 @@ from helpers.strange import DIRECTIVES, FILES, MJCF, URDF, broken, ends, put
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base.guarded import crash_of
+from drake_diff._base.sandbox import crash_of
 from drake_diff.cli import main as cli
 from drake_diff.exceptions import ModelError
 

@@ -19,9 +19,9 @@ from helpers.models import ROOT
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base import strangers
-from drake_diff._base.confined import memory_at_most
-from drake_diff._base.strangers import arrays_of, files_in, read_plain
+from drake_diff._base import untrusted
+from drake_diff._base.sandbox import memory_at_most
+from drake_diff._base.untrusted import arrays_of, files_in, read_plain
 from drake_diff.artifact import list_runs
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.mcap_file import read_mcap, recover_mcap
@@ -85,7 +85,7 @@ def test_a_run_whose_files_are_too_much_to_read_is_broken(tmp_path, monkeypatch)
 
 def test_a_log_of_more_messages_than_there_is_memory_for_is_refused_before_it_is_used_up(tmp_path, monkeypatch):
     """Protobuf's C ends the process where it gets no memory: by SIGSEGV, of 4.9 million messages and 4 GiB."""
-    monkeypatch.setattr("drake_diff._base.confined.NEARLY", 1e-9)
+    monkeypatch.setattr("drake_diff._base.sandbox.NEARLY", 1e-9)
     with memory_at_most(2**40), pytest.raises(MemoryError):
         read_mcap(RUN / "trace.mcap")
     assert read_mcap(RUN / "trace.mcap").messages
@@ -97,7 +97,7 @@ def test_a_device_is_not_opened():
 
 
 def test_a_link_to_a_folder_is_not_followed_and_a_folder_has_a_most_of_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(strangers, "MOST_FILES", 10)
+    monkeypatch.setattr(untrusted, "MOST_FILES", 10)
     (tmp_path / "out").symlink_to("/")
     (tmp_path / "a").touch()
     assert sorted(files_in(tmp_path)) == ["a", "out"]

@@ -4,11 +4,9 @@ A module of such functions is loaded through `kernel`, when it is first needed: 
 compiles once on a machine, after which the result is read from the cache beside the module.
 """
 
-import os
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -18,28 +16,12 @@ from drake_diff._base.clock import uncounted
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_saves = True
-
-
-def never_save() -> None:
-    """From now on compiled functions are read from the cache, and none is saved: this process may not write there."""
-    global _saves
-    _saves = False
-
 
 def compiled(function: Function) -> Function:
     """The function, of numbers and arrays alone, compiled; a division by zero gives what NumPy's does."""
     from numba import njit
 
     time_compilations()
-    if not _saves:
-        from numba.core import caching
-
-        caching._CacheLocator.ensure_cache_path = _find_cache
-        caching.IndexDataCacheFile.save = lambda *_: None
-        with suppress(RuntimeError):  # there is no cache yet
-            return cast(Function, njit(cache=True, error_model="numpy")(function))
-        return cast(Function, njit(error_model="numpy")(function))
     return cast(Function, njit(cache=True, error_model="numpy")(function))
 
 
@@ -63,12 +45,6 @@ def time_compilations() -> None:
                 uncounted(time.monotonic() - self.start)
 
     event.register("numba:compile", Timer())
-
-
-def _find_cache(locator: Any) -> None:
-    """In the place of Numba's own check, which writes: OSError where a folder has no compiled functions."""
-    if not any(name.endswith(".nbi") for name in os.listdir(locator.get_cache_path())):
-        raise FileNotFoundError
 
 
 @cache

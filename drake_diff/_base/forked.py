@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from drake_diff._base.clock import now
-from drake_diff._base.confined import DIE_WITH_PARENT
 
 LOOK = 0.02  # [s] from one look at what ends the work to the next
 TO_HEAR = 0.25  # [s] in which work that was sent a signal may end by itself
 BREAK = ("jax", "torch", "tensorflow")  # their threads hold locks, which a forked process would wait for for ever
+DIE_WITH_PARENT = 1  # of prctl(2)
 LENGTH = struct.Struct("=Q")
 
 Send = Callable[[Any], None]

@@ -14,7 +14,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import make_folder, write_whole
-from drake_diff._base.strangers import read_plain
+from drake_diff._base.untrusted import read_plain
 from drake_diff.artifact.identified_motion import joined
 from drake_diff.artifact.rerun import TRACE, rebuilt
 from drake_diff.comparison.kept import ARRAYS, LARGEST, RECORDINGS, read_arrays, write_arrays

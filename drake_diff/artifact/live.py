@@ -14,10 +14,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_diff._base.strangers import read_plain
-from drake_diff.artifact.apart import first_look
+from drake_diff._base.untrusted import read_plain
 from drake_diff.artifact.rerun import TRACE
 from drake_diff.artifact.sections import rebuild_goal
+from drake_diff.artifact.verify import require_readable
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, ModelError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS, read_into
@@ -66,7 +66,7 @@ def scene_of_run(directory: str | Path, *, models: str | Path | None = None) -> 
     A process of its own reads the run first: ArtifactError where it does not survive that.
     """
     folder = Path(directory)
-    first_look("drake_diff.artifact.live:_scene_apart", folder, models)
+    require_readable("drake_diff.artifact.live:_scene_apart", folder, models)
     return _scene(folder, None if models is None else Path(models))
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.strangers import read_plain
+from drake_diff._base.untrusted import read_plain
 from drake_diff.artifact.again import contract_as, model_as
 from drake_diff.artifact.differences import ABSOLUTE, NUMBER, Compared, compare_fields, is_near, leaves
 from drake_diff.artifact.rerun import rebuilt

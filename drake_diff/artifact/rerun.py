@@ -19,7 +19,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, positive_float
 from drake_diff._base.files import write_whole
-from drake_diff._base.strangers import arrays_of
+from drake_diff._base.untrusted import arrays_of
 from drake_diff.artifact.sections import rebuild_problem
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
 from drake_diff.model.load_file import FORMATS

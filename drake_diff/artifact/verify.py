@@ -12,7 +12,8 @@ import numpy as np
 
 from drake_diff._base.arrays import positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.strangers import MOST_READ, MOST_TEXT, files_in, read_plain, sha256_of
+from drake_diff._base.sandbox import Outcome, call
+from drake_diff._base.untrusted import MOST_READ, MOST_TEXT, files_in, read_plain, sha256_of
 from drake_diff.artifact.again import (
     OF_RECOVERED,
     SAME_PLAN,
@@ -24,7 +25,6 @@ from drake_diff.artifact.again import (
     made_again,
     model_as,
 )
-from drake_diff.artifact.apart import call_on, first_look
 from drake_diff.artifact.claim import claims_of
 from drake_diff.artifact.differences import (
     Compared,
@@ -39,7 +39,7 @@ from drake_diff.artifact.phases_again import PhasesAgain, inconsistencies, phase
 from drake_diff.artifact.rerun import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve
 from drake_diff.artifact.save import FILES
 from drake_diff.artifact.trace import CONFIGURATION, Trace, read_trace
-from drake_diff.exceptions import ArtifactError, DrakeDiffError, MissingDependencyError, ModelError
+from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, MissingDependencyError, ModelError
 from drake_diff.model.step import step
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.certification import CertificationRecord, certify_model
@@ -102,7 +102,6 @@ class Verification(ShowsItsRepr):
         claimed: What the record says was asked and came out. A weaker claim can be just as true.
         unchecked: What was not checked, by key.
         rounded: What differs by no more than machines round differently.
-        unlimited: What this system could not keep from the process that made it again.
         checked: How many values of record, trace and pages were compared with those made again.
         notes: Versions that differ from those of the record.
 
@@ -119,7 +118,6 @@ class Verification(ShowsItsRepr):
     claimed: tuple[str, ...] = ()
     unchecked: tuple[str, ...] = ()
     rounded: tuple[str, ...] = ()
-    unlimited: tuple[str, ...] = ()
     checked: int = 0
     notes: tuple[str, ...] = ()
 
@@ -158,7 +156,6 @@ class Verification(ShowsItsRepr):
             "undecided": self.undecided,
             "broken": self.complaints,
             "rounded": self.rounded,
-            "not limited": self.unlimited,
             "note": self.notes,
         }
         told = []
@@ -200,9 +197,9 @@ def verify(
     another version of Drake where numbers differ. It takes as long as the solve or the search for causes did, of which
     it waits for 60 seconds where `time_limit` says nothing else.
 
-    The directory may be a stranger's. Its model is read and run in a process of its own, which has limits of time and
-    memory, no network, and no file to open but those of the directory, of Python and below `models`. Where that process
-    crashes the verdict is "broken", where it comes to a limit "undecided".
+    The directory may be a stranger's. Its model is read and run in a child process with limits of time and memory, and
+    with the rights of this one (see docs/strangers.md). Where that process crashes the verdict is "broken", where it
+    reaches a limit "undecided".
 
     Args:
         directory: What `save`, `save_comparison`, `save_robustness`, `certify_model`, `run_panel` or `save_rollout`
@@ -236,8 +233,9 @@ def verify(
         return found
     if found.record.kind in NOT_RERUN and not has_recordings(found.record):
         return _run_again(found, found.record, None)
-    answer = call_on("drake_diff.artifact.verify:_apart", folder, models, float(time_limit), float(memory_limit))
-    found = replace(found, unlimited=answer.unlimited)
+    answer = call_with_limits(
+        "drake_diff.artifact.verify:_apart", folder, models, float(time_limit), float(memory_limit)
+    )
     if answer.exceeded:
         more = "time_limit= and memory_limit=, or --time-limit and --memory-limit, give it more"
         return replace(found, undecided=(f"it was not made again: {answer.exceeded}: {more}",))
@@ -245,6 +243,23 @@ def verify(
         return _judged(found, [f"it cannot be made again: {answer.sentence}"], [])
     texts: dict[str, Any] = {name: tuple(str(line) for line in answer.value[name]) for name in MADE_APART}
     return replace(found, **texts, checked=int(answer.value["checked"]))
+
+
+def call_with_limits(
+    function: str, folder: Path, models: str | Path | None, seconds: float = WAITED, memory: float = 1.0
+) -> Outcome:
+    """Call `function(directory, models)` in a child process; InputError if `models` is no folder."""
+    if models is not None and not Path(models).is_dir():
+        raise InputError("models", got=str(models), expected="a folder that exists")
+    given = {"directory": str(folder.resolve()), "models": None if models is None else str(Path(models).resolve())}
+    return call(function, given, seconds, memory)
+
+
+def require_readable(function: str, folder: Path, models: str | Path | None) -> None:
+    """Call `function` in a child process first; ArtifactError where that does not survive it."""
+    answer = call_with_limits(function, folder, models)
+    if answer.sentence:
+        raise ArtifactError(f"{folder}: {answer.sentence}")
 
 
 def verify_own(directory: Path) -> Verification:
@@ -379,7 +394,7 @@ def recalled(directory: str | Path, *, models: str | Path | None = None, trusted
     """
     folder = Path(directory)
     if not trusted:
-        first_look("drake_diff.artifact.verify:_recalled_apart", folder, models)
+        require_readable("drake_diff.artifact.verify:_recalled_apart", folder, models)
     with _recalled(folder, None if models is None else Path(models)) as solution:
         yield solution
 

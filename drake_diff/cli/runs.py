@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drake_diff._base.confined import memory_at_most
+from drake_diff._base.sandbox import memory_at_most
 from drake_diff._base.signals import INTERRUPTED, held_interrupts
 from drake_diff.cli.text import ModelFolder, RunDirectory, judged, out_option, plain, progress_line, show, table
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, WriteError
@@ -231,11 +231,8 @@ def verify(
     Exit status 0 only if all of it came out again. What was claimed and what was not checked is printed first.
     Comparisons and robustness trials are not run again: unchanged, they are "intact", with exit status 1. But what was
     said of recordings is made again: how they compare, and their causes.
-    RUN may be a stranger's: its model is read in a process with limits of time, memory and files, and no network.
+    RUN may be a stranger's: its model is read in a child process with limits of time and memory.
     """
-    from drake_diff._base.guarded import start
-
-    start()  # it imports Drake while this process does
     from drake_diff.artifact.verify import verify as verify_run
 
     found = verify_run(run, models=models, time_limit=time_limit, memory_limit=memory_limit)

@@ -131,7 +131,7 @@ def survived(file: Path, options: Mapping[str, Any]) -> None:
 
     Drake's parsers crash on some files, OBJ and VTK meshes of wrong numbers among them, and would end this process.
     """
-    from drake_diff._base.guarded import crash_of
+    from drake_diff._base.sandbox import crash_of
     from drake_diff.model.model import load_model
     from drake_diff.model.step import step
 

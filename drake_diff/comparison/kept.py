@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.files import make_folder, write_whole
-from drake_diff._base.strangers import arrays_of
+from drake_diff._base.untrusted import arrays_of
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ArtifactError
 

@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError
 
 from drake_diff._base.files import make_folder, write_whole
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.strangers import MOST_TEXT, json_of, read_plain
+from drake_diff._base.untrusted import MOST_TEXT, json_of, read_plain
 from drake_diff.exceptions import ArtifactError
 from drake_diff.record.parts import DataBoundary, Embodiment, FileEvidence, ModelInput, Part, Provenance
 from drake_diff.record.provenance import file_evidence

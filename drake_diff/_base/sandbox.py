@@ -1,0 +1,189 @@
+"""Run a function in one child process with limits of time and memory: its crash or overrun is reported, not shared.
+
+The child is a fresh Python process; arguments and value travel as JSON. It has the rights of the user who started it:
+see docs/strangers.md for what that does not protect against.
+"""
+
+import faulthandler
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+GIB = 2**30
+LARGEST_ANSWER = 64 * 2**20  # bytes, also of any other file that the child writes
+START_UP = 60.0  # [s] in which Python has imported Drake, on a busy machine too
+LAST_WORDS = 300  # characters of what a process wrote before it ended
+COMMAND = "from drake_diff._base.sandbox import serve; serve()"
+REQUEST, ANSWER, OUTPUT = "request.json", "answer.json", "output.txt"
+USED = "/proc/self/statm"  # in pages; the sixth number is that of data and stack
+NEARLY = 0.9  # of the memory that a process may have
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The value that a call returned, or why there is none.
+
+    `crashed` names the signal that ended the child, `exceeded` the limit that it reached, `error` what it raised.
+    """
+
+    value: Any = None
+    crashed: str = ""
+    exceeded: str = ""
+    error: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """Why there is no value; "" where there is one."""
+        if self.crashed:
+            return f"the model cannot be read or run: the process that did so ended by {self.crashed}"
+        return self.exceeded or self.error
+
+
+def call(function: str, arguments: Mapping[str, Any], seconds: float = 60.0, memory: float = 1.0) -> Outcome:
+    """Call `function`, "module:name", in a child process.
+
+    Args:
+        function: The module is imported before the limits hold.
+        arguments: By keyword, as JSON has them.
+        seconds: How long the call may take.
+        memory: How much memory the child may have, in GiB.
+    """
+    request = {"function": function, "arguments": dict(arguments), "seconds": seconds, "memory": int(memory * GIB)}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)]),
+    }
+    with tempfile.TemporaryDirectory(prefix="drake_diff_") as name:
+        folder = Path(name)
+        (folder / REQUEST).write_text(json.dumps(request))
+        with (folder / OUTPUT).open("wb") as output:
+            child = subprocess.Popen(
+                [sys.executable, "-P", "-c", COMMAND],  # -P: the child imports nothing from the working directory
+                cwd=folder,
+                env={**environment, "TMPDIR": name},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+            )
+            try:
+                child.wait(timeout=seconds + START_UP)
+            except subprocess.TimeoutExpired:
+                pass
+            finally:
+                with suppress(OSError):  # the child, and whatever it started
+                    os.killpg(child.pid, signal.SIGKILL)
+                status = child.wait()
+        return _outcome(folder, status, request)
+
+
+def _outcome(folder: Path, status: int, request: Mapping[str, Any]) -> Outcome:
+    """What came of a child that has ended with `status`."""
+    answer = folder / ANSWER
+    if status == 0 and answer.is_file():
+        return Outcome(**json.loads(answer.read_bytes()))
+    if -status in (signal.SIGALRM, signal.SIGKILL):
+        killed = "or the machine has no memory left" if -status == signal.SIGKILL else "the limit that was given"
+        return Outcome(exceeded=f"it did not end within {request['seconds']:g} s, {killed}")
+    if -status == signal.SIGXFSZ:
+        return Outcome(error=f"its answer has more than {LARGEST_ANSWER} bytes")
+    if status < 0:
+        return Outcome(crashed=signal.Signals(-status).name + _last_line((folder / OUTPUT).read_bytes()))
+    return Outcome(error=f"its process ended with status {status} and gave no answer")
+
+
+def serve() -> None:
+    """In the child: call the function of request.json under its limits, and write answer.json."""
+    request = json.loads(Path(REQUEST).read_text())
+    module, _, name = request["function"].partition(":")
+    function = getattr(import_module(module), name)
+    _limit(resource.RLIMIT_DATA, request["memory"])
+    _limit(resource.RLIMIT_CORE, 0)
+    _limit(resource.RLIMIT_FSIZE, LARGEST_ANSWER)
+    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # Python ignores it, and a write fails
+    signal.setitimer(signal.ITIMER_REAL, request["seconds"])  # ends the child, whatever it does, also without a parent
+    try:
+        answer = {"value": function(**request["arguments"])}
+    except MemoryError:
+        answer = {"exceeded": f"it needs more than {request['memory'] / GIB:g} GiB, the limit that was given"}
+    except (Exception, SystemExit) as error:
+        answer = {"error": f"{type(error).__name__}: {error}"}
+    Path(ANSWER).write_text(json.dumps(answer))
+    os._exit(0)  # threads of libraries may not end
+
+
+def _limit(kind: int, most: int) -> None:
+    _, hard = resource.getrlimit(kind)
+    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    resource.setrlimit(kind, (most, most))
+
+
+def _last_line(output: bytes) -> str:
+    last = output[-LAST_WORDS:].decode(errors="replace").strip().rpartition("\n")[2]
+    return f" ({last})" if last else ""
+
+
+def crash_of(action: Callable[[], object]) -> str:
+    """The signal that ended a process forked from this one to call `action()`, and its last words; "" where none did.
+
+    For a file of the user's own: it takes as long as `action()`, and some milliseconds. Only for a process without
+    threads of Python, as a command is.
+    """
+    parent, child = os.getpid(), 0
+    with tempfile.TemporaryFile() as output:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 counts the threads of libraries too
+                child = os.fork()
+            if child == 0:
+                os.dup2(output.fileno(), 1)
+                os.dup2(output.fileno(), 2)
+                resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+                faulthandler.disable()  # its words would be the last ones
+                action()
+            status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) if child else 0
+        except BaseException:  # Ctrl-C; in the child, whatever `action` raises is for the caller to meet
+            if child:
+                os.kill(child, signal.SIGKILL)
+                os.waitpid(child, 0)
+            raise
+        finally:
+            if os.getpid() != parent:
+                os._exit(0)
+        if status >= 0:
+            return ""
+        output.seek(0)
+        return signal.Signals(-status).name + _last_line(output.read())
+
+
+@contextmanager
+def memory_at_most(bytes_: int) -> Iterator[None]:
+    """Let this process have at most so much of its own memory while the block runs; MemoryError where it needs more."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    least = min(most for most in (bytes_, soft, hard) if most != resource.RLIM_INFINITY)
+    resource.setrlimit(resource.RLIMIT_DATA, (least, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def check_memory() -> None:
+    """MemoryError where this process has used nearly all that it may have: libraries in C crash where they get none."""
+    most, _ = resource.getrlimit(resource.RLIMIT_DATA)
+    if most == resource.RLIM_INFINITY or not os.path.exists(USED):
+        return
+    pages = int(Path(USED).read_text().split()[5])
+    if pages * resource.getpagesize() > NEARLY * most:
+        raise MemoryError
