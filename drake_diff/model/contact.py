@@ -71,7 +71,7 @@ def contact_modes(model: Model, x: ArrayLike, u: ArrayLike | None = None) -> dic
 
 def active_modes(model: Model) -> dict[Pair, str]:
     """The modes of the pairs that push each other in the step that `step.advance` took last on the double twin."""
-    found: dict[Pair, str] = {}
+    modes: dict[Pair, str] = {}
     for a, b, force, info in contact_forces(model.double):
         normal = _normal(info)
         push = abs(float(force @ normal))
@@ -80,25 +80,25 @@ def active_modes(model: Model) -> dict[Pair, str]:
         mu_a, mu_b = (proximity_property(model.double.inspector, geometry, "friction") or 0.0 for geometry in (a, b))
         possible = 2 * mu_a * mu_b / (mu_a + mu_b) * push if mu_a + mu_b else 0.0  # Drake's rule for two frictions
         tangential = float(np.linalg.norm(force - (force @ normal) * normal))
-        part = SLIDING_PART[model.contract.contact.approximation]
-        found[_pair(model, a, b)] = SLIDING if tangential >= part * possible else STICKING
-    return found
+        sliding_part = SLIDING_PART[model.contract.contact.approximation]
+        modes[_pair(model, a, b)] = SLIDING if tangential >= sliding_part * possible else STICKING
+    return modes
 
 
 def contacts_of_the_step(model: Model) -> tuple[ContactPoint, ...]:
     """The contacts of the step that `step.advance` took last on the double twin."""
-    found, results = [], model.double.plant.get_contact_results_output_port().Eval(model.double.context)
+    contacts, results = [], model.double.plant.get_contact_results_output_port().Eval(model.double.context)
     for i in range(results.num_point_pair_contacts()):
         info = results.point_pair_contact_info(i)
         pair = info.point_pair()
         where, ids = (info.contact_point(), pair.nhat_BA_W, -info.contact_force()), (pair.id_A, pair.id_B)
-        found.append(_contact_point(model, *ids, *where, pair.depth, info.slip_speed()))
+        contacts.append(_contact_point(model, *ids, *where, pair.depth, info.slip_speed()))
     for i in range(results.num_hydroelastic_contacts()):
         info = results.hydroelastic_contact_info(i)
         surface, force = info.contact_surface(), info.F_Ac_W().translational()
         where, ids = (surface.centroid(), _normal(info), force), (surface.id_M(), surface.id_N())
-        found.append(_contact_point(model, *ids, *where, 0.0, 0.0))
-    return tuple(found)
+        contacts.append(_contact_point(model, *ids, *where, 0.0, 0.0))
+    return tuple(contacts)
 
 
 def _contact_point(
@@ -180,15 +180,15 @@ def deepest_overlap(model: Model) -> tuple[float, float, str]:
 
     The thickness and the name are those of the thinner of the two geometries; (0, inf, "nothing") where none overlap.
     """
-    found = 0.0, float("inf"), "nothing"
+    deepest = 0.0, float("inf"), "nothing"
     port = model.plant.get_geometry_query_input_port()
     if not port.HasValue(model.double.context):
-        return found
+        return deepest
     for pair in port.Eval(model.double.context).ComputePointPairPenetration():
         thickness, name = min(_thickness(model, geometry) for geometry in (pair.id_A, pair.id_B))
-        if pair.depth / thickness > found[0] / found[1]:
-            found = float(pair.depth), thickness, name
-    return found
+        if pair.depth / thickness > deepest[0] / deepest[1]:
+            deepest = float(pair.depth), thickness, name
+    return deepest
 
 
 def thinnest_geometry(model: Model) -> tuple[float, str]:

@@ -68,16 +68,16 @@ def replace_collision_geometry(plant: MultibodyPlant, scene_graph: pg.SceneGraph
 
 def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     inspector = scene_graph.model_inspector()
-    found = collision_geometries(plant, scene_graph)
+    geometries = collision_geometries(plant, scene_graph)
     welded = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
-    fixed = [int(body.index()) in welded for body, _ in found]
+    fixed = [int(body.index()) in welded for body, _ in geometries]
     # Pairs that a file or a user lets pass through each other: Drake keeps its filters by geometry, so the spheres
     # would not inherit them.
-    pairs = [(a, b) for (body_a, a), (body_b, b) in combinations(found, 2) if body_a.index() != body_b.index()]
+    pairs = [(a, b) for (body_a, a), (body_b, b) in combinations(geometries, 2) if body_a.index() != body_b.index()]
     filtered = [(a, b) for a, b in pairs if inspector.CollisionFiltered(a, b)]
-    became = {geometry: [geometry] for _, geometry in found}
+    became = {geometry: [geometry] for _, geometry in geometries}
     notes = []
-    for (body, geometry), stays in zip(found, fixed, strict=True):
+    for (body, geometry), stays in zip(geometries, fixed, strict=True):
         name, shape = f"{inspector.GetName(geometry)} on {body.name()}", inspector.GetShape(geometry)
         if isinstance(shape, pg.Convex | pg.Ellipsoid | pg.Mesh):
             notes.append(

@@ -163,10 +163,10 @@ class Contract:
 
     def __repr__(self) -> str:
         counts = ["positions", "velocities", "inputs", "bodies", "joints", "geometries"]
-        told = ", ".join(f"{len(getattr(self, kind))} {kind}" for kind in counts).replace("geom", "collision geom")
+        counted = ", ".join(f"{len(getattr(self, kind))} {kind}" for kind in counts).replace("geom", "collision geom")
         return (
             f"Contract of {self.name}: time step {self.time_step:g} s, {self.integrator}\n"
-            f"  {told}, {self.constraints} constraints\n"
+            f"  {counted}, {self.constraints} constraints\n"
             f"  contact {self.contact.model}, {self.contact.approximation}; print(contract) shows everything"
         )
 

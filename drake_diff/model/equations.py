@@ -73,10 +73,10 @@ class EquationsOfMotion:
             return np.full(nx, np.nan)
         x = knot[:nx]
         twin.set_state(x)
-        found = np.empty(nx)
-        found[:nq] = x[nq:] if self.plain_rates else self.q_dot(twin, x)
-        found[nq:] = self.acceleration(knot[nx:])[0]
-        return found
+        rates = np.empty(nx)
+        rates[:nq] = x[nq:] if self.plain_rates else self.q_dot(twin, x)
+        rates[nq:] = self.acceleration(knot[nx:])[0]
+        return rates
 
     def autodiff(self, x: Any, u: Any) -> Any:
         """The same with AutoDiffXd in and out."""

@@ -80,18 +80,18 @@ def file_facts(path: Path, packages: PackageMap) -> FileFacts:
 
     Of what is no XML that is nothing. Raises ModelError where a file cannot be read.
     """
-    found = FileFacts()
-    _read(path, packages, None, found)
-    return found
+    facts = FileFacts()
+    _read(path, packages, None, facts)
+    return facts
 
 
-def _read(path: Path, packages: PackageMap, instance: str | None, found: FileFacts) -> None:
+def _read(path: Path, packages: PackageMap, instance: str | None, facts: FileFacts) -> None:
     try:
         if path.name.endswith(".dmd.yaml"):
             for directive in FlattenModelDirectives(LoadModelDirectives(str(path)), packages).directives:
                 if directive.add_model is not None:
                     file = Path(packages.ResolveUrl(directive.add_model.file))
-                    _read(file, packages, directive.add_model.name, found)
+                    _read(file, packages, directive.add_model.name, facts)
             return
         xml = XmlText(path.read_bytes())
         root = xml.root
@@ -100,37 +100,37 @@ def _read(path: Path, packages: PackageMap, instance: str | None, found: FileFac
     except (OSError, RuntimeError) as error:
         raise ModelError(f"{path}: what it says of joints and links cannot be read: {error}") from error
     if root.tag == "robot":
-        _read_urdf(root, instance or root.get("name") or path.stem, found)
+        _read_urdf(root, instance or root.get("name") or path.stem, facts)
     if root.tag == "mujoco":
-        _read_mjcf(Mjcf(with_includes(xml, path)), instance or root.get("model") or path.stem, found)
+        _read_mjcf(Mjcf(with_includes(xml, path)), instance or root.get("model") or path.stem, facts)
     for model in root.findall("model"):  # of SDF
-        _read_sdf(model, instance or model.get("name"), found)
+        _read_sdf(model, instance or model.get("name"), facts)
     for model in (model for world in root.findall("world") for model in world.findall("model")):
-        _read_sdf(model, model.get("name"), found)
+        _read_sdf(model, model.get("name"), facts)
 
 
-def _read_urdf(robot: Element, name: str, found: FileFacts) -> None:
+def _read_urdf(robot: Element, name: str, facts: FileFacts) -> None:
     names = {joint.get("name") for joint in robot.findall("joint")}
     for joint in robot.findall("joint"):
         limit, mimic, key = joint.find("limit"), joint.find("mimic"), (name, joint.get("name"))
-        found.joints[key] = JointSays(None if limit is None else _number(limit.get("effort")))
+        facts.joints[key] = JointSays(None if limit is None else _number(limit.get("effort")))
         if mimic is not None and joint.get("type") != "fixed" and mimic.get("joint") in names:
-            found.followers[key] = _drakes_mimic(key, mimic)
+            facts.followers[key] = _drakes_mimic(key, mimic)
     for link in robot.findall("link"):
-        found.links[name, link.get("name")] = _link_of_urdf(link)
+        facts.links[name, link.get("name")] = _link_of_urdf(link)
 
 
-def _read_mjcf(mjcf: Mjcf, name: str, found: FileFacts) -> None:
+def _read_mjcf(mjcf: Mjcf, name: str, facts: FileFacts) -> None:
     limits = {actuator.joint: actuator.limit for actuator in mjcf.actuators if math.isfinite(actuator.limit)}
     for joint in mjcf.joints.values():
         spring = (joint.stiffness, joint.rest) if joint.stiffness else None
         effort = limits.get(joint.name, joint.effort)
-        found.joints[name, joint.name] = JointSays(effort, spring=spring, armature=joint.armature)
+        facts.joints[name, joint.name] = JointSays(effort, spring=spring, armature=joint.armature)
     for pair in mjcf.coupled:
         mimic = Mimic(name, pair.follower, pair.leader, pair.ratio, pair.offset, in_drake=False)
-        found.followers[name, pair.follower] = mimic
-    found.disabled.update(mjcf.disabled)
-    found.left_out.update((name, actuator.joint) for actuator in mjcf.actuators if not actuator.read)
+        facts.followers[name, pair.follower] = mimic
+    facts.disabled.update(mjcf.disabled)
+    facts.left_out.update((name, actuator.joint) for actuator in mjcf.actuators if not actuator.read)
 
 
 def _drakes_mimic(key: Key, mimic: Element) -> Mimic:
@@ -150,29 +150,29 @@ def _link_of_urdf(link: Element) -> LinkSays:
     )
 
 
-def _read_sdf(model: Element, name: str, found: FileFacts) -> None:
+def _read_sdf(model: Element, name: str, facts: FileFacts) -> None:
     for joint in model.findall("joint"):
         effort, key = _text(joint, "axis", "limit", "effort"), (name, joint.get("name"))
-        found.joints[key] = JointSays(effort, passive=effort == 0)
-        own = next((element for element in joint.children if element.tag.endswith(":mimic")), None)
+        facts.joints[key] = JointSays(effort, passive=effort == 0)
+        mimic_element = next((element for element in joint.children if element.tag.endswith(":mimic")), None)
         mimic = joint.find("axis", "mimic")
-        if own is not None:  # Drake's element
-            found.followers[key] = _drakes_mimic(key, own)
+        if mimic_element is not None:  # Drake's element
+            facts.followers[key] = _drakes_mimic(key, mimic_element)
         elif mimic is not None:  # SDF's, which Drake does not read
-            ratio, offset, at = (
-                default if mimic.find(part) is None else _or_nan(_text(mimic, part))
-                for part, default in (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
+            ratio, offset, reference = (
+                default if mimic.find(tag) is None else _or_nan(_text(mimic, tag))
+                for tag, default in (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
             )
-            found.followers[key] = Mimic(*key, mimic.get("joint"), ratio, offset - ratio * at, in_drake=False)
+            facts.followers[key] = Mimic(*key, mimic.get("joint"), ratio, offset - ratio * reference, in_drake=False)
     for link in model.findall("link"):
         mass, inertial = _text(link, "inertial", "mass"), link.find("inertial")
         automatic = inertial is not None and inertial.get("auto") in ("true", "1")
         given = link.find("inertial", "inertia") is not None
         diagonal = [_text(link, "inertial", "inertia", kind) for kind in ("ixx", "iyy", "izz")] if given else []
         says = LinkSays(mass, _sum(diagonal), len(link.findall("collision")), not automatic)
-        found.links[name, link.get("name")] = says
+        facts.links[name, link.get("name")] = says
     for inner in model.findall("model"):
-        _read_sdf(inner, f"{name}::{inner.get('name')}", found)
+        _read_sdf(inner, f"{name}::{inner.get('name')}", facts)
 
 
 def _text(element: Element, *path: str) -> float | None:

@@ -83,8 +83,8 @@ class BodyForce:
 
     def to_dict(self) -> dict[str, Any]:
         """Its fields for JSON; an infinite limit is None."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {key: _plain(value) for key, value in found.items()}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {key: _plain(value) for key, value in values.items()}
 
 
 def _limit(subject: str, given: Any) -> float:
@@ -103,21 +103,21 @@ def check_body_forces(given: Sequence[BodyForce | Mapping[str, Any]]) -> tuple[B
     """What `load_model` was given, or what a record has of it, as BodyForces of different names."""
     if isinstance(given, (str, Mapping, BodyForce)) or not isinstance(given, Sequence):
         raise InputError("body_forces", got=type(given).__name__, expected="a list of dd.model.BodyForce")
-    found: list[BodyForce] = []
-    for one in given:
-        if isinstance(one, Mapping):
+    forces: list[BodyForce] = []
+    for force in given:
+        if isinstance(force, Mapping):
             known = {field.name for field in fields(BodyForce)}
-            for key in one.keys() - known:
+            for key in force.keys() - known:
                 raise UnknownNameError("field of a BodyForce", got=key, known=known)
-            for key in {"name", "body"} - one.keys():
+            for key in {"name", "body"} - force.keys():
                 raise InputError("body_forces", got=f"one without {key}", expected="name and body")
-            one = BodyForce(**one)
-        if not isinstance(one, BodyForce):
-            raise InputError("body_forces", got=type(one).__name__, expected="a list of dd.model.BodyForce")
-        if any(one.name == other.name for other in found):
-            raise InputError("body_forces", got=f"{one.name} twice", expected="each name once")
-        found.append(one)
-    return tuple(found)
+            force = BodyForce(**force)
+        if not isinstance(force, BodyForce):
+            raise InputError("body_forces", got=type(force).__name__, expected="a list of dd.model.BodyForce")
+        if any(force.name == other.name for other in forces):
+            raise InputError("body_forces", got=f"{force.name} twice", expected="each name once")
+        forces.append(force)
+    return tuple(forces)
 
 
 def add_body_forces(builder: DiagramBuilder, plant: MultibodyPlant, forces: Sequence[BodyForce]) -> None:
@@ -166,9 +166,9 @@ class Inputs:
         rows = np.asarray(rows, dtype=float)
         if self.plain:
             return rows
-        found = np.zeros((len(self.names), *rows.shape[1:]))
-        found[self.actuator >= 0] = rows[self.actuator[self.actuator >= 0]]
-        return found
+        by_input = np.zeros((len(self.names), *rows.shape[1:]))
+        by_input[self.actuator >= 0] = rows[self.actuator[self.actuator >= 0]]
+        return by_input
 
 
 class _Wiring:
@@ -203,22 +203,24 @@ class _Wiring:
         """The leaves, and which of their input ports, that an input port of the diagram feeds."""
         by_id = {id(leaf): leaf for leaf in self.leaves}
         return [
-            (by_id[of], i) for (of, i), source in self.sources.items() if isinstance(source, int) and source == port
+            (by_id[system_id], i)
+            for (system_id, i), source in self.sources.items()
+            if isinstance(source, int) and source == port
         ]
 
     def behind(self, plant: Any, ports: Sequence[int]) -> tuple[list[Any], set[int]]:
         """The systems, but plant and scene graph, and the diagram's own ports that input ports of `plant` depend on."""
-        found: list[Any] = []
+        systems: list[Any] = []
         reached: set[int] = set()
         waiting = [self.sources[id(plant), i] for i in ports]
         while waiting:
             source = waiting.pop()
             if isinstance(source, int):
                 reached.add(source)
-            elif source not in (None, plant, *found) and not isinstance(source, SceneGraph):
-                found.append(source)
+            elif source not in (None, plant, *systems) and not isinstance(source, SceneGraph):
+                systems.append(source)
                 waiting += [self.sources[id(source), i] for i in range(source.num_input_ports())]
-        return found, reached
+        return systems, reached
 
 
 def _leaf(system: Any, port: Any) -> Any:
@@ -242,7 +244,9 @@ def read_inputs(diagram: Diagram, plant: Any, forces: Sequence[BodyForce] = ()) 
     acting = [whole, *parts, generalized, int(plant.get_applied_spatial_force_input_port().get_index()), *targets]
     systems, reached = wiring.behind(plant, acting)
     _check_states(systems)
-    own = [generalized, *targets] if isinstance(diagram, RobotDiagram) else []  # which it exports in any case
+    always_exported = (
+        [generalized, *targets] if isinstance(diagram, RobotDiagram) else []
+    )  # which it exports in any case
     vectors: list[tuple[int, Any, set[int]]] = []
     places: list[int] = []  # before which of them the actuators stand
     left_out: list[str] = []
@@ -256,28 +260,28 @@ def read_inputs(diagram: Diagram, plant: Any, forces: Sequence[BodyForce] = ()) 
             places.append(len(vectors))
         elif number not in reached:
             left_out.append(port.get_name())
-        elif not (alone and into <= set(own)):
+        elif not (alone and into <= set(always_exported)):
             vectors.append((number, port, into))
     chosen = {number for number, _, _ in vectors}
     fed = frozenset(i for i in acting if _is_fed(wiring.sources[id(plant), i], chosen))
     driven = [i for i, a in enumerate(actuators(plant)) if whole in fed or _own_port(a, parts) in fed]
     rows = _rows_of_actuators(plant, [i for i in range(plant.num_actuators()) if i not in driven])
-    found: list[Row] = []
+    input_rows: list[Row] = []
     ports: list[tuple[int, slice]] = []
     first = min(places, default=0)
     for number, port, into in vectors:
         if len(ports) == first:
-            found += rows
-        ports.append((number, slice(len(found), len(found) + port.size())))
-        found += _rows_of_port(plant, port, into, generalized, forces)
+            input_rows += rows
+        ports.append((number, slice(len(input_rows), len(input_rows) + port.size())))
+        input_rows += _rows_of_port(plant, port, into, generalized, forces)
     if len(ports) == first:
-        found += rows
+        input_rows += rows
     if not ports and (whole in fed or driven):
         raise ModelError(
             "the plant's actuation input is connected inside the diagram, but drake_diff has to set it: leave it free "
             "or export it, or export the input of the system that feeds it"
         )
-    names, units, lower, upper, index = zip(*found, strict=True) if found else ((),) * 5
+    names, units, lower, upper, index = zip(*input_rows, strict=True) if input_rows else ((),) * 5
     return Inputs(
         names=_told_apart(names),
         units=units,
@@ -318,9 +322,9 @@ def _check_states(systems: Sequence[Any]) -> None:
 
 
 def _rows_of_actuators(plant: Any, which: list[int]) -> list[Row]:
-    found, names = actuators(plant), list(labelled(actuators(plant)))
+    motors, names = actuators(plant), list(labelled(actuators(plant)))
     lower, upper = plant.GetEffortLowerLimits(), plant.GetEffortUpperLimits()
-    units = ["N" if a.joint().type_name() == "prismatic" else "N m" for a in found]
+    units = ["N" if a.joint().type_name() == "prismatic" else "N m" for a in motors]
     return [(names[i], units[i], float(lower[i]), float(upper[i]), i) for i in which]
 
 

@@ -55,10 +55,10 @@ class Kinematics:
         reached = {WORLD}
         left = joints(self.plant)
         while left:
-            found = [j for j in left if len(reached & _ends(j)) > 0]
-            if not found:
+            reachable = [j for j in left if len(reached & _ends(j)) > 0]
+            if not reachable:
                 raise ModelError(f"joint {left[0].name()} is not connected to the world")
-            for joint in found:
+            for joint in reachable:
                 left.remove(joint)
                 a, b = int(joint.parent_body().index()), int(joint.child_body().index())
                 if a in reached and b not in reached:
@@ -100,13 +100,13 @@ class Kinematics:
     def _masses(self) -> list[tuple[int, float, Array]]:
         """(body, mass [kg], centre of mass (3,) in it [m])."""
         context = self.plant.CreateDefaultContext()
-        found = []
+        masses = []
         for body in bodies(self.plant):
             mass = float(body.get_mass(context))
             if mass > 0:
                 center = np.array(body.CalcCenterOfMassInBodyFrame(context))
-                found.append((int(body.index()), mass, _without_rounding(center)))
-        return found
+                masses.append((int(body.index()), mass, _without_rounding(center)))
+        return masses
 
     def _state(self, x: Any, speeds: bool) -> "_State":
         """The plant's own state, in which joints that follow others have coordinates too."""

@@ -88,8 +88,8 @@ def read_into(
             raise ModelError(f"{path}: expected text in UTF-8, got {got}") from error
         except DRAKES_REFUSALS as error:
             raise ModelError(refusal(path, reading.in_own_words(str(error)), reading.xml, notes)) from error
-    told = tuple(reading.in_own_words(note) for note in notes)
-    return FileRead(told, PackageMap(parser.package_map()), reading.done)
+    sentences = tuple(reading.in_own_words(note) for note in notes)
+    return FileRead(sentences, PackageMap(parser.package_map()), reading.done)
 
 
 @dataclass
@@ -110,10 +110,10 @@ class _Reading:
         xml = self._prepared(path)
         self.given["<literal-string>" + path.suffix] = self.given["<literal-string>.urdf"] = str(path)
         if xml is not None and xml.changed:
-            found = self.parser.AddModelsFromString(str(xml), path.suffix.lstrip("."))
+            added = self.parser.AddModelsFromString(str(xml), path.suffix.lstrip("."))
         else:
-            found = self.parser.AddModels(str(path))
-        self._corrected(xml, found[0] if found else None)
+            added = self.parser.AddModels(str(path))
+        self._corrected(xml, added[0] if added else None)
 
     def directives(self, path: Path) -> None:
         """Read a .dmd.yaml file: each robot file that it adds as `robot` reads one."""
@@ -157,11 +157,11 @@ class _Reading:
             if not mjcf.has_other_springs:
                 self.notes[:] = [note for note in self.notes if not OF_A_SPRING.search(note)]
 
-    def in_own_words(self, said: str) -> str:
+    def in_own_words(self, message: str) -> str:
         """What the parser said, with the files of the user in the place of what it was given."""
         for name, path in self.given.items():
-            said = said.replace(name, path)
-        return said
+            message = message.replace(name, path)
+        return message
 
 
 @contextmanager

@@ -61,20 +61,20 @@ class FileMeshes:
 
     def notes(self) -> list[str]:
         """What the user should know of meshes that are not used, a sentence each."""
-        told = []
+        sentences = []
         if self.skipped:
-            told.append(
+            sentences.append(
                 f"{len(self.skipped)} collision meshes skipped, Drake uses only {' '.join(USABLE_MESHES)}: "
                 f'{_listed(self.skipped)}. meshes="convex" or meshes="spheres" takes them.'
             )
         if self.missing:
-            told.append(
+            sentences.append(
                 f"{len(self.missing)} meshes skipped, no file found: {_listed(self.missing)}. Links without a shape "
                 "are drawn as a skeleton; packages={name: folder} says where a package is."
             )
         if self.unusable:
-            told.append(f"{len(self.unusable)} meshes skipped, they cannot be used: {_listed(self.unusable)}.")
-        return told
+            sentences.append(f"{len(self.unusable)} meshes skipped, they cannot be used: {_listed(self.unusable)}.")
+        return sentences
 
 
 def _listed(names: list[str]) -> str:
@@ -82,24 +82,24 @@ def _listed(names: list[str]) -> str:
     return "; ".join(names[:MOST_TOLD]) + more
 
 
-def read_meshes(found: FileMeshes, xml: XmlText, path: Path, packages: PackageMap) -> None:
+def read_meshes(meshes: FileMeshes, xml: XmlText, path: Path, packages: PackageMap) -> None:
     """Change what `xml`, the text of the robot file at `path`, says of meshes.
 
     Raises ModelError where a scale is no number.
     """
     if xml.root.tag == "mujoco":
-        _convert_assets(found, xml, path)
+        _convert_assets(meshes, xml, path)
         return
     for element in xml.root.iter("visual", "collision"):
         mesh = next(element.iter("mesh"), None)
         if mesh is not None:
             try:
-                _change(found, xml, element, mesh, _place(_uri(mesh), path, packages))
+                _change(meshes, xml, element, mesh, _place(_uri(mesh), path, packages))
             except ModelError as error:
                 raise ModelError(f"{path}:{mesh.line}: {error}") from error
 
 
-def _convert_assets(found: FileMeshes, xml: XmlText, path: Path) -> None:
+def _convert_assets(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
     """Give Drake an OBJ in the place of each mesh of an MJCF file that it does not read.
 
     It computes masses by them, as MuJoCo does; `put_meshes` then puts back what was there.
@@ -109,16 +109,16 @@ def _convert_assets(found: FileMeshes, xml: XmlText, path: Path) -> None:
         if file is None:
             continue  # which Drake says
         if file.suffix.lower() not in (*NOT_OBJ, OF_MUJOCO):
-            found.whole[str(file)] = file
+            meshes.whole[str(file)] = file
             continue
         try:
             triangles = read_mesh(file)
         except ModelError as error:
             raise ModelError(f"{path}:{mesh.line}: {error}") from error
-        obj = found.folder / f"mesh_{len(found.converted)}" / f"{file.stem}.obj"
+        obj = meshes.folder / f"mesh_{len(meshes.converted)}" / f"{file.stem}.obj"
         obj.parent.mkdir()
         obj.write_text(as_obj(triangles))
-        found.converted[str(obj)] = file
+        meshes.converted[str(obj)] = file
         xml.set(mesh, "file", str(obj))
 
 
@@ -132,36 +132,36 @@ def _asset(xml: XmlText, mesh: Element, path: Path) -> Path:
     return (path.parent / folders.get("meshdir", folders.get("assetdir", "")) / name).absolute()
 
 
-def _change(found: FileMeshes, xml: XmlText, element: Element, mesh: Element, place: Path | None) -> None:
+def _change(meshes: FileMeshes, xml: XmlText, element: Element, mesh: Element, location: Path | None) -> None:
     """Do to a visual or collision what its mesh needs."""
     uri, link = _uri(mesh), element.parent.get("name", "?") if element.parent else "?"
-    if f"//{DOWNLOADED}/" in uri and not place:
+    if f"//{DOWNLOADED}/" in uri and not location:
         return
-    file, told = _file(place), f"{link} {element.tag} {uri}"
-    scale = _scale(mesh, told)
+    file, label = _file(location), f"{link} {element.tag} {uri}"
+    scale = _scale(mesh, label)
     ending = Path(uri).suffix.lower()
     if file is None:
-        found.missing.append(told)
+        meshes.missing.append(label)
         xml.remove(element)
     elif ending not in (*USABLE_MESHES, *READ_BY_TRIMESH):
-        found.unusable.append(f"{told} (a format that is not known)")
+        meshes.unusable.append(f"{label} (a format that is not known)")
         xml.remove(element)
-    elif element.tag == "visual" or (found.treatment == "skip" and ending in USABLE_MESHES):
-        if place is None or not place.is_file() or ":///" in uri.removeprefix("file"):  # Drake would not find it
+    elif element.tag == "visual" or (meshes.treatment == "skip" and ending in USABLE_MESHES):
+        if location is None or not location.is_file() or ":///" in uri.removeprefix("file"):  # Drake would not find it
             set_uri(xml, mesh, f"file://{file}")
-    elif found.treatment == "skip":
-        found.skipped.append(told)
+    elif meshes.treatment == "skip":
+        meshes.skipped.append(label)
         xml.remove(element)
     else:
         wanted = CollisionMesh(link, file, scale)
         try:
-            _became(wanted, found.treatment)
+            _became(wanted, meshes.treatment)
         except ModelError as error:
-            found.unusable.append(f"{told} ({error})")
+            meshes.unusable.append(f"{label} ({error})")
             xml.remove(element)
             return
-        radius = PLACEHOLDER * (1 + len(found.wanted))
-        found.wanted[radius] = wanted
+        radius = PLACEHOLDER * (1 + len(meshes.wanted))
+        meshes.wanted[radius] = wanted
         _put_sphere(xml, element, mesh, radius, file.stem)
 
 
@@ -170,7 +170,7 @@ def _uri(mesh: Element) -> str:
     return (mesh.get("filename") or (uri.text if uri else "")).strip()
 
 
-def _scale(mesh: Element, told: str) -> Scale:
+def _scale(mesh: Element, label: str) -> Scale:
     child = mesh.find("scale")
     text = mesh.get("scale") or (child.text if child else "") or "1"
     try:
@@ -178,7 +178,7 @@ def _scale(mesh: Element, told: str) -> Scale:
     except ValueError:
         numbers = []
     if len(numbers) not in (1, 3) or not all(np.isfinite(numbers)) or 0 in numbers:
-        raise ModelError(f"{told}: expected a scale of one or three numbers that are not 0, got {text!r}")
+        raise ModelError(f"{label}: expected a scale of one or three numbers that are not 0, got {text!r}")
     return numbers[0], numbers[-1 if len(numbers) == 1 else 1], numbers[-1]
 
 
@@ -224,8 +224,8 @@ def find_file(uri: str, path: Path, packages: PackageMap) -> Path | None:
     return _file(_place(uri, path, packages))
 
 
-def _file(place: Path | None) -> Path | None:
-    return None if place is None else in_any_case(place) or in_any_case(Path(unquote(str(place))))
+def _file(location: Path | None) -> Path | None:
+    return None if location is None else in_any_case(location) or in_any_case(Path(unquote(str(location))))
 
 
 def _place(uri: str, path: Path, packages: PackageMap) -> Path | None:
@@ -249,10 +249,10 @@ def in_any_case(path: Path) -> Path | None:
         if path.is_file():
             return path.resolve()
         here = Path(path.anchor)
-        for part in path.parts[1:]:
-            step = here / part
-            if part != ".." and not step.exists():
-                same = [other.name for other in here.iterdir() if other.name.lower() == part.lower()]
+        for component in path.parts[1:]:
+            step = here / component
+            if component != ".." and not step.exists():
+                same = [other.name for other in here.iterdir() if other.name.lower() == component.lower()]
                 if not same:
                     return None
                 step = here / min(same)
@@ -311,14 +311,14 @@ def _put_back(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMes
     inspector = scene_graph.model_inspector()
     for geometry in inspector.GetAllGeometryIds():
         shape = inspector.GetShape(geometry)
-        own = meshes.converted.get(_path_of(shape))
-        if own is None:
+        original = meshes.converted.get(_path_of(shape))
+        if original is None:
             continue
         if inspector.GetProximityProperties(geometry) is None:
-            scene_graph.ChangeShape(plant.get_source_id(), geometry, pg.Mesh(str(own), shape.scale3()))
+            scene_graph.ChangeShape(plant.get_source_id(), geometry, pg.Mesh(str(original), shape.scale3()))
         elif meshes.treatment == "skip":
             link = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name()
-            meshes.skipped.append(f"{link} collision {own.name}")
+            meshes.skipped.append(f"{link} collision {original.name}")
             scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
 
 

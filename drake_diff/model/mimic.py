@@ -76,18 +76,18 @@ class Coupling:
 
     def forces(self, force: Any) -> Any:
         """(nv,) E' of the plant's generalized force (m,), floats or AutoDiffXd."""
-        found = force[self.own_v]
+        reduced = force[self.own_v]
         for i in np.setdiff1d(np.arange(len(self.of_v)), self.own_v):
-            found[self.of_v[i]] = found[self.of_v[i]] + self.ratio_v[i] * force[i]
-        return found
+            reduced[self.of_v[i]] = reduced[self.of_v[i]] + self.ratio_v[i] * force[i]
+        return reduced
 
     def limits(self, lower: Array, upper: Array, *, of_velocities: bool = False) -> tuple[Array, Array]:
         """The own lower and upper limits (n,) that keep to all of the plant's."""
-        of, ratio = (self.of_v, self.ratio_v) if of_velocities else (self.of_q, self.ratio_q)
-        offset = np.zeros(len(of)) if of_velocities else self.offset
+        leader, ratio = (self.of_v, self.ratio_v) if of_velocities else (self.of_q, self.ratio_q)
+        offset = np.zeros(len(leader)) if of_velocities else self.offset
         count = len(self.own_v if of_velocities else self.own_q)
         low, high = np.full(count, -np.inf), np.full(count, np.inf)
-        for i, k in enumerate(of):
+        for i, k in enumerate(leader):
             ends = sorted(((lower[i] - offset[i]) / ratio[i], (upper[i] - offset[i]) / ratio[i]))
             low[k], high[k] = max(low[k], ends[0]), min(high[k], ends[1])
         return low, high
@@ -99,9 +99,11 @@ class Coupling:
             return np.linalg.solve(E.T @ A @ E, E.T @ (A @ v))
         value = ExtractValue(A)
         mass = E.T @ value @ E
-        own = np.linalg.solve(mass, E.T @ (value @ ExtractValue(v.reshape(-1, 1)).ravel()))
-        missing = self.forces(A @ (v - self.velocities(own)))  # 0, with the derivatives of one step of Newton's method
-        return own + np.linalg.inv(mass) @ missing
+        solution = np.linalg.solve(mass, E.T @ (value @ ExtractValue(v.reshape(-1, 1)).ravel()))
+        missing = self.forces(
+            A @ (v - self.velocities(solution))
+        )  # 0, with the derivatives of one step of Newton's method
+        return solution + np.linalg.inv(mass) @ missing
 
 
 def check_mimic(choice: str | None) -> None:
@@ -112,34 +114,34 @@ def check_mimic(choice: str | None) -> None:
 
 def _called(plant: MultibodyPlant, mimic: Mimic, name: str) -> list[Any]:
     """The joints of that name, those of the mimic's model instance where others have them too."""
-    found = [j for j in joints(plant) if j.name() == name]
-    own = [j for j in found if plant.GetModelInstanceName(j.model_instance()) == mimic.instance]
-    return own if len(found) > 1 else found
+    same_name = [j for j in joints(plant) if j.name() == name]
+    same_instance = [j for j in same_name if plant.GetModelInstanceName(j.model_instance()) == mimic.instance]
+    return same_instance if len(same_name) > 1 else same_name
 
 
 def _joint(plant: MultibodyPlant, mimic: Mimic, name: str) -> Any:
-    found = _called(plant, mimic, name)
-    if len(found) != 1:
+    matches = _called(plant, mimic, name)
+    if len(matches) != 1:
         raise ModelError(f"mimic: the joint {mimic.follower} follows {mimic.leader}, and there is no joint {name}")
-    if not can_be_driven(found[0]):
-        kind = found[0].type_name()
+    if not can_be_driven(matches[0]):
+        kind = matches[0].type_name()
         raise ModelError(f"mimic: {mimic} is of revolute and prismatic joints here, and {name} is a {kind} joint")
-    return found[0]
+    return matches[0]
 
 
 def joints_of_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> list[tuple[Mimic, Any, Any]]:
     """Each with the joints that follow and lead."""
-    found = [(m, _joint(plant, m, m.follower), _joint(plant, m, m.leader)) for m in mimics]
-    for mimic, _, _ in found:
+    triples = [(m, _joint(plant, m, m.follower), _joint(plant, m, m.leader)) for m in mimics]
+    for mimic, _, _ in triples:
         if mimic.ratio == 0 or not np.isfinite([mimic.ratio, mimic.offset]).all():
             raise ModelError(f"mimic: {mimic}: expected a finite ratio other than 0")
-    return found
+    return triples
 
 
 def _resolved(pairs: list[tuple[Mimic, Any, Any]]) -> dict[Any, tuple[Any, float, float]]:
     """By the index of each follower the joint that leads in the end, and q = ratio * its q + offset."""
     direct = {follower.index(): (leader, m.ratio, m.offset) for m, follower, leader in pairs}
-    found = {}
+    resolved = {}
     for follower in direct:
         leader, ratio, offset = direct[follower]
         seen = {follower}
@@ -149,8 +151,8 @@ def _resolved(pairs: list[tuple[Mimic, Any, Any]]) -> dict[Any, tuple[Any, float
             seen.add(leader.index())
             leader, r, o = direct[leader.index()]
             ratio, offset = ratio * r, ratio * o + offset
-        found[follower] = (leader, ratio, offset)
-    return found
+        resolved[follower] = (leader, ratio, offset)
+    return resolved
 
 
 def uncoupled(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic, ...]:
@@ -159,17 +161,17 @@ def uncoupled(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic, ..
     Raises ModelError where one cannot be, or where the plant has other constraints: pydrake does not tell which is
     which.
     """
-    found = tuple(mimics)
-    _resolved(joints_of_mimics(plant, found))
-    own, count = sum(m.in_drake for m in found), int(plant.num_constraints())
-    if found and count != own:
+    couplings = tuple(mimics)
+    _resolved(joints_of_mimics(plant, couplings))
+    known, count = sum(m.in_drake for m in couplings), int(plant.num_constraints())
+    if couplings and count != known:
         raise ModelError(
-            f"mimic: the model has {count} constraints for {own} mimic joints, and Drake does not tell which are "
+            f"mimic: the model has {count} constraints for {known} mimic joints, and Drake does not tell which are "
             "which: take the other constraints (balls, welds, distances) out of the file"
         )
-    for constraint in plant.GetConstraintIds() if found else ():
+    for constraint in plant.GetConstraintIds() if couplings else ():
         plant.RemoveConstraint(constraint)
-    return found
+    return couplings
 
 
 def still_moving(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic, ...]:
@@ -207,10 +209,10 @@ def fix_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, .
         q = float(np.clip(leader.default_positions()[0], low, max(low, high)))
         for joint, ratio, offset in [(leader, 1.0, 0.0), *led]:
             places[joint.index()] = (joint, ratio * q + offset)
-    told = ", ".join(f"{joint.name()} at {q:.6g}" for joint, q in places.values())  # before Drake forgets them
+    positions = ", ".join(f"{joint.name()} at {q:.6g}" for joint, q in places.values())  # before Drake forgets them
     for joint, q in places.values():
         weld(plant, joint, q)
-    return (f"{len(places)} mimic joints and those that they follow were fixed: {told}.",)
+    return (f"{len(places)} mimic joints and those that they follow were fixed: {positions}.",)
 
 
 def _check_limits(leader: str, low: float, high: float) -> None:
@@ -222,8 +224,8 @@ def couple(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, ...]:
     """Give Drake the constraints of mimic joints again; a sentence for what is reduced."""
     for mimic, follower, leader in joints_of_mimics(plant, mimics):
         plant.AddCouplerConstraint(follower, leader, mimic.ratio, mimic.offset)
-    told = ", ".join(map(str, mimics))
-    return (f"{len(mimics)} mimic joints were reduced: {told}.",) if mimics else ()
+    listing = ", ".join(map(str, mimics))
+    return (f"{len(mimics)} mimic joints were reduced: {listing}.",) if mimics else ()
 
 
 def coupling_of(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> Coupling | None:
@@ -239,9 +241,9 @@ def coupling_of(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> Coupling | 
         ratio_q[i], ratio_v[j], offset[i] = ratio, ratio, add
     own_q, own_v = np.flatnonzero(leading_q == np.arange(n)), np.flatnonzero(leading_v == np.arange(m))
     of_q, of_v = np.searchsorted(own_q, leading_q), np.searchsorted(own_v, leading_v)
-    found = Coupling(mimics, own_q, own_v, of_q, of_v, ratio_q, ratio_v, offset)
+    coupling = Coupling(mimics, own_q, own_v, of_q, of_v, ratio_q, ratio_v, offset)
     names = plant.GetPositionNames(add_model_instance_prefix=False)
-    lows, highs = found.limits(plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
+    lows, highs = coupling.limits(plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
     for i, low, high in zip(own_q, lows, highs, strict=True):
         _check_limits(names[i].rsplit("_", 1)[0], low, high)
-    return found
+    return coupling

@@ -92,11 +92,11 @@ def _unread(mjcf: "Mjcf", path: Path) -> Iterator[str]:
 def with_includes(xml: XmlText, path: Path) -> XmlText:
     """`xml`, the text of the file at `path`, with what it includes. ModelError where that never ends."""
     count = 0
-    while found := [(element, file) for element in xml.root.iter("include") if (file := _included(element, path))]:
-        count += len(found)
+    while includes := [(element, file) for element in xml.root.iter("include") if (file := _included(element, path))]:
+        count += len(includes)
         if count > MOST_INCLUDES:
             raise ModelError(f"{path}: it includes itself, or more than {MOST_INCLUDES} files")
-        for element, file in found:
+        for element, file in includes:
             inner = XmlText(file.read_bytes())
             xml.replace(element, " ".join(inner.content(inner.root).splitlines()))
         xml = XmlText(str(xml).encode())
@@ -159,10 +159,10 @@ class Mjcf:
 
     @cached_property
     def defaults(self) -> Defaults:
-        found: Defaults = {MAIN: {}}
+        defaults: Defaults = {MAIN: {}}
         for section in self.root.findall("default"):
-            _read_class(section, section.get("class") or MAIN, MAIN, found)
-        return found
+            _read_class(section, section.get("class") or MAIN, MAIN, defaults)
+        return defaults
 
     @property
     def needs_flat_defaults(self) -> bool:
@@ -185,22 +185,22 @@ class Mjcf:
 
     def attributes(self, element: Element) -> Attributes:
         """Those of an element, with those that its default class gives."""
-        name, at = element.get("class"), element.parent
-        while not name and at is not None:
-            name, at = at.get("childclass"), at.parent
+        name, element_above = element.get("class"), element.parent
+        while not name and element_above is not None:
+            name, element_above = element_above.get("childclass"), element_above.parent
         return self.defaults.get(name or MAIN, self.defaults[MAIN]).get(element.tag, {}) | element.attributes
 
     @cached_property
     def joints(self) -> dict[str, Joint]:
         """Those of one coordinate that have a name."""
-        found = {}
+        joints = {}
         for element in (e for body in self.root.findall("worldbody") for e in body.iter("joint")):
             says = self.attributes(element)
             kind = says.get("type", "hinge")
             if kind in SCALAR and says.get("name"):
                 unit = math.pi / 180 if kind == "hinge" and self.degrees else 1.0
                 stiffness = _numbers(says.get("stiffness", "0"))
-                found[says["name"]] = Joint(
+                joints[says["name"]] = Joint(
                     says["name"],
                     stiffness[0] if len(stiffness) == 1 else 0.0,
                     unit * _first(says.get("springref", "0")),
@@ -208,7 +208,7 @@ class Mjcf:
                     _first(says.get("armature", "0")),
                     self._range(says, "actuatorfrc"),
                 )
-        return found
+        return joints
 
     @property
     def has_other_springs(self) -> bool:
@@ -271,12 +271,14 @@ class Mjcf:
 
 def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> list[str]:
     """Give the actuators of a plant that is not finalized the limits and gains that the file means; what was done."""
-    own = [actuator for actuator in actuators(plant) if actuator.model_instance() == instance]
+    motors = [actuator for actuator in actuators(plant) if actuator.model_instance() == instance]
     says = [actuator for kind in KINDS for actuator in mjcf.actuators if actuator.read and actuator.kind == kind]
-    if [a.joint().name() for a in own] != [a.joint for a in says]:  # in Drake's order
-        raise ModelError(f"expected the {len(says)} motors and position actuators of the file, Drake read {len(own)}")
+    if [a.joint().name() for a in motors] != [a.joint for a in says]:  # in Drake's order
+        raise ModelError(
+            f"expected the {len(says)} motors and position actuators of the file, Drake read {len(motors)}"
+        )
     limits, gains = [], []
-    for actuator, meant in zip(own, says, strict=True):
+    for actuator, meant in zip(motors, says, strict=True):
         if not math.isclose(actuator.effort_limit(), meant.limit, rel_tol=1e-12):
             limits.append(f"{actuator.name()} ({meant.limit:g} for {actuator.effort_limit():g})")
             actuator.set_effort_limit(meant.limit)
@@ -298,9 +300,9 @@ def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> 
     return notes
 
 
-def _read_class(section: Element, name: str, parent: str, found: Defaults) -> None:
-    inherited = {tag: dict(attributes) for tag, attributes in found.get(parent, {}).items()}
-    tags = found.setdefault(name, {})
+def _read_class(section: Element, name: str, parent: str, defaults: Defaults) -> None:
+    inherited = {tag: dict(attributes) for tag, attributes in defaults.get(parent, {}).items()}
+    tags = defaults.setdefault(name, {})
     for tag, attributes in inherited.items():
         tags[tag] = attributes | tags.get(tag, {})
     for element in section.children:
@@ -312,7 +314,7 @@ def _read_class(section: Element, name: str, parent: str, found: Defaults) -> No
             for kind in ACTUATORS if shared else ():
                 tags[kind] = tags.get(kind, {}) | shared
     for element in section.findall("default"):
-        _read_class(element, element.get("class"), name, found)
+        _read_class(element, element.get("class"), name, defaults)
 
 
 def _loses(section: Element, above: set[str]) -> bool:

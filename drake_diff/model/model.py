@@ -128,7 +128,8 @@ class Model(ShowsItsRepr):
         velocities = self.plant.GetVelocityNames(add_model_instance_prefix=prefix)
         if coupling is not None:
             positions, velocities = (
-                [a[i] for i in of] for a, of in ((positions, coupling.own_q), (velocities, coupling.own_v))
+                [a[i] for i in independent]
+                for a, independent in ((positions, coupling.own_q), (velocities, coupling.own_v))
             )
         self.position_names: tuple[str, ...] = tuple(positions)
         self.velocity_names: tuple[str, ...] = tuple(velocities)
@@ -234,8 +235,8 @@ class Model(ShowsItsRepr):
         if self.coupling is None:
             return range(i, i + joint.num_positions()), range(j, j + joint.num_velocities())
         q, v = (
-            np.flatnonzero((own >= start) & (own < start + count))
-            for own, start, count in (
+            np.flatnonzero((independent >= start) & (independent < start + count))
+            for independent, start, count in (
                 (self.coupling.own_q, i, joint.num_positions()),
                 (self.coupling.own_v, j, joint.num_velocities()),
             )
@@ -298,8 +299,8 @@ class Model(ShowsItsRepr):
         """Which forces the diagram's own systems exert on the plant; empty where none does."""
         plant = self.plant
         ports = [plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port()]
-        found = [f"the diagram feeds {port.get_name()}" for port in ports if self.feeds(port)]
-        return ", ".join(found + ["the diagram drives actuators"] * bool(self.inputs.fed_actuators))
+        reasons = [f"the diagram feeds {port.get_name()}" for port in ports if self.feeds(port)]
+        return ", ".join(reasons + ["the diagram drives actuators"] * bool(self.inputs.fed_actuators))
 
     @cached_property
     def carriers(self) -> dict[Any, tuple[str, bool]]:
@@ -313,14 +314,14 @@ class Model(ShowsItsRepr):
         Raises ModelError where what the diagram's systems exert cannot be told, or depends on time, and where another
         thread has set a parameter that Drake keeps in the plant.
         """
-        found = self._here.double
-        if found is None:
+        twin = self._here.double
+        if twin is None:
             self.shared.enter()
-            found = self._twin(float, self.diagram, self.plant)
+            twin = self._twin(float, self.diagram, self.plant)
             if self.inputs.systems and not self.body_forces:
-                _check_time(self, found)
-            self._here.double = found
-        return found
+                _check_time(self, twin)
+            self._here.double = twin
+        return twin
 
     @property
     def autodiff(self) -> Twin:
@@ -328,11 +329,11 @@ class Model(ShowsItsRepr):
 
         Raises ModelError where a system of the diagram has no AutoDiffXd form.
         """
-        found = self._here.autodiff
-        if found is None:
+        twin = self._here.autodiff
+        if twin is None:
             self.shared.enter()
-            found = self._here.autodiff = self._converted()
-        return found
+            twin = self._here.autodiff = self._converted()
+        return twin
 
     @property
     def has_autodiff(self) -> bool:
@@ -369,13 +370,13 @@ class Model(ShowsItsRepr):
         What is made while parameters are applied that are not the model's own is not kept, unless it depends on the
         model's structure alone (`of_structure`), which no parameter changes.
         """
-        kept = self._here.cache
-        if key in kept:
-            found: T = kept[key]
-            return found
+        entries = self._here.cache
+        if key in entries:
+            value: T = entries[key]
+            return value
         made = make()
         if of_structure or not self.has_other_parameters:
-            kept[key] = made
+            entries[key] = made
         return made
 
     def _twin(self, scalar: Any, diagram: Any, plant: Any) -> Twin:

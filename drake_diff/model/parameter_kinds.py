@@ -83,9 +83,9 @@ def _springs(plant: Any, kind: Any) -> dict[str, Any]:
     """The springs of a kind by their joint's label; of two springs on one joint neither can be named."""
     labels = {joint.index(): label for label, joint in labelled(joints(plant)).items()}
     elements = [plant.get_force_element(tree.ForceElementIndex(i)) for i in range(plant.num_force_elements())]
-    found = [(labels[e.joint().index()], e) for e in elements if isinstance(e, kind)]
-    names = [label for label, _ in found]
-    return {label: spring for label, spring in found if names.count(label) == 1}
+    springs = [(labels[e.joint().index()], e) for e in elements if isinstance(e, kind)]
+    names = [label for label, _ in springs]
+    return {label: spring for label, spring in springs if names.count(label) == 1}
 
 
 def _hinge_springs(model: Model) -> dict[str, Any]:
@@ -105,14 +105,14 @@ def geometries_of(twin: Twin) -> dict[str, list[Any]]:
     inspector, plant = twin.inspector, twin.plant
     if inspector is None or twin.scene_graph is None:
         return {}
-    found: dict[str, list[Any]] = {}
+    by_label: dict[str, list[Any]] = {}
     for label, body in {"world": plant.world_body(), **labelled(bodies(plant))}.items():
         frame = plant.GetBodyFrameIdIfExists(body.index())
-        own = [] if frame is None else list(inspector.GetGeometries(frame, Role.kProximity))
-        if own:
-            found[label] = own
-            found |= {f"{label}/{inspector.GetName(i).split('::')[-1]}": [i] for i in own}
-    return found
+        of_body = [] if frame is None else list(inspector.GetGeometries(frame, Role.kProximity))
+        if of_body:
+            by_label[label] = of_body
+            by_label |= {f"{label}/{inspector.GetName(i).split('::')[-1]}": [i] for i in of_body}
+    return by_label
 
 
 def _read_inertia(body: Any) -> list[float] | None:
@@ -195,10 +195,10 @@ def _read_gravity(model: Model) -> Any:
 
 
 def _write_gravity(twin: Twin, label: str, value: Values) -> None:
-    own = plain(value)
-    twin.plant.mutable_gravity_field().set_gravity_vector(own)
+    vector = plain(value)
+    twin.plant.mutable_gravity_field().set_gravity_vector(vector)
     if np.asarray(value).dtype == object:  # the plant takes the number, a force carries its derivative
-        twin.added["gravity"] = GravityChange(value - own)
+        twin.added["gravity"] = GravityChange(value - vector)
 
 
 _set_center_of_mass = _setter(Twin.body, "SetCenterOfMassInBodyFrame", vector=True)
@@ -237,8 +237,8 @@ def _contact_kind(quantity: str, unit: str, read: Callable[[Any, Any], Any], cha
     """`read(inspector, geometry)`, None where it has no value; `change(twin, geometry, value, root context)`."""
 
     def values(model: Model) -> dict[str, set[Any]]:
-        found = geometries_of(model.double)
-        return {label: {read(model.double.inspector, i) for i in ids} for label, ids in found.items()}
+        geometries = geometries_of(model.double)
+        return {label: {read(model.double.inspector, i) for i in ids} for label, ids in geometries.items()}
 
     def write(twin: Twin, label: str, value: Values) -> None:
         root = twin.scene_graph.GetMyMutableContextFromRoot(twin.root_context)

@@ -85,13 +85,13 @@ def list_parameters(model: Model) -> list[Parameter]:
     """
 
     def read() -> tuple[Parameter, ...]:
-        found = []
+        parameters = []
         for kind in KINDS:
             for label, unit, value in kind.find(model):
                 lower = 0.0 if kind.positive else -np.inf
                 value = frozen(np.atleast_1d(value))
-                found.append(Parameter(f"{label}.{kind.quantity}", unit, value, lower, np.inf, kind.source, kind))
-        return tuple(sorted(found, key=lambda parameter: parameter.name))
+                parameters.append(Parameter(f"{label}.{kind.quantity}", unit, value, lower, np.inf, kind.source, kind))
+        return tuple(sorted(parameters, key=lambda parameter: parameter.name))
 
     return list(model.cache("parameters", read))
 
@@ -218,15 +218,15 @@ def select(model: Model, parameters: Parameters) -> ParameterVector:
     for name in names:
         if name not in known:
             raise UnknownNameError("parameter", got=name, known=known)
-    found = tuple(known[name] for name in names)
-    for p in found:
+    selected = tuple(known[name] for name in names)
+    for p in selected:
         whole = f"{p.label.rsplit('/', 1)[0]}.{p.kind.quantity}"
         if p.kind in CONTACT_KINDS and "/" in p.label and whole in names:
             expected = "only one of them, as the first sets the second too"
             raise InputError("parameters", got=f"{whole} and {p.name}", expected=expected)
     given = parameters if isinstance(parameters, Mapping) else {}
-    values = [_check_value(p, given[p.name]) if p.name in given else p.value for p in found]
-    return ParameterVector(model, found, frozen(np.concatenate(values)))
+    values = [_check_value(p, given[p.name]) if p.name in given else p.value for p in selected]
+    return ParameterVector(model, selected, frozen(np.concatenate(values)))
 
 
 def _select_again(model: Model | None, values: dict[str, Array]) -> ParameterVector:
@@ -236,14 +236,14 @@ def _select_again(model: Model | None, values: dict[str, Array]) -> ParameterVec
 
 def plain_parameters(values: Mapping[str, Any]) -> ParameterVector:
     """Named numbers of no model, in the order of `values`."""
-    found = []
+    parameters = []
     for name, value in values.items():
         if not (isinstance(name, str) and name):
             raise InputError("parameters", got=repr(name), expected="names with their values")
         kind = Kind("", AUTODIFF, lambda model: {}, "", lambda element: None, lambda twin, label, value: None)
         value = finite_array(f"parameter {name}", np.atleast_1d(value), (1,))
-        found.append(Parameter(name, "unknown", value, -np.inf, np.inf, AUTODIFF, kind))
-    return ParameterVector(cast(Model, None), tuple(found), frozen([p.value[0] for p in found]))
+        parameters.append(Parameter(name, "unknown", value, -np.inf, np.inf, AUTODIFF, kind))
+    return ParameterVector(cast(Model, None), tuple(parameters), frozen([p.value[0] for p in parameters]))
 
 
 def _check_value(p: Parameter, given: Any) -> Array:

@@ -28,8 +28,8 @@ def instances_with_joints(plant: Any) -> list[ModelInstanceIndex]:
 
 def bodies(plant: Any) -> list[Any]:
     """Every body but the world."""
-    found = [plant.get_body(index) for i in instances(plant) for index in plant.GetBodyIndices(i)]
-    return [body for body in found if body.index() != plant.world_body().index()]
+    members = [plant.get_body(index) for i in instances(plant) for index in plant.GetBodyIndices(i)]
+    return [body for body in members if body.index() != plant.world_body().index()]
 
 
 def joints(plant: Any) -> list[Any]:
@@ -45,12 +45,12 @@ def actuators(plant: Any) -> list[Any]:
 def labelled(elements: list[Any]) -> dict[str, Any]:
     """The elements by name, or by "instance::name" where two model instances use the same."""
     names = [element.name() for element in elements]
-    found = {}
+    by_label = {}
     for element, name in zip(elements, names, strict=True):
         if names.count(name) > 1:
             name = f"{element.GetParentPlant().GetModelInstanceName(element.model_instance())}::{name}"
-        found[name] = element
-    return found
+        by_label[name] = element
+    return by_label
 
 
 # The quantities of contact by the names that parameters have, with Drake's names for them.
@@ -78,9 +78,9 @@ def proximity_property(inspector: Any, geometry: Any, quantity: str) -> float | 
 def scene_graph_beside(diagram: Any, path: DiagramPath) -> Any | None:
     """The SceneGraph, of either scalar type, nearest to the plant at `path`; None where there is none."""
     for depth in reversed(range(len(path))):
-        found = [s for s in follow(diagram, path[:depth]).GetSystems() if isinstance(s, _SCENE_GRAPHS)]
-        if found:
-            return found[0]
+        scene_graphs = [s for s in follow(diagram, path[:depth]).GetSystems() if isinstance(s, _SCENE_GRAPHS)]
+        if scene_graphs:
+            return scene_graphs[0]
     return None
 
 
@@ -103,13 +103,13 @@ def path_to_the_plant(diagram: Diagram) -> DiagramPath:
 
 
 def _paths_to_plants(diagram: Diagram, here: DiagramPath) -> list[DiagramPath]:
-    found: list[DiagramPath] = []
+    paths: list[DiagramPath] = []
     for i, system in enumerate(diagram.GetSystems()):
         if isinstance(system, MultibodyPlant):
-            found.append((*here, i))
+            paths.append((*here, i))
         elif isinstance(system, Diagram):
-            found += _paths_to_plants(system, (*here, i))
-    return found
+            paths += _paths_to_plants(system, (*here, i))
+    return paths
 
 
 def follow(diagram: Any, path: DiagramPath) -> Any:

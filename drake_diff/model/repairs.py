@@ -95,13 +95,13 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
         else:
             unlimited.append(name)
     if added:
-        told = ", ".join(f"{name} ({limit:g})" for name, limit in added)
+        listing = ", ".join(f"{name} ({limit:g})" for name, limit in added)
         whose = "given" if isinstance(asked, dict) else "that the file gives"
-        notes.append(f"{len(added)} actuators added, with the effort limits {whose}: {told}.")
+        notes.append(f"{len(added)} actuators added, with the effort limits {whose}: {listing}.")
     if unlimited:
-        told = ", ".join(unlimited)
+        listing = ", ".join(unlimited)
         why = "as asked" if isinstance(asked, dict) else "as the file gives none or 0"
-        notes.append(f"{len(unlimited)} actuators added without an effort limit, {why}: {told}.")
+        notes.append(f"{len(unlimited)} actuators added without an effort limit, {why}: {listing}.")
     if opened:
         notes.append(f"Limits of 0 of driven joints taken as none: {', '.join(opened)}.")
     return tuple(notes)
@@ -192,10 +192,10 @@ def weld_link(plant: MultibodyPlant, name: str) -> None:
 def frame_named(plant: MultibodyPlant, subject: str, name: str) -> Any:
     """The frame called `name`, or "instance::name"; UnknownNameError lists those that exist."""
     frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
-    found = labelled([f for f in frames if f.name() and f.body().index() != plant.world_body().index()])
-    if name not in found:
-        raise UnknownNameError(subject, got=name, known=found)
-    return found[name]
+    by_name = labelled([f for f in frames if f.name() and f.body().index() != plant.world_body().index()])
+    if name not in by_name:
+        raise UnknownNameError(subject, got=name, known=by_name)
+    return by_name[name]
 
 
 def floating_trees(plant: MultibodyPlant) -> list[list[Any]]:
@@ -209,11 +209,11 @@ def floating_trees(plant: MultibodyPlant) -> list[list[Any]]:
             group[a] |= group[b]
             for index in group[b]:
                 group[index] = group[a]
-    found: dict[int, list[Any]] = {}
+    trees: dict[int, list[Any]] = {}
     for body in bodies(plant):
         if int(plant.world_body().index()) not in group[int(body.index())]:
-            found.setdefault(id(group[int(body.index())]), []).append(body)
-    return [sorted(tree, key=lambda body: int(body.index()) in children) for tree in found.values()]
+            trees.setdefault(id(group[int(body.index())]), []).append(body)
+    return [sorted(tree, key=lambda body: int(body.index()) in children) for tree in trees.values()]
 
 
 def _can_move(plant: MultibodyPlant, tree: list[Any]) -> bool:
@@ -224,8 +224,8 @@ def _can_move(plant: MultibodyPlant, tree: list[Any]) -> bool:
 def _what_holds(plant: MultibodyPlant) -> str:
     world = plant.world_body().index()
     held = [j for j in joints(plant) if world in (j.parent_body().index(), j.child_body().index())]
-    told = ", ".join(f"{j.name()} ({j.type_name()}) holds {j.child_body().name()}" for j in held)
-    return f"as the file ties it to the world: {told or 'there is no body'}"
+    holders = ", ".join(f"{j.name()} ({j.type_name()}) holds {j.child_body().name()}" for j in held)
+    return f"as the file ties it to the world: {holders or 'there is no body'}"
 
 
 def fix(plant: MultibodyPlant, names: tuple[str, ...], done: Collection[str] = ()) -> tuple[str, ...]:
@@ -234,7 +234,7 @@ def fix(plant: MultibodyPlant, names: tuple[str, ...], done: Collection[str] = (
     Those that are `done` were made fixed in the file's text.
     """
     known = {name: joint for name, joint in labelled(joints(plant)).items() if joint.num_velocities()}
-    told = [f"{name} at 0" for name in done]
+    fixed_at = [f"{name} at 0" for name in done]
     for name in [name for name in names if name not in done]:
         if name not in known:
             raise UnknownNameError("fix_joints: joint that can move", got=name, known=known)
@@ -254,8 +254,8 @@ def fix(plant: MultibodyPlant, names: tuple[str, ...], done: Collection[str] = (
             weld(plant, joint, q)
         except DRAKES_REFUSALS as error:
             raise ModelError(f"fix_joints={name!r}: {_plain(error)}") from error
-        told.append(f"{name} at {q:g}")
-    return (f"{len(told)} joints fixed: {', '.join(told)}.",) if told else ()
+        fixed_at.append(f"{name} at {q:g}")
+    return (f"{len(fixed_at)} joints fixed: {', '.join(fixed_at)}.",) if fixed_at else ()
 
 
 def weld(plant: MultibodyPlant, joint: Any, q: float) -> None:
@@ -272,7 +272,7 @@ def weld(plant: MultibodyPlant, joint: Any, q: float) -> None:
 
 def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
     """Put the springs of a file on its joints that Drake's parser does not read: those of MJCF."""
-    told = []
+    sentences = []
     for name, joint in labelled(joints(plant)).items():
         says = facts.joints.get(_key(plant, joint))
         if says is None or says.spring is None or not can_be_driven(joint):
@@ -284,8 +284,12 @@ def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
             )
         spring = RevoluteSpring if isinstance(joint, RevoluteJoint) else PrismaticSpring
         plant.AddForceElement(spring(joint, rest, stiffness))
-        told.append(f"{name} ({stiffness:g} about {rest:g})")
-    return (f"{len(told)} springs of joints, which Drake's parser does not read: {', '.join(told)}.",) if told else ()
+        sentences.append(f"{name} ({stiffness:g} about {rest:g})")
+    return (
+        (f"{len(sentences)} springs of joints, which Drake's parser does not read: {', '.join(sentences)}.",)
+        if sentences
+        else ()
+    )
 
 
 def check_contact(value: Any) -> None:
@@ -296,20 +300,20 @@ def check_contact(value: Any) -> None:
 
 def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     """Let nothing collide: every collision shape loses that role and is drawn no more."""
-    found = collision_geometries(plant, scene_graph)
-    for _, geometry in found:
+    geometries = collision_geometries(plant, scene_graph)
+    for _, geometry in geometries:
         scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
-    return (f"{len(found)} collision shapes taken away: nothing touches.",) if found else ()
+    return (f"{len(geometries)} collision shapes taken away: nothing touches.",) if geometries else ()
 
 
 def touch_the_world_alone(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     """Let what moves collide with what is fixed to the world only; to be called when every shape is there."""
     fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
-    found = [geometry for body, geometry in collision_geometries(plant, scene_graph) if int(body.index()) not in fixed]
-    if found:
-        apart = pg.CollisionFilterDeclaration().ExcludeWithin(pg.GeometrySet(found))
+    moving = [geometry for body, geometry in collision_geometries(plant, scene_graph) if int(body.index()) not in fixed]
+    if moving:
+        apart = pg.CollisionFilterDeclaration().ExcludeWithin(pg.GeometrySet(moving))
         scene_graph.collision_filter_manager().Apply(apart)
-    return (f"{len(found)} collision shapes touch only what is fixed to the world, not each other.",) if found else ()
+    return (f"{len(moving)} collision shapes touch only what is fixed to the world, not each other.",) if moving else ()
 
 
 def as_ground(value: Any) -> float | bool | None:

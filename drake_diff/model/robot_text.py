@@ -67,21 +67,21 @@ def _unread(xml: XmlText, path: Path) -> Iterator[str]:
     for added in xml.root.iter("fluid_added_mass"):
         yield f"{path}:{added.line}: <fluid_added_mass> is ignored."
     for tag, meaning in OF_SIMULATORS.items() if xml.root.tag == "robot" else ():
-        found = [element for element in xml.root.iter(tag) if element.children]
-        if found:
-            yield f"{path}:{found[0].line}: {len(found)} <{tag}> are ignored: {meaning}."
+        elements = [element for element in xml.root.iter(tag) if element.children]
+        if elements:
+            yield f"{path}:{elements[0].line}: {len(elements)} <{tag}> are ignored: {meaning}."
 
 
 def _without_lost_joints(xml: XmlText) -> list[str]:
     """Leave out what speaks of a joint that is not there, and what a fixed joint mimics: Drake refuses both."""
-    told, joints = [], {joint.get("name"): joint for joint in xml.root.findall("joint")}
+    sentences, joints = [], {joint.get("name"): joint for joint in xml.root.findall("joint")}
     for name, joint in joints.items():
         for mimic in joint.findall("mimic"):
             leader = mimic.get("joint")
             if joint.get("type") == "fixed":
-                told.append(f"The joint {name} is fixed, so that it mimics nothing.")
+                sentences.append(f"The joint {name} is fixed, so that it mimics nothing.")
             elif leader and leader not in joints:
-                told.append(f"The joint {name} mimics {leader}, which does not exist: it moves by itself.")
+                sentences.append(f"The joint {name} mimics {leader}, which does not exist: it moves by itself.")
             else:
                 continue
             xml.remove(mimic)
@@ -90,8 +90,8 @@ def _without_lost_joints(xml: XmlText) -> list[str]:
         driven = [joint.get("name") for joint in transmission.findall("joint")]
         if driven and not there & set(driven):
             xml.remove(transmission)
-            told.append(f"A transmission is left out, as its joint does not exist: {', '.join(driven)}.")
-    return told
+            sentences.append(f"A transmission is left out, as its joint does not exist: {', '.join(driven)}.")
+    return sentences
 
 
 def _check_yaml(path: Path) -> None:
@@ -101,7 +101,7 @@ def _check_yaml(path: Path) -> None:
     def size(node: Any) -> int:
         if id(node) not in sizes:
             inner = [] if node is None or isinstance(node.value, str) else node.value
-            pairs = [part for entry in inner for part in (entry if isinstance(entry, tuple) else (entry,))]
+            pairs = [pair for entry in inner for pair in (entry if isinstance(entry, tuple) else (entry,))]
             sizes[id(node)] = 1 + sum(map(size, pairs))
         return sizes[id(node)]
 
@@ -110,8 +110,8 @@ def _check_yaml(path: Path) -> None:
         large = size(root) > MOST_NODES
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        at = f":{mark.line + 1}" if mark else ""
-        raise ModelError(f"{path}{at}: no YAML: {getattr(error, 'problem', None) or error}") from error
+        line_number = f":{mark.line + 1}" if mark else ""
+        raise ModelError(f"{path}{line_number}: no YAML: {getattr(error, 'problem', None) or error}") from error
     except RecursionError as error:
         raise ModelError(f"{path}: its lists are too deep") from error
     if large:
@@ -121,12 +121,12 @@ def _check_yaml(path: Path) -> None:
 def _one_colour_for_each_material(xml: XmlText) -> list[str]:
     """Drake refuses a material that is defined in two ways or in none, which only changes what is drawn."""
     known: dict[str, str] = {}
-    told: dict[str, None] = {}
+    renamed: dict[str, None] = {}
     top = xml.root.findall("material")
     for material in [*top, *(m for m in xml.root.iter("material") if m.parent is not xml.root)]:
         name, colour, texture = material.get("name"), material.find("color"), material.find("texture")
         if colour and "," in colour.get("rgba"):
-            told[f"{name or 'one'} has its colour written with commas"] = None
+            renamed[f"{name or 'one'} has its colour written with commas"] = None
             xml.set(colour, "rgba", " ".join(colour.get("rgba").replace(",", " ").split()))
         given = " ".join(colour.get("rgba").split()) if colour else texture.get("filename") if texture else ""
         if not name or (name in known and given in ("", known[name])):
@@ -135,23 +135,27 @@ def _one_colour_for_each_material(xml: XmlText) -> list[str]:
             known[name] = given
         elif given:
             xml.fill(material, "")
-            told[f"{name} is defined in two ways, of which the first is drawn"] = None
+            renamed[f"{name} is defined in two ways, of which the first is drawn"] = None
         else:
             xml.remove(material)
-            told[f"{name} is not defined"] = None
-    return [f"Materials: {'; '.join(told)}."] if told else []
+            renamed[f"{name} is not defined"] = None
+    return [f"Materials: {'; '.join(renamed)}."] if renamed else []
 
 
 def _continuous_without_limits(xml: XmlText) -> list[str]:
     """URDF gives a continuous joint no limits; where a file writes 0 and 0 all the same, Drake would hold the joint."""
-    told = []
+    sentences = []
     for joint in [j for j in xml.root.findall("joint") if j.get("type") == "continuous"]:
         limit = joint.find("limit")
         if limit and limit.get("lower") and limit.get("lower") == limit.get("upper"):
-            told.append(joint.get("name"))
+            sentences.append(joint.get("name"))
             xml.drop(limit, "lower")
             xml.drop(limit, "upper")
-    return [f"Limits of continuous joints left out, lower and upper are the same: {', '.join(told)}."] if told else []
+    return (
+        [f"Limits of continuous joints left out, lower and upper are the same: {', '.join(sentences)}."]
+        if sentences
+        else []
+    )
 
 
 def fix_in_text(xml: XmlText, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -163,11 +167,11 @@ def fix_in_text(xml: XmlText, path: Path, names: tuple[str, ...]) -> tuple[str, 
     followers = {name: mimic.get("joint") for name, joint in there.items() if (mimic := joint.find("mimic"))}
     if xml.root.tag != "robot" or not followers:
         return ()
-    found = [name for name in names if name in there and there[name].get("type") in MOVING]
+    moving = [name for name in names if name in there and there[name].get("type") in MOVING]
     for follower, leader in followers.items():
-        if leader in found and follower not in found:
+        if leader in moving and follower not in moving:
             raise ModelError(f"{path}: fix_joints={leader!r}: {follower} mimics it: fix {follower} too")
-    for name in found:
+    for name in moving:
         limit = there[name].find("limit")
         if limit and (_above(limit.get("lower"), "0") or _above("0", limit.get("upper"))):
             range_ = f"[{limit.get('lower')}, {limit.get('upper')}]"
@@ -175,7 +179,7 @@ def fix_in_text(xml: XmlText, path: Path, names: tuple[str, ...]) -> tuple[str, 
         xml.set(there[name], "type", "fixed")
         for mimic in there[name].findall("mimic"):
             xml.remove(mimic)
-    return tuple(found)
+    return tuple(moving)
 
 
 def included(path: Path) -> Iterator[str]:
@@ -197,17 +201,17 @@ def included(path: Path) -> Iterator[str]:
 def files_of_directives(path: Path) -> list[str]:
     """What a .dmd.yaml file calls `file`. ModelError where it is no YAML, or far too large."""
     _check_yaml(path)
-    found, waiting = [], [yaml.compose(path.read_text())]
+    files, waiting = [], [yaml.compose(path.read_text())]
     while waiting:
         node = waiting.pop()
         for entry in getattr(node, "value", None) or [] if not isinstance(node, yaml.ScalarNode) else []:
             if not isinstance(entry, tuple):
                 waiting.append(entry)
             elif entry[0].value == "file" and isinstance(entry[1], yaml.ScalarNode):
-                found.append(str(entry[1].value))
+                files.append(str(entry[1].value))
             else:
                 waiting.append(entry[1])
-    return found
+    return files
 
 
 def refuse_circles(path: Path, above: tuple[Path, ...]) -> None:
@@ -242,9 +246,9 @@ def add_packages(packages: PackageMap, path: Path, given: Mapping[str, str] | No
             continue
         seen.add(file)
         for name in sorted(set(re.findall(r"(?:package|model)://([^/\"'<>\s]+)/", file.read_text(errors="replace")))):
-            found = None if packages.Contains(name) else package_above(file, name)
-            if found is not None:
-                packages.Add(name, str(found))
+            location = None if packages.Contains(name) else package_above(file, name)
+            if location is not None:
+                packages.Add(name, str(location))
         waiting += [target for uri in included(file) if (target := _target(packages, file, uri)) is not None]
 
 
@@ -267,13 +271,17 @@ def package_above(file: Path, name: str) -> Path | None:
     return None
 
 
-def refusal(path: Path, said: str, xml: XmlText | None, notes: list[str]) -> str:
+def refusal(path: Path, message: str, xml: XmlText | None, notes: list[str]) -> str:
     """What Drake says of the file, with its name, the line if that can be known, and what to do if that is known."""
-    said = IN_CPP.sub("", said).strip()
-    said = said.replace(f"{path}:{path}", str(path))
-    known = re.search(re.escape(str(path)) + r":\d+", said)
-    line = "" if known or xml is None else "".join(f"; see {path}:{at}: {what}" for at, what in _suspects(xml, said))
-    unknown = re.search(r"unknown package '([^']+)'", said)
+    message = IN_CPP.sub("", message).strip()
+    message = message.replace(f"{path}:{path}", str(path))
+    known = re.search(re.escape(str(path)) + r":\d+", message)
+    line = (
+        ""
+        if known or xml is None
+        else "".join(f"; see {path}:{line_number}: {what}" for line_number, what in _suspects(xml, message))
+    )
+    unknown = re.search(r"unknown package '([^']+)'", message)
     remedy = ""
     if unknown:
         remedy = f". Say where it is: load_model(..., packages={{{unknown[1]!r}: folder}})"
@@ -281,17 +289,17 @@ def refusal(path: Path, said: str, xml: XmlText | None, notes: list[str]) -> str
             remedy += "; drake_diff downloads nothing, pydrake's PackageMap().GetPath('drake_models') does"
     elif xml is None and notes and notes[0].startswith(f"{path}, line"):
         remedy = f". Correct {notes[0].split(': only')[0]}"
-    return f"{path}: expected a robot model that Drake can read; Drake says: {said}{line}{remedy}"
+    return f"{path}: expected a robot model that Drake can read; Drake says: {message}{line}{remedy}"
 
 
-def _suspects(xml: XmlText, said: str) -> list[tuple[int, str]]:
+def _suspects(xml: XmlText, message: str) -> list[tuple[int, str]]:
     """The first element that what Drake said can be about, with its line: Drake names none for a wrong value."""
-    value = re.search(r"attribute (\w+) got (.*)", said)
+    value = re.search(r"attribute (\w+) got (.*)", message)
     for element in xml.root.iter():
         shown = f"<{element.tag} " + " ".join(f'{k}="{v}"' for k, v in element.attributes.items()) + ">"
         if value and element.attributes.get(value[1]) == value[2].strip():
             return [(element.line, shown)]
-        if not value and any(_wrong(element, word) for word in re.findall(r"\w+", said)):
+        if not value and any(_wrong(element, word) for word in re.findall(r"\w+", message)):
             return [(element.line, shown)]
     return []
 
@@ -305,7 +313,7 @@ def _wrong(element: Element, word: str) -> bool:
         return _above(low, high) or _above("0", element.get("velocity", "0"))
     if word in ("radius", "length", "size", "mass"):
         text = element.get(word) or element.get("size" if word == "radius" else "value" if element.tag == word else "")
-        return any(_above("0", part) for part in text.split())
+        return any(_above("0", number) for number in text.split())
     return False
 
 

@@ -42,13 +42,13 @@ def sample_states(model: Model, count: int, seed: int = 0) -> list[SampledState]
         far = float(np.clip(near + ONE_WAY * (1 if lower[i] >= 0 else -1), lower[i], upper[i]))
         middle[i], effort[i] = (near + far) / 2, EFFORT * abs(far - near)
     touches = model.contract.contact.collision_pairs > 0
-    found: list[SampledState] = []
+    samples: list[SampledState] = []
     for i in range(count):
         x = _touching(model, random) if touches and i % 2 else None
         kind = FREE if x is None else CONTACT
         x = _free(model, random) if x is None else x
-        found.append(SampledState(kind, frozen(x), frozen(middle + effort * random.uniform(-1, 1, model.nu))))
-    return found
+        samples.append(SampledState(kind, frozen(x), frozen(middle + effort * random.uniform(-1, 1, model.nu))))
+    return samples
 
 
 def _free(model: Model, random: np.random.Generator) -> Array:

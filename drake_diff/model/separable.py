@@ -33,18 +33,18 @@ def inseparable_pairs(plant: MultibodyPlant, diagram: Diagram) -> Pairs:
     if not port.HasValue(context):
         return ()
     postures = [plant.GetPositions(context)] + [_posture(plant, random) for _ in range(POSTURES)]
-    found: set[tuple[Any, Any]] = set()
+    pairs: set[tuple[Any, Any]] = set()
     for k, q in enumerate([*postures[:FIRST], *postures]):
         plant.SetPositions(context, q)
         query = port.Eval(context)
         try:
-            here = {tuple(sorted((of.id_A, of.id_B))) for of in query.ComputePointPairPenetration()}
+            here = {tuple(sorted((contact.id_A, contact.id_B))) for contact in query.ComputePointPairPenetration()}
         except RuntimeError as error:
             raise ModelError(f"Drake cannot tell which shapes overlap: {error}") from error
-        found = found | here if k < FIRST else {pair for pair in found if pair in here or _are_flush(query, *pair)}
-        if not found and k >= FIRST:
+        pairs = pairs | here if k < FIRST else {pair for pair in pairs if pair in here or _are_flush(query, *pair)}
+        if not pairs and k >= FIRST:
             break
-    return tuple(sorted(found))
+    return tuple(sorted(pairs))
 
 
 def _are_flush(query: Any, a: Any, b: Any) -> bool:

@@ -130,11 +130,11 @@ def softened(model: Model, contact: SoftContact) -> Model:
 
 def distances(twin: Twin) -> dict[tuple[str, str], float]:
     """The signed distance [m] of the geometries of every two bodies that may collide, in the context's state."""
-    found: dict[tuple[str, str], float] = {}
+    by_pair: dict[tuple[str, str], float] = {}
     for pair, (a, b) in _pairs(twin.plant, twin.context):
         names = (a.name(), b.name())
-        found[names] = min(float(pair.distance), found.get(names, np.inf))
-    return found
+        by_pair[names] = min(float(pair.distance), by_pair.get(names, np.inf))
+    return by_pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ class Separation:
 
 def separations(twin: Twin) -> list[Separation]:
     """Every pair of geometries that may collide, always in the same order, in the context's state."""
-    plant, context, found, coupling = twin.plant, twin.context, [], twin.coupling
+    plant, context, rows, coupling = twin.plant, twin.context, [], twin.coupling
     mass = twin.mass_matrix()
     to_v = np.array([plant.MapQDotToVelocity(context, e) for e in np.eye(plant.num_positions())]).T
     if coupling is not None:
@@ -160,8 +160,8 @@ def separations(twin: Twin) -> list[Separation]:
         v = np.linalg.solve(mass, rate)
         opening = twin.rates(v / max(rate @ v, np.finfo(float).tiny))
         names = (a.name(), b.name())
-        found.append(Separation(names, float(pair.distance), rate @ to_v, opening, float(rate @ v)))
-    return found
+        rows.append(Separation(names, float(pair.distance), rate @ to_v, opening, float(rate @ v)))
+    return rows
 
 
 def _distance_rate(plant: Any, context: Any, pair: Any, bodies: tuple[Any, Any]) -> Any:
@@ -171,8 +171,8 @@ def _distance_rate(plant: Any, context: Any, pair: Any, bodies: tuple[Any, Any])
     for body, geometry, p_GC in zip(bodies, (pair.id_A, pair.id_B), (pair.p_ACa, pair.p_BCb), strict=True):
         X_BG = inspector.GetPoseInFrame(geometry)
         p_BC = (X_BG.rotation().matrix() @ np.asarray(p_GC) + X_BG.translation()).reshape(3, 1)
-        own = body.body_frame()
-        jacobians.append(plant.CalcJacobianTranslationalVelocity(context, by_v, own, p_BC, world, world))
+        frame = body.body_frame()
+        jacobians.append(plant.CalcJacobianTranslationalVelocity(context, by_v, frame, p_BC, world, world))
     return (jacobians[0] - jacobians[1]).T @ np.asarray(pair.nhat_BA_W)
 
 
@@ -182,7 +182,7 @@ def _pairs(plant: Any, context: Any) -> list[tuple[Any, tuple[Any, Any]]]:
     if not port.HasValue(context):
         return []
     query = port.Eval(context)
-    inspector, found = query.inspector(), []
+    inspector, pairs = query.inspector(), []
     for ids in sorted(inspector.GetCollisionCandidates(), key=lambda pair: [int(i.get_value()) for i in pair]):
         try:
             pair = from_half_space(query, ids) or query.ComputeSignedDistancePairClosestPoints(*ids)
@@ -190,5 +190,5 @@ def _pairs(plant: Any, context: Any) -> list[tuple[Any, tuple[Any, Any]]]:
             why = "soft contact needs the distance of every pair, and Drake cannot compute one"
             raise ModelError(f"{why}: {error}") from error
         bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in (pair.id_A, pair.id_B)]
-        found.append((pair, (bodies[0], bodies[1])))
-    return found
+        pairs.append((pair, (bodies[0], bodies[1])))
+    return pairs

@@ -50,7 +50,7 @@ def fit_spheres(hull: Hull, label: str) -> Spheres:
     largest = shape.largest_radius()
     best = shape.alone(largest)
     if best.ground_gap > CLOSE_ENOUGH * largest:
-        tried = [shape.filled(part * largest) for part in RADII]
+        tried = [shape.filled(share * largest) for share in RADII]
         enough = [spheres for spheres in tried if spheres.ground_gap <= GOOD_ENOUGH * largest]
         best = enough[0] if enough else min(tried, key=lambda spheres: spheres.ground_gap)
     return Spheres(middle + size * best.centres, size * best.radius, size * best.ground_gap, size * best.open_gap)
@@ -73,8 +73,8 @@ class _Shape:
         planes = np.append(self.normals, np.ones((len(self.normals), 1)), axis=1)
         program.AddLinearConstraint(planes, np.full(len(planes), -np.inf), self.offsets, x)
         program.AddLinearCost(-x[3])
-        found = self._solved(program, x)
-        return float(np.min(self.offsets - self.normals @ found[:3])) * (1 - 1e-6)
+        solution = self._solved(program, x)
+        return float(np.min(self.offsets - self.normals @ solution[:3])) * (1 - 1e-6)
 
     def closest_centre(self, point: Array, radius: float) -> Array:
         """(3,) the centre closest to `point` of a sphere that fits in."""
@@ -102,7 +102,7 @@ class _Shape:
         centres = [self.closest_centre(farthest, radius)]
         while len(centres) < MOST_SPHERES:
             placed = np.array(centres)
-            wanted = [self.closest_centre(place, radius) for place in self._missing(placed, radius)]
+            wanted = [self.closest_centre(point, radius) for point in self._missing(placed, radius)]
             new = [c for c in wanted if np.min(np.linalg.norm(placed - c, axis=1)) >= SAME * radius]
             if not new:
                 break  # the spheres will do, or none of this radius comes closer
@@ -119,12 +119,12 @@ class _Shape:
         """The points (3,) of the hull that need a sphere most, the worst first."""
         probes = directions(PROBES)
         ground, bare = self._ground_gaps(centres, radius), self._open_gaps(centres, radius)
-        found = []
+        missing = []
         if np.max(ground) > CLOSE_ENOUGH * radius:
-            found.append(self.corners[np.argmax(self.corners @ probes[np.argmax(ground)])])
+            missing.append(self.corners[np.argmax(self.corners @ probes[np.argmax(ground)])])
         if np.max(bare) > radius:
-            found.append(self.surface[np.argmax(bare)])
-        return found
+            missing.append(self.surface[np.argmax(bare)])
+        return missing
 
     def _ground_gaps(self, centres: Array, radius: float) -> Array:
         """How much farther than the spheres the hull reaches in each direction."""
@@ -143,7 +143,7 @@ def _surface_points(corners: Array, triangles: Integers) -> Array:
     a, b, c = (corners[triangles[:, i]] for i in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     cuts = np.ceil(np.sqrt(SURFACE_POINTS * areas / np.sum(areas))).astype(int)
-    found = [corners]
+    points = [corners]
     for p, q, r, n in zip(a, b, c, np.maximum(cuts, 1), strict=True):
-        found += [p + (i * (q - p) + j * (r - p)) / n for i in range(n + 1) for j in range(n + 1 - i)]
-    return np.vstack(found)
+        points += [p + (i * (q - p) + j * (r - p)) / n for i in range(n + 1) for j in range(n + 1 - i)]
+    return np.vstack(points)

@@ -42,23 +42,23 @@ class TangentSpace:
         """(size,): the tangent vector at `x0` that leads to `x1`."""
         if not self.quaternions:
             return x1 - x0
-        found, (of_x, of_d) = np.empty(self.size, np.result_type(x1, x0)), self._plain  # of AutoDiffXd, too
-        found[of_d] = x1[of_x] - x0[of_x]
+        difference, (of_x, of_d) = np.empty(self.size, np.result_type(x1, x0)), self._plain  # of AutoDiffXd, too
+        difference[of_d] = x1[of_x] - x0[of_x]
         for q, r in self._turns:
             between = _right_product(_conjugate(x0[q])) @ x1[q]
-            found[r] = 2 * between[1:] / between[0]
-        return found
+            difference[r] = 2 * between[1:] / between[0]
+        return difference
 
     def scale(self, ranges: Array) -> Array:
         """(size,): the ranges (nx,) of a state's entries as those of a tangent vector; a turn's is the same all round.
 
         A quaternion changes by half of the angle that its body turns by.
         """
-        found, (of_x, of_d) = np.empty(self.size), self._plain
-        found[of_d] = ranges[of_x]
+        scales, (of_x, of_d) = np.empty(self.size), self._plain
+        scales[of_d] = ranges[of_x]
         for q, r in self._turns:
-            found[r] = 2 * np.max(ranges[q])
-        return found
+            scales[r] = 2 * np.max(ranges[q])
+        return scales
 
     def derivative_of_plus(self, x: Array) -> Array:
         """(nx, size): d plus(x, d) / d d at d = 0."""

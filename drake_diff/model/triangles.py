@@ -47,9 +47,9 @@ class Triangles:
         """The faces of each colour as a mesh of its own; all of them with None where the mesh has no colours."""
         if self.colours is None:
             return [(self, None)]
-        found, which = np.unique(self.colours, axis=0, return_inverse=True)
+        colours, which = np.unique(self.colours, axis=0, return_inverse=True)
         parts: list[tuple[Triangles, Colour | None]] = []
-        for i, (r, g, b) in enumerate(found.tolist()):
+        for i, (r, g, b) in enumerate(colours.tolist()):
             used, faces = np.unique(self.faces[which.ravel() == i], return_inverse=True)
             parts.append((Triangles(self.vertices[used], faces.reshape(-1, 3)), (r, g, b)))
         return parts
@@ -109,20 +109,22 @@ def _read(path: Path, _changed: int, _size: int) -> Triangles:
     try:
         data, beside = BytesIO(path.read_bytes()), _Materials(path.parent)
         scene: Any = trimesh.load_scene(data, file_type=kind[1:], resolver=beside, process=False)
-        found = [_part(scene, node, coloured=kind != ".stl") for node in scene.graph.nodes_geometry]
+        nodes = [_part(scene, node, coloured=kind != ".stl") for node in scene.graph.nodes_geometry]
     except Exception as error:  # a reader of strangers' files raises whatever it runs into
-        told = str(error) or type(error).__name__
-        raise ModelError(f"{path}: expected a mesh that can be read; trimesh says: {told}") from error
-    parts = [part for part in found if part is not None and len(part.faces)]
+        message = str(error) or type(error).__name__
+        raise ModelError(f"{path}: expected a mesh that can be read; trimesh says: {message}") from error
+    parts = [mesh for mesh in nodes if mesh is not None and len(mesh.faces)]
     if not parts:
         raise ModelError(f"{path}: expected a mesh of triangles")
-    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    starts = np.cumsum([0] + [len(mesh.vertices) for mesh in parts])
     colours = None
-    if any(part.colours is not None for part in parts):
-        each = [np.tile(PLAIN, (len(part.faces), 1)) if part.colours is None else part.colours for part in parts]
-        colours = _few_colours(np.concatenate(each))
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    if any(mesh.colours is not None for mesh in parts):
+        colours_of_faces = [
+            np.tile(PLAIN, (len(mesh.faces), 1)) if mesh.colours is None else mesh.colours for mesh in parts
+        ]
+        colours = _few_colours(np.concatenate(colours_of_faces))
+    vertices = np.concatenate([mesh.vertices for mesh in parts])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(parts, starts, strict=False)])
     return _joined(vertices, faces, colours)
 
 
@@ -182,12 +184,12 @@ def _colours(visual: Any, count: int) -> Array | None:
 
 def _few_colours(colours: Array) -> Array:
     """The same colours where they are few; else the commonest, and the average of the others in place of these."""
-    found, which, counts = np.unique(colours, axis=0, return_inverse=True, return_counts=True)
-    if len(found) <= MOST_COLOURS:
+    distinct, which, counts = np.unique(colours, axis=0, return_inverse=True, return_counts=True)
+    if len(distinct) <= MOST_COLOURS:
         return colours
     rest = np.sort(np.argsort(-counts, kind="stable")[MOST_COLOURS - 1 :])
-    found[rest] = np.average(found[rest], axis=0, weights=counts[rest])
-    return np.asarray(found[which.ravel()])
+    distinct[rest] = np.average(distinct[rest], axis=0, weights=counts[rest])
+    return np.asarray(distinct[which.ravel()])
 
 
 def scaled(mesh: Triangles, scale: Sequence[float]) -> Triangles:
@@ -206,14 +208,14 @@ def with_fewer_faces(meshes: Sequence[Triangles], limit: int) -> tuple[Triangles
     if sum(len(mesh.faces) for mesh in meshes) <= limit:
         return tuple(meshes)
     cell = float(np.sqrt(2 * sum(float(np.sum(_areas(mesh)[1])) for mesh in meshes) / limit))
-    found = [_clusters(mesh, cell) for mesh in meshes]
+    clustered = [_clusters(mesh, cell) for mesh in meshes]
     for _ in range(SEARCHES):
-        count = sum(len(kept) for _, kept, _ in found)
+        count = sum(len(faces) for _, faces, _ in clustered)
         if 0.8 * limit <= count <= limit:
             break
         cell *= float(np.sqrt(max(count, 1) / (0.9 * limit)))  # faces go with 1 / cell^2
-        found = [_clusters(mesh, cell) for mesh in meshes]
-    return tuple(_clustered(mesh, *clusters) for mesh, clusters in zip(meshes, found, strict=True))
+        clustered = [_clusters(mesh, cell) for mesh in meshes]
+    return tuple(_clustered(mesh, *clusters) for mesh, clusters in zip(meshes, clustered, strict=True))
 
 
 def _areas(mesh: Triangles) -> tuple[Array, Array]:
@@ -233,9 +235,9 @@ def _joined(vertices: Array, faces: Integers, colours: Array | None) -> Triangle
 
 def _cells(vertices: Array, cell: float) -> tuple[int, Integers, Integers]:
     """How many cells of a grid hold vertices, the first vertex in each, and the cell of each vertex."""
-    at = np.floor((vertices - np.min(vertices, axis=0)) / cell + 0.5).astype(np.int64)
-    shape = np.max(at, axis=0) + 1
-    key = (at[:, 0] * shape[1] + at[:, 1]) * shape[2] + at[:, 2]
+    cells = np.floor((vertices - np.min(vertices, axis=0)) / cell + 0.5).astype(np.int64)
+    shape = np.max(cells, axis=0) + 1
+    key = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
     _, first, which = np.unique(key, return_index=True, return_inverse=True)
     return len(first), first, which.ravel()
 
@@ -252,10 +254,10 @@ def _clusters(mesh: Triangles, cell: float) -> tuple[Integers, Integers, float]:
     return where, apart[np.sort(first)], cell
 
 
-def _clustered(mesh: Triangles, where: Integers, kept: Integers, cell: float) -> Triangles:
+def _clustered(mesh: Triangles, where: Integers, remaining: Integers, cell: float) -> Triangles:
     vertices = _representatives(mesh, where, cell)
-    used, faces = np.unique(where[mesh.faces[kept]], return_inverse=True)
-    colours = None if mesh.colours is None else mesh.colours[kept]
+    used, faces = np.unique(where[mesh.faces[remaining]], return_inverse=True)
+    colours = None if mesh.colours is None else mesh.colours[remaining]
     return Triangles(vertices[used], faces.reshape(-1, 3), colours)
 
 
@@ -333,7 +335,7 @@ def _distance(points: Array, hull: Hull) -> Array:
     """(n,) how far each point is outside the plane that it is farthest out of, negative inside the hull."""
     planes = np.append(hull.normals, -hull.offsets[:, None], axis=1).T
     return np.concatenate(
-        [np.max(np.append(part, np.ones((len(part), 1)), axis=1) @ planes, axis=1) for part in _split(points)]
+        [np.max(np.append(block, np.ones((len(block), 1)), axis=1) @ planes, axis=1) for block in _split(points)]
     )
 
 
@@ -346,12 +348,12 @@ def _farthest(points: Array, count: int) -> Array:
     """Those points that are farthest out along some of `count` directions."""
     among = directions(count)
     best, reach, start = np.zeros(count, dtype=np.int64), np.full(count, -np.inf), 0
-    for part in _split(points):
-        along = among @ part.T
+    for block in _split(points):
+        along = among @ block.T
         winner = np.argmax(along, axis=1)
         farther = along[np.arange(count), winner]
         best, reach = np.where(farther > reach, winner + start, best), np.maximum(farther, reach)
-        start += len(part)
+        start += len(block)
     return points[np.unique(best)]
 
 

@@ -51,8 +51,8 @@ class SpringChange:
 
     def potential(self, plant: Any, context: Any) -> float:
         q = plant.GetPositions(context)[self.position]
-        own = self.own_stiffness * (q - self.own_rest) ** 2
-        return float(self.stiffness * (q - self.rest) ** 2 - own) / 2
+        original = self.own_stiffness * (q - self.own_rest) ** 2
+        return float(self.stiffness * (q - self.rest) ** 2 - original) / 2
 
 
 @dataclass
@@ -63,12 +63,12 @@ class GravityChange:
 
     def force(self, plant: Any, context: Any) -> Any:
         field = plant.mutable_gravity_field()
-        own = field.gravity_vector()
+        original = field.gravity_vector()
         total = 0.0
         for axis, amount in zip(np.eye(3), self.added, strict=True):
             field.set_gravity_vector(axis)
             total = total + amount * field.CalcGravityGeneralizedForces(context)
-        field.set_gravity_vector(own)
+        field.set_gravity_vector(original)
         return total
 
     def potential(self, plant: Any, context: Any) -> float:
@@ -121,16 +121,16 @@ class Twin:
 
     def damping(self) -> Any:
         """(nv,) the joint damping coefficients in the context [N s/m or N m s/rad]."""
-        found = self._joint_damping()
+        coefficients = self._joint_damping()
         if self.coupling is not None:
-            found = self.coupling.forces(self.coupling.ratio_v * found)
-        return found
+            coefficients = self.coupling.forces(self.coupling.ratio_v * coefficients)
+        return coefficients
 
     def _joint_damping(self) -> Any:
-        found = np.zeros(self.plant.num_velocities()).astype(self.scalar)
+        coefficients = np.zeros(self.plant.num_velocities()).astype(self.scalar)
         for velocities, joint in self._moving_joints:
-            found[velocities] = joint.GetDampingVector(self.context)
-        return found
+            coefficients[velocities] = joint.GetDampingVector(self.context)
+        return coefficients
 
     @property
     def position_limits(self) -> tuple[Array, Array]:
@@ -224,19 +224,19 @@ class Twin:
         It is that at the context's state and input, which holds over a step.
         """
         plant, context, fed = self.plant, self.context, self.inputs.fed
-        found = np.zeros(plant.num_velocities()).astype(self.scalar)
+        total = np.zeros(plant.num_velocities()).astype(self.scalar)
         port = plant.get_applied_generalized_force_input_port()
         if int(port.get_index()) in fed:
-            found = found + port.Eval(context)
+            total = total + port.Eval(context)
         port = plant.get_applied_spatial_force_input_port()
         if int(port.get_index()) in fed:
             forces, world = MultibodyForces_[self.scalar](plant), plant.world_frame()
-            for one in port.Eval(context):
-                body = plant.get_body(one.body_index)
-                place = plant.EvalBodyPoseInWorld(context, body).rotation().multiply(one.p_BoBq_B)
-                body.AddInForce(context, p_BP_E=place, F_Bp_E=one.F_Bq_W, frame_E=world, forces=forces)
-            found = found + plant.CalcGeneralizedForces(context, forces)
-        return self.own_force(found)
+            for external in port.Eval(context):
+                body = plant.get_body(external.body_index)
+                offset = plant.EvalBodyPoseInWorld(context, body).rotation().multiply(external.p_BoBq_B)
+                body.AddInForce(context, p_BP_E=offset, F_Bp_E=external.F_Bq_W, frame_E=world, forces=forces)
+            total = total + plant.CalcGeneralizedForces(context, forces)
+        return self.own_force(total)
 
     def systems_force(self) -> Any:
         """(nv,) `applied_force`, and that of the actuators which the diagram's systems drive, within their limits.
@@ -257,12 +257,12 @@ class Twin:
         for i, actuator in enumerate(actuators(plant) if driven else ()):
             if i not in driven:
                 continue
-            effort, part = 0.0, parts[actuator.model_instance()]
+            effort, port = 0.0, parts[actuator.model_instance()]
             if int(whole.get_index()) in fed:
                 effort = effort + whole.Eval(self.context)[i]
-            if int(part.get_index()) in fed:
-                own = [a for a in actuators(plant) if a.model_instance() == actuator.model_instance()]
-                effort = effort + part.Eval(self.context)[[a.index() for a in own].index(actuator.index())]
+            if int(port.get_index()) in fed:
+                motors = [a for a in actuators(plant) if a.model_instance() == actuator.model_instance()]
+                effort = effort + port.Eval(self.context)[[a.index() for a in motors].index(actuator.index())]
             limit = float(actuator.effort_limit())
             total[actuator.joint().velocity_start()] += max(-limit, min(limit, effort))
         return self.own_force(total)

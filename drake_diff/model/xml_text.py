@@ -38,10 +38,10 @@ class Element:
 
     def find(self, *path: str) -> "Element | None":
         """The first child of that tag, its first child of the next tag, and so on."""
-        found: Element | None = self
+        element: Element | None = self
         for tag in path:
-            found = None if found is None else next((c for c in found.children if c.tag == tag), None)
-        return found
+            element = None if element is None else next((c for c in element.children if c.tag == tag), None)
+        return element
 
     def findall(self, tag: str) -> "list[Element]":
         return [child for child in self.children if child.tag == tag]
@@ -64,7 +64,7 @@ class XmlText:
     def __init__(self, data: bytes):
         self.data = data
         # Drake takes a comment with -- in it, which no XML may have; lines and positions stay.
-        self._tags = re.sub(rb"<!--.*?-->", lambda found: re.sub(rb"[^\n]", b" ", found[0]), data, flags=re.DOTALL)
+        self._tags = re.sub(rb"<!--.*?-->", lambda match: re.sub(rb"[^\n]", b" ", match[0]), data, flags=re.DOTALL)
         self._changes: list[tuple[int, int, bytes]] = []
         self._open: list[Element] = []
         self._roots: list[Element] = []
@@ -105,8 +105,8 @@ class XmlText:
 
     def _behind_tag(self, start: int) -> int:
         """The position behind the tag that begins at `start`: its ">" outside of quotes."""
-        found = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>").match(self._tags, start)
-        return found.end() if found else len(self._tags)
+        match = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>").match(self._tags, start)
+        return match.end() if match else len(self._tags)
 
     def content(self, element: Element) -> str:
         """The XML text inside an element."""
@@ -148,19 +148,19 @@ class XmlText:
         element.attributes[name] = value
         tag = self.data[element.start : element.inside]
         new = quoteattr(value).encode()
-        found = re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
-        if found:
-            self._replace(element.start + found.start(1), element.start + found.end(1), new)
+        match = re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
+        if match:
+            self._replace(element.start + match.start(1), element.start + match.end(1), new)
         else:
-            at = element.start + 1 + len(element.tag.encode())
-            self._replace(at, at, b" " + name.encode() + b"=" + new)
+            offset = element.start + 1 + len(element.tag.encode())
+            self._replace(offset, offset, b" " + name.encode() + b"=" + new)
 
     def drop(self, element: Element, name: str) -> None:
         """Take an attribute out, if it is there."""
         tag = self.data[element.start : element.inside]
-        found = re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
-        if found:
-            self._replace(element.start + found.start(), element.start + found.end(), b"")
+        match = re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
+        if match:
+            self._replace(element.start + match.start(), element.start + match.end(), b"")
 
     def fill(self, element: Element, content: str) -> None:
         """Put XML text in the place of all that is inside an element."""
@@ -182,9 +182,9 @@ class XmlText:
 
     def __str__(self) -> str:
         """The text with all changes; of two in one place the outer one counts."""
-        parts, at = [], 0
+        parts, end_of_last = [], 0
         for start, end, new in sorted(self._changes, key=lambda change: (change[0], -change[1])):
-            if start >= at:
-                parts += [self.data[at:start], new]
-                at = end
-        return (b"".join(parts) + self.data[at:]).decode()
+            if start >= end_of_last:
+                parts += [self.data[end_of_last:start], new]
+                end_of_last = end
+        return (b"".join(parts) + self.data[end_of_last:]).decode()
