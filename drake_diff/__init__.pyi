@@ -11,7 +11,6 @@ from . import motion as motion
 from . import optimize as optimize
 from . import panels as panels
 from . import record as record
-from . import studies as studies
 from . import trials as trials
 from .artifact.save import save as save
 from .artifact.trace import read_trace as read_trace

@@ -277,7 +277,7 @@ def exit_of(monkeypatch, *words):
 
 COMMANDS = (
     "run", "audit", "certify", "compare", "export-model", "robustness", "panel", "verify", "list", "compare-runs",
-    "view", "export", "gradient-panel", "contact-table",
+    "view", "export",
 )  # fmt: skip
 
 
@@ -330,7 +330,6 @@ def test_help_tells_all_defaults_and_no_text_is_taken_for_markup(monkeypatch, ca
         (("audit", "nothing.urdf"), "expected a file that exists, got nothing.urdf"),
         (("certify", "PENDULUM", "--out", "FILE"), "is a file"),
         (("panel", "nothing.toml"), "expected a panel in TOML"),
-        (("gradient-panel", "--cases", "magic"), "got 'magic'"),
         (("export", "nothing"), "expected --ros2"),
     ],
 )

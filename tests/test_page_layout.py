@@ -388,14 +388,24 @@ def test_a_replay_of_many_bodies_has_fewer_frames():
     assert frames_of(times, 100)[-1] == (10.0, 1000)
 
 
+def write_plots(path, data):
+    """A page with plots and no replay."""
+    runs = [{"name": name, "verdict": "pass", "sentence": "It holds.", "duration_s": 1.0} for name in ("one", "other")]
+    record = {
+        "sentence": "Same.",
+        "runs": runs,
+        **{key: [] for key in ("metrics", "configuration", "versions", "refused")},
+    }
+    write_page(path, "compare_runs.html.j2", record=record, data=data, view="", caption="none")
+
+
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory):
     """A page whose names would be markup, or formulas in a spreadsheet."""
     names = ("=1+1", "+cmd|' /C calc'!A0", "-2", "@SUM(A1)", "\t=1", EVIL, 'a"b,c')
     plots = [Plot(name, EVIL, [0.0, 1.0], [Line(name, [1.0, -2.0])], group=EVIL, note=EVIL) for name in names]
     path = tmp_path_factory.mktemp("hostile") / "report.html"
-    record = {"cases": [], "seeds": 1, "samples": 1, "budget": 1, "batch": 1}
-    write_page(path, "gradient_panel.html.j2", record=record, data=page_data(1.0, plots, [certificate(2, 3)]))
+    write_plots(path, page_data(1.0, plots, [certificate(2, 3)]))
     return path, names
 
 
@@ -409,7 +419,7 @@ def test_no_name_in_the_data_ends_its_script(hostile):
 def test_hostile_names_are_text_in_plots_and_in_their_csv(hostile, browser):
     path, names = hostile
     open_page(browser, path)
-    assert browser.title == "gradient panel"
+    assert browser.title == "one and other"
     assert EVIL in texts(browser, ".plot h4")
     assert not texts(browser, "img")
     head, *rows = saved_by(browser, ".legend .csv")
@@ -423,11 +433,10 @@ def test_hostile_names_are_text_in_plots_and_in_their_csv(hostile, browser):
 @browsing
 def test_the_entries_of_a_certificate_are_read_with_the_keyboard(browser, tmp_path):
     page = tmp_path / "report.html"
-    record = {"cases": [], "seeds": 1, "samples": 1, "budget": 1, "batch": 1}
     data = page_data(
         0.0, [Plot("a", "m", [0.0, 1.0], [Line("y", [1, 2])])], [certificate(2, 3), certificate(2, 3, [(1, 2)])]
     )
-    write_page(page, "gradient_panel.html.j2", record=record, data=data)
+    write_plots(page, data)
     page.write_text(page.read_text().replace('<div id="plots"', '<div id="maps"></div><div id="plots"'))
     open_page(browser, page)
     assert texts(browser, ".map h3")[0].startswith("1: ")  # the one that does not agree comes first

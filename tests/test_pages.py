@@ -19,7 +19,6 @@ from drake_diff.artifact.live import scene_of_run
 from drake_diff.artifact.verify import recalled
 from drake_diff.pages import html
 from drake_diff.pages.html import render, write_page
-from drake_diff.studies.gradient_cases import wall
 
 PACKAGE = Path(dd.__file__).parent
 EVIL = "</script><script>document.title = 'evil'</script><img src=x onerror=\"document.title = 'evil'\">'"
@@ -58,24 +57,21 @@ def pages(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for room in ("artifact", "comparison", "trials"):
             patch.setattr(f"drake_diff.{room}.page.write_page", write_poisoned)
-        patch.setattr("drake_diff.studies.gradient_study.write_page", write_poisoned)
         dd.save(solution, folder / "run")
         with recalled(folder / "run") as plan:
             trials = dd.robustness(plan, {"mass": [0.02, 0.4]}, trials=2, controller="open_loop")
             dd.trials.save_robustness(trials, folder / "trials", folder / "run")
         dd.comparison.save_comparison(dd.compare(model, ("drake:lagged", "newton"), num_steps=5), folder / "engines")
-        dd.studies.save_gradient_panel(dd.studies.gradient_panel([wall()], seeds=2), folder / "panel")
     found = {
         "report": folder / "run/report.html",
         "robustness": folder / "trials/robustness.html",
         "comparison": folder / "engines/comparison.html",
-        "gradient_panel": folder / "panel/gradient_panel.html",
     }
     assert all(path.is_file() for path in found.values())
     return found
 
 
-PAGES = ("report", "robustness", "comparison", "gradient_panel")
+PAGES = ("report", "robustness", "comparison")
 
 
 def elements(page):
@@ -109,7 +105,7 @@ def test_no_text_becomes_an_element(pages, name):
 
 
 def test_an_element_that_got_into_a_page_is_noticed(pages):
-    page = pages["gradient_panel"].read_text()
+    page = pages["robustness"].read_text()
     assert not is_harmless(page.replace("</header>", "</header><script>1</script>"))
     assert not is_harmless(page.replace("</header>", "</header><img src=x>"))
     assert not is_harmless(page.replace("<header>", "<header onclick='1'>"))
@@ -125,7 +121,7 @@ def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
     ready = "return document.documentElement.dataset.ready === 'yes'"
     WebDriverWait(browser, 30).until(lambda b: b.execute_script(ready))
     assert errors(browser) == []
-    assert browser.title == "gradient panel" if name == "gradient_panel" else "evil" in browser.title  # as a part of it
+    assert "evil" in browser.title  # as a part of it
     assert browser.title != "evil"
     assert EVIL in browser.execute_script("return document.body.innerText")
     assert browser.execute_script("return document.querySelectorAll('.plot canvas').length") > 0
@@ -151,8 +147,8 @@ def test_a_live_view_has_no_hostile_path(pages):
 def test_what_a_template_asks_for_must_be_given(tmp_path):
     from jinja2 import UndefinedError
 
-    with pytest.raises(UndefinedError, match="cases"):
-        write_page(tmp_path / "page.html", "gradient_panel.html.j2", record={}, data={})
+    with pytest.raises(UndefinedError, match="runs"):
+        write_page(tmp_path / "page.html", "compare_runs.html.j2", record={}, data={})
     assert not list(tmp_path.iterdir())
 
 
@@ -192,7 +188,7 @@ def test_templates_and_assets_go_into_the_wheel():
 
 def test_templates_are_loaded_when_a_page_is_written():
     code = (
-        "import sys, drake_diff as dd; dd.solve, dd.save, dd.compare, dd.robustness, dd.studies.gradient_panel;"
+        "import sys, drake_diff as dd; dd.solve, dd.save, dd.compare, dd.robustness;"
         "from drake_diff.pages import html; print('jinja2' in sys.modules); html.content_policy('');"
         "print('jinja2' in sys.modules)"
     )

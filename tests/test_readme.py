@@ -116,8 +116,8 @@ SOURCES = {
     "docs/contact.md": {
         "1000": "drake_diff.model.triangles:MOST_CORNERS",
         "30000": "drake_diff.pages.shapes:MOST_FACES",
-        "1": "tests/test_contact_table.py::test_values_by_hand_and_by_drake_alone",
-        "1e4": "tests/test_contact_table.py::test_values_by_hand_and_by_drake_alone",
+        "1": "tests/test_contact_table.py::test_values_are_those_by_hand_and_by_drake_alone",
+        "1e4": "tests/test_contact_table.py::test_values_are_those_by_hand_and_by_drake_alone",
         "1e-6": SAP,
         "1e-3": "drake_diff.motion.flow.plant:STICTION_SPEED",
         **dict.fromkeys(("0.42", "0.29", "-0.13"), TABLE),

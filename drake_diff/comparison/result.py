@@ -274,7 +274,7 @@ class Comparison:
         after_contact = any(
             "contact law" in (e.first.responsible, e.largest.responsible) for e in others if e.verdict != "same"
         )
-        note = " From the first touch on a state is only as good as the contact law: drake-diff contact-table."
+        note = " From the first touch on a state is only as good as the contact law: examples/studies/contact_table.py."
         own, wrong, open_, blind = (
             [e.engine for e in self.engines if e.gradient == kind]
             for kind in ("its own step's", "not its own step's", "undecided", "none")

@@ -1,5 +1,7 @@
 """What many tests load or build: the models of this repository, robots, and plants under construction."""
 
+import importlib.util
+import sys
 import warnings
 import zlib
 from importlib.metadata import files
@@ -145,3 +147,12 @@ def strike(plant, context, body, impulse):
     J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, body.body_frame(), at, world, world)
     change = np.linalg.solve(plant.CalcMassMatrix(context), J.T @ impulse)
     plant.SetVelocities(context, plant.GetVelocities(context) + change)
+
+
+def script(path):
+    """A Python file of the repository as a module."""
+    spec = importlib.util.spec_from_file_location(f"script_{Path(path).stem}", ROOT / path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for their module
+    spec.loader.exec_module(module)
+    return module

@@ -1,5 +1,0 @@
-"""What was found with the toolkit, ready to run again: contact in all engines, orders of gradients."""
-
-from drake_diff._base.lazy import attach_stub as _attach_stub
-
-__getattr__, __dir__, __all__ = _attach_stub(__name__, __file__)
