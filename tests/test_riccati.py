@@ -6,18 +6,8 @@ import numpy as np
 import pytest
 from helpers.table import each_row
 
-from drake_diff._base.compiled import kernel
-from drake_diff.optimize.ilqr import riccati
+from drake_diff.optimize.ilqr import riccati_kernel
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic, follow, slope_along, solve_riccati
-
-
-@pytest.fixture(autouse=True, params=["NumPy", "compiled"])
-def sweeps(request, monkeypatch):
-    """Both forms of the recursion, whatever the size."""
-    if request.param == "compiled":
-        pytest.importorskip("numba")
-    monkeypatch.setattr(riccati, "WORTH_COMPILING", 0 if request.param == "compiled" else np.inf)
-    return request.param
 
 
 def problem(seed=0, count=6, n=3, m=2, *, gaps=1.0, free=0.0, bound=np.inf):
@@ -114,7 +104,7 @@ def test_one_step_by_hand(bound, regularization, u, K, s, P, slope, curvature, g
 
 
 @each_row("seed", range(3))
-@each_row("size", [(6, 3, 2), (20, 4, 1), (1, 2, 3)])
+@each_row("size", [(6, 3, 2), (20, 4, 1), (1, 2, 3), (9, 7, 4), (3, 1, 5)])
 @each_row("free", [0.0, 1e6])
 def test_the_policy_leads_to_the_minimum_of_the_whole_problem(seed, size, free):
     """1e-9 of the largest entry: 20 unstable steps magnify rounding."""
@@ -157,30 +147,10 @@ def test_without_a_minimum_there_is_no_policy_until_it_is_regularized(size):
     assert solve_riccati(p, 1e3) is None
 
 
-@each_row("size", [(6, 3, 2), (9, 7, 4), (20, 4, 1), (3, 1, 5)])
-@each_row("bound", [np.inf, 0.2, 0.02])
-@each_row("regularization", [0.0, 0.3])
-def test_both_forms_find_the_same(size, bound, regularization, sweeps, monkeypatch):
-    """1e-11 of the largest entry: sums in another order, over 20 unstable steps."""
-    p = problem(5, *size, bound=bound)
-    found = solve_riccati(p, regularization)
-    monkeypatch.setattr(riccati, "WORTH_COMPILING", np.inf)
-    expected = solve_riccati(p, regularization)
-    for name in ("feedforward", "feedback", "value_gradients", "value_hessians"):
-        one, other = getattr(found, name), getattr(expected, name)
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-11 * max(1.0, np.abs(other).max()))
-    np.testing.assert_array_equal(np.abs(found.feedforward) == bound, np.abs(expected.feedforward) == bound)
-    assert (found.slope, found.curvature, found.gradient) == pytest.approx(
-        (expected.slope, expected.curvature, expected.gradient), rel=1e-10
-    )
-
-
-def test_a_sweep_is_compiled_for_one_kind_of_arguments(sweeps):
+def test_a_sweep_is_compiled_for_one_kind_of_arguments():
     """As of read-only arrays, or of those that are not contiguous: each takes seconds."""
-    if sweeps == "NumPy":
-        pytest.skip("nothing is compiled")
     p = problem()
     p.F.setflags(write=False)
     solve_riccati(p, 0.0)
     solve_riccati(replace(p, F=np.asfortranarray(p.F), gaps=np.zeros((6, 3), dtype=int)), 1)
-    assert len(kernel(riccati.KERNEL).sweep.signatures) == 1
+    assert len(riccati_kernel.sweep.signatures) == 1

@@ -32,7 +32,6 @@ from drake_diff.optimize.ilqr.expansion import (
     with_active,
 )
 from drake_diff.optimize.ilqr.riccati import (
-    WORTH_COMPILING,
     AffinePolicy,
     LinearQuadratic,
     follow,
@@ -166,7 +165,7 @@ def _smooth_roll(problem: Problem) -> SmoothRoll | None:
     """What motions of the problem are tried by; None where that is Drake's step itself."""
     if not problem.has_model or problem.motion != STEPS or problem.design.vector.parameters or problem.design.count:
         return None
-    return smooth_roll_of(problem.model) if problem.nx + problem.nu >= WORTH_COMPILING else None
+    return smooth_roll_of(problem.model)
 
 
 class _Bends:

@@ -60,10 +60,13 @@ def _value(H: Array, g: Array, d: Array) -> float:
 
 
 @compiled
-def _in_box(
+def minimize_in_box(
     H: Array, g: Array, lower: Array, upper: Array, iterations: int, sizes: Array, d: Array, free: Flags
 ) -> bool:
-    """`minimize_in_box` of a positive definite H (m, m); False if a part of it is not."""
+    """The d (m,) of least g' d + d' H d / 2 within bounds, and which are free; False if a part of H fails.
+
+    H (m, m) is positive definite. By projected Newton steps.
+    """
     m = len(g)
     part, L, step = np.empty((m, m)), np.empty((m, m)), np.empty((m, 1))
     slope, moved, of = np.empty(m), np.empty(m), np.empty(m, dtype=np.int64)
@@ -117,7 +120,7 @@ def _hold(
     if not leaves:
         return True
     d, part, L = np.empty(m), np.empty((m, m)), np.empty((m, m))
-    if not _in_box(hessian, Q_ux[:, 0].copy(), lower, upper, iterations, sizes, d, free):
+    if not minimize_in_box(hessian, Q_ux[:, 0].copy(), lower, upper, iterations, sizes, d, free):
         return False
     rows, count = np.empty((m, w)), 0
     of = np.empty(m, dtype=np.int64)
@@ -142,6 +145,21 @@ def _hold(
     for i in range(m):
         K[i, 0] = d[i]
     return True
+
+
+@compiled
+def add_ridge(hessian: Array, regularization: float, least_scale: float) -> None:
+    """Add `regularization` times its diagonal, of entries far below the largest `least_scale` of that, to a Hessian.
+
+    The ridge of an all-zero diagonal is `regularization` itself.
+    """
+    m, largest = len(hessian), 0.0
+    for a in range(m):
+        largest = max(largest, abs(hessian[a, a]))
+    if regularization > 0:
+        for a in range(m):
+            scale = max(abs(hessian[a, a]), least_scale * largest) if largest > 0 else 1.0
+            hessian[a, a] += regularization * scale
 
 
 @compiled
@@ -201,18 +219,13 @@ def sweep(
                 p0 = F[k, j, i]
                 for c in range(i, z):
                     Q[i, c] += p0 * PF[j, c]
-        largest = 0.0
         for a in range(m):
             by_input[k, a], Q_ux[a, 0] = q[n + a], q[n + a]
             for c in range(n):
                 Q_ux[a, 1 + c] = Q[c, n + a]
             for b in range(m):
                 of_inputs[k, a, b] = hessian[a, b] = Q[n + min(a, b), n + max(a, b)]
-            largest = max(largest, abs(hessian[a, a]))
-        if regularization > 0:
-            for a in range(m):
-                scale = max(abs(hessian[a, a]), least_scale * largest) if largest > 0 else 1.0
-                hessian[a, a] += regularization * scale
+        add_ridge(hessian, regularization, least_scale)
         if not _factor(hessian, m, L):
             return False
         gain = K[k]
