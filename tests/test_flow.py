@@ -493,3 +493,33 @@ def test_contacts_that_begin_at_once_are_all_met():
     assert ours[6] == pytest.approx(0.05 + speed * left - 9.81 * left**2 / 2, abs=1e-7)
     assert ours[:4] == pytest.approx([1, 0, 0, 0], abs=1e-9)
     assert found[6, 4] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.15])
+def test_hard_contact_is_the_limit_of_the_compliant_one(ratio):
+    """Values and slopes differ by k^(-1/2), the time in contact, as the stiffness grows at the same damping ratio.
+
+    A ball of 1 kg falls h = 0.4 m at 1 m/s. The force k (x + tau x') of the damping ratio z ends at the speed
+    exp(-z (pi - 2 asin z) / sqrt(1 - z^2)) of that at which it began; t is the time of the fall, v that speed.
+    """
+    height, speed, duration, g = 0.4, 1.0, 0.4, 9.81
+    v = np.sqrt(speed**2 + 2 * g * height)
+    t, e = (v - speed) / g, np.exp(-ratio * (np.pi - 2 * np.arcsin(ratio)) / np.sqrt(1 - ratio**2))
+    left = duration - t
+    end = 0.1 + e * v * left - g * left**2 / 2
+    by_v, by_t = e * left, g * left - e * v
+    by = [by_v * g / v + by_t / v, -(by_v * speed / v + by_t * (speed / v - 1) / g)]  # by height and upward speed
+    errors = []
+    for stiffness in (1e4, 1e6, 1e8):
+        plant = Plant(0.02, "sap" if ratio else "lagged")
+        relaxation = 2 * ratio / np.sqrt(stiffness)
+        properties = contact_properties(2 * stiffness, friction=0.0, relaxation_time=relaxation / 2)
+        plant.ball("ball", 1.0, 0.1, properties, "x", "z")
+        plant.ground(properties)
+        x0 = [0, 0.1 + height, 0, -speed]
+        soft = dd.differentiate_rollout(plant.model(), x0, None, lambda x: x[1], num_steps=20, method="continuous")
+        apart = np.max(np.abs(soft.by_x0[[1, 3]] - by)) / np.max(np.abs(by))
+        errors.append([abs(soft.loss - end), apart])
+    orders = np.log10(np.array(errors[:-1]) / np.array(errors[1:])) / 2
+    assert np.all(np.abs(orders[-1] - 0.5) < 0.03), (errors, orders)
+    assert np.all(np.array(errors[-1]) < 1e-2)  # of 3e-4 s of contact

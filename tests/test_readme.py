@@ -82,7 +82,7 @@ CODES = {
 }
 # Of each number the constant that it is ("module:NAME", of 5 % as a part), or the test that fails without it.
 UNDEFINED = "tests/test_undefined.py::test_what_the_entry_says_is_what_the_loss_does"
-LIMIT = "tests/test_rigid_impacts.py::test_hard_contact_is_the_limit_of_the_compliant_one"
+LIMIT = "tests/test_flow.py::test_hard_contact_is_the_limit_of_the_compliant_one"
 SOURCES = {
     "README.md": {
         **CODES,

@@ -10,7 +10,6 @@ import numpy as np
 from drake_diff.optimize.phased import Chain, PhasedSolution
 from drake_diff.optimize.problem.held import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
-from drake_diff.optimize.problem.rigid import RigidReset
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.directory import name_of
@@ -52,7 +51,7 @@ def phases_record(folder: Path, problem: PhasedProblem, verdict: Passed, sentenc
 def _asked(problem: PhasedProblem) -> dict[str, Any]:
     names = ", then ".join(problem.names)
     repeated = " and again from the start" if problem.periodic is not False else ""
-    rigid = [isinstance(switch.reset, RigidReset) for switch in problem.switches]
+    rigid = [isinstance(switch.reset, Impact) and switch.reset.has_gap for switch in problem.switches]
     limitations = [*LIMITATIONS, *([] if all(rigid) else [AT_THEIR_TIMES]), *([WHERE_GAPS_CLOSE] if any(rigid) else [])]
     statement = (
         f"{problem.name} in {len(problem.phases)} phases ({names}{repeated}), linked by resets, each as its record"
@@ -122,10 +121,7 @@ def _reset(switch: Switch, problem: PhasedProblem) -> dict[str, Any] | None:
     if switch.matrix is not None:
         same = switch.told == "the state goes on"
         return {"identity": {}} if same else {"matrix": {"rows": np.asarray(switch.matrix).tolist()}}
-    held = problem.phases[switch.after].system
-    if isinstance(switch.reset, Impact) and switch.reset.held is held:
-        return {"impact": {}}
-    return {"rigid": switch.reset.to_dict()} if isinstance(switch.reset, RigidReset) else None
+    return {"impact": switch.reset.to_dict()} if isinstance(switch.reset, Impact) else None
 
 
 def chain_evidence(chain: Chain) -> ChainEvidence:

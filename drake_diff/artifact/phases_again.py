@@ -18,9 +18,8 @@ from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, rebuilt, resolve
 from drake_diff.artifact.trace import read_trace
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, ModelError
 from drake_diff.optimize.phased import PhasedSolution
-from drake_diff.optimize.problem.held import HeldContacts
+from drake_diff.optimize.problem.held import HeldContacts, Impact
 from drake_diff.optimize.problem.phases import PhasedProblem
-from drake_diff.optimize.problem.rigid import RigidReset
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
@@ -136,7 +135,7 @@ def _check_links(found: PhasesAgain, record: PhasesRecord, plans: list[dict[str,
     for i, link in enumerate(record.links):
         before, after = plans[link.before]["xs"][-1], plans[link.after]["xs"][0]
         reset = link.reset or {}
-        if "impact" in reset or "rigid" in reset:
+        if "impact" in reset:
             continue  # with the model: see `_solve_again`
         if not reset:
             found.undecided.append(
@@ -219,16 +218,14 @@ def _problem_of(record: PhasesRecord, solutions: list[Solution]) -> PhasedProble
         reset: dict[str, Any] = dict(link.reset or {})
         system = solutions[link.after].problem.system
         if "impact" in reset:
-            if not isinstance(system, HeldContacts):
-                raise ArtifactError(f"{record.FILE}: an impact into phase {link.after}, which holds no points")
-            resets.append(system.impact)
-        elif "rigid" in reset:
-            before = solutions[link.before].problem.system
-            model: Any = before.model if isinstance(before, HeldContacts) else before
+            if not reset["impact"] and isinstance(system, HeldContacts):  # as records of 2.x tell that it stops them
+                resets.append(system.impact)
+                continue
+            model: Any = system.model if isinstance(system, HeldContacts) else system
             try:
-                resets.append(RigidReset.from_dict(reset["rigid"], model))
+                resets.append(Impact.from_dict(reset["impact"], model))
             except DrakeDiffError as error:
-                raise ArtifactError(f"{record.FILE}: its rigid impact cannot be rebuilt: {error}") from error
+                raise ArtifactError(f"{record.FILE}: its impact cannot be rebuilt: {error}") from error
         else:
             resets.append(None if "identity" in reset else np.array(reset["matrix"]["rows"], dtype=float))
     closing: Any = False

@@ -23,11 +23,17 @@ from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCo
 from drake_diff.optimize.problem.coupling import Couples, Periodic
 from drake_diff.optimize.problem.dwell import Dwell
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
-from drake_diff.optimize.problem.held import QUANTITIES, HeldContacts, HeldQuantity, held_quantity
+from drake_diff.optimize.problem.held import (
+    IMPACT_QUANTITIES,
+    QUANTITIES,
+    HeldContacts,
+    HeldQuantity,
+    held_quantity,
+    impact_quantity,
+)
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.rates import InputRate, Jerk
-from drake_diff.optimize.problem.rigid import RIGID_QUANTITIES, RigidQuantity, rigid_quantity
 from drake_diff.optimize.problem.schedule import ContactSchedule
 from drake_diff.optimize.problem.terminal import TerminalSet
 from drake_diff.optimize.problem.timed import SumOfCosts, TrackingCost
@@ -374,8 +380,7 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
 
 def _quantity(function: Any) -> dict[str, Any] | None:
     """What made a constraint's function; None of a user's own."""
-    is_told = isinstance(function, (HeldQuantity, RigidQuantity))
-    return function.to_dict() if is_told else description_of(function)
+    return function.to_dict() if isinstance(function, HeldQuantity) else description_of(function)
 
 
 def finite_list(values: Any) -> list[float | None]:
@@ -464,8 +469,8 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
 def _rebuild_constraint(c: dict[str, Any], system: Model | HeldContacts) -> Constraint:
     told, model = c["quantity"], system if isinstance(system, Model) else system.plant.model
     kind = next(iter(told))
-    if kind in RIGID_QUANTITIES:
-        function: Any = rigid_quantity(model, told)
+    if kind in IMPACT_QUANTITIES:
+        function: Any = impact_quantity(model, told)
     elif kind in QUANTITIES and isinstance(system, HeldContacts):
         function = held_quantity(system, told)
     else:

@@ -68,6 +68,16 @@ class HeldPlant:
         """(K, nx) the rates and (K, nx, nx + nu) their Jacobians, these by CasADi."""
         return self.values(knots), np.array([self.rates.jacobian(knot) for knot in knots])
 
+    def jump_at(self, x: Array) -> tuple[Array, Array]:
+        """(nv,) what an impact adds to the velocities so that it stops the points, and its impulses (m,), by Drake."""
+        model, m = self.model, len(self.rows)
+        speeds = np.asarray(self.speeds(InitializeAutoDiff(x).ravel())).ravel()[self.rows]
+        J = gradient_rows(speeds, model.nx)[:, model.nv :]
+        set_state(model.double, x)
+        whole = np.block([[model.double.mass_matrix(), -J.T], [J, np.zeros((m, m))]])
+        found = np.linalg.solve(whole, np.concatenate([np.zeros(model.nv), -J @ x[model.nv :]]))
+        return found[: model.nv], found[model.nv :]
+
     def _solved(self, knot: Array) -> tuple[Array, Array]:
         model, n, m = self.model, self.model.nv, len(self.rows)
         if not np.all(np.isfinite(knot)):
@@ -87,7 +97,7 @@ class HeldPlant:
 
     @cached_property
     def _symbolic(self) -> dict[str, Any]:
-        """Expressions of a knot: rates, forces, and the state after an impact."""
+        """Expressions of a knot: rates and forces, and the change of velocities and the impulses of an impact."""
         model, n = self.model, self.model.nv
         knot = ca.SX.sym("knot", model.nx + model.nu)
         q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
@@ -99,8 +109,9 @@ class HeldPlant:
         pushed = ca.ldl_solve(ca.SX(ca.densify(J.T)), *factors)
         inner = ca.ldl(ca.densify(J @ pushed))
         forces = ca.ldl_solve(-(ca.jacobian(speed, q) @ v + J @ free), *inner)
-        after = v - pushed @ ca.ldl_solve(speed, *inner)
-        found = {"rates": ca.vertcat(v, free + pushed @ forces), "forces": forces, "after": ca.vertcat(q, after)}
+        impulses = -ca.ldl_solve(speed, *inner)
+        found = {"rates": ca.vertcat(v, free + pushed @ forces), "forces": forces}
+        found |= {"jump": pushed @ impulses, "impulses": impulses}
         return {name: (knot, value) for name, value in found.items()}
 
     @cached_property
@@ -114,9 +125,14 @@ class HeldPlant:
         return _Expression(*self._symbolic["forces"])
 
     @cached_property
-    def after(self) -> _Expression:
-        """(nx,) the state after an impact that stops the points, of a knot whose input has no part in it."""
-        return _Expression(*self._symbolic["after"])
+    def jump(self) -> _Expression:
+        """(nv,) what an impact that stops the points adds to the velocities of a knot; its input has no part in it."""
+        return _Expression(*self._symbolic["jump"])
+
+    @cached_property
+    def impulses(self) -> _Expression:
+        """(m,) [N s] the impulses of such an impact."""
+        return _Expression(*self._symbolic["impulses"])
 
 
 def held_plant(model: Model, places: Callable[[Any], Any], speeds: Callable[[Any], Any]) -> HeldPlant | Refusal:

@@ -1,9 +1,5 @@
 from .gradient import RolloutGradient as RolloutGradient
 from .policy import ParametricPolicy as ParametricPolicy
-from .rigid.contact import RigidContact as RigidContact
-from .rigid.impact import rigid_impact as rigid_impact
-from .rigid.points import PointOnPlane as PointOnPlane
-from .rigid.steps import rigid_motion as rigid_motion
 from .rollout import Rollout as Rollout
 from .smoothing import Barrier as Barrier
 from .smoothing import Gaussian as Gaussian

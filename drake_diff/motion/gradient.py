@@ -21,7 +21,6 @@ from drake_diff.model.parameters import Parameters, ParameterVector, applied, se
 from drake_diff.model.step import advance
 from drake_diff.motion.loss import Feedback, Loss, Totals, total_gradients
 from drake_diff.motion.policy import active_parameters, differentiate_policy
-from drake_diff.motion.rigid.contact import RigidContact
 from drake_diff.motion.rollout import Policy, check_inputs
 
 if TYPE_CHECKING:
@@ -120,7 +119,7 @@ def differentiate_rollout(
     policy: Policy | None = None,
     parameters: Parameters = (),
     num_steps: int | None = None,
-    method: str | RigidContact = "auto",
+    method: str = "auto",
 ) -> RolloutGradient:
     """The gradient of a loss along a rollout, by reverse accumulation through the Jacobians of its steps.
 
@@ -142,8 +141,6 @@ def differentiate_rollout(
             the state, the inputs, the policy and contact's parameters. Columns in which the loss has no slope, after
             many bounces or where a body barely touches, are in `undefined`, and a `GradientWarning` names them: what
             the gradient has there is the derivative of that point alone (`drake_diff.motion.undefined` says when).
-            Or a `motion.RigidContact`: the motion with hard contact (see `motion.rigid_motion`), whose restitution, and
-            friction where it is given, are the parameters of the result; `parameters` are none then.
 
     Returns:
         The loss; `by_x0` (nx,), `by_us` (N, nu), `by_parameters` (np,), `by_policy` (n,); the motion, and the norm of
@@ -160,14 +157,14 @@ def differentiate_rollout(
         >>> g.by_x0.shape, g.by_us.shape, g.loss > 0.09
         ((4,), (10, 1), True)
     """
-    if isinstance(method, str) and method != CONTINUOUS:
+    if method != CONTINUOUS:
         check_method(method)
     x0 = finite_array("x0", x0, (model.nx,))
     if us is not None and policy is not None:
         raise InputError("differentiate_rollout", got="us and policy", expected="one of them")
     vector = select(model, parameters)
-    if isinstance(method, RigidContact) or method == CONTINUOUS:
-        return _in_continuous_time(model, x0, us, policy, loss, vector, num_steps, method)
+    if method == CONTINUOUS:
+        return _in_continuous_time(model, x0, us, policy, loss, vector, num_steps)
     feedback: list[Feedback] = []
     with applied(vector) as set_model:
         if policy is None:
@@ -216,16 +213,10 @@ def _in_continuous_time(
     loss: Loss,
     vector: ParameterVector,
     num_steps: int | None,
-    method: str | RigidContact,
 ) -> RolloutGradient:
-    """The gradient along the flow, or through rigid impacts, and a warning where the loss has no slope.
-
-    See `drake_diff.motion.undefined`.
-    """
+    """The gradient along the flow, and a warning where the loss has no slope: see `drake_diff.motion.undefined`."""
     from drake_diff.motion.flow.integrate import TOLERANCE  # loads CasADi
     from drake_diff.motion.flow.steps import FlowSteps
-    from drake_diff.motion.rigid.steps import TOLERANCE as RIGID
-    from drake_diff.motion.rigid.steps import RigidSteps
     from drake_diff.motion.undefined import Beside, undefined_columns
 
     if policy is None:
@@ -233,13 +224,8 @@ def _in_continuous_time(
     else:
         given = np.zeros((positive_int("num_steps", num_steps), model.nu))
     with applied(vector) as set_model:
-        if isinstance(method, RigidContact):
-            beside = Beside(model, x0, given, policy, loss, vector, RigidSteps(set_model, vector, method))
-            tolerances: tuple[float, ...] = (RIGID,)
-        else:
-            beside = Beside(model, x0, given, policy, loss, vector, FlowSteps(set_model, vector))
-            tolerances = TOLERANCE, FINER * TOLERANCE
-    for tolerance in tolerances:
+        beside = Beside(model, x0, given, policy, loss, vector, FlowSteps(set_model, vector))
+    for tolerance in (TOLERANCE, FINER * TOLERANCE):
         linearization, feedback, inputs = beside.linearize(tolerance)
         value, totals = total_gradients(loss, x0, inputs, policy, linearization, feedback)
         undefined = undefined_columns(beside, totals)

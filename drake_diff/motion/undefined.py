@@ -41,7 +41,6 @@ from drake_diff.motion.policy import (
     differentiate_policy,
     policy_parameters,
 )
-from drake_diff.motion.rigid.steps import RigidSteps
 from drake_diff.motion.smoothing import Gaussian, Smoothed, smooth
 
 WIDE, BETWEEN, MIDDLE, NARROW = 1e-2, 5e-3, 1e-3, 1e-4  # of a column's unit, to both sides
@@ -153,7 +152,7 @@ class Beside:
     policy: Any
     loss: Loss
     vector: ParameterVector
-    steps: FlowSteps | RigidSteps  # of the motion itself, whose equations are made
+    steps: FlowSteps  # of the motion itself, whose equations are made
     known: dict[tuple[bytes, float], tuple[float, bool]] = field(default_factory=dict)  # losses beside
 
     @cached_property
@@ -173,15 +172,12 @@ class Beside:
             return x0, values.reshape(self.us.shape), None, vector
         return x0, self.us, ParametricPolicy(self.policy, values) if given else self.policy, vector
 
-    def _steps(self, vector: ParameterVector, tolerance: float) -> FlowSteps | RigidSteps:
+    def _steps(self, vector: ParameterVector, tolerance: float) -> FlowSteps:
         """Those of the motion itself, which have its materials, unless parameters are moved."""
-        if isinstance(self.steps, RigidSteps):
-            self.steps.tolerance = tolerance
-        elif not np.array_equal(vector.values, self.vector.values):
+        if not np.array_equal(vector.values, self.vector.values):
             with applied(vector) as model:
                 return FlowSteps(model, vector, tolerance)
-        else:
-            self.steps.integrator.tolerance = tolerance
+        self.steps.integrator.tolerance = tolerance
         return self.steps
 
     def linearize(self, tolerance: float) -> tuple[list[StepDerivatives], list[Feedback], Array]:
@@ -217,8 +213,7 @@ class Beside:
     def _flat(self, totals: Totals, by_displacement: Array) -> Array:
         """(n,) by displacements, of which those of the start move x0 by (nx, size)."""
         given = totals.inputs.ravel() if self.policy is None else totals.policy
-        own = totals.parameters[: len(self.vector.values)]  # restitution and friction are none of the model's
-        return np.concatenate([totals.states[0] @ by_displacement, given, own])
+        return np.concatenate([totals.states[0] @ by_displacement, given, totals.parameters])
 
     def _derivative_of_start(self, d: Array, step: float = 1e-5) -> Array:
         """(nx, size): of x0 moved by d (size,), which is linear but for a turn; to 1e-10."""
@@ -288,7 +283,7 @@ class Line:
 
 
 def along_the_flow(
-    steps: FlowSteps | RigidSteps, x0: Array, us: Array, policy: Any
+    steps: FlowSteps, x0: Array, us: Array, policy: Any
 ) -> tuple[list[StepDerivatives], list[Feedback], Array]:
     """The motion in continuous time first, then the derivatives of its intervals; a policy takes the length of `us`."""
     feedback, nu = list[Feedback](), steps.model.nu
@@ -302,9 +297,6 @@ def along_the_flow(
         feedback.append((by_x, by_parameters[:, active].copy(), active))
         return u
 
-    if isinstance(steps, RigidSteps):
-        _, inputs, motion = steps.roll(x0, choose, len(us))
-        return steps.derivatives(motion), feedback, inputs
     _, inputs, flow = steps.roll(x0, choose, len(us))
     return steps.derivatives(flow), feedback, inputs
 

@@ -5,10 +5,10 @@ from .problem.dwell import Dwell as Dwell
 from .problem.dynamics import DiscreteMap as DiscreteMap
 from .problem.dynamics import plant_dynamics as plant_dynamics
 from .problem.held import HeldContacts as HeldContacts
+from .problem.held import Impact as Impact
 from .problem.phases import PhasedProblem as PhasedProblem
 from .problem.rates import InputRate as InputRate
 from .problem.rates import Jerk as Jerk
-from .problem.rigid import RigidReset as RigidReset
 from .problem.schedule import ContactSchedule as ContactSchedule
 from .problem.terminal import TerminalSet as TerminalSet
 from .problem.timed import TrackingCost as TrackingCost

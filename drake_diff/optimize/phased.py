@@ -1,8 +1,8 @@
 """Problems in phases: solved as one program, each phase judged as a solution, and their links and their chain as well.
 
 A chain is the motion that the dynamics make from the first state of all, through the resets at the times of the plan,
-open loop or under TVLQR whose cost to go is led back through the resets too. A `RigidReset` comes where its gap closes,
-by the law of impact itself, and the cost to go is led back through its saltation matrix.
+open loop or under TVLQR whose cost to go is led back through the resets too. An `Impact` with a gap comes where that
+closes, by Drake's mass matrix, and the cost to go is led back through its saltation matrix.
 """
 
 import time
@@ -23,9 +23,9 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError, Un
 from drake_diff.optimize.certified import certify_equations
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, status_of, unmeasured
+from drake_diff.optimize.problem.held import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.rigid import RigidReset
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report, heard
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Search, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
@@ -172,11 +172,11 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
         b, ranges, names = motion.task.bounds, motion.task.problem.ranges(motion.xs), motion.task.dynamics.state_names
         xs, wanted = motion.led_from(x, gains[i]), motion.xs
         switch = next((s for s in problem.switches if s.before == i), None)
-        impact = None if switch is None or not isinstance(switch.reset, RigidReset) else switch.reset
+        impact = None if switch is None else _impact_of(switch)
         if impact is not None:
             late = _until_it_touches(motion, xs, gains[i], impact)
             if late is None:
-                return float("inf"), f"{', '.join(impact.contacts)} do not touch at the end of {name}"
+                return float("inf"), f"{', '.join(impact.held.rows)} do not touch at the end of {name}"
             xs, wanted = late, np.vstack([wanted[: (len(late) - 2) // SUBSTEPS + 1], wanted[-1:]])
         beyond = np.max(np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)[1:], axis=0)
         at_knots = xs[::SUBSTEPS] if impact is None else np.vstack([xs[:-1:SUBSTEPS][: len(wanted) - 1], xs[-1:]])
@@ -184,10 +184,7 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
         found = [(f"at most {{:.2g}} from the plan in {name}", apart), (f"{{:.2g}} beyond its bound in {name}", beyond)]
         if switch is not None:
             with np.errstate(all="ignore"):
-                try:
-                    x = switch(xs[-1]) if impact is None else impact.law(xs[-1])
-                except SimulationError as error:
-                    return float("inf"), f"the impact after {name} has no end: {error}"
+                x = switch(xs[-1]) if impact is None else impact.by_drake(xs[-1])
             if switch.after == 0:
                 found.append((f"{{:.2g}} from its first value after {name}", np.abs(x - motions[0].xs[0])))
                 ranges = np.concatenate([ranges, motions[0].task.problem.ranges(motions[0].xs)])
@@ -201,7 +198,7 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
     return worst, where
 
 
-def _until_it_touches(motion: Collocated, xs: Array, gains: Array | None, impact: RigidReset) -> Array | None:
+def _until_it_touches(motion: Collocated, xs: Array, gains: Array | None, impact: Impact) -> Array | None:
     """(S, nx) where a motion leads, ten steps an interval, until the gap closes that closes at the end of the plan.
 
     `xs` is where it leads to the end; from there it goes on for a tenth of its time. A gap that the plan itself closes
@@ -262,14 +259,20 @@ def _gains(problem: PhasedProblem, motions: Sequence[Collocated]) -> list[Array 
     return found
 
 
+def _impact_of(switch: Switch) -> Impact | None:
+    """The impact of a switch that comes where a gap closes."""
+    return switch.reset if isinstance(switch.reset, Impact) and switch.reset.has_gap else None
+
+
 def _across(switch: Switch, before: Collocated, after: Collocated) -> Array:
     """(n, m) the derivative of a first state by the last one before; of a rigid impact the saltation matrix."""
     x = before.xs[-1]
-    if not isinstance(switch.reset, RigidReset):
+    impact = _impact_of(switch)
+    if impact is None:
         return switch.jacobian(x)
     last, first = (np.concatenate([m.xs[k], m.us[k]])[None] for m, k in ((before, -1), (after, 0)))
     rates = before.task.moved(last, np.array([len(before.mesh) - 2]))[0]
-    return switch.reset.saltation(x, rates, after.task.moved(first, np.array([0]))[0])
+    return impact.saltation(x, rates, after.task.moved(first, np.array([0]))[0])
 
 
 def solve_phased(
@@ -610,8 +613,10 @@ def _broken_links(draft: PhasedSolution) -> Iterator[str]:
         i = int(np.argmax(errors))
         if not errors[i] <= FEASIBILITY_TOLERANCE:
             yield f"{s.label} is missed by {errors[i]:.3g} in {s.rows[i]}, above {FEASIBILITY_TOLERANCE:g}"
-        if isinstance(s.reset, RigidReset):
-            yield from _broken_law(draft, s, s.reset)
+        impact = _impact_of(s)
+        if impact is not None:
+            for rule in impact.broken_rules(draft.phases[s.before].xs[-1]):
+                yield f"{s.label}: {rule}"
     if draft.problem.horizon is not None:
         lower, upper = draft.problem.horizon
         beyond = max(lower - draft.horizon, draft.horizon - upper)
@@ -620,22 +625,6 @@ def _broken_links(draft: PhasedSolution) -> Iterator[str]:
     for certificate in draft.link_certificates:
         if certificate.verdict != "agree":
             yield f"the certificate of {certificate.subject} says {certificate.verdict}: {certificate.worst}"
-
-
-def _broken_law(draft: PhasedSolution, s: Switch, impact: RigidReset) -> Iterator[str]:
-    """Where the law of impact does not lead to the first state after it, or the gap is not closed."""
-    before, after = draft.phases[s.before].xs[-1], draft.phases[s.after].xs[0]
-    gap = impact.first_gap(before)
-    if not abs(gap) <= FEASIBILITY_TOLERANCE:
-        yield f"{s.label}: {', '.join(impact.contacts)} are {gap:.3g} m apart, above {FEASIBILITY_TOLERANCE:g}"
-    try:
-        off = np.abs(impact.law(before) - after)
-    except SimulationError as error:
-        yield f"{s.label}: {error}"
-        return
-    i = int(np.argmax(off))
-    if not off[i] <= FEASIBILITY_TOLERANCE:
-        yield f"{s.label}: the law of impact leads elsewhere, by {off[i]:.3g} in {s.rows[i]}: a contact opens or slides"
 
 
 def _ended(draft: PhasedSolution, status: Status, details: Sequence[str]) -> PhasedSolution:

@@ -22,9 +22,8 @@ class PhaseEvidence(Part):
 class LinkEvidence(Part):
     """From the last state of phase `before` to the first of phase `after`, by their places among the phases.
 
-    `reset` is {"identity": {}}, {"matrix": {"rows": ...}}, {"impact": {}} (of the points that the phase after holds) or
-    {"rigid": {...}} (restitution, friction, law, points and contacts of a rigid impact); null is a user's function,
-    whose name is `told`.
+    `reset` is {"identity": {}}, {"matrix": {"rows": ...}} or {"impact": {...}} (points, axes, restitution, places and
+    friction of a rigid impact); null is a user's function, whose name is `told`.
     """
 
     before: int

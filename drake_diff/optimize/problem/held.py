@@ -5,8 +5,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from pydrake.autodiffutils import InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float
+from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.model.model import Model
@@ -16,6 +18,7 @@ from drake_diff.optimize.problem.dynamics import Dynamics
 
 AXES = "xyz"
 STAYS = 1e-3  # [m] how far a held point may drift from its place
+STAYS_CLOSED = 1e-5  # [m, N s] of the gap and the impulses of an impact, as of every constraint of a plan
 
 
 class HeldContacts(Dynamics):
@@ -98,10 +101,6 @@ class HeldContacts(Dynamics):
         """The reset of a rigid, inelastic impact that stops the points: from the state before, the state after."""
         return Impact(self)
 
-    def _after(self, x: Any) -> Any:
-        """(nx,) the state after a rigid, inelastic impact that stops the points, from the state `x` (nx,) before."""
-        return self.plant.after(np.concatenate([np.asarray(x), np.zeros(self.nu)]))
-
     def kept(self, at: Any = None, *, friction: float | None = None, tolerance: float = STAYS) -> list[Constraint]:
         """What a stance keeps: it begins at rest, its points stay, the ground only pushes, and no foot slides.
 
@@ -147,16 +146,19 @@ class HeldContacts(Dynamics):
         return where
 
     def _pushing(self, friction: float) -> Iterator[Constraint]:
+        for name, z, along in self.normals():
+            yield Constraint(HeldForce(self, z), lower=0.0, name=f"{name} pushes")
+            if along:
+                cone = FrictionCone(self, z, along, friction)
+                yield Constraint(cone, lower=cone_limits(along), name=f"{name} does not slide")
+
+    def normals(self) -> Iterator[tuple[str, int, list[int]]]:
+        """Of each point its name, and which of `rows` are its z, and its x and y."""
         for name in self.points:
-            own = {row[-1]: i for i, row in enumerate(self.rows) if row[:-2] == name}
-            if "z" not in own:
+            rows = {row[-1]: i for i, row in enumerate(self.rows) if row[:-2] == name}
+            if "z" not in rows:
                 raise InputError("friction", got=f"{name}, which is not held along z", expected="points held along z")
-            yield Constraint(HeldForce(self, own["z"]), lower=0.0, name=f"{name} pushes")
-            along = [own[axis] for axis in "xy" if axis in own]
-            if along:  # of one direction the cone is two half planes
-                cone = FrictionCone(self, own["z"], along, friction)
-                lower = np.zeros(2) if len(along) == 1 else 0.0
-                yield Constraint(cone, lower=lower, name=f"{name} does not slide")
+            yield name, rows["z"], [rows[axis] for axis in "xy" if axis in rows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,14 +172,148 @@ class _Stacked:
         return np.concatenate([np.asarray(function(x)).ravel()[self.columns] for function in self.functions])
 
 
-@dataclass(frozen=True, eq=False)
 class Impact:
-    """A reset: from the state `x` (nx,) before a rigid impact the state after it."""
+    """A rigid impact of points that the world holds, or throws back, as the reset between two phases.
 
-    held: HeldContacts
+        [M  -J'] [v+]   [M v-    ]
+        [J   0 ] [P ] = [-e J v- ]
+
+    With J v the velocities of the held coordinates and e the restitution. All of these coordinates are in the impact:
+    with axes="z" a point slides without friction, with all axes it sticks. Given `at`, the impact comes where the gap
+    closes, also in the chain of all phases, and its feedback is led back through the saltation matrix
+    dR/dx + (f+ - dR/dx f-) g' / (g' f-), with R the reset, f the rates, and g the gap.
+
+    Args:
+        held: The points.
+        restitution: e, from 0 (the points stop) to 1.
+        at: Where the points meet the world: the height z of all, or (m,) places of `held.rows`, NaN where there is no
+            gap. None where the plan alone says when the impact comes.
+        friction: The coefficient within which the impulses have to stay; None asks nothing of them.
+
+    Raises:
+        InputError: A number does not fit.
+
+    Example:
+        >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
+        >>> foot = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+        >>> landing = dd.optimize.Impact(foot, at=0.0, friction=0.8)
+        >>> landing
+        Impact of foot x, foot z: restitution 0
+    """
+
+    def __init__(self, held: HeldContacts, *, restitution: float = 0.0, at: Any = None, friction: float | None = None):
+        if not isinstance(held, HeldContacts):
+            raise InputError("held", got=type(held).__name__, expected="HeldContacts")
+        self.held, self.restitution = held, float(finite_array("restitution", restitution, ()))
+        if not 0 <= self.restitution <= 1:
+            raise InputError("restitution", got=restitution, expected="a number from 0 to 1")
+        self.where = held._where(at)
+        self.gap_rows = np.flatnonzero(~np.isnan(self.where))
+        self.friction = None if friction is None else positive_float("friction", friction)
+        self.__qualname__ = f"the impact of {', '.join(held.rows)}"  # by which a problem in phases tells it
+
+    def __repr__(self) -> str:
+        return f"Impact of {', '.join(self.held.rows)}: restitution {self.restitution:g}"
+
+    @property
+    def has_gap(self) -> bool:
+        """Whether the impact comes where a gap closes, and not when the plan says."""
+        return len(self.gap_rows) > 0
 
     def __call__(self, x: Any) -> Any:
-        return self.held._after(x)
+        """(nx,) the state after the impact, from the state `x` (nx,) before, in any arithmetic."""
+        x, nq = np.asarray(x), self.held.plant.model.nq
+        jump = self.held.plant.jump(np.concatenate([x, np.zeros(self.held.nu)]))
+        return np.concatenate([x[:nq], x[nq:] + (1 + self.restitution) * jump])
+
+    def impulses(self, x: Any) -> Any:
+        """(m,) [N s] on the points, one for each of `held.rows`, in any arithmetic."""
+        found = self.held.plant.impulses(np.concatenate([np.asarray(x), np.zeros(self.held.nu)]))
+        return (1 + self.restitution) * found
+
+    def gaps(self, x: Any) -> Any:
+        """[m] how far the points are from where they meet the world, in any arithmetic."""
+        return self.held.places(x)[self.gap_rows] - self.where[self.gap_rows]
+
+    def first_gap(self, x: Array) -> float:
+        """[m] the smallest of the gaps."""
+        return float(np.min(self.gaps(x)))
+
+    def by_drake(self, x: Array) -> Array:
+        """(nx,) the state after, by Drake's mass matrix and velocities."""
+        jump, _ = self.held.plant.jump_at(np.asarray(x, dtype=float))
+        after = np.array(x, dtype=float)
+        after[self.held.plant.model.nq :] += (1 + self.restitution) * jump
+        return after
+
+    def broken_rules(self, x: Array) -> list[str]:
+        """What of the impact at `x` (nx,) the world does not do: a gap that is open, a pull, a slide."""
+        found = [f"{self.held.rows[i]} is {gap:.3g} m apart" for i, gap in zip(self.gap_rows, self.gaps(x), strict=True)
+                 if not abs(gap) <= STAYS_CLOSED]  # fmt: skip
+        if self.friction is None:
+            return found
+        values = (1 + self.restitution) * self.held.plant.jump_at(np.asarray(x, dtype=float))[1]
+        for name, z, along in self.held.normals():
+            most, slide = self.friction * values[z], float(np.linalg.norm(values[along]))
+            if values[z] < -STAYS_CLOSED:
+                found.append(f"the ground pulls at {name} by {-values[z]:.3g} N s")
+            elif slide > most + STAYS_CLOSED:
+                found.append(f"{name} slides: {slide:.3g} N s along the ground, friction holds {most:.3g}")
+        return found
+
+    def saltation(self, x: Array, rates: Array, rates_after: Array) -> Array:
+        """(nx, nx) of the rates (nx,) before and after; the reset's own derivative where no single gap closes."""
+        nx, nq = self.held.nx, self.held.plant.model.nq
+        reset = np.eye(nx)
+        slopes = self.held.plant.jump.jacobian(np.concatenate([x, np.zeros(self.held.nu)]))[:, :nx]
+        reset[nq:] += (1 + self.restitution) * slopes
+        if len(self.gap_rows) != 1:
+            return reset
+        row = gradient_rows(np.asarray(self.gaps(InitializeAutoDiff(x).ravel())).reshape(1), nx)[0]
+        closing = float(row @ rates)
+        if not closing < 0:
+            return reset
+        return np.asarray(reset + np.outer(rates_after - reset @ rates, row) / closing)
+
+    def kept(self) -> list[Constraint]:
+        """What the phase before ends with: the gaps are closed, and with friction the impulses push and do not slide.
+
+        Returns:
+            Constraints at its last knot.
+
+        Example:
+            >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
+            >>> foot = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+            >>> [constraint.label for constraint in dd.optimize.Impact(foot, at=0.0, friction=0.8).kept()]
+            ['foot z touches', 'foot is pushed', 'foot does not slide in the impact']
+        """
+        found, zero = [], np.zeros(len(self.gap_rows))
+        if self.has_gap:
+            names = " and ".join(self.held.rows[i] for i in self.gap_rows)
+            found.append(Constraint(ImpactGaps(self), zero, zero, knots=-1, name=f"{names} touches"))
+        if self.friction is not None:
+            for name, z, along in self.held.normals():
+                found.append(Constraint(ImpactPush(self, z), lower=0.0, knots=-1, name=f"{name} is pushed"))
+                if along:
+                    cone = ImpactCone(self, z, along, self.friction)
+                    label = f"{name} does not slide in the impact"
+                    found.append(Constraint(cone, lower=cone_limits(along), knots=-1, name=label))
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """What a record tells of it."""
+        at = [None if np.isnan(place) else float(place) for place in self.where]
+        return self.held.to_dict() | {"restitution": self.restitution, "at": at, "friction": self.friction}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any], model: Model) -> "Impact":
+        """The same again; InputError where `values` are none."""
+        try:
+            held = HeldContacts(model, values["points"], axes=values["axes"])
+            at = [np.nan if place is None else place for place in values["at"]]
+            return cls(held, restitution=values["restitution"], at=at, friction=values["friction"])
+        except (KeyError, TypeError) as error:
+            raise InputError("impact", got=repr(values)[:80], expected="what Impact.to_dict tells") from error
 
 
 class HeldQuantity:
@@ -231,14 +367,78 @@ class FrictionCone(HeldQuantity):
     friction: float
 
     def __call__(self, x: Any, u: Any) -> Any:
-        f = self.held.forces(x, u)
-        if len(self.along) == 1:
-            most, t = self.friction * f[self.z], f[self.along[0]]
-            return np.array([most - t, most + t])
-        return self.friction**2 * f[self.z] ** 2 - sum(f[i] ** 2 for i in self.along)
+        return _within_cone(self.held.forces(x, u), self.z, self.along, self.friction)
+
+
+def _within_cone(f: Any, z: int, along: list[int], friction: float) -> Any:
+    if len(along) == 1:
+        most, t = friction * f[z], f[along[0]]
+        return np.array([most - t, most + t])
+    return friction**2 * f[z] ** 2 - sum(f[i] ** 2 for i in along)
+
+
+def cone_limits(along: list[int]) -> Any:
+    """The lower limits of a friction cone: of one direction it is two half planes."""
+    return np.zeros(2) if len(along) == 1 else 0.0
+
+
+class ImpactQuantity(HeldQuantity):
+    """The base of the functions that an impact's constraints are of, each of the state before it."""
+
+    impact: Impact
+
+    def to_dict(self) -> dict[str, Any]:
+        """The kind, the impact and the values."""
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "impact"}  # type: ignore[arg-type]
+        return {type(self).__name__: {"impact": self.impact.to_dict(), **values}}
+
+
+@dataclass(frozen=True, eq=False)
+class ImpactGaps(ImpactQuantity):
+    """The gaps that close."""
+
+    impact: Impact
+
+    def __call__(self, x: Any) -> Any:
+        return self.impact.gaps(x)
+
+
+@dataclass(frozen=True, eq=False)
+class ImpactPush(ImpactQuantity):
+    """One of the impulses."""
+
+    impact: Impact
+    row: int
+
+    def __call__(self, x: Any) -> Any:
+        return self.impact.impulses(x)[self.row]
+
+
+@dataclass(frozen=True, eq=False)
+class ImpactCone(ImpactQuantity):
+    """What `FrictionCone` is of forces, of impulses."""
+
+    impact: Impact
+    z: int
+    along: list[int]
+    friction: float
+
+    def __call__(self, x: Any) -> Any:
+        return _within_cone(self.impact.impulses(x), self.z, self.along, self.friction)
 
 
 QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (HeldSpeeds, HeldPlaces, HeldForce, FrictionCone)}
+IMPACT_QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (ImpactGaps, ImpactPush, ImpactCone)}
+
+
+def impact_quantity(model: Model, told: dict[str, Any]) -> ImpactQuantity:
+    """The function that `ImpactQuantity.to_dict` told of, on `model`; InputError where that is none."""
+    ((kind, values),) = told.items()
+    impact = Impact.from_dict(values["impact"], model)
+    found: ImpactQuantity = IMPACT_QUANTITIES[kind](
+        impact, **{name: value for name, value in values.items() if name != "impact"}
+    )
+    return found
 
 
 def held_quantity(held: HeldContacts, told: dict[str, Any]) -> HeldQuantity:

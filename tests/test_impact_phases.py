@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.models import Plant, contact_properties
-from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from helpers.models import Plant, add_slide, contact_properties
+from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces, RevoluteJoint, SpatialInertia
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError, ModelWarning, UnknownNameError
-from drake_diff.motion import PointOnPlane, RigidContact
-from drake_diff.optimize import HeldContacts, PhasedProblem, RigidReset
+from drake_diff.exceptions import InputError, ModelWarning
+from drake_diff.optimize import HeldContacts, Impact, PhasedProblem
 from drake_diff.optimize.phased import _across, judged_phases
 from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.record.sealed import canonical, own_sha256
@@ -31,7 +30,7 @@ def thrown():
     for axis in "xz":
         plant.plant.AddJointActuator(f"push_{axis}", plant.plant.GetJointByName(f"ball_{axis}"))
     model = plant.model()
-    reset = RigidReset(model, RigidContact(RESTITUTION, friction=0))
+    reset = Impact(HeldContacts(model, {"ball": [0, 0, -0.1]}, axes="z"), restitution=RESTITUTION, at=0.0)
     way = {"num_steps": 12, "horizon": (0.1, 1.5), "running_cost": dd.QuadraticCost(R=np.eye(2))}
     down = dd.Problem(model, x0=[0, 0.8, 0, 0], constraints=reset.kept(), **way)
     up = dd.Problem(model, x0=[0.5, 0.1, 1, 1], x_goal=[1.2, 0.9, np.nan, np.nan], **way)
@@ -44,8 +43,8 @@ def landed():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
-    landing = RigidReset(model, RigidContact(0.0, friction=0.8, points=PointOnPlane("foot", FOOT)))
     stance, effort = HeldContacts(model, {"foot": FOOT}), dd.QuadraticCost(R=1e-2 * np.eye(2))
+    landing = Impact(stance, at=0.0, friction=0.8)
     x0, begins = np.array([0, 0.35, 0, 0, 0.4, 0, 0, 0]), np.array([0.1, 0.05, 0, 0, 0, 0, 0, 0])
     fly = dd.Problem(model, x0=x0, num_steps=15, horizon=(0.1, 0.8), running_cost=effort, constraints=landing.kept())
     stand = dd.Problem(
@@ -163,13 +162,13 @@ def test_a_plan_that_the_law_of_impact_does_not_have_is_refused(landed, seed):
     reset = problem.switches[0].reset
     P = HopperByHand(problem.phases[0].system).impact(landed.phases[0].xs[-1])[1]
     needed = abs(P[0]) / P[1]
-    less = RigidContact(0.0, friction=needed * random.uniform(0.1, 0.9), points=reset.contact.points)
-    bouncy = RigidContact(10 ** random.uniform(-4, -1), friction=0.8, points=reset.contact.points)
-    for contact, told in ((less, "a contact opens or slides"), (bouncy, "is missed by")):
-        other = PhasedProblem(problem.phases, resets=[RigidReset(reset.model, contact)], names=problem.names)
+    less = Impact(reset.held, at=0.0, friction=needed * random.uniform(0.1, 0.9))
+    bouncy = Impact(reset.held, restitution=10 ** random.uniform(-4, -1), at=0.0, friction=0.8)
+    for impact, reason in ((less, "foot slides"), (bouncy, "is missed by")):
+        other = PhasedProblem(problem.phases, resets=[impact], names=problem.names)
         again = rejudged(landed, problem=other)
         assert again.status is dd.Status.CONVERGED_NOT_VERIFIED
-        assert told in again.message
+        assert reason in again.message
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -182,18 +181,57 @@ def test_a_plan_whose_impact_comes_at_another_time_is_refused(thrown, seed):
     phases[0] = replace(phases[0], xs=xs)
     again = rejudged(thrown, phases=tuple(phases))
     assert again.status is dd.Status.CONVERGED_NOT_VERIFIED
-    assert "apart, above 1e-05" in again.message
+    assert "m apart" in again.message
 
 
 def test_what_is_no_impact_is_refused_early(landed):
-    model = landed.problem.phases[0].system
-    foot = PointOnPlane("foot", FOOT)
-    two = RigidContact(points=(foot, PointOnPlane("body")), friction=0)
-    with pytest.raises(InputError, match="contacts: expected some of foot on world, body on world"):
-        RigidReset(model, two)
-    with pytest.raises(UnknownNameError, match="contact: expected one of"):
-        RigidReset(model, two, "leg on world")
-    assert repr(RigidReset(model, two, "foot on world")) == "RigidReset of foot on world: restitution 0, friction 0"
+    stance = landed.problem.phases[1].system
+    for wrong, message in (
+        ({"restitution": 1.1}, "restitution: expected a number from 0 to 1"),
+        ({"at": [0.0]}, "at: expected a height, or 2 places"),
+        ({"friction": -0.1}, "friction: expected"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Impact(stance, **wrong)
+    with pytest.raises(InputError, match="held: expected HeldContacts"):
+        Impact(stance.model)
+
+
+def test_the_saltation_matrix_of_a_bounce():
+    """[[-e, 0], [-(1 + e) g / v, -e]] of height and speed, at e = 0.8 and v = -3."""
+    plant = Plant(0.01, "lagged")
+    plant.ball("ball", 1.0, 0.1, contact_properties(2e4), "x", "z")
+    plant.plant.AddJointActuator("push", plant.plant.GetJointByName("ball_x"))
+    impact = Impact(HeldContacts(plant.model(), {"ball": [0, 0, -0.1]}, axes="z"), restitution=0.8, at=0.0)
+    x = np.array([0, 0.1, 0, -3.0])
+    np.testing.assert_allclose(impact(x), [0, 0.1, 0, 2.4], atol=1e-14)
+    np.testing.assert_allclose(impact.by_drake(x), [0, 0.1, 0, 2.4], atol=1e-14)
+    xi = impact.saltation(x, np.array([0, -3.0, 0, -G]), np.array([0, 2.4, 0, -G]))
+    np.testing.assert_allclose(xi[np.ix_([1, 3], [1, 3])], [[-0.8, 0], [5.886, -0.8]], atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, -1.1])
+def test_a_rod_that_strikes_with_its_end(angle):
+    """Without friction: P = (1 + e) v / (1 / m + r^2 / I), r the horizontal way to the end, I = m L^2 / 12."""
+    m, length, e, v = 2.0, 1.2, 0.6, np.array([0.3, -1.5, -0.7])
+    plant = Plant(0.01, "lagged")
+    bodies = [plant.plant.AddRigidBody(name, SpatialInertia.Zero()) for name in ("one", "two")]
+    rod = plant.plant.AddRigidBody("rod", SpatialInertia.ThinRodWithMass(m, length, np.array([1.0, 0, 0])))
+    add_slide(plant.plant, "x", plant.plant.world_frame(), bodies[0], "x")
+    add_slide(plant.plant, "z", bodies[0].body_frame(), bodies[1], "z")
+    plant.plant.AddJoint(RevoluteJoint("angle", bodies[1].body_frame(), rod.body_frame(), [0, 1, 0]))
+    plant.plant.AddJointActuator("push", plant.plant.GetJointByName("angle"))
+    held = HeldContacts(plant.model(), {"rod": [length / 2, 0, 0]}, axes="z")
+    end = np.array([np.cos(angle), -np.sin(angle)]) * length / 2
+    x = np.array([0.2, -end[1], angle, *v])
+    impact, inertia = Impact(held, restitution=e, at=0.0), m * length**2 / 12
+    impulse = (1 + e) * -(v[1] - v[2] * end[0]) / (1 / m + end[0] ** 2 / inertia)
+    np.testing.assert_allclose(impact.impulses(x), [impulse], rtol=1e-11)
+    wanted = v + np.array([0, impulse / m, -end[0] * impulse / inertia])
+    for after in (impact(x), impact.by_drake(x)):
+        np.testing.assert_allclose(after[3:], wanted, atol=1e-11)
+    assert impact.broken_rules(x) == []
+    assert impact.first_gap(x + 0.1) == pytest.approx(0.1 + (np.sin(angle) - np.sin(angle + 0.1)) * length / 2)
 
 
 @pytest.mark.slow
@@ -205,8 +243,8 @@ def test_a_landing_is_made_again_and_a_forged_one_is_not(landed, tmp_path):
         warnings.simplefilter("ignore", ModelWarning)
         assert dd.verify(tmp_path / "run").verdict == "holds"
         fields = json.loads((tmp_path / "run" / "phases.json").read_text())
-        assert fields["links"][0]["reset"]["rigid"]["points"][0]["point"] == FOOT
-        fields["links"][0]["reset"]["rigid"]["restitution"] = 0.01
+        assert fields["links"][0]["reset"]["impact"]["points"]["foot"] == FOOT
+        fields["links"][0]["reset"]["impact"]["restitution"] = 0.01
         fields["record_sha256"] = own_sha256(fields)
         (tmp_path / "run" / "phases.json").write_text(canonical(fields))
         assert dd.verify(tmp_path / "run").verdict == "broken"
