@@ -11,8 +11,6 @@ from helpers.models import ROOT
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
 
 import impact_orders
-import impact_page
-import impact_peers
 import impacts
 from impact_cases import FAMILIES, Material, Mover, Obstacle, case
 from impact_truth import Motion, Slopes, truth
@@ -129,8 +127,8 @@ def test_the_readmes_table_of_a_bounce_and_a_toss():
     printed = [[cell.strip() for cell in row.split("|")[2:4]] for row in table.splitlines()[2:]]
     motions = impact_orders.BALL, impact_orders.CUBE
     found = [
-        [impact_peers.drake(one, one.columns[0], 1e-3)[1] for one in motions],
-        [impact_peers.drake(one, one.columns[0], 2e-4)[1] for one in motions],
+        [impact_orders.drake(one, one.columns[0], 1e-3)[1] for one in motions],
+        [impact_orders.drake(one, one.columns[0], 2e-4)[1] for one in motions],
         [impacts.ours(one, one.model(), np.zeros((one.num_steps, 0)))[1][one.columns[0]] for one in motions],
         [impact_orders.reference(one)[1] for one in motions],
     ]
@@ -144,31 +142,3 @@ def test_value_and_slope_of_a_bounce_converge_by_the_order_of_the_method():
     for what in ("value", "slope"):
         assert impact_orders.order(found["tolerance"], found[what]) == pytest.approx(1.0, abs=0.2)
         assert -impact_orders.order(found["steps"], found[what]) > 4.5
-
-
-def test_the_page_names_every_column_that_is_not_as_it_should_be():
-    column = {"column": 1, "slopes": (1.0, 1.0, 1.0), "doubt": 0.0, "ours": 1.0, "error": 0.0, "right": True}
-    kinds = [
-        column | {"kind": "exists", "undefined": False},
-        column | {"kind": "exists", "undefined": True},
-        column | {"kind": "exists", "undefined": False, "right": False},
-        column | {"kind": "none", "undefined": False, "right": False},
-        column | {"kind": "none", "undefined": True, "right": False},
-        column | {"kind": "narrow", "undefined": False, "right": False},
-        column | {"kind": "narrow", "undefined": True, "right": False},
-    ]
-    told = impact_page.failures([{"name": "toss 0.1", "law": "sap", "columns": kinds}])
-    ends = [line.rsplit(", ", 1)[1] for line in told.splitlines() if line.startswith("-")]
-    assert ends == ["called undefined", "off", "not called undefined", "off and not called undefined"]
-
-
-def test_a_wrong_derivative_of_a_peer_is_counted_as_wrong():
-    answers = [
-        {"slope": 1.005, "wanted": 1.0},
-        {"slope": 1.09, "wanted": 1.0},
-        {"slope": -1.0, "wanted": 1.0},
-        {"slope": float("nan"), "wanted": 1.0},
-        {"slope": 3.0, "wanted": None},
-        {"error": "no such shape"},
-    ]
-    assert impact_page.row("drake", answers)[1:] == ["3", "1", "2", "1", "9 %", "2"]

@@ -5,9 +5,8 @@
     python tests/benchmarks --compare OLD.json NEW.json
 
 Models: cases.CASES and the whole solves of solves.SOLVES; quantities: those of peers.QUANTITIES, solve,
-start (of processes: imports and --help) and layers.
+start (of processes: imports and --help).
 --quick takes less than two minutes: five models, short horizons, no MJX. Peers that are not installed are named;
-Crocoddyl runs in the environment whose Python $CROCODDYL_PYTHON names (see crocoddyl_peer.py).
 """
 
 import argparse
@@ -20,8 +19,7 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
 
 import compare  # noqa: E402
-from cases import CASES, case  # noqa: E402
-from layers import Layers, layers  # noqa: E402
+from cases import CASES  # noqa: E402
 from peers import QUANTITIES  # noqa: E402
 from solves import QUICK_SOLVES, SOLVES, solved  # noqa: E402
 from starts import started  # noqa: E402
@@ -30,9 +28,7 @@ from table import document, machine, save, show  # noqa: E402
 
 from drake_diff.exceptions import InputError, UnknownNameError  # noqa: E402
 
-KINDS = (*QUANTITIES, "solve", "start", "layers")
-LAYERS_OF = ("pendulum", "panda", "solo12", "sphere", "chain30")
-LAYERS_HORIZON = 10
+KINDS = (*QUANTITIES, "solve", "start")
 
 
 def chosen(only: str, quick: bool) -> tuple[list[str], list[str], list[str]]:
@@ -52,11 +48,11 @@ def run(only: str, quick: bool, out: Path | None) -> dict:
     """The suite, as the JSON has it; `out` has what there is after each model."""
     models, kinds, solves = chosen(only, quick)
     before, quantities = machine(), [kind for kind in kinds if kind in QUANTITIES]
-    found: list[Row | Missing | Layers] = []
+    found: list[Row | Missing] = []
     for part in _parts(models, quantities, solves, kinds, quick):
         found += part
-        rows, missing, parts = ([one for one in found if isinstance(one, kind)] for kind in (Row, Missing, Layers))
-        whole = document(rows, missing, parts, before, {"only": only, "quick": quick})
+        rows, missing = ([one for one in found if isinstance(one, kind)] for kind in (Row, Missing))
+        whole = document(rows, missing, before, {"only": only, "quick": quick})
         if out:
             save(out, whole)
     return whole
@@ -64,17 +60,11 @@ def run(only: str, quick: bool, out: Path | None) -> dict:
 
 def _parts(
     models: list[str], quantities: list[str], solves: list[str], kinds: list[str], quick: bool
-) -> Iterator[list[Row | Missing] | list[Layers]]:
+) -> Iterator[list[Row | Missing]]:
     for name in models:
         yield [*measured(name, quantities, quick)] if quantities else []
-        yield _layers(name) if "layers" in kinds and name in LAYERS_OF else []
     yield [*solved(solves, quick)]
     yield [*started(quick)] if "start" in kinds else []
-
-
-def _layers(name: str) -> list[Layers]:
-    one = case(name)
-    return [layers(one, kind, 0 if kind in QUANTITIES[:2] else LAYERS_HORIZON) for kind in QUANTITIES]
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from step_derivatives import MODELS, panda_arm, robot, state
+from panda_arm import MODELS, panda_arm, robot, state
 
 import drake_diff as dd
 from drake_diff.exceptions import ModelWarning

@@ -22,7 +22,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pydrake.common
-from step_derivatives import MODELS, panda_arm
+from panda_arm import MODELS, panda_arm
 
 import drake_diff as dd
 from drake_diff.exceptions import ModelWarning

@@ -1,13 +1,11 @@
 """Plans with contact: each task from starts drawn by a seed, solved, verified, and looked at by a referee of its own.
 
     python tests/benchmarks/contact_plans.py --seed 0 --starts 5 --jobs 2
-    python tests/benchmarks/contact_plans.py --tasks solo12_jump,solo12_trot --crocoddyl /path/to/its/python
     python tests/benchmarks/contact_plans.py --tasks go2_stand,go2_trot --time-step 0.05 --starts 2
 
 The referee is Drake alone: it builds the plant, sends it the plan's inputs, and measures what the task asks. Where a
 robot falls by rounding alone unless it is balanced, each step of the plan is compared with Drake's own instead. A plan
-that solve calls verified and the referee does not find is false. Verified plans are followed by their own feedback in
-steps of h/2 and h/4, in continuous time and in MuJoCo with matched contact, and those that hold there are counted.
+that solve calls verified and the referee does not find is false.
 Times are processor seconds of one thread: of the whole solve with its verification, of an iteration of its search, and
 of Drake's own simulation of the motion.
 """
@@ -19,7 +17,6 @@ import inspect
 import json
 import logging
 import os
-import subprocess
 import sys
 import time
 import warnings
@@ -33,7 +30,6 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 
 import numpy as np  # noqa: E402
-from contact_elsewhere import HOLDS, PLANTS, counts, where_else  # noqa: E402
 from pydrake.systems.analysis import Simulator  # noqa: E402
 
 MODULES = ("legged_tasks", "biped_tasks", "manipulation_tasks", "arm_tasks")
@@ -108,7 +104,7 @@ def takes_step(make):
     return "h" in inspect.signature(make).parameters
 
 
-def one(name, seed, start, crocoddyl, time_step):
+def one(name, seed, start, time_step):
     """A row of the table: one task from one start, in steps of the task's own where `time_step` is 0."""
     warnings.simplefilter("ignore")
     logging.getLogger("drake").setLevel(logging.ERROR)
@@ -143,22 +139,7 @@ def one(name, seed, start, crocoddyl, time_step):
     row["false"] = row["verified"] and bool(wrong)
     if len(ticks) > 1:
         row["iteration_s"] = (ticks[-1] - ticks[0]) / (len(ticks) - 1)
-    if row["verified"]:
-        row["elsewhere"] = vars(where_else(task.problem, solution))
-    if crocoddyl and task.schedule is not None:
-        row["crocoddyl"] = beside(crocoddyl, task)
     return row
-
-
-def beside(python, task):
-    """What Crocoddyl makes of the same task, in its own environment, told when each foot stands."""
-    from legged_tasks import told
-
-    script = Path(__file__).parent / "contact_plans_crocoddyl.py"
-    run = subprocess.run([python, script], input=json.dumps(told(task)), capture_output=True, text=True, check=False)
-    if run.returncode:
-        return {"error": run.stderr.strip().splitlines()[-1][:200] if run.stderr.strip() else "no answer"}
-    return json.loads(run.stdout.strip().splitlines()[-1])
 
 
 def told_of(rows):
@@ -170,19 +151,11 @@ def told_of(rows):
 
     count = len(rows)
     ratio = middle("iteration_s") / middle("simulation_s")
-    others = [row["crocoddyl"] for row in rows if "crocoddyl" in row]
-    solved = [other for other in others if other.get("solved")]
-    other = f"{np.median([o['cpu_s'] for o in solved]):.2f} s, {len(solved)} of {len(others)}" if solved else "-"
     numbers = [sum(row[key] for row in rows) for key in ("solved", "verified", "false")]
     seconds = [f"{middle(key):.2f} s" for key in ("guess_s", "cpu_s", "search_s")]
     found = [f"{numbers[0]} of {count}", f"{numbers[1]} of {count}", str(numbers[2])]
-    rest = [f"{middle('iterations'):.0f}", f"{1e3 * middle('simulation_s'):.1f} ms", f"{ratio:.1f}", other]
-    return "| " + " | ".join([rows[0]["task"], *found, *seconds, *rest, *held(rows)]) + " |"
-
-
-def held(rows):
-    """In how many of the plants that could be had the verified plans hold."""
-    return counts([row["elsewhere"]["found"] for row in rows if "elsewhere" in row])
+    rest = [f"{middle('iterations'):.0f}", f"{1e3 * middle('simulation_s'):.1f} ms", f"{ratio:.1f}"]
+    return "| " + " | ".join([rows[0]["task"], *found, *seconds, *rest]) + " |"
 
 
 COLUMNS = (
@@ -196,8 +169,6 @@ COLUMNS = (
     "Iterations",
     "Drake",
     "Iteration / Drake",
-    "Crocoddyl",
-    *PLANTS,
 )
 HEAD = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|"
 
@@ -209,7 +180,6 @@ def main():
     parser.add_argument("--tasks", default="", help="names or their beginnings, with commas; all where empty")
     parser.add_argument("--time-step", type=float, default=0.0, help="[s] of robots on legs; each task's own where 0")
     parser.add_argument("--jobs", type=int, default=1, help="processes, each with one start at a time")
-    parser.add_argument("--crocoddyl", default="", help="a Python that has Crocoddyl")
     parser.add_argument("--json", default="", help="where all rows are written")
     parser.add_argument("--why", action="store_true", help="tells of each start that is not verified why")
     arguments = parser.parse_args()
@@ -220,8 +190,8 @@ def main():
     ]
     if not names:
         parser.error(f"no task of that name{' that is told of any time step' * (h > 0)}: {', '.join(every_task())}")
-    seed, crocoddyl = arguments.seed, arguments.crocoddyl
-    asked = [(name, seed, start, crocoddyl, h) for name in names for start in range(arguments.starts)]
+    seed = arguments.seed
+    asked = [(name, seed, start, h) for name in names for start in range(arguments.starts)]
     steps = f"steps of {1e3 * h:g} ms" if h else "Drake steps of the tasks' own length"
     print(f"seed {seed}, {arguments.starts} starts, {steps}\n{HEAD}", flush=True)
     rows, open_rows = [], {}
@@ -235,15 +205,10 @@ def main():
                 )
             if len(open_rows[row["task"]]) == arguments.starts:
                 print(told_of(open_rows[row["task"]]), flush=True)
-            elsewhere = row.get("elsewhere")
-            if arguments.why and elsewhere and set(elsewhere["found"].values()) != {HOLDS}:
-                print(f"  {row['task']} {row['start']}: {elsewhere['sentence']}", flush=True)
     if arguments.json:
         Path(arguments.json).write_text(json.dumps(rows, indent=1))
     totals = [sum(row[key] for row in rows) for key in ("solved", "verified", "false")]
-    everywhere = ", ".join(f"{plant} {count}" for plant, count in zip(PLANTS, held(rows), strict=True))
     print(f"\n{len(rows)} starts: the referee finds {totals[0]}, {totals[1]} verified, {totals[2]} false")
-    print(f"of the verified ones hold in {everywhere}")
 
 
 if __name__ == "__main__":

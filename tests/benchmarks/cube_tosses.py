@@ -1,6 +1,6 @@
 """A cube's contact identified from motion-captured tosses, and judged on tosses that were not used.
 
-    python tests/benchmarks/cube_tosses.py TOSSES.npz [--fit 20] [--held-out 30] [--steps 2] [--seed 0] [--mujoco]
+    python tests/benchmarks/cube_tosses.py TOSSES.npz [--fit 20] [--held-out 30] [--steps 2] [--seed 0]
 
 TOSSES.npz has `length` and `state` of real tosses at 148 Hz (ContactNets, BSD-3): quaternion, position, angular
 velocity in the body's frame and velocity. Each toss that was held out is simulated from its first state; its error is
@@ -253,7 +253,6 @@ def main() -> int:
     parser.add_argument("--held-out", type=int, default=30)
     parser.add_argument("--steps", type=int, default=2, help="between two samples")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--mujoco", action="store_true")
     given = parser.parse_args()
     tosses = read_tosses(given.tosses)
     order = np.random.default_rng(given.seed).permutation(len(tosses))
@@ -294,13 +293,6 @@ def main() -> int:
     first, slippery = (spread_of(identified, held, values, other) for other in ({}, more))
     print(told("A model that is right, from first states as uncertain as these", first))
     print(told("The same with 10 % more friction of the cube's side, 5 % of the pair", slippery), flush=True)
-    if given.mujoco:
-        from cube_tosses_mujoco import fit_by_sysid
-
-        # MuJoCo's velocity of a flight is that of Drake's steps: both take v + g h first, and then x + v h.
-        begins = [first_state(identified, log) for log in logs]
-        for line in fit_by_sysid(fitted, held, begins, flown, center, found.steps, given.steps):
-            print(line)
     return 0
 
 

@@ -1,18 +1,13 @@
-"""Whole solves by iLQR beside Crocoddyl's FDDP in C++: the same steps, costs and guess, at rest without effort.
+"""Whole solves by iLQR at rest without effort, to where a full step promises less than the row's `stop` of cost.
 
-    python tests/benchmarks/ilqr.py [PYTHON_WITH_CROCODDYL]
+    python tests/benchmarks/ilqr.py
 
-Both stop where a full step promises less than the row's `stop` of cost. Crocoddyl wants an environment of its own (see
-crocoddyl_peer.py); without one, our times stand alone. It is run on one thread and on two; a solve is repeated, and
-wall and processor time [ms] are medians.
+A solve is repeated, and wall and processor time [ms] are medians. Robots have no joint damping, friction or limits.
 """
 
-import json
 import math
 import re
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 import warnings
@@ -21,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from cases import chain_urdf, written
-from step_derivatives import panda_arm
+from panda_arm import panda_arm
 
 import drake_diff as dd
 from drake_diff.exceptions import ModelWarning
@@ -29,7 +24,6 @@ from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.program import Limits
 
 REPEATS = 7
-THREADS = (1, 2)
 UR5 = next(f for f in files("example-robot-data") or () if f.name == "ur5_robot.urdf")
 
 
@@ -99,21 +93,10 @@ def ours(task: dict, repeats: int = 0) -> dict:
     }
 
 
-def theirs(python: str, given: list[dict], threads: int) -> list[dict]:
-    script = Path(__file__).with_name("crocoddyl_peer.py")
-    command = [python, script, "--threads", str(threads)]
-    done = subprocess.run(command, input=json.dumps(given), capture_output=True, text=True)
-    if done.returncode:
-        sys.exit(f"crocoddyl failed: {done.stderr[-2000:]}")
-    return json.loads(done.stdout)
-
-
 def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         given = tasks(Path(name))
         found = {"drake_diff": [ours(task, REPEATS) for task in given]}
-        for threads in THREADS if len(sys.argv) > 1 else ():
-            found[f"Crocoddyl, {threads} thread{'s' * (threads > 1)}"] = theirs(sys.argv[1], given, threads)
     print(f"{'problem':14s}{'stop':>8s}  {'solver':22s}{'ms':>9s}{'cpu ms':>9s}{'steps':>7s}{'cost':>16s}  converged")
     for i, task in enumerate(given):
         for solver, rows in found.items():

@@ -1,28 +1,22 @@
 """How value and slope of two impacts converge: along the flow by its tolerance, through Drake's steps by their length.
 
-    python tests/benchmarks/impact_orders.py [--out FILE.json] [--picture docs/impacts_orders.png]
-
 BALL bounces without loss or gravity and has a closed form. CUBE is tossed, and its reference is Drake's continuous
 plant by Runge-Kutta 3 at an accuracy of 1e-11, with central differences of two widths, extrapolated. An order is the
 slope of a straight line through log(error): over that of the tolerance, of the length of Drake's steps, or, along the
 flow, of the number of steps in which something pushes.
 """
 
-import argparse
-import json
-import logging
 import os
 from dataclasses import replace
 from math import cos, pi, sin, sqrt
-from pathlib import Path
 
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
 
 import numpy as np  # noqa: E402
 from impact_cases import Case, Material, Mover, Obstacle, corners  # noqa: E402
-from impact_peers import drake  # noqa: E402
 from impact_truth import Motion  # noqa: E402
+from pydrake.autodiffutils import AutoDiffXd  # noqa: E402
 
 from drake_diff.model.parameters import select  # noqa: E402
 from drake_diff.motion.flow.integrate import pushing_of  # noqa: E402
@@ -86,6 +80,25 @@ def along_the_flow(one: Case, tolerance: float) -> tuple[float, float, int]:
     )
 
 
+def drake(one: Case, column: int, step: float) -> tuple[float, float]:
+    """The loss, and its derivative by a number of the first state, through AutoDiffXd in Drake alone."""
+    _, double = one.diagram(step)
+    diagram = double.ToAutoDiffXd()
+    plant = next(system for system in diagram.GetSystems() if hasattr(system, "SetPositionsAndVelocities"))
+    root = diagram.CreateDefaultContext()
+    context = plant.GetMyContextFromRoot(root)
+    if plant.num_actuators():
+        plant.get_actuation_input_port().FixValue(context, np.array([AutoDiffXd(one.input)]))
+    x = [AutoDiffXd(float(value), [float(i == column)]) for i, value in enumerate(one.x0)]
+    plant.SetPositionsAndVelocities(context, np.array(x))
+    for _ in range(round(one.duration / step)):
+        ahead = diagram.EvalUniquePeriodicDiscreteUpdate(root)
+        root.SetDiscreteState(ahead)
+    loss = one.loss(plant.GetPositionsAndVelocities(context))
+    gradient = loss.derivatives()
+    return float(loss.value()), float(gradient[0]) if len(gradient) else 0.0
+
+
 def order(over, errors) -> float:
     """p of error = c over^p, from the first to the least."""
     last = int(np.argmin(errors)) + 1
@@ -102,62 +115,3 @@ def measure(one: Case, law: str | None) -> dict:
         found = [drake(replace(one, law=law), one.columns[0], h) for h in STEPS]
         over = {"h": STEPS}
     return over | {"value": [abs(f[0] - value) for f in found], "slope": [abs(f[1] - slope) for f in found]}
-
-
-def picture(found: dict, out: Path) -> None:
-    """Both motions: errors along the flow by its tolerance, and through Drake's steps (lagged) by their length."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), sharey=True)
-    titles = {"continuous": 'method="continuous"', "lagged": "Drake's discrete steps, lagged"}
-    for axis, (law, over) in zip(axes, (("continuous", "tolerance"), ("lagged", "h")), strict=True):
-        for color, (name, laws) in zip(("C0", "C1"), found.items(), strict=True):
-            for what, line in (("value", "--"), ("slope", "-")):
-                one = laws[law]
-                axis.loglog(one[over], one[what], line, color=color, marker=".", label=f"{name}: {what}")
-        axis.set(title=titles[law], xlabel="tolerance" if over == "tolerance" else "step [s]", ylim=(1e-13, 1e3))
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("error")
-    axes[1].legend(fontsize=8, loc="lower right")
-    figure.tight_layout()
-    figure.savefig(out, dpi=80, metadata={"Software": None})
-
-
-def run() -> dict:
-    """Both motions, along the flow and through Drake's steps."""
-    names = {"a ball bounces": BALL, "a cube is tossed": CUBE}
-    return {
-        name: {law or "continuous": measure(one, law) for law in (None, "lagged", "similar")}
-        for name, one in names.items()
-    }
-
-
-def told(name: str, law: str, one: dict, what: str) -> str:
-    """One curve: its orders, and its errors."""
-    errors = one[what]
-    orders = ", ".join(f"order {abs(order(one[by], errors)):.1f} by {by}" for by in one if by not in ("value", "slope"))
-    return f"{name}, {law}, {what}: {orders}; errors " + " ".join(f"{e:.1e}" for e in errors)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--picture", type=Path)
-    options = parser.parse_args()
-    logging.getLogger("drake").setLevel(logging.ERROR)  # what it tells of every half space
-    found = run()
-    for name, laws in found.items():
-        for law, one in laws.items():
-            for what in ("value", "slope"):
-                print(told(name, law, one, what), flush=True)
-    if options.out:
-        options.out.write_text(json.dumps(found, indent=1) + "\n")
-    if options.picture:
-        picture(found, options.picture)
-
-
-if __name__ == "__main__":
-    main()

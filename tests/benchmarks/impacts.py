@@ -1,15 +1,12 @@
-"""The gradient through random impacts beside the truth, and beside what other simulators make of it.
+"""The gradient through random impacts beside the truth.
 
     pip install -e '.[test]'
-    python tests/benchmarks/impacts.py [--seed 0] [--count 100] [--only toss,rod] [--no-peers] [--out FILE.json]
-    python tests/benchmarks/impacts.py --page FILE.json [--mjx FILE.json] [--newton FILE.json] [--nosnoc FILE.json]
+    python tests/benchmarks/impacts.py [--seed 0] [--count 100] [--only toss,rod] [--out FILE.json]
 
 Of each case (impact_cases.py) some columns of the gradient are judged: by the first state, contact's parameters, an
 input. The truth is Drake's own continuous plant by error-controlled Runge-Kutta 3 and central differences of three
 widths (impact_truth.py); where those agree to 0.1 % ours is to be within 1 %, elsewhere it is to be `undefined`. What
-it costs is processor time beside that of the rollout alone, medians of three in turns. Other simulators are asked for
-the first column (impact_peers.py). --page writes docs/impacts.md from runs of before; those of MJX, Newton and nosnoc
-have scripts of their own.
+it costs is processor time beside that of the rollout alone, medians of three in turns.
 """
 
 import argparse
@@ -27,7 +24,6 @@ from pathlib import Path
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
 
-import impact_page  # noqa: E402
 import numpy as np  # noqa: E402
 from impact_cases import FAMILIES, Case, case  # noqa: E402
 from impact_truth import Slopes, truth  # noqa: E402
@@ -128,23 +124,6 @@ def judge(one: Case, truths: Path | None, *, costs: bool = True) -> dict:
     return found
 
 
-def judge_peers(one: Case, judged: dict) -> dict:
-    """What other simulators make of the first column: their slope, and what it should be; or why there is none."""
-    import impact_peers
-
-    column, first, found = one.columns[0], judged["columns"][0], {}
-    if first["kind"] == "none":
-        return {}
-    for name, ask in impact_peers.PEERS.items():
-        try:
-            slope, own = ask(one, column)
-        except (DrakeDiffError, RuntimeError, ValueError) as error:
-            found[name] = {"error": f"{type(error).__name__}: {error}"}
-            continue
-        found[name] = {"slope": slope, "wanted": first["slopes"][1] if own is impact_peers.TRUTH else own}
-    return found
-
-
 def figures(cases: list[dict]) -> list[tuple[str, int, int]]:
     """(what, how many, of how many)."""
     columns = [column for one in cases for column in one["columns"]]
@@ -193,21 +172,9 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--begin", type=int, default=0, help="the number of the first case")
     parser.add_argument("--only", default=",".join(FAMILIES), help="families, with commas between them")
-    parser.add_argument("--no-peers", action="store_true", help="leave out the other simulators")
-    parser.add_argument("--page", type=Path, help="write docs/impacts.md from what --out wrote before", nargs="+")
-    for name in impact_page.MORE:
-        parser.add_argument(f"--{name}", type=Path, help=f"what impact_{name}.py wrote, for --page")
     parser.add_argument("--truths", type=Path, help="where truths are kept for another run")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    if options.page:
-        more = {name: getattr(options, name) for name in impact_page.MORE}
-        found = {name: json.loads(file.read_text()) for name, file in more.items() if file}
-        runs = [json.loads(file.read_text()) for file in options.page]  # of one seed, one part after the other
-        whole = runs[-1] | {"cases": [one for run in runs for one in run["cases"]]}
-        text = impact_page.page(whole, found)
-        (HERE.parents[1] / "docs" / "impacts.md").write_text(text)
-        return 0
     logging.getLogger("drake").setLevel(logging.ERROR)  # what it tells of every half space
     only, cases = options.only.split(","), []
     for family in only:
@@ -217,8 +184,6 @@ def main() -> int:
         one = case(options.seed, number)
         if one.family in only:
             cases.append(judge(one, options.truths))
-            if not options.no_peers and cases[-1]["columns"]:
-                cases[-1]["peers"] = judge_peers(one, cases[-1])
             print(line(cases[-1]), flush=True)
             if options.out:
                 whole = {"seed": options.seed, "count": options.begin + options.count, "cases": cases}

@@ -203,23 +203,3 @@ def _low(twin, facts, foot, knot, xs, us):
     plant.SetPositions(context, xs[knot, : plant.num_positions()])
     height = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(foot)).translation()[2] - facts.radius
     return float(max(IN_AIR - height, 0.0))
-
-
-def told(task):
-    """What another program needs to know of a task: plain values for JSON."""
-    robot = task.name.rsplit("_", 1)[0]
-    facts, problem = LEGGED[robot], task.problem
-    model = problem.model
-    return {
-        "file": str(robot_on_feet(robot, model.time_step)),
-        "feet": facts.feet,
-        "base": facts.base,
-        "friction": FRICTION,
-        "positions": list(model.state_names[: model.nq]),
-        "x0": np.asarray(problem.x0).tolist(),
-        "end": np.asarray(task.options["initial_guess"][0][-1]).tolist(),
-        "time_step": model.time_step,
-        "phases": task.schedule.phases,
-        "swing": SWING * HEIGHTS[robot],
-        "at_place": AT_PLACE,
-    }

@@ -1,10 +1,5 @@
-"""Peers that are called in their own coordinates: MuJoCo, MJX, and Crocoddyl in a process of its own."""
+"""Peers that are called in their own coordinates: MuJoCo and MJX."""
 
-import json
-import os
-import shutil
-import subprocess
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,11 +15,8 @@ from peers import (
     Pinocchio,
     PinocchioAlone,
 )
-from timing import Block
 
-from drake_diff.engines.urdf import urdf
 from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError
-from drake_diff.mechanics.description import describe
 
 LARGEST_MJX = 7  # velocities; what has more compiles for minutes
 SMALL = 1e-6  # of mjd_transitionFD, as in its own documentation
@@ -133,59 +125,8 @@ class Mjx(Native):
         return super().in_drake(quantity, answer)
 
 
-class Crocoddyl(Peer):
-    """`crocoddyl_steps.py` in the Python of $CROCODDYL_PYTHON: it makes the calls that are timed, between requests."""
-
-    name = "Crocoddyl"
-    how: ClassVar = {"step": "calc", "": "calc and calcDiff, C++; no joint damping, every joint an input"}
-
-    def __init__(self, case: Case):
-        super().__init__(case)
-        python = os.environ.get("CROCODDYL_PYTHON")
-        if not python:
-            raise MissingDependencyError("no $CROCODDYL_PYTHON: see crocoddyl_peer.py for its environment")
-        if not shutil.which(python):
-            raise MissingDependencyError(f"$CROCODDYL_PYTHON: expected a Python, got {python}")
-        if case.floats:
-            raise ModelError("its side here is for joints on a fixed base alone")
-        self.actuation = describe(case.model).actuation
-        script = Path(__file__).with_name("crocoddyl_steps.py")
-        self.process = subprocess.Popen([python, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        effort = (self.actuation @ case.u).tolist()
-        text = urdf(describe(case.model)).replace('type="continuous"', 'type="revolute"')  # else q is cosine and sine
-        told = {"urdf": text, "x": case.x.tolist(), "u": effort, "ends": case.ends.tolist()}
-        self.ask(told | {"time_step": case.model.time_step})
-
-    def ask(self, request: dict[str, Any]) -> Any:
-        self.process.stdin.write(json.dumps(request) + "\n")
-        self.process.stdin.flush()
-        line = self.process.stdout.readline()
-        if not line:
-            raise SimulationError(f"{self.name} has died with exit status {self.process.wait()}")
-        return json.loads(line)
-
-    def close(self) -> None:
-        self.process.stdin.close()
-        self.process.wait()
-        self.process.stdout.close()
-
-    def block(self, quantity: str, horizon: int) -> Block:
-        return lambda calls: tuple(self.ask({"quantity": quantity, "horizon": horizon, "calls": calls})["seconds"])
-
-    def answer(self, quantity: str, horizon: int) -> Any:
-        return self.ask({"quantity": quantity, "horizon": horizon, "calls": 0})["answer"]
-
-    def in_drake(self, quantity: str, answer: Any) -> np.ndarray | None:
-        if quantity == "step_jacobian":
-            A, B = (np.array(part) for part in answer)
-            return np.hstack([A, B @ self.actuation])
-        if quantity == "rollout_gradient":
-            return np.array(answer) @ self.actuation
-        return np.array(answer) if quantity == "step" else None
-
-
 PEERS: tuple[type[Peer], ...] = (
-    DrakeAutodiff, DrakeDifferences, DrakeDiff, Mujoco, Mjx, Pinocchio, PinocchioAlone, Casadi, Crocoddyl,
+    DrakeAutodiff, DrakeDifferences, DrakeDiff, Mujoco, Mjx, Pinocchio, PinocchioAlone, Casadi,
 )  # fmt: skip
 
 

@@ -1,8 +1,5 @@
 """Whole solves: the problems of `collocation.py` and `ilqr.py`, as they stand there, in turns."""
 
-import json
-import os
-import subprocess
 import sys
 import tempfile
 import warnings
@@ -12,7 +9,7 @@ from pathlib import Path
 import collocation
 import ilqr
 from suite import Missing, Row, row
-from timing import Block, block, measure, timed
+from timing import block, measure, timed
 
 import drake_diff as dd
 from drake_diff.exceptions import ModelWarning
@@ -20,7 +17,6 @@ from drake_diff.exceptions import ModelWarning
 SOLVES = {"kelly": "Kelly's cart-pole, 50", "panda_reach": "Panda reach"}  # the others take minutes
 QUICK_SOLVES = ("kelly",)
 BUDGET, QUICK_BUDGET = 20.0, 5.0  # [s]
-FDDP = "Crocoddyl FDDP"
 
 
 def solved(names: list[str], quick: bool) -> Iterator[Row | Missing]:
@@ -55,37 +51,13 @@ def _collocated(name: str, problem: dd.Problem, budget: float) -> Iterator[Row]:
         yield row(about, who, _told(*answer[1:]), first, sample, (base, samples[base]), None)
 
 
-def _reach(task: dict, budget: float) -> Iterator[Row | Missing]:
-    who, python = "drake_diff iLQR", os.environ.get("CROCODDYL_PYTHON")
-    firsts, blocks = {who: timed(lambda: ilqr.ours(task))}, {who: block(lambda: ilqr.ours(task))}
-    notes = {who: "the model's loading included", FDDP: "on the wall"}
-    if python:
-        firsts[FDDP] = timed(lambda: _crocoddyl(python, task))
-        blocks[FDDP] = _by_its_own_clock(python, task)
-    else:
-        yield Missing("panda_reach", "solve", FDDP, "no $CROCODDYL_PYTHON: see crocoddyl_peer.py")
-    samples = measure(blocks, budget)
+def _reach(task: dict, budget: float) -> Iterator[Row]:
+    who = "drake_diff iLQR"
+    answer, first = timed(lambda: ilqr.ours(task))
+    sample = measure({who: block(lambda: ilqr.ours(task))}, budget)[who]
     about = {"model": "panda_reach", "joints": 7, "quantity": "solve", "horizon": task["count"]}
-    for name, sample in samples.items():
-        answer, first = firsts[name]
-        told = _told("solved" if answer["ok"] else "not solved", answer["cost"], answer["iterations"])
-        yield row(about, name, f"{told}, {notes[name]}", first, sample, (who, samples[who]), None)
-
-
-def _by_its_own_clock(python: str, task: dict) -> Block:
-    """The seconds that `crocoddyl_peer.py` measures, on the wall: its start and imports do not count."""
-
-    def run(calls: int) -> tuple[float, float]:
-        seconds = sum(_crocoddyl(python, task)["seconds"] for _ in range(calls))
-        return seconds, seconds
-
-    return run
-
-
-def _crocoddyl(python: str, task: dict) -> dict:
-    script = Path(__file__).with_name("crocoddyl_peer.py")
-    done = subprocess.run([python, script], input=json.dumps([task]), capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)[0]
+    told = _told("solved" if answer["ok"] else "not solved", answer["cost"], answer["iterations"])
+    yield row(about, who, f"{told}, the model's loading included", first, sample, (who, sample), None)
 
 
 def _told(outcome: str, cost: float, iterations: int) -> str:

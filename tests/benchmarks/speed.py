@@ -24,8 +24,8 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
+from panda_arm import panda_arm, state  # noqa: E402
 from pydrake.multibody.tree import BodyIndex  # noqa: E402
-from step_derivatives import panda_arm, state  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 

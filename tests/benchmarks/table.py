@@ -10,7 +10,6 @@ from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from layers import Layers
 from rich.console import Console
 from rich.table import Table
 from suite import Missing, Row
@@ -47,7 +46,7 @@ def versions() -> dict[str, str | None]:
     return found | {"commit": done.stdout.strip() or None}
 
 
-def document(rows: list[Row], missing: list[Missing], parts: list[Layers], before: dict, asked: dict) -> dict:
+def document(rows: list[Row], missing: list[Missing], before: dict, asked: dict) -> dict:
     """All of a run, as it is saved; `before` is the machine at its start."""
     return {
         "format": FORMAT,
@@ -57,7 +56,6 @@ def document(rows: list[Row], missing: list[Missing], parts: list[Layers], befor
         "versions": versions(),
         "rows": [row.as_dict() for row in rows],
         "missing": [asdict(one) for one in missing],
-        "layers": [asdict(one) for one in parts],
     }
 
 
@@ -66,7 +64,7 @@ def save(path: Path, found: dict) -> None:
 
 
 def show(found: dict) -> None:
-    """A table a quantity and horizon, of ratios to its base; then layers, and what is missing."""
+    """A table a quantity and horizon, of ratios to its base; then what is missing."""
     console = Console(width=None if Console().is_terminal else 190)
     about = found["machine"]
     console.print(
@@ -80,8 +78,6 @@ def show(found: dict) -> None:
         console.print(_ratios(quantity + (f", {horizon} steps" if horizon else ""), chosen))
     if solves := [r for r in rows if r["quantity"] == "solve"]:
         console.print(_solves(solves))
-    if found["layers"]:
-        console.print(_layers(found["layers"]))
     for line in [*_how(rows), *_missing(found["missing"])]:
         console.print(line, highlight=False)
 
@@ -143,16 +139,4 @@ def _solves(rows: Iterable[dict]) -> Table:
     for row in rows:
         times = (seconds(row[clock]["median"]) for clock in ("cpu", "wall"))
         table.add_row(row["model"], row["peer"], *times, ratio(row["ratio"]), row["base"], row["how"])
-    return table
-
-
-def _layers(parts: list[dict]) -> Table:
-    table = Table(title="drake_diff's own time by layer", title_justify="left")
-    for name in ("model", "quantity", "with clocks", *parts[0]["seconds"], "clocks"):
-        table.add_column(name)
-    for part in parts:
-        whole = sum(part["seconds"].values())
-        shares = (f"{100 * one / whole:.0f}%" for one in part["seconds"].values())
-        steps = f", {part['horizon']} steps" if part["horizon"] else ""
-        table.add_row(part["model"], part["quantity"] + steps, seconds(whole), *shares, f"x{part['clocks']:.2f}")
     return table
