@@ -131,8 +131,8 @@ def test_a_tolerance_that_no_solver_reaches_is_judged_by_our_own_measures(solver
 @each_row("outcome", ["INFEASIBLE", "FAILED", "ITERATION_LIMIT", "INACCURATE", "NO_GRADIENT"])
 def test_what_a_solver_says_of_an_optimum_is_measured_again(outcome):
     """The words are false of an optimum; a plan that keeps all, and is the optimum of another cost, is none."""
-    from drake_diff.optimize.judge import judged
     from drake_diff.optimize.program import NlpResult, Outcome
+    from drake_diff.optimize.verification import judged
 
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT)
@@ -154,8 +154,8 @@ def test_what_a_solver_says_of_an_optimum_is_measured_again(outcome):
 
 
 def test_infeasible_stays_where_something_asked_is_not_kept():
-    from drake_diff.optimize.judge import judged
     from drake_diff.optimize.program import NlpResult, Outcome
+    from drake_diff.optimize.verification import judged
 
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT)

@@ -162,8 +162,7 @@ def test_a_collocation_solver_that_lies_is_not_believed(monkeypatch):
     monkeypatch.setattr("drake_diff.optimize.run.solve_collocation", liar)
     solution = collocate(swing_up(), solver="snopt")
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
-    assert "defect" in solution.message
-    assert "is above 1e-05" in solution.message
+    assert "defect" in {c.what for c in solution.plan_checks.failing}
 
 
 @each_row("row, column", [(2, 1), (2, 3), (3, 1), (3, 3), (2, 4), (3, 4)])

@@ -16,9 +16,9 @@ import drake_diff as dd
 import drake_diff.optimize.run as run_module
 import drake_diff.optimize.transcription.collocation as collocation_module
 from drake_diff.exceptions import InputError, ModelWarning, UnknownNameError
-from drake_diff.optimize.judge import complaints_about, judged
 from drake_diff.optimize.problem.obstacles import along_steps
 from drake_diff.optimize.program import NlpResult, Outcome
+from drake_diff.optimize.verification import judged
 
 BALL = dd.SphereObstacle([0.0, 0.0, -1.2], 0.1, name="ball")
 POST = dd.BoxObstacle([0.0, 0.0, -1.25], [0.1, 0.4, 0.2], name="post")
@@ -110,7 +110,12 @@ def test_where_a_plan_jumps_through_between_knots_the_mesh_is_refined(monkeypatc
     monkeypatch.setattr(collocation_module, "CLEARANCE_ROUNDS", 0)
     solution = dd.solve(problem, method="collocation", max_iterations=200, refine=False)
     assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
-    assert "between the nodes lower enters obstacle 'ball' by" in solution.message
+    assert failing(solution, "between the nodes")[0].where.startswith("lower and obstacle 'ball' at ")
+
+
+def failing(solution, plant):
+    """The clearances that fail in a plant."""
+    return [c for c in solution.plan_checks.failing if (c.what, c.plant) == ("clearance", plant)]
 
 
 def test_no_obstacle_is_so_thin_that_a_motion_jumps_over_it_unseen():
@@ -129,21 +134,22 @@ def test_no_obstacle_is_so_thin_that_a_motion_jumps_over_it_unseen():
         along = np.clip(np.sum((tips[k] - hinges) * (tips - hinges), axis=1) / 0.49**2, 0, 1)[:, None]
         nearest = np.linalg.norm(hinges + along * (tips - hinges) - tips[k], axis=1).min()
         assert nearest < 1e-3
-        told = "; ".join(complaints_about(replace(plan, problem=arm([ball], **ends))))
-        assert re.search(r"between the nodes lower enters obstacle 'pin' by \d+(\.\d+)? mm", told), (k, told)
+        (found,) = failing(replace(plan, problem=arm([ball], **ends)), "between the nodes")
+        assert found.where.startswith("lower and obstacle 'pin' at "), k
+        assert found.value > ball.margin, k  # it is entered
 
 
 def test_steps_are_looked_at_as_closely_and_a_motion_too_wild_to_be_seen_is_none():
     constraint = arm([dd.SphereObstacle([0, 0, -1.25], 1e-3, margin=1e-3, name="pin")]).kept_goals[0]
     for turn in (0.5, 3.0, 40.0):  # in one step, past the pin in its middle
         steps = along_steps(np.array([0.0, 1.0]), np.array([[-turn / 2, 0, 0, 0], [turn / 2 + 0.3, 0, 0, 0]]))
-        (told,) = constraint.too_near(*steps, constraint.tolerance)
-        assert "lower enters obstacle 'pin' by" in told
+        found = constraint.nearest(*steps, constraint.tolerance)
+        assert found.where.startswith("lower and obstacle 'pin' at ")
+        assert found.value > constraint.margin
     beside = along_steps(np.array([0.0, 1.0]), np.array([[0.03, 0, 0, 0], [1.0, 0, 0, 0]]))
-    assert not list(constraint.too_near(*beside, constraint.tolerance))  # 0.03 of 1.25 m: clear of 21 mm
+    assert constraint.nearest(*beside, constraint.tolerance).passes  # 0.03 of 1.25 m: clear of 21 mm
     wild = along_steps(np.array([0.0, 1.0]), np.array([[0.03, 0, 0, 0], [1e9, 0, 0, 0]]))
-    (told,) = constraint.too_near(*wild, constraint.tolerance)
-    assert "cannot be seen" in told or "enters" in told
+    assert constraint.nearest(*wild, constraint.tolerance).value > constraint.margin
 
 
 @pytest.mark.slow
@@ -153,7 +159,7 @@ def test_where_steps_jump_through_they_are_looked_at_within(monkeypatch):
     through = dd.solve(problem, method="ilqr", max_iterations=200)
     assert not through.success
     assert through.constraint_violation <= 1e-5  # every knot is clear
-    assert "between the knots lower enters obstacle 'ball' by" in through.message
+    assert failing(through, "between the knots")[0].value > BALL.margin
     assert depth_by_drake(problem.model, through.xs, BALL, parts=50) > 0
 
 
@@ -162,16 +168,14 @@ def test_a_plan_through_an_obstacle_is_refused_and_says_by_how_much_and_when():
     assert without.success
     problem = arm([dd.SphereObstacle([0.0, 0.0, -1.25], 0.1, name="ball")])
     through = replace(without, problem=problem)
-    told = "; ".join(complaints_about(through))
-    assert "clear of 'ball'" in told  # at a knot
-    assert "between the nodes lower enters obstacle 'ball' by" in told
+    assert any("clear of 'ball' at knot" in c.where for c in through.plan_checks.failing)
+    assert failing(through, "between the nodes")[0].value > 0.01
     found = judged(through, NlpResult(np.zeros(1), Outcome.SOLVED, "said to be solved", ()))
     assert found.status is dd.Status.CONVERGED_NOT_VERIFIED
-    failures = [failure for r in through.replays for failure in r.failures]
-    deep = [f for f in failures if "enters obstacle 'ball' by" in f]
+    deep = [c for r in through.replays for c in r.checks if c.what == "clearance" and c.value > 0.01]
     assert len(deep) >= 4
     # the rod passes the middle of the ball, at 0.75 s, whose far side is 0.1 m and the capsule's radius away
-    assert all(" at 0.7" in f or " at 0.8" in f for f in deep), deep
+    assert all(" at 0.7" in c.where or " at 0.8" in c.where for c in deep), deep
 
 
 @each_row(
@@ -184,8 +188,8 @@ def test_a_plan_through_an_obstacle_is_refused_and_says_by_how_much_and_when():
         (lambda: dd.BoxObstacle([0, 0, 0], [0.1, 0.0, 0.1]), "BoxObstacle.size"),
         (lambda: dd.BoxObstacle([0, 0, 0], [1, 1, 1], rotation=[2, 0, 0, 0]), "norm"),
         (lambda: dd.SelfCollision(ignore=["upper"]), "SelfCollision.ignore"),
-        (lambda: arm([dd.SphereObstacle([0.0, 0.0, -0.4], 0.5)]), "x0.*upper enters obstacle sphere at 0, 0, -0.4 by"),
-        (lambda: arm([dd.SphereObstacle([-0.7, 0.0, -0.5], 0.1)]), "x_goal.*lower enters"),
+        (lambda: arm([dd.SphereObstacle([0.0, 0.0, -0.4], 0.5)]), "x0.*upper and obstacle sphere at 0, 0, -0.4 come"),
+        (lambda: arm([dd.SphereObstacle([-0.7, 0.0, -0.5], 0.1)]), "x_goal.*lower and obstacle"),
     ],
     ids=str,
 )
@@ -231,7 +235,7 @@ def test_neighbours_and_what_always_overlaps_are_left_out_of_self_collision():
 def test_a_folded_arm_is_refused_by_self_collision():
     model = example_robot("ur5_robot.urdf", 0.02)
     folded = np.concatenate([[0, -1.2, 3.1, 0, 0, 0], np.zeros(6)])
-    with pytest.raises(InputError, match=r"x0: .* (overlap by|apart)"):
+    with pytest.raises(InputError, match=r"x0: .* nearer than their margin"):
         dd.Problem(model, x0=folded, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[dd.SelfCollision()])
 
 

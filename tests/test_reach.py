@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import LinearSpringDamper, RevoluteJoint, SpatialInertia
 
 import drake_diff as dd
-from drake_diff.optimize.reach import out_of_reach
+from drake_diff.optimize.optimality import out_of_reach
 from drake_diff.optimize.shooting import ShootingVariables
 
 H, N = 0.02, 40

@@ -11,14 +11,16 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.model.parameters import select
+from drake_diff.optimize.checks import check
+from drake_diff.optimize.messages import controls
 from drake_diff.optimize.replay import (
     FEEDBACK_TOLERANCE,
     STATE_TOLERANCE,
     Plan,
     broken_variants,
+    deciding,
     held,
     replays,
-    told_of_controls,
     track,
 )
 from drake_diff.optimize.solution import Status
@@ -64,7 +66,7 @@ def test_feedback_holds_what_open_loop_loses(load):
     found = replays(plan)
     assert by_name(found, "in steps of 0.01 s", "open loop").goal_error > 0.1
     assert by_name(found, "in steps of 0.01 s", "TVLQR").goal_error < 1e-3
-    assert not list(broken_variants(plan, found))
+    assert not broken_variants(plan, found)
 
 
 def test_the_plants_own_step_gives_the_plan_back(write_urdf):
@@ -75,22 +77,23 @@ def test_the_plants_own_step_gives_the_plan_back(write_urdf):
 
 
 @each_row(
-    "fields, clause",
+    "fields, what, where, value",
     [
-        ({"x_goal": [0.9, math.nan]}, "slide_x ends 0.15 from its goal, tolerance 0.0525"),
-        ({"x_goal": [math.nan, 0.0]}, "slide_v ends"),
-        ({"bounds": dd.Bounds(x_upper=[0.5, math.inf])}, "slide_x is 0.55 beyond its bound at 1 s"),
-        ({"constraints": dd.Constraint(lambda x: x[1], upper=1, name="slow")}, "slow is broken by 1 at knot 20"),
-        ({"waypoints": {10: [0.1, math.nan]}}, "waypoint at knot 10 is broken"),
+        ({"x_goal": [0.9, math.nan]}, "goal", "slide_x", 0.15),
+        ({"x_goal": [math.nan, 0.0]}, "goal", "slide_v", 2.0),
+        ({"bounds": dd.Bounds(x_upper=[0.5, math.inf])}, "bound", "slide_x at 1 s", 0.55),
+        ({"constraints": dd.Constraint(lambda x: x[1], upper=1, name="slow")}, "constraint", "slow at knot 20", 1.0),
+        ({"waypoints": {10: [0.1, math.nan]}}, "constraint", "waypoint at knot 10 at knot 10", 0.175),
     ],
 )
-def test_a_plan_that_misses_what_is_asked_is_told(write_urdf, fields, clause):
+def test_a_plan_that_misses_what_is_asked_is_told(write_urdf, fields, what, where, value):
     """u = 2 for 1 s: x ends at 1.05 (symplectic), v at 2, x_10 = 0.275."""
     problem = block(write_urdf, **{"final_cost": lambda x: x[0], **fields})
     plan = plan_of(problem, np.full((COUNT, 1), 2.0))
     found = by_name(replays(plan), f"in steps of {H:g} s", "open loop")
-    assert any(clause in failure for failure in found.failures), found.failures
-    assert len(list(broken_variants(plan, replays(plan)))) == 3
+    (failing,) = [c for c in found.checks if not c.passes]
+    assert (failing.what, failing.where, failing.value) == (what, where, pytest.approx(value))
+    assert len(broken_variants(plan, replays(plan))) == 3
 
 
 @each_row("i", range(4))
@@ -106,14 +109,13 @@ def test_one_coordinate_off_is_refused_and_named(load, i):
         goal[i] += sign * factor * tolerance
         limits[i] = sign * (np.max(sign * xs[1:, i]) - factor * tolerance)
         side = "x_upper" if sign > 0 else "x_lower"
-        for asked, clause in (
-            ({"x_goal": goal}, f"{model.state_names[i]} ends {factor * tolerance:.3g} from its goal"),
-            ({"bounds": dd.Bounds(**{side: limits})}, f"{model.state_names[i]} is {factor * tolerance:.3g} beyond its"),
-        ):
+        for asked, what in (({"x_goal": goal}, "goal"), ({"bounds": dd.Bounds(**{side: limits})}, "bound")):
             problem = dd.Problem(model, x0=x0, num_steps=15, final_cost=lambda x: x[0], **asked)
             found = by_name(replays(plan_of(problem, us)), f"in steps of {model.time_step:g} s", "open loop")
             assert found.holds is (factor < 1), found.failures
-            assert factor < 1 or clause in found.failures[0]
+            (row,) = [c for c in found.checks if c.what == what]
+            assert row.where.startswith(model.state_names[i])
+            assert (row.value, row.tolerance) == pytest.approx((factor * tolerance, tolerance), rel=1e-6)
 
 
 def test_the_tolerance_is_five_percent_of_the_range(write_urdf):
@@ -162,7 +164,7 @@ def test_energy_out_of_nothing_is_told(load):
     problem = dd.Problem(model, x0=[0.02, 0], num_steps=4, final_cost=lambda x: x[0])  # later it is no small swing
     plan = plan_of(problem, np.zeros((4, 1)))
     found = by_name(replays(plan), "in steps of 0.55 s", "open loop")
-    assert any("J of energy come from nowhere" in failure for failure in found.failures), found
+    assert ("energy", "gained") in [(c.what, c.where) for c in found.checks if not c.passes], found
 
 
 def test_a_deep_overlap_is_told_and_another_approximation_is_tried(tmp_path):
@@ -180,7 +182,8 @@ def test_a_deep_overlap_is_told_and_another_approximation_is_tried(tmp_path):
     assert 0.02 < found[3].penetration < 0.05  # Hunt-Crossley dissipation, which sap leaves out, sinks slower
     assert found[3].holds
     for replay in found[:3]:
-        assert "limit 0.05 m (a quarter of " in replay.failures[0]
+        (deep,) = [c for c in replay.checks if not c.passes]
+        assert (deep.what, deep.tolerance, deep.unit) == ("penetration", pytest.approx(0.05), "m")
         assert 0.09 < replay.penetration < 0.2  # near the static depth, and less than twice that, the undamped swing
 
 
@@ -208,9 +211,8 @@ def test_a_plan_that_lives_from_one_law_of_contact_is_refused_in_the_other_in_fi
     other = ["with lagged contact", "with lagged contact in steps of 0.00025 s"]
     assert [(r.variant, r.holds) for r in found[-2:]] == [(name, False) for name in other]
     assert all(r.holds for r in found[:-2])
-    refused = list(broken_variants(plan, found))
-    assert len(refused) == 1
-    assert refused[0].startswith(f"replayed {other[1]} it does not hold: open loop, z_x ends")
+    assert list(broken_variants(plan, found)) == [other[1]]
+    assert [(c.what, c.where) for c in found[-1].checks if not c.passes] == [("goal", "z_x")]
     assert found[-1].motion.xs[-1, 0] > 0.11  # 0.1 s to the ground, 0.03 s on its spring, and on the way up
 
 
@@ -220,14 +222,13 @@ def test_where_the_other_law_fails_at_the_plans_own_step_the_message_says_so(wri
     own, other = f"in steps of {H:g} s", "with lagged contact"
     known = by_name(replays(plan), own, "open loop")
     finer, why = f"{other} in steps of {H / 8:g} s", "the foot is thrown up"
-    rows = ((own, ()), (other, (why,)), (finer, ()))
-    found = [dataclasses.replace(known, variant=name, failures=failures) for name, failures in rows]
-    assert list(broken_variants(plan, found)) == []
-    assert (
-        told_of_controls(plan, found)
-        == f"on the plant open loop; open loop {other}, where steps are longer, not: {why}"
-    )
-    assert next(broken_variants(plan, found[:2])).startswith(f"replayed {other} it does not hold: open loop, {why}")
+    failed = (check("motion", why, math.inf, 0.0),)
+    rows = ((own, ()), (other, failed), (finer, ()))
+    found = [dataclasses.replace(known, variant=name, checks=checks) for name, checks in rows]
+    assert broken_variants(plan, found) == {}
+    said = controls(found, deciding(plan, found), finest=False)
+    assert said == f"on the plant open loop; open loop {other}, where steps are longer, not: {why}"
+    assert list(broken_variants(plan, found[:2])) == [other]
 
 
 def test_a_replay_prints_what_failed_and_not_its_arrays(write_urdf):
@@ -278,10 +279,10 @@ def test_a_frame_that_has_to_be_exact_is_replayed_in_steps_that_are_fine_enough_
         replay = by_name(found, f"in steps of {0.1 / parts:.4g} s", "open loop")
         assert replay.motion.xs[-1, 0] == pytest.approx(1 + 0.1 / parts, rel=1e-9)
         assert replay.holds == (parts >= 32)
-    assert not list(broken_variants(plan, found))
+    assert not broken_variants(plan, found)
 
 
-def test_a_verdict_names_how_far_the_plan_ends_from_its_goal_and_what_is_allowed(write_urdf):
+def test_a_check_has_how_far_the_plan_ends_from_its_goal_and_what_is_allowed(write_urdf):
     """A block moved in steps of 0.05 s: held inputs in half the steps lead elsewhere by the closed form of the sums."""
     problem = block(write_urdf, x_goal=[1, 0])
     solution = dd.solve(problem, method="shooting")
@@ -292,12 +293,11 @@ def test_a_verdict_names_how_far_the_plan_ends_from_its_goal_and_what_is_allowed
     controlled = [r for r in solution.replays if r.variant == "in steps of 0.025 s"]
     assert min(r.goal_error for r in controlled) <= off + 1e-9
     assert controlled[0].goal_error == pytest.approx(off, rel=1e-6)
-    assert "% of its range, of 5% of each state's range in the plan (3% under TVLQR) allowed" in solution.message
-    assert "slide_x ends" in solution.message
-    assert "diagram" not in solution.message
+    (ends,) = [c for c in controlled[0].checks if c.what == "goal"]
+    assert (ends.where, ends.value) == ("slide_x", pytest.approx(off, rel=1e-6))
+    assert ends.tolerance == pytest.approx(0.05 * np.ptp(solution.xs[:, 0]))
     from_diagram = dd.solve(dd.Problem(rail_block(), x0=[0, 0], x_goal=[1, 0], num_steps=10), method="shooting")
-    assert "in steps of 0.1 s" in from_diagram.message
-    assert "a diagram allows no other step" in from_diagram.message
+    assert {r.variant for r in from_diagram.replays} == {"in steps of 0.1 s"}  # it allows no other step
 
 
 def test_a_solve_whose_replay_fails_is_no_success(load):

@@ -87,7 +87,7 @@ def test_metrics_that_are_defined_otherwise_are_not_compared(runs, tmp_path):
     cost = record.metrics[0].model_copy(update={"unit": "J"})
     packages = {**record.provenance.packages, "drake": "0.1"}
     provenance = record.provenance.model_copy(update={"packages": packages})
-    changes = {"metrics": [cost, *record.metrics[1:-1]], "evaluations": [], "provenance": provenance}
+    changes = {"metrics": [cost, *record.metrics[1:-1]], "provenance": provenance}
     record.model_copy(update=changes).write(directory)
     found = compare_runs(runs / "a", directory)
     assert not found.comparable

@@ -13,7 +13,9 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.artifact import measure
 from drake_diff.exceptions import InputError
-from drake_diff.optimize.replay import judged_replay, told_of_controls
+from drake_diff.optimize.checks import check
+from drake_diff.optimize.messages import controls
+from drake_diff.optimize.replay import deciding, judged_replay
 
 METHODS = ("collocation", "shooting", "ilqr")
 OPEN, CLOSED = "open loop", "TVLQR"
@@ -237,7 +239,7 @@ def test_another_status_leaves_the_measures_as_they_were_taken(method):
 
 @each_row("name", ["xs", "us", "problem", "certificates", "cost"])
 def test_what_a_measure_may_depend_on_is_not_told(name):
-    with pytest.raises(InputError, match=f"expected one of elsewhere, iterations, .*, got '{name}'"):
+    with pytest.raises(InputError, match=f"expected one of cross_checks, iterations, .*, got '{name}'"):
         solved("ilqr").told(**{name: None})
 
 
@@ -252,9 +254,10 @@ def of_replays(good):
     found = []
     for variant in ("in steps of 0.1 s", "in steps of 0.05 s"):
         for control in (OPEN, CLOSED):
-            failures = () if control in good else (f"x ends far off {variant} by {control}",)
-            found.append(dataclasses.replace(s.replays[0], variant=variant, control=control, failures=failures))
-    return told_of_controls(s.plan, found), judged_replay(s.plan, found)
+            why = f"x ends far off {variant} by {control}"
+            checks = () if control in good else (check("motion", why, math.inf, 0.0),)
+            found.append(dataclasses.replace(s.replays[0], variant=variant, control=control, checks=checks))
+    return controls(found, deciding(s.plan, found), finest=False), judged_replay(s.plan, found)
 
 
 def test_a_plan_that_holds_under_every_control_says_so():

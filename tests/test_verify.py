@@ -187,7 +187,7 @@ def lying(section, change):
         fields = honest(measurement, folder).model_dump()
         change(fields[section])
         if section in ("metrics", "replays"):  # whoever lies about them leaves out what says otherwise
-            fields |= {"evaluations": [], "panel": None}
+            fields |= {"panel": None}
         return EvidenceRecord.model_validate(fields)
 
     return record_of
@@ -255,7 +255,6 @@ def test_a_run_that_stopped_far_from_its_goal_cannot_say_that_it_converged(solut
     def forged(measurement, folder):
         fields = honest(measurement, folder).model_dump()
         fields["metrics"] = [m for m in fields["metrics"] if m["verdict"] != "fail"]
-        fields["evaluations"] = []
         fields["replays"] = [{**r, "holds": True, "failures": []} for r in fields["replays"]]
         fields["failures"] = []
         fields["events"] = [e for e in fields["events"] if e["kind"] != "failure"]
@@ -329,7 +328,7 @@ def test_another_version_of_drake_is_a_reason_for_doubt_not_a_lie(run, copy):
     record = dd.load_record(copy)
     older = record.provenance.model_copy(update={"packages": {**record.provenance.packages, "drake": "1.40.0"}})
     metric = record.metrics[0].model_copy(update={"value": 1.0})
-    changes = {"provenance": older, "metrics": [metric, *record.metrics[1:]], "evaluations": []}
+    changes = {"provenance": older, "metrics": [metric, *record.metrics[1:]]}
     record.model_copy(update=changes).write(copy)
     found = dd.verify(copy)
     assert (found.verdict, found.complaints) == ("undecided", ())

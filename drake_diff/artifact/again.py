@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.artifact.cross_check import NOT_INSTALLED, SIMULATORS, cross_check
 from drake_diff.artifact.measurement import measure
-from drake_diff.artifact.other_plants import NOT_INSTALLED, elsewhere
 from drake_diff.artifact.rerun import PLAN, plan_fields, resolve, solve_again
 from drake_diff.artifact.save import REPLAY, REPORT, record_of, write_files
 from drake_diff.artifact.sections import COSTS, unknown_functions
@@ -119,8 +119,9 @@ def _apart(found: Solution, told: Solution) -> float:
 
 def _written(solution: Solution, record: EvidenceRecord, apart: float) -> Again:
     """All files of `solution`, made in a folder of their own."""
-    if record.elsewhere is not None:
-        solution = elsewhere(solution, record.elsewhere.engines)
+    engines = None if record.solver is None else record.solver.options.get("cross_check")
+    if isinstance(engines, list):
+        solution = cross_check(solution, [str(name) for name in engines])
     with TemporaryDirectory() as folder:
         place, measurement = Path(folder), measure(solution)
         again, unchecked = _but_for_simulators(_as_given(record_of(measurement, place), record), record)
@@ -131,25 +132,31 @@ def _written(solution: Solution, record: EvidenceRecord, apart: float) -> Again:
 
 def _but_for_simulators(again: EvidenceRecord, record: EvidenceRecord) -> tuple[EvidenceRecord, tuple[str, ...]]:
     """With what `record` says of simulators that are not installed here, or were not there, and which these are."""
-    if again.elsewhere is None or record.elsewhere is None or len(again.elsewhere.rows) != len(record.elsewhere.rows):
-        return again, ()
-    rows, unchecked = [], []
-    for here, there in zip(again.elsewhere.rows, record.elsewhere.rows, strict=True):
-        lacking = [row for row in (here, there) if any(why.startswith(NOT_INSTALLED) for why in row.failures)]
-        rows.append(there if lacking else here)
-        if lacking and here.plant == there.plant:
+
+    def by_plant(rows: Sequence[Any]) -> dict[str, list[Any]]:
+        return {name: [r for r in rows if r.variant.startswith(f"in {name}")] for name in SIMULATORS}
+
+    here, there = by_plant(again.replays), by_plant(record.replays)
+    rows, unchecked = list(again.replays), list[str]()
+    for name in SIMULATORS:
+        lacking = [
+            side
+            for side in (here, there)
+            if any(r.failures[0].startswith(NOT_INSTALLED) for r in side[name] if r.failures)
+        ]
+        if len(lacking) == 1:
+            rows = [r for r in rows if r not in here[name]] + there[name]
             where = "was not installed where the record was made" if lacking[0] is there else "is not installed here"
-            unchecked.append(f"elsewhere.rows[{len(rows) - 1}] and elsewhere.sentence: {there.plant} {where}")
+            unchecked.append(f"replays in {name}, which {where}")
     if not unchecked:
         return again, ()
-    kept = again.elsewhere.model_copy(update={"rows": rows, "sentence": record.elsewhere.sentence})
-    return again.model_copy(update={"elsewhere": kept}), tuple(unchecked)
+    return again.model_copy(update={"replays": rows, "panel": record.panel}), tuple(unchecked)
 
 
 def _as_given(again: EvidenceRecord, record: EvidenceRecord) -> EvidenceRecord:
     """With what nothing can make again as `record` says it."""
     contract, model = contract_as(again.contract, record.contract), model_as(again.model, record.model)
-    given = {name: getattr(record, name) for name in (*GIVEN, "files", "record_sha256")}
+    given = {name: getattr(record, name) for name in (*GIVEN, "files", "record_sha256", "evaluations", "elsewhere")}
     return again.model_copy(update={**given, "contract": contract, "model": model})
 
 

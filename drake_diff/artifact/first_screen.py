@@ -9,10 +9,10 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.artifact.measurement import Measurement
-from drake_diff.artifact.sections import UNKNOWN, units_of
 from drake_diff.optimize.problem.cost import ConstantCost
 from drake_diff.optimize.problem.dwell import Dwell
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
+from drake_diff.optimize.problem.names import UNKNOWN, units_of
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.terminal import TerminalSet
@@ -146,11 +146,6 @@ def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[Check]:
     text = f"not kept: {_listed(broken)}" if broken else f"all {len(decided)} bounds are kept"
     found.append(Check("Plan", "fail" if failed else "undecided" if broken else "pass", text))
     found += _of_replays(m, record["replays"])
-    if record["elsewhere"] is not None:
-        rows = record["elsewhere"]["rows"]
-        lost = any(row["measured"] and not row["holds"] for row in rows)
-        kind = "warn" if lost else "pass" if all(row["holds"] for row in rows) else "info"
-        found.append(Check("In other plants", kind, record["elsewhere"]["sentence"]))
     certificates = record["gradient"]["certificates"]
     agree = sum(c["verdict"] == "agree" for c in certificates)
     kind = "info" if not certificates else "pass" if agree == len(certificates) else "undecided"
@@ -159,7 +154,7 @@ def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[Check]:
         kind, told = (
             "pass",
             "that of the end is a slope of another integration",
-        )  # else the plan is none (optimize.slope)
+        )  # else the plan is none
     found.append(Check("Gradients", kind, told))
     return found
 

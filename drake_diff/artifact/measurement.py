@@ -13,8 +13,6 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
-from drake_diff.artifact.second_measurement import evaluation_failures, evaluations
-from drake_diff.artifact.sections import units_of
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.model import Model
@@ -22,13 +20,14 @@ from drake_diff.model.parameters import Parameter, ParameterVector, applied
 from drake_diff.model.plant import FLOATING, bodies, joints
 from drake_diff.model.step import set_state
 from drake_diff.motion.rollout import CONTINUOUS, STEPS, Rollout, drift, smooth_mean
-from drake_diff.optimize.elsewhere import Elsewhere, Followed
+from drake_diff.optimize.measure import INTEGRATION_TOLERANCE
+from drake_diff.optimize.problem.names import units_of
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
-from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
+from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
-from drake_diff.record.parts import Evaluation, Event, Failure, Label, Metric
-from drake_diff.record.solve import ElsewhereEvidence, FollowedEvidence, ReplayEvidence
+from drake_diff.record.parts import Event, Failure, Label, Metric
+from drake_diff.record.solve import ReplayEvidence
 
 AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
 ON_THE_PLANT = {  # by the problem's motion
@@ -83,7 +82,6 @@ class Measurement(ShowsItsRepr):
         replays: The plan in every variant of the plant.
         metrics: Every measure of the plan and of its replay; those with a tolerance decide.
         invariants: What physics keeps along the replay.
-        evaluations: The metrics that have a second measurement, beside it.
         failures: Why the run is no success; none for a success.
         events: What happened, in order: the solver, contacts, inputs at their limits, failures.
 
@@ -110,7 +108,6 @@ class Measurement(ShowsItsRepr):
     thinnest: str
     metrics: tuple[Metric, ...]
     invariants: tuple[Metric, ...]
-    evaluations: tuple[Evaluation, ...]
     failures: tuple[Failure, ...]
     events: tuple[Event, ...]
 
@@ -169,8 +166,7 @@ def measure(solution: Solution) -> Measurement:
         metrics += _metrics_of_the_replay(solution, motion, states, positions)
         invariants += _invariants(solution.vector, motion, _unit(positions), ON_THE_PLANT[problem.motion])
         limit, thinnest = thinnest_geometry(problem.model)
-    beside = evaluations(solution, motion, metrics)
-    failures = (*_failures(solution, metrics), *evaluation_failures(beside, metrics))
+    failures = tuple(_failures(solution, metrics))
     return Measurement(
         solution=solution,
         positions=positions,
@@ -186,7 +182,6 @@ def measure(solution: Solution) -> Measurement:
         thinnest=thinnest,
         metrics=tuple(metrics),
         invariants=tuple(invariants),
-        evaluations=beside,
         failures=failures,
         events=tuple(_events(solution, motion, failures)),
     )
@@ -305,35 +300,6 @@ def replay_evidence(r: Replay) -> ReplayEvidence:
         holds=r.holds,
         failures=list(r.failures),
     )
-
-
-def elsewhere_evidence(found: Elsewhere | None) -> ElsewhereEvidence | None:
-    """Where else a plan holds, as it stands in a record."""
-    if found is None:
-        return None
-
-    def row(r: Followed) -> FollowedEvidence:
-        measures = (r.goal_error, r.bound_violation, r.penetration, r.off)
-        goal, bound, depth, off = (float(v) if math.isfinite(v) else None for v in measures)
-        return FollowedEvidence(
-            plant=r.plant,
-            where=r.where,
-            control=r.control,
-            time_step_s=r.time_step or None,
-            measured=r.measured,
-            goal_error=goal,
-            bound_violation=bound,
-            penetration_m=depth,
-            off_plan=off,
-            left_plan_s=r.left_at,
-            holds=r.holds,
-            failures=list(r.failures),
-            unlike=list(r.unlike),
-            remark=r.remark,
-        )
-
-    rows = [row(r) for r in found.rows]
-    return ElsewhereEvidence(sentence=found.sentence, engines=list(found.engines), period_s=found.period, rows=rows)
 
 
 def failure_of(error: BaseException) -> Failure:

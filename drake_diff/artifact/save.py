@@ -15,7 +15,7 @@ import numpy as np
 
 from drake_diff._base.files import make_folder
 from drake_diff._base.signals import held_interrupts
-from drake_diff.artifact.measurement import Measurement, elsewhere_evidence, failure_of, measure, replay_evidence
+from drake_diff.artifact.measurement import Measurement, failure_of, measure, replay_evidence
 from drake_diff.artifact.phased import directory_of, phases_record, save_phases
 from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, write_plan
 from drake_diff.artifact.sections import asked, found, panel_of
@@ -221,11 +221,9 @@ def record_of(m: Measurement, folder: Path) -> EvidenceRecord:
         sentence=m.solution.message,
         metrics=m.metrics,
         invariants=m.invariants,
-        evaluations=m.evaluations,
         events=m.events,
-        replays=[replay_evidence(r) for r in m.replays],
+        replays=[replay_evidence(r) for r in (*m.replays, *m.solution.cross_checks)],
         panel=panel_of(m.solution),
-        elsewhere=elsewhere_evidence(m.solution.elsewhere),
         failures=m.failures,
         **asked(m.solution.problem, m.solution),
         **found(m.solution),

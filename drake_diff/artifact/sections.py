@@ -31,6 +31,7 @@ from drake_diff.optimize.problem.held import (
     held_quantity,
     impact_quantity,
 )
+from drake_diff.optimize.problem.names import units_of
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.rates import InputRate, Jerk
@@ -90,7 +91,6 @@ UNITS = {
     "collision_pairs, constraints, num_steps": "1",
 }
 COUPLED = "those of the states and inputs that they join, and per s of rates"
-UNKNOWN = "unknown"  # the unit of a number of plain dynamics
 LIMITATIONS = [
     "of the model in simulation only: nothing here was measured on a robot",
     "a cost is that of a local optimum at best",
@@ -188,8 +188,8 @@ def _given_data(problem: Problem) -> Iterator[DataUse]:
 
 def panel_of(solution: Solution) -> EvaluationPanel:
     """Under what a solution is judged: every replay, and which of them its verdict rests on."""
-    problem, found = solution.problem, solution.replays
-    decides = deciding(solution.plan, found) if problem.has_model else []
+    problem = solution.problem
+    decides = deciding(solution.plan, solution.replays) if problem.has_model else []
     cases = [
         PanelCase(
             variant=r.variant,
@@ -198,7 +198,7 @@ def panel_of(solution: Solution) -> EvaluationPanel:
             contact_approximation=r.approximation,
             decides=r.variant in decides,
         )
-        for r in found
+        for r in (*solution.replays, *solution.cross_checks)
     ]
     statement = "the plan's own start, model and inputs in each case; a variant that decides holds under one control"
     if not problem.has_model:
@@ -248,14 +248,6 @@ def found(solution: Solution, *, measured: bool = True) -> dict[str, Any]:
         iterations=len(solution.iterations),
     )
     return {"solver": solver, "parameters": parameters, "gradient": _gradient(solution, measured)}
-
-
-def units_of(problem: Problem) -> tuple[str, ...]:
-    """(nx + nu,) the units of the states and inputs."""
-    if problem.moved is None:
-        return (UNKNOWN,) * (problem.nx + problem.nu)
-    contract = problem.moved.contract
-    return tuple(c.unit for c in contract.positions + contract.velocities + contract.inputs)
 
 
 def _observation(problem: Problem, time_step: float) -> Observation:

@@ -669,8 +669,9 @@ def _odd_contract(record: EvidenceRecord, again: dict[str, Any]) -> Iterator[str
 def _other_versions(record: SealedRecord) -> tuple[str, ...]:
     was, now = record.provenance.packages, packages_here()
     used = ["drake", "drake-diff", "numpy", "casadi"]
-    if isinstance(record, EvidenceRecord) and record.elsewhere is not None:
-        used += record.elsewhere.engines
+    if isinstance(record, EvidenceRecord) and record.solver is not None:
+        engines = record.solver.options.get("cross_check")
+        used += map(str, engines) if isinstance(engines, list) else ()
     if isinstance(record, IdentificationRecord) or has_recordings(record):
         used.append("numba")  # by which the motions are computed, where it is there
     names = [n for n in used if was.get(n) != now.get(n)]

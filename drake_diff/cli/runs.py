@@ -39,8 +39,8 @@ def add_commands(app: typer.Typer) -> None:
 def run(
     script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="A Python file with a function problem().")],
     out: Annotated[Path | None, out_option("artifacts/<script>")] = None,
-    elsewhere: Annotated[
-        bool, typer.Option("--elsewhere", help="Follow the plan in finer steps, continuous time and MuJoCo too.")
+    cross_check: Annotated[
+        bool, typer.Option("--cross-check", help="Replay the plan in continuous time and in MuJoCo too.")
     ] = False,
     view: Annotated[
         bool, typer.Option("--view", help="Show the search in a browser on this machine, and its plan until Ctrl-C.")
@@ -48,8 +48,8 @@ def run(
 ) -> None:
     """Solve the problem that SCRIPT defines, measure the solution again, and write the run directory.
 
-    SCRIPT may also define solve_options, a dictionary of arguments of drake_diff.solve. With --elsewhere the plan is
-    followed in other plants too, and the record says where it holds; the exit status does not depend on that.
+    SCRIPT may also define solve_options, a dictionary of arguments of drake_diff.solve. With --cross-check the plan
+    is replayed in other plants too, and the record says where it holds; the exit status does not depend on that.
     Exit status 0 only if the solution passes every check. Ctrl-C, SIGTERM and SIGHUP end the search: its best plan is
     written. One that comes later, while it is measured, ends the run (exit status 130), which `recover` completes; one
     that comes before the search leaves a record that says so (130 too).
@@ -72,7 +72,7 @@ def run(
         with written_whole(directory) as folder:
             claimed.append(folder)
             try:
-                problem, options = _asked(script, elsewhere)
+                problem, options = _asked(script, cross_check)
             except KeyboardInterrupt:
                 sentence = "the run was interrupted while its problem was set up, before the search began"
                 with held_interrupts():
@@ -80,7 +80,7 @@ def run(
                 show(f"{sentence}; a record that says so is in {folder}")
                 raise typer.Exit(INTERRUPTED) from None
             told: dict[str, Any] = {"view": show_address} if view else {}
-            record = _solved_into(directory, folder, problem, options | told, elsewhere)
+            record = _solved_into(directory, folder, problem, options | told, cross_check)
     except KeyboardInterrupt:
         if claimed:
             raise
@@ -93,7 +93,7 @@ def run(
     raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 
-def _asked(script: Path, elsewhere: bool) -> tuple[Any, dict[str, Any]]:
+def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
     """The problem that a script defines, and its options of `solve`."""
     module = _loaded(script)
     problem, options = module.problem(), getattr(module, "solve_options", {})
@@ -103,8 +103,8 @@ def _asked(script: Path, elsewhere: bool) -> tuple[Any, dict[str, Any]]:
 
     if not isinstance(problem, (Problem, PhasedProblem)):
         raise InputError("problem()", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
-    if elsewhere and not (isinstance(problem, Problem) and problem.has_model):
-        raise InputError("--elsewhere", got="a problem without a model, or in phases", expected="a model's problem")
+    if cross_check and not (isinstance(problem, Problem) and problem.has_model):
+        raise InputError("--cross-check", got="a problem without a model, or in phases", expected="a model's problem")
     if not isinstance(options, dict):
         raise InputError("solve_options", got=type(options).__name__, expected="a dictionary")
     known = [name for name in inspect.signature(solve).parameters if name not in OURS]
@@ -125,9 +125,9 @@ def _wait_at(place: str) -> None:
         typer.echo("ended")
 
 
-def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str, Any], elsewhere: bool) -> Any:
+def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str, Any], checked: bool) -> Any:
     """Solve, measure and write `folder`, which is to be `directory`; what is interrupted takes no other run's place."""
-    from drake_diff.artifact.other_plants import elsewhere as follow_elsewhere
+    from drake_diff.artifact.cross_check import cross_check
     from drake_diff.artifact.save import begin, begin_failure, begin_interrupted, keep_plan, plan_kept, write_run
     from drake_diff.optimize.solve import solve
     from drake_diff.record.directory import is_taken
@@ -145,9 +145,9 @@ def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str,
     try:
         with progress_line("solving") as report:
             solution: Any = solve(problem, progress=report, on_start=on_start, on_plan=on_plan, **options)
-        if elsewhere:
-            with progress_line("following it elsewhere"):
-                solution = follow_elsewhere(solution)
+        if checked:
+            with progress_line("replaying it in other plants"):
+                solution = cross_check(solution)
         with plan_kept(solution, directory.name, folder):
             record = write_run(solution, folder)
     except KeyboardInterrupt:
@@ -205,10 +205,6 @@ def _show_record(record: Any) -> None:
         told = plain("holds") if replay.holds else plain(f"does not hold: {replay.failures[0]}", "red")
         goal = "-" if replay.goal_error is None else f"{replay.goal_error:.3g}"
         show(f"replayed {replay.variant}, {replay.control}: goal error {goal},", told)
-    for row in record.elsewhere.rows if record.elsewhere is not None else ():
-        why = "" if row.holds else f": {'; '.join((*row.unlike, *row.failures))}"
-        verdict = "holds" if row.holds else "does not hold" if row.measured else "not measured"
-        show(f"followed {row.where}, {row.control}:", plain(verdict + why, "red" if row.measured and why else ""))
     for p in record.parameters:
         moved = f", from {p.start:.6g}" if p.optimized else ""
         show(f"{p.name} = {p.value:.9g} {p.unit}{moved}, derivative from {p.derivative_source}")

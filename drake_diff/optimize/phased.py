@@ -22,12 +22,12 @@ from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.optimize.certified import certify_equations
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
-from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, status_of, unmeasured
+from drake_diff.optimize.measure import INTEGRATION_TOLERANCE
 from drake_diff.optimize.problem.held import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report, heard
-from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Search, Solution, Status
+from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
     FOUND,
@@ -38,6 +38,7 @@ from drake_diff.optimize.transcription.collocation import (
     finer_mesh,
 )
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, default_scheme
+from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, status_of, unmeasured
 
 OTHER_GUESSES = 8  # where no motion is found from the first
 FINER_ROUNDS = 6  # of meshes whose plan does not hold

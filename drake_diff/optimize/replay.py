@@ -5,16 +5,16 @@ of the plant holds if the inputs, open loop or with TVLQR feedback about the pla
 an unstable motion diverges open loop however right it is, and feedback through contact can do harm. A discrete plan has
 to hold at h, h/2 and h/8; a collocated one, whose interval need not be a step that the simulator can take, at two
 successive ones of h, h/2, ... h/64. Under feedback less is allowed, since the end then depends on its weights too.
-The other approximation of contact is followed by the gains of the plan's own steps, those that a robot would be driven
-by: where a foot has just landed lagged contact has derivatives of fifty times the plan's, and its own gains throw the
-foot up. A step that is right for one law may be too long for another, whose foot then goes through the ground. So a
-plan that does not hold in the other law at h is tried in it at h/8, and that decides, whatever it says.
+The other approximation of contact is followed by the gains of the plan's own steps: where a foot has just landed lagged
+contact has derivatives of fifty times the plan's, and its own gains throw the foot up. A step that is right for one law
+may be too long for another, whose foot then goes through the ground. So a plan that does not hold in the other law at h
+is tried in it at h/8, and that decides.
 A plan in continuous time, whose law of contact is one, has to hold in another integration of that law: its equations
 are Drake's terms and the contact written out, and share nothing with those that the plan was made by.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -32,7 +32,9 @@ from drake_diff.motion.intervals import intervals_of
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.replayed import replayed
 from drake_diff.motion.rollout import CONTINUOUS, Policy, Rollout, rollout
-from drake_diff.optimize.problem.goals import GoalConstraint, in_words
+from drake_diff.optimize.checks import Check, check
+from drake_diff.optimize.problem.goals import GoalConstraint
+from drake_diff.optimize.problem.names import units_of
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, along_steps, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.problem.terminal import TerminalConstraint
@@ -51,12 +53,14 @@ OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tams
 FINE = 8  # parts of a step: what is left of an error of O(h) from there on is a seventh of what is seen up to there
 # Intervals are cut into at most that many steps: a hand that is to be within 5 mm at 1 m/s needs those of 5 ms.
 FINER, FINEST = 16, 64
-APART = "by another integration in continuous time"
 MOST_STEPS = 4000  # of a replay in more than FINER parts of an interval
+ANOTHER_INTEGRATION = "by another integration in continuous time"
+OPEN_LOOP, FEEDBACK = "open loop", "TVLQR"
+BROKEN = (SimulationError, ModelError, GradientError, ValueError)
 
 
 class Motion(Protocol):
-    """What is judged of a motion: times (n+1,) [s], xs (n+1, nx), us (n, nu) and penetration (n+1,) [m]."""
+    """What is measured of a motion: times (n+1,) [s], xs (n+1, nx), us (n, nu) and penetration (n+1,) [m]."""
 
     @property
     def times(self) -> Array: ...
@@ -70,23 +74,31 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Replay(ShowsItsRepr):
-    """One rollout of a plan: in which variant of the plant, how controlled, and what does not hold in it."""
+    """A plan followed in one variant of the plant under one control: its motion and what is checked of it.
+
+    `motion` is None, and the measures infinite, where it could not be taken.
+    """
 
     variant: str
     control: str  # "open loop" or "TVLQR"
-    time_step: float  # [s]
+    time_step: float  # [s]; 0 in continuous time
     approximation: str
-    motion: Rollout | None  # None if it could not be taken, `failures` saying why
-    goal_error: float  # the largest distance from the goal, free entries apart, in the state's units
-    bound_violation: float  # the largest excess of a state over a bound, in the state's units
-    energy_error: float  # [J] drift of the energy that no force accounts for
-    penetration: float  # [m]
-    failures: tuple[str, ...]
+    motion: Any
+    checks: tuple[Check, ...]
+    goal_error: float = np.inf  # the largest distance from the goal, free entries apart, in the state's units
+    bound_violation: float = np.inf  # the largest excess of a state over a bound, in the state's units
+    energy_error: float = np.inf  # [J] drift of the energy that no force accounts for
+    penetration: float = np.inf  # [m]
 
     @property
     def holds(self) -> bool:
-        """Whether nothing failed."""
-        return not self.failures
+        """Whether every check passes."""
+        return all(c.passes for c in self.checks)
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """A clause for each check that does not pass."""
+        return tuple(str(c) for c in self.checks if not c.passes)
 
     def __str__(self) -> str:
         return f"{self.variant}, {self.control}: {'; '.join(self.failures) or 'holds'}"
@@ -147,9 +159,9 @@ class Plan:
         if not self.continuous:
             return None
         known = self.halved_gains
-        at = np.minimum(np.arange(parts * self.problem.num_steps) * 2 / parts, len(known) - 1)
-        first = np.minimum(at.astype(int), len(known) - 2)
-        ahead = (at - first)[:, None, None]
+        places = np.minimum(np.arange(parts * self.problem.num_steps) * 2 / parts, len(known) - 1)
+        first = np.minimum(places.astype(int), len(known) - 2)
+        ahead = (places - first)[:, None, None]
         return np.asarray((1 - ahead) * known[first] + ahead * known[first + 1])
 
     def model_at(self, parts: int) -> Model:
@@ -162,8 +174,8 @@ def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
     """`Plan.sample` of states xs (N+1, nx) at the ends of steps over which us (N, nu) is held."""
 
     def sample(parts: int) -> tuple[Array, Array]:
-        at = np.arange(parts * len(us) + 1) / parts
-        between = np.array([np.interp(at, np.arange(len(xs)), column) for column in xs.T]).T
+        places = np.arange(parts * len(us) + 1) / parts
+        between = np.array([np.interp(places, np.arange(len(xs)), column) for column in xs.T]).T
         return between, np.repeat(us, parts, axis=0)
 
     return sample
@@ -173,32 +185,60 @@ def replays(plan: Plan) -> tuple[Replay, ...]:
     """`plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR."""
     model = plan.problem.model
     if plan.problem.motion == CONTINUOUS:
-        return tuple(_replay_in(plan, APART, lambda: model, 1, plan.open_loop))
-    found = list(_replay_step(plan, 1))
+        return tuple(_replay_in(plan, ANOTHER_INTEGRATION, lambda: model, 1, plan.open_loop))
+    rows = list(_replay_step(plan, 1))
     if model.can_rebuild:  # a user's diagram is one plant: there are no variants of it to try
         parts = 2
-        found += _replay_step(plan, parts)
+        rows += _replay_step(plan, parts)
         if not plan.continuous:
-            found += _replay_step(plan, FINE)
+            rows += _replay_step(plan, FINE)
         most = finest_parts(plan)
-        while plan.continuous and parts < most and not (_holds(found[-2:]) and _holds(found[-4:-2])):
+        while plan.continuous and parts < most and not (_any_holds(rows[-2:]) and _any_holds(rows[-4:-2])):
             parts *= 2
-            found += _replay_step(plan, parts)
+            rows += _replay_step(plan, parts)
         contact = model.contract.contact
         if contact.collision_pairs and not plan.continuous:
             other = OTHER_APPROXIMATION[contact.approximation]
             name = f"with {other} contact"
             tried = _replay_in(plan, name, lambda: model.with_contact(other), 1)
-            found += tried
-            if not _holds(tried):
+            rows += tried
+            if not _any_holds(tried):
                 name = f"{name} in steps of {plan.time_step / FINE:.4g} s"
-                found += _replay_in(plan, name, lambda: plan.model_at(FINE).with_contact(other), FINE)
-    return tuple(found)
+                rows += _replay_in(plan, name, lambda: plan.model_at(FINE).with_contact(other), FINE)
+    return tuple(rows)
 
 
 def finest_parts(plan: Plan) -> int:
     """In how many steps an interval of a collocated plan is cut at most."""
     return min(FINEST, max(FINER, MOST_STEPS // plan.problem.num_steps))
+
+
+def deciding(plan: Plan, rows: Sequence[Replay]) -> list[str]:
+    """The variants in which the plan has to hold."""
+    variants = list(dict.fromkeys(r.variant for r in rows))
+    if plan.continuous:
+        return variants[-2:] if len(variants) > 1 else []  # the two finest; one alone says nothing
+    return [v for v in variants if not any(other.startswith(f"{v} in steps of ") for other in variants)]
+
+
+def broken_variants(plan: Plan, rows: Sequence[Replay]) -> dict[str, list[Replay]]:
+    """The replays of each variant in which the plan has to hold and does not, whatever the control."""
+    tried = {variant: [r for r in rows if r.variant == variant] for variant in deciding(plan, rows)}
+    return {variant: found for variant, found in tried.items() if not _any_holds(found)}
+
+
+def judged_replay(plan: Plan, rows: Sequence[Replay]) -> Replay | None:
+    """The motion that a verdict rests on: open loop where that holds, else under TVLQR; None where neither does."""
+    decides = deciding(plan, rows)
+    for control in dict.fromkeys(r.control for r in rows):
+        tried = [r for r in rows if r.control == control]
+        if all(r.holds for r in tried if r.variant in decides):
+            return next((r for r in tried if r.holds), None)
+    return None
+
+
+def _any_holds(rows: Sequence[Replay]) -> bool:
+    return any(r.holds for r in rows)
 
 
 def _replay_step(plan: Plan, parts: int) -> list[Replay]:
@@ -207,139 +247,75 @@ def _replay_step(plan: Plan, parts: int) -> list[Replay]:
     return _replay_in(plan, name, lambda: plan.model_at(parts), parts, known)
 
 
-def _holds(found: Sequence[Replay]) -> bool:
-    return any(r.holds for r in found)
-
-
-def deciding(plan: Plan, found: Sequence[Replay]) -> list[str]:
-    """The variants in which the plan has to hold."""
-    variants = list(dict.fromkeys(r.variant for r in found))
-    if plan.continuous:
-        return variants[-2:] if len(variants) > 1 else []  # the two finest; one alone says nothing
-    return [v for v in variants if not any(other.startswith(f"{v} in steps of ") for other in variants)]
-
-
-def broken_variants(plan: Plan, found: Sequence[Replay]) -> Iterator[str]:
-    """A clause for each variant of the plant in which the plan does not hold, whatever the control."""
-    for variant in deciding(plan, found):
-        tried = [r for r in found if r.variant == variant]
-        if not _holds(tried):
-            yield f"replayed {variant} it does not hold: " + "; ".join(f"{r.control}, {r.failures[0]}" for r in tried)
-
-
-def told_of_controls(plan: Plan, found: Sequence[Replay]) -> str:
-    """Under which control a plan that holds does so, and under which it does not; empty where nothing was replayed."""
-    if not found:
-        return ""
-    decides = deciding(plan, found)
-    if not decides:
-        return "on the plant nothing was replayed in finer steps, which a diagram does not allow"
-    controls = list(dict.fromkeys(r.control for r in found))
-    good = [c for c in controls if all(r.holds for r in found if r.control == c and r.variant in decides)]
-    if not good:
-        held = (r for r in found if r.holds and r.variant in decides)
-        where = ", ".join(f"{r.variant} {_words(r.control)}" for r in held)
-        longer = next((r for r in found if not (r.holds or r.variant in decides)), None)
-        return f"on the plant, {where}; nowhere under both" + (_in_longer_steps(longer) if longer else "")
-    told = "on the plant " + " and ".join(map(_words, good)) + (f" {decides[0]} or less" if plan.continuous else "")
-    for control in controls:
-        failed = [r for r in found if r.control == control and not r.holds]
-        if control not in good:
-            told += f", not {_words(control)}: {failed[0].variant}, {failed[0].failures[0]}"
-        elif failed:  # in steps that are too coarse for a collocated plan, or for the other law of contact
-            told += _in_longer_steps(failed[0])
-    return told
-
-
-def _in_longer_steps(r: Replay) -> str:
-    return f"; {_words(r.control)} {r.variant}, where steps are longer, not: {r.failures[0]}"
-
-
-def told_of_goals(plan: Plan, found: Sequence[Replay]) -> str:
-    """How far from each goal the plan is where it has to hold, at worst, and what is allowed; empty without goals."""
-    told = []
-    for c in plan.problem.kept_goals:
-        misses = []
-        for variant in deciding(plan, found):
-            kept = [r.motion for r in found if r.variant == variant and r.holds and r.motion is not None]
-            misses += [min(_miss(c, motion, plan) for motion in kept)] * bool(kept)
-        if misses:
-            told.append(f"{c.told(max(misses))}, of {in_words(c.tolerance, c.unit)} allowed")
-    return "; ".join(told)
-
-
-def _miss(c: GoalConstraint, motion: Motion, plan: Plan) -> float:
-    """The largest distance of a replay from a goal at the knots of the plan."""
-    parts = (len(motion.xs) - 1) // plan.problem.num_steps
-    knots = plan.problem.knots_of(c, input_at_end=False)
-    if c.dwells:
-        return max(c.miss(x) for x in motion.xs[parts * knots[0] : parts * knots[-1] + 1])
-    return max(c.miss(motion.xs[parts * k]) for k in knots)
-
-
-def _missed_goals(plan: Plan, motion: Motion, wider: float) -> Iterator[str]:
-    """The goals that a replay is further from than their tolerance."""
-    for c in plan.problem.kept_goals:
-        if isinstance(c, ClearanceConstraint):  # see `came_too_near`
-            continue
-        miss, tolerance = _miss(c, motion, plan), wider * c.tolerance
-        if not miss <= tolerance:
-            yield f"{c.told(miss)}, tolerance {in_words(tolerance, c.unit)}"
-
-
-def _left_alone(plan: Plan, model: Model, motion: Motion) -> Iterator[str]:
-    """The terminal sets whose regulator, followed from the end of a replay, does not bring the plant to rest."""
-    for c in plan.problem.kept_goals:
-        if isinstance(c, TerminalConstraint) and not c.region.converges(model, motion.xs[-1]):
-            yield f"from its end the regulator of its {c.label} does not converge"
-
-
-def told_of_tolerance(plan: Plan, found: Sequence[Replay]) -> str:
-    """How far from its goal a plan ends where it has to hold, and what is allowed; empty where nothing has to."""
-    decides = deciding(plan, found)
-    if not decides or np.all(np.isnan(plan.problem.goal)):
-        return f"bounds are kept to {STATE_TOLERANCE:.0%} of each state's range in the plan" if decides else ""
-    worst: tuple[float, str] = (-1.0, "")
-    for variant in decides:
-        ends = [r.motion.xs[-1] for r in found if r.variant == variant and r.holds and r.motion is not None]
-        misses = [np.abs(plan.problem.goal_error(x)) / plan.scale for x in ends]
-        if misses:
-            off = min(misses, key=lambda miss: float(np.max(miss)))
-            i = int(np.argmax(off))
-            told = (
-                f"{plan.problem.state_names[i]} ends {off[i] * plan.scale[i]:.2g} from its goal {variant}, {off[i]:.1%}"
-            )
-            worst = max(worst, (float(off[i]), told))
-    only = "" if len(decides) > 1 or plan.problem.motion == CONTINUOUS else ", and a diagram allows no other step"
-    allowed = f"{STATE_TOLERANCE:.0%} of each state's range in the plan ({FEEDBACK_TOLERANCE:.0%} under TVLQR)"
-    return f"at worst {worst[1]} of its range, of {allowed} allowed{only}"
-
-
-def judged_replay(plan: Plan, found: Sequence[Replay]) -> Replay | None:
-    """The motion that a verdict rests on: open loop where that holds, else under TVLQR; None where neither does."""
-    decides = deciding(plan, found)
-    for control in dict.fromkeys(r.control for r in found):
-        tried = [r for r in found if r.control == control]
-        if all(r.holds for r in tried if r.variant in decides):
-            return next((r for r in tried if r.holds), None)
-    return None
-
-
-def _words(control: str) -> str:
-    return control if control == "open loop" else f"under {control}"
-
-
 def _replay_in(
     plan: Plan, variant: str, make: Callable[[], Model], parts: int, known: Rollout | None = None
 ) -> list[Replay]:
     """Both replays in one variant of the plant; open loop, whose motion may be `known`, alone without inputs."""
-    controls = {"open loop": known, "TVLQR": None} if plan.problem.model.nu else {"open loop": known}
+    controls = {OPEN_LOOP: known, FEEDBACK: None} if plan.problem.model.nu else {OPEN_LOOP: known}
     try:
         model = make()
         with applied(select(model, plan.vector.to_dict())) as set_model:
             return [_replay(plan, variant, control, set_model, parts, motion) for control, motion in controls.items()]
     except (ModelError, InputError) as error:
-        return [_missing(plan, variant, control, str(error)) for control in controls]
+        return [missing_replay(plan, variant, control, str(error)) for control in controls]
+
+
+def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:
+    law_is_another = model.contract.contact.approximation != plan.problem.model.contract.contact.approximation
+    try:
+        xs, us = plan.sample(parts)
+        if known is not None:
+            motion = known
+        elif control == OPEN_LOOP:
+            motion = _rolled(plan.problem, model, xs[0], us, len(us))
+        else:
+            gains = np.repeat(plan.own_gains, parts, axis=0) if law_is_another else plan.gains(parts)
+            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us, gains), len(us))
+    except BROKEN as error:
+        return missing_replay(plan, variant, control, str(error))
+    # Feedback corrects what the laws of contact differ by: there nothing tighter can be asked of it.
+    part = STATE_TOLERANCE if control == OPEN_LOOP or law_is_another else FEEDBACK_TOLERANCE
+    checks = (*motion_checks(plan, model, motion, parts, part), energy_check(motion))
+    return measured_replay(plan, variant, control, model, motion, checks)
+
+
+def measured_replay(
+    plan: Plan, variant: str, control: str, model: Model, motion: Any, checks: Iterable[Check], time_step: float = -1.0
+) -> Replay:
+    """A replay that was taken; `time_step` [s] is the model's unless it is given."""
+    bounds, feedback = plan.problem.bounds, None if control == OPEN_LOOP else control
+    beyond = np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper)[1:]
+    return Replay(
+        variant=variant,
+        control=control,
+        time_step=model.time_step if time_step < 0 else time_step,
+        approximation=model.contract.contact.approximation,
+        motion=motion,
+        checks=tuple(replace(c, plant=variant, feedback=feedback) for c in checks),
+        goal_error=_largest(np.abs(plan.problem.goal_error(motion.xs[-1]))),
+        bound_violation=_largest(np.maximum(beyond, 0.0)),
+        energy_error=getattr(motion, "energy_drift", np.nan),
+        penetration=_largest(motion.penetration),
+    )
+
+
+def missing_replay(plan: Plan, variant: str, control: str, why: str) -> Replay:
+    """A replay that could not be taken: its measures are infinite, never zero."""
+    feedback = None if control == OPEN_LOOP else control
+    row = replace(check("motion", why, np.inf, 0.0, verdict="undecided"), plant=variant, feedback=feedback)
+    return Replay(variant, control, plan.time_step, plan.problem.model.contract.contact.approximation, None, (row,))
+
+
+def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, count: int) -> Rollout:
+    """The plant's motion by its own steps, or in continuous time by another integration than a plan is made by."""
+    if problem.motion == CONTINUOUS:
+        return replayed(model, x0, inputs, count)
+    if callable(inputs):
+        return rollout(model, x0, policy=inputs, num_steps=count)
+    return rollout(model, x0, inputs)
+
+
+# Feedback.
 
 
 def regulator(plan: Plan, model: Model, xs: Array, us: Array) -> TVLQR:
@@ -358,27 +334,26 @@ def track(plan: Plan, model: Model, xs: Array, us: Array, gains: Array | None = 
     The latter make it remember its last input: it is for one rollout. The `gains` (N, nu, nt) may be known.
     """
     bounds = plan.problem.bounds
-    policy = regulator(plan, model, xs, us) if gains is None else about(model, xs, us, gains)
+    policy = regulator(plan, model, xs, us) if gains is None else _about(model, xs, us, gains)
     slew, last = np.full(model.nu, np.inf), list[Array]()
     period = model.time_step if plan.continuous else plan.time_step  # a held input jumps at the plan's own knots
     for limit in plan.problem.rate_limits:
         if limit.of_inputs:
             entries, limits = limit.entries(plan.problem.system)
             slew[entries] = np.minimum(slew[entries], limits * period)
-
     unlimited = bool(np.all(np.isinf(slew)))
 
-    def kept(x: Any, t: float) -> Any:
+    def law(x: Any, t: float) -> Any:
         wanted = np.minimum(np.maximum(policy(x, t), bounds.u_lower), bounds.u_upper)
         if unlimited:
             return wanted
         last[:] = [wanted if not last else np.clip(wanted, last[0] - slew, last[0] + slew)]
         return last[0]
 
-    return kept
+    return law
 
 
-def about(model: Model, xs: Array, us: Array, gains: Array) -> Policy:
+def _about(model: Model, xs: Array, us: Array, gains: Array) -> Policy:
     """The law of `TVLQR` about xs (N+1, nx) and us (N, nu) by `gains` (N, nu, nt)."""
     space, h = tangent_space(model), model.time_step
 
@@ -394,126 +369,99 @@ def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
 
     Where jerks are limited, the end has no weight of its own: the last steps would pull at it.
     """
-    model = plan.problem.model
-    space = tangent_space(model)
-    scale = space.scale(plan.scale)
+    space = tangent_space(plan.problem.model)
     effort = np.maximum(np.max(np.abs(us), axis=0), SMALLEST_RANGE)
-    Q = np.diag(1 / scale**2)
+    Q = np.diag(1 / space.scale(plan.scale) ** 2)
     smooth = any(not limit.of_inputs for limit in plan.problem.rate_limits)
     return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), (1.0 if smooth else FINAL_WEIGHT) * Q
 
 
-def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:
-    approximation = model.contract.contact.approximation
-    law_is_another = approximation != plan.problem.model.contract.contact.approximation
-    try:
-        xs, us = plan.sample(parts)
-        if known is not None:
-            motion = known
-        elif control == "open loop":
-            motion = _rolled(plan.problem, model, xs[0], us, len(us))
-        else:
-            gains = np.repeat(plan.own_gains, parts, axis=0) if law_is_another else plan.gains(parts)
-            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us, gains), len(us))
-    except (SimulationError, ModelError, GradientError, ValueError) as error:
-        return _missing(plan, variant, control, str(error))
-    bounds = plan.problem.bounds
-    beyond = np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper)[1:]
-    return Replay(
-        variant=variant,
-        control=control,
-        time_step=model.time_step,
-        approximation=approximation,
-        motion=motion,
-        goal_error=float(np.max(np.abs(plan.problem.goal_error(motion.xs[-1])))),
-        bound_violation=float(np.max(beyond, initial=0.0)),
-        energy_error=motion.energy_drift,
-        penetration=float(np.max(motion.penetration)),
-        failures=(
-            *failures_of(plan, model, motion, parts, goal_tolerance(control, law_is_another)),
-            *broken_balance(motion),
-        ),
-    )
+# What is checked of a motion.
 
 
-def failures_of(plan: Plan, model: Model, motion: Motion, parts: int, part: float, wider: float = 1.0) -> Iterator[str]:
-    """What `motion`, of which `parts` steps make one of the plan's, does not keep of what was asked; energy apart.
+def motion_checks(
+    plan: Plan, model: Model, motion: Motion, parts: int, part: float, wider: float = 1.0
+) -> Iterator[Check]:
+    """All that the problem asks of `motion`, of which `parts` steps make one of the plan's; energy apart.
 
     It may end `part` of each state's range from x_goal; every other tolerance is `wider` than a replay's.
     """
-    yield from missed_goal(plan, plan.problem.goal_error(motion.xs[-1]), part)
-    yield from left_bounds(plan, motion, wider)
-    yield from _missed_goals(plan, motion, wider)
-    yield from _left_alone(plan, model, motion)
-    yield from _broken_constraints(plan, motion.xs[::parts], motion.us[::parts], wider)
-    yield from came_too_near(plan, motion)
-    yield from too_deep(model, motion)
+    problem = plan.problem
+    if not np.all(np.isnan(problem.goal)):
+        yield goal_check(plan, problem.goal_error(motion.xs[-1]), part)
+    yield bounds_check(plan, motion, wider)
+    for c in problem.kept_goals:
+        if not isinstance(c, ClearanceConstraint):
+            yield check("goal", c.label, _miss(c, motion, plan), wider * c.tolerance, c.unit)
+        if isinstance(c, TerminalConstraint):
+            off = 0.0 if c.region.converges(model, motion.xs[-1]) else np.inf
+            yield check("regulator", c.label, off, 0.0)
+    yield from _constraint_checks(plan, motion.xs[::parts], motion.us[::parts], wider)
+    yield from clearance_checks(plan, motion)
+    if model.contract.contact.collision_pairs:
+        yield penetration_check(model, motion)
 
 
-def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, count: int) -> Rollout:
-    """The plant's motion by its own steps, or in continuous time by another integration than a plan is made by."""
-    if problem.motion == CONTINUOUS:
-        return replayed(model, x0, inputs, count)
-    if callable(inputs):
-        return rollout(model, x0, policy=inputs, num_steps=count)
-    return rollout(model, x0, inputs)
+def goal_check(plan: Plan, distance: Array, part: float = STATE_TOLERANCE) -> Check:
+    """The `distance` (nx,) from the goal of the state that is furthest from it, of that part of its range."""
+    i = int(np.argmax(np.nan_to_num(np.abs(distance) / plan.scale, nan=np.inf)))
+    name, unit = plan.problem.state_names[i], units_of(plan.problem)[i]
+    return check("goal", name, abs(distance[i]), part * plan.scale[i], unit)
 
 
-def _missing(plan: Plan, variant: str, control: str, why: str) -> Replay:
-    """A replay that could not be taken: its measures are infinite, never zero."""
-    inf, approximation = float("inf"), plan.problem.model.contract.contact.approximation
-    return Replay(variant, control, plan.time_step, approximation, None, inf, inf, inf, inf, failures=(why,))
-
-
-def goal_tolerance(control: str, law_is_another: bool) -> float:
-    """How far from its goal a replay may end, as a part of each state's range in the plan.
-
-    Under another law of contact nothing tighter can be asked of feedback either: it corrects what the laws differ by.
-    """
-    return STATE_TOLERANCE if control == "open loop" or law_is_another else FEEDBACK_TOLERANCE
-
-
-def missed_goal(plan: Plan, distance: Array, part: float = STATE_TOLERANCE) -> Iterator[str]:
-    """Where the `distance` (nx,) from the goal is above that part of a state's range."""
-    missed, tolerance = np.abs(distance), part * plan.scale
-    if not np.all(missed <= tolerance):
-        worst = int(np.argmax(np.nan_to_num(missed / plan.scale, nan=np.inf)))
-        name = plan.problem.model.state_names[worst]
-        yield f"{name} ends {missed[worst]:.3g} from its goal, tolerance {tolerance[worst]:.3g}"
-
-
-def left_bounds(plan: Plan, motion: Motion, wider: float = 1.0) -> Iterator[str]:
-    """Where a state of the motion, but the first, is beyond a bound by more than the tolerance."""
+def bounds_check(plan: Plan, motion: Motion, wider: float = 1.0) -> Check:
+    """The state of the motion, but the first, that is furthest beyond a bound for its range."""
     bounds, scale, tolerance = plan.problem.bounds, plan.scale, wider * STATE_TOLERANCE * plan.scale
     excess = np.maximum(np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper), 0.0)[1:]
-    if np.any(excess > tolerance):
-        k, i = divmod(int(np.argmax(excess / scale)), excess.shape[1])
-        name, when = plan.problem.model.state_names[i], motion.times[k + 1]
-        yield f"{name} is {excess[k, i]:.3g} beyond its bound at {when:.3g} s, tolerance {tolerance[i]:.3g}"
+    k, i = divmod(int(np.argmax(np.nan_to_num(excess / scale, nan=np.inf))), excess.shape[1])
+    where = f"{plan.problem.state_names[i]} at {motion.times[k + 1]:.3g} s"
+    return check("bound", where, excess[k, i], tolerance[i], units_of(plan.problem)[i])
 
 
-def came_too_near(plan: Plan, motion: Motion) -> Iterator[str]:
-    """Where the motion enters an obstacle, at its states or between them: it may use the margin up."""
+def clearance_checks(plan: Plan, motion: Motion) -> Iterator[Check]:
+    """How near the motion comes to obstacles, at its states or between them: it may use the margin up."""
     for c in clearances(plan.problem.kept):
-        yield from c.too_near(*along_steps(motion.times, motion.xs), c.tolerance)
+        yield c.nearest(*along_steps(motion.times, motion.xs), c.tolerance)
 
 
-def too_deep(model: Model, motion: Motion) -> Iterator[str]:
-    """Where geometries overlap by more than a quarter of the thinner of them."""
-    least, _ = thinnest_geometry(model)
-    worst = 0.0, ""
+def penetration_check(model: Model, motion: Motion) -> Check:
+    """The deepest overlap for a quarter of the thinner of the geometries that overlap."""
+    least, name = thinnest_geometry(model)
+    deep = list[Check]()
     for k in np.flatnonzero(motion.penetration > PENETRATION_PART * least):
         set_state(model.double, motion.xs[k])
         depth, thickness, geometry = deepest_overlap(model)
-        limit = PENETRATION_PART * thickness
-        if depth / limit > max(worst[0], 1.0):
-            told = f"geometries overlap by {depth:.3g} m at {motion.times[k]:.3g} s, limit {limit:.3g} m"
-            worst = depth / limit, f"{told} (a quarter of {geometry})"
-    if worst[1]:
-        yield worst[1]
+        where = f"{geometry} at {motion.times[k]:.3g} s"
+        deep.append(check("penetration", where, depth, PENETRATION_PART * thickness, "m"))
+    if deep:
+        return max(deep, key=lambda c: c.ratio)
+    worst = int(np.argmax(motion.penetration))
+    where = f"{name} at {motion.times[worst]:.3g} s"
+    return check("penetration", where, motion.penetration[worst], PENETRATION_PART * least, "m")
 
 
-def _broken_constraints(plan: Plan, xs: Array, us: Array, wider: float) -> Iterator[str]:
+def energy_check(motion: Rollout) -> Check:
+    """Energy out of nothing, or gone; what constraints (couplers, balls, welds) take is not told."""
+    gained, tolerance = motion.energy_drift, energy_tolerance(motion)
+    told = gained > 0 or np.all(np.isfinite(motion.constraint_violation))
+    return check("energy", "gained" if gained > 0 else "lost", abs(gained) if told else 0.0, tolerance, "J")
+
+
+def energy_tolerance(motion: Rollout) -> float:
+    """[J] how much lasting energy a motion may gain or lose unexplained."""
+    return max(ENERGY_TOLERANCE * motion.energy_exchanged, SMALLEST_ENERGY)
+
+
+def _miss(c: GoalConstraint, motion: Motion, plan: Plan) -> float:
+    """The largest distance of a replay from a goal at the knots of the plan."""
+    parts = (len(motion.xs) - 1) // plan.problem.num_steps
+    knots = plan.problem.knots_of(c, input_at_end=False)
+    if c.dwells:
+        return max(c.miss(x) for x in motion.xs[parts * knots[0] : parts * knots[-1] + 1])
+    return max(c.miss(motion.xs[parts * k]) for k in knots)
+
+
+def _constraint_checks(plan: Plan, xs: Array, us: Array, wider: float) -> Iterator[Check]:
     """Of constraints, couplings and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
     problem, tolerances = plan.problem, dict[str, float]()
     planned_xs, planned_us = plan.sample(1)
@@ -529,18 +477,10 @@ def _broken_constraints(plan: Plan, xs: Array, us: Array, wider: float) -> Itera
     goals = {c.label for c in problem.kept_goals}.difference(tolerances)  # they say themselves how near is near enough
     for name, (excess, knot) in problem.constraint_excess(xs, us, coupled=couplings).items():
         tolerance = wider * tolerances.get(name, STATE_TOLERANCE * float(np.max(plan.scale)))
-        if not (name in goals or excess <= tolerance):
-            yield f"{name} is broken by {excess:.3g} at knot {knot}, tolerance {tolerance:.3g}"
+        if name not in goals:
+            yield check("constraint", f"{name} at knot {knot}", excess, tolerance)
 
 
-def broken_balance(motion: Rollout) -> Iterator[str]:
-    """Energy out of nothing, or gone; what constraints (couplers, balls, welds) take is not told."""
-    gained, tolerance = motion.energy_drift, energy_tolerance(motion)
-    if gained > tolerance or (gained < -tolerance and np.all(np.isfinite(motion.constraint_violation))):
-        way = "come from nowhere" if gained > 0 else "go nowhere"
-        yield f"{abs(gained):.3g} J of energy {way}, tolerance {tolerance:.3g} J"
-
-
-def energy_tolerance(motion: Rollout) -> float:
-    """[J] how much lasting energy a motion may gain or lose unexplained."""
-    return max(ENERGY_TOLERANCE * motion.energy_exchanged, SMALLEST_ENERGY)
+def _largest(values: Array) -> float:
+    """The largest value, at least 0; inf where one is no number."""
+    return float("inf") if np.any(np.isnan(values)) else float(np.max(values, initial=0.0))

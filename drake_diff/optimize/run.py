@@ -24,14 +24,12 @@ from drake_diff.optimize.continuation import Stages, solve_continuation
 from drake_diff.optimize.guess import Guess
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through_jumps
-from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused, status_of, unmeasured
+from drake_diff.optimize.optimality import HOLDS, doubt_of_the_slope, out_of_reach, why_blind
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report, heard
-from drake_diff.optimize.reach import out_of_reach, why_blind
 from drake_diff.optimize.shooting import ShootingVariables, roll_segments, solve_shooting
-from drake_diff.optimize.slope import HOLDS, doubt_of_the_slope
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
@@ -42,6 +40,7 @@ from drake_diff.optimize.transcription.collocation import (
     kept,
 )
 from drake_diff.optimize.transcription.drake import solve_collocation
+from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, refused, status_of, unmeasured
 
 CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
 FINER_ROUNDS = 6  # of a mesh whose plan does not hold
@@ -431,9 +430,9 @@ class Run:
         if solution.status not in PLANS or not problem.has_model:
             return solution
         if problem.motion != STEPS and solution.success:
-            doubt = doubt_of_the_slope(solution)
+            doubt = doubt_of_the_slope(problem, solution.step_vector, solution.xs[0], solution.us)
             if doubt is not None:
-                return ended(solution, *doubt)
+                return ended(solution, Status(doubt[0]), doubt[1])
             solution = solution.told(message=f"{solution.message}; {HOLDS}")
         xs, us = solution.plan.sample(1)
         variables = ShootingVariables(problem, around=xs)

@@ -20,28 +20,18 @@ from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.motion.intervals import intervals_of
-from drake_diff.motion.rollout import STEPS, Rollout, roll_states
-from drake_diff.optimize.elsewhere import Elsewhere
+from drake_diff.motion.rollout import STEPS, Rollout
+from drake_diff.optimize.checks import Check, Checks
+from drake_diff.optimize.measure import following_checks, plan_checks
 from drake_diff.optimize.optimality import Optimality, final_state_norms, optimality
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
-from drake_diff.optimize.replay import Plan, Replay, held, judged_replay, replays
+from drake_diff.optimize.replay import OPEN_LOOP, Plan, Replay, held, judged_replay, replays
 from drake_diff.optimize.shooting import ShootingVariables
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
-# Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
-# its motion is not the model's.
-INTEGRATION_TOLERANCE = 1e-2
-TOLD = (
-    "status",
-    "message",
-    "iterations",
-    "solver_message",
-    "options",
-    "search",
-    "optima",
-    "elsewhere",
-)  # fields that no measure depends on
+# Fields that no measure depends on.
+TOLD = ("cross_checks", "iterations", "message", "optima", "options", "search", "solver_message", "status")
 
 
 class Status(enum.Enum):
@@ -119,7 +109,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         multipliers: of the bounds and rows of what collocation or iLQR solved, with which a search from here begins.
         optima: with `restarts`, the verified solutions that differ in cost or motion, the cheapest first.
         search: the arguments of `solve`, None of a solution that it did not make.
-        elsewhere: where else it holds, of a solution that `artifact.elsewhere` returned.
+        cross_checks: replays in other plants, of a solution that `artifact.cross_check` returned.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -151,7 +141,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
     search: Search | None = None
     multipliers: Multipliers | None = None
     optima: tuple["Solution", ...] = ()
-    elsewhere: Elsewhere | None = None
+    cross_checks: tuple[Replay, ...] = ()
 
     def __str__(self) -> str:
         measures = f"cost {self.cost:.6g}, defect {self.defect:.2g}, goal error {self.goal_error:.2g}"
@@ -176,8 +166,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         ]
         if "replays" in vars(self) and self.replays:  # they take time: a printed line starts none
             lines.append(f"replays: {sum(r.holds for r in self.replays)} of {len(self.replays)} hold")
-        if self.elsewhere is not None:
-            lines.append(f"elsewhere: {self.elsewhere}")
+        lines += [f"cross-checked {row}" for row in self.cross_checks]
         return "\n  ".join(lines)
 
     def told(self, **fields: Any) -> "Solution":
@@ -379,6 +368,35 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         return max((excess for excess, _ in self.constraint_excess.values()), default=0.0)
 
     @cached_property
+    def plan_checks(self) -> Checks:
+        """What is checked of the states and inputs themselves; replays apart."""
+        return Checks(plan_checks(self))
+
+    @cached_property
+    def following(self) -> list[Check]:
+        """Of a collocated plan: whether its dynamics follow it from its first state, open loop and else under TVLQR."""
+        return [] if self.transcribed is None else following_checks(self, self.transcribed)
+
+    @property
+    def checks(self) -> Checks:
+        """Everything that was checked, the worst first: of the plan, of each replay and of other plants.
+
+        Replays are taken when they are first asked for.
+
+        Example:
+            >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+            >>> effort = dd.QuadraticCost(R=[[1.0]])
+            >>> problem = dd.Problem(block, x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=1.0, running_cost=effort)
+            >>> solution = dd.solve(problem)
+            >>> sorted({c.what for c in solution.checks})
+            ['bound', 'constraint', 'cost', 'defect', 'derivative', 'following', 'goal', 'integration', 'start']
+            >>> [c.verdict for c in solution.checks if c.verdict != "pass"]
+            []
+        """
+        rows = [c for replay in (*self.replays, *self.cross_checks) for c in replay.checks]
+        return Checks([*self.plan_checks, *self.following, *rows])
+
+    @cached_property
     def goal_error(self) -> float:
         """The largest distance of the final state from the goal, free entries apart."""
         return _largest(np.abs(self.problem.goal_error(self.xs[-1])))
@@ -456,24 +474,19 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         """The replay that a success rests on: open loop where that holds, else under TVLQR; None where neither does."""
         return judged_replay(self.plan, self.replays) if self.problem.has_model else None
 
-    @cached_property
+    @property
     def half_step_error(self) -> float:
         """How far from xs[-1] the same held inputs lead at half the time step: what a step size decided.
 
-        inf where the model cannot be built again (it came from a diagram) or stepped, NaN of a motion in
-        continuous time, which has no steps.
+        inf where that replay cannot be taken, NaN of a motion in continuous time, which has no steps.
         """
         if self.problem.motion != STEPS:
             return float("nan")
-        if self.replay is None:
+        half = f"in steps of {self.time_step / 2:.4g} s"
+        motions = [r.motion for r in self.replays if (r.variant, r.control) == (half, OPEN_LOOP)]
+        if self.replay is None or not motions or motions[0] is None:
             return float("inf")
-        try:
-            finer = self.problem.model.at_time_step(self.time_step / 2)
-            with applied(select(finer, self.vector.to_dict())) as model:
-                end = roll_states(model, self.xs[0], np.repeat(self.replay.us, 2, axis=0))[-1]
-        except (ModelError, SimulationError):
-            return float("inf")
-        return _largest(np.abs(end - self.xs[-1]))
+        return _largest(np.abs(motions[0].xs[-1] - self.xs[-1]))
 
     @property
     def _num_intervals(self) -> int:

@@ -24,7 +24,6 @@ from drake_diff.optimize.continuation import check_schedule
 from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.guess import another_guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained
-from drake_diff.optimize.judge import overlaps
 from drake_diff.optimize.optima import distinct
 from drake_diff.optimize.phased import PhasedSolution, solve_phased
 from drake_diff.optimize.problem.phases import PhasedProblem
@@ -39,6 +38,7 @@ from drake_diff.optimize.transcription.collocation import (
     MeshRefinement,
 )
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
+from drake_diff.optimize.verification import overlaps
 
 COMPILED = 0.5  # [s] that are worth a word
 LARGEST_TOLERANCE = 1e3

@@ -60,7 +60,9 @@ class Space:
         """What is too near to an obstacle at posture q (nq,); "" where nothing is."""
         x = np.concatenate([q, np.zeros(self.robot.model.nv)])
         worst = max(self.kept, key=lambda c: float(c.lacking(x[None])[0]), default=None)
-        return worst.told_at(x, None) if worst is not None and worst.lacking(x[None])[0] > 0 else ""
+        return (
+            str(worst.check_at(x, "that posture", 0.0)) if worst is not None and worst.lacking(x[None])[0] > 0 else ""
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,15 @@ from drake_diff.loop.run import ClosedLoop, Controller, Loop, OpenLoop, closed_l
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
-from drake_diff.optimize.replay import Plan, came_too_near, finest_parts, left_bounds, missed_goal, too_deep, track
+from drake_diff.optimize.replay import (
+    Plan,
+    bounds_check,
+    clearance_checks,
+    finest_parts,
+    goal_check,
+    penetration_check,
+    track,
+)
 from drake_diff.record.parts import Label
 from drake_diff.trials.perturbation import Setup, perturbed
 
@@ -159,14 +167,14 @@ class Task:
         """One run of `setup`, judged; under `policy` in the controller's place, if it is given."""
         with applied(select(setup.model, setup.parameters)) as model:
             found = closed_loop(model, policy or self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
-            depth = () if found.ended else tuple(too_deep(model, found.motion))
-        near = () if found.ended else tuple(came_too_near(self.plan, found.motion))
+            depth = () if found.ended else (penetration_check(model, found.motion),)
+        near = () if found.ended else tuple(clearance_checks(self.plan, found.motion))
         last = found.motion.xs[-1]
         goal = self.plan.problem.goal_error(last) if self.judged_by == "the goal" else last - self.xs[-1]
-        kept_not = (*missed_goal(self.plan, goal), *left_bounds(self.plan, found.motion), *near, *depth)
+        checks = (goal_check(self.plan, goal), bounds_check(self.plan, found.motion), *near, *depth)
         return Judgement(
             run=found,
-            failures=(found.ended,) if found.ended else kept_not,
+            failures=(found.ended,) if found.ended else tuple(str(c) for c in checks if not c.passes),
             goal_error=float(np.max(np.abs(goal))),
             displacement=tangent_space(self.model).minus(last, self._end),
             judged=bool(np.all(np.isfinite(goal))),

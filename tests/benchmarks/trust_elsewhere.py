@@ -15,9 +15,9 @@ from scipy.integrate import solve_ivp
 from trust import Figure
 
 import drake_diff as dd
-from drake_diff.artifact.other_plants import followed_in
+from drake_diff.artifact.cross_check import WIDER, Follower, replays_in
 from drake_diff.engines.load import load_engine
-from drake_diff.optimize.elsewhere import STATE_TOLERANCE, WIDER, Follower
+from drake_diff.optimize.replay import STATE_TOLERANCE
 from drake_diff.optimize.solution import Solution, Status
 
 COUNT = 120
@@ -52,13 +52,13 @@ def _measured(random, count, folder):
         quantity = [*NUMBERS, ""][k % (len(NUMBERS) + 1)]
         truth, row = slid(random, quantity, folder)
         if quantity:
-            told[0] += any(line.startswith(f"{quantity}: ") for line in row.unlike) and not row.holds
+            told[0] += any(c.where.startswith(f"{quantity}: ") for c in unlike(row)) and not row.holds
             told[1] += 1
         else:
-            wrong += bool(row.unlike)
+            wrong += bool(unlike(row))
             right += 1
         if truth is not None:
-            motions[0] += (not row.failures) == truth
+            motions[0] += all(c.passes for c in row.checks if c.what != "model") == truth
             motions[1] += 1
     return [
         Figure("plans that do not hold in continuous time, told", *said[False], 0.99, True),
@@ -69,6 +69,11 @@ def _measured(random, count, folder):
             "slides in a simulator, right or not, judged by their motion as their formula says", *motions, 0.99, True
         ),
     ]
+
+
+def unlike(row):
+    """What a simulator has otherwise than Drake."""
+    return [c for c in row.checks if c.what == "model"]
 
 
 def given(model, x0, steps, goal):
@@ -91,8 +96,8 @@ def fallen(random, folder):
     height = by_formula(k / 2, 2 * tau, fall, steps * h)
     miss = abs(height + RADIUS - solution.xs[-1, 1])
     part = miss / (STATE_TOLERANCE * solution.plan.scale[1])
-    row = Follower(solution.plan).in_continuous_time()
-    return (None if CLEAR < part < 1 / CLEAR else bool(part <= 1)), row.holds
+    rows = Follower(solution.plan).in_continuous_time()
+    return (None if CLEAR < part < 1 / CLEAR else bool(part <= 1)), any(row.holds for row in rows)
 
 
 def by_formula(k, tau, fall, duration):
@@ -122,7 +127,7 @@ def slid(random, quantity, folder):
         text = planted(engine.mjcf, quantity, off)
         (folder / "other.xml").write_text(text)
         engine = load_engine("mujoco", model, path=folder / "other.xml")
-    row = followed_in(Follower(solution.plan), engine)
+    row = replays_in(Follower(solution.plan), engine)[0]
     if quantity not in ("", "friction", "mass"):
         return None, row
     miss = abs(distance / (off if quantity == "friction" else 1.0) - distance)

@@ -18,7 +18,6 @@ from trust import Figure
 
 import drake_diff as dd
 from drake_diff.optimize import Dwell, InputRate, Jerk, Periodic, TerminalSet
-from drake_diff.optimize.judge import complaints_about
 from drake_diff.optimize.replay import broken_variants
 
 COUNT = 150
@@ -164,7 +163,7 @@ def case(seed, number):
     if not solution.success:
         return None
     judged = dataclasses.replace(solution, problem=asked)
-    accepted = not list(complaints_about(judged)) and not list(broken_variants(judged.plan, judged.replays))
+    accepted = not judged.plan_checks.failing and not list(broken_variants(judged.plan, judged.replays))
     return broken(solution), accepted
 
 

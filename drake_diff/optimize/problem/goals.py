@@ -58,15 +58,14 @@ class Mark:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GoalConstraint(Constraint):
-    """A constraint of the state that a goal comes to, which tells in the goal's own words how far a motion is from it.
+    """A constraint of the state that a goal comes to.
 
-    A plan keeps its bounds, a replay may `miss` what is wanted by `tolerance`; both are in `unit`. `words` makes a
-    clause of such a distance: "hand ends 0.3 mm from its target". `norm` is the order of the norm of several rows.
+    A plan keeps its bounds, a replay may `miss` what is wanted by `tolerance`; both are in `unit`. `norm` is the order
+    of the norm of several rows.
     """
 
     tolerance: float = 0.0
     unit: str = "m"
-    words: Callable[[str], str] = str
     norm: float = 2.0
     dwells: bool = False  # whether it holds all along between its knots
     measured: Any = None  # a function of the state whose norm the miss is, where the bounded one is another
@@ -96,8 +95,8 @@ class GoalConstraint(Constraint):
         return off if np.isfinite(off) else float("inf")
 
     def told(self, miss: float) -> str:
-        """A clause about a motion whose largest `miss` this is."""
-        return self.words(in_words(miss, self.unit))
+        """A clause about a motion whose largest `miss` this is: "hand position is 0.3 mm off"."""
+        return f"{self.label} is {in_words(miss, self.unit)} off"
 
 
 def in_words(value: float, unit: str) -> str:
@@ -205,16 +204,12 @@ class FrameGoal(Goal):
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         found = []
         if self.position is not None:
-            where, words = (
-                frame_position(model, self.frame, self.point),
-                told(self.frame, "from its target", self.knots),
-            )
-            name = f"{self.frame} position"
-            found.append(within(where, _gaps(self.position), self.tolerance, "m", name, self.knots, words))
+            where, name = frame_position(model, self.frame, self.point), f"{self.frame} position"
+            found.append(within(where, _gaps(self.position), self.tolerance, "m", name, self.knots))
         if self.rotation is not None:
             turned = frame_rotation_error(model, self.frame, np.array(self.rotation))
-            name, words = f"{self.frame} rotation", told(self.frame, "turned from its target", self.knots)
-            found.append(within(turned, np.zeros(3), self.rotation_tolerance, "rad", name, self.knots, words))
+            name = f"{self.frame} rotation"
+            found.append(within(turned, np.zeros(3), self.rotation_tolerance, "rad", name, self.knots))
         return tuple(found)
 
     def marks(self) -> tuple[Mark, ...]:
@@ -277,14 +272,14 @@ class FrameVelocityGoal(Goal):
             raise InputError("FrameVelocityGoal", got="nothing but free entries", expected="a velocity")
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        found, words = [], told(self.frame, "from the velocity that is wanted", self.knots)
+        found = []
         if any(v is not None for v in self.velocity):
             moving, name = frame_velocity(model, self.frame, self.point), f"{self.frame} velocity"
-            found.append(within(moving, _gaps(self.velocity), self.tolerance, "m/s", name, self.knots, words))
+            found.append(within(moving, _gaps(self.velocity), self.tolerance, "m/s", name, self.knots))
         if any(v is not None for v in self.angular_velocity):
             turning, name = frame_angular_velocity(model, self.frame), f"{self.frame} angular velocity"
             wanted = _gaps(self.angular_velocity)
-            found.append(within(turning, wanted, self.angular_tolerance, "rad/s", name, self.knots, words))
+            found.append(within(turning, wanted, self.angular_tolerance, "rad/s", name, self.knots))
         return tuple(found)
 
     def marks(self) -> tuple[Mark, ...]:
@@ -343,10 +338,8 @@ class JointGoal(Goal):
             here = [i for i in wanted if units[i] == unit]
             names = [model.state_names[i] for i in here]
             label = ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} more"
-            words, target = told(label, "from the goal", self.knots), np.array([wanted[i] for i in here])
-            found.append(
-                within(_Entries(tuple(here)), target, self.tolerance, unit, label, self.knots, words, norm=np.inf)
-            )
+            target = np.array([wanted[i] for i in here])
+            found.append(within(_Entries(tuple(here)), target, self.tolerance, unit, label, self.knots, norm=np.inf))
         return tuple(found)
 
 
@@ -387,10 +380,8 @@ class CenterOfMassGoal(Goal):
         )
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        name = "centre of mass"
-        words = told(f"the {name}", "from its target", self.knots)
         wanted = _gaps(self.position)
-        return (within(center_of_mass(model), wanted, self.tolerance, "m", name, self.knots, words),)
+        return (within(center_of_mass(model), wanted, self.tolerance, "m", "centre of mass", self.knots),)
 
     def marks(self) -> tuple[Mark, ...]:
         return _place("target of the centre of mass", self.position, self.tolerance)
@@ -436,7 +427,7 @@ class KeepLevel(Goal):
         )
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        leans, words = frame_tilt(model, self.frame, self.axis), told(self.frame, "from upright", self.knots)
+        leans = frame_tilt(model, self.frame, self.axis)
         return (
             GoalConstraint(
                 _Squared(leans, self.tolerance),
@@ -445,7 +436,6 @@ class KeepLevel(Goal):
                 name=f"{self.frame} level",
                 tolerance=self.tolerance,
                 unit="rad",
-                words=words,
                 measured=leans,
             ),
         )
@@ -501,7 +491,6 @@ def within(
     unit: str,
     name: str,
     knots: Any,
-    words: Callable[[str], str],
     *,
     part: float = AIMED,
     norm: float = 2.0,
@@ -513,13 +502,7 @@ def within(
     sides = np.count_nonzero(np.isfinite(wanted)) ** (1 / norm)
     half = part * tolerance / sides
     lower, upper = (np.where(np.isnan(wanted), np.sign(side) * np.inf, wanted + side) for side in (-half, half))
-    return GoalConstraint(function, lower, upper, knots, name, tolerance=tolerance, unit=unit, words=words, norm=norm)
-
-
-def told(what: str, off: str, knots: Any) -> Callable[[str], str]:
-    """The words of a distance: "hand ends 0.3 mm from its target"."""
-    ends = "ends" if knots == LAST else "is at most"
-    return lambda distance: f"{what} {ends} {distance} {off}"
+    return GoalConstraint(function, lower, upper, knots, name, tolerance=tolerance, unit=unit, norm=norm)
 
 
 def _place(label: str, position: Any, tolerance: float) -> tuple[Mark, ...]:

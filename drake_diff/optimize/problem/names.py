@@ -78,3 +78,12 @@ def bounds_of(system: Model | Dynamics, given: Any) -> Any:
 
 
 SIDES = ("lower", "upper")
+UNKNOWN = "unknown"  # the unit of a number of plain dynamics
+
+
+def units_of(problem: Any) -> tuple[str, ...]:
+    """(nx + nu,) the units of the states and inputs of a `Problem`."""
+    if problem.moved is None:
+        return (UNKNOWN,) * (problem.nx + problem.nu)
+    contract = problem.moved.contract
+    return tuple(c.unit for c in contract.positions + contract.velocities + contract.inputs)

@@ -22,8 +22,9 @@ from drake_diff.mechanics.placing import Placing, placing_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 from drake_diff.model.sampling import any_state
+from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, checked_weight, in_words, name_of, rotation_of
+from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, checked_weight, name_of, rotation_of
 
 MARGIN = 0.01  # [m]
 TOLERANCE_PART, SMALLEST_TOLERANCE = 0.1, 1e-4  # of the margin, and [m]: what a plan may be nearer between its knots
@@ -92,37 +93,32 @@ class ClearanceConstraint(GoalConstraint):
         xs[unseen] = np.nan  # a motion too wild to be looked at: nobody knows what it enters
         return times, xs
 
-    def too_near(self, times: Array, at: Motion, allowed: float) -> Iterator[str]:
-        """A clause where a motion lacks more than `allowed` [m] of the margin, at `times` (K,) [s] or in between."""
+    def nearest(self, times: Array, at: Motion, allowed: float) -> Check:
+        """What a motion lacks most of the margin, of `allowed` [m], at `times` (K,) [s] or in between."""
         times, xs = self.seen(times, at, allowed)
-        lacking = self.lacking(xs)
-        worst = int(np.argmax(lacking))
-        if not lacking[worst] <= allowed:
-            yield self.told_at(xs[worst], float(times[worst]))
+        worst = int(np.argmax(self.lacking(xs)))
+        return self.check_at(xs[worst], f"{times[worst]:.4g} s", allowed)
+
+    def check_at(self, x: Array, time: str, allowed: float) -> Check:
+        """What the nearest pair lacks of the margin at x (nx,), of `allowed` [m]."""
+        values = self.clearance.values(x[None])[0]
+        who, lacking = self.clearance.labels[int(np.argmin(values))], float(self.lacking(x[None])[0])
+        where = f"{who} and {self.thing}" if self.thing else who
+        return check("clearance", f"{where} at {time}", lacking, allowed, "m")
 
     def lacking(self, xs: Array) -> Array:
         """(K,) [m] by how much the nearest row at each of xs (K, nx) is nearer than the margin; inf of no number."""
         values = self.clearance.values(xs)
         return np.where(np.all(np.isfinite(values), axis=1), self.margin - np.min(values, axis=1), np.inf)
 
-    def told_at(self, x: Array, time: float | None) -> str:
-        """What is too near at x (nx,), by how much, and when [s]."""
-        values = self.clearance.values(x[None])[0]
-        row = int(np.argmin(values))
-        who, distance = self.clearance.labels[row], float(values[row])
-        when = "" if time is None else f" at {time:.4g} s"
-        if not np.isfinite(distance):
-            return f"whether {who} keeps clear{' of ' * bool(self.thing)}{self.thing} cannot be seen{when}"
-        far = in_words(abs(distance), "m")
-        if distance < 0:
-            return f"{who} enters {self.thing} by {far}{when}" if self.thing else f"{who} overlap by {far}{when}"
-        near = f"is {far} from {self.thing}" if self.thing else f"are {far} apart"
-        return f"{who} {near}{when}, nearer than the margin of {in_words(self.margin, 'm')}"
-
     def check(self, subject: str, x: Array) -> None:
         """Raise InputError where x (nx,) is nearer than the margin by more than that."""
         if float(self.lacking(x[None])[0]) > self.between:
-            raise InputError(subject, got=self.told_at(x, None), expected="clear of it: a plan has to be there")
+            raise InputError(
+                subject,
+                got=str(self.check_at(x, subject, self.between)),
+                expected="clear of it: a plan has to be there",
+            )
 
 
 class Obstacle(Goal):
@@ -159,7 +155,6 @@ class Obstacle(Goal):
             name=name,
             tolerance=max(margin, SMALLEST_TOLERANCE),
             unit="m",
-            words=lambda off: f"{off} of the margin {'of ' + thing if thing else 'between links'} are used",
             measured=used,
             thing=thing,
         )

@@ -305,19 +305,13 @@ class _OfFeet(StateFunction):
 def _rows(
     function: Callable[[Any], Any], knots: Indices, name: str, off: str, tolerance: float, **sides: Any
 ) -> Iterator[GoalConstraint]:
-    """`function` within `sides` at `knots`, if there are any; in `off` a clause says what is missed."""
+    """`function` within `sides` at `knots`, if there are any; `off` says what is missed."""
     if not len(knots):
         return
     unit = "m/s" if off.startswith("of slip") else "m"
     at = tuple(int(k) for k in knots)
-
-    def words(distance: str) -> str:
-        return f"{name}: {'each ' if ', ' in name else ''}at most {distance} {off}"
-
     label = f"{name}: {off}"
-    yield GoalConstraint(
-        function, knots=at, name=label, tolerance=tolerance, unit=unit, words=words, norm=np.inf, **sides
-    )
+    yield GoalConstraint(function, knots=at, name=label, tolerance=tolerance, unit=unit, norm=np.inf, **sides)
 
 
 def _phase(given: Any) -> tuple[int, tuple[str, ...]]:

@@ -164,7 +164,6 @@ class TerminalSet(Goal):
         if problem.optimizes_parameters:
             raise InputError("TerminalSet", got='"parameters" in optimize', expected="a model that does not change")
         region = self.region(problem.model, problem.bounds, problem.parameters)
-        evidence = f"{region.level:.4g} from which {region.samples} of {region.samples} random states converged"
         return (
             TerminalConstraint(
                 region.value,
@@ -173,7 +172,6 @@ class TerminalSet(Goal):
                 name="terminal set",
                 tolerance=1.0,
                 unit="of the level",
-                words=lambda part: f"the end is at {part} {evidence}",
                 measured=lambda x: np.array([region.value(x)]),
                 region=region,
             ),

@@ -1,15 +1,16 @@
 """How far a collocated motion leaves its bounds and constraints between the nodes at which the solver keeps them."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import GradientError
+from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.goals import GoalConstraint, in_words
+from drake_diff.optimize.problem.goals import GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
@@ -34,7 +35,7 @@ class Excess:
 
     The tolerance of each is 1e-3 of its range along the motion, or 1e-5 where that is more. A constraint has to hold
     within 1e-3 of the ranges of states and inputs besides. `worst` is the largest excess as a part of its tolerance,
-    `where` that is, and `broken` has a clause for each that is above, in one of the `intervals`.
+    `where` that is, and `checks` has one for each bound and constraint; what fails does so in one of the `intervals`.
     """
 
     state: float
@@ -42,7 +43,7 @@ class Excess:
     constraint: float
     worst: float
     where: str
-    broken: tuple[str, ...]
+    checks: tuple[Check, ...]
     intervals: tuple[int, ...]
 
 
@@ -57,9 +58,9 @@ def violation_between_nodes(motion: Collocated) -> Excess:
 
     Returns:
         An `Excess`: the largest of a `state`, an `input` and a `constraint` over a bound, each in its own unit, `where`
-        the worst is, and what is `broken` by more than its tolerance. States and constraints are looked at in 9 places
-        within each interval, inputs in 39, and constraints also where they come nearest to a bound between these; a
-        constraint that holds at some knots only is left out.
+        the worst is, and a check of each. States and constraints are looked at in 9 places within each interval, inputs
+        in 39, and constraints also where they come nearest to a bound between these; a constraint that holds at some
+        knots only is left out.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -96,18 +97,18 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     every = [each for kind in found for each in kind]
     largest = {kind: max((e.excess for e in every if e.kind == kind), default=0.0) for kind in KINDS}
     worst = max(every, key=lambda e: e.part)
-    where = f"{worst.name} by {worst.excess:.3g} at {worst.time:.4g} s" if worst.excess > 0 else "nowhere"
+    where = worst.check.where if worst.excess > 0 else "nowhere"
     return Excess(
         **largest,
         worst=worst.part,
         where=where,
-        broken=tuple(str(e) for e in every if not e.part <= 1),
+        checks=tuple(e.check for e in every),
         intervals=tuple(np.unique(motion.interval_at(np.concatenate([e.when for e in every]))).tolist()),
     )
 
 
-def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -> Iterator[str]:
-    """A clause for each constraint that a motion in steps, xs (N+1, nx) under us (N, nu), goes through between two."""
+def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -> Iterator[Check]:
+    """Whether a motion in steps, xs (N+1, nx) under us (N, nu), goes through a constraint between two of them."""
     every = np.unique(
         np.concatenate([times, np.interp(np.arange(0, len(us), 1 / SUBSTEPS), np.arange(len(xs)), times)])
     )
@@ -120,27 +121,22 @@ def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -
     for c in problem.constraints:
         if c.knots is None:
             moments, between, applied = _looked_at(c, every, *at(every), at)
-            values = _values(c, between, applied)
-            through = _depth(c, between, applied, _excess(values, c.lower, c.upper), scale)[1]
-            if np.any(through):
-                when = moments[np.flatnonzero(np.any(through, axis=1))[0]]
-                yield f"between the knots the motion goes through what {c.label} forbids, at {when:.4g} s"
+            excess = _excess(_values(c, between, applied), c.lower, c.upper)
+            through = np.any(_depth(c, between, applied, excess, scale)[1], axis=1)
+            first = int(np.argmax(through))
+            passed = float(np.max(excess[first])) if through[first] else 0.0
+            yield check("passage", f"{c.label} at {moments[first]:.4g} s", passed, 0.0)
 
 
 @dataclass(frozen=True)
 class _Beyond:
-    """The largest excess of one number over its bounds, and when."""
+    """The largest excess of one number over its bounds, in one of the `KINDS`, and when it is above its tolerance."""
 
     kind: str
-    name: str
     excess: float
     part: float  # of its tolerance
-    time: float
-    when: Array  # [s] the times at which it is above its tolerance
-    told: str
-
-    def __str__(self) -> str:
-        return f"between the nodes {self.told}"
+    when: Array  # [s]
+    check: Check
 
 
 def _beyond(
@@ -150,15 +146,14 @@ def _beyond(
     excess, tolerance = _excess(values, lower, upper), _tolerance(ranges)
     found = []
     for i, k in enumerate(np.argmax(excess, axis=0).tolist()):
-        far, when = float(excess[k, i]), float(times[k])
-        told = f"{_told(names[i], far, when)}, tolerance {tolerance[i]:.3g}"
-        part = far / float(tolerance[i])
-        found.append(_Beyond(kind, names[i], far, part, when, times[~(excess[:, i] <= tolerance[i])], told))
+        far, limit = float(excess[k, i]), float(tolerance[i])
+        row = _between("bound", f"{names[i]} at {times[k]:.4g} s", far, limit)
+        found.append(_Beyond(kind, far, far / limit, times[~(excess[:, i] <= limit)], row))
     return found
 
 
-def _told(name: str, far: float, when: float) -> str:
-    return f"{name} is {far:.3g} beyond its bound at {when:.4g} s"
+def _between(what: str, where: str, value: float, tolerance: float, unit: str = "1") -> Check:
+    return replace(check(what, where, value, tolerance, unit), plant="between the nodes")
 
 
 def _excess(values: Array, lower: Array, upper: Array) -> Array:
@@ -179,9 +174,9 @@ def _too_near(motion: Collocated, c: ClearanceConstraint) -> _Beyond:
     moments, places = motion.seen(c)
     lacking = c.lacking(places)
     row = int(np.argmax(lacking))
-    far, when = max(float(lacking[row]), 0.0), float(moments[row])
-    told = f"{c.told_at(places[row], when)}, tolerance {in_words(c.between, 'm')}"
-    return _Beyond("constraint", c.label, far, far / c.between, when, moments[~(lacking <= c.between)], told)
+    far = max(float(lacking[row]), 0.0)
+    nearest = replace(c.check_at(places[row], f"{moments[row]:.4g} s", c.between), plant="between the nodes")
+    return _Beyond("constraint", far, far / c.between, moments[~(lacking <= c.between)], nearest)
 
 
 def _of_stay(motion: Collocated, c: GoalConstraint) -> _Beyond:
@@ -192,9 +187,9 @@ def _of_stay(motion: Collocated, c: GoalConstraint) -> _Beyond:
     here = (times >= begin) & (times <= end)
     times, misses = times[here], np.array([c.miss(x) for x in xs[here]])
     k = int(np.argmax(misses))
-    told = f"{c.told(float(misses[k]))} at {times[k]:.4g} s, tolerance {in_words(c.tolerance, c.unit)}"
-    beyond, far = times[misses > c.tolerance], max(float(misses[k]) - c.tolerance, 0.0)
-    return _Beyond("constraint", c.label, far, float(misses[k]) / c.tolerance, float(times[k]), beyond, told)
+    row = _between("constraint", f"{c.label} at {times[k]:.4g} s", float(misses[k]), c.tolerance, c.unit)
+    far = max(float(misses[k]) - c.tolerance, 0.0)
+    return _Beyond("constraint", far, row.ratio, times[misses > c.tolerance], row)
 
 
 def _of_constraint(motion: Collocated, c: Constraint, ranges: Array) -> list[_Beyond]:
@@ -224,14 +219,13 @@ def _of_constraint(motion: Collocated, c: Constraint, ranges: Array) -> list[_Be
     found = []
     for i in range(values.shape[1]):
         k = int(np.lexsort((excess[:, i], part[:, i]))[-1])
-        far, when = float(excess[k, i]), float(times[k])
-        told = f"{_told(c.label, far, when)}, tolerance {tolerance[i]:.3g}"
+        far, where = float(excess[k, i]), f"{c.label} at {times[k]:.4g} s"
+        row = _between("bound", where, far, float(tolerance[i]))
         if through[k, i]:
-            told = f"{_told(c.label, far, when)}: the motion goes through what it forbids"
+            row = replace(row, what="passage", verdict="fail")
         elif depth[k, i] / DEPTH_TOLERANCE > far / tolerance[i]:
-            away = f"{depth[k, i]:.2%} of the ranges of states and inputs away, tolerance {DEPTH_TOLERANCE:.1%}"
-            told = f"{_told(c.label, far, when)}, and holds only {away}"
-        found.append(_Beyond("constraint", c.label, far, float(part[k, i]), when, times[~(part[:, i] <= 1)], told))
+            row = _between("depth", where, float(depth[k, i]), DEPTH_TOLERANCE)
+        found.append(_Beyond("constraint", far, float(part[k, i]), times[~(part[:, i] <= 1)], row))
     return found
 
 

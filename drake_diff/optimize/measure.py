@@ -1,0 +1,128 @@
+"""What is checked of a solution's own states and inputs, replays apart."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.certificates.certificate import Certificate
+from drake_diff.model.contact import penetration
+from drake_diff.model.parameters import applied
+from drake_diff.model.step import set_state
+from drake_diff.optimize.checks import Check, check
+from drake_diff.optimize.problem.names import units_of
+from drake_diff.optimize.problem.obstacles import along_steps, clearances
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
+from drake_diff.optimize.transcription.between import passed_between_steps, violation_between_nodes
+from drake_diff.optimize.transcription.collocation import SUBSTEPS, Collocated
+
+# Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
+# its motion is not the model's.
+INTEGRATION_TOLERANCE = 1e-2
+ASKED = ("defect", "goal", "bound", "constraint", "start", "cost")  # checks of what a solver is asked to satisfy
+
+
+def plan_checks(s: Any) -> Iterator[Check]:
+    """Of a `Solution`: what was asked at the knots and between them, overlaps of a collocated plan, certificates."""
+    yield from _knot_checks(s)
+    if s.transcribed is not None:
+        yield from _interval_checks(s, s.transcribed)
+        if s.problem.has_model and s.problem.model.contract.contact.collision_pairs:
+            yield _overlap_check(s, s.transcribed)
+    elif np.all(np.isfinite(s.xs)):
+        between = [c.nearest(*along_steps(s.times, s.xs), c.between) for c in clearances(s.problem.kept)]
+        between += passed_between_steps(s.problem, s.times, s.xs, s.us)
+        yield from (replace(c, plant="between the knots") for c in between)
+    bad = [c for c in s.certificates if c.verdict != "agree"]
+    yield from (_derivative_check(c) for c in bad[:1] or s.certificates[:1])
+
+
+def _knot_checks(s: Any) -> Iterator[Check]:
+    """Equations, ends, bounds and constraints."""
+    units, names, limit = units_of(s.problem), s.problem.state_names, FEASIBILITY_TOLERANCE
+    knots = np.flatnonzero(~(s.defects <= limit))
+    after = (
+        f"knots {_spans(knots)}" if len(knots) else f"knot {int(np.argmax(s.defects))}" if len(s.defects) else "none"
+    )
+    yield check("defect", after, s.defect, limit)
+    off = np.nan_to_num(np.abs(s.problem.goal_error(s.xs[-1])), nan=np.inf)
+    i = int(np.argmax(off))
+    if not np.all(np.isnan(s.problem.goal)):
+        yield check("goal", names[i], s.goal_error, limit, units[i])
+    yield from _excess_checks("bound", s.bound_excess)
+    yield from _excess_checks("constraint", s.constraint_excess)
+    yield check("start", "the motion", s.initial_state_error, limit)
+    yield check("cost", "the whole motion", 0.0 if np.isfinite(s.cost) else np.inf, 0.0)
+
+
+def _excess_checks(what: str, excesses: Mapping[str, tuple[float, int]]) -> Iterator[Check]:
+    for name, (excess, knot) in excesses.items():
+        yield check(what, f"{name} at knot {knot}", excess, FEASIBILITY_TOLERANCE)
+    if not excesses:
+        yield check(what, "all at all knots", 0.0, FEASIBILITY_TOLERANCE)
+
+
+def _interval_checks(s: Any, motion: Collocated) -> Iterator[Check]:
+    """Whether the motion between nodes is that of the dynamics, and within its bounds and constraints."""
+    tolerance = INTEGRATION_TOLERANCE * np.minimum(s.problem.ranges(motion.xs), 1.0)
+    knot, i = np.unravel_index(int(np.argmax(motion.gaps / tolerance)), motion.gaps.shape)
+    where = f"{s.problem.state_names[i]} at knot {knot}"
+    yield check("integration", where, motion.gaps[knot, i], tolerance[i], units_of(s.problem)[i])
+    yield from violation_between_nodes(motion).checks
+
+
+def _overlap_check(s: Any, motion: Collocated) -> Check:
+    """How deep geometries overlap, at knots or between them, in a motion that leaves contact out."""
+    model, (times, between) = s.problem.model, motion.between_knots
+    xs, depths = np.vstack([motion.xs, between]), []
+    finite = np.isfinite(xs).all(axis=1)
+    with applied(s.vector):
+        for x in xs[finite]:
+            set_state(model.double, x)
+            depths.append(penetration(model))
+    k = int(np.argmax(depths))
+    return check("overlap", f"geometries at {np.append(s.times, times)[finite][k]:.4g} s", depths[k], 0.0, "m")
+
+
+def _derivative_check(c: Certificate) -> Check:
+    e = c.worst
+    where = f"d {e.row} / d {e.column}: {c.verdict}{f' ({e.reason})' if e.reason else ''}"
+    return check("derivative", where, abs(e.derivative - e.difference), e.tolerance, verdict=_verdict(c.verdict))
+
+
+def _verdict(certified: str) -> Any:
+    return "pass" if certified == "agree" else "undecided" if certified in ("undecided", "not_converged") else "fail"
+
+
+def following_checks(s: Any, motion: Collocated) -> list[Check]:
+    """Whether the dynamics follow the plan from its first knot to its last: open loop, and where not, under TVLQR."""
+    names, ranges, units = s.problem.state_names, s.problem.ranges(motion.xs), units_of(s.problem)
+    rows = list[Check]()
+    for control in ("open loop", "TVLQR"):
+        xs = motion.led(control)
+        what, i, off, time = _furthest(s, motion, xs, ranges)
+        row = check(what, f"{names[i]} at {time}", off, INTEGRATION_TOLERANCE * ranges[i], units[i])
+        rows.append(replace(row, plant="continuous time", feedback=None if control == "open loop" else control))
+        if rows[-1].passes:
+            break
+    return rows
+
+
+def _furthest(s: Any, motion: Collocated, xs: Array, ranges: Array) -> tuple[str, int, float, str]:
+    """What of xs (S, nx) is off most for its range: a state from the plan at knots, or beyond a bound anywhere."""
+    b = s.problem.bounds
+    apart = np.nan_to_num(np.abs(xs[::SUBSTEPS] - motion.xs), nan=np.inf)
+    beyond = np.nan_to_num(np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)[1:], nan=np.inf)
+    k, i = np.unravel_index(int(np.argmax(apart / ranges)), apart.shape)
+    m, j = np.unravel_index(int(np.argmax(beyond / ranges)), beyond.shape)
+    if beyond[m, j] / ranges[j] > apart[k, i] / ranges[i]:
+        return "bound", int(j), float(beyond[m, j]), f"knot {(m + 1) // SUBSTEPS}"
+    return "following", int(i), float(apart[k, i]), f"knot {k}"
+
+
+def _spans(knots: Any) -> str:
+    """Whole numbers as ranges: "0-11, 14"."""
+    runs = np.split(knots, np.flatnonzero(np.diff(knots) > 1) + 1)
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run))

@@ -1,0 +1,110 @@
+"""Metrics of a measurement beside the same taken a second time: by NumPy, and by pydrake's own plant and context."""
+
+import numpy as np
+import pytest
+from helpers.robots import example_robot, state_in_contact, state_in_range
+from helpers.table import each_row
+from pydrake.multibody.tree import JointIndex
+
+import drake_diff as dd
+from drake_diff.artifact import measure
+
+
+def by_hand(model, random, x0=None, steps=8, off=0.01):
+    """A plan that is not quite a motion of the model, and misses all that was asked by some hundredths."""
+    xs = dd.rollout(
+        model, state_in_range(model, random) if x0 is None else x0, random.normal(size=(steps, model.nu))
+    ).xs
+    us, plan = random.normal(size=(steps, model.nu)), xs + off * random.normal(size=xs.shape)
+    bounds = dd.Bounds(np.min(xs, axis=0), np.max(xs, axis=0), -np.ones(model.nu) / 2, np.ones(model.nu) / 2)
+    cost = dd.QuadraticCost(Q=np.diag(random.uniform(size=model.nx)), R=np.diag(random.uniform(size=model.nu)))
+    problem = dd.Problem(
+        model, x0=xs[0], x_goal=xs[-1], num_steps=steps, running_cost=cost, final_cost=cost, bounds=bounds
+    )
+    solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", plan, us)
+    vars(solution)["replays"] = ()  # they are no part of what is measured here, and take most of the time
+    return solution
+
+
+class Referee:
+    """The plant of a model with a context of its own."""
+
+    def __init__(self, model):
+        self.plant, self.root = model.plant, model.diagram.CreateDefaultContext()
+        self.context = self.plant.GetMyMutableContextFromRoot(self.root)
+
+    def at(self, x):
+        self.plant.SetPositionsAndVelocities(self.context, x)
+        return self
+
+    def depth(self):
+        port = self.plant.get_geometry_query_input_port()
+        pairs = port.Eval(self.context).ComputePointPairPenetration() if port.HasValue(self.context) else []
+        return max((pair.depth for pair in pairs), default=0.0)
+
+    def energy(self):
+        v = self.plant.GetVelocities(self.context)
+        kinetic = v @ self.plant.CalcMassMatrix(self.context) @ v / 2
+        return kinetic + self.plant.CalcPotentialEnergy(self.context)
+
+    def beyond_limits(self):
+        q, worst = self.plant.GetPositions(self.context), 0.0
+        for joint in map(self.plant.get_joint, map(JointIndex, range(self.plant.num_joints()))):
+            own = q[joint.position_start() : joint.position_start() + joint.num_positions()]
+            excess = np.maximum(joint.position_lower_limits() - own, own - joint.position_upper_limits())
+            worst = max(worst, float(np.max(excess, initial=0.0)))
+            if len(own) > joint.num_velocities():
+                worst = max(worst, abs(float(np.linalg.norm(own[:4])) - 1))
+        return worst
+
+    def defect(self, x, u, after):
+        self.at(x)
+        self.plant.get_actuation_input_port().FixValue(self.context, u)
+        values = self.plant.AllocateDiscreteVariables()
+        self.plant.CalcForcedDiscreteVariableUpdate(self.context, values)
+        return float(np.max(np.abs(after - values.value())))
+
+
+def second_measurement(solution):
+    """{metric: value}."""
+    problem, xs, us = solution.problem, np.asarray(solution.xs), np.asarray(solution.us)
+    b, h, referee, replay = problem.bounds, problem.model.time_step, Referee(problem.model), solution.replay
+    running, final = problem.running_cost, problem.final_cost
+    cost = sum(h * (x @ running.Q @ x + u @ running.R @ u) for x, u in zip(xs, us, strict=False))
+    outside = [b.x_lower - xs[1:], xs[1:] - b.x_upper, b.u_lower - us, us - b.u_upper]
+    energies = [referee.at(x).energy() for x in replay.xs]
+    return {
+        "initial state error": np.max(np.abs(xs[0] - problem.x0)),
+        "goal error": np.max(np.abs(xs[-1] - problem.goal)),
+        "bound violation": max(float(np.max(part)) for part in outside),
+        "horizon": h * len(us),
+        "cost": cost + xs[-1] @ final.Q @ xs[-1],
+        "defect": max(referee.defect(x, u, after) for x, u, after in zip(xs, us, xs[1:], strict=False)),
+        "replay end error": np.max(np.abs(replay.xs[-1] - xs[-1])),
+        "penetration": max(referee.at(x).depth() for x in replay.xs),
+        "energy scale": np.ptp(energies),
+        "joint limit violation": max(referee.at(x).beyond_limits() for x in replay.xs),
+    }
+
+
+CASES = [
+    (name, seed) for seed, name in enumerate(("solo12.urdf", "a1.urdf", "panda.urdf", "ur5_robot.urdf", "z1.urdf"))
+]
+
+
+@each_row("name, seed", CASES)
+def test_metrics_agree_with_a_second_measurement(name, seed):
+    random = np.random.default_rng(seed)
+    floating = name in ("solo12.urdf", "a1.urdf")
+    model = example_robot(name, feet=floating)
+    solution = by_hand(model, random, state_in_contact(model, random) if floating else None)
+    metrics = {m.name: m.value for m in measure(solution).metrics}
+    second = second_measurement(solution)
+    if model.num_constraints:  # of Panda's fingers, which are coupled: pydrake does not tell their violation
+        assert metrics["joint limit violation"] is None
+        del second["joint limit violation"]
+    for metric, value in second.items():
+        assert metrics[metric] == pytest.approx(value, rel=1e-9, abs=1e-12 * max(1.0, np.abs(solution.xs).max())), (
+            metric
+        )
+    assert min(metrics[m] for m in second if m not in ("penetration", "joint limit violation")) > 1e-4
