@@ -14,7 +14,7 @@ from timing import block, measure, timed
 import drake_diff as dd
 from drake_diff.exceptions import ModelWarning
 
-SOLVES = {"kelly": "Kelly's cart-pole, 50", "panda_reach": "Panda reach"}  # the others take minutes
+SOLVES = ("kelly", "panda_reach")
 QUICK_SOLVES = ("kelly",)
 BUDGET, QUICK_BUDGET = 20.0, 5.0  # [s]
 
@@ -26,10 +26,9 @@ def solved(names: list[str], quick: bool) -> Iterator[Row | Missing]:
         for name in names:
             print(f"{name}, solve", file=sys.stderr, flush=True)
             if name == "panda_reach":
-                yield from _reach(ilqr.tasks(Path(folder))[0], BUDGET)
+                yield from _reach(ilqr.panda_reach(Path(folder)), BUDGET)
             else:
-                problem = collocation.problems(Path(folder))[SOLVES[name]]
-                yield from _collocated(name, problem, QUICK_BUDGET if quick else BUDGET)
+                yield from _collocated(name, collocation.kelly(), QUICK_BUDGET if quick else BUDGET)
 
 
 def _collocated(name: str, problem: dd.Problem, budget: float) -> Iterator[Row]:
@@ -41,8 +40,7 @@ def _collocated(name: str, problem: dd.Problem, budget: float) -> Iterator[Row]:
         "drake_diff, Drake's scheme": lambda: collocation.ours(problem, "drake"),
         "drake_diff, Hermite-Simpson": lambda: collocation.ours(problem, "hermite_simpson"),
     }
-    if name == "kelly":
-        calls["CasADi by hand, Hermite-Simpson"] = collocation.kelly_by_hand
+    calls["CasADi by hand, Hermite-Simpson"] = collocation.kelly_by_hand
     firsts = {who: timed(call) for who, call in calls.items()}
     samples = measure({who: block(call) for who, call in calls.items()}, budget)
     about = {"model": name, "joints": problem.model.nv, "quantity": "solve", "horizon": problem.num_steps}
