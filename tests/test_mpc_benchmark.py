@@ -67,7 +67,7 @@ def test_a_controller_that_does_nothing_does_not_pass(crane, monkeypatch):
             return np.zeros(1)
 
     monkeypatch.setattr("drake_diff.loop.MPC", Idle)
-    run = realtime.drive(replace(crane, duration=0.4), problem, plan, 0, "cpu", 1, 0)
+    run = realtime.drive(replace(crane, duration=0.4), problem, plan, 0, "cpu")
     assert not run.arrived
 
 

@@ -8,12 +8,7 @@ the mean distance of the centre over time, in % of the cube's width. First state
 motion goes through the positions before the first contact. Lengths are put right by gravity: in the air these cubes
 fall by less than 9.81 m/s^2. The centre of mass is off the middle, and the recorded axes of the cube are turned from
 one set of throws to the next: cube_tosses_axes.py puts that right, by the motion before the first contact. Drake fits
-eight corner spheres, and pads on the faces with a friction of their own; --mujoco gives the same simulated steps to
-MuJoCo's sysid toolbox (pip install mujoco[sysid]), with the corners alone.
-
-Where errors come from: the error of a model that is right is that of its first states, how far apart motions end that
-begin at states which the measured positions allow. Beside it stands how far apart they end where friction is 5 %
-larger, and the friction of impacts and of slides, by the motion alone.
+eight corner spheres, and pads on the faces with a friction of their own.
 """
 
 import argparse
@@ -21,7 +16,7 @@ import os
 import sys
 import tempfile
 import time
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
@@ -33,11 +28,7 @@ from cube_tosses_axes import axes_of, rotations, turned  # noqa: E402
 import drake_diff as dd  # noqa: E402
 from drake_diff._base.arrays import Array  # noqa: E402
 from drake_diff.identification import ContactIdentification, first_state, identify_contact  # noqa: E402
-from drake_diff.identification.chart import Chart  # noqa: E402
-from drake_diff.identification.flights import flights_of, millisecond, start_of  # noqa: E402
-from drake_diff.identification.measured import read_pieces  # noqa: E402
-from drake_diff.mechanics.description import coordinates_of  # noqa: E402
-from drake_diff.model.parameters import applied, select  # noqa: E402
+from drake_diff.identification.flights import flights_of  # noqa: E402
 
 RATE, WIDTH, MASS, INERTIA = 148.0, 0.1048, 0.37, 0.00081  # [Hz, m, kg, kg m^2] as published with the tosses
 INSET = 0.0024  # [m] by hand, radius of a corner sphere: its centre is so far inside of three faces
@@ -149,47 +140,6 @@ def in_the_air(flown: list[Array]) -> tuple[Array, Array]:
     return found, np.sqrt(np.diag(np.linalg.solve(H, np.linalg.solve(H, scores.T @ scores).T)))
 
 
-def frictions(tosses: list[Array], model: dd.Model, g: Array, center: Array) -> tuple[Array, Array]:
-    """Tangential over normal: of impulses (n,) between flights, and speed and that of forces (m, 2) in flat slides.
-
-    An impulse is the change of velocity of the centre of mass from one flight to the next, where contact lasts for 8
-    samples at most. A cube
-    slides flat where a face is within 0.01 rad of the ground and the centre within 0.6 mm of its height at rest.
-    """
-    impulses, slides = [], []
-    for xs in tosses:
-        at, spans = xs[:, 4:7] + rotations(xs[:, :4]) @ center, flights_of(model, xs)
-        for (a, b), (c, d) in pairwise(spans):
-            if c - b > 8:
-                continue
-            when, speeds = (b + c) / 2 / RATE, []
-            for first, last in ((a, b), (c, d)):
-                t = np.arange(first, last + 1) / RATE - when
-                A = np.stack([np.ones_like(t), t], axis=1)
-                speeds.append(np.linalg.lstsq(A, at[first : last + 1] - np.outer(t**2 / 2, g), rcond=None)[0][1])
-            change = speeds[1] - speeds[0]
-            impulses.append(np.linalg.norm(change[:2]) / change[2])
-        rest = np.median(xs[-5:, 6])
-        flat = (np.max(np.abs(rotations(xs[:, :4])[:, 2]), axis=1) > np.cos(0.01)) & (np.abs(xs[:, 6] - rest) < 6e-4)
-        t = np.arange(-3, 4) / RATE
-        A = np.stack([np.ones(7), t, t**2 / 2], axis=1)
-        for k in range(3, len(xs) - 3, 3):
-            if np.all(flat[k - 3 : k + 4]) and abs(xs[k, 9]) < 1:
-                _, v, acc = np.linalg.lstsq(A, xs[k - 3 : k + 4, 4:6], rcond=None)[0]
-                if (speed := np.linalg.norm(v)) > 0.08:
-                    slides.append((speed, -acc @ v / speed / -g[2]))
-    return np.array(impulses), np.array(slides)
-
-
-def tell_frictions(tosses: list[Array], model: dd.Model, g: Array, center: Array) -> None:
-    impulses, slides = frictions(tosses, model, g, center)
-    low, half, high = np.percentile(impulses, [25, 50, 75])
-    print(f"friction of {len(impulses)} impacts {half:.3f} (half of them from {low:.3f} to {high:.3f}), and of slides:")
-    for slow, fast in pairwise((0.08, 0.15, 0.3, 0.5, 2.0)):  # [m/s]
-        part = slides[(slides[:, 0] >= slow) & (slides[:, 0] < fast), 1]
-        print(f"  from {slow} to {fast} m/s {np.median(part):.3f}, {len(part)} of them")
-
-
 def scaled(tosses: list[Array], by: float) -> list[Array]:
     """All lengths times `by`."""
     columns = np.ones(13)
@@ -203,30 +153,6 @@ def errors_of(model: dd.Model, tosses: list[Array], starts: list[Array], values:
     for xs, x0 in zip(tosses, starts, strict=True):
         motion = dd.rollout(model, x0, np.zeros(((len(xs) - 1) * each, 0)), parameters=values).xs[::each, 4:7]
         found.append(np.mean(np.linalg.norm(motion - xs[:, 4:7], axis=1)) / WIDTH * 100)
-    return np.array(found)
-
-
-def spread_of(model: dd.Model, tosses: list[Array], values: dict[str, object], more: dict[str, object]) -> Array:
-    """[% of the width] how far motions are from that of the best first state, on average over each toss.
-
-    They begin at four other first states that the measured positions allow, and have the parameters `more`.
-    """
-    found, each, random = [], round(1 / RATE / model.time_step), np.random.default_rng(0)
-    chart = Chart(coordinates_of(model))
-    for xs in tosses:
-        flights = flights_of(model, xs)
-        if not flights or flights[0][0] > 0:
-            continue
-        (piece,) = read_pieces(model, recording("toss", xs), 0.0)
-        with applied(select(model, values)) as own:
-            start = start_of(own, chart, piece.part(*flights[0]), millisecond(chart, [piece]))
-        starts, us = [start.x, *start.others(chart, 4, random)], np.zeros(((len(xs) - 1) * each, 0))
-        motions = [
-            dd.rollout(model, x0, us, parameters=values if k == 0 else {**values, **more}).xs[::each, 4:7]
-            for k, x0 in enumerate(starts)
-        ]
-        apart = [np.mean(np.linalg.norm(one - motions[0], axis=1)) for one in motions[1:]]
-        found.append(np.mean(apart) / WIDTH * 100)
     return np.array(found)
 
 
@@ -270,7 +196,6 @@ def main() -> int:
     print(f"{len(others)} tosses that were not held out fall by {np.round(g, 4)} +- {np.round(g_off, 4)} m/s^2:")
     print(f"lengths are taken times {9.81 / fall:.4f}")
     print(f"their centre of mass is at {np.round(1e3 * center, 2)} +- {np.round(1e3 * axes.errors, 2)} mm", flush=True)
-    tell_frictions(others, middle, g, center)
     fitted, held = (scaled(each, 9.81 / fall) for each in (fitted, held))
     logs = [recording(f"toss {i}", x) for i, x in enumerate(fitted)]
     center = center * 9.81 / fall
@@ -289,10 +214,6 @@ def main() -> int:
     print(told("Drake, identified, first states by flight", errors))
     sure = axes.sure[parts[2]] > 0.95
     print(told("  those of them whose axes are sure to 95 %", errors[sure]), flush=True)
-    more = {f"{body}.friction": 1.1 * float(np.asarray(values[f"{body}.friction"])) for body in ("cube", "pads")}
-    first, slippery = (spread_of(identified, held, values, other) for other in ({}, more))
-    print(told("A model that is right, from first states as uncertain as these", first))
-    print(told("The same with 10 % more friction of the cube's side, 5 % of the pair", slippery), flush=True)
     return 0
 
 

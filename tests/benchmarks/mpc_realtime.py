@@ -38,7 +38,6 @@ from drake_diff.model import BodyForce  # noqa: E402
 
 FINE = 1e-3  # [s] the referee's step
 PUSHES = 3
-STEPS_BESIDE = 10
 DRAWS = 5  # runs with the same problem and other pushes
 FREE = np.inf
 HOME = np.array([0, -0.785, 0, -2.356, 0, 1.571, 0.785])
@@ -243,7 +242,6 @@ class Run:
     wall: np.ndarray
     period: float
     statuses: list[str]
-    beside: np.ndarray  # (ticks,) distance of the first input from that of a converged plan, of the inputs' range
 
 
 def blows(task, seed):
@@ -257,16 +255,13 @@ def blows(task, seed):
     return found
 
 
-def drive(task, problem, plan, seed, clock, iterations, steps_beside):
+def drive(task, problem, plan, seed, clock):
     mpc = dd.loop.MPC(problem, horizon=task.horizon, plan=plan)
-    slow = dd.loop.MPC(problem, horizon=task.horizon, plan=plan, iterations=steps_beside) if steps_beside else None
     h, plant, pushes = problem.model.time_step, Plant(task), blows(task, seed)
     per_tick = round(h / FINE)
     plant.start(np.array(problem.x0))
-    u, statuses, cpu, wall, beside = np.array(plan[1][0]), [], [], [], []
-    limits = [np.where(np.isfinite(side), side, np.nan) for side in (problem.bounds.u_lower, problem.bounds.u_upper)]
-    wide = limits[1] - limits[0]
-    wide, lost = np.where(np.isfinite(wide), wide, np.ptp(plan[1], axis=0)), False
+    u, statuses, cpu, wall = np.array(plan[1][0]), [], [], []
+    lost = False
     for k in range(round(task.duration / h)):
         now = k * per_tick
         for at, impulse in pushes:
@@ -278,8 +273,6 @@ def drive(task, problem, plan, seed, clock, iterations, steps_beside):
         cpu.append(time.thread_time() - begin[0])
         wall.append(time.perf_counter() - begin[1])
         statuses.append(mpc.status)
-        if slow is not None:
-            beside.append(np.max(np.abs(slow(x, k * h) - new) / wide))
         taken = (cpu if clock == "cpu" else wall)[-1]
         late = min(int(np.ceil(taken / FINE)), per_tick)
         try:
@@ -308,7 +301,6 @@ def drive(task, problem, plan, seed, clock, iterations, steps_beside):
         wall=np.array(wall),
         period=h,
         statuses=statuses,
-        beside=np.array(beside),
     )
 
 
@@ -330,7 +322,7 @@ def planned(name, draw, bare):
     return task, problem, tuple(np.array(part) for part in solution.plan.sample(1))
 
 
-def measure(name, seed, count, clock, *, bare=False, steps_beside=0):
+def measure(name, seed, count, clock, *, bare=False):
     """(runs, problems that were not solved)"""
     found, unsolved = [], 0
     for i in range(count):
@@ -339,7 +331,7 @@ def measure(name, seed, count, clock, *, bare=False, steps_beside=0):
         if plan is None:
             unsolved += 1
             continue
-        found.append(drive(task, problem, plan, seed * 1000 + i, clock, 1, steps_beside if i % DRAWS == 0 else 0))
+        found.append(drive(task, problem, plan, seed * 1000 + i, clock))
     return found, unsolved
 
 
@@ -376,7 +368,7 @@ def details(name, runs, bare):
     worst = {k: max(r.excess[k] for r in runs) for k in runs[0].excess}
     followed = sum("followed further" in s for r in runs for s in r.statuses)
     gives = sum("gives way" in s for r in runs for s in r.statuses)
-    beside, wall = np.concatenate([r.beside for r in runs]), np.concatenate([r.wall for r in runs])
+    wall = np.concatenate([r.wall for r in runs])
     excess = ", ".join(f"{k} {v:.3g}" for k, v in worst.items())
     said = [
         f"largest excess over a limit, or distance from a gate: {excess}; largest miss of the goal "
@@ -386,11 +378,6 @@ def details(name, runs, bare):
         + ", ".join(f"{v:.1f}" for v in 1e3 * np.percentile(wall, [50, 99, 100]))
         + f" ms, {int(np.sum(wall <= runs[0].period))} of {len(wall)} ticks in time",
     ]
-    if len(beside):
-        said.append(
-            f"the input beside that of a plan with {STEPS_BESIDE} steps a tick along the same motion, of its range: "
-            f"median {np.median(beside):.2g}, 99 % {np.percentile(beside, 99):.2g}, largest {np.max(beside):.2g}"
-        )
     if bare:
         excess = ", ".join(f"{k} {max(r.excess[k] for r in bare):.3g}" for k in bare[0].excess)
         said.append(f"without these limits in the problem {sum(r.kept for r in bare)} of {len(bare)} runs keep them, "
@@ -405,14 +392,11 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--clock", choices=("cpu", "wall"), default="cpu")
     parser.add_argument("--bare", type=int, default=DRAWS, help="runs of a problem without the limits")
-    parser.add_argument("--no-beside", action="store_true", help="no comparison with more steps a tick")
-    parser.add_argument("--verbose", action="store_true")
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
     held, rows, more = True, [], []
     for name in options.only.split(","):
-        steps = 0 if options.no_beside else STEPS_BESIDE
-        runs, unsolved = measure(name, options.seed, options.count, options.clock, steps_beside=steps)
+        runs, unsolved = measure(name, options.seed, options.count, options.clock)
         if not runs:
             print(f"{name}: no problem of {unsolved} was planned")
             held = False
@@ -421,10 +405,6 @@ def main():
         rows.append(row(name, runs, unsolved))
         more.append(details(name, runs, bare))
         print(rows[-1], more[-1], sep="\n", flush=True)
-        if options.verbose:
-            for r in runs:
-                odd = sorted({s[:110] for s in r.statuses if s != "ok"})
-                print(f"    {r.seed}: {r.excess} ended {r.ended:.3g}", *odd[:6], sep="\n        ")
         held &= all(r.kept and r.passed and r.arrived and np.all(r.taken <= r.period) for r in runs)
     if options.markdown:
         clocks = {"cpu": "those of the controller's thread", "wall": "those of the wall's clock"}
