@@ -60,6 +60,7 @@ class RolloutGradient(ShowsItsRepr):
     xs: Array  # (N+1, nx) the motion
     us: Array  # (N, nu) the inputs that were applied
     methods: tuple[str, ...]  # where the step Jacobians came from: one name, or more where a fallback was taken
+    loss_method: str  # what differentiated the loss by the motion: "autograd", or "autodiff" where that cannot
     # Of method="continuous": the columns in which the loss has no slope, the derivative being that of a point alone.
     undefined: tuple[Undefined, ...] = ()
 
@@ -202,6 +203,7 @@ def _collected(
         xs=frozen(np.vstack([x0, [d.x_next for d in linearization]])),
         us=frozen(inputs),
         methods=tuple(sorted({d.method for d in linearization})),
+        loss_method=totals.loss_method,
     )
 
 

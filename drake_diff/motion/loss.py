@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from drake_diff.exceptions import GradientError, InputError
 from drake_diff.motion.policy import policy_parameters
 
 Loss = Callable[..., Any]
+AUTOGRAD, AUTODIFF = "autograd", "autodiff"  # the methods that differentiate a loss
 # A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
 Feedback = tuple[Array, Array, slice]
 
@@ -27,6 +28,7 @@ class Totals:
     inputs: Array
     parameters: Array
     policy: Array
+    loss_method: str = ""  # see `differentiate_loss`
 
 
 def accumulate(
@@ -63,8 +65,9 @@ def total_gradients(
 ) -> tuple[float, Totals]:
     """The value of a loss of the steps from `x0` (nx,) under `us` (N, nu), and its total gradients."""
     xs = np.vstack([x0, [d.x_next for d in linearization]])
-    value, by_xs, by_us = differentiate_loss(loss, xs, us)
-    return value, accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
+    value, by_xs, by_us, method = differentiate_loss(loss, xs, us)
+    totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
+    return value, replace(totals, loss_method=method)
 
 
 def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:
@@ -72,19 +75,23 @@ def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:
     return float(loss(xs[-1]) if takes_one_argument(loss) else loss(xs, us))
 
 
-def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]:
-    """(value, gradient by xs (N+1, nx), gradient by us (N, nu)) of `loss` on its own, the steps apart."""
+def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array, str]:
+    """(value, gradient by xs (N+1, nx), gradient by us (N, nu), method) of `loss` on its own, the steps apart.
+
+    The method is "autograd"; "autodiff", whose time grows with the square of the motion's length, for what autograd
+    cannot follow, and for a loss of the final state alone.
+    """
     if takes_one_argument(loss):
         value, gradient = gradient_of(loss, xs[-1])
-        return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us)
+        return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us), AUTODIFF
     try:
         with np.errstate(all="ignore"):  # what is not finite is refused below, whole
             value, (by_xs, by_us) = traced_gradient(loss, (xs, us))
-    except Exception:  # it does what is not known there, or is wrong itself, which shows here
-        return _by_autodiff(loss, xs, us)
+    except Exception:  # autograd cannot follow it, or it is wrong itself, which AutoDiffXd shows
+        return *_by_autodiff(loss, xs, us), AUTODIFF
     if not (np.isfinite(value) and np.all(np.isfinite(by_xs)) and np.all(np.isfinite(by_us))):
         raise GradientError(f"the loss or its gradient is not finite: value {value}")
-    return value, by_xs, by_us
+    return value, by_xs, by_us, AUTOGRAD
 
 
 def _by_autodiff(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]:

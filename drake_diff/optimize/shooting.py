@@ -431,7 +431,7 @@ class RolloutCost:
             value, by_xs[-1] = differentiate_final_cost(self.final, xs[-1])
             total += value
         if self.trajectory is not None:
-            value, added_xs, added_us = differentiate_loss(self.trajectory, xs, us)
+            value, added_xs, added_us, _ = differentiate_loss(self.trajectory, xs, us)
             total, by_xs, by_us = total + value, by_xs + added_xs, by_us + added_us
         return total, by_xs, by_us
 
