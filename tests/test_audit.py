@@ -228,7 +228,7 @@ def test_with_fallback_a_pair_without_properties_is_judged_as_point_contact():
 
 
 def test_a_pair_that_the_table_takes_but_drake_refuses_is_still_found(monkeypatch):
-    monkeypatch.setattr("drake_diff.certificates.place.autodiff_supports", lambda *_: True)
+    monkeypatch.setattr("drake_diff.certificates.finding.autodiff_supports", lambda *_: True)
     found = only(audit(*pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995)), "autodiff_refused")
     assert (found.severity, found.subject) == ("error", "step")
     assert "Penetration queries between shapes 'Box' and 'Box'" in found.message

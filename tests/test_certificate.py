@@ -12,9 +12,9 @@ from pydrake.multibody.tree import PdControllerGains
 import drake_diff as dd
 from drake_diff._base.differences import sweep_of
 from drake_diff._base.refusal import Refusal
-from drake_diff.certificates.judgement import judge
-from drake_diff.certificates.neighbourhood import look_around
-from drake_diff.derivatives.polish import Polished
+from drake_diff.certificates.certificate import judge
+from drake_diff.certificates.differences import look_around
+from drake_diff.derivatives.refine_step import RefinedSteps
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError, UnknownNameError
 from drake_diff.model.plant import joints
 
@@ -429,9 +429,11 @@ def test_steps_that_are_not_known_to_rounding_are_said_to_be_drakes_own_and_hide
     def refused(model, vector, xs, us, values):
         n = len(xs)
         refusals = dict.fromkeys(range(n), Refusal("not today"))
-        return Polished(xs, xs, np.ones(n, dtype=bool), np.full(n, np.nan), np.full((n, model.nv), np.nan), refusals)
+        return RefinedSteps(
+            xs, xs, np.ones(n, dtype=bool), np.full(n, np.nan), np.full((n, model.nv), np.nan), refusals
+        )
 
-    monkeypatch.setattr("drake_diff.certificates.certify.polished_steps", refused)
+    monkeypatch.setattr("drake_diff.certificates.certify.refine_steps", refused)
     model = sliding("lagged")
     certificate = dd.certify(model, [0.0, 0.1 - 1e-3, 1.0, 0.01], [0.3, -0.2])
     assert certificate.verdict == "undecided"

@@ -21,7 +21,7 @@ from drake_diff.artifact.listing import list_runs
 from drake_diff.artifact.recover import recover
 from drake_diff.cli import main as cli
 from drake_diff.cli.text import as_options
-from drake_diff.derivatives.methods import METHODS
+from drake_diff.derivatives import METHODS
 from drake_diff.exceptions import ArtifactError
 from drake_diff.optimize import solve as solving
 from drake_diff.record import directory as directories

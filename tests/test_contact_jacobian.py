@@ -4,26 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.forms import both_forms
 from helpers.robots import example_robot, state_in_contact
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base import compiled as of_numba
 from drake_diff.derivatives import analytic
-from drake_diff.derivatives.contact import laws as friction_cone
-from drake_diff.derivatives.contact import witness
-from drake_diff.derivatives.contact.laws import Cone, HuntCrossley, Impulse, StateChange
-from drake_diff.derivatives.contact.material import MaterialChange
-from drake_diff.derivatives.contact.pairs import read_pairs
-from drake_diff.derivatives.joint_impulses import JointImpulses
+from drake_diff.derivatives.contact import law_kernel, laws, nearest_points
+from drake_diff.derivatives.contact.active_contacts import read_pairs
+from drake_diff.derivatives.contact.laws import ContactLaw
 from drake_diff.derivatives.steps import take_step
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.parameters import select
 from drake_diff.model.step import set_state
 
 pytest.importorskip("pinocchio")
-pytest.importorskip("numba")
 
 MATERIAL = (
     "<drake:proximity_properties><drake:point_contact_stiffness>{k}</drake:point_contact_stiffness>"
@@ -106,9 +100,6 @@ def _agree(model, x, u):
     assert ours.method == "analytic", ours.reason
     # Both are right to rounding, which near-rigid contact and the inverse of a mass matrix magnify.
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
-    for jacobians, known in both_forms(model, x, u):
-        assert known.all()
-        np.testing.assert_allclose(jacobians[0], exact, rtol=0, atol=1e-9 * np.abs(exact).max())
 
 
 def _contacts(model):
@@ -242,7 +233,7 @@ def test_other_shapes_meet_as_drake_lets_them(tmp_path, mine, other):
 @each_row("wrong", ["normal", "point", "swapped"])
 def test_a_wrong_motion_of_the_contact_is_refused(tmp_path, monkeypatch, wrong):
     """One per cent of how the normal or the point turns, or the bodies swapped."""
-    right = witness.overlap_change
+    right = nearest_points.overlap_change
 
     def changed(a, b, of):
         change, known = right(a, b, of)
@@ -256,7 +247,7 @@ def test_a_wrong_motion_of_the_contact_is_refused(tmp_path, monkeypatch, wrong):
     x = np.r_[1.0, 0.1, 0.2, 0.3, 0.1, 0.06, 0.07, 0.4, -0.3, 0.5, 0.2, -0.1, 0.3]
     assert dd.differentiate_step(model, x, method="analytic").method == "analytic"
     assert _contacts(model)
-    monkeypatch.setattr(witness, "overlap_change", changed)
+    monkeypatch.setattr(nearest_points, "overlap_change", changed)
     model = _load(tmp_path, fixed, _link("b", _sphere("probe", "0.03 -0.02 0.01", 0.06), 0.7))
     with pytest.raises(GradientError, match="differs from AutoDiffXd's"):
         dd.differentiate_step(model, x, method="analytic")
@@ -312,7 +303,7 @@ def test_a_sticking_balls_step_in_closed_form(tmp_path):
 def test_a_sliding_balls_friction_in_closed_form(tmp_path):
     """g_n D = a + mu v_x, a = -phi / (h + tau) - v*, D = R_n + mu^2 (R_t + 1 / m_x) + 1 / m_z.
 
-    Both from v_x' > 0 and y_n, y_t of `friction_cone`, but for its soft norm.
+    Both from v_x' > 0 and y_n, y_t of `laws`, but for its soft norm.
     """
     model, h = _puck(tmp_path), 0.004
     mu, soft, v_x, v_z = 2 * 0.4 * 0.6 / (0.4 + 0.6), h + 0.05, 1.0, -0.02 - 9.81 * h
@@ -385,48 +376,55 @@ def test_given_values_are_not_kept(tmp_path):
 
 
 def _laws(count, seed):
-    """Contacts that stick, slide and part, compliant and near-rigid, of each approximation."""
+    """Contacts that stick, slide and part, compliant and near-rigid, of each approximation; and their velocities."""
     random = np.random.default_rng(seed)
     normal = random.standard_normal((count, 3))
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     velocity = 0.02 * random.standard_normal((count, 1)) * normal
     velocity += 10 ** random.uniform(-5, 0, (count, 1)) * random.standard_normal((count, 3))
     common = {
-        "velocity": velocity,
         "normal": normal,
         "phi": -1e-3 * random.random(count),
         "weight": random.uniform(0.5, 5.0, count),
         "friction": random.uniform(0.1, 1.5, count),
-        "stiffness": 10 ** random.uniform(3, 8, count),
+        "time": random.uniform(0.0, 0.1, count),
+        "before": random.standard_normal(count),
+        "dissipation": random.uniform(0.0, 5.0, count),
         "time_step": 0.005,
+        "near_rigid": 1.0,
     }
-    softer = {**common, "stiffness": 10 ** random.uniform(2, 5, count)}
-    softer |= {"before": random.standard_normal(count), "dissipation": random.uniform(0.0, 5.0, count)}
-    softer["stiction_tolerance"] = 1e-4
-    return {
-        "sap": Cone(**common, time=random.uniform(0.0, 0.1, count), near_rigid=1.0),
-        "similar": HuntCrossley(**softer, lagged=False),
-        "lagged": HuntCrossley(**softer, lagged=True),
-    }
+    stiffness = {"sap": 10 ** random.uniform(3, 8, count)}
+    stiffness["similar"] = stiffness["lagged"] = 10 ** random.uniform(2, 5, count)
+    return {a: ContactLaw(a, stiffness=k, **common) for a, k in stiffness.items()}, velocity
 
 
-def _regime(solved):
-    """(M, n) which branch of the law each contact is on."""
-    if isinstance(solved, Impulse):
-        return np.stack([solved.sticks, solved.pushes, solved.is_rigid], axis=1)
-    return np.stack([solved.pushes, solved.is_soft, solved.damping > 0], axis=1)
+def _solved(law, velocity):
+    """(M, 23) of each contact the impulse, and which branch of the law it is on: (M, 3) flags."""
+    found, constants = np.zeros((len(velocity), 23)), (1e-3, 1e-7, 1e-4)
+    for m, at in enumerate(found):
+        law_kernel.solve_law(
+            laws.LAWS[law.approximation], law.time_step, law.near_rigid, constants, law.normal[m], law.phi[m],
+            law.friction[m], law.stiffness[m], law.time[m], law.dissipation[m], law.weight[m], velocity[m],
+            law.before[m], at,
+        )  # fmt: skip
+    return found, found[:, [15, 16, 18] if law.approximation == "sap" else [21, 22, 10]] > 0
 
 
-def _changed(solved, name, change):
-    """The derivative of the impulse along a change of one of its arguments."""
-    count = len(change)
-    if name in ("friction", "stiffness", "time", "dissipation"):
-        zero = np.zeros((count, 1))
-        material = dict.fromkeys(("friction", "stiffness", "time", "dissipation", "other_part"), zero)
-        return solved.by_material(MaterialChange(**{**material, name: change[:, None]}))[:, 0]
-    state = {"velocity": np.zeros((count, 1, 3)), "normal": np.zeros((count, 1, 3))}
-    state |= {n: np.zeros((count, 1)) for n in ("phi", "weight", "before")}
-    return solved.by_state(StateChange(**{**state, name: change[:, None]}))[:, 0]
+def _changed(law, velocity, solved, name, change):
+    """(M, 3) the derivative of the impulse along a change of one of its arguments."""
+    zero, found = np.zeros(3), np.empty_like(velocity)
+    for m in range(len(velocity)):
+        of_state, of_material = (
+            tuple(float(change[m]) if name == one else 0.0 for one in names)
+            for names in (("phi", "weight", "before"), ("friction", "stiffness", "time", "dissipation"))
+        )
+        of_velocity, of_normal = (change[m] if name == one else zero for one in ("velocity", "normal"))
+        law_kernel.change_law(
+            laws.LAWS[law.approximation], law.time_step, 1e-3, law.normal[m], law.phi[m], law.friction[m],
+            law.stiffness[m], law.dissipation[m], law.weight[m], velocity[m], solved[m], of_velocity, of_normal,
+            of_state, of_material, found[m],
+        )  # fmt: skip
+    return found
 
 
 ARGUMENTS = ["velocity", "normal", "phi", "weight", "friction", "stiffness"]
@@ -438,30 +436,31 @@ ARGUMENTS = ["velocity", "normal", "phi", "weight", "friction", "stiffness"]
     + [("sap", "time"), *((a, n) for a in ("similar", "lagged") for n in ("before", "dissipation"))],
 )
 def test_the_impulses_derivative_is_its_difference(approximation, name):
-    law, random = _laws(400, 1)[approximation], np.random.default_rng(4)
-    solved, step = law.solve(), 1e-8 if name == "velocity" else 1e-7  # soft norms turn within 1e-7 of it
-    regime = _regime(solved)
+    every, velocity = _laws(400, 1)
+    law, random = every[approximation], np.random.default_rng(4)
+    (solved, regime), step = _solved(law, velocity), 1e-8 if name == "velocity" else 1e-7  # soft norms turn within 1e-7
     assert (regime.any(axis=0) & ~regime.all(axis=0)).all()  # every branch is among them
-    value = getattr(law, name)
+    value = velocity if name == "velocity" else getattr(law, name)
     change = random.standard_normal(value.shape) * (value if name == "stiffness" else 1.0)
-    sides = [replace(law, **{name: value + side * step * change}).solve() for side in (1, -1)]
-    keep = np.all([_regime(side) == regime for side in sides], axis=(0, 2))
+    sides = []
+    for moved in (value + step * change, value - step * change):
+        sides.append(_solved(law, moved) if name == "velocity" else _solved(replace(law, **{name: moved}), velocity))
+    keep = np.all([side[1] == regime for side in sides], axis=(0, 2))
     assert keep.sum() > 350
-    differences = (sides[0].impulse - sides[1].impulse) / (2 * step)
-    found = _changed(solved, name, change)
+    differences = (sides[0][0][:, :3] - sides[1][0][:, :3]) / (2 * step)
+    found = _changed(law, velocity, solved, name, change)
     size = np.maximum(np.abs(differences).max(axis=1), 1e-3)[:, None]
     np.testing.assert_allclose((found / size)[keep], (differences / size)[keep], atol=2e-5)  # the step's own error
     if name == "velocity":
-        whole = (solved.by_velocity() @ change[:, :, None])[..., 0]
-        np.testing.assert_allclose(whole, found, atol=1e-12 * np.abs(found).max())
-    if name == "before":
-        np.testing.assert_allclose(solved.by_before() * change[:, None], found, atol=1e-15)
+        impulse, slope = law.impulses(velocity)
+        np.testing.assert_array_equal(impulse, solved[:, :3])
+        np.testing.assert_allclose((slope @ change[:, :, None])[..., 0], found, atol=1e-12 * np.abs(found).max())
 
 
 def test_another_law_is_found_out(tmp_path, monkeypatch):
     """A wrong constant moves v' off the solution, or, where it hardly does, the Jacobian off AutoDiffXd's."""
     x = [0.0, 0.1 - 1e-3, 1e-4, -0.02]
-    monkeypatch.setattr(friction_cone, "SIGMA", 1.1e-3)
+    monkeypatch.setattr(laws, "SIGMA", 1.1e-3)
     with pytest.raises(GradientError, match="analytic derivative is not known"):
         dd.differentiate_step(_puck(tmp_path), x, method="analytic")
     assert analytic.SAME_JACOBIAN == 1e-9
@@ -526,9 +525,13 @@ def test_what_autodiff_does_not_step_is_certified_by_differences(tmp_path, monke
         assert bool(note) == agrees == (not why)
     assert len(ends) == 3  # not where the Jacobian itself is the differences'
     assert all(np.abs(end - d.x_next).max() < 1e-6 for end in ends)
-    monkeypatch.setattr(of_numba, "has_numba", lambda: False)
-    right = JointImpulses.by_motion
-    monkeypatch.setattr(JointImpulses, "by_motion", lambda *a: 1.001 * right(*a))
+    right = analytic.contact_jacobians
+
+    def wrong(*arguments):
+        jacobians, *rest = right(*arguments)
+        return 1.001 * jacobians, *rest
+
+    monkeypatch.setattr(analytic, "contact_jacobians", wrong)
     with pytest.raises(GradientError, match="differs from the differences of the step solved to rounding"):
         dd.differentiate_step(refused_by_autodiff(), x, method="analytic")
 

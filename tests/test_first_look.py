@@ -7,10 +7,9 @@ from helpers.robots import example_robot, state_in_contact, state_in_range
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.certificates.certify import certify_inside
-from drake_diff.certificates.first_look import LookAt
-from drake_diff.certificates.neighbourhood import is_broken
-from drake_diff.certificates.steps import certify_steps, first_looks
+from drake_diff.certificates.certify import certify_inside, certify_steps, first_looks
+from drake_diff.certificates.differences import is_broken
+from drake_diff.certificates.directions import LookAt
 
 RANDOM = np.random.default_rng(3)
 WEIGHT = RANDOM.standard_normal((5, 8)) * 10.0 ** RANDOM.uniform(-3, 3, (5, 1)) * 10.0 ** RANDOM.uniform(-3, 0, 8)

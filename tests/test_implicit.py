@@ -25,7 +25,6 @@ from pydrake.multibody.tree import (
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 import drake_diff as dd
-from drake_diff._base import compiled
 from drake_diff.certificates.certify import certify_inside
 from drake_diff.derivatives import sources
 from drake_diff.derivatives.smooth_step import SmoothStep
@@ -349,20 +348,18 @@ def test_a_box_in_the_air_that_autodiff_refuses_on_a_broad_phase_hit(ground):
     assert refused or ground == "half space"  # which 1.51 refuses and 1.58 does not
 
 
-def test_the_automatic_choice_says_what_it_took_and_why(load, without_pinocchio, monkeypatch):
-    """As after a plain install, without the extra `fast`."""
-    monkeypatch.setattr(compiled, "has_numba", lambda: False)
+def test_the_automatic_choice_says_what_it_took_and_why(load):
     model = load("double_pendulum.urdf")
-    point = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
-    d = dd.differentiate_step(model, *point)
+    point, names = ([0.4, -0.9, 1.3, -0.6], [0.25, -0.15]), ["lower.mass"]
+    d = dd.differentiate_step(model, *point, parameters=names)
     assert d.method == "implicit"
     assert "equal to autodiff, as certified on this model" in d.reason
-    again = dd.differentiate_step(model, [0.1, 0.2, 0.3, 0.4], [0.0, 1.0])
+    again = dd.differentiate_step(model, [0.1, 0.2, 0.3, 0.4], [0.0, 1.0], parameters=names)
     assert (again.method, again.reason) == (d.method, d.reason)  # once and for all
 
 
 @pytest.mark.parametrize("slow", ["implicit", "autodiff"])
-def test_a_delay_changes_nothing_about_the_choice(load, without_pinocchio, monkeypatch, slow):
+def test_a_delay_changes_nothing_about_the_choice(load, monkeypatch, slow):
     """The choice stands in records: one that went by the clock would change from machine to machine."""
     models = [load("double_pendulum.urdf") for _ in range(2)]
     point = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]

@@ -15,11 +15,11 @@ from helpers.table import each_row
 from pydrake.multibody.tree import RpyFloatingJoint
 
 import drake_diff as dd
-from drake_diff._base import compiled
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified, is_own
-from drake_diff.derivatives.joint_impulses import NEAR_RIGID, JointImpulses
-from drake_diff.derivatives.polish import polished_step
+from drake_diff.derivatives import analytic
+from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified
+from drake_diff.derivatives.joint_impulses import NEAR_RIGID
+from drake_diff.derivatives.refine_step import refine_step
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.mechanics.tree import OwnDynamics
@@ -329,32 +329,28 @@ def test_auto_serves_wherever_autodiff_does_and_every_step_is_had_to_rounding():
     served = []
     for model, x, u in example_robots():
         served.append(same_where_autodiff_works(model, x, u))
-        solved = polished_step(model, select(model, ()), x, u)
+        solved = refine_step(model, select(model, ()), x, u)
         assert not isinstance(solved, Refusal), f"{model.name}: {solved}"
     assert served.count(True) >= 30
 
 
-def test_without_pinocchio_our_own_dynamics_serve(load, without_pinocchio, monkeypatch):
-    monkeypatch.setattr(compiled, "has_numba", lambda: False)
+def test_without_pinocchio_our_own_dynamics_serve(load, without_pinocchio):
     model = load("double_pendulum.urdf")
     xs, us = np.array([[0.4, -0.9, 1.3, -0.6]] * 2), np.array([[0.25, -0.15]] * 2)
     equal(model, xs, us)
-    assert is_own(model)
-    assert dd.differentiate_step(model, xs[0], us[0]).method == "implicit"  # of one state in less time
+    assert dd.differentiate_step(model, xs[0], us[0]).method == "analytic"
 
 
-@each_row("name, has_numba", [("solo12.urdf", False), ("solo12.urdf", True), ("go2.urdf", True), ("bolt.urdf", False)])
-def test_our_own_dynamics_are_pinocchios(name, has_numba, without_pinocchio, monkeypatch):
+@each_row("name", ["solo12.urdf", "go2.urdf", "bolt.urdf"])
+def test_our_own_dynamics_are_pinocchios(name, without_pinocchio):
     """In flight and on their feet, at their stops too, as AutoDiffXd has them; a wrong inertia is found out."""
-    if not has_numba:
-        monkeypatch.setattr(compiled, "has_numba", lambda: False)
     model, random = example_robot(name, 0.01, feet=True), np.random.default_rng(4)
     xs = np.array([state_in_contact(model, random), state_in_range(model, random)])
     xs[1, :4] *= 1.1  # of any norm
     xs[1, model.nq - 1] = model.position_limits[0][-1] + 1e-3
     equal(model, xs, 0.1 * random.standard_normal((2, model.nu)))
     smooth = analytic_of(model)
-    assert (smooth.dynamics.compiled is not None) == (has_numba and compiled.has_numba())
+    assert smooth.dynamics.compiled is not None
     wrong = replace(smooth.dynamics.tree, inertia=1.001 * smooth.dynamics.tree.inertia)
     doctored = replace(smooth, dynamics=replace(smooth.dynamics, tree=wrong, compiled=None))
     assert "of the forces in Drake's equation" in certified(model, doctored).reason
@@ -443,9 +439,13 @@ def test_joints_that_are_coupled_are_linearized_at_once():
 
 
 def test_a_wrong_derivative_at_a_limit_is_refused_on_the_model(monkeypatch):
-    monkeypatch.setattr(compiled, "has_numba", lambda: False)
-    right = JointImpulses.by_motion
-    monkeypatch.setattr(JointImpulses, "by_motion", lambda *a: 1.001 * right(*a))
+    right = analytic.contact_jacobians
+
+    def wrong(*arguments):
+        jacobians, *rest = right(*arguments)
+        return 1.001 * jacobians, *rest
+
+    monkeypatch.setattr(analytic, "contact_jacobians", wrong)
     model = limited_pendulum()
     found = dd.differentiate_step(model, [0.999, 2.0], [0.1])
     assert found.method == "autodiff"

@@ -12,7 +12,7 @@ from helpers.table import each_row
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
-from drake_diff.derivatives.reduced import Reduced
+from drake_diff.derivatives.analytic import Reduced
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.plant import actuators

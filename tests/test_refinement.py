@@ -11,8 +11,8 @@ from pydrake.multibody.tree import PdControllerGains, SpatialInertia
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 import drake_diff as dd
-from drake_diff.certificates.refinement import REFINEMENTS, beside_slopes, judge_levels
-from drake_diff.certificates.slopes import Direction, Motions, Slope, directions
+from drake_diff.certificates.displaced import Displaced, Line
+from drake_diff.certificates.refinement import REFINEMENTS, Motions, Slope, beside_slopes, judge_levels
 from drake_diff.exceptions import CertificateError, InputError, ModelError, SimulationError
 from drake_diff.model.parameters import select
 from drake_diff.motion import continuous
@@ -95,9 +95,9 @@ def test_the_line_through_the_loss_is_as_wide_as_the_way_of_eight_steps(tmp_path
     """A touch is a step later where the start is v h higher, or v h / t faster upwards, after a fall of t."""
     h, parts = 1e-3, REFINEMENTS[-1]
     model = Bounce(1e4).model(tmp_path / "bouncer.sdf", "sap", h)
-    us, nothing = np.zeros((400, 0)), select(model, ())
-    motions = Motions(model, np.array(DROP), us, height, nothing, parts, None)
-    by_z, by_v = (motions.slope(along).width for along in directions(model, np.array(DROP), us, nothing))
+    moved = Displaced(model, np.array(DROP), np.zeros((400, 0)), height, None, select(model, ()), "auto")
+    motions = Motions(moved, parts, None)
+    by_z, by_v = (motions.slope(line).width for line in moved.lines)
     fall = np.sqrt(2 * (DROP[0] - RADIUS) / 9.81)
     assert by_z == pytest.approx(8 * 9.81 * fall * h / parts, rel=2e-3)  # the touch is seen at the end of a step
     assert by_v == pytest.approx(by_z / fall, rel=2e-3)
@@ -161,7 +161,7 @@ def test_a_smooth_motion_has_all_three_slopes_and_says_them(load):
         load("pendulum.urdf"), [0.5, 0.3], np.full((30, 1), 0.2), height, refine=True, parameters=("pole.mass",)
     ).require()
     along = certificate.refinements[0].compared
-    assert [c.slope.direction.name for c in along] == ["hinge_q[0]", "hinge_w[0]", "motor at all times", "pole.mass"]
+    assert [c.slope.line.name for c in along] == ["hinge_q[0]", "hinge_w[0]", "motor at all times", "pole.mass"]
     for c in along:  # an error of first order in h / 4 = 2.5 ms, at 4.4 rad/s
         assert c.slope.secant == pytest.approx(c.slope.continuous, rel=0.02)
         assert c.disagree == ()
@@ -214,7 +214,7 @@ def test_an_entry_is_judged_by_the_size_of_those_of_its_kind(kind, converges):
 def test_a_gradient_of_one_is_compared_with_the_slopes(secant, continuous, spread, disagree):
     levels = judge_levels("time step", (1.0, 0.5, 0.25), ["z"], np.ones((3, 1)), ["position [m]"])
     assert levels.converged.all()
-    slope = Slope(Direction("z", slice(0, 1), 1.0, np.ones(1), 1.0), secant, 0.1, continuous, spread, ())
+    slope = Slope(Line("z", np.array([0]), 1.0, np.ones(1), 1.0), secant, 0.1, continuous, spread, ())
     found = beside_slopes(levels, [slope])
     assert found.compared[0].disagree == disagree
     assert found.converged.all() == (not disagree)

@@ -11,9 +11,8 @@ from pydrake.autodiffutils import AutoDiffXd
 
 import drake_diff as dd
 from drake_diff._base.autodiff import chain_rows, plain
-from drake_diff.certificates.directions import FIRST, MISS, QUANTILE, Probe, weights
-from drake_diff.certificates.feedback import fresh
-from drake_diff.certificates.stairs import stairs_of_policy
+from drake_diff.certificates.directions import SAMPLE, Probe, weights
+from drake_diff.certificates.displaced import fresh, stairs_of_policy
 from drake_diff.exceptions import CertificateError, GradientError, InputError
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import ParametricPolicy
@@ -144,10 +143,10 @@ def linear(gradient, offset=0.0):
 
 def test_the_quantiles_are_those_of_chi_squared():
     """Closed forms: 1 - e^(-x/2) (1 + x/2) and erf(sqrt(x/2)) - sqrt(2x/pi) e^(-x/2) (1 + x/3); to four digits."""
-    four, five = QUANTILE[4], QUANTILE[5]
-    assert 1 - math.exp(-four / 2) * (1 + four / 2) == pytest.approx(MISS / 2, rel=1e-3)
+    four, five = SAMPLE.quantiles
+    assert 1 - math.exp(-four / 2) * (1 + four / 2) == pytest.approx(SAMPLE.miss / 2, rel=1e-3)
     by_five = math.erf(math.sqrt(five / 2)) - math.sqrt(2 * five / math.pi) * math.exp(-five / 2) * (1 + five / 3)
-    assert by_five == pytest.approx(MISS / 2, rel=1e-3)
+    assert by_five == pytest.approx(SAMPLE.miss / 2, rel=1e-3)
 
 
 def test_an_error_is_seldom_larger_than_the_bound():
@@ -159,7 +158,7 @@ def test_an_error_is_seldom_larger_than_the_bound():
         error[: 1 + seed % 12] = 1.0
         stated = true * (1 + 0.3 * error)
         weight = weights(np.abs(stated), kinds)
-        gaps = Probe(linear(true), stated, weight, seed).gaps(0.0, 1e-4, FIRST)
+        gaps = Probe(linear(true), stated, weight, seed).gaps(0.0, 1e-4, SAMPLE.first)
         missed += gaps.bound < np.linalg.norm((stated - true) * weight)
     assert 0 < missed <= 12
 

@@ -243,7 +243,7 @@ def test_a_solver_that_lies_is_not_believed(load, monkeypatch):
 
 
 def test_a_wrong_derivative_is_named_and_keeps_a_solve_from_success(load, monkeypatch):
-    module = sys.modules["drake_diff.certificates.steps"]
+    module = sys.modules["drake_diff.certificates.certify"]
     original = module.derivatives_along
 
     def one_percent_off(*args, **options):

@@ -15,10 +15,9 @@ from pydrake.multibody.tree import (
 )
 
 import drake_diff as dd
-from drake_diff.derivatives.implicit import takes_many
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import ModelWarning
-from drake_diff.mechanics.tree import TreeDynamics, tree_of
+from drake_diff.mechanics.tree import TreeDynamics, tree_for, tree_of
 from drake_diff.model.parameters import applied, select
 
 
@@ -129,7 +128,7 @@ def without_gravity():
 def test_what_is_no_such_tree_is_told_and_taken_by_autodiff(make, words):
     model = make()
     assert words in tree_of(model).reason
-    assert not takes_many(model)
+    assert tree_for(model) is None
     x = model.default_state + 0.01
     if model.nq != model.nv:
         x[:4] = [1, 0, 0, 0]
@@ -148,7 +147,7 @@ def test_a_tree_that_is_not_drakes_is_not_used(monkeypatch):
 
     monkeypatch.setattr("drake_diff.mechanics.tree.tree_of", wrong)
     model = random_tree(5)
-    assert not takes_many(model)
+    assert tree_for(model) is None
     x = 0.1 * np.ones(model.nx)
     u = 0.1 * np.ones(model.nu)
     a, b = (dd.differentiate_step(model, x, u, method=m) for m in ("implicit", "autodiff"))
@@ -161,7 +160,6 @@ def test_a_whole_rollout_in_one_call_is_the_one_by_autodiff(load, name):
     random = np.random.default_rng(0)
     x0, us = 0.3 * random.standard_normal(model.nx), random.standard_normal((30, model.nu))
     ours, drakes = (derivatives_along(model, x0, us, method=method) for method in ("implicit", "autodiff"))
-    assert takes_many(model)
     for a, b in zip(ours, drakes, strict=True):
         assert a.method == "implicit"
         assert np.array_equal(a.x_next, b.x_next)

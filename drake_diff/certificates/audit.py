@@ -19,8 +19,7 @@ from pydrake.multibody.tree import FixedOffsetFrame, WeldJoint
 
 from drake_diff._base.arrays import Array
 from drake_diff.certificates.audit_model import FILE_CHECKS
-from drake_diff.certificates.finding import SEVERITIES, Finding, Findings, Severity
-from drake_diff.certificates.place import PARALLEL, Collider, Pair, Place
+from drake_diff.certificates.finding import PARALLEL, SEVERITIES, Collider, Finding, Findings, Pair, Place, Severity
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
 from drake_diff.model.contact_geometry import MEETS_A_SPHERE

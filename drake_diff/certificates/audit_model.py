@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from pydrake.multibody.plant import DiscreteContactApproximation
 
-from drake_diff.certificates.finding import Finding, Severity
-from drake_diff.certificates.place import Place
+from drake_diff.certificates.finding import Finding, Place, Severity
 from drake_diff.exceptions import ModelError
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.model import Model

@@ -1,30 +1,57 @@
-"""The rollouts that a certificate takes: the loss at displaced first states, inputs and parameters."""
+"""The rollouts that a certificate takes, and what it asks of the loss and the policy alone.
 
+A rollout's gradient goes through u = policy(x, t). It is wrong where the policy remembers what it was asked before,
+as the derivative by what is remembered is nowhere, and where its derivative is not its own. Both are told here by
+asking the policy alone; what they do to the gradient, rollouts tell.
+
+A loss or a policy may be a staircase: rounding, a table or a whole number make a function that is flat, or nearly so,
+between jumps. Its derivative is true and worthless, and where the steps are wide no difference of a rollout meets one.
+The function alone can be asked far from the motion at next to no cost, along one line, over lengths from 1e-4 to 10
+times the scale.
+"""
+
+import types
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, finite_array
+from drake_diff._base.differences import central_differences
 from drake_diff.certificates.certify import move, solver_tolerance, state_scale
-from drake_diff.certificates.feedback import fresh, with_parameters
-from drake_diff.derivatives.polish import Polished, polished_steps
+from drake_diff.derivatives.refine_step import RefinedSteps, refine_steps
+from drake_diff.derivatives.sources import PARITY_TOLERANCE
+from drake_diff.exceptions import GradientError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied
+from drake_diff.model.plant import actuators
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import TangentSpace, tangent_space
 from drake_diff.motion.gradient import RolloutGradient, differentiate_rollout
 from drake_diff.motion.loss import Loss, evaluate_loss
-from drake_diff.motion.policy import policy_parameters
+from drake_diff.motion.policy import ParametricPolicy, active_parameters, differentiate_policy, policy_parameters
 
+WIDEST = 0.25  # of the scale of a state or a parameter: how far differences may move it
 MANY = 256  # rollouts whose steps are solved at once
 Point = tuple[Array, Array, Array, ParameterVector]  # x0 (nx,), us (N, nu), the policy's parameters, the model's
 
 
 class NotSolvedError(Exception):
     """A step is not known to rounding; it says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One direction in which a rollout is moved: one column of its gradient, or one input by as much at all times."""
+
+    name: str
+    columns: Indices  # of the gradient, which add up to it
+    scale: float
+    vector: Array  # (n,) the displacement by a unit of it
+    room: float  # how far differences may move it, in its unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +103,27 @@ class Displaced:
         of_model = [first + i for i, p in enumerate(self.vector.parameters) for _ in p.value]
         return np.array([*of_x0, *given, *of_model], dtype=np.intp)
 
+    @cached_property
+    def lines(self) -> tuple[Line, ...]:
+        """Each state, each input by as much at all times or each parameter of the policy, and each of the model."""
+        (count, nu), size = self.us.shape, self.space.size
+        given = count * nu if self.policy is None else 0
+        units = np.eye(len(self.scale)) / self.scale
+        found = [
+            Line(self.columns[j], np.array([j]), float(self.scale[j]), units[j], WIDEST * float(self.scale[j]))
+            for j in (*range(size), *range(size + given, len(self.scale)))
+        ]
+        if self.policy is not None:
+            return tuple(found)
+        limits = self.model.inputs.of_actuators([a.effort_limit() for a in actuators(self.model.plant)])
+        cut = np.where(self.model.inputs.actuator >= 0, limits, np.inf)
+        for j in range(nu):
+            columns, sizes = size + j + nu * np.arange(count), np.abs(self.us[:, j])
+            name, room = f"{self.model.input_names[j]} at all times", float(np.abs(cut[j] - sizes).min())
+            scale = max(1.0, float(sizes.max()))
+            found.insert(size + j, Line(name, columns, scale, units[columns].sum(axis=0), room))
+        return tuple(found)
+
     def at(self, displacement: Array) -> Point:
         """What is rolled out at a displacement (n,)."""
         point = move(self.space, self.model.nx, np.concatenate([self.x0, self._values]), self.scale * displacement)
@@ -118,7 +166,7 @@ class Displaced:
         Raises NotSolvedError where a step is not known to rounding.
         """
         with applied(self.vector) as model:
-            found = polished_steps(model, self.vector, g.xs[:-1], g.us)
+            found = refine_steps(model, self.vector, g.xs[:-1], g.us)
         _check_solved(found)
         left = [self.space.minus(*pair) for pair in zip(found.drake, found.x_next, strict=True)]
         return np.array(left), float(np.max(found.left))
@@ -143,7 +191,7 @@ class Displaced:
         with applied(self.vector) as model:
             for k in range(count):
                 inputs[:, k] = [ask(x, k, h) for ask, x, h in zip(asks, xs[:, k], times, strict=True)]
-                found = polished_steps(model, self.vector, xs[:, k], inputs[:, k], values)
+                found = refine_steps(model, self.vector, xs[:, k], inputs[:, k], values)
                 _check_solved(found)
                 xs[:, k + 1] = [self.space.plus(x_next, left[k]) for x_next in found.x_next]
         return np.array([[evaluate_loss(self.loss, *motion)] for motion in zip(xs, inputs, strict=True)])
@@ -161,6 +209,214 @@ class Displaced:
         return lambda x, k, h: finite_array("policy(x, t)", asked(x.copy(), k * h), (nu,))
 
 
-def _check_solved(found: Polished) -> None:
+def _check_solved(found: RefinedSteps) -> None:
     for k, refusal in found.refused.items():
         raise NotSolvedError(f"{refusal} (step {k})" if len(found.refused) < len(found.left) else str(refusal))
+
+
+SHARED = ("pydrake.", "drake_diff.model.")  # packages whose objects a copy shares with the original: models and plants
+STEPS = (1e-4, 1e-6)  # of the differences of a policy; a derivative must miss both
+MISSED = 1e-3  # of the row's largest entry
+LEAST = 1e-6  # of the input: a smaller derivative is not told from rounding
+ASKED = 5  # times along the motion at which the derivative is compared
+
+
+def fresh(policy: Any) -> Any:
+    """A copy of `policy` with a memory of its own: containers and arrays are copied, however deep they stand.
+
+    Models are shared, as are objects that are not made in Python; a memory among the globals of a module is, too.
+    """
+    return _copied(policy, {})
+
+
+def _copied(thing: Any, known: dict[int, Any]) -> Any:
+    """`thing`, or a copy where it can remember; `known` are the copies that there are, by the originals' id."""
+    if id(thing) in known or type(thing).__module__.startswith(SHARED):
+        return known.get(id(thing), thing)
+    if isinstance(thing, types.FunctionType):
+        return _copied_function(thing, known)
+    if isinstance(thing, types.MethodType):
+        return types.MethodType(thing.__func__, _copied(thing.__self__, known))
+    if isinstance(thing, partial):
+        arguments = (_copied(one, known) for one in thing.args)
+        return partial(_copied(thing.func, known), *arguments, **_copied(thing.keywords, known))
+    if isinstance(thing, dict | list | deque | set | np.ndarray):
+        return _copied_container(thing, known)
+    made_by: Any = type(thing).__new__
+    if made_by is object.__new__ and hasattr(thing, "__dict__"):  # of a class written in Python
+        known[id(thing)] = copy = object.__new__(type(thing))
+        copy.__dict__.update({name: _copied(value, known) for name, value in vars(thing).items()})
+    return known.get(id(thing), thing)
+
+
+def _copied_container(thing: Any, known: dict[int, Any]) -> Any:
+    known[id(thing)] = copy = thing.copy()
+    if isinstance(thing, np.ndarray):
+        copy.flags.writeable = thing.flags.writeable
+    elif not isinstance(thing, set):
+        for key in thing if isinstance(thing, dict) else range(len(thing)):
+            copy[key] = _copied(thing[key], known)
+    return copy
+
+
+def _copied_function(function: types.FunctionType, known: dict[int, Any]) -> types.FunctionType:
+    """With cells of its own, as a closure's memory stands there, or in its attributes or default arguments."""
+    cells = function.__closure__ or ()
+    copies = tuple(types.CellType() for _ in cells)
+    code, names = function.__code__, function.__globals__
+    copy = types.FunctionType(code, names, function.__name__, None, copies if cells else None)
+    known[id(function)] = copy  # before its cells, one of which may hold it
+    copy.__defaults__, copy.__kwdefaults__ = (
+        _copied(some, known) for some in (function.__defaults__, function.__kwdefaults__)
+    )
+    copy.__dict__.update({name: _copied(value, known) for name, value in vars(function).items()})
+    for empty, cell in zip(copies, cells, strict=True):
+        if cell != types.CellType():  # a name that the function closes over and that is not bound yet
+            empty.cell_contents = _copied(cell.cell_contents, known)
+    return copy
+
+
+def with_parameters(policy: Any, parameters: Array) -> Any:
+    """`policy` with other `parameters` (n,); itself where it has none."""
+    return ParametricPolicy(policy, parameters) if len(policy_parameters(policy)) else policy
+
+
+def check_memory(policy: Any, g: RolloutGradient, time_step: float) -> None:
+    """Refuse a policy that says another u at a state and a time of the motion of `g` after it was asked elsewhere.
+
+    `policy` has led another motion before; it is asked from the end to the start.
+    """
+    for k in reversed(range(len(g.us))):
+        u, again = g.us[k], finite_array("policy(x, t)", policy(g.xs[k].copy(), k * time_step), (g.us.shape[1],))
+        if not np.all(np.abs(again - u) <= PARITY_TOLERANCE * np.maximum(1.0, np.abs(u))):
+            i = int(np.argmax(np.abs(again - u)))
+            raise GradientError(
+                f"the policy remembers: at t = {k * time_step:g} s and the same x, u[{i}] was {u[i]:.9g}, and after "
+                f"another motion it is {again[i]:.9g}; make it a function of x and t alone"
+            )
+
+
+def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_step: float) -> str:
+    """What the policy's own derivative misses at five times along the motion; empty where it is right there."""
+    parameters, nu = policy_parameters(policy), g.us.shape[1]
+    for k in np.unique(np.linspace(0, len(g.us) - 1, ASKED).astype(int)):
+        x, t = g.xs[k], float(k * time_step)
+        acting = np.arange(len(parameters))[active_parameters(policy, t)]
+        scale = np.maximum(1.0, np.abs(parameters[acting]))
+        columns = (*space.names, *(f"its parameter {i}" for i in acting))
+
+        def moved(d: Array, x: Array = x, t: float = t, acting: Indices = acting, scale: Array = scale) -> Array:
+            values = np.array(parameters)
+            values[acting] += scale * d[space.size :]
+            return finite_array(
+                "policy(x, t)", with_parameters(policy, values)(space.plus(x, d[: space.size]), t), (nu,)
+            )
+
+        u, by_x, by_parameters = differentiate_policy(policy, x, t, nu)
+        stated = np.hstack([by_x @ space.derivative_of_plus(x), by_parameters[:, acting] * scale])
+        found = [central_differences(moved, len(columns), h) for h in STEPS]
+        size = np.maximum(np.abs(stated), np.abs(found[-1])).max(axis=1, initial=0.0, keepdims=True)
+        size = np.maximum(size, LEAST * np.maximum(1.0, np.abs(u))[:, None])
+        gap = np.minimum(*(np.abs(stated - some) for some in found)) / size
+        if np.max(gap, initial=0.0) > MISSED:
+            i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
+            unit = np.concatenate([np.ones(space.size), scale])[j]
+            return (
+                f"the policy states a wrong derivative: at t = {t:g} s that of u[{i}] by {columns[j]} is "
+                f"{stated[i, j] / unit:.6g}, differences of the policy say {found[-1][i, j] / unit:.6g}"
+            )
+    return ""
+
+
+LENGTHS = tuple(10.0**k for k in range(-4, 2))  # of the line, to each side
+CELLS = 16  # both sides together
+STAIRS = 3  # jumps in as many cells: fewer are a switch, which the motion may never meet
+QUARTERINGS = 10
+SETTLED = 2  # after so many a smooth function's cells differ by 1/256, those of a corner by 1/16
+KEPT = 0.125  # and those of a jump by as much as before
+ROUNDED, PART = 1e-12, 1e-6  # of the largest value, and of what they differ by: a jump that is told
+SINGLE = 5e-7  # of an input: single precision is no staircase
+OUTSIDE = (ValueError, ArithmeticError, LookupError)  # what a function may raise where it is not defined
+
+Jump = tuple[float, float]  # from where to where
+
+
+def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
+    """How the loss alone jumps around the motion of `g`; empty where it is no staircase."""
+    by_x = _line(len(g.xs), space.size)
+    states = np.array([space.derivative_of_plus(x) @ d for x, d in zip(g.xs, by_x, strict=True)])
+    inputs = _line(*g.us.shape)
+
+    def along(s: float) -> float:
+        return evaluate_loss(loss, g.xs + s * states, g.us + s * inputs)
+
+    if not (found := _stairs(along, 0.0)):
+        return ""
+    size = along(found[1]) - along(found[0])
+    return (
+        f"the loss is a staircase: of {CELLS} parts of a line through the motion {found[2]} jump, one by {size:.3g} "
+        f"at {found[0]:.3g}"
+    )
+
+
+def stairs_of_policy(policy: Callable[..., Array], g: RolloutGradient, space: TangentSpace, time_step: float) -> str:
+    """How the policy alone jumps around three states of the motion of `g`; empty where it is no staircase."""
+    asked, nu = fresh(policy), g.us.shape[1]
+    weight = _line(1, nu)[0]
+    for k in sorted({0, len(g.us) // 2, len(g.us) - 1}):
+        x, t, direction = g.xs[k], float(k * time_step), _line(1, space.size)[0]
+
+        def u(s: float, x: Array = x, t: float = t, direction: Array = direction) -> Array:
+            return np.asarray(asked(space.plus(x, s * direction), t), dtype=float)
+
+        def along(s: float, u: Callable[[float], Array] = u) -> float:
+            return float(weight @ u(s))
+
+        if found := _stairs(along, SINGLE * float(np.abs(g.us[k]).sum())):
+            change = u(found[1]) - u(found[0])
+            i = int(np.argmax(np.abs(change)))
+            return (
+                f"the policy is a staircase: at t = {t:g} s, of {CELLS} parts of a line through x {found[2]} jump, "
+                f"u[{i}] by {change[i]:.3g} at {found[0]:.3g}"
+            )
+    return ""
+
+
+def _line(rows: int, columns: int) -> Array:
+    """(rows, columns) a direction with no small entry."""
+    random = np.random.default_rng(2)
+    return np.asarray(random.uniform(0.5, 1.0, (rows, columns)) * random.choice([-1.0, 1.0], (rows, columns)))
+
+
+def _stairs(f: Callable[[float], float], least: float) -> tuple[float, float, int] | None:
+    """Where a function of one number jumps first, from and to, and in how many cells; None where it is no staircase."""
+    with np.errstate(all="ignore"):
+        for length in LENGTHS:
+            ends = np.linspace(-length, length, CELLS + 1)
+            try:
+                values = np.array([f(float(s)) for s in ends])
+                told = max(least, ROUNDED * float(np.max(np.abs(values))), PART * float(np.ptp(values)))
+                if not np.max(np.abs(np.diff(values, 3))) > told:  # which is nothing where a function is smooth
+                    continue
+                jumps = [found for i in range(CELLS) if (found := _jump(f, ends[i : i + 2], values[i : i + 2], told))]
+            except OUTSIDE:
+                return None
+            if len(jumps) >= STAIRS:
+                return *jumps[0], len(jumps)
+    return None
+
+
+def _jump(f: Callable[[float], float], ends: Array, values: Array, least: float) -> Jump | None:
+    """Where `f` jumps between two places (2,): the quarter that changes unlike the others is divided again."""
+    sizes: list[float] = []
+    for k in range(QUARTERINGS):
+        places = np.linspace(float(ends[0]), float(ends[1]), 5)
+        heights = np.array([values[0], *(f(float(s)) for s in places[1:-1]), values[1]])
+        changes = np.diff(heights)
+        apart = np.abs(changes - np.median(changes))
+        i = int(np.argmax(apart))
+        sizes.append(float(apart[i]))
+        if not apart[i] > least or (k == SETTLED and apart[i] < KEPT * sizes[0]):
+            return None
+        ends, values = places[i : i + 2], heights[i : i + 2]
+    return (float(ends[0]), float(ends[1])) if sizes[-1] > sizes[SETTLED] / 2 else None

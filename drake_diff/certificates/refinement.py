@@ -9,23 +9,168 @@ not small (k tau v in `sap`): what is lost of it grows along a step and starts a
 sawtooth of the start. Its teeth shrink with h and keep their slope, which is what derivatives see at every h. So the
 gradient is compared with two slopes that no tooth is in: of a line through the loss over many teeth, and of the motion
 in continuous time.
+
+1. A line through the loss of the discrete motion over a width of many teeth. Two geometries touch one step later where
+   a direction moves them apart by the way v h by which they approach each other in a step: that is the width of a
+   tooth, and it is measured where they touch.
+2. Central differences of the loss of the motion in continuous time, where there is one (see `truth`).
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff.certificates.slopes import Motions, Slope, directions
+from drake_diff.certificates.displaced import Displaced, Line
 from drake_diff.certificates.truth import Truth
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, list_parameters, select
-from drake_diff.model.tangent import TangentSpace, tangent_space
-from drake_diff.motion.gradient import RolloutGradient, differentiate_rollout
-from drake_diff.motion.loss import Loss, takes_one_argument
+from drake_diff.model.parameters import TIME_STEP, applied, list_parameters, select
+from drake_diff.model.step import set_state
+from drake_diff.motion.gradient import differentiate_rollout
+from drake_diff.motion.loss import evaluate_loss, takes_one_argument
+from drake_diff.motion.rollout import roll_states
+
+FRACTIONS = np.array([0.25, 0.5, 0.75, 1.0])  # of the width: where the loss is taken, on both sides, whole teeth apart
+TEETH = 8.0  # to each side
+ALIKE = 30.0  # what needs so many times the narrowest tooth's width is hardly moved by the direction
+WIDTH = 1e-3  # of the scale, where no tooth is known
+PILOT = 1e-6  # of the scale: how far a direction is followed to see what it moves
+
+
+@dataclass(frozen=True, eq=False)
+class Slope:
+    """How the loss changes along one direction; NaN where that cannot be told, `missing` saying why."""
+
+    line: Line
+    secant: float
+    width: float  # to both sides, in the unit of the direction
+    continuous: float
+    spread: float  # by how much that may be off; infinite where there is none
+    missing: tuple[str, ...]
+
+    def __str__(self) -> str:
+        found = []
+        if np.isfinite(self.secant):
+            found.append(f"over +-{self.width:.2g} the loss itself rises by {self.secant:.4g}")
+        if np.isfinite(self.continuous):
+            sure = (
+                f"(+-{self.spread:.1g})"
+                if np.isfinite(self.spread)
+                else "over its narrowest width, and does not settle"
+            )
+            found.append(f"the continuous motion's slope is {self.continuous:.4g} {sure}")
+        return ", ".join((*found, *self.missing))
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """A rollout and those beside it, in steps of which `parts` make one of the model's, and in continuous time."""
+
+    moved: Displaced
+    parts: int
+    truth: Truth | None
+    no_truth: str = ""
+
+    def slope(self, line: Line) -> Slope:
+        """The loss's, along one direction."""
+        secant = width = continuous = spread = np.nan
+        missing = []
+        try:
+            width = self._width(line)
+            secant = self._secant(line, width)
+        except DrakeDiffError as error:
+            missing.append(f"no line through the loss: {error}")
+        if self.truth is None:
+            missing.append(f"no slope of the continuous motion: {self.no_truth}")
+        else:
+            true = self.truth.slope(line.name)
+            if true.exists is None:
+                missing.append(f"no slope of the continuous motion: {true.reason}")
+            else:
+                continuous, spread = (true.value, true.error) if true.exists else (true.slopes[-1], np.inf)
+        return Slope(line, secant, width, continuous, spread, tuple(missing))
+
+    def _states(self, line: Line, s: float) -> tuple[Array, Array]:
+        """xs (parts N + 1, nx) of the discrete motion moved by `s` along the line, and its us (N, nu)."""
+        x0, us, _, values = self.moved.at(s * line.vector)
+        with applied(select(self._finer, values.to_dict())) as finer:
+            return roll_states(finer, x0, np.repeat(us, self.parts, axis=0)), us
+
+    def _secant(self, line: Line, width: float) -> float:
+        """By least squares of an odd cubic through the loss at `FRACTIONS` of the width."""
+        rises = []
+        for s in FRACTIONS * width:
+            (ahead, us_ahead), (behind, us_behind) = self._states(line, s), self._states(line, -s)
+            rise = evaluate_loss(self.moved.loss, ahead[:: self.parts], us_ahead)
+            rises.append((rise - evaluate_loss(self.moved.loss, behind[:: self.parts], us_behind)) / 2)
+        fitted = np.linalg.lstsq(np.column_stack([FRACTIONS, FRACTIONS**3]), np.array(rises), rcond=None)[0]
+        return float(fitted[0] / width)
+
+    def _width(self, line: Line) -> float:
+        width = WIDTH * line.scale
+        if self._touches:
+            teeth = self._teeth(line)
+            told = teeth[teeth <= ALIKE * np.min(teeth, initial=np.inf)]
+            width = max(width, TEETH * float(np.max(told, initial=0.0)))
+        if width > line.room:
+            why = f"{TEETH:g} steps' way is +-{width:.2g}" if width > WIDTH * line.scale else f"+-{width:.2g}"
+            raise SimulationError(f"{why}, and it may not be moved by more than {line.room:.2g}")
+        return width
+
+    def _teeth(self, line: Line) -> Array:
+        """(n,) how far the direction has to move each touch to make it a step later; none where it does not."""
+        step, found = PILOT * line.scale, []
+        (ahead, _), (behind, _) = self._states(line, step), self._states(line, -step)
+        for k, pair, way in self._touches:
+            by = (self._depths(ahead[k]).get(pair, 0.0) - self._depths(behind[k]).get(pair, 0.0)) / (2 * step)
+            if abs(by) > 0:
+                found.append(way / abs(by))
+        return np.array(found)
+
+    @cached_property
+    def _finer(self) -> Model:
+        return (
+            self.moved.model
+            if self.parts == 1
+            else self.moved.model.at_time_step(self.moved.model.time_step / self.parts)
+        )
+
+    @cached_property
+    def _touches(self) -> list[tuple[int, tuple[int, int], float]]:
+        """(k, pair, way [m]) of each pair of geometries that overlap from state k on: by how much more in a step."""
+        if not self.moved.model.contract.contact.collision_pairs:
+            return []
+        with applied(select(self._finer, self.moved.vector.to_dict())) as finer:
+            xs = roll_states(finer, self.moved.x0, np.repeat(self.moved.us, self.parts, axis=0))
+        found: list[tuple[int, tuple[int, int], float]] = []
+        before: dict[tuple[int, int], float] = {}
+        for k, x in enumerate(xs):
+            now = self._depths(x, ahead=False)
+            later = self._depths(x) if now.keys() - before.keys() else {}
+            for pair in now.keys() - before.keys():
+                way = later.get(pair, 0.0) - now[pair]
+                if way > 0 and (k > 0 or now[pair] <= way):  # what starts deeper did not just touch
+                    found.append((k, pair, way))
+            before = now
+        return found
+
+    def _depths(self, x: Array, *, ahead: bool = True) -> dict[tuple[int, int], float]:
+        """[m] by pair of geometries that overlap in the state `x`, or where its velocity takes it in a step."""
+        twin, nq = self._finer.double, self.moved.model.nq
+        set_state(twin, x)
+        if ahead:
+            set_state(twin, np.concatenate([x[:nq] + self._finer.time_step * twin.rates(x[nq:]), x[nq:]]))
+        try:
+            pairs = twin.plant.get_geometry_query_input_port().Eval(twin.context).ComputePointPairPenetration()
+        except RuntimeError as error:
+            raise SimulationError(f"Drake cannot tell how deep geometries overlap: {error}") from error
+        return {(int(p.id_A.get_value()), int(p.id_B.get_value())): float(p.depth) for p in pairs}
+
 
 REFINEMENTS = (1, 2, 4)
 STIFFENING = (1, 4, 16)
@@ -34,7 +179,6 @@ TRUSTED = 0.1  # how far from its limit a gradient may be, relative to it
 STILL = 1e-2  # changes below this part tell no rate
 NEGLIGIBLE = 1e-3  # entries below this part of the largest are judged by its measure
 SPREAD = 0.05  # how far apart two differences of the continuous motion may be, relative to their size
-Columns = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +191,7 @@ class Compared:
 
     def __str__(self) -> str:
         said = f"; the gradient is not {' and not '.join(self.disagree)}" if self.disagree else ""
-        return f"along {self.slope.direction.name} {_row(self.gradient)}, {self.slope}{said}"
+        return f"along {self.slope.line.name} {_row(self.gradient)}, {self.slope}{said}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +230,7 @@ class Refinement:
                 + (f" ({count} of {len(self.columns)} entries)" if count > 1 else "")
             ]
         # The one that disagrees most, else the one of the column above.
-        of_worst = [c for c in self.compared if j in range(len(self.columns))[c.slope.direction.columns]]
+        of_worst = [c for c in self.compared if j in c.slope.line.columns]
         parts += [str(c) for c in ([c for c in self.compared if c.disagree] or of_worst)[:1]]
         return "; ".join(parts)
 
@@ -95,82 +239,60 @@ def _row(values: Array) -> str:
     return ", ".join(f"{value:.4g}" for value in values)
 
 
-def flat_gradient(space: TangentSpace, g: RolloutGradient, shape: tuple[int, ...]) -> Array:
-    """[by x0 on the tangent space; by each of the inputs (N, nu), held over several steps; by parameters]."""
-    by_us = g.by_us.reshape(shape[0], len(g.by_us) // shape[0], shape[1]).sum(axis=1)
-    return np.concatenate([g.by_x0 @ space.derivative_of_plus(g.xs[0]), by_us.ravel(), g.by_parameters])
-
-
-def at_finer_steps(
-    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, method: str
-) -> Iterator[Array]:
+def at_finer_steps(moved: Displaced) -> Iterator[Array]:
     """The gradient at h/2 and h/4 under the same inputs, the loss seeing the states at the same times."""
-    if TIME_STEP in {p.name for p in vector.parameters}:
+    if TIME_STEP in {p.name for p in moved.vector.parameters}:
         raise InputError("parameters", got=TIME_STEP, expected="others, as refine=True changes the time step")
+    model, loss, (count, nu) = moved.model, moved.loss, moved.us.shape
+    options: dict[str, Any] = {"parameters": moved.vector.to_dict(), "method": moved.method}
     for m in REFINEMENTS[1:]:
-        finer, held = model.at_time_step(model.time_step / m), np.repeat(us, m, axis=0)
+        finer, held = model.at_time_step(model.time_step / m), np.repeat(moved.us, m, axis=0)
         coarse = loss if takes_one_argument(loss) else lambda xs, us, m=m: loss(xs[::m], us[::m])
-        g = differentiate_rollout(finer, x0, held, coarse, parameters=vector.to_dict(), method=method)
-        yield flat_gradient(tangent_space(model), g, us.shape)
+        g = differentiate_rollout(finer, moved.x0, held, coarse, **options)
+        yield moved.flat(replace(g, by_us=g.by_us.reshape(count, m, nu).sum(axis=1)))
 
 
-def in_stiffer_contact(
-    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, method: str
-) -> Iterator[Array]:
+def in_stiffer_contact(moved: Displaced) -> Iterator[Array]:
     """The gradient at 4 and 16 times every stiffness that the model states, at the model's own time step."""
+    model, given = moved.model, moved.vector.to_dict()
     stated = {p.name: float(p.value[0]) for p in list_parameters(model) if p.kind.quantity == "stiffness"}
     # By body if all its geometries have one value, else by geometry.
     named = {name for name in stated if "/" not in name or f"{name.split('/')[0]}.stiffness" not in stated}
-    if both := sorted(named & vector.to_dict().keys()):
+    if both := sorted(named & given.keys()):
         raise InputError("parameters", got=both[0], expected="others, as refine_stiffness=True changes it")
     if not named:
         raise InputError("refine_stiffness", got="a model that states no point stiffness", expected="one that does")
     for factor in STIFFENING[1:]:
         with applied(select(model, {name: factor * stated[name] for name in stated if name in named})) as stiffer:
-            g = differentiate_rollout(stiffer, x0, us, loss, parameters=vector.to_dict(), method=method)
-        yield flat_gradient(tangent_space(model), g, us.shape)
+            g = differentiate_rollout(stiffer, moved.x0, moved.us, moved.loss, parameters=given, method=moved.method)
+        yield moved.flat(g)
 
 
-def refine_by_time_step(
-    model: Model,
-    x0: Array,
-    us: Array,
-    loss: Loss,
-    vector: ParameterVector,
-    method: str,
-    first: Array,
-    columns: Columns,
-    truth: Truth | None,
-    no_truth: str,
-) -> Refinement:
+def refine_by_time_step(moved: Displaced, first: Array, truth: Truth | None, no_truth: str) -> Refinement:
     """The gradient `first` (n,) at h, at h/2 and h/4, beside the slopes of the loss itself and the `truth`.
 
     `no_truth` says why there is none.
     """
-    values = np.array([first, *at_finer_steps(model, x0, us, loss, vector, method)])
-    levels = tuple(model.time_step / m for m in REFINEMENTS)
-    found = judge_levels("time step", levels, columns, values, kinds_of(model, len(us), vector))
-    motions = Motions(model, x0, us, loss, vector, REFINEMENTS[-1], truth, no_truth)
-    compared = [motions.slope(direction) for direction in directions(model, x0, us, vector)]
-    return beside_slopes(found, compared)
+    values = np.array([first, *at_finer_steps(moved)])
+    levels = tuple(moved.model.time_step / m for m in REFINEMENTS)
+    found = judge_levels("time step", levels, moved.columns, values, kinds_of(moved))
+    motions = Motions(moved, REFINEMENTS[-1], truth, no_truth)
+    return beside_slopes(found, [motions.slope(line) for line in moved.lines])
 
 
-def refine_by_stiffness(
-    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, method: str, first: Array, columns: Columns
-) -> Refinement:
+def refine_by_stiffness(moved: Displaced, first: Array) -> Refinement:
     """The gradient `first` (n,) at k, at 4 k and 16 k."""
-    values = np.array([first, *in_stiffer_contact(model, x0, us, loss, vector, method)])
-    levels = tuple(map(float, STIFFENING))
-    return judge_levels("stiffness, times", levels, columns, values, kinds_of(model, len(us), vector))
+    values, levels = np.array([first, *in_stiffer_contact(moved)]), tuple(map(float, STIFFENING))
+    return judge_levels("stiffness, times", levels, moved.columns, values, kinds_of(moved))
 
 
-def kinds_of(model: Model, count: int, vector: ParameterVector) -> list[str]:
-    """(n,) the kind of each column of a gradient of `count` steps: what is of one kind has one unit."""
-    contract, space = model.contract, tangent_space(model)
+def kinds_of(moved: Displaced) -> list[str]:
+    """(n,) the kind of each column of a gradient: what is of one kind has one unit."""
+    contract, space = moved.model.contract, moved.space
     units = [f"position [{term.unit}]" for term in contract.positions]
     units += [f"velocity [{term.unit}]" for term in contract.velocities]
     kinds = [unit for i, unit in enumerate(units) if i not in space.quaternions]
-    return kinds + count * [f"input [{term.unit}]" for term in contract.inputs] + list(vector.names)
+    return kinds + len(moved.us) * [f"input [{term.unit}]" for term in contract.inputs] + list(moved.vector.names)
 
 
 def judge_levels(
@@ -203,7 +325,7 @@ def beside_slopes(found: Refinement, slopes: Sequence[Slope]) -> Refinement:
     """
     converged, compared = found.converged.copy(), []
     for slope in slopes:
-        columns = slope.direction.columns
+        columns = slope.line.columns
         along = found.values[:, columns].sum(axis=1)
         size = float(found.scale[columns].sum())
         disagree = []

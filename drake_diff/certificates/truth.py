@@ -18,35 +18,43 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, Indices, frozen
+from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.certificates.displaced import Displaced
-from drake_diff.certificates.judgement import VERDICTS
-from drake_diff.certificates.neighbourhood import TINY
+from drake_diff.certificates.certificate import VERDICTS
+from drake_diff.certificates.differences import TINY
+from drake_diff.certificates.displaced import Displaced, Line
 from drake_diff.exceptions import DrakeDiffError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied
-from drake_diff.model.plant import actuators
 from drake_diff.motion.continuous import HUNT_CROSSLEY, KELVIN_VOIGT, ContinuousMotion
 from drake_diff.motion.gradient import CONTINUOUS, RolloutGradient
 from drake_diff.motion.loss import evaluate_loss
 
-WIDTHS = (1e-2, 1e-3, 1e-4)  # of a column's scale, to both sides
-BETWEEN = 5e-3  # a fourth, where the first is another slope than the rest
-CURVE = (WIDTHS[0] ** 2 - WIDTHS[1] ** 2) / (BETWEEN**2 - WIDTHS[1] ** 2)  # how the slopes of a smooth curve differ
-BENT = 0.1  # of that: what its next derivative may add
-SHRINKS = 0.3  # of a smooth curve's corner a tenth is left over a tenth of the width, of a real one all
-SMOOTH = 0.1  # part of the widths where nothing touches
-TOLERANCE = 1e-5  # of an integration's step, as a part of the width
-SETTLED = 1e-3  # how far apart slopes may be, of their size
-RIGHT = 1e-2  # how far from the truth a gradient may be, of its size
-NEGLIGIBLE = 1e-3  # of the largest column, each moved by its scale: a smaller one is judged as if it were that large
-CLOSE = 3e-3  # the same, for a yes
-NOTHING = 1e-7  # of the loss: a change by a whole scale that is none
-KNOWN = 1e-2  # of a slope: the integration's own error at most
-SURE = 3.0  # times what the integration's error is found to be
-ROUNDED = 1e-15  # of a loss: its rounding
-UNKNOWN = 1e6  # of its size: what would have been noticed where nothing is measured
+
+@dataclass(frozen=True)
+class TruthOptions:
+    """How slopes of the motion in continuous time are measured and judged."""
+
+    widths: tuple[float, ...] = (1e-2, 1e-3, 1e-4)  # of a column's scale, to both sides
+    between: float = 5e-3  # a fourth, where the first is another slope than the rest
+    curve: float = (1e-2**2 - 1e-3**2) / (5e-3**2 - 1e-3**2)  # how the slopes of a smooth curve differ over these
+    bent: float = 0.1  # of that: what its next derivative may add
+    shrinks: float = 0.3  # of a smooth curve's corner a tenth is left over a tenth of the width, of a real one all
+    smooth: float = 0.1  # part of the widths where nothing touches
+    tolerance: float = 1e-5  # of an integration's step, as a part of the width
+    settled: float = 1e-3  # how far apart slopes may be, of their size
+    right: float = 1e-2  # how far from the truth a gradient may be, of its size
+    negligible: float = 1e-3  # of the largest column, each moved by its scale: a smaller one is judged as that large
+    close: float = 3e-3  # the same, for a yes
+    nothing: float = 1e-7  # of the loss: a change by a whole scale that is none
+    known: float = 1e-2  # of a slope: the integration's own error at most
+    sure: float = 3.0  # times what the integration's error is found to be
+    rounded: float = 1e-15  # of a loss: its rounding
+    unknown: float = 1e6  # of its size: what would have been noticed where nothing is measured
+
+
+TRUTH = TruthOptions()
+
 SECONDS = 10.0  # of this thread's work
 FORMULAS = {KELVIN_VOIGT: "k (x + tau x')+", HUNT_CROSSLEY: "k x (1 + d x')+"}
 
@@ -82,7 +90,7 @@ class TrueSlope(ShowsItsRepr):
     @property
     def agrees(self) -> bool | None:
         """Whether ours is the truth, to 1 % and its error; None where the truth is not known, or there is none."""
-        return bool(abs(self.ours - self.value) <= RIGHT * self.size + self.error) if self.exists else None
+        return bool(abs(self.ours - self.value) <= TRUTH.right * self.size + self.error) if self.exists else None
 
     def __repr__(self) -> str:
         if not self.exists:
@@ -184,17 +192,6 @@ def softest_contact(model: Model, xs: Array) -> str | None:
     return told
 
 
-@dataclass(frozen=True)
-class _Line:
-    """One direction: which columns add up to it, and a unit of it as a displacement (n,)."""
-
-    name: str
-    columns: Indices
-    scale: float
-    vector: Array
-    room: float  # how far it may be moved, in its unit
-
-
 @dataclass(eq=False)
 class _Measurement:
     moved: Displaced
@@ -219,8 +216,10 @@ class _Measurement:
         measured = {x.name: self._measured(x) for x in order}
         sizes = [abs(s) * x.scale for x in order for s in (*measured[x.name].slopes[-1:], self._ours(x))]
         # and what changes the loss by no part of it that matters, moved by a whole scale
-        least = max(NEGLIGIBLE * max(sizes, default=0.0), NOTHING * max(map(abs, losses), default=0.0))
-        noise = np.abs(np.array(losses[:3]) - losses[-1]) + ROUNDED * max(map(abs, losses)) if losses else np.zeros(3)
+        least = max(TRUTH.negligible * max(sizes, default=0.0), TRUTH.nothing * max(map(abs, losses), default=0.0))
+        noise = (
+            np.abs(np.array(losses[:3]) - losses[-1]) + TRUTH.rounded * max(map(abs, losses)) if losses else np.zeros(3)
+        )
         slopes = tuple(judged(measured[x.name], noise, least / x.scale) for x in self.lines)
         loss, error = losses[-1] if losses else np.nan, abs(losses[-1] - losses[-2]) if losses[1:] else np.nan
         found = Truth(law, loss, error, self.ours, slopes, self.seconds, self.touches)
@@ -229,36 +228,13 @@ class _Measurement:
     def _beyond(self) -> str:
         return f"not measured within the budget of {self.seconds:g} s"
 
-    def _ours(self, line: _Line) -> float:
+    def _ours(self, line: Line) -> float:
         return float(self.gradient[line.columns].sum())
 
     @cached_property
-    def lines(self) -> list[_Line]:
+    def lines(self) -> list[Line]:
         """Those that are asked for."""
-        return [line for line in self._all_lines() if self.columns is None or line.name in self.columns]
-
-    def _all_lines(self) -> list[_Line]:
-        """Each state, each input by as much at all times or each parameter of the policy, and each of the model."""
-        moved, (count, nu) = self.moved, self.moved.us.shape
-        of_x0, given = moved.space.size, count * nu if moved.policy is None else 0
-        single = [*range(of_x0), *range(of_x0 + given, len(moved.scale))]
-        found = []
-        for j in single:
-            unit = np.zeros(len(moved.scale))
-            unit[j] = 1 / moved.scale[j]
-            found.append(_Line(moved.columns[j], np.array([j]), float(moved.scale[j]), unit, np.inf))
-        if moved.policy is not None:
-            return found
-        limits = moved.model.inputs.of_actuators([a.effort_limit() for a in actuators(moved.model.plant)])
-        cut = np.where(moved.model.inputs.actuator >= 0, limits, np.inf)
-        for j in range(nu):
-            columns = of_x0 + j + nu * np.arange(count)
-            unit = np.zeros(len(moved.scale))
-            unit[columns] = 1 / moved.scale[columns]
-            sizes = np.abs(moved.us[:, j])
-            name, room = f"{moved.model.input_names[j]} at all times", float(np.abs(cut[j] - sizes).min())
-            found.insert(of_x0 + j, _Line(name, columns, max(1.0, float(sizes.max())), unit, room))
-        return found
+        return [line for line in self.moved.lines if self.columns is None or line.name in self.columns]
 
     def _loss(self, displacement: Array, tolerance: float, law: str | None = None) -> float:
         x0, us, parameters, values = self.moved.at(displacement)
@@ -272,25 +248,25 @@ class _Measurement:
         return evaluate_loss(self.moved.loss, xs, inputs)
 
     def _widths(self) -> tuple[float, ...]:
-        return tuple(w if self.touches else SMOOTH * w for w in WIDTHS)
+        return tuple(w if self.touches else TRUTH.smooth * w for w in TRUTH.widths)
 
     def _losses(self) -> Iterator[float]:
         """The loss by an integration for each width, and by one that is better than the last."""
         still = np.zeros(len(self.moved.scale))
-        first = self._loss(still, TOLERANCE * WIDTHS[0])  # and what touches
-        yield first if self.touches else self._loss(still, TOLERANCE * self._widths()[0])
+        first = self._loss(still, TRUTH.tolerance * TRUTH.widths[0])  # and what touches
+        yield first if self.touches else self._loss(still, TRUTH.tolerance * self._widths()[0])
         for width in self._widths()[1:]:
-            yield self._loss(still, TOLERANCE * width)
-        yield self._loss(still, TOLERANCE * self._widths()[-1] / 10)
+            yield self._loss(still, TRUTH.tolerance * width)
+        yield self._loss(still, TRUTH.tolerance * self._widths()[-1] / 10)
 
-    def _slope(self, line: _Line, width: float, law: str | None = None) -> tuple[float, float]:
+    def _slope(self, line: Line, width: float, law: str | None = None) -> tuple[float, float]:
         """Over `width` times the scale to both sides; and by how much it is another one ahead than behind."""
         w = width * line.scale
-        ahead, behind = (self._loss(s * w * line.vector, TOLERANCE * width, law) for s in (1, -1))
+        ahead, behind = (self._loss(s * w * line.vector, TRUTH.tolerance * width, law) for s in (1, -1))
         nearest = int(np.argmin(np.abs(np.log(np.array(self._widths()) / width))))
         return (ahead - behind) / (2 * w), (ahead - 2 * self.losses[nearest] + behind) / w
 
-    def _measured(self, line: _Line) -> TrueSlope:
+    def _measured(self, line: Line) -> TrueSlope:
         """The slopes along a line, from wide to narrow; not judged."""
         widths = list(self._widths())
         found = TrueSlope(line.name, tuple(line.columns.tolist()), self._ours(line))
@@ -298,8 +274,8 @@ class _Measurement:
             return replace(found, reason=f"not measured: moved by {widths[0] * line.scale:.2g} it is cut off")
         try:
             over = [self._slope(line, w) for w in widths]
-            if not abs(over[0][0] - over[1][0]) <= SETTLED * max(abs(slope) for slope, _ in over):
-                widths.insert(1, widths[0] * BETWEEN / WIDTHS[0])
+            if not abs(over[0][0] - over[1][0]) <= TRUTH.settled * max(abs(slope) for slope, _ in over):
+                widths.insert(1, widths[0] * TRUTH.between / TRUTH.widths[0])
                 over.insert(1, self._slope(line, widths[1]))
         except TimeoutError:
             return replace(found, reason=self._beyond())
@@ -310,7 +286,11 @@ class _Measurement:
 
     def _beside_other_law(self, found: Truth) -> Truth:
         """With what Drake's continuous plant would do, which has Hunt and Crossley's law whatever the steps have."""
-        still, slopes, tolerance = np.zeros(len(self.moved.scale)), list(found.slopes), TOLERANCE * WIDTHS[1]
+        still, slopes, tolerance = (
+            np.zeros(len(self.moved.scale)),
+            list(found.slopes),
+            TRUTH.tolerance * TRUTH.widths[1],
+        )
         found = replace(found, other_law=HUNT_CROSSLEY)
         try:
             loss = self._loss(still, tolerance, HUNT_CROSSLEY)
@@ -322,7 +302,7 @@ class _Measurement:
             if not one.exists:
                 continue
             try:
-                slopes[i] = replace(one, by_other_law=self._slope(line, WIDTHS[1], HUNT_CROSSLEY)[0] - one.value)
+                slopes[i] = replace(one, by_other_law=self._slope(line, TRUTH.widths[1], HUNT_CROSSLEY)[0] - one.value)
             except (TimeoutError, DrakeDiffError):
                 break  # NaN: not measured
         return replace(found, slopes=tuple(slopes), by_other_law=loss - found.loss)
@@ -333,16 +313,18 @@ def judged(one: TrueSlope, noise: Array, least: float) -> TrueSlope:
     if not one.slopes:
         return replace(one, size=max(abs(one.ours), least))
     (wide, *between, middle, narrow), w = one.slopes, np.array([*one.widths[:1], *one.widths[-2:]])
-    hidden = SURE * noise / w  # of each slope
+    hidden = TRUTH.sure * noise / w  # of each slope
     size = max(abs(narrow), abs(middle), least)
     found = replace(one, size=max(size, abs(one.ours)) if size > 0 else abs(one.ours))
-    if least > 0 and hidden[-1] > KNOWN * size and hidden[-1] > abs(narrow - middle):
+    if least > 0 and hidden[-1] > TRUTH.known * size and hidden[-1] > abs(narrow - middle):
         return replace(found, reason=f"not known: the integration's error is {hidden[-1]:.1g} of it")
-    narrows = abs(narrow - middle) <= SETTLED * size + hidden[1] + hidden[2]
-    gap, slack = wide - middle, SETTLED * size + hidden[0] + hidden[1]
-    bends = bool(between) and abs(gap - CURVE * (between[0] - middle)) <= BENT * abs(gap) + CURVE * slack
+    narrows = abs(narrow - middle) <= TRUTH.settled * size + hidden[1] + hidden[2]
+    gap, slack = wide - middle, TRUTH.settled * size + hidden[0] + hidden[1]
+    bends = (
+        bool(between) and abs(gap - TRUTH.curve * (between[0] - middle)) <= TRUTH.bent * abs(gap) + TRUTH.curve * slack
+    )
     corner, before = abs(one.corners[-1]), abs(one.corners[-2])
-    if corner > SETTLED * size + 4 * hidden[2] and corner > SHRINKS * before:
+    if corner > TRUTH.settled * size + 4 * hidden[2] and corner > TRUTH.shrinks * before:
         ahead, behind = (narrow + s * one.corners[-1] / 2 for s in (1, -1))
         return replace(found, exists=False, reason=f"it has a corner here, {ahead:.4g} ahead and {behind:.4g} behind")
     if narrows and (abs(gap) <= slack or bends):
@@ -359,15 +341,15 @@ def by_truth(truth: Truth, subject: str) -> dict[str, Any]:
     )
     size = np.maximum(size, TINY)
     known = np.array([bool(one.exists) for one in slopes]).reshape(shape)
-    gap, tolerance = np.abs(ours - value), CLOSE * size + error
+    gap, tolerance = np.abs(ours - value), TRUTH.close * size + error
     codes = np.full(shape, VERDICTS.index("undecided"))
-    codes[known & (gap <= tolerance) & (gap + tolerance <= RIGHT * size)] = VERDICTS.index("agree")
-    codes[known & (gap > RIGHT * size + error)] = VERDICTS.index("disagree")
+    codes[known & (gap <= tolerance) & (gap + tolerance <= TRUTH.right * size)] = VERDICTS.index("agree")
+    codes[known & (gap > TRUTH.right * size + error)] = VERDICTS.index("disagree")
     reasons = {}
     for j, one in enumerate(slopes):
         if one.exists is False:
             codes[0, j], reasons[0, j] = VERDICTS.index("discontinuous"), repr(one)
-    unknown = UNKNOWN * size
+    unknown = TRUTH.unknown * size
     return {
         "rows": ("loss",), "columns": tuple(one.column for one in slopes), "derivative": frozen(ours),
         "difference": frozen(np.where(known, value, np.nan)), "tolerance": frozen(np.where(known, tolerance, unknown)),

@@ -23,7 +23,7 @@ from drake_diff.cli.text import (
     table,
     takes_model,
 )
-from drake_diff.derivatives.methods import METHODS
+from drake_diff.derivatives import METHODS
 from drake_diff.exceptions import InputError
 
 GAPS = {"same": "green", "other law": "yellow", "other model": "red", "unexplained": "red"}

@@ -1,1 +1,3 @@
 from .step import StepDerivatives as StepDerivatives
+
+METHODS: tuple[str, ...]

@@ -14,17 +14,17 @@ from pydrake.autodiffutils import InitializeAutoDiff
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.contact.active_contacts import JOINT_LIMITS, is_iterated
 from drake_diff.derivatives.contact.jacobian import contact_form, contact_jacobians, material_of
-from drake_diff.derivatives.contact.material import QUANTITIES, material_change
-from drake_diff.derivatives.contact.touching import JOINT_LIMITS, is_iterated
+from drake_diff.derivatives.contact.laws import QUANTITIES, material_change
 from drake_diff.derivatives.implicit import RESIDUAL_TOLERANCE, differentiate_equation, form_of
-from drake_diff.derivatives.polish import polished_steps
-from drake_diff.derivatives.reduced import Reduced
+from drake_diff.derivatives.refine_step import refine_steps
 from drake_diff.derivatives.smooth_step import SmoothStep, build_analytic
-from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, Steps
+from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, Steps, take_steps
 from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
+from drake_diff.mechanics.compiled_tree import CompiledTree, compiled_tree
 from drake_diff.mechanics.coordinates import Coordinates
-from drake_diff.mechanics.tree import OwnDynamics
+from drake_diff.mechanics.description import describe_tree
 from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select, write_autodiff
@@ -36,6 +36,7 @@ SAME_JACOBIAN = 1e-9
 # of contact, it leaves up to 1e-8 of noise, and may jump on one side.
 SAME_DIFFERENCES, SAME_WHERE_ITERATED, DIFFERENCES = 1e-5, 3e-4, (3e-7, 1e-5, 1e-4)
 SAME_WHERE_STOPPED = 3e-4  # two ends as far apart as 1e-6 of the momentum, where friction turns within 1e-4 m/s
+SAME_END = 1e-10  # of x' with reduced joints: both are of Drake's own step, projected by the same matrix
 SAME_STEP = 1e-12  # of the largest entry of x' (or 1): the same positions, summed in another order
 CERTIFIED_STATES, STATES_TRIED = 3, 60
 FAR = 4.0  # [m or rad]
@@ -129,17 +130,10 @@ def analytic_of(model: Model) -> SmoothStep | Refusal:
 
 def one_smooth_step(model: Model, steps: Steps) -> Array | None:
     """(nx, nx + nu) of one step in which nothing touches; None where it takes more than `SmoothStep.one` to know it."""
-    if model.coupling is not None or model.num_constraints or is_own(model):
+    if model.coupling is not None or model.num_constraints:
         return None
     smooth = analytic_of(model)
     return None if isinstance(smooth, Refusal) else smooth.one(steps.xs[0], steps.us[0], steps.x_next[0])
-
-
-def is_own(model: Model) -> bool:
-    """Whether the model's smooth step is by our own dynamics in NumPy, which take longer than others for one state."""
-    smooth = analytic_of(model)
-    own = smooth.dynamics if isinstance(smooth, SmoothStep) else None
-    return isinstance(own, OwnDynamics) and own.compiled is None
 
 
 def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:
@@ -363,7 +357,7 @@ def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array, Arra
     point = np.concatenate([steps.xs[k], steps.us[k]])
     size = width * np.maximum(1.0, np.abs(point))
     points = np.concatenate([point + np.diag(size), point - np.diag(size), point[None]])
-    found = polished_steps(model, steps.vector, points[:, : model.nx], points[:, model.nx :])
+    found = refine_steps(model, steps.vector, points[:, : model.nx], points[:, model.nx :])
     for why in found.refused.values():
         return why
     here = found.x_next[-1]
@@ -372,3 +366,59 @@ def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array, Arra
         np.asarray(((here - found.x_next[count:-1]) / size[:, None]).T),
         here,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """What of a model with reduced mimic joints does not change from step to step.
+
+    A step is that of the whole plant, from q = r q_own + offset and v = E v_own, whose velocities v' are then brought
+    back as an impulse on the joints would: with A the mass matrix and h D,
+
+        E' A (v' - E v_own') = 0,   so   E' A E dv_own' = E' (A dv' + dA (v' - E v_own'))
+
+    and q' = q + h N(q) E v_own'.
+    """
+
+    coupling: Coupling
+    tree: CompiledTree  # of the whole plant
+    smooth: SmoothStep
+
+    @classmethod
+    def of(cls, model: Model, coupling: Coupling, smooth: SmoothStep) -> "Reduced":
+        """Of the smooth step of `model.whole`; raises ModelError where its tree is none of ours."""
+        tree = compiled_tree(describe_tree(model.whole))
+        if tree is None:
+            raise ModelError("a free body is not joined to the world by its own frame")
+        return cls(coupling, tree, smooth)
+
+    def whole(self, steps: Steps) -> tuple[Steps, Flags]:
+        """The same steps of the whole plant, and which (N,) of them lead where these do."""
+        model = steps.model
+        xs = self.coupling.state(steps.xs)
+        found, same = take_steps(model.whole, steps.vector, xs[0], steps.us, xs), np.empty(len(steps), dtype=bool)
+        for k, (x, x_next) in enumerate(zip(steps.xs, steps.x_next, strict=True)):
+            set_state(model.double, x)
+            gap = np.abs(model.double.next_state(found.x_next[k]) - x_next)
+            same[k] = bool(np.all(gap <= SAME_END * np.maximum(1.0, np.abs(x_next))))
+        return found, same
+
+    def jacobians(self, steps: Steps, whole: Steps, of_whole: Array) -> Array:
+        """(N, nx, nx + nu) from those of the whole plant."""
+        coupling, c, h = self.coupling, self.smooth.coordinates, self.smooth.time_step
+        E, nq, nx = coupling.spread, len(coupling.own_q), steps.model.nx
+        into = np.zeros((whole.model.nx, nx))  # of the own state into the whole one
+        into[np.arange(c.nq), coupling.of_q] = coupling.ratio_q
+        into[c.nq :, nq:] = E
+        chained = np.concatenate([of_whole[:, :, : whole.model.nx] @ into, of_whole[:, :, whole.model.nx :]], axis=2)
+        q, v_next = whole.xs[:, : c.nq], steps.x_next[:, nq:] @ E.T
+        slack, still = whole.x_next[:, c.nq :] - v_next, np.zeros((len(q), c.nv))
+        moving = self.tree(q, still, slack)
+        A = moving.mass + np.diag(self.smooth.dynamics.armature)
+        right = A @ chained[:, c.nq :]
+        by_motion = moving.by_q - self.tree(q, still, still).by_q  # of M slack
+        right[:, :, :nq] += by_motion @ c.motion(q) @ into[: c.nq, :nq]
+        velocities = np.linalg.solve(E.T @ A @ E, E.T @ right)
+        positions = h * c.rate(q) @ (E @ velocities)
+        positions[:, :, :nq] += (np.eye(c.nq) + h * c.rate_by_position(v_next)) @ into[: c.nq, :nq]
+        return np.concatenate([positions[:, coupling.own_q], velocities], axis=1)

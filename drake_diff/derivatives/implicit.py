@@ -10,9 +10,8 @@ damping D and the PD controllers are implicit. With the inputs clipped at their 
     input_i = clip(u_i - kp_i (q_i + h v'_i - q_ref_i) - kd_i (v'_i - v_ref_i)),
 
 so dv' = -(dr/dv')^-1 dr with dr/dv' = M / h + D + B (kd + h kp) B' for the inputs that are not clipped, and
-q' = q + h N(q) v'. By the time step dr = (B kp v' - M (v' - v) / h^2) dh. Only r is differentiated, at Drake's own v':
-of a tree of hinges and slides by its own formulas (`mechanics.tree`), for many steps in one call; else, and by
-parameters, by AutoDiffXd.
+q' = q + h N(q) v'. By the time step dr = (B kp v' - M (v' - v) / h^2) dh. Only r is differentiated, at Drake's own v',
+by AutoDiffXd.
 r(v') = 0 is checked: where it does not hold, something else acts, or the AutoDiffXd plant is not the double one.
 """
 
@@ -28,7 +27,6 @@ from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.steps import Jacobians, NotSmoothError, Steps
 from drake_diff.exceptions import DrakeDiffError
-from drake_diff.mechanics.tree import TreeDynamics, tree_for
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import write_autodiff
 from drake_diff.model.plant import actuators, joints
@@ -36,8 +34,6 @@ from drake_diff.model.step import set_state
 
 # Rounding of the forces that balance, relative to the largest of them. What a solver leaves is larger.
 RESIDUAL_TOLERANCE = 1e-9
-# From so many joints on NumPy's calls for one state cost less than AutoDiffXd's arithmetic.
-TREE_JOINTS = 5
 
 
 class Implicit:
@@ -49,64 +45,20 @@ class Implicit:
     name = "implicit"
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
-        """Those of one tree of hinges and slides in one call, others step by step."""
-        model, form = steps.model, form_of(steps.model)
+        """Step by step."""
+        form, values = form_of(steps.model), np.empty((len(steps), steps.model.nx, steps.width))
         if form.excluded:
             return Refusal(form.excluded)
-        tree = tree_for(model) if len(steps) > 1 or model.nv >= TREE_JOINTS else None
-        if tree is not None:
-            values, missing = _by_tree(form, tree, steps)
-        else:
-            values, missing = np.empty((len(steps), model.nx, steps.width)), np.zeros(len(steps))
-            for k, touches in enumerate(steps.touching.tolist()):
-                missing[k] = 0.0 if touches else differentiate_equation(form, steps, k, values[k])
         refused: dict[int, DrakeDiffError] = {}
-        if not steps.some_touch and np.count_nonzero(missing <= RESIDUAL_TOLERANCE) == len(missing):
-            return Jacobians(values, refused, timed=True)
-        for k, (part, touches) in enumerate(zip(missing.tolist(), steps.touching.tolist(), strict=True)):
+        for k, touches in enumerate(steps.touching.tolist()):
             if touches:
                 refused[k] = NotSmoothError("geometries touch")
-            elif not part <= RESIDUAL_TOLERANCE:
-                why = f"contact, a joint limit or a constraint acts: {part:.3g} of the forces are not accounted for"
+                continue
+            missing = differentiate_equation(form, steps, k, values[k])
+            if not missing <= RESIDUAL_TOLERANCE:
+                why = f"contact, a joint limit or a constraint acts: {missing:.3g} of the forces are not accounted for"
                 refused[k] = NotSmoothError(why)
         return Jacobians(values, refused, timed=True)
-
-
-def takes_many(model: Model) -> bool:
-    """Whether many steps are differentiated in one call."""
-    return not form_of(model).excluded and tree_for(model) is not None
-
-
-def _by_tree(form: "Form", tree: TreeDynamics, steps: Steps) -> tuple[Array, Array]:
-    """(N, nx, nx + nu) the derivatives of N steps, and (N,) the force that is not accounted for, as a part.
-
-    One more column by the time step where that is a parameter, beside which there is none here.
-    """
-    n, h, damping = steps.model.nv, steps.model.time_step, tree.own_damping
-    q, v, v_next = steps.xs[:, :n], steps.xs[:, n:], steps.x_next[:, n:]
-    effort, free, (kp, kd) = form.effort(q, v_next, steps.us, h)
-    d = tree(tree.place(steps.model, q), q, v, (v_next - v) / h)
-    rest = damping * (v_next - v) - np.clip(effort, -form.limit, form.limit) @ form.actuation.T
-    diagonal = np.arange(n)
-    by_next = d.mass / h
-    by_next[:, diagonal, diagonal] += damping
-    pressed = form.actuation * free[:, None, :]
-    by_point = np.concatenate([d.by_q, d.by_v - by_next, -pressed], axis=2)
-    if form.pd:
-        by_point[:, :, form.position] += pressed * kp
-        by_next = by_next + (pressed * (kd + h * kp)) @ form.actuation.T
-    timed = steps.vector.step_entry is not None
-    if timed:
-        by_step = -(d.mass @ ((v_next - v) / h**2)[:, :, None])
-        if form.pd:
-            by_step += (pressed * kp) @ v_next[:, form.velocity, None]
-        by_point = np.concatenate([by_point, by_step], axis=2)
-    velocities = -np.linalg.solve(by_next, by_point)
-    positions = h * velocities
-    positions[:, diagonal, diagonal] += 1.0
-    if timed:
-        positions[:, :, -1] += v_next
-    return np.concatenate([positions, velocities], axis=1), _missing(d.tau, rest)
 
 
 def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) -> float:
@@ -126,7 +78,7 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
     write_autodiff(vector, model, variables[nx:])
     set_state(model.autodiff, variables[:nx])
     needed = model.autodiff.inverse_dynamics(np.array([AutoDiffXd(a) for a in change / h])).reshape(-1, 1)
-    force, rest = ExtractValue(needed).ravel(), damping * change - applied  # as in _missing, of one step
+    force, rest = ExtractValue(needed).ravel(), damping * change - applied
     missing = float(np.abs(force + rest).max() / max(1.0, np.abs(force).max(), np.abs(rest).max()))
     if not missing <= RESIDUAL_TOLERANCE:
         return missing
@@ -152,12 +104,6 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
     if step is not None:
         jacobian[:nq, step] += np.asarray(twin.rates(v_next))
     return missing
-
-
-def _missing(needed: Array, rest: Array) -> Array:
-    """(...,) the largest force (..., nv) that is not accounted for, relative to the largest of those that are."""
-    size = np.maximum(np.maximum(np.abs(needed).max(axis=-1), np.abs(rest).max(axis=-1)), 1.0)
-    return np.asarray(np.abs(needed + rest).max(axis=-1) / size)
 
 
 def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, num_parameters: int) -> Array:

@@ -14,15 +14,26 @@ and w = j diag(A)^-1 j' its effective inverse mass, h the time step:
 
 b = 0.1^2 / (4 pi^2) is Drake's near-rigid factor (Castro, Permenter and Han, "An unconstrained convex formulation of
 compliant contact", 2022).
+
+The couplers of a plant are read from Drake's own steps, as it gives them in no other way. With no other constraint than
+one coupler the step's problem is quadratic and Drake solves it to rounding. The impulse A (v' - v*) of such a step lies
+along (1, -ratio) of the two joints; its size says how far the joints are off.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet
+from pydrake.multibody.tree import MultibodyForces
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.refusal import Refusal
+from drake_diff.model.mimic import joints_of_mimics
+from drake_diff.model.model import Model
+from drake_diff.model.plant import joints
 
 NEAR_RIGID = 0.1**2 / (4 * np.pi**2)
 LIMIT_STIFFNESS = 1e12  # Drake's [N/m or N m/rad]
@@ -53,18 +64,6 @@ class JointImpulses:
         wanted = (self.target - (self.direction * v[self.problem]).sum(axis=1)) / self.compliance
         free = (wanted > self.lower) & (wanted < self.upper)
         return np.clip(wanted, self.lower, self.upper), np.where(free, 1 / self.compliance, 0.0)
-
-    def by_motion(self, v: Array, diagonal: Array, diagonal_slope: Array, h: float) -> Array:
-        """(S, nv) how the impulses of limits and couplers change with the degrees of freedom, v' (N, nv) being fixed.
-
-        Through v_hat, which falls by j / 2h, and through R where it is b w; `diagonal_slope` (N, nv, nv) has the
-        derivatives of the diagonal (N, nv) of A.
-        """
-        impulse, slope = self.at(v)
-        softer = np.where(self.near_rigid, NEAR_RIGID * impulse * slope, 0.0)[:, None]
-        of_weight = (self.direction / diagonal[self.problem]) ** 2
-        by_weight = (of_weight[:, None, :] @ diagonal_slope[self.problem])[:, 0]
-        return np.asarray(softer * by_weight - slope[:, None] * self.direction / (2 * h))
 
 
 def gather(parts: Sequence[JointImpulses], nv: int) -> JointImpulses:
@@ -123,3 +122,125 @@ class Controllers:
         total, bound = h * kp + kd, h * self.limit[which]
         near_rigid = (lowered < 1).ravel()
         return JointImpulses(problem, direction, effort / total, 1 / (h * total), -bound, bound, near_rigid)
+
+
+PROBES = 3  # two to read, one more to check
+SAME = 1e-8  # of the largest entry: what Drake's solver leaves of a quadratic problem is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Couplers:
+    """K couplers."""
+
+    direction: Array  # (K, nv)
+    offset: Array  # (K,)
+
+    def impulses(self, q: Array, diagonal: Array, h: float) -> JointImpulses:
+        """Of N states: q (N, nv) of each degree of freedom, `diagonal` (N, nv) that of A."""
+        count, (rows, nv) = len(q), self.direction.shape
+        off = (q @ self.direction.T - self.offset).ravel()
+        w = (1 / diagonal @ (self.direction**2).T).ravel()
+        infinite = np.full(count * rows, np.inf)
+        direction = np.broadcast_to(self.direction, (count, rows, nv)).reshape(-1, nv)
+        problem = np.repeat(np.arange(count), rows)
+        return JointImpulses(problem, direction, -off / (2 * h), NEAR_RIGID * w, -infinite, infinite, infinite > 0)
+
+
+def couplers_of(model: Model) -> Couplers | Refusal:
+    """Those that act in the model's steps; a Refusal where a constraint is none, or could not be read."""
+
+    if model.coupling is not None:
+        return model.cache("couplers", lambda: _known(model), of_structure=True)
+
+    def read() -> Couplers | Refusal:
+        found = []
+        for constraint in model.plant.GetConstraintIds():
+            if not model.plant.GetConstraintActiveStatus(model.double.context, constraint):
+                continue
+            coupler = _read(model, constraint)
+            if isinstance(coupler, Refusal):
+                return coupler
+            found.append(coupler)
+        directions, offsets = [d for d, _ in found], [o for _, o in found]
+        return Couplers(np.array(directions).reshape(-1, model.nv), np.array(offsets, dtype=float))
+
+    return model.cache("couplers", read, of_structure=True)
+
+
+def _known(model: Model) -> Couplers:
+    """Those of mimic joints that are reduced, in the velocities of the whole plant."""
+    pairs = joints_of_mimics(model.plant, model.coupling.mimics if model.coupling is not None else ())
+    directions = np.zeros((len(pairs), model.plant.num_velocities()))
+    for row, (mimic, follower, leader) in zip(directions, pairs, strict=True):
+        row[follower.velocity_start()], row[leader.velocity_start()] = 1.0, -mimic.ratio
+    return Couplers(directions, np.array([mimic.offset for mimic, _, _ in pairs]))
+
+
+def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
+    """The direction (nv,) and the offset of one."""
+    plant, random = model.plant, np.random.default_rng(0)
+    root = model.diagram.CreateDefaultContext()
+    context = plant.GetMyMutableContextFromRoot(root)
+    scene_graph = model.double.scene_graph
+    if scene_graph is not None:  # nothing touches in this context
+        everything = GeometrySet(scene_graph.model_inspector().GetAllGeometryIds())
+        filters = scene_graph.collision_filter_manager(scene_graph.GetMyMutableContextFromRoot(root))
+        filters.Apply(CollisionFilterDeclaration().ExcludeWithin(everything))
+    for other in plant.GetConstraintIds():
+        plant.SetConstraintActiveStatus(context, other, other == constraint)
+    if model.systems_act:
+        return Refusal(f"a constraint acts, and {model.systems_act}")
+    if model.nu:
+        plant.get_actuation_input_port().FixValue(context, np.zeros(model.nu))
+    try:
+        probes = [_probe(model, context, random) for _ in range(PROBES)]
+    except RuntimeError as error:
+        return Refusal(f"a constraint acts, which could not be read: {error}")
+    position, velocity = _single(model)
+    impulse = probes[0][2]
+    coupled = np.flatnonzero(np.abs(impulse) > SAME * np.abs(impulse).max())
+    if len(coupled) != 2 or not np.isin(coupled, velocity).all():
+        return Refusal("a constraint acts that couples no two joints")
+    direction = np.zeros(model.nv)
+    direction[coupled] = impulse[coupled] / impulse[coupled[0]]
+    q = np.zeros((PROBES, model.nv))
+    q[:, velocity] = np.array([p[0] for p in probes])[:, position]
+    offsets = []
+    for k, (_, v_next, impulse, A) in enumerate(probes):
+        R = NEAR_RIGID * float((direction**2 / np.diag(A)).sum())
+        offsets.append(float(direction @ q[k] + 2 * model.time_step * (R * impulse[coupled[0]] + direction @ v_next)))
+        if not np.abs(impulse - impulse[coupled[0]] * direction).max() <= SAME * np.abs(impulse).max():
+            return Refusal("a constraint acts that couples no two joints")
+    if not np.ptp(offsets) <= SAME:
+        return Refusal("a constraint acts between two joints that is no coupler")
+    return direction, float(np.mean(offsets))
+
+
+def _probe(model: Model, context: Any, random: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+    """q, v', A (v' - v*) and A of one step from rest, where all other forces are held, so that v* = 0.
+
+    Else a robot falls, and beside its momentum the impulse of a light finger is a matter of rounding.
+    """
+    plant = model.plant
+    lower, upper = (
+        np.clip(side, -1.0, 1.0) for side in (plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
+    )
+    q = np.array(plant.GetPositions(context))
+    position, _ = _single(model)
+    q[position] = (lower + random.uniform(0.3, 0.7, len(q)) * (upper - lower))[position]
+    plant.SetPositions(context, q)
+    plant.SetVelocities(context, np.zeros(model.nv))
+    forces = MultibodyForces(plant)
+    plant.CalcForceElementsContribution(context, forces)
+    held = plant.CalcInverseDynamics(context, np.zeros(model.nv), forces)
+    plant.get_applied_generalized_force_input_port().FixValue(context, held)
+    v_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())[model.nq :]
+    A = plant.CalcMassMatrix(context) + model.time_step * np.diag(model.double.damping())
+    return q, v_next, A @ v_next, A
+
+
+def _single(model: Model) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The indices in q and in v of the joints with one of each."""
+    found = [j for j in joints(model.plant) if j.num_positions() == j.num_velocities() == 1]
+    positions, velocities = [j.position_start() for j in found], [j.velocity_start() for j in found]
+    return np.array(positions, dtype=np.intp), np.array(velocities, dtype=np.intp)

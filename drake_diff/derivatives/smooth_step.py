@@ -24,7 +24,7 @@ from drake_diff.derivatives.implicit import Form, form_of
 from drake_diff.derivatives.steps import Steps
 from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.compiled_tree import compiled_tree
-from drake_diff.mechanics.coordinates import Coordinates, native_positions, turn, turn_change, turn_derivatives, turning
+from drake_diff.mechanics.coordinates import Coordinates, native_positions, turn, turn_derivatives, turning
 from drake_diff.mechanics.description import Description, describe_tree
 from drake_diff.mechanics.tree import OwnDynamics, tree_of
 from drake_diff.model.model import Model
@@ -58,10 +58,6 @@ class Dynamics(Protocol):
 
     def accelerate_one(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
         """As `accelerate`, of one state (nq,) and (nv,); they may be overwritten by the next call."""
-        ...
-
-    def motions(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array]:
-        """(N, nv, 6) of each degree of freedom, (N, nv, 6, 6) of what it carries, and a (N, nv)."""
         ...
 
 
@@ -234,30 +230,10 @@ class SmoothStep:
         q_next = at.q + h * (N @ v_next[..., None])[..., 0]
         return np.concatenate([upper, lower], axis=1), np.concatenate([q_next, v_next], axis=1)
 
-    def motions(self, at: Native, us: Array) -> tuple[Array, Array, Array]:
-        """(N, nv, 6) the motion [linear; angular] of each degree of freedom in world, about its origin, at unit speed.
-
-        And (N, nv, 6, 6) the spatial inertia of what it carries, and v' (N, nv) were the step smooth.
-        """
-        force, _ = self.force_of(at.q, at.v, us)
-        S, inertia, native = self.dynamics.motions(at.q_native, at.v_native, force)
-        return at.Q.swapaxes(-1, -2) @ S, inertia, self._v_next(at, native)
-
     def _v_next(self, at: Native, native: Array) -> Array:
         """(N, nv) v' by the accelerations (N, nv)."""
         a = (at.Q.swapaxes(-1, -2) @ native[..., None])[..., 0] + turning(self.turned, at.v)
         return np.asarray(at.v + self.time_step * a)
-
-    def pushed(self, at: Native, us: Array, push: Array) -> Array:
-        """The derivative of v' as `assemble` takes it, of steps under further generalized forces `push` (N, nv)."""
-        c = self.coordinates
-        force, clipped = self.force_of(at.q, at.v, us)
-        force = force + push
-        solved = self.dynamics.accelerate(at.q_native, at.v_native, (at.Q @ force[..., None])[..., 0])
-        velocities, _ = self._velocities(at, solved, clipped)
-        by_turn = solved[2] @ turn_change(self.turned, at.Q, force)  # a fixed force is another one in other frames
-        velocities[:, :, : c.nv] += self.time_step * at.Q.swapaxes(-1, -2) @ by_turn
-        return velocities
 
 
 def build_analytic(model: Model) -> SmoothStep:

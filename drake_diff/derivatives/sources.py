@@ -23,10 +23,10 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.differences import Many, plateau, sweep_of
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives.analytic import Analytic, is_own
+from drake_diff.derivatives import METHODS
+from drake_diff.derivatives.analytic import Analytic
 from drake_diff.derivatives.implicit import Implicit, form_of
-from drake_diff.derivatives.methods import METHODS
-from drake_diff.derivatives.polish import polished_steps, solves_the_step
+from drake_diff.derivatives.refine_step import refine_steps, solves_the_step
 from drake_diff.derivatives.steps import Jacobians, Source, Steps, take_step, take_steps
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.model import Model
@@ -39,7 +39,7 @@ PARITY_TOLERANCE = 1e-9
 # Cube root of the double step's rounding: where truncation and rounding of a central difference balance.
 DIFFERENCE_STEP = 1e-5
 # Friction turns within 1e-4 m/s, so that it is smaller where impulses act; 1e-5 was up to 20 times off there.
-POLISHED_STEP = 3e-7
+REFINED_STEP = 3e-7
 TIME_STEP_DIFFERENCE = 4e-4  # of a step's length, which a step depends on smoothly where contact lasts
 # Two ways to the same smooth Jacobian differ by rounding, which the inverse of a mass matrix may magnify.
 SAME_JACOBIAN = 1e-10
@@ -106,7 +106,7 @@ def check_parity(model: Model, autodiff: Array, double: Array) -> None:
 class Differences:
     """Central differences of the double step; by parameters, where they depend least on their size.
 
-    Where impulses act they are of the step solved to rounding (see `polish`), so that what Drake's solver leaves
+    Where impulses act they are of the step solved to rounding (see `refine_step`), so that what Drake's solver leaves
     unsolved is not in them; where that is not had, of Drake's own, and the note says why.
     """
 
@@ -177,19 +177,19 @@ def _differenced(steps: Steps, k: int, quotients: Callable[[Many, float], Array]
         return points[:, : model.nx], points[:, model.nx : model.nx + model.nu], points[:, model.nx + model.nu :]
 
     def to_rounding(displacements: Array) -> Array:
-        found = polished_steps(model, vector, *apart(displacements))
+        found = refine_steps(model, vector, *apart(displacements))
         refused.extend(found.refused.values())
         return found.x_next
 
     def drakes_own(displacements: Array) -> Array:
         return np.array([step_at(model, vector, *row) for row in zip(*apart(displacements), strict=True)])
 
-    here = polished_steps(model, vector, x[None], u[None])
+    here = refine_steps(model, vector, x[None], u[None])
     refused.extend(here.refused.values())
     if not refused and not here.acts[0]:
         return quotients(drakes_own, DIFFERENCE_STEP), ""
     if not refused:
-        found = quotients(to_rounding, POLISHED_STEP)
+        found = quotients(to_rounding, REFINED_STEP)
         if not refused:
             return found, "of the step solved to rounding"
     return quotients(drakes_own, DIFFERENCE_STEP), f"of Drake's own step, {refused[0]}"
@@ -274,8 +274,6 @@ def order_of(steps: Steps, method: str, single: bool) -> tuple[Source, ...]:
         return _ORDERS[method]
     if single and steps.model.nv < CONTACT_SIZE and not steps.vector.parameters and steps.some_touch:
         return SMALL_IN_CONTACT
-    if single and is_own(steps.model):
-        return (IMPLICIT, ANALYTIC, AUTODIFF, DIFFERENCES)
     return _ORDERS["auto"]
 
 

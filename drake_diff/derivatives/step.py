@@ -12,7 +12,6 @@ from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of, one_smooth_step
-from drake_diff.derivatives.implicit import takes_many
 from drake_diff.derivatives.sources import ANALYTIC, CERTIFIED, IMPLICIT, OF_ONE_KIND, Chosen, check_method, choose
 from drake_diff.derivatives.steps import Steps, known_steps, take_step, take_steps
 from drake_diff.exceptions import GradientError, ShapeError
@@ -194,15 +193,13 @@ def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
 
 def smooth_jacobians(model: Model, xs: Array, us: Array, x_next: Array | None = None) -> Array | None:
     """(N, nx, nx + nu) of steps that are all smooth, in one call; None where one is not, or there is no such call."""
-    if isinstance(analytic_of(model), Refusal) and not takes_many(model):
+    if isinstance(analytic_of(model), Refusal):
         return None
     vector = select(model, ())
     steps = take_steps(model, vector, xs[0], us, xs) if x_next is None else known_steps(model, vector, xs, us, x_next)
     if steps.some_touch:
         return None
     found = ANALYTIC.differentiate(steps)
-    if isinstance(found, Refusal):
-        found = IMPLICIT.differentiate(steps)
     if isinstance(found, Refusal) or found.refused:
         return None
     _check_derivatives(model, found.values)

@@ -329,7 +329,7 @@ def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometr
 
 
 def _pair(inspector: Any, ids: Sequence[Any], names: tuple[str, str]) -> PairContract:
-    """What Drake makes of two sides: see `derivatives.contact.material`."""
+    """What Drake makes of two sides: see `derivatives.contact.laws`."""
     read = {name: [proximity_property(inspector, i, name) for i in ids] for name in MATERIAL}
     known = {name: (float(a), float(b)) for name, (a, b) in read.items() if a is not None and b is not None}
     friction, stiffness = (_harmonic(known[name]) if name in known else None for name in ("friction", "stiffness"))

@@ -7,7 +7,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
-from drake_diff.certificates.first_look import LookAt, certificate_by
+from drake_diff.certificates.directions import LookAt, certificate_by
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.optimize.problem.dynamics import DiscreteMap
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem

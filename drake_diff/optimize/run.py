@@ -14,7 +14,7 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.clock import StoppedError, TimeIsUpError, now, until, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.certificates.certificate import Certificate
-from drake_diff.certificates.steps import certify_steps
+from drake_diff.certificates.certify import certify_steps
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import TIME_STEP

@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_diff._base.files import write_whole
-from drake_diff.certificates.certificate import Certificate
-from drake_diff.certificates.judgement import VERDICTS
+from drake_diff.certificates.certificate import VERDICTS, Certificate
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff.certificates.certificate import Certificate
-from drake_diff.certificates.judgement import VERDICTS
+from drake_diff.certificates.certificate import VERDICTS, Certificate
 from drake_diff.exceptions import ModelError
 from drake_diff.model.inputs import BodyForce
 from drake_diff.model.load_file import FORMATS

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from drake_diff._base.arrays import finite_array
-from drake_diff.certificates.rollout import RolloutCertificate
-from drake_diff.certificates.sampled import SampledCertificate
+from drake_diff.certificates.rollout import RolloutCertificate, SampledCertificate
 from drake_diff.certificates.truth import TrueSlope, Truth
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model

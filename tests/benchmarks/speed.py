@@ -32,9 +32,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from helpers.robots import FOOT, example_robot  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
-from drake_diff._base.compiled import has_numba  # noqa: E402
-from drake_diff.derivatives.analytic import analytic_of  # noqa: E402
-from drake_diff.derivatives.contact.jacobian import contact_form, material_of, numpy_jacobians  # noqa: E402
 from drake_diff.derivatives.steps import known_steps  # noqa: E402
 from drake_diff.engines.mujoco.engine import MujocoEngine  # noqa: E402
 from drake_diff.exceptions import ModelWarning  # noqa: E402
@@ -91,16 +88,7 @@ def calls_of(motion: Motion) -> dict[str, Call]:
         "`differentiate_step`": (lambda: dd.differentiate_step(model, x, u), 1),
         "AutoDiffXd, a step": (lambda: dd.differentiate_step(model, x, u, method="autodiff"), 1),
     }
-    steps = known_steps(model, select(model, ()), xs[:-1], us, ends)
-    if steps.some_touch:
-        smooth = analytic_of(model)
-        form = contact_form(model, smooth)
-        material = material_of(model, form)
-        calls["the contact equation in NumPy, a step"] = (
-            lambda: numpy_jacobians(form, smooth, steps, material, None),
-            KNOTS,
-        )
-    else:
+    if not known_steps(model, select(model, ()), xs[:-1], us, ends).some_touch:
         bodies = MujocoEngine(model)
         bodies._set(x, u)
         A, B = np.zeros((model.nx, model.nx)), np.zeros((model.nx, model.nu))
@@ -187,8 +175,7 @@ def table(quick: bool) -> str:
         lines.append(
             f"| gradient of {count:,} steps, of a loss of the end and of the whole | {' | '.join(cells)} | | |"
         )
-    how = "Numba" if has_numba() else "NumPy"
-    machine = f"Python {platform.python_version()}, contact by {how}, MuJoCo {mujoco.__version__}"
+    machine = f"Python {platform.python_version()}, MuJoCo {mujoco.__version__}"
     return "\n".join([*lines, "", f"Times Drake's own step of the same motion, or `rollout`; {machine}."])
 
 

@@ -20,9 +20,8 @@ from pydrake.multibody.tree import JointIndex
 from trust import Figure
 
 import drake_diff as dd
-from drake_diff.certificates.certify import StepAround, in_steps, state_scale
-from drake_diff.certificates.first_look import LookAt
-from drake_diff.certificates.steps import looks
+from drake_diff.certificates.certify import StepAround, in_steps, looks, state_scale
+from drake_diff.certificates.directions import LookAt
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space

@@ -1,8 +1,6 @@
 """What contacts, joint limits and couplers change of a step's Jacobian, state by state: compiled.
 
-The formulas are those of `jacobian`, `kinematics`, `laws` and `joint_impulses`, which say what they are. What is of one
-contact is done in one pass, where NumPy goes through memory once for each sum. Kept apart as Numba compiles what is in
-here.
+`jacobian` has the equation, `kinematics` the motion of contacts, `laws` and `joint_impulses` the impulses.
 """
 
 from typing import NamedTuple
@@ -11,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.compiled import compiled
+from drake_diff.derivatives.contact.law_kernel import SAME_MATERIAL, SAME_STATE, SAP, change_law, solve_law
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-
-SAP, SIMILAR, LAGGED = 0, 1, 2
 
 
 class Touching(NamedTuple):
@@ -40,6 +37,7 @@ class Pairs(NamedTuple):
     time: Array  # (P,)
     dissipation: Array  # (P,)
     other_part: Array  # (P,)
+    changes: Array  # (5, P, np) of these five by parameters
 
 
 class Spheres(NamedTuple):
@@ -199,137 +197,6 @@ def touch(s: Spheres, p: Pairs, poses: Array, c: Touching) -> None:
 
 
 @compiled
-def _law(
-    law: int,
-    h: float,
-    beta: float,
-    constants: tuple[float, float, float],
-    n: Array,
-    phi: float,
-    mu: float,
-    k: float,
-    tau: float,
-    d: float,
-    w: float,
-    u: Array,
-    u_0: float,
-    at: Array,
-) -> None:
-    """Solve the law of a contact with the velocity u (3,) after the step and u_0 along the normal before it.
-
-    `at` keeps what its derivatives are made of, from at[0:3] the impulse on.
-    """
-    sigma, soft_norm, stiction_tolerance = constants
-    vn = u[0] * n[0] + u[1] * n[1] + u[2] * n[2]
-    if law == SAP:
-        soft = h + tau
-        rigid, compliant = (beta / (2 * np.pi)) ** 2 * w, 1.0 / (h * k * soft)
-        R_n, R_t = max(rigid, compliant), sigma * w
-        y_n = (-phi / soft - vn) / R_n
-        squared = soft_norm**2
-        for i in range(3):
-            at[3 + i] = (vn * n[i] - u[i]) / R_t  # y_t
-            squared += at[3 + i] * at[3 + i]
-        y_r, ratio = np.sqrt(squared), R_t / R_n
-        sticks = y_r <= mu * y_n
-        pushes = sticks or -mu * ratio * y_r < y_n
-        g_n = 0.0
-        if sticks:
-            g_n = y_n
-        elif pushes:
-            g_n = (y_n + mu * ratio * y_r) / (1 + mu * mu * ratio)
-        for i in range(3):
-            at[6 + i] = at[3 + i] / y_r  # the tangent
-            at[i] = (at[3 + i] if sticks else mu * g_n * at[6 + i]) + g_n * n[i]
-        at[9], at[10], at[11], at[12], at[13], at[14] = soft, R_n, R_t, vn, y_n, y_r
-        at[15], at[16], at[17] = 1.0 if sticks else 0.0, 1.0 if pushes else 0.0, g_n
-        at[18] = 1.0 if rigid > compliant else 0.0
-        return
-    elastic, slowed = h * max(-k * phi, 0.0), max(1 - d * u_0, 0.0)
-    soft = mu * sigma * w * elastic * slowed
-    e = max(stiction_tolerance, soft)
-    squared = e * e
-    for i in range(3):
-        at[3 + i] = u[i] - vn * n[i]
-        squared += at[3 + i] * at[3 + i]
-    s = np.sqrt(squared)
-    z = vn if law == LAGGED else vn - mu * (s - e)
-    force, left = -k * phi - h * k * z, 1 - d * z
-    pushes = force > 0 and left > 0
-    g_n = h * force * left if pushes else 0.0
-    n_f = elastic * slowed if law == LAGGED else g_n
-    for i in range(3):
-        at[6 + i] = at[3 + i] / s
-        at[i] = g_n * n[i] - mu * n_f * at[6 + i]
-    at[9], at[10], at[11], at[12], at[13], at[14] = elastic, slowed, e, vn, s, z
-    at[15], at[16], at[17], at[18], at[19] = force, left, g_n, n_f, w
-    at[20], at[21], at[22] = u_0, 1.0 if pushes else 0.0, 1.0 if soft > stiction_tolerance else 0.0
-
-
-@compiled
-def _law_change(
-    law: int,
-    h: float,
-    sigma: float,
-    n: Array,
-    mu: float,
-    k: float,
-    d: float,
-    w: float,
-    u: Array,
-    at: Array,
-    du: Array,
-    dn: Array,
-    d_phi: float,
-    d_w: float,
-    d_before: float,
-    out: Array,
-) -> None:
-    """out (3,) the change of the impulse by those of u, of the normal, phi, w and u_0."""
-    d_vn = du[0] * n[0] + du[1] * n[1] + du[2] * n[2] + u[0] * dn[0] + u[1] * dn[1] + u[2] * dn[2]
-    if law == SAP:
-        soft, R_n, R_t, vn, y_n, y_r = at[9], at[10], at[11], at[12], at[13], at[14]
-        sticks, pushes, g_n = at[15] != 0, at[16] != 0, at[17]
-        if not pushes:
-            out[0], out[1], out[2] = 0.0, 0.0, 0.0
-            return
-        d_Rt = d_w / w
-        d_Rn = d_Rt if at[18] != 0 else 0.0
-        d_yn = -(d_vn + d_phi / soft) / R_n - y_n * d_Rn
-        ratio, d_yr = R_t / R_n, 0.0
-        for i in range(3):
-            out[i] = -(du[i] - d_vn * n[i] - vn * dn[i]) / R_t - at[3 + i] * d_Rt  # d y_t
-            d_yr += at[6 + i] * out[i]
-        if sticks:
-            for i in range(3):
-                out[i] += d_yn * n[i] + g_n * dn[i]
-            return
-        slide = d_yn + mu * ratio * (d_yr + (y_r - mu * g_n) * (d_Rt - d_Rn))
-        slide /= 1 + mu * mu * ratio
-        for i in range(3):
-            turned = (out[i] - at[6 + i] * d_yr) / y_r
-            out[i] = mu * (slide * at[6 + i] + g_n * turned) + slide * n[i] + g_n * dn[i]
-        return
-    elastic, slowed, e, vn, s = at[9], at[10], at[11], at[12], at[13]
-    force, left, g_n, n_f = at[15], at[16], at[17], at[18]
-    pushes, is_soft = at[21] != 0, at[22] != 0
-    d_force, n_0 = -k * d_phi, elastic * slowed
-    d_n0 = h * slowed * d_force + (elastic * -d * d_before if slowed > 0 else 0.0)
-    d_e = sigma * mu * (d_w * n_0 + w * d_n0) if is_soft else 0.0
-    d_s = e / s * d_e
-    for i in range(3):
-        out[i] = du[i] - d_vn * n[i] - vn * dn[i]  # d v_t
-        d_s += at[6 + i] * out[i]
-    d_z = d_vn if law == LAGGED else d_vn - mu * (d_s - d_e)
-    d_push = d_force - h * k * d_z
-    d_gn = h * (left * d_push - force * d * d_z) if pushes else 0.0
-    d_nf = d_n0 if law == LAGGED else d_gn
-    for i in range(3):
-        turned = (out[i] - at[6 + i] * d_s) / s
-        out[i] = d_gn * n[i] + g_n * dn[i] - mu * (d_nf * at[6 + i] + n_f * turned)
-
-
-@compiled
 def _add_contact(
     p: Plant,
     pairs: Pairs,
@@ -348,7 +215,7 @@ def _add_contact(
     across: Array,
     y: Array,
 ) -> None:
-    """Add what contact m changes to right (nv, 2 nv + nu), left (nv, nv) and push (nv,); from L on is scratch."""
+    """Add what contact m changes to right (nv, 2 nv + nu + np), left (nv, nv) and push (nv,); from L on is scratch."""
     nv, n, here, change = len(v), c.normal[m], c.point[m], c.change[m]
     i_pair, moves, law, h = c.pair[m], p.moves, p.law, p.time_step
     sphere, other = pairs.by_body[pairs.sides[i_pair, 0]], pairs.by_body[pairs.sides[i_pair, 1]]
@@ -375,7 +242,8 @@ def _add_contact(
             size += W[a, b] * W[a, b]
     size = np.sqrt(size)
     w = size / 3
-    _law(law, h, p.near_rigid, p.constants, n, c.phi[m], mu, k_c, tau, d, w, u, u_0, at)
+    phi = c.phi[m]
+    solve_law(law, h, p.near_rigid, p.constants, n, phi, mu, k_c, tau, d, w, u, u_0, at)
     f0, f1, f2 = at[0], at[1], at[2]
     for j in range(nv):  # how p, the normal and phi move, f x a, and what the weight's change is made of
         s = sphere[j] - other[j]
@@ -414,13 +282,13 @@ def _add_contact(
             va2 += s * v[j] * S[j, 2]
     for a in range(3):  # the impulse's slope by the velocity
         du[a] = 1.0
-        _law_change(law, h, sigma, n, mu, k_c, d, w, u, at, du, zero, 0.0, 0.0, 0.0, g)
+        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, at, du, zero, SAME_STATE, SAME_MATERIAL, g)
         for b in range(3):
             G[b, a] = g[b]
         du[a] = 0.0
     g_0 = np.zeros(3)
     if law != SAP:
-        _law_change(law, h, sigma, n, mu, k_c, d, w, u, at, zero, zero, 0.0, 0.0, 1.0, g_0)
+        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, at, zero, zero, (0.0, 0.0, 1.0), SAME_MATERIAL, g_0)
     for j in range(nv):
         a0, a1, a2, l0, l1, l2 = S[j, 0], S[j, 1], S[j, 2], L[j, 0], L[j, 1], L[j, 2]
         p0, p1, p2 = point[j, 0], point[j, 1], point[j, 2]
@@ -462,7 +330,8 @@ def _add_contact(
         d_w += a0 * w0 + a1 * w1 + a2 * w2 + l0 * w3 + l1 * w4 + l2 * w5
         d_w = 2 * d_w - by_slope
         dn[0], dn[1], dn[2] = point[j, 3], point[j, 4], point[j, 5]
-        _law_change(law, h, sigma, n, mu, k_c, d, w, u, at, du, dn, point[j, 6], d_w, d_before, g)
+        of_state = (point[j, 6], d_w, d_before)
+        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, at, du, dn, of_state, SAME_MATERIAL, g)
         for i in range(nv):
             s = sphere[i] - other[i]
             if s == 0:
@@ -473,6 +342,22 @@ def _add_contact(
                 found += across[j, 0] * L[i, 0] + across[j, 1] * L[i, 1] + across[j, 2] * L[i, 2]
                 found -= across[i, 0] * l0 + across[i, 1] * l1 + across[i, 2] * l2
             right[i, j] += s * found
+    begin = right.shape[1] - pairs.changes.shape[2]
+    for r in range(pairs.changes.shape[2]):  # by parameters of the material: through the law, and as the point moves
+        by = pairs.changes[:, i_pair, r]
+        back = -phi * by[4]  # along the normal
+        m0, m1, m2 = back * n[0], back * n[1], back * n[2]
+        du[0], du[1], du[2] = ua1 * m2 - ua2 * m1, ua2 * m0 - ua0 * m2, ua0 * m1 - ua1 * m0
+        d_w = -2 * (m0 * turned_sum[0] + m1 * turned_sum[1] + m2 * turned_sum[2])
+        d_before = n[0] * (va1 * m2 - va2 * m1) + n[1] * (va2 * m0 - va0 * m2) + n[2] * (va0 * m1 - va1 * m0)
+        of_state, of_material = (0.0, d_w, d_before), (by[0], by[1], by[2], by[3])
+        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, at, du, zero, of_state, of_material, g)
+        for i in range(nv):
+            s = sphere[i] - other[i]
+            if s != 0:
+                found = L[i, 0] * g[0] + L[i, 1] * g[1] + L[i, 2] * g[2]
+                found += across[i, 0] * m0 + across[i, 1] * m1 + across[i, 2] * m2
+                right[i, begin + r] += s * found
     for i in range(nv):
         s = sphere[i] - other[i]
         if s == 0:
@@ -564,7 +449,7 @@ def _solve(L: Array, B: Array) -> None:
 
 @compiled
 def _assemble(p: Plant, q: Array, v_next: Array, by: Array, nq: int, out: Array) -> None:
-    """out (nx, nx + nu) from the derivative of v' by small motion, v and u: by (nv, 2 nv + nu)."""
+    """out (nx, nx + nu + np) from the derivative (nv, 2 nv + nu + np) of v' by small motion, v, u and parameters."""
     nv, width, h = len(v_next), by.shape[1], p.time_step
     shift = nq - nv
     out[:] = 0.0
@@ -639,14 +524,15 @@ def step_jacobians(
     out: Array,
     sizes: Array,
 ) -> None:
-    """(N, nx, nx + nu) of N steps from q and v to v', `at_joints` (N, nv) being the positions of hinges and slides.
+    """(N, nx, nx + nu + np) of N steps from q and v to v'; `at_joints` (N, nv) are the positions of hinges and slides.
 
     `force` (N, nv) are those beside inverse dynamics, which was differentiated at (v' - v) / h. In `sizes` (N, 3) are
     the momentum that the impulses do not account for, that which v' has, and the impulses', each in Drake's norm.
     """
     N, nv = v.shape
     nq, nu, h = q.shape[1], p.actuation.shape[1], p.time_step
-    right, left, factor = np.empty((nv, 2 * nv + nu)), np.empty((nv, nv)), np.zeros((nv, nv))
+    right, left = np.empty((nv, 2 * nv + nu + pairs.changes.shape[2])), np.empty((nv, nv))
+    factor = np.zeros((nv, nv))
     A, diagonal, push, gained = np.empty((nv, nv)), np.empty(nv), np.empty(nv), np.empty((nv, 1))
     free, j = np.empty((nv, 1)), np.zeros(nv)
     L, point, across, y = np.empty((nv, 3)), np.empty((nv, 7)), np.empty((nv, 3)), np.empty((nv, 7))
@@ -667,6 +553,7 @@ def step_jacobians(
             right[i, nv + i] -= h * p.damping[i]
             for k in range(nu):
                 right[i, 2 * nv + k] = 0.0 if clipped[n, k] else h * p.actuation[i, k]
+            right[i, 2 * nv + nu :] = 0.0
             gained[i, 0] = h * (tau[n, i] - force[n, i]) + p.armature[i] * (v_next[n, i] - v[n, i])
             free[i, 0] = gained[i, 0]
         _factor(A, factor)

@@ -21,8 +21,8 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.derivatives.contact.material import QUANTITIES, Material, MaterialChange, combine
-from drake_diff.derivatives.contact.pairs import ContactPairs, read_pairs
+from drake_diff.derivatives.contact.active_contacts import ContactPairs, read_pairs
+from drake_diff.derivatives.contact.laws import QUANTITIES, Material, MaterialChange, combine
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.model import Model

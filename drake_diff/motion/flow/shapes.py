@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.derivatives.contact.pairs import ContactPairs
+from drake_diff.derivatives.contact.active_contacts import ContactPairs
 
 TINY = 1e-30  # [m^2] keeps the distance from a point or an axis differentiable on it
 

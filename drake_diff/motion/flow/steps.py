@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff.derivatives.contact.material import QUANTITIES, material_change
+from drake_diff.derivatives.contact.laws import QUANTITIES, material_change
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.counted import stepped

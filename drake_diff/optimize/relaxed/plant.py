@@ -23,9 +23,15 @@ from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, cross, skew
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives.contact.kinematics import Contacts, Topology, topology_of
-from drake_diff.derivatives.contact.material import Material, read_material
-from drake_diff.derivatives.contact.pairs import ContactPairs, Touches, read_pairs
+from drake_diff.derivatives.contact.active_contacts import (
+    ContactPairs,
+    Contacts,
+    Topology,
+    Touches,
+    read_pairs,
+    topology_of,
+)
+from drake_diff.derivatives.contact.laws import Material, read_material
 from drake_diff.derivatives.implicit import form_of
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree

@@ -5,9 +5,18 @@ Where contact, joint limits, PD controllers or couplers act, Drake's step solves
     |D (A (v' - v*) - j)| <= 1e-14 + 1e-6 max(|D A v'|, |D j|),    D = diag(A)^-1/2, j = J' g the impulses
 
 (Castro, Permenter and Han, "An unconstrained convex formulation of compliant contact", 2022), which is the noise of its
-differences. `polished_steps` states the same problem again (see `convex_step`), with Drake's own mass matrix, forces
-and contacts, checks that Drake's solution solves it within this very tolerance, and solves it to rounding from there.
-Where Drake's does not, the problem is not Drake's and a Refusal says by how much.
+differences. `refine_steps` states the same problem again, with Drake's mass matrix, forces and contacts, checks that
+Drake's solution solves it within this very tolerance, and solves it to rounding from there. Where Drake's does not, the
+problem is not Drake's and a Refusal says by how much.
+
+For A = M + h D, v* the velocity without impulses and convex potentials l_c of contacts and joints, v' is the only
+minimum of
+
+    l(v') = (v' - v*)' A (v' - v*) / 2 + sum_c l_c(J_c v'),
+
+where A (v' - v*) = sum_c J_c' g_c(J_c v'), g_c = -dl_c / d(J_c v') being the impulses (see `contact.laws` and
+`joint_impulses`). A few Newton steps from Drake's solution leave rounding only. A line search along each step looks for
+the minimum of l, of which it needs the slope alone.
 """
 
 from collections.abc import Mapping
@@ -18,22 +27,184 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_diff._base.arrays import Array, cross
+from drake_diff._base.arrays import Array, Indices, cross
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives.contact.kinematics import weigh
-from drake_diff.derivatives.contact.laws import Cone, HuntCrossley
-from drake_diff.derivatives.contact.material import QUANTITIES, combine
-from drake_diff.derivatives.convex_step import ContactImpulses, ConvexSteps
-from drake_diff.derivatives.couplers import Couplers, couplers_of
+from drake_diff.derivatives.contact.active_contacts import weigh
+from drake_diff.derivatives.contact.laws import QUANTITIES, ContactLaw, combine
 from drake_diff.derivatives.implicit import Form, form_of
-from drake_diff.derivatives.joint_impulses import Controllers, gather, limit_impulses
+from drake_diff.derivatives.joint_impulses import (
+    Controllers,
+    Couplers,
+    JointImpulses,
+    couplers_of,
+    gather,
+    limit_impulses,
+)
 from drake_diff.model.contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.plant import joints, proximity_property
 from drake_diff.model.step import advance, set_state
 
-STICTION_TOLERANCE = 1e-4  # [m/s] Drake's default, which it does not give back: another one is refused by the check
+ROUNDING = 64 * float(np.finfo(float).eps)  # of the sums
+SOLVED = 1e-12  # of the momentum; from there on steps are taken as long as they halve what is missing
+MAX_STEPS = 60
+BISECTIONS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class ContactImpulses:
+    """M contacts, each in one of N problems."""
+
+    problem: Indices  # (M,)
+    jacobian: Array  # (M, nv, 3) J'
+    law: ContactLaw
+
+    def part(self, which: Indices, position: Indices) -> "ContactImpulses":
+        """Some of them, in the problems that `position` says."""
+        return ContactImpulses(position, self.jacobian[which], self.law.part(which))
+
+    def at(self, v: Array) -> tuple[Array, Array]:
+        """The impulses (M, 3) at the velocities v (N, nv), and their derivatives (M, 3, 3) by -J v'."""
+        impulse, slope = self.law.impulses((v[self.problem][:, None, :] @ self.jacobian)[:, 0])
+        return impulse, -slope
+
+
+def _add(total: Array, where: Indices, parts: Array) -> None:
+    """Add each of parts (M, ...) to the entry of `total` that `where` (M,) says: np.add.at, many times as fast."""
+    if len(where):
+        order, begins, rows = _grouped(where)
+        total[rows] += np.add.reduceat(parts[order], begins, axis=0)
+
+
+def _add_squares(total: Array, where: Indices, size: Array, vectors: Array) -> None:
+    """Add size w w' of each of vectors (M, n) to the entry of `total` (N, n, n) that `where` (M,) says."""
+    if not len(where):
+        return
+    order, begins, rows = _grouped(where)
+    counts = np.diff(begins, append=len(where))
+    at = np.repeat(np.arange(len(rows)), counts), np.arange(len(where)) - np.repeat(begins, counts)
+    stacked = np.zeros((2, len(rows), int(np.max(counts)), vectors.shape[1]))
+    stacked[0][at], stacked[1][at] = vectors[order], (size[:, None] * vectors)[order]
+    total[rows] += stacked[0].swapaxes(1, 2) @ stacked[1]
+
+
+def _grouped(where: Indices) -> tuple[Indices, Indices, Indices]:
+    """The order by group, where each group begins in it, and the groups."""
+    order = np.argsort(where, kind="stable")
+    begins = np.flatnonzero(np.diff(where[order], prepend=-1))
+    return order, begins, where[order][begins]
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """What is left of the momentum balance of N problems at some velocities."""
+
+    missing: Array  # (N, nv) A (v' - v*) - J' g
+    given: Array  # (N, nv) J' g
+    curvature: Array  # (N, nv, nv) the second derivative of l
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexSteps:
+    """N problems."""
+
+    A: Array  # (N, nv, nv)
+    momentum: Array  # (N, nv) A v*, which is better known than v* where A is ill conditioned
+    contacts: ContactImpulses | None
+    joints: JointImpulses
+    same_tree: NDArray[np.bool_]  # (nv, nv)
+
+    def part(self, which: Indices) -> "ConvexSteps":
+        """Some of the problems."""
+        position = np.full(len(self.A), -1, dtype=np.intp)
+        position[which] = np.arange(len(which))
+        contacts, joints = self.contacts, self.joints
+        own = np.flatnonzero(position[joints.problem] >= 0)
+        joints = joints.part(own, position[joints.problem[own]])
+        if contacts is not None:
+            own = np.flatnonzero(position[contacts.problem] >= 0)
+            contacts = contacts.part(own, position[contacts.problem[own]])
+        return ConvexSteps(self.A[which], self.momentum[which], contacts, joints, self.same_tree)
+
+    def taking_part(self) -> NDArray[np.bool_]:
+        """(N, nv) the degrees of freedom of the trees that an impulse may reach, which Drake solves for."""
+        reached = np.zeros(self.momentum.shape, dtype=bool)
+        if self.contacts is not None:
+            np.logical_or.at(reached, self.contacts.problem, (self.contacts.jacobian != 0).any(axis=2))
+        np.logical_or.at(reached, self.joints.problem, self.joints.direction != 0)
+        return np.asarray(reached @ self.same_tree)
+
+    def at(self, v: Array) -> Balance:
+        """The balance at v (N, nv)."""
+        given, curvature = np.zeros_like(v), np.array(self.A)
+        if self.contacts is not None:
+            J, (impulse, slope) = self.contacts.jacobian, self.contacts.at(v)
+            _add(given, self.contacts.problem, (J @ impulse[..., None])[..., 0])
+            _add(curvature, self.contacts.problem, J @ slope @ J.swapaxes(-1, -2))
+        j, (pull, stiffness) = self.joints.direction, self.joints.at(v)
+        _add(given, self.joints.problem, j * pull[:, None])
+        _add_squares(curvature, self.joints.problem, stiffness, j)
+        had = (self.A @ v[..., None])[..., 0]
+        return Balance(had - self.momentum - given, given, curvature)
+
+    def norm(self, momentum: Array) -> Array:
+        """(N,) that of Drake's solver, |diag(A)^-1/2 p| of p (N, nv)."""
+        return np.asarray(np.sqrt((momentum * momentum / np.einsum("kii->ki", self.A)).sum(axis=1)))
+
+    def scale(self, v: Array, given: Array) -> Array:
+        """(N,) the momentum that Drake's solver compares with."""
+        had = (self.A @ v[..., None])[..., 0]
+        return np.asarray(np.maximum(self.norm(had), self.norm(given)))
+
+    def rounding(self, v: Array, at: Balance) -> Array:
+        """(N,) what of the momentum rounding may leave at v (N, nv): of sums, and of stiff impulses.
+
+        The sums may be far larger than what they amount to, as where a heavy tree has a light link.
+        """
+        of_sums = (np.abs(at.curvature) @ np.abs(v)[..., None])[..., 0] + np.abs(self.momentum)
+        return np.maximum(SOLVED * self.scale(v, at.given), ROUNDING * self.norm(of_sums)) + np.finfo(float).tiny
+
+    def solve(self, v: Array, at: Balance) -> tuple[Array, NDArray[np.bool_]]:
+        """v' (N, nv) to rounding from v (N, nv) with its balance, and whether it was reached (N,)."""
+        v, reached = np.array(v), np.zeros(len(v), dtype=bool)
+        open_, problems = np.arange(len(v)), self
+        for _ in range(MAX_STEPS):
+            own = v[open_]
+            size = problems.norm(at.missing)
+            step = np.array(-np.linalg.solve(at.curvature, at.missing[..., None])[..., 0], dtype=float)
+            ahead = problems.at(own + step)
+            ahead_size = problems.norm(ahead.missing)
+            near = size <= problems.rounding(own, at)
+            last = near & (ahead_size >= size / 2)  # as far as rounding lets it
+            slope = (ahead.missing * step).sum(axis=1)
+            search = ~near & (slope > 0) & (ahead_size > size / 2)  # beyond the minimum along the step
+            if search.any():
+                which = np.flatnonzero(search)
+                step[which] *= _along(problems.part(which), own[which], step[which])[:, None]
+            better = ~last | (ahead_size < size)
+            v[open_[better]] = (own + step)[better]
+            reached[open_[last]] = True
+            if last.all():
+                break
+            if search.any() or last.any():
+                open_, problems = open_[~last], problems.part(np.flatnonzero(~last))
+                at = problems.at(v[open_])
+            else:
+                at = ahead
+        return v, reached
+
+
+def _along(problems: ConvexSteps, v: Array, step: Array) -> Array:
+    """(N,) the part of each step (N, nv) at which l is smallest along it, l being larger again at its end."""
+    lower, upper = np.zeros(len(v)), np.ones(len(v))
+    for _ in range(BISECTIONS):
+        middle = (lower + upper) / 2
+        falls = (problems.at(v + middle[:, None] * step).missing * step).sum(axis=1) < 0
+        lower, upper = np.where(falls, middle, lower), np.where(falls, upper, middle)
+    return (lower + upper) / 2
+
+
 # Drake's A, v* and J are ours to rounding, and so is what it compared with its tolerance.
 DRAKES_STOP = SAP_RELATIVE_TOLERANCE * (1 + 1e-3)
 AT_REST = 1e-14 / SAP_RELATIVE_TOLERANCE  # [J^1/2] 1e-14 is its absolute tolerance
@@ -41,7 +212,7 @@ FREE_STEP = 1e-9  # of the momentum: what no impulse reaches is not solved for, 
 
 
 @dataclass(frozen=True, eq=False)
-class Polished:
+class RefinedSteps:
     """N steps solved to rounding; those that are refused hold NaN."""
 
     x_next: Array  # (N, nx)
@@ -52,23 +223,23 @@ class Polished:
     refused: Mapping[int, Refusal]
 
 
-def polished_step(model: Model, vector: ParameterVector, x: Array, u: Array) -> Array | Refusal:
+def refine_step(model: Model, vector: ParameterVector, x: Array, u: Array) -> Array | Refusal:
     """(nx,) the step from x (nx,) under u (nu,) to rounding, `vector` being applied; or why it is not had.
 
     Raises SimulationError where Drake cannot take the step.
     """
-    found = polished_steps(model, vector, x[None], u[None])
+    found = refine_steps(model, vector, x[None], u[None])
     return found.refused.get(0, found.x_next[0])
 
 
-def polished_steps(
+def refine_steps(
     model: Model,
     vector: ParameterVector,
     xs: Array,
     us: Array,
     values: Array | None = None,
     held: Array | None = None,
-) -> Polished:
+) -> RefinedSteps:
     """The steps from each of xs (N, nx) under each of us (N, nu); many in one call cost far less than one by one.
 
     `values` (N, np) are the parameters of each step, those of `vector`, which is applied, where it is None. `held`
@@ -78,10 +249,10 @@ def polished_steps(
     Raises SimulationError where Drake cannot take a step.
     """
     if values is None or not vector.parameters:
-        return _polish(model, vector, xs, us, None, held)
+        return _refine(model, vector, xs, us, None, held)
     times = np.array([vector.time_step(row) for row in values])
     if np.all(times == model.time_step):
-        return _polish(model, vector, xs, us, values, held)
+        return _refine(model, vector, xs, us, values, held)
     x_next, drake, left, acts = np.empty_like(xs), np.empty_like(xs), np.empty(len(xs)), np.zeros(len(xs), dtype=bool)
     missing = np.empty((len(xs), model.whole.nv))
     refused: dict[int, Refusal] = {}
@@ -89,14 +260,14 @@ def polished_steps(
         which = np.flatnonzero(times == h)
         points = xs[which], us[which], values[which], None if held is None else held[which]
         if h == model.time_step:
-            part = _polish(model, vector, *points)
+            part = _refine(model, vector, *points)
         else:
             with applied(vector.at(points[2][0])) as other:
-                part = _polish(other, vector.at(points[2][0]), *points)
+                part = _refine(other, vector.at(points[2][0]), *points)
         x_next[which], drake[which], left[which], acts[which] = part.x_next, part.drake, part.left, part.acts
         missing[which] = part.missing
         refused |= {int(which[k]): why for k, why in part.refused.items()}
-    return Polished(x_next, drake, acts, left, missing, refused)
+    return RefinedSteps(x_next, drake, acts, left, missing, refused)
 
 
 def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
@@ -118,13 +289,13 @@ def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
     return not refused and bool(np.all(np.abs(moved) <= FREE_STEP * np.maximum(1.0, np.abs(end))))
 
 
-def _polish(
+def _refine(
     model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None, held: Array | None
-) -> Polished:
+) -> RefinedSteps:
     """Of one time step. Reduced coordinates are read from the step of the whole plant, as in `advance`."""
     if model.coupling is None:
-        return _polish_whole(model, vector, xs, us, values, held, couplers_of(model))
-    whole = _polish_whole(model.whole, vector, model.coupling.state(xs), us, values, held, couplers_of(model))
+        return _refine_whole(model, vector, xs, us, values, held, couplers_of(model))
+    whole = _refine_whole(model.whole, vector, model.coupling.state(xs), us, values, held, couplers_of(model))
     drake, x_next = np.empty_like(xs), np.full_like(xs, np.nan)
     try:
         for k, x in enumerate(xs):
@@ -137,10 +308,10 @@ def _polish(
     finally:
         if values is not None:
             vector.write(model.double, vector.values)
-    return Polished(x_next, drake, whole.acts, whole.left, whole.missing, whole.refused)
+    return RefinedSteps(x_next, drake, whole.acts, whole.left, whole.missing, whole.refused)
 
 
-def _polish_whole(
+def _refine_whole(
     model: Model,
     vector: ParameterVector,
     xs: Array,
@@ -148,7 +319,7 @@ def _polish_whole(
     values: Array | None,
     held: Array | None,
     couplers: Couplers | Refusal,
-) -> Polished:
+) -> RefinedSteps:
     """With all coordinates of the plant."""
     form = form_of(model)
     why = couplers.reason if isinstance(couplers, Refusal) else form.driven
@@ -174,7 +345,7 @@ def _polish_whole(
     x_next, left = np.full_like(xs, np.nan), np.full(len(xs), np.nan)
     acts, missing = np.zeros(len(xs), dtype=bool), np.full((len(xs), model.nv), np.nan)
     if why:
-        return Polished(x_next, drake, acts, left, missing, {k: Refusal(why) for k in range(len(xs))})
+        return RefinedSteps(x_next, drake, acts, left, missing, {k: Refusal(why) for k in range(len(xs))})
     if read:
         which = np.array([r.step for r in read], dtype=np.intp)
         problems = _problems(model, form, read, xs[which], us[which], couplers)
@@ -186,7 +357,7 @@ def _polish_whole(
         refused |= {int(which[i]): Refusal(why) for i, why in whys.items()}
         x_next[which] = _states(model, xs[which], v_next)
     x_next[list(refused)] = np.nan
-    return Polished(x_next, drake, acts, left, missing, refused)
+    return RefinedSteps(x_next, drake, acts, left, missing, refused)
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,18 +527,20 @@ def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array)
         sides[moving],
     )
     material = combine(sides)
-    weight, h = weigh(J, weights[problem]).value, model.time_step
-    contact, velocity = model.contract.contact, np.zeros_like(normal)
-    law: Cone | HuntCrossley
-    if contact.approximation == "sap":
-        rigid = float(model.plant.get_sap_near_rigid_threshold())
-        stiffness = material.friction, material.stiffness, material.time
-        law = Cone(velocity, normal, phi, weight, *stiffness, time_step=h, near_rigid=rigid)
-    else:
-        before = ((v[problem][:, None, :] @ J)[:, 0] * normal).sum(axis=1)
-        stiffness = material.friction, material.stiffness, material.dissipation
-        lagged = contact.approximation == "lagged"
-        law = HuntCrossley(velocity, before, normal, phi, weight, *stiffness, h, STICTION_TOLERANCE, lagged)
+    contact = model.contract.contact
+    law = ContactLaw(
+        approximation=contact.approximation,
+        time_step=model.time_step,
+        near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
+        before=((v[problem][:, None, :] @ J)[:, 0] * normal).sum(axis=1),
+        normal=normal,
+        phi=phi,
+        weight=weigh(J, weights[problem]),
+        friction=material.friction,
+        stiffness=material.stiffness,
+        time=material.time,
+        dissipation=material.dissipation,
+    )
     return ContactImpulses(problem, J, law)
 
 

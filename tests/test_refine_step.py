@@ -15,10 +15,11 @@ from scipy.optimize import bisect
 
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives import joint_impulses, polish, sources
+from drake_diff.derivatives import joint_impulses, sources
+from drake_diff.derivatives import refine_step as refining
 from drake_diff.derivatives.contact import laws
-from drake_diff.derivatives.couplers import couplers_of
-from drake_diff.derivatives.polish import polished_step, polished_steps
+from drake_diff.derivatives.joint_impulses import couplers_of
+from drake_diff.derivatives.refine_step import refine_step, refine_steps
 from drake_diff.exceptions import GradientError
 from drake_diff.model.parameters import applied, select
 
@@ -26,14 +27,14 @@ H = 0.005
 NEAR_RIGID = 0.01 / (4 * np.pi**2)  # Drake's, of limits, controllers and couplers
 
 
-def polished(model, x, u=(), parameters=()):
-    found = polished_step(model, select(model, parameters), np.array(x, dtype=float), np.array(u, dtype=float))
+def refined(model, x, u=(), parameters=()):
+    found = refine_step(model, select(model, parameters), np.array(x, dtype=float), np.array(u, dtype=float))
     assert not isinstance(found, Refusal), found
     return found
 
 
 def why_not(model, x, u=()):
-    found = polished_step(model, select(model, ()), np.array(x, dtype=float), np.array(u, dtype=float))
+    found = refine_step(model, select(model, ()), np.array(x, dtype=float), np.array(u, dtype=float))
     assert isinstance(found, Refusal)
     return str(found)
 
@@ -64,7 +65,7 @@ def test_a_ball_that_presses_on_the_ground(approximation, overlap, speed):
     model, k = ball(approximation, stiffness=5e3, axes="z"), 5e3
 
     def end(z, v):
-        return polished(model, [z, v])[1]
+        return refined(model, [z, v])[1]
 
     exact = (speed - 9.81 * H + H * k * overlap) / (1 + H * H * k)
     z = 0.1 - overlap
@@ -83,7 +84,7 @@ def test_a_compliant_ball_of_sap():
     model, k, soft = made.model(), 5e3, H + 0.02
     R = 1 / (H * k * soft)
     exact = (-0.2 - 9.81 * H + 3e-3 / soft / R) / (1 + 1 / R)
-    assert polished(model, [0.097, -0.2])[1] == pytest.approx(exact, rel=1e-13)
+    assert refined(model, [0.097, -0.2])[1] == pytest.approx(exact, rel=1e-13)
 
 
 @each_row("v0, push", [(1.0, 0.0), (0.0, 4.9), (0.0, 6.0), (1e-4, 2.0)])
@@ -97,11 +98,11 @@ def test_a_ball_that_slides_or_creeps(v0, push):
     e, mu, g, h = 1e-4, 0.5, 9.81, H
     w = bisect(lambda v: v - v0 - h * push + mu * g * h * v / np.hypot(v, e), -1.0, 2.0, xtol=1e-16)
     stiff = 1 + mu * g * h * e * e / np.hypot(w, e) ** 3
-    assert polished(model, state(v0), [push])[2] == pytest.approx(w, rel=1e-10, abs=1e-13)
+    assert refined(model, state(v0), [push])[2] == pytest.approx(w, rel=1e-10, abs=1e-13)
     step = 1e-7
     by_v, by_u = (
-        slope(lambda v: polished(model, state(v), [push])[2], v0, step),
-        slope(lambda u: polished(model, state(v0), [u])[2], push, step),
+        slope(lambda v: refined(model, state(v), [push])[2], v0, step),
+        slope(lambda u: refined(model, state(v0), [u])[2], push, step),
     )
     # Rounding / step is 1e-9 at most; what the friction's bend adds in 1e-7 m/s, beside e, is a part of 1e-6.
     assert by_v == pytest.approx(1 / stiff, rel=2e-6, abs=3e-9)
@@ -114,7 +115,7 @@ def test_a_push_that_drakes_solver_does_not_notice():
     model, x = ball(stiffness=1e6, time_step=h, pushed=True), [0.0, 0.1 - 9.81e-6, 0.0, 0.0]
     exact = h / (1 + 0.5 * 9.81 * h / 1e-4)
     assert slope(lambda u: dd.step(model, x, [u])[2], 0.0, 5e-6) == 0.0
-    assert slope(lambda u: polished(model, x, [u])[2], 0.0, 5e-6) == pytest.approx(exact, rel=1e-9)
+    assert slope(lambda u: refined(model, x, [u])[2], 0.0, 5e-6) == pytest.approx(exact, rel=1e-9)
     d = dd.differentiate_step(model, x, [0.0], method="finite_difference")
     assert d.reason == "asked for; of the step solved to rounding"
     assert d.B[2, 0] == pytest.approx(exact, abs=1e-10)  # rounding of 1e-17 / 3e-7
@@ -155,7 +156,7 @@ def test_a_joint_at_its_limit(q, v, u, held):
         pushed = (A * side * free - distance / (2 * H) / R) / (A + 1 / R)
         if -distance / (2 * H) > pushed:
             exact = side * pushed
-    assert polished(model, [q, v], [u])[1] == pytest.approx(exact, rel=1e-13, abs=1e-15)
+    assert refined(model, [q, v], [u])[1] == pytest.approx(exact, rel=1e-13, abs=1e-15)
     assert (exact != free) == bool(held)
 
 
@@ -163,7 +164,7 @@ def test_a_step_that_ends_at_rest_beside_a_limit():
     """v' = v + h (u - 3 v) / A is 0 to rounding, as at the end of a plan: nothing is left to compare rounding with."""
     model, A = slide(limits=(-1.0, 1.0), damping=3.0), 2.1 + 3.0 * H
     v = 0.3
-    assert polished(model, [-0.999, v], [3.0 * v - A * v / H])[1] == pytest.approx(0.0, abs=1e-15)
+    assert refined(model, [-0.999, v], [3.0 * v - A * v / H])[1] == pytest.approx(0.0, abs=1e-15)
 
 
 @each_row("gains", [(300.0, 20.0), (1e9, 1e6)])
@@ -177,7 +178,7 @@ def test_a_pd_controller_within_its_effort_at_its_limit_and_too_stiff_for_the_st
     effort = u - kp * (q + H * exact) - kd * exact
     if abs(effort) > limit:
         exact = v + H * np.sign(effort) * limit / A
-    assert polished(model, [q, v], [u])[1] == pytest.approx(exact, rel=1e-12)
+    assert refined(model, [q, v], [u])[1] == pytest.approx(exact, rel=1e-12)
     assert (lowered < 1) == (gains[0] == 1e9)
 
 
@@ -188,7 +189,7 @@ def test_two_blocks_whose_rails_are_coupled(u):
     q, v = np.array([0.3, 0.05]), np.array([0.2, -0.1])
     free = v + h * np.array([u, 0.0])
     exact = free + j * (-(j @ q) / (2 * h) - j @ free) / (NEAR_RIGID * 5 + 5)
-    assert polished(model, [*q, *v], [u])[2:] == pytest.approx(exact, rel=1e-12)
+    assert refined(model, [*q, *v], [u])[2:] == pytest.approx(exact, rel=1e-12)
     found = couplers_of(model)
     np.testing.assert_allclose(found.direction, [[1, -2]], rtol=1e-12)
 
@@ -209,7 +210,7 @@ def test_couplers_of_light_fingers_of_a_robot_that_falls(time_step):
 def test_a_hand_whose_fingers_are_coupled_and_controlled():
     model, random = example_robot("panda.urdf", gains=(100.0, 3.0)), np.random.default_rng(1)
     xs = np.array([state_in_range(model, random) for _ in range(10)])
-    found = polished_steps(model, select(model, ()), xs, random.standard_normal((10, model.nu)))
+    found = refine_steps(model, select(model, ()), xs, random.standard_normal((10, model.nu)))
     assert {str(why) for why in found.refused.values()} <= {"hydroelastic contact acts"}
     assert np.nanmax(np.abs(found.x_next - found.drake)) < 1e-6
 
@@ -248,7 +249,7 @@ def test_the_differences_on_four_feet_are_autodiffs(approximation):
     assert touching == 4
     step, columns = 1e-7, [8, 12, 19, 21, 22, 24, 30]
     ends = np.array([x + side * step * np.eye(model.nx)[j] for j in columns for side in (1, -1)])
-    found = polished_steps(model, select(model, ()), ends, np.tile(u, (len(ends), 1)))
+    found = refine_steps(model, select(model, ()), ends, np.tile(u, (len(ends), 1)))
     assert not found.refused
     ours = ((found.x_next[::2] - found.x_next[1::2]) / (2 * step)).T
     drakes = ((found.drake[::2] - found.drake[1::2]) / (2 * step)).T
@@ -268,7 +269,7 @@ def test_a_box_in_point_contact_which_autodiff_does_not_have():
     x = model.default_state
     x[:4] = np.array([1, 0.05, 0.03, 0.2]) / np.linalg.norm([1, 0.05, 0.03, 0.2])
     x[6], x[10:13] = 0.06, [0.5, 0.1, -0.1]
-    assert np.abs(polished(model, x) - dd.step(model, x)).max() < 1e-6
+    assert np.abs(refined(model, x) - dd.step(model, x)).max() < 1e-6
     assert len(dd.rollout(model, x, num_steps=1).contacts[0]) == 1
     d = dd.differentiate_step(model, x, method="finite_difference")
     assert d.reason.endswith("of the step solved to rounding")
@@ -287,7 +288,7 @@ def test_parts_of_one_body_that_overlap_take_no_part():
     made.shape(made.plant.world_body(), Sphere(0.1), properties, RigidTransform([0, 0.45, 0]))
     made.ground(properties)
     model = made.model()
-    assert np.abs(polished(model, [0.099, -0.1]) - dd.step(model, [0.099, -0.1])).max() < 1e-6
+    assert np.abs(refined(model, [0.099, -0.1]) - dd.step(model, [0.099, -0.1])).max() < 1e-6
 
 
 def test_a_link_far_lighter_than_what_carries_it():
@@ -302,7 +303,7 @@ def test_a_link_far_lighter_than_what_carries_it():
     model, random = made.model(), np.random.default_rng(0)
     for _ in range(20):
         x = np.r_[0.02 * random.standard_normal(2), random.standard_normal(2)]
-        assert np.abs(polished(model, x) - dd.step(model, x)).max() < 1e-3
+        assert np.abs(refined(model, x) - dd.step(model, x)).max() < 1e-3
 
 
 def test_differences_say_where_the_step_is_not_had_to_rounding():
@@ -321,9 +322,9 @@ def test_a_step_is_the_same_alone_and_among_others_and_free_steps_are_drakes():
     xs = np.array([state() for _ in range(6)])
     xs[2, 6] += 0.5
     us = 0.1 * random.standard_normal((6, 12))
-    many = polished_steps(model, select(model, ()), xs, us)
+    many = refine_steps(model, select(model, ()), xs, us)
     for k in range(6):
-        assert np.array_equal(many.x_next[k], polished(model, xs[k], us[k]))
+        assert np.array_equal(many.x_next[k], refined(model, xs[k], us[k]))
     np.testing.assert_allclose(many.x_next[2], many.drake[2], rtol=0, atol=1e-14)  # two orders of one sum
     assert np.abs(many.x_next - many.drake).max() > 1e-10
 
@@ -338,9 +339,9 @@ def test_parameters_of_each_step():
     values = vector.values * (1 + 0.1 * np.random.default_rng(5).uniform(-1, 1, (5, 3)))
     values[:3, 2] = H
     with applied(vector) as same:
-        before = polished_steps(same, vector, x[None], np.zeros((1, 0))).x_next[0]
-        many = polished_steps(same, vector, np.tile(x, (5, 1)), np.zeros((5, 0)), values)
-        assert np.array_equal(polished_steps(same, vector, x[None], np.zeros((1, 0))).x_next[0], before)
+        before = refine_steps(same, vector, x[None], np.zeros((1, 0))).x_next[0]
+        many = refine_steps(same, vector, np.tile(x, (5, 1)), np.zeros((5, 0)), values)
+        assert np.array_equal(refine_steps(same, vector, x[None], np.zeros((1, 0))).x_next[0], before)
     assert not many.refused
     for k in range(5):
         given = dict(zip(names, values[k], strict=True))
@@ -381,14 +382,14 @@ def test_another_material_is_refused(monkeypatch, wrong):
     """By 1e-4 of its value: what the solver would have had to leave is 20 to 1,000 times its tolerance."""
     approximation = "sap" if wrong == "time" else "lagged"
     model = ball(approximation, stiffness=1e4, relaxation_time=0.02, dissipation=2.0)
-    x, right = [0.0, 0.0985, 1.0, -0.3], polish.combine
-    polished(model, x)
+    x, right = [0.0, 0.0985, 1.0, -0.3], refining.combine
+    refined(model, x)
 
     def other(sides):
         material = right(sides)
         return replace(material, **{wrong: getattr(material, wrong) * (1 + 1e-4)})
 
-    monkeypatch.setattr(polish, "combine", other)
+    monkeypatch.setattr(refining, "combine", other)
     assert "its solver stops at 1e-06: the equation is not Drake's" in why_not(model, x)
 
 
@@ -397,7 +398,7 @@ def test_other_constants_of_drake_are_refused(monkeypatch):
     creeping = ball("sap", stiffness=1e4, relaxation_time=0.02)
     cases = [(limited, [1.01, 0.0], [0.0]), (controlled, [0.02, 0.3], [0.0]), (creeping, [0.0, 0.0985, 1e-3, -0.3], [])]
     for case in cases:
-        polished(*case)
+        refined(*case)
     monkeypatch.setattr(joint_impulses, "NEAR_RIGID", 1.01 * NEAR_RIGID)
     monkeypatch.setattr(laws, "SIGMA", 1.01e-3)
     for case in cases:
@@ -429,7 +430,7 @@ def test_what_is_not_known_is_named():
 def test_a_robot_in_the_air_with_controllers():
     model, random = example_robot("ur5_robot.urdf", gains=(400.0, 30.0)), np.random.default_rng(0)
     xs = np.array([state_in_range(model, random) for _ in range(20)])
-    found = polished_steps(model, select(model, ()), xs, random.standard_normal((20, model.nu)))
+    found = refine_steps(model, select(model, ()), xs, random.standard_normal((20, model.nu)))
     assert not found.refused
     assert np.abs(found.x_next - found.drake).max() < 1e-9  # without limits the problem is quadratic: one step
 
@@ -445,7 +446,7 @@ def test_robots_in_contact_are_never_refused_and_planted_materials_nearly_always
 
     Where a foot leaves the ground in the step, or presses with less than 1e-6 of the momentum, nobody can notice.
     """
-    random, right = np.random.default_rng(7), polish.combine
+    random, right = np.random.default_rng(7), refining.combine
     noticed, states, worst = 0, 0, 0.0
     for name in (name for name, floating in ROBOTS.items() if floating):
         for time_step, stiffness in ((5e-4, 1e6), (1e-3, 1e4), (2e-3, 1e5), (5e-3, 1e3)):
@@ -453,15 +454,15 @@ def test_robots_in_contact_are_never_refused_and_planted_materials_nearly_always
             model = example_robot(name, time_step, **options)
             xs = np.array([state_in_contact(model, random, depth=10 ** random.uniform(-4, -2)) for _ in range(12)])
             us = random.standard_normal((12, model.nu))
-            found = polished_steps(model, select(model, ()), xs, us)
+            found = refine_steps(model, select(model, ()), xs, us)
             assert not found.refused
             worst = max(worst, np.abs(found.x_next - found.drake).max())
             assert found.left.max() <= 1e-6
             with monkeypatch.context() as planted:
                 planted.setattr(
-                    polish, "combine", lambda sides: replace(m := right(sides), stiffness=1.01 * m.stiffness)
+                    refining, "combine", lambda sides: replace(m := right(sides), stiffness=1.01 * m.stiffness)
                 )
-                noticed += len(polished_steps(model, select(model, ()), xs, us).refused)
+                noticed += len(refine_steps(model, select(model, ()), xs, us).refused)
             states += 12
     assert states == 288
     assert 1e-7 < worst < 1e-3  # what the solver's stop is worth

@@ -19,21 +19,31 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.differences import RATIO_SQUARED, Difference, Many
 
-STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
-SPACINGS = (1e-9, 1e-7, 1e-5, 1e-3)  # of the values along a line
-ROUNDED_POINT = 4 * np.finfo(float).eps  # of a point's entries: what displacing them to both sides rounds
-VALUES = 8  # at each spacing, to each side
-ORDERS = (4, 5, 6)  # of the differences that tell scatter
+
+@dataclass(frozen=True)
+class DifferenceOptions:
+    """How a function is differenced around a point, and what of it is noise."""
+
+    steps: tuple[float, ...] = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
+    spacings: tuple[float, ...] = (1e-9, 1e-7, 1e-5, 1e-3)  # of the values along a line
+    rounded_point: float = 4 * np.finfo(float).eps  # of a point's entries: what displacing them to both sides rounds
+    values: int = 8  # at each spacing, to each side
+    orders: tuple[int, ...] = (4, 5, 6)  # of the differences that tell scatter
+    last_place: float = 1.1e-16  # half a unit in the last place of 1
+    safety: float = 3.0  # scatter is a standard deviation, from a few values
+    told: float = 30.0  # times the scatter: a corner or jump that can be told from it
+    visible: float = 1e-10  # of a value: smaller stairs are its rounding, magnified
+    fine: float = 1e-5  # for this and the next see `_stairs`
+    flat: float = 1e-2
+    shrinks: float = 0.7  # or more at a corner; 0.56 of |x|^1.5, which has none, 0.32 of what is smooth
+    near: int = 2  # spacings at which what is no scatter, but a corner or stairs, is as a rule not met
+    halvings: int = 24
+    stairs: int = 3  # jumps to each side, each in another interval, make a staircase: one alone is a contact's onset
+
+
+DIFFERENCES = DifferenceOptions()
+
 TINY = 1e-300  # no number that means anything is smaller
-LAST_PLACE = 1.1e-16  # half a unit in the last place of 1
-SAFETY = 3.0  # scatter is a standard deviation, from a few values
-TOLD = 30.0  # times the scatter: a corner or jump that can be told from it
-VISIBLE = 1e-10  # of a value: smaller stairs are its rounding, magnified
-FINE, FLAT = 1e-5, 1e-2  # see `_stairs`
-SHRINKS = 0.7  # or more at a corner; 0.56 of |x|^1.5, which has none, 0.32 of what is smooth
-NEAR = 2  # spacings at which what is no scatter, but a corner or stairs, is as a rule not met
-HALVINGS = 24
-STAIRS = 3  # jumps to each side, each in another interval, make a staircase: one alone is a contact's onset
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,7 @@ class Neighbourhood:
 
     centre: Array  # the value at the point
     size: Array  # (m,) the values' magnitude, which rounding goes by
-    forward: Array  # (s, m, n) one-sided quotients at STEPS
+    forward: Array  # (s, m, n) one-sided quotients at DIFFERENCES.steps
     backward: Array  # (s, m, n)
     scatter: Array  # (m,) of a value, over 1e-6, or what a solver leaves
     finest: Array  # (m,) over 1e-8
@@ -55,10 +65,13 @@ class Neighbourhood:
         central = (self.forward + self.backward) / 2
         values = central[1:] + (central[1:] - central[:-1]) / (RATIO_SQUARED - 1)
         three = np.array([values[w : w + 3] for w in range(len(values) - 2)])
-        steps = np.array(STEPS)[:, None, None]
+        steps = np.array(DIFFERENCES.steps)[:, None, None]
         # An entry's own values scatter no more than they change at all: many entries are zero, and solved exactly.
         change = (steps * np.maximum(np.abs(self.forward), np.abs(self.backward))).max(axis=0)
-        noise = np.maximum(np.minimum(SAFETY * self.scatter[:, None], 2 * change), LAST_PLACE * self.size[:, None])
+        noise = np.maximum(
+            np.minimum(DIFFERENCES.safety * self.scatter[:, None], 2 * change),
+            DIFFERENCES.last_place * self.size[:, None],
+        )
         doubt = noise / steps[2:-1] + self._corners()
         return three[:, 1], three.max(axis=1) - three.min(axis=1) + doubt
 
@@ -69,7 +82,7 @@ class Neighbourhood:
         plateau at the mean of two slopes.
         """
         gap = np.abs(self.forward - self.backward)[1:-1]
-        shrinks = gap[1:] <= SHRINKS * gap[:-1]
+        shrinks = gap[1:] <= DIFFERENCES.shrinks * gap[:-1]
         return np.asarray(np.where(shrinks, 0.0, gap[1:] / 2))
 
 
@@ -81,7 +94,7 @@ def look_around(
     `unsolved` (m,) is how wrong a value may be at most because a solver stopped early: such jumps are no stairs. Nor is
     what comes of rounding the displaced `point` (n,), which is more than the value's own rounding where terms cancel.
     """
-    steps = np.array(STEPS)[:, None, None]
+    steps = np.array(DIFFERENCES.steps)[:, None, None]
     sides = np.stack([steps * np.eye(n), -steps * np.eye(n)]).reshape(-1, n)
     direction = _line(n)
     values = f(np.vstack([np.zeros((1, n)), sides, _along(n)]))
@@ -92,14 +105,14 @@ def look_around(
 
     changes = apart(np.asarray(values[1:], dtype=float))
     rows = changes.shape[1]
-    ahead, behind = changes[: len(sides)].reshape(2, len(STEPS), n, rows).swapaxes(2, 3) / steps
+    ahead, behind = changes[: len(sides)].reshape(2, len(DIFFERENCES.steps), n, rows).swapaxes(2, 3) / steps
     size = np.abs(centre) if minus is np.subtract else np.ones(rows)
     along, rounding, by_spacing = _scattered(changes[len(sides) :], size)
     unknown = np.array(np.broadcast_to(unsolved, rows), dtype=float)
     if point is not None:
-        unknown = np.maximum(unknown, ROUNDED_POINT * np.nan_to_num(np.abs(ahead[0])) @ np.abs(point))
-    scatter = np.maximum(by_spacing[:, :NEAR].max(axis=(0, 1)), unknown / SAFETY)
-    finest = np.maximum(by_spacing[:, 0].max(axis=0), unknown / SAFETY)
+        unknown = np.maximum(unknown, DIFFERENCES.rounded_point * np.nan_to_num(np.abs(ahead[0])) @ np.abs(point))
+    scatter = np.maximum(by_spacing[:, : DIFFERENCES.near].max(axis=(0, 1)), unknown / DIFFERENCES.safety)
+    finest = np.maximum(by_spacing[:, 0].max(axis=0), unknown / DIFFERENCES.safety)
     stairs = _stairs(lambda t: apart(f(np.multiply.outer(t, direction))), along, by_spacing, rounding, unknown)
     return Neighbourhood(centre, size, ahead, -behind, scatter, finest, stairs)
 
@@ -112,25 +125,27 @@ def is_broken(changes: Many, n: int) -> str:
     direction, found = _line(n), changes(_along(n))
     unsolved = np.zeros(found.shape[1])
     along, rounding, by_spacing = _scattered(found, unsolved + 1)
-    still = np.maximum(by_spacing[:, 0].min(axis=0), rounding[:, NEAR - 1].max(axis=0))
-    for k in range(NEAR):
+    still = np.maximum(by_spacing[:, 0].min(axis=0), rounding[:, DIFFERENCES.near - 1].max(axis=0))
+    for k in range(DIFFERENCES.near):
         through = np.concatenate([along[1, k, ::-1], np.zeros((1, len(unsolved))), along[0, k]])
-        if np.any(_scatter(through) > TOLD * still):
+        if np.any(_scatter(through) > DIFFERENCES.told * still):
             return "it is broken beside the point"
     some = _stairs(lambda t: changes(np.multiply.outer(t, direction)), along, by_spacing, rounding, unsolved)
     return next(iter(some.values()), "")
 
 
 def _along(n: int) -> Array:
-    """(K, n) places along a line to both sides of the point, at each of SPACINGS."""
-    places = np.multiply.outer([1.0, -1.0], np.multiply.outer(SPACINGS, np.arange(1, VALUES + 1)))
+    """(K, n) places along a line to both sides of the point, at each of DIFFERENCES.spacings."""
+    places = np.multiply.outer(
+        [1.0, -1.0], np.multiply.outer(DIFFERENCES.spacings, np.arange(1, DIFFERENCES.values + 1))
+    )
     return np.asarray(places.reshape(-1, 1) * _line(n))
 
 
 def _scattered(changes: Array, size: Array) -> tuple[Array, Array, Array]:
     """The `changes` along a line (2, spacings, values, m), their rounding and their scatter (2, spacings, m)."""
-    along = changes.reshape(2, len(SPACINGS), VALUES, -1)
-    rounding = LAST_PLACE * (size + np.abs(along).max(axis=2))
+    along = changes.reshape(2, len(DIFFERENCES.spacings), DIFFERENCES.values, -1)
+    rounding = DIFFERENCES.last_place * (size + np.abs(along).max(axis=2))
     return along, rounding, np.maximum(_scatter(along), rounding)
 
 
@@ -143,7 +158,7 @@ def _line(n: int) -> Array:
 def _scatter(values: Array) -> Array:
     """(..., m) the standard deviation of equally spaced `values` (..., k, m) around a smooth curve."""
     found = []
-    for order in ORDERS:
+    for order in DIFFERENCES.orders:
         differences = np.diff(values, order, axis=-2)
         found.append((differences**2).mean(axis=-2) / comb(2 * order, order))
     return np.asarray(np.sqrt(np.median(found, axis=0)))
@@ -156,15 +171,21 @@ def _stairs(
 
     `along_line` gives the changes (k, m) at k places of the line, `scatter` is (2, spacings, m).
     """
-    slope = (along[0, 0, -1] - along[1, 0, -1]) / (2 * VALUES * SPACINGS[0])
+    slope = (along[0, 0, -1] - along[1, 0, -1]) / (2 * DIFFERENCES.values * DIFFERENCES.spacings[0])
     found: dict[int, str] = {}
-    for k in range(1, len(SPACINGS) if len(slope) else 0):
+    for k in range(1, len(DIFFERENCES.spacings) if len(slope) else 0):
         finest = np.maximum(scatter[:, 0].max(axis=0), rounding[:, k].max(axis=0)) + TINY
-        values = 2 * rounding[:, k].max(axis=0) / LAST_PLACE
-        least, both = np.maximum(np.maximum(TOLD * finest, unsolved), VISIBLE * values), scatter[:, k].min(axis=0)
-        if SPACINGS[k] > FINE:  # where contact's onsets are as close, only what is flat between its jumps is stairs
+        values = 2 * rounding[:, k].max(axis=0) / DIFFERENCES.last_place
+        least, both = (
+            np.maximum(np.maximum(DIFFERENCES.told * finest, unsolved), DIFFERENCES.visible * values),
+            scatter[:, k].min(axis=0),
+        )
+        # Where contact's onsets are as close, only what is flat between its jumps is stairs.
+        if DIFFERENCES.spacings[k] > DIFFERENCES.fine:
             risen = np.abs(along[:, k]).max(axis=(0, 1))
-            both = np.where(np.abs(slope) * VALUES * SPACINGS[k] <= FLAT * risen, both, 0.0)
+            both = np.where(
+                np.abs(slope) * DIFFERENCES.values * DIFFERENCES.spacings[k] <= DIFFERENCES.flat * risen, both, 0.0
+            )
         row = int(np.argmax(both / finest))
         if row in found or not both[row] > least[row]:
             continue
@@ -172,7 +193,7 @@ def _stairs(
             _jumps(along_line, row, sign, k, along[s, k, :, row], slope[row], least[row])
             for s, sign in enumerate((1, -1))
         ]
-        if all(len(some) >= STAIRS for some in jumps):
+        if all(len(some) >= DIFFERENCES.stairs for some in jumps):
             (up, here), (down, there) = jumps[0][0], jumps[1][0]
             found[row] = (
                 f"it jumps by {up:.2g} at {here:.2g} and by {down:.2g} at {there:.2g} of a line through the point"
@@ -184,12 +205,15 @@ def _jumps(
     along_line: Callable[[Array], Array], row: int, sign: int, k: int, values: Array, slope: float, least: float
 ) -> list[tuple[float, float]]:
     """Up to three jumps of a row and where, each found by halving one of the intervals between `values` (k,)."""
-    places, heights = sign * SPACINGS[k] * np.arange(VALUES + 1), np.concatenate([[0.0], values])
+    places, heights = (
+        sign * DIFFERENCES.spacings[k] * np.arange(DIFFERENCES.values + 1),
+        np.concatenate([[0.0], values]),
+    )
     off = np.abs(np.diff(heights) - slope * np.diff(places))
     found: list[tuple[float, float]] = []
-    for i in np.argsort(-off, kind="stable")[:STAIRS]:
+    for i in np.argsort(-off, kind="stable")[: DIFFERENCES.stairs]:
         ends, ends_at = places[i : i + 2].copy(), heights[i : i + 2].copy()
-        for _ in range(HALVINGS):
+        for _ in range(DIFFERENCES.halvings):
             middle = ends.mean()
             value = along_line(np.array([middle]))[0, row]
             halves = np.abs(np.diff([ends_at[0], value, ends_at[1]]) - slope * (ends[1] - ends[0]) / 2)

@@ -43,7 +43,6 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_diff._base.arrays import Array, skew
-from drake_diff.derivatives.contact.pairs import move_apart
 from drake_diff.model.model import Model
 
 Flags = NDArray[np.bool_]
@@ -186,7 +185,7 @@ _FEATURES = (_sphere, _half_space, _box, _cylinder, _capsule, _ellipsoid, _mesh,
 
 
 @dataclass(frozen=True, eq=False)
-class WitnessPairs:
+class NearestPointPairs:
     """Q pairs of which SceneGraph says where they touch."""
 
     ids: tuple[tuple[Any, Any], ...]
@@ -239,7 +238,7 @@ def _times(pose: Array, other: Array) -> Array:
     return np.concatenate([R @ other[:, :3], at], axis=2)
 
 
-def read_witness_pairs(model: Model, without: set[tuple[Any, Any]]) -> WitnessPairs:
+def read_nearest_point_pairs(model: Model, without: set[tuple[Any, Any]]) -> NearestPointPairs:
     """The pairs of `model` that may move against each other and are not among `without`."""
     inspector, plant = model.double.inspector, model.plant
     ids = []
@@ -249,7 +248,7 @@ def read_witness_pairs(model: Model, without: set[tuple[Any, Any]]) -> WitnessPa
     bodies = tuple(tuple(plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in pair) for pair in ids)
     shapes = tuple((inspector.GetShape(a), inspector.GetShape(b)) for a, b in ids)
     known = tuple((Shape.of(inspector, a), Shape.of(inspector, b)) for a, b in ids)
-    return WitnessPairs(tuple(ids), bodies, shapes, known, {})
+    return NearestPointPairs(tuple(ids), bodies, shapes, known, {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -409,3 +408,10 @@ class PairScene:
         R = RotationMatrix(AngleAxis(angle, motion[3:] / angle)) if angle else RotationMatrix()
         at = R @ (pose.translation() - here[:3]) + here[:3] + motion[:3]
         return self.find(RigidTransform(R @ pose.rotation(), at))
+
+
+def move_apart(model: Model, pair: tuple[Any, Any]) -> bool:
+    """Whether two geometries are on bodies that are not welded together, on which contact would do nothing."""
+    plant, inspector = model.plant, model.double.inspector
+    body, other = (plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in pair)
+    return all(welded.index() != body.index() for welded in plant.GetBodiesWeldedTo(other))

@@ -1,0 +1,322 @@
+"""The contacts of a state: which pairs overlap, distance, normal, and how both change as the bodies move.
+
+Drake's point contact of a sphere (centre c, radius r) with a shape has the signed distance phi = d(c) - r, d being the
+shape's own, the normal n = grad d, from the shape to the sphere, and acts at c - (r + b phi) n with
+b = k_o / (k_s + k_o), the other shape's part of the two stiffnesses. Spheres, boxes, capsules and half spaces are one
+shape: what is within R of a box, d = |e| - R where e leads from the box to c, and inside the way to the nearest face.
+Pairs without a sphere are taken as SceneGraph finds them: see `nearest_points`.
+
+S_j = [l_j; a_j] is the motion of degree of freedom j in world about its origin, L_j = l_j + a_j x p its velocity at the
+contact p, and s_j = 1, -1 or 0 where it moves the sphere's side alone, the other side alone, or both or none. Then
+
+    J_c = (s_j L_j)_j,   dS_k / dq_j = S_j x S_k where j moves the axis of k, else 0,
+
+dq being the small motion that a velocity makes. Drake weighs friction by w = |W| / 3 with W = J_c diag(A)^-1 J_c',
+A the mass matrix with what joint damping adds in a step.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
+
+from drake_diff._base.arrays import Array, Indices, cross, own_array, skew
+from drake_diff._base.compiled import kernel
+from drake_diff.derivatives.contact.nearest_points import NearestPointPairs, move_apart, read_nearest_point_pairs
+from drake_diff.derivatives.steps import Steps
+from drake_diff.mechanics.description import Description
+from drake_diff.model.model import Model
+
+KERNEL = "drake_diff.derivatives.contact.kernel"
+
+
+@dataclass(frozen=True, eq=False)
+class Touches:
+    """M pairs that overlap, each in one of N states; in world."""
+
+    state: Indices  # (M,)
+    pair: Indices
+    middle: Array  # (M, 3) half way between the deepest points of the two [m]
+    phi: Array  # (M,) the signed distance, below 0 [m]
+    normal: Array  # (M, 3) from the other shape to the sphere
+    change: Array  # (M, 7, 6) of [middle; normal; phi], as moved with the other shape, by the sphere's twist in it
+
+    def at(self, part: Array) -> tuple[Array, Array]:
+        """Where the contacts act (M, 3), and (M, 7, 6) as `change`, of that point and by the twist there.
+
+        `part` (M,) is the other shape's of the two stiffnesses.
+        """
+        n, share = self.normal, (part - 0.5)[:, None]
+        back = share * self.phi[:, None] * n  # from the point to the middle
+        change = np.array(self.change)
+        change[:, :, 3:] -= self.change[:, :, :3] @ skew(back)
+        along = n[:, :, None] * change[:, 6:] + self.phi[:, None, None] * change[:, 3:6]
+        change[:, :3] -= share[..., None] * along
+        return self.middle - back, change
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPairs:
+    """P pairs of a sphere and another shape; those without a sphere, or with a shape not known here, are left out."""
+
+    bodies: tuple[Any, ...]  # Drake's, of all shapes
+    ids: tuple[tuple[Any, Any], ...]  # of the sphere and of the other shape
+    sphere_body: Indices  # (P,) in bodies
+    other_body: Indices
+    center: Array  # (P, 3) of the sphere, in its body [m]
+    radius: Array  # (P,)
+    rotation: Array  # (P, 3, 3) of the other shape, in its body
+    position: Array  # (P, 3)
+    lower: Array  # (P, 3) the corners of the other shape's box
+    upper: Array
+    rounding: Array  # (P,) R
+    is_round: NDArray[np.bool_]  # (P,) whether the other shape is the cylinder along z within its box
+
+    def overlapping(self, of_pairs: Any, poses: Array) -> Any:
+        """The kernel.Touching of those that overlap where the bodies are at `poses` (N, bodies, 3, 4)."""
+        compiled, N = kernel(KERNEL), len(poses)
+        shapes = self.center, self.radius, self.rotation, self.position, self.lower, self.upper, self.rounding
+        spheres, first = compiled.Spheres(*map(own_array, shapes)), np.empty(N + 1, dtype=np.int64)
+        pair = np.empty(N * len(self.radius), dtype=np.int64)
+        M = compiled.overlapping(spheres, of_pairs.sides, poses, first, pair)
+        contacts = compiled.Touching(
+            first, pair[:M], np.empty((M, 3)), np.empty((M, 3)), np.empty(M), np.empty((M, 7, 6))
+        )
+        compiled.touch(spheres, of_pairs, poses, contacts)
+        return contacts
+
+    def touching(self, poses: Array) -> Touches:
+        """The pairs that overlap where the bodies are at `poses` (N, bodies, 3, 4)."""
+        count, sides = len(self.ids), np.stack([self.sphere_body, self.other_body], axis=1)
+        none, halves = np.zeros(count), np.full(count, 0.5)  # half of the overlap on each side: the middle
+        of_pairs = kernel(KERNEL).Pairs(
+            sides, np.zeros((len(self.bodies), 0)), none, none, none, none, halves, np.zeros((5, count, 0))
+        )
+        found = self.overlapping(of_pairs, own_array(poses))
+        state = np.repeat(np.arange(len(poses)), np.diff(found.first))
+        return Touches(state, found.pair, found.point, found.phi, found.normal, found.change)
+
+
+def read_pairs(model: Model, *, cylinders: bool = False) -> ContactPairs:
+    """The pairs of spheres of `model`, none where there are none; with cylinders, which `touching` does not know."""
+    plant, inspector = model.plant, model.double.inspector
+    ids, at, radius, boxes, rounds = [], [], [], [], []
+    bodies: dict[Any, tuple[int, Any]] = {}
+    for pair in sorted(inspector.GetCollisionCandidates()) if inspector is not None else ():
+        shapes = [inspector.GetShape(i) for i in pair]
+        first = 0 if isinstance(shapes[0], Sphere) else 1
+        other = shapes[1 - first]
+        box = _box_around(other) if cylinders and isinstance(other, Cylinder) else _rounded_box(other)
+        if not isinstance(shapes[first], Sphere) or box is None or not move_apart(model, pair):
+            continue
+        ids.append((pair[first], pair[1 - first]))
+        radius.append(shapes[first].radius())
+        boxes.append(box)
+        rounds.append(isinstance(other, Cylinder))
+        own = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in ids[-1]]
+        at.append([bodies.setdefault(body.index(), (len(bodies), body))[0] for body in own])
+    poses = [[inspector.GetPoseInFrame(i) for i in pair] for pair in ids]
+    count, of_body = len(ids), np.array(at, dtype=np.intp).reshape(-1, 2)
+    return ContactPairs(
+        bodies=tuple(body for _, body in bodies.values()),
+        ids=tuple(ids),
+        sphere_body=of_body[:, 0],
+        other_body=of_body[:, 1],
+        center=np.array([X.translation() for X, _ in poses]).reshape(count, 3),
+        radius=np.array(radius, dtype=float),
+        rotation=np.array([X.rotation().matrix() for _, X in poses]).reshape(count, 3, 3),
+        position=np.array([X.translation() for _, X in poses]).reshape(count, 3),
+        lower=np.array([lower for lower, _, _ in boxes]).reshape(count, 3),
+        upper=np.array([upper for _, upper, _ in boxes]).reshape(count, 3),
+        rounding=np.array([rounding for _, _, rounding in boxes], dtype=float),
+        is_round=np.array(rounds, dtype=bool),
+    )
+
+
+def _box_around(shape: Cylinder) -> tuple[Array, Array, float]:
+    half = np.array([shape.radius(), shape.radius(), shape.length() / 2])
+    return -half, half, 0.0
+
+
+def _rounded_box(shape: Shape) -> tuple[Array, Array, float] | None:
+    """The box's lower and upper corner and the rounding of a shape, None where it is none."""
+    if isinstance(shape, Sphere):
+        return np.zeros(3), np.zeros(3), shape.radius()
+    if isinstance(shape, Capsule):
+        half = np.array([0.0, 0.0, shape.length() / 2])
+        return -half, half, shape.radius()
+    if isinstance(shape, Box):
+        half = np.array(shape.size()) / 2
+        return -half, half, 0.0
+    if isinstance(shape, HalfSpace):
+        return np.full(3, -np.inf), np.array([np.inf, np.inf, 0.0]), 0.0
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """Which degrees of freedom of a tree move which; 1 where they do, else 0."""
+
+    moves: Array  # (nv, nv) j the axis of k
+    before: Array  # (nv, nv) j is moved by k, or k is of the same joint
+    turns: Array  # (nv,) 0 for the translations of free bodies
+    bodies: dict[str, Array]  # (nv,) of each body, which move it
+
+
+def topology_of(description: Description) -> Topology:
+    """The topology of a tree of hinges, slides and free bodies; these turn about axes that only translations move."""
+    nv = description.coordinates.nv
+    moves, before, turns = np.zeros((nv, nv)), np.zeros((nv, nv)), np.ones(nv)
+    bodies = {"world": np.zeros(nv)}
+    for link in description.links:
+        own = link.v_start + np.arange({"weld": 0, "quaternion_floating": 6}.get(link.kind, 1))
+        above = np.flatnonzero(bodies[link.parent])
+        moves[np.ix_(above, own)] = before[np.ix_(own, above)] = before[np.ix_(own, own)] = 1.0
+        if len(own) > 1:
+            moves[np.ix_(own[3:], own[:3])] = 1.0
+            turns[own[3:]] = 0.0
+        bodies[link.body] = np.array(bodies[link.parent])
+        bodies[link.body][own] = 1.0
+    return Topology(moves, before, turns, bodies)
+
+
+def weigh(J: Array, diagonal: Array) -> Array:
+    """w (M,) of Jacobians' transposes J (M, nv, 3) and the diagonal (M, nv) of A."""
+    W = J.swapaxes(-1, -2) @ (J / diagonal[..., None])
+    return np.asarray(np.sqrt((W * W).sum(axis=(1, 2))) / 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """M contacts, and the motions of the degrees of freedom there."""
+
+    touch: Touches
+    moves: Array  # (nv, nv)
+    sphere: Array  # (M, nv) 1 where it moves the sphere
+    other: Array  # (M, nv) 1 where it moves the other shape
+    angular: Array  # (M, nv, 3) a
+    point: Array  # (M, 3) p
+    at_point: Array  # (M, nv, 3) L
+    change: Array  # (M, 7, 6) of p, the normal and phi by the twist there: see `pairs.Touches`
+    unknown: dict[int, str] = field(default_factory=dict)  # the states of which that is not known
+
+    @property
+    def side(self) -> Array:
+        """(M, nv) s."""
+        return self.sphere - self.other
+
+    @property
+    def jacobian(self) -> Array:
+        """(M, nv, 3) the transpose of J."""
+        return np.asarray(self.side[..., None] * self.at_point)
+
+    def displacement(self) -> tuple[Array, Array, Array]:
+        """How p (M, nv, 3), the normal (M, nv, 3) and phi (M, nv) move with each degree of freedom."""
+        twist = np.concatenate([self.at_point, self.angular], axis=-1)
+        found = (self.side[..., None] * twist) @ self.change.swapaxes(-1, -2)
+        other = self.other[..., None]
+        normal = found[..., 3:6] + other * cross(self.angular, self.touch.normal[:, None, :])
+        return found[..., :3] + other * self.at_point, normal, found[..., 6]
+
+    def velocity_change(self, v: Array, point: Array) -> Array:
+        """(M, nv, 3) the change of J v with the degrees of freedom for fixed v (M, nv); p changes by (M, nv, 3)."""
+        u = v * self.side
+        found = cross(u[:, None, :] @ self.angular, point)
+        after = (self.moves * u[:, None, :]) @ np.concatenate([self.at_point, self.angular], axis=-1)
+        return np.asarray(found + cross(self.angular, after[..., :3]) + cross(self.at_point, after[..., 3:]))
+
+    def force_change(self, force: Array, point: Array) -> Array:
+        """(M, nv, nv) the change of J' f for fixed f (M, 3), likewise."""
+        twisted = cross(force[:, None, :], self.angular)  # f x a
+        across = twisted @ self.at_point.swapaxes(-1, -2)  # (f x a_k) . L_j = -a_k . (f x L_j)
+        moved = twisted @ point.swapaxes(-1, -2) + self.moves.T * (across.swapaxes(-1, -2) - across)
+        return np.asarray(self.side[..., None] * moved)
+
+
+SPHERES, JOINT_LIMITS = "spheres", "joint limits"  # what acts in a step, beside pairs of other shapes
+
+
+def is_iterated(kind: str) -> bool:
+    """Whether SceneGraph comes to the point of contact of such shapes by an iteration; see `AllPairs.kinds`."""
+    return kind not in (SPHERES, JOINT_LIMITS) and not {"Sphere", "HalfSpace"} & set(kind.split(" and "))
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """N states: where the bodies are, and what SceneGraph found there."""
+
+    poses: Array  # (N, bodies, 3, 4)
+    state: Indices  # (M,) of what was found
+    pair: Indices  # (M,)
+    found: Array  # (M, 7) the middle, the normal and phi
+    to_one_side: set[int] = field(default_factory=set)  # the states in which how that changes is known to one side only
+
+
+@dataclass(frozen=True, eq=False)
+class AllPairs:
+    """P pairs, those of spheres first."""
+
+    bodies: tuple[Any, ...]  # Drake's, of all shapes
+    ids: tuple[tuple[Any, Any], ...]
+    sides: Indices  # (P, 2) in bodies
+    spheres: ContactPairs
+    others: NearestPointPairs
+
+    def place(self, steps: Steps, poses: Array) -> Placed:
+        """At the steps' states, where the bodies are at `poses` (N, bodies, 3, 4)."""
+        found: list[tuple[int, int, Array]] = []
+        for k in np.flatnonzero(steps.touching & bool(self.others.ids)).tolist():
+            steps.stand_at(k)
+            found += [(k, len(self.spheres.ids) + i, of) for i, of in self.others.find(steps.model)]
+        state, pair = (np.array([row[i] for row in found], dtype=np.intp) for i in (0, 1))
+        return Placed(poses, state, pair, np.array([of for *_, of in found]).reshape(-1, 7))
+
+    def kinds(self, placed: Placed, count: int) -> list[set[str]]:
+        """Of each of `count` states with contact what kinds of shapes touch: spheres, or two others by their names.
+
+        Those whose change is known to one side only are kinds of their own.
+        """
+        found: list[set[str]] = [set() for _ in range(count)]
+        for state, pair in zip(placed.state, placed.pair, strict=True):
+            shapes = self.others.shapes[pair - len(self.spheres.ids)]
+            side = " and to one side" if int(state) in placed.to_one_side else ""
+            found[state].add(" and ".join(sorted(type(shape).__name__ for shape in shapes)) + side)
+        return [kinds or {SPHERES} for kinds in found]
+
+    def found(self, placed: Placed) -> Touches:
+        """What SceneGraph found."""
+        found = placed.found
+        nothing = np.full((len(found), 7, 6), np.nan)
+        return Touches(placed.state, placed.pair, found[:, :3], found[:, 6], found[:, 3:6], nothing)
+
+    def complete(self, touch: Touches, placed: Placed, twists: Array) -> dict[int, str]:
+        """Say of what SceneGraph found how it changes; the states of which it is not known, and why.
+
+        `twists` (M, nv, 6) are those of the first shape in the second by the degrees of freedom, at the middle.
+        """
+        count, unknown = len(self.spheres.ids), {}
+        for pair in np.unique(touch.pair[touch.pair >= count]):
+            which = np.flatnonzero(touch.pair == pair)
+            a, b = (placed.poses[touch.state[which], side] for side in self.sides[pair])
+            of = np.concatenate([touch.middle[which], touch.normal[which], touch.phi[which, None]], axis=1)
+            touch.change[which], known, sided = self.others.change(int(pair) - count, (a, b), of, twists[which])
+            names = " and a ".join(type(shape).__name__ for shape in self.others.shapes[pair - count])
+            bodies = " and ".join(body.name() for body in self.others.bodies[pair - count])
+            for state in touch.state[which[~known]]:
+                unknown[int(state)] = f"where Drake finds a {names} to touch, of {bodies}, jumps or has no derivative"
+            placed.to_one_side.update(touch.state[which[sided]].tolist())
+        return unknown
+
+
+def read_all_pairs(model: Model) -> AllPairs:
+    """Those of `model`, none where nothing of it may touch."""
+    spheres = read_pairs(model)
+    others = read_nearest_point_pairs(model, set(spheres.ids))
+    bodies = {body.index(): body for body in (*spheres.bodies, *(b for both in others.bodies for b in both))}
+    order = {index: i for i, index in enumerate(bodies)}
+    own = np.stack([spheres.sphere_body, spheres.other_body], axis=1)
+    sides = np.array([[order[b.index()] for b in both] for both in others.bodies], dtype=np.intp).reshape(-1, 2)
+    ids = (*spheres.ids, *others.ids)
+    return AllPairs(tuple(bodies.values()), ids, np.concatenate([own, sides]), spheres, others)
