@@ -6,9 +6,9 @@ from contextlib import closing
 from pathlib import Path
 
 from drake_diff._base.arrays import positive_int
+from drake_diff.panels.evaluation import TrialFunction, check_engine, evaluate
 from drake_diff.panels.panel_file import expand, load_panel
 from drake_diff.panels.results import PanelTable, begun_record, ended_record, journal, write_table
-from drake_diff.panels.workers import TrialFunction, check_engine, evaluate_all
 from drake_diff.record.provenance import provenance_of
 
 Progress = Callable[[int, int, int], None]
@@ -75,12 +75,12 @@ def run_panel(
     }
     directory = Path(out) if out is not None else Path("artifacts") / path.stem
     start = time.monotonic()
-    with journal(directory, made, {trial.id for trial in trials}) as book:
+    with journal(directory, made) as book:
         begun = begun_record(directory, len(trials), made)
         begun.begin(directory)
         errors = sum("error" in row for row in book.rows.values())
         left = [trial for trial in trials if trial.id not in book.rows]
-        with closing(evaluate_all(left, function, count, engine, address)) as finished:
+        with closing(evaluate(left, function, count, engine, address)) as finished:
             for trial, row in finished:
                 book.add(trial.id, row)
                 errors += "error" in row

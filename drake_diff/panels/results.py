@@ -10,7 +10,7 @@ import io
 import json
 import os
 import statistics
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
@@ -21,9 +21,9 @@ from drake_diff._base.files import doing, make_folder, write_whole
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import success_rate
 from drake_diff.exceptions import ArtifactError, InputError
+from drake_diff.pages.html import page_data, write_page
+from drake_diff.panels.evaluation import Row
 from drake_diff.panels.panel_file import PanelTrial, canonical, cell_name
-from drake_diff.panels.ranking import ranked, write_ranking
-from drake_diff.panels.workers import Row
 from drake_diff.record.directory import is_taken
 from drake_diff.record.panel import TRIALS, PanelRecord, PanelTrialRecord, no_model, trial_record
 from drake_diff.record.provenance import provenance_of, written_now
@@ -32,15 +32,29 @@ from drake_diff.record.sealed import WallClock
 JOURNAL, TABLE, SUMMARY, PAGE = "trials.jsonl", "table.csv", "summary.json", "panel.html"
 RANKED = ("place", "name", "apart", "trials", "errors", "success", "numbers")  # of a cell in the record of a panel
 SHOWN_CELLS = 8  # in a repr
+COST = "cost"  # the number that ranks where nothing is judged, and among equals: less is better
 
 
 class Journal:
-    """An open journal; `rows` are those of the finished trials, by id."""
+    """The rows of the finished trials, by id, each a line on the disk before the next trial is counted."""
 
-    def __init__(self, path: Path, file: BinaryIO, panel: Mapping[str, Any], known: Collection[str]):
-        self.path, self.file = path, file
+    def __init__(self, path: Path, file: BinaryIO, panel: Mapping[str, Any]):
+        self.path, self.file, self.rows = path, file, dict[str, Row]()
         self.head = _line({"panel": panel}, b"")
-        self.rows = self._read(panel, known)
+        data = file.read()
+        whole = data[: data.rfind(b"\n") + 1]  # a killed process leaves a line half written: it is cut off
+        file.seek(len(whole))
+        file.truncate()
+        if not whole:
+            self._write(self.head)
+            return
+        old, self.rows = read_journal(path, whole)
+        for key in sorted({*old, *panel}):
+            if old.get(key) != panel.get(key):
+                raise ArtifactError(
+                    f"{path} is the journal of another panel: {key}: expected {panel.get(key)}, got {old.get(key)}; "
+                    "choose another directory, or remove this one to start over"
+                )
 
     def add(self, trial: str, row: Row) -> None:
         """Write the row of a finished trial to the disk."""
@@ -53,34 +67,10 @@ class Journal:
             self.file.flush()
             os.fsync(self.file.fileno())
 
-    def _read(self, panel: Mapping[str, Any], known: Collection[str]) -> dict[str, Row]:
-        """Read all whole lines and cut off the rest: a line that a killed process left half written."""
-        whole = self.file.read().rpartition(b"\n")
-        lines = whole[0].split(b"\n") if whole[1] else []
-        self.file.seek(len(whole[0]) + len(whole[1]))
-        self.file.truncate()
-        if not lines:
-            self._write(self.head)
-            return {}
-        old = _read_line(self.path, 1, lines[0], b"").get("panel", {})
-        for key in sorted({*old, *panel}):
-            if old.get(key) != panel.get(key):
-                raise ArtifactError(
-                    f"{self.path} is the journal of another panel: {key}: expected {panel.get(key)}, "
-                    f"got {old.get(key)}; choose another directory, or remove this one to start over"
-                )
-        rows: dict[str, Row] = {}
-        for number, line in enumerate(lines[1:], 2):
-            found = _read_line(self.path, number, line, self.head)
-            if found["id"] not in known or found["id"] in rows:
-                raise ArtifactError(f"{self.path}, line {number}: trial {found['id']} is unknown or stands there twice")
-            rows[found["id"]] = found["row"]
-        return rows
-
 
 @contextmanager
-def journal(directory: Path, panel: Mapping[str, Any], known: Collection[str]) -> Iterator[Journal]:
-    """Open the journal in `directory` of the panel that `panel` describes, with the trials `known`.
+def journal(directory: Path, panel: Mapping[str, Any]) -> Iterator[Journal]:
+    """Open the journal in `directory` of the panel that `panel` describes.
 
     ArtifactError where it is another panel's, where a whole line is damaged, or where another process has it open;
     InputError where the directory holds other things, and no journal.
@@ -96,11 +86,11 @@ def journal(directory: Path, panel: Mapping[str, Any], known: Collection[str]) -
         except OSError as error:
             raise ArtifactError(f"{path}: another process is at work on this panel") from error
         file.seek(0)
-        yield Journal(path, file, panel, known)
+        yield Journal(path, file, panel)
 
 
 def read_journal(path: Path, data: bytes) -> tuple[dict[str, Any], dict[str, Row]]:
-    """What the panel is, and the rows by trial, of the bytes of a journal that is complete.
+    """What the panel is, and the rows by trial, of the bytes of a journal of whole lines.
 
     ArtifactError where a line is damaged, half written, or of a trial that stands there twice.
     """
@@ -109,10 +99,10 @@ def read_journal(path: Path, data: bytes) -> tuple[dict[str, Any], dict[str, Row
         raise ArtifactError(f"{path}: its last line is half written")
     panel, rows, head = _read_line(path, 1, lines[0], b"").get("panel"), {}, lines[0] + b"\n"
     for number, line in enumerate(lines[1:], 2):
-        found = _read_line(path, number, line, head)
-        if not isinstance(found.get("row"), dict) or found.get("id") in rows:
+        content = _read_line(path, number, line, head)
+        if not isinstance(content.get("row"), dict) or content.get("id") in rows:
             raise ArtifactError(f"{path}, line {number}: expected a row, of each trial once")
-        rows[str(found["id"])] = found["row"]
+        rows[str(content["id"])] = content["row"]
     if not isinstance(panel, dict):
         raise ArtifactError(f"{path}, line 1: expected what the panel is")
     return panel, rows
@@ -229,6 +219,48 @@ def ended_record(begun: PanelRecord, table: PanelTable, seconds: float) -> Panel
             "wall_clock": WallClock(written_utc=written_now(), duration_s=seconds),
         }
     )
+
+
+def ranked(summary: Mapping[str, Any]) -> tuple[str, list[dict[str, Any]]]:
+    """By what the cells of `summary` are ranked, and a row for each, the best first.
+
+    Cells with a success rate are ranked by the lower end of its 95 % interval, equals by the mean cost; others by the
+    mean cost. A trial that ended in an error is no success, and has no cost: of cells without rates those with fewer
+    errors come first. `apart` says whether the interval of a cell lies below that of the best; None without rates.
+    """
+    cells = summary["cells"]
+    judged = all("success" in cell for cell in cells)
+
+    def key(cell: Mapping[str, Any]) -> tuple[float, ...]:
+        cost = cell["numbers"].get(COST, {}).get("mean", float("inf"))
+        rate = cell["success"]["low"] if judged else 0.0
+        return (-rate, 0.0 if judged else cell["errors"], cost)
+
+    ordered = sorted(cells, key=key)  # equals stay in the panel's order
+    rows: list[dict[str, Any]] = []
+    for i, cell in enumerate(ordered):
+        place = i + 1 if not rows or key(ordered[i - 1]) != key(cell) else rows[-1]["place"]
+        apart = cell["success"]["high"] < ordered[0]["success"]["low"] if judged else None
+        rows.append({"place": place, "name": cell_name(cell["cell"]), "apart": apart, **cell})
+    if judged:
+        return "the lower end of the 95 % interval of the success rate, then the mean cost", rows
+    if any(COST in cell["numbers"] for cell in cells):
+        return "the fewest errors, then the mean cost; no trial says whether it is a success", rows
+    return "the fewest errors; no trial says whether it is a success, or has a cost", rows
+
+
+def write_ranking(path: Path, summary: Mapping[str, Any]) -> None:
+    """Write the page of a panel's `summary`."""
+    by, rows = ranked(summary)
+    errors = summary["errors"]
+    record = {
+        "name": path.parent.name,
+        "verdict": "fail" if errors else "pass",
+        "sentence": f"{rows[0]['name']} is the best of {len(rows)} cells, by {by}",
+        "provenance": provenance_of().model_dump(mode="json"),
+        **summary,
+    }
+    write_page(path, "panel.html.j2", record=record, data=page_data(0.0, []), rows=rows)
 
 
 def _csv(rows: Sequence[Row], answered: set[str]) -> bytes:
