@@ -7,7 +7,7 @@ from helpers.engines import engine_of
 from helpers.table import each_row
 
 from drake_diff.comparison.attribution import SCHEMES, Terms, attribute, euler
-from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.engines.formats import mjcf
 from drake_diff.exceptions import NotOfferedError
 from drake_diff.mechanics.coordinates import Coordinates, exponential_turn, rotation
 from drake_diff.mechanics.description import describe

@@ -22,7 +22,7 @@ from pydrake.multibody.tree import (
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import DoublePendulum, NumpyEngine, Pendulum
-from drake_diff.engines.urdf import inertial_urdf, urdf
+from drake_diff.engines.formats import inertial_urdf, urdf
 from drake_diff.exceptions import ModelError, ModelWarning
 from drake_diff.mechanics.description import describe
 

@@ -12,7 +12,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.engines import ClosedForm
-from drake_diff.engines.contract_line import UNKNOWN, is_another_model
+from drake_diff.engines.contract import UNKNOWN, is_another_model
 from drake_diff.exceptions import InputError, NonFiniteError, ShapeError, UnknownNameError
 
 TRUE = {"cart": 1.0, "bob": 0.3, "length": 0.5, "g": 9.81, "coriolis": 1.0, "gain": 1.0}

@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.comparison import files as comparison_trace
-from drake_diff.comparison.files import record_of
-from drake_diff.comparison.page import comparison_data
+from drake_diff.comparison.files import comparison_data, record_of
 from drake_diff.record.sealed import own_sha256
 
 

@@ -13,8 +13,7 @@ import drake_diff as dd
 from drake_diff.comparison.result import LAWS
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.exceptions import ModelError
-from drake_diff.export.checks import written
-from drake_diff.export.export import export_model
+from drake_diff.export.export import export_model, written
 from drake_diff.mechanics.description import describe
 
 G, H = 9.81, 0.005
@@ -121,7 +120,7 @@ def test_the_filters_of_a_model_written_by_hand_are_read(tmp_path):
 def test_the_stiffness_that_is_read_is_that_on_which_a_weight_rests_in_mujoco(cone, condim, solref):
     """m g / k deep, for every cone, dimension and form of solref; 0.001 s is cut at two steps."""
     mujoco = pytest.importorskip("mujoco")
-    from drake_diff.engines.mujoco.contacts import read_pairs
+    from drake_diff.engines.mujoco_contract import read_pairs
 
     model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="{cone}"/>
     <default><geom solref="{solref}" solimp="0.9 0.9 0.001" condim="{condim}" friction="0.5 0.01 0.01"/></default>

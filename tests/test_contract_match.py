@@ -12,7 +12,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import CartPole, DoublePendulum, MassSpringDamper, NumpyEngine, Pendulum
-from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.engines.formats import mjcf
 from drake_diff.exceptions import InputError, ModelError, NotOfferedError
 from drake_diff.mechanics.description import describe
 

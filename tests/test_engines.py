@@ -41,7 +41,7 @@ from drake_diff.engines.closed_form import (
     SlidingBlock,
     SphereOnGround,
 )
-from drake_diff.engines.common import without_lines
+from drake_diff.engines.interface import without_lines
 from drake_diff.exceptions import (
     ModelError,
     ModelWarning,
@@ -222,9 +222,7 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(load, monkeypatch, name
     assert [line.quantity for line in dd.engines.match_contracts(drake, other) if line.verdict == "different"] == (
         [] if name == "pinocchio" else ["integrator"]
     )
-    module = sys.modules[
-        f"drake_diff.{'mechanics.coordinates' if name == 'pinocchio' else 'engines.mujoco.coordinates'}"
-    ]
+    module = sys.modules[f"drake_diff.{'mechanics.coordinates' if name == 'pinocchio' else 'engines.mujoco_contract'}"]
     real = module.rotation
     wrong = {"quaternion order": lambda q: real(np.roll(q, 1)), "velocity frame": lambda q: np.eye(3)}
     for swapped in wrong.values():

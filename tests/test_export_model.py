@@ -17,13 +17,12 @@ from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff.cli.main import app
+from drake_diff.comparison.attribution import move
 from drake_diff.engines.closed_form import BY_MODEL
-from drake_diff.engines.motion import move
-from drake_diff.engines.urdf import urdf
+from drake_diff.engines.formats import urdf
 from drake_diff.exceptions import CertificateError, InputError, ModelError, ModelWarning, UnknownNameError
-from drake_diff.export import checks, export
-from drake_diff.export.checks import check_small_models, complaints, written
-from drake_diff.export.export import export_model
+from drake_diff.export import export
+from drake_diff.export.export import check_small_models, complaints, export_model, written
 from drake_diff.mechanics.description import describe, describe_whole
 from drake_diff.model.sampling import sample_states
 
@@ -234,13 +233,13 @@ def wrong_gravity(monkeypatch):
 
 
 def wrong_file(form):
-    right = checks.written
+    right = export.written
 
     def wrong(asked, description, time_step):
         text = right(asked, description, time_step)
         return text.replace("0.1", "0.1001") if asked == form else text
 
-    return lambda monkeypatch: monkeypatch.setattr(checks, "written", wrong)
+    return lambda monkeypatch: monkeypatch.setattr(export, "written", wrong)
 
 
 @each_row(
@@ -267,7 +266,7 @@ def test_what_a_format_cannot_say_is_refused(load, tmp_path, monkeypatch):
         export_model(model, tmp_path / "out", target="isaaclab")
     assert not (tmp_path / "out").exists()
     export_model(model, tmp_path / "out", target="gazebo")  # SDF has springs
-    monkeypatch.setattr(checks, "find_spec", lambda name: None)
+    monkeypatch.setattr(export, "find_spec", lambda name: None)
     with pytest.raises(ModelError, match="MuJoCo is not installed"):  # and Drake reads no springs in MJCF
         export_model(model, tmp_path / "mjcf", target="mjcf")
 

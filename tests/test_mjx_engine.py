@@ -27,7 +27,7 @@ from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import MassSpringDamper, NumpyEngine
-from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.engines.formats import mjcf
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.tangent import tangent_space
@@ -188,7 +188,7 @@ def test_mjx_still_cannot_have_limits_with_elliptic_cones_and_no_contact(load):
     import jax
     from mujoco import mjx
 
-    from drake_diff.engines.mujoco.engine import mujoco_model
+    from drake_diff.engines.mujoco import mujoco_model
 
     _, compiled = mujoco_model(describe(load("cart_pole.urdf")), 0.01, None)
     model = mjx.put_model(compiled)

@@ -55,8 +55,8 @@ def pages(tmp_path_factory):
     cost = dd.QuadraticCost(R=[[1.0]])
     solution = dd.solve(dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost), method="shooting")
     with pytest.MonkeyPatch.context() as patch:
-        for room in ("artifact", "comparison", "trials"):
-            patch.setattr(f"drake_diff.{room}.page.write_page", write_poisoned)
+        for module in ("artifact.page", "comparison.files", "trials.page"):
+            patch.setattr(f"drake_diff.{module}.write_page", write_poisoned)
         dd.save(solution, folder / "run")
         with recalled(folder / "run") as plan:
             trials = dd.robustness(plan, {"mass": [0.02, 0.4]}, trials=2, controller="open_loop")

@@ -16,7 +16,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
-from drake_diff.engines.urdf import bullet_urdf
+from drake_diff.engines.formats import bullet_urdf
 from drake_diff.exceptions import ModelError, NonFiniteError, NotOfferedError, ShapeError, SimulationError
 from drake_diff.mechanics.description import Geometry, describe, rigid_links
 

@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff.cli.main import app
-from drake_diff.engines.motion import move
-from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.comparison.attribution import move
+from drake_diff.engines.formats import mjcf
 from drake_diff.exceptions import ArtifactError, InputError, ShapeError
 
 H = 0.01

@@ -16,8 +16,7 @@ from drake_diff.artifact.differences import Compared
 from drake_diff.artifact.recordings_again import ENDED, RecordingsAgain, compare_causes
 from drake_diff.artifact.verify import verify_own
 from drake_diff.comparison.files import PAGE, hash_of_arrays
-from drake_diff.comparison.kept import place_of, read_arrays, write_arrays
-from drake_diff.comparison.recordings import with_own_names
+from drake_diff.comparison.recordings import place_of, read_arrays, with_own_names, write_arrays
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.identification.cause import cause_of
 from drake_diff.identification.words import Words

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.contract_line import is_another_model
-from drake_diff.engines.contract_match import match_contracts
+from drake_diff.engines.contract import is_another_model, match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine
 from drake_diff.engines.load import load_engine

@@ -17,8 +17,15 @@ from drake_diff._base.files import make_folder, write_whole
 from drake_diff._base.untrusted import read_plain
 from drake_diff.artifact.identified_motion import joined
 from drake_diff.artifact.rerun import TRACE, rebuilt
-from drake_diff.comparison.kept import ARRAYS, LARGEST, RECORDINGS, read_arrays, write_arrays
-from drake_diff.comparison.recordings import Recording, read_recording
+from drake_diff.comparison.recordings import (
+    ARRAYS,
+    LARGEST,
+    RECORDINGS,
+    Recording,
+    read_arrays,
+    read_recording,
+    write_arrays,
+)
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.identification.identify import Asked, Identification, identify
 from drake_diff.identification.measured import hash_of

@@ -19,8 +19,7 @@ from drake_diff.artifact.again import contract_as, model_as
 from drake_diff.artifact.differences import ABSOLUTE, NUMBER, Compared, compare_fields, is_near, leaves
 from drake_diff.artifact.rerun import rebuilt
 from drake_diff.comparison.files import MOTION, PAGE, REPLAY, TRACE, hash_of_arrays, row_of
-from drake_diff.comparison.kept import place_of, read_arrays
-from drake_diff.comparison.recordings import Recording
+from drake_diff.comparison.recordings import Recording, place_of, read_arrays
 from drake_diff.comparison.result import slug
 from drake_diff.comparison.side_by_side import compare_recordings
 from drake_diff.identification.cause import cause_of

@@ -10,12 +10,11 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import preformatted
-from drake_diff.comparison.attribution import Attribution
+from drake_diff.comparison.attribution import AGREES, BROKE_OFF, Attribution, EngineMotion, JacobianAt
 from drake_diff.comparison.recordings import Recording
-from drake_diff.engines.contract_line import LAWS, UNKNOWN, ContractLine, is_another_model
+from drake_diff.engines.contract import LAWS, UNKNOWN, ContractLine, is_another_model
 from drake_diff.engines.equations import UserFunction
 from drake_diff.engines.interface import Precision
-from drake_diff.engines.motion import AGREES, BROKE_OFF, EngineMotion, JacobianAt
 from drake_diff.model.model import Model
 
 Verdict = Literal["same", "other law", "other model", "unexplained"]

@@ -14,16 +14,22 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.refusal import Refusal
 from drake_diff.comparison import attribution
+from drake_diff.comparison.attribution import (
+    EngineMotion,
+    JacobianAt,
+    jacobian_at,
+    measured,
+    move,
+    rollout_jacobian,
+    seconds,
+)
 from drake_diff.comparison.recordings import Recording, check_recording, steps_between
 from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
-from drake_diff.engines.contact_match import contact_lines
-from drake_diff.engines.contract_line import MUST_HAVE, Match
-from drake_diff.engines.contract_match import match_contracts
+from drake_diff.engines.contract import MUST_HAVE, Match, contact_lines, match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.equations import ClosedForm
 from drake_diff.engines.interface import Engine
 from drake_diff.engines.load import ELSEWHERE, ENGINES, load_spec
-from drake_diff.engines.motion import EngineMotion, JacobianAt, jacobian_at, measured, move, rollout_jacobian, seconds
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model

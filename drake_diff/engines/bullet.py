@@ -15,9 +15,17 @@ from numpy.typing import ArrayLike
 from pydrake.math import RotationMatrix
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.common import RigidEngine, geometry_contracts, shape_of, without_lines
-from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobian, limit
-from drake_diff.engines.urdf import bullet_urdf
+from drake_diff.engines.formats import bullet_urdf
+from drake_diff.engines.interface import (
+    DRAKES_STEP,
+    EngineContract,
+    RigidEngine,
+    StepJacobian,
+    geometry_contracts,
+    limit,
+    shape_of,
+    without_lines,
+)
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
 from drake_diff.mechanics.description import Geometry, JointContract, PairContract, RigidLink, joint_contract, split

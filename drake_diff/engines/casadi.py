@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.common import EulerEngine, PlantEngine
-from drake_diff.engines.interface import EngineContract, floats, limit
-from drake_diff.engines.urdf import carried_by, inertial_urdf
+from drake_diff.engines.formats import carried_by, inertial_urdf
+from drake_diff.engines.interface import EngineContract, EulerEngine, PlantEngine, floats, limit
 from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.coordinates import euler_acceleration
 from drake_diff.mechanics.description import Description, JointContract, Link, joint_contract

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, positive_float
-from drake_diff.engines.common import EulerEngine
-from drake_diff.engines.interface import EngineContract, float_rows, floats
+from drake_diff.engines.interface import EngineContract, EulerEngine, float_rows, floats
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration
 from drake_diff.mechanics.description import JointContract, joint_contract

@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import differentiate_step
-from drake_diff.engines.common import geometry_contracts
-from drake_diff.engines.interface import EngineContract, StepJacobian, float_rows, floats
-from drake_diff.engines.reduced import reduced_contract
+from drake_diff.engines.interface import EngineContract, StepJacobian, float_rows, floats, geometry_contracts
+from drake_diff.engines.load import reduced_contract
 from drake_diff.mechanics.description import Description, describe, joint_contracts
 from drake_diff.model.contact import penetration
 from drake_diff.model.model import Model

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array
-from drake_diff.engines.common import Arguments
-from drake_diff.engines.contract_line import FUNCTION_DOES_NOT_SAY, SAME_NUMBER, ContractLine, Match
+from drake_diff.engines.contract import FUNCTION_DOES_NOT_SAY, SAME_NUMBER, ContractLine, Match
 from drake_diff.engines.drake import DrakeEngine
-from drake_diff.engines.interface import DRAKES_STEP, Engine, EngineContract, StepJacobian, float_rows
+from drake_diff.engines.interface import DRAKES_STEP, Arguments, Engine, EngineContract, StepJacobian, float_rows
 from drake_diff.exceptions import InputError, NotOfferedError, SimulationError, UnknownNameError
 from drake_diff.mechanics.coordinates import euler_step
 from drake_diff.mechanics.description import JointContract, coordinates_of
@@ -232,6 +231,37 @@ class ClosedForm(Arguments):
         """The same function, with its joints of one degree of freedom in another order, turned or shifted."""
         return _Turned(self, order, signs, shift)
 
+    def part_lines(self, match: Match, states: Sequence[tuple[Array, Array]]) -> tuple[ContractLine, ...]:
+        """A line per part of the forces, at `states` (q, v); of two closed forms, and of one without M(q), none."""
+        theirs = next(engine for engine in match.engines if engine is not self)
+        random, contract = np.random.default_rng(1), theirs.contract
+        limit = np.minimum(np.array(contract.effort_limits), 1.0)
+        us = [limit * random.uniform(-1, 1, len(limit)) for _ in states]
+        try:
+            masses = [theirs.mass_matrix(q) for q, _ in states]
+            wanted = [_parts_of(theirs, *state, u) for state, u in zip(states, us, strict=True)]
+            given = [self.parts(M, *s, u) for M, s, u in zip(masses, states, us, strict=True)]
+        except (InputError, NotOfferedError, SimulationError) as error:
+            return tuple(ContractLine(part, "different", f"not comparable: {error}") for part in PARTS)
+        tolerance = max(SAME_NUMBER[match.precision], ROUNDING * max(float(np.linalg.cond(M)) for M in masses))
+        names = [j.name for j in contract.joints for _ in range(6 if j.kind == "quaternion_floating" else 1)]
+        scale = np.array([max(float(np.abs(part).max(initial=0.0)) for part in parts) for parts in wanted])
+        lines = []
+        for i, quantity in enumerate(PARTS):
+            a, b = (np.array([parts[i] for parts in found]) for found in (wanted, given))
+            off = np.abs(b - a) > tolerance * np.maximum(scale, np.abs(b).max(axis=1, initial=0.0))[:, None]
+            wrong = [f"of {names[j]}, {_told(a[:, j], b[:, j])}" for j in np.flatnonzero(off.any(axis=0))]
+            told = f"of {', '.join(dict.fromkeys(names))}, at {len(states)} random states"
+            lines.append(ContractLine(quantity, "different" if wrong else "equal", "; ".join(wrong) or told))
+        if all(line.verdict == "equal" for line in lines):
+            return tuple(lines)
+        remark = _as_if(self, (masses, states, us), (wanted, tolerance * scale))
+        if not remark and lines[-1].verdict == "different" and len(_wrong(lines)) > 1:
+            remark = "a wrong inertia looks like this, as the forces are taken with M(q) of the other engine"
+        last = _wrong(lines)[-1]
+        lines[last] = replace(lines[last], detail="; ".join(part for part in (lines[last].detail, remark) if part))
+        return tuple(lines)
+
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         """NotOfferedError: differences of its steps are taken where a Jacobian is compared."""
         raise NotOfferedError(f"{self.name}: equations of motion without derivatives")
@@ -296,41 +326,6 @@ class _Turned:
             back[self.v[self.order]] = self.signs * a[self.v]
             found.append(M @ back)
         return Parts(*found)
-
-
-def part_lines(match: Match, states: Sequence[tuple[Array, Array]]) -> tuple[ContractLine, ...]:
-    """A line per part of the forces, at `states` (q, v); of two closed forms, and of one without M(q), none."""
-    theirs: Engine | ClosedForm
-    mine, theirs = match.engines if isinstance(match.engines[0], ClosedForm) else match.engines[::-1]
-    if not isinstance(mine, ClosedForm):
-        raise TypeError("expected a closed form")
-    random, contract = np.random.default_rng(1), theirs.contract
-    limit = np.minimum(np.array(contract.effort_limits), 1.0)
-    us = [limit * random.uniform(-1, 1, len(limit)) for _ in states]
-    try:
-        masses = [theirs.mass_matrix(q) for q, _ in states]
-        wanted = [_parts_of(theirs, *state, u) for state, u in zip(states, us, strict=True)]
-        given = [mine.parts(M, *s, u) for M, s, u in zip(masses, states, us, strict=True)]
-    except (InputError, NotOfferedError, SimulationError) as error:
-        return tuple(ContractLine(part, "different", f"not comparable: {error}") for part in PARTS)
-    tolerance = max(SAME_NUMBER[match.precision], ROUNDING * max(float(np.linalg.cond(M)) for M in masses))
-    names = [j.name for j in contract.joints for _ in range(6 if j.kind == "quaternion_floating" else 1)]
-    scale = np.array([max(float(np.abs(part).max(initial=0.0)) for part in parts) for parts in wanted])
-    lines = []
-    for i, quantity in enumerate(PARTS):
-        a, b = (np.array([parts[i] for parts in found]) for found in (wanted, given))
-        off = np.abs(b - a) > tolerance * np.maximum(scale, np.abs(b).max(axis=1, initial=0.0))[:, None]
-        wrong = [f"of {names[j]}, {_told(a[:, j], b[:, j])}" for j in np.flatnonzero(off.any(axis=0))]
-        told = f"of {', '.join(dict.fromkeys(names))}, at {len(states)} random states"
-        lines.append(ContractLine(quantity, "different" if wrong else "equal", "; ".join(wrong) or told))
-    if all(line.verdict == "equal" for line in lines):
-        return tuple(lines)
-    remark = _as_if(mine, (masses, states, us), (wanted, tolerance * scale))
-    if not remark and lines[-1].verdict == "different" and len(_wrong(lines)) > 1:
-        remark = "a wrong inertia looks like this, as the forces are taken with M(q) of the other engine"
-    last = _wrong(lines)[-1]
-    lines[last] = replace(lines[last], detail="; ".join(part for part in (lines[last].detail, remark) if part))
-    return tuple(lines)
 
 
 def _wrong(lines: Sequence[ContractLine]) -> list[int]:

@@ -12,8 +12,19 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff.engines.common import RigidEngine, geometry_contracts, shape_of, without_damping, without_lines
-from drake_diff.engines.interface import DRAKES_STEP, UNLIMITED, EngineContract, StepJacobian, floats, limit
+from drake_diff.engines.interface import (
+    DRAKES_STEP,
+    UNLIMITED,
+    EngineContract,
+    RigidEngine,
+    StepJacobian,
+    floats,
+    geometry_contracts,
+    limit,
+    shape_of,
+    without_damping,
+    without_lines,
+)
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
 from drake_diff.mechanics.description import Geometry, JointContract, RigidLink, RigidLinks, joint_contract

@@ -12,8 +12,16 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.common import RigidEngine, geometry_contracts, principal, shape_of
-from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobian, floats
+from drake_diff.engines.interface import (
+    DRAKES_STEP,
+    EngineContract,
+    RigidEngine,
+    StepJacobian,
+    floats,
+    geometry_contracts,
+    principal,
+    shape_of,
+)
 from drake_diff.exceptions import MissingDependencyError, ModelError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
 from drake_diff.mechanics.description import Geometry, JointContract, PairContract, RigidLink, joint_contract, split

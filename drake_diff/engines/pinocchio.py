@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.common import EulerEngine, PlantEngine
-from drake_diff.engines.interface import EngineContract, floats
+from drake_diff.engines.interface import EngineContract, EulerEngine, PlantEngine, floats
 from drake_diff.exceptions import MissingDependencyError
 from drake_diff.mechanics.coordinates import euler_acceleration, native_positions, turn, turn_derivatives, turning
 from drake_diff.mechanics.description import JointContract, joint_contract

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_diff.engines.common import principal, shape_of
-from drake_diff.engines.urdf import AtZero
+from drake_diff.engines.formats import AtZero
+from drake_diff.engines.interface import principal, shape_of
 from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.description import Description, Follower, Geometry, Link
 

@@ -33,7 +33,7 @@ from helpers.robots import FOOT, example_robot  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
 from drake_diff.derivatives.steps import known_steps  # noqa: E402
-from drake_diff.engines.mujoco.engine import MujocoEngine  # noqa: E402
+from drake_diff.engines.mujoco import MujocoEngine  # noqa: E402
 from drake_diff.exceptions import ModelWarning  # noqa: E402
 from drake_diff.model.parameters import select  # noqa: E402
 from drake_diff.model.step import advance  # noqa: E402

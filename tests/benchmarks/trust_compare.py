@@ -16,7 +16,7 @@ from helpers.robots import example_robot, state_in_contact, state_in_range
 from trust import Figure
 
 import drake_diff as dd
-from drake_diff.engines.mujoco.engine import generated
+from drake_diff.engines.mujoco import generated
 from drake_diff.exceptions import ModelWarning
 from drake_diff.mechanics.description import describe
 

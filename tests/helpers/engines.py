@@ -77,7 +77,7 @@ def assert_free_steps_agree(model, name, step, jacobian, *, states=5):
 def assert_free_bodies_differ_by_the_exponential(model, name, *, states=3):
     """From Drake's step, in an engine that has MuJoCo's."""
     drake, mujoco, random = dd.engines.load_engine("drake", model), engine_of(name, model), np.random.default_rng(3)
-    from drake_diff.engines.mujoco.engine import exponential_gap
+    from drake_diff.engines.mujoco import exponential_gap
 
     space = tangent_space(model)
 

@@ -1,4 +1,4 @@
-"""MuJoCo, on MJCF generated from Drake's plant or on the user's own.
+"""MuJoCo, on MJCF generated from Drake's plant, numbers to the last digit, or on the user's own.
 
 With Euler or implicitfast joint damping is implicit, (M + h D) a = ..., and v' = v + h a: Drake's free step, but for a
 free body's quaternion (`exponential_gap`). The contract says where an MJCF asks for another.
@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, frozen, positive_float
-from drake_diff.engines.common import PlantEngine
-from drake_diff.engines.interface import EngineContract, StepJacobian
-from drake_diff.engines.mujoco.contract import check_known, read_contract, read_followers
-from drake_diff.engines.mujoco.coordinates import MujocoCoordinates
-from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.engines.formats import mjcf
+from drake_diff.engines.interface import (
+    EngineContract,
+    PlantEngine,
+    StepJacobian,
+)
+from drake_diff.engines.mujoco_contract import MujocoCoordinates, check_known, read_contract, read_followers
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.description import Description, Follower
 from drake_diff.model.model import Model

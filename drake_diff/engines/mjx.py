@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff.engines.common import PlantEngine
-from drake_diff.engines.interface import EngineContract, StepJacobian
-from drake_diff.engines.mujoco.contract import CONES, read_contract, touches
-from drake_diff.engines.mujoco.coordinates import MujocoCoordinates
-from drake_diff.engines.mujoco.engine import mujoco_model
+from drake_diff.engines.interface import EngineContract, PlantEngine, StepJacobian
+from drake_diff.engines.mujoco import mujoco_model
+from drake_diff.engines.mujoco_contract import CONES, MujocoCoordinates, read_contract, touches
 from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.model.model import Model
 

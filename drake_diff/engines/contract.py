@@ -1,0 +1,461 @@
+"""Whether two engines simulate the same model, line by line, before either takes a step: bodies, forces, contact."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.engines.interface import Engine, EngineContract, Precision
+from drake_diff.exceptions import NotOfferedError
+from drake_diff.mechanics.description import GeometryContract, JointContract, PairContract
+
+Verdict = Literal["equal", "mapped", "different"]
+# Two libraries' sums over a tree differ by rounding, magnified by cancellation; a wrong number differs by far more.
+SAME_NUMBER: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-5}
+# Below any inertia that matters: what MuJoCo gives a point mass, 2e-15 kg m^2, and rounding of zeros.
+NOTHING: dict[Precision, float] = {"float64": 1e-12, "float32": 1e-6}
+
+# What an engine must have of contact: where it lacks them and they are at work, it simulates another model.
+MUST_HAVE = ("shapes", "poses", "contact pairs")
+# What is the engine's own whatever the model: the form of its laws.
+LAWS = (
+    "integrator", "scalar type", "derivative convention", "limit law", "contact law", "solver tolerance", "reset",
+)  # fmt: skip
+
+
+# Of a quantity that is different because nobody says what it is, which neither breaks nor explains anything.
+NOT_TOLD, FUNCTION_DOES_NOT_SAY = "the recording does not say", "a user's function does not say"
+UNKNOWN = (NOT_TOLD, FUNCTION_DOES_NOT_SAY)
+
+
+@dataclass(frozen=True, repr=False)
+class ContractLine:
+    """One thing that two engines must share, and whether they do.
+
+    Attributes:
+        quantity: what is compared, such as "mass" or "contact law".
+        verdict: "equal", "mapped" (the same in other coordinates; `detail` says how) or "different".
+        detail: the common value, or both values, their place, and the reason where there is one.
+        reason: why an engine cannot have what the other has; empty where the model itself differs.
+
+    Example:
+        >>> print(dd.engines.ContractLine("time step", "equal", "0.01 [s]"))
+        equal     time step: 0.01 [s]
+    """
+
+    quantity: str
+    verdict: Verdict
+    detail: str
+    reason: str = ""
+
+    def __repr__(self) -> str:
+        return f"{self.verdict:9} {self.quantity}: {self.detail}"
+
+
+def is_another_model(line: ContractLine, touched: bool) -> bool:
+    """Whether a line that is different makes another model, where contact is at work (`touched`) or not."""
+    return (touched and line.quantity in MUST_HAVE) or (not line.reason and line.quantity not in LAWS)
+
+
+class Match:
+    """Lines of two engines' contracts, `one` and `two`, compared in the coarser arithmetic of both."""
+
+    def __init__(self, a: Engine, b: Engine):
+        self.engines = a, b
+        self.one, self.two = self.contracts = a.contract, b.contract
+        self.precision: Precision = "float32" if "float32" in [c.precision for c in self.contracts] else "float64"
+        sides = [side for c in self.contracts for j in c.joints for side in (j.lower, j.upper)]
+        self.limited = any(math.isfinite(side) for side in sides)
+
+    def same(self, a: Any, b: Any) -> bool:
+        if isinstance(a, str) or isinstance(b, str) or not (math.isfinite(a) and math.isfinite(b)):
+            return bool(a == b)
+        return abs(a - b) <= max(NOTHING[self.precision], SAME_NUMBER[self.precision] * max(abs(a), abs(b)))
+
+    def both(self, a: object, b: object) -> str:
+        return f"{self.one.engine}: {a}; {self.two.engine}: {b}"
+
+    def different(self, quantity: str, what: str) -> ContractLine:
+        """With the reason of the engine that has one."""
+        reason = self.one.reasons.get(quantity) or self.two.reasons.get(quantity) or ""
+        told = reason if reason in UNKNOWN else "; ".join(part for part in (what, reason) if part)
+        return ContractLine(quantity, "different", told, reason)
+
+    def text(self, quantity: str, a: str, b: str) -> ContractLine:
+        return ContractLine(quantity, "equal", a) if a == b else self.different(quantity, self.both(a, b))
+
+    def all_same(self, a: Sequence[Any], b: Sequence[Any]) -> bool:
+        return len(a) == len(b) and all(map(self.same, a, b))
+
+    def numbers(self, quantity: str, a: tuple[Any, ...], b: tuple[Any, ...], unit: str = "") -> ContractLine:
+        if self.all_same(a, b):
+            return ContractLine(quantity, "equal", f"{values_told(a)} {unit}".strip())
+        return self.different(quantity, f"{self.both(values_told(a), values_told(b))} {unit}".strip())
+
+    def order(self) -> ContractLine:
+        quantity = "joint order and names"
+        a, b = (tuple(j.name for j in contract.joints) for contract in self.contracts)
+        if a != b:
+            return self.numbers(quantity, a, b)
+        inside = [values_told(contract.native_order) for contract in self.contracts]
+        if inside[0] != inside[1]:
+            return ContractLine(quantity, "mapped", f"by name, from {self.both(*inside)}")
+        return ContractLine(quantity, "equal", values_told(a))
+
+    def joints(self, quantity: str, read: Callable[[JointContract], tuple[Any, ...]]) -> ContractLine:
+        """By name, so that another order is reported once and not in every line."""
+        others = {j.name: j for j in self.two.joints}
+        common = [j for j in self.one.joints if j.name in others]
+        if not common:
+            return ContractLine(quantity, "different", "no joint has the same name in both")
+        lines = {j.name: self.numbers(quantity, read(j), read(others[j.name])) for j in common}
+        wrong = {name: line for name, line in lines.items() if line.verdict == "different"}
+        if not wrong:
+            return ContractLine(quantity, "equal", "of " + ", ".join(lines))
+        first = next(iter(wrong.values()))
+        if first.reason in UNKNOWN:
+            return first
+        detail = "; ".join(f"{name}: {line.detail}" for name, line in wrong.items())
+        return ContractLine(quantity, "different", detail, first.reason)
+
+    def actuation(self) -> ContractLine:
+        quantity, inputs = "actuator mapping", self.one.inputs
+        if inputs != self.two.inputs:
+            return self.numbers(quantity, inputs, self.two.inputs)
+        if not inputs:
+            return ContractLine(quantity, "equal", "no inputs")
+        a, b = _forces_by_joint(self.one), _forces_by_joint(self.two)
+        wrong = [
+            f"{self.one.engine}: {name} drives {a[name]}; {self.two.engine}: {b[name]}"
+            for name in inputs
+            if a[name].keys() != b[name].keys() or not all(self.same(gain, b[name][j]) for j, gain in a[name].items())
+        ]
+        if wrong:
+            return self.different(quantity, "; ".join(wrong))
+        return ContractLine(quantity, "equal", "; ".join(f"{name} drives {a[name]}" for name in inputs))
+
+    def effort_limits(self) -> ContractLine:
+        if not self.one.inputs and not self.two.inputs:
+            return ContractLine("effort limits", "equal", "no inputs")
+        return self.numbers("effort limits", self.one.effort_limits, self.two.effort_limits)
+
+    def dynamics(self) -> tuple[ContractLine, ...]:
+        """M and bias at random states in Drake's coordinates; of a closed form the parts of its forces."""
+        kinds = [j.kind for j in self.one.joints]
+        if kinds != [j.kind for j in self.two.joints]:
+            why = "not comparable: the joints are of other types"
+            return ContractLine("M(q)", "different", why), ContractLine("bias(q, v)", "different", why)
+        random, (a, b) = np.random.default_rng(0), self.engines
+        states = [_random_state(kinds, random) for _ in range(RANDOM_STATES)]
+        if of_parts := getattr(a, "part_lines", None) or getattr(b, "part_lines", None):  # a user's accelerations
+            lines: tuple[ContractLine, ...] = of_parts(self, states)
+            return lines
+        return (
+            self.term("M(q)", [(q,) for q, _ in states], a.mass_matrix, b.mass_matrix),
+            self.term("bias(q, v)", states, a.bias, b.bias),
+        )
+
+    def term(
+        self, quantity: str, states: Sequence[tuple[Array, ...]], a: Callable[..., Array], b: Callable[..., Array]
+    ) -> ContractLine:
+        worst, entry, same = 0.0, "", SAME_NUMBER[self.precision]
+        for state in states:
+            try:
+                x, y = a(*state), b(*state)
+            except NotOfferedError as error:
+                return ContractLine(quantity, "different", f"not comparable: {error}", str(error))
+            gap = np.abs(x - y) / max(float(np.abs(x).max()), NOTHING[self.precision] / same)
+            where = np.unravel_index(int(np.argmax(gap)), gap.shape)
+            if not gap[where] <= worst:
+                values = self.both(f"{x[where]:.10g}", f"{y[where]:.10g}")
+                worst, entry = float(gap[where]), f"entry {[int(i) for i in where]}, {values}"
+        within = f"to {worst:.1e} of its largest entry at {RANDOM_STATES} random states"
+        if worst <= same:
+            return ContractLine(quantity, "equal", within)
+        return ContractLine(quantity, "different", f"{within}, {entry}")
+
+    def state(self) -> ContractLine:
+        quantity, (a, b) = "state of a free body", (contract.state for contract in self.contracts)
+        if not any(j.kind == "quaternion_floating" for c in self.contracts for j in c.joints):
+            return ContractLine(quantity, "equal", "no free body")
+        return ContractLine(quantity, "equal", a) if a == b else ContractLine(quantity, "mapped", self.both(a, b))
+
+    def limit_law(self) -> ContractLine:
+        if not self.limited:
+            return ContractLine("limit law", "equal", "no joint is limited")
+        return self.text("limit law", self.one.limit_law, self.two.limit_law)
+
+    def solver_tolerance(self) -> ContractLine:
+        if not self.limited and not any(c.contacts for c in self.contracts):
+            return ContractLine("solver tolerance", "equal", "nothing to solve: neither contact nor limits")
+        told = ("none" if c.solver_tolerance is None else f"{c.solver_tolerance:g}" for c in self.contracts)
+        return self.text("solver tolerance", *told)
+
+    def scalar_type(self) -> ContractLine:
+        a, b = (contract.precision for contract in self.contracts)
+        if a == b:
+            return ContractLine("scalar type", "equal", a)
+        return ContractLine("scalar type", "different", self.both(a, b), f"its arithmetic is {self.precision}")
+
+    def derivatives(self) -> ContractLine:
+        quantity, told = "derivative convention", [contract.derivatives for contract in self.contracts]
+        if told[0] == told[1]:
+            return ContractLine(quantity, "equal", told[0])
+        if "none" in told:
+            return ContractLine(quantity, "different", self.both(*told), "it offers no derivatives")
+        return ContractLine(quantity, "mapped", self.both(*told))
+
+
+def values_told(values: tuple[Any, ...]) -> str:
+    shown = [value if isinstance(value, str) else f"{value:.10g}" for value in values]
+    return shown[0] if len(shown) == 1 else "(" + ", ".join(shown) + ")"
+
+
+RANDOM_STATES = 5
+JOINT_NUMBERS: dict[str, Callable[[JointContract], tuple[Any, ...]]] = {
+    "joint types": lambda j: (j.kind,),
+    "frames": lambda j: (*j.axis, *j.anchor),
+    "mass": lambda j: (j.mass,),
+    "center of mass": lambda j: j.center_of_mass,
+    "inertia": lambda j: j.inertia,
+    "damping": lambda j: (j.damping,),
+    "armature": lambda j: (j.armature,),
+    "springs": lambda j: (j.stiffness, j.rest if j.stiffness else 0.0),
+    "position limits": lambda j: (j.lower, j.upper),
+}
+
+
+def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
+    """Compare what two engines simulate, quantity by quantity, before either takes a step.
+
+    M(q) and the bias forces are compared at random states, everything else as the engines report it.
+
+    Args:
+        a: one engine, from `load_engine`; its values come first in the details.
+        b: another engine on the same model.
+
+    Returns:
+        A line per quantity. A line that is "different" has no reason where the model differs (another mass), and the
+        reason where the engine cannot have what the other has (another contact law).
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> drake, hand = (dd.engines.load_engine(name, model) for name in ("drake", "numpy"))
+        >>> lines = dd.engines.match_contracts(drake, hand)
+        >>> print([line.quantity for line in lines if line.verdict == "different"])
+        []
+    """
+    match = Match(a, b)
+    one, two = match.one, match.two
+    return (
+        match.order(),
+        *(match.joints(quantity, read) for quantity, read in JOINT_NUMBERS.items()),
+        match.numbers("gravity", one.gravity, two.gravity, "[m/s^2]"),
+        match.actuation(),
+        match.effort_limits(),
+        *match.dynamics(),
+        match.numbers("time step", (one.time_step,), (two.time_step,), "[s]"),
+        match.text("integrator", one.integrator, two.integrator),
+        match.state(),
+        match.limit_law(),
+        match.text("contact law", one.contact_law, two.contact_law),
+        *contact_lines(match),
+        match.solver_tolerance(),
+        match.text("reset", one.reset, two.reset),
+        match.scalar_type(),
+        match.derivatives(),
+    )
+
+
+def _forces_by_joint(contract: EngineContract) -> dict[str, dict[str, float]]:
+    """Of each input, the generalized force per unit by joint."""
+    owners = [name for j in contract.joints for name in [j.name] * (6 if j.kind == "quaternion_floating" else 1)]
+    rows = list(zip(owners, contract.actuation, strict=True))
+    return {name: {joint: row[i] for joint, row in rows if row[i]} for i, name in enumerate(contract.inputs)}
+
+
+def _random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array, Array]:
+    """q and v of joints of these kinds, in Drake's coordinates, quaternions of norm 1."""
+    free = [kind == "quaternion_floating" for kind in kinds]
+    parts = [random.standard_normal(7 if floats else 1) for floats in free]
+    for part in (part for part, floats in zip(parts, free, strict=True) if floats):
+        part[:4] /= np.linalg.norm(part[:4])
+    return np.concatenate(parts), random.standard_normal(len(kinds) + 5 * sum(free))
+
+
+TOLD = 4  # pairs or geometries that a line names
+Shared = Sequence[tuple[PairContract, PairContract]]
+
+
+def contact_lines(match: Match) -> tuple[ContractLine, ...]:
+    """Shapes, poses, pairs, friction, stiffness, dissipation, margin, and what Drake's contact does not have.
+
+    A number that differs has no reason: it is another model. What an engine has no number for has its reason.
+    """
+    one, two = match.contracts
+    same = same_geometries(match)
+    a = {frozenset(same.get(name, name) for name in pair.names): pair for pair in one.contacts}
+    b = {frozenset(pair.names): pair for pair in two.contacts}
+    shared = [(a[names], b[names]) for names in a if names in b]
+    return (
+        *_geometries(match, same),
+        _pairs(match, a, b),
+        _numbers(match, "friction", shared, lambda pair: pair.friction, "[1]"),
+        _numbers(match, "stiffness", shared, lambda pair: pair.stiffness, "[N/m]"),
+        _dissipation(match, shared),
+        _numbers(match, "contact margin", shared, lambda pair: pair.margin, "[m]"),
+        _more(match, shared),
+    )
+
+
+def same_geometries(match: Match) -> dict[str, str]:
+    """The name in the second engine of each geometry of the first that is there: by name, else by place, else nearest.
+
+    A name is taken without what Drake puts around it: model::name#number.
+    """
+    a, b = (list(c.geometries) for c in match.contracts)
+    found: dict[str, str] = {}
+    touching = _touching(match.one) | _touching(match.two)
+
+    def take(rule: Callable[[GeometryContract, GeometryContract], bool]) -> None:
+        for x in [x for x in a if x.name not in found]:
+            free = [y for y in b if y.name not in found.values() and rule(x, y)]
+            if free:
+                found[x.name] = min(free, key=lambda y: float(np.linalg.norm(np.subtract(x.position, y.position)))).name
+
+    take(lambda x, y: x.name == y.name)
+    take(lambda x, y: _plain(x.name) == _plain(y.name) and x.carrier == y.carrier)
+    a, b = ([g for g in side if g.name in touching] for side in (a, b))
+    take(lambda x, y: _same_shape(match, x, y) and _same_pose(match, x, y))
+    take(lambda x, y: x.kind == y.kind and x.carrier == y.carrier)
+    return found
+
+
+def _plain(name: str) -> str:
+    return name.split("#")[0].split("::")[-1]
+
+
+def _touching(contract: EngineContract) -> set[str]:
+    return {name for pair in contract.contacts for name in pair.names}
+
+
+def _same_shape(match: Match, x: GeometryContract, y: GeometryContract) -> bool:
+    return x.kind == y.kind and match.all_same(x.sizes, y.sizes)
+
+
+def _same_pose(match: Match, x: GeometryContract, y: GeometryContract) -> bool:
+    placed = match.all_same(x.position, y.position) and match.all_same(x.directions, y.directions)
+    return x.carrier == y.carrier and placed
+
+
+def _geometries(match: Match, same: Mapping[str, str]) -> tuple[ContractLine, ContractLine]:
+    """Of those that are in both, and may touch something in one."""
+    a, b = ({g.name: g for g in c.geometries} for c in match.contracts)
+    touching = _touching(match.one), _touching(match.two)
+    both = [(a[x], b[y]) for x, y in same.items() if x in touching[0] or y in touching[1]]
+    shapes, poses = [], []
+    for x, y in both:
+        if not _same_shape(match, x, y):
+            shapes.append(f"{x.name}: {match.both(*(f'{g.kind} {values_told(g.sizes)}' for g in (x, y)))} [m]")
+        if not _same_pose(match, x, y):
+            poses.append(f"{x.name}: {match.both(*map(_place, (x, y)))}")
+    told = f"of {len(both)} geometries" if both else "nothing can touch"
+    return _line(match, "shapes", shapes, told), _line(match, "poses", poses, told)
+
+
+def _place(g: GeometryContract) -> str:
+    along = f", directions {values_told(g.directions)}" if g.directions else ""
+    return f"on {g.carrier} at {values_told(g.position)} [m]{along}"
+
+
+def _line(match: Match, quantity: str, wrong: list[str], told: str) -> ContractLine:
+    """What is wrong without a reason to excuse it; the engine's own word on it is told all the same."""
+    if not wrong:
+        return ContractLine(quantity, "equal", told)
+    remark = match.one.reasons.get(quantity) or match.two.reasons.get(quantity)
+    return ContractLine(quantity, "different", "; ".join([_some(wrong), *([remark] if remark else [])]))
+
+
+def _some(parts: list[str]) -> str:
+    return "; ".join(parts[:TOLD]) + (f"; and {len(parts) - TOLD} more" if len(parts) > TOLD else "")
+
+
+def _pairs(
+    match: Match, a: Mapping[frozenset[str], PairContract], b: Mapping[frozenset[str], PairContract]
+) -> ContractLine:
+    quantity = "contact pairs"
+    if a.keys() == b.keys():
+        return ContractLine(quantity, "equal", f"{len(a)} pairs" if a else "none")
+    sides = ((match.one.engine, a, b), (match.two.engine, b, a))
+    only = [
+        f"only in {engine}: {_some(missing)}"
+        for engine, own, others in sides
+        if (missing := sorted(" with ".join(own[names].names) for names in own.keys() - others.keys()))
+    ]
+    return match.different(quantity, "; ".join([match.both(len(a), len(b)), *only]))
+
+
+def _numbers(
+    match: Match, quantity: str, shared: Shared, read: Callable[[PairContract], float | None], unit: str
+) -> ContractLine:
+    """A value that neither gives is the same default only where the contact law is the same."""
+    wrong, absent, seen = [], [], set()
+    for x, y in shared:
+        p, q = read(x), read(y)
+        seen.add(p)
+        told = f"{' with '.join(x.names)}: {match.both(p, q)} {unit}"
+        if p is None or q is None:
+            absent += [told] if p is not q or match.one.contact_law != match.two.contact_law else []
+        elif not match.same(p, q):
+            wrong.append(told)
+    if absent and not wrong:
+        return match.different(quantity, _some(absent))
+    values = sorted(value for value in seen if value is not None)
+    told = f"{values_told(tuple(values[:TOLD]))} {unit}" if values else "of no pair"
+    return _line(match, quantity, wrong + absent, told)
+
+
+def _dissipation(match: Match, shared: Shared) -> ContractLine:
+    """Hunt and Crossley's where both have it, and the relaxation time, or the critical one of an engine's own law."""
+    quantity = "dissipation"
+    wrong: list[str] = []
+    absent: list[str] = []
+    mapped: list[str] = []
+    for x, y in shared:
+        name = " with ".join(x.names)
+        if x.dissipation is not None and y.dissipation is not None and not match.same(x.dissipation, y.dissipation):
+            wrong.append(f"{name}: {match.both(x.dissipation, y.dissipation)} [s/m]")
+        p, q = x.relaxation_time, y.relaxation_time
+        told = f"{name}: {match.both(p, q)} [s]"
+        if p is None or q is None:
+            absent += [told] if p is not q else []
+        elif not match.same(p, q):
+            critical = any(_critical(match, pair) for pair in (x, y))
+            (mapped if critical else wrong).append(told)
+    if wrong:
+        return _line(match, quantity, wrong, "")
+    if absent:
+        return match.different(quantity, _some(absent))
+    if mapped:
+        said = f"relaxation times {_some(mapped)}: the damping is critical, which is the engine's own"
+        return ContractLine(quantity, "mapped", said)
+    return ContractLine(quantity, "equal", f"of {len(shared)} pairs" if shared else "of no pair")
+
+
+def _critical(match: Match, pair: PairContract) -> bool:
+    times = pair.relaxation_time, pair.critical_time
+    return None not in times and match.same(*times)
+
+
+def _more(match: Match, shared: Shared) -> ContractLine:
+    wrong = []
+    for x, y in shared:
+        p, q = dict(x.more), dict(y.more)
+        for name in {**p, **q}:
+            if not match.same(p.get(name, 0.0), q.get(name, 0.0)):
+                both = match.both(p.get(name, 0.0), q.get(name, 0.0))
+                wrong.append(f"{' with '.join(x.names)}: {name}, {both}")
+    return _line(match, "other contact terms", wrong, "none")

@@ -1,0 +1,391 @@
+"""Drake's plant as URDF, MJCF and SDF: the same bodies, joints, motors and shapes, numbers to the last digit.
+
+In URDF and SDF each link's frame stands at its joint and parallel to the world where q = 0: no joint is turned against
+its parent, so nothing goes through roll, pitch and yaw but geometry. URDF has no springs; friction and softness of
+contact are written in the elements that Drake reads. SDF drives joints, and has no names of actuators: the input of a
+joint has the joint's name, and an effort of 0 means that nothing drives it. Bullet gets each link in the frame of its
+joint, with its inertia by the principal axes.
+"""
+
+from collections.abc import Mapping, Sequence
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from drake_diff._base.arrays import Array
+from drake_diff.engines.interface import UNLIMITED, principal, row, shape_of, xml_text
+from drake_diff.exceptions import ModelError
+from drake_diff.mechanics.coordinates import rotation
+from drake_diff.mechanics.description import Description, Geometry, Link, RigidLink
+
+# Drake's own elements, in URDF and SDF, of what a side of a contact is made.
+PROXIMITY = {
+    "friction": ("mu_dynamic", "mu_static"), "stiffness": ("point_contact_stiffness",),
+    "dissipation": ("hunt_crossley_dissipation",), "relaxation_time": ("relaxation_time",),
+}  # fmt: skip
+KINDS = {"weld": "fixed", "prismatic": "prismatic", "quaternion_floating": "floating"}
+SHAPES = ("Sphere", "Box", "Cylinder")  # URDF's own; Bullet has capsules too
+
+
+def urdf(description: Description) -> str:
+    """The URDF text, with a link "world" that free bodies float on.
+
+    A motor's torque limit is its joint's effort; geometries that are no sphere, box or cylinder are left out.
+    """
+    root, elements = _tree(description, "world", description.links)
+    zero = AtZero(description)
+    for geometry in (g for g in description.geometries if shape_of(g)[0] in SHAPES):
+        collision = _add_collision(elements[geometry.body], geometry, zero.in_frame(geometry.body) @ geometry.pose)
+        material = SubElement(collision, "drake:proximity_properties")
+        for quantity, value in geometry.material.items():
+            for name in PROXIMITY[quantity]:
+                SubElement(material, f"drake:{name}", value=row(value))
+    armature = {x.joint: x.armature for x in description.moving}
+    for name, joint in zip(description.inputs, description.actuated, strict=True):
+        transmission = SubElement(root, "transmission", name=name)
+        SubElement(transmission, "type").text = "transmission_interface/SimpleTransmission"
+        driven = SubElement(transmission, "joint", name=joint)
+        SubElement(driven, "hardwareInterface").text = "EffortJointInterface"
+        motor = SubElement(transmission, "actuator", name=name)
+        # The first motor of a joint has its whole armature.
+        SubElement(motor, "drake:rotor_inertia", value=row(armature.pop(joint, 0.0)))
+        SubElement(motor, "drake:gear_ratio", value="1.0")
+    return xml_text(root)
+
+
+def inertial_urdf(description: Description, base: str) -> str:
+    """The URDF text, without geometry and motors, of the tree on the link `base`, a free body or "world"."""
+    return xml_text(_tree(description, base, carried_by(description, base))[0])
+
+
+def bullet_urdf(links: Sequence[tuple[int, RigidLink]], geometries: Sequence[tuple[int, Geometry]]) -> str:
+    """One tree for Bullet: links, each with its place (by which geometries and children name it).
+
+    The first link may be a free body; a tree that hangs on the world gets a massless base "world". Raises ModelError
+    for a half space on a link, which Bullet has on the world alone.
+    """
+    root = Element("robot", name="tree")
+    if not links[0][1].free:
+        _add_inertial(SubElement(root, "link", name="world"), 0.0, RigidTransform(), np.zeros((3, 3)))
+    for number, link in links:
+        body = SubElement(root, "link", name=f"link_{number}")
+        moments, turn = principal(link.inertia)
+        axes = RigidTransform(RotationMatrix(rotation(turn)), link.center_of_mass)
+        _add_inertial(body, link.mass, axes, np.diag(moments))
+        for geometry in (g for owner, g in geometries if owner == number):
+            if shape_of(geometry)[0] == "HalfSpace":
+                raise ModelError(f"geometry {geometry.name}: Bullet has half spaces only on the world")
+            _add_collision(body, geometry, geometry.pose)
+        if not link.free:
+            parent = "world" if link.parent < 0 else f"link_{link.parent}"
+            joint = _add_joint(root, f"joint_{number}", link.joint.kind, (parent, f"link_{number}"), link.on_parent)
+            limited = np.isfinite(link.joint.lower) or np.isfinite(link.joint.upper)
+            sides = (link.joint.lower, link.joint.upper) if limited else (1.0, -1.0)  # upper below lower: no limit
+            _add_freedom(joint, link.axis, link.joint.damping, UNLIMITED, sides)
+    return xml_text(root)
+
+
+def carried_by(description: Description, base: str) -> tuple[Link, ...]:
+    """The links that stand on `base`, a free body or "world", free bodies not among them."""
+    bodies, found = {base}, []
+    for link in description.links:
+        if link.parent in bodies and link.kind != "quaternion_floating":
+            bodies.add(link.body)
+            found.append(link)
+    return tuple(found)
+
+
+class AtZero:
+    """Where `bodies` and the `frames` of links are in the world where q = 0: frames at the joints, parallel to it."""
+
+    def __init__(self, description: Description):
+        self.bodies, self.frames = {"world": RigidTransform()}, {"world": RigidTransform()}
+        for link in description.links:
+            at = self.bodies[link.parent] @ link.on_parent
+            self.bodies[link.body] = at @ link.on_child.inverse()
+            self.frames[link.body] = RigidTransform(at.translation())
+
+    def in_frame(self, body: str) -> RigidTransform:
+        """The pose of a body in its link's frame."""
+        return self.frames[body].inverse() @ self.bodies[body]
+
+    def in_parent(self, link: Link) -> RigidTransform:
+        """The pose of a link's frame in that of its parent."""
+        return self.frames[link.parent].inverse() @ self.frames[link.body]
+
+    def inertia(self, link: Link) -> tuple[Array, Array]:
+        """Centre of mass (3,) and inertia (3, 3) about it, in the link's frame."""
+        X = self.in_frame(link.body)
+        R = X.rotation().matrix()
+        return np.asarray(X @ link.center_of_mass), R @ link.inertia @ R.T
+
+    def axis(self, link: Link) -> Array:
+        """(3,) of its joint, of norm 1."""
+        turn = (self.bodies[link.parent] @ link.on_parent).rotation().matrix()
+        return np.asarray(turn @ link.axis / np.linalg.norm(link.axis))
+
+
+def _tree(description: Description, base: str, links: tuple[Link, ...]) -> tuple[Element, dict[str, Element]]:
+    """The document of `links` on the link `base`, and its links."""
+    root = Element("robot", {"name": "from_drake", "xmlns:drake": "http://drake.mit.edu"})
+    elements = {name: SubElement(root, "link", name=name) for name in (base, *(x.body for x in links))}
+    zero = AtZero(description)
+    for link in description.links:
+        if link.body in elements:
+            center, inertia = zero.inertia(link)
+            _add_inertial(elements[link.body], link.mass, RigidTransform(center), inertia)
+    for link in links:
+        limited = bool(np.isfinite(link.lower) or np.isfinite(link.upper))
+        kind = KINDS.get(link.kind) or ("revolute" if limited else "continuous")
+        joint = _add_joint(root, link.joint, kind, (link.parent, link.body), zero.in_parent(link))
+        if link.kind in ("revolute", "prismatic"):
+            own = [e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint]
+            sides = None if kind == "continuous" else (link.lower, link.upper)
+            _add_freedom(joint, zero.axis(link), link.damping, min([UNLIMITED, *own]), sides)
+            for each in (each for each in description.followers if each.joint == link.joint):
+                SubElement(joint, "mimic", joint=each.leader, multiplier=row(each.ratio), offset=row(each.offset))
+    return root, elements
+
+
+def _add_joint(root: Element, name: str, kind: str, sides: tuple[str, str], X: RigidTransform) -> Element:
+    joint = SubElement(root, "joint", name=name, type=kind)
+    SubElement(joint, "parent", link=sides[0])
+    SubElement(joint, "child", link=sides[1])
+    _place(joint, X)
+    return joint
+
+
+def _add_freedom(joint: Element, axis: Array, damping: float, effort: float, sides: tuple[float, float] | None) -> None:
+    SubElement(joint, "axis", xyz=row(axis))
+    SubElement(joint, "dynamics", damping=row(damping))
+    limit = SubElement(joint, "limit", effort=row(effort), velocity=row(UNLIMITED))
+    if sides:
+        limit.set("lower", row(max(sides[0], -UNLIMITED)))
+        limit.set("upper", row(min(sides[1], UNLIMITED)))
+
+
+def _add_inertial(body: Element, mass: float, center: RigidTransform, inertia: Array) -> None:
+    """`inertia` (3, 3) is about `center` and in its axes."""
+    inertial = SubElement(body, "inertial")
+    _place(inertial, center)
+    SubElement(inertial, "mass", value=row(mass))
+    places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    SubElement(inertial, "inertia", {name: row(inertia[place]) for name, place in places.items()})
+
+
+def _add_collision(body: Element, geometry: Geometry, X: RigidTransform) -> Element:
+    kind, sizes = shape_of(geometry)
+    collision = SubElement(body, "collision", name=geometry.name)
+    _place(collision, X)
+    element = SubElement(SubElement(collision, "geometry"), kind.lower())
+    for name, values in sizes.items():
+        element.set(name, row(values))
+    return collision
+
+
+def _place(element: Element, X: RigidTransform) -> None:
+    rpy: Array = RollPitchYaw(X.rotation()).vector()
+    SubElement(element, "origin", xyz=row(X.translation()), rpy=row(rpy))
+
+
+# MuJoCo refuses a mass [kg] or moment of inertia [kg m^2] of at most 1e-15: massless links and point masses get this.
+SMALLEST = 2e-15
+# Constant impedance of contacts: near enough to rigid for friction to hold, far enough for a spring to be one.
+IMPEDANCE = 0.9
+FRICTION_IMPEDANCE_RATIO = 100.0  # so that what sticks creeps little
+STIFFEST = 0.9999  # MuJoCo's largest impedance: joints that follow others give way by a ten-thousandth
+
+
+def mjcf(description: Description, time_step: float, inverse_masses: Mapping[str, float] | None = None) -> str:
+    """The MJCF text, whose contacts have Drake's stiffness where they rest (see `contacts`) and are damped critically.
+
+    `inverse_masses` are what MuJoCo takes for 1 / mass of each body, which only it knows; `generated` asks it. Without
+    them contacts have MuJoCo's own stiffness, which is another model's. Geometries that are no sphere, box, cylinder,
+    capsule, ellipsoid or half space are left out, with their pairs.
+
+    Raises:
+        ModelError: a free body whose joint's frames are not its own and the world's.
+    """
+    root = Element("mujoco", model="from_drake")
+    smallest = row(SMALLEST)
+    SubElement(root, "compiler", angle="radian", fusestatic="false", boundmass=smallest, boundinertia=smallest)
+    numbers = {"timestep": time_step, "tolerance": 1e-12, "impratio": FRICTION_IMPEDANCE_RATIO}
+    option = {name: row(value) for name, value in numbers.items()}
+    option |= {"integrator": "Euler", "cone": "elliptic", "gravity": row(description.gravity)}
+    SubElement(SubElement(root, "option", option), "flag", warmstart="disable")
+    bodies = {"world": SubElement(root, "worldbody")}
+    for link in description.links:
+        bodies[link.body] = _add_mjcf_body(bodies[link.parent], link)
+    body_of = {g.name: g.body for g in description.geometries if _add_mjcf_geometry(bodies[g.body], g)}
+    actuators, contacts = SubElement(root, "actuator"), SubElement(root, "contact")
+    for i, (name, joint) in enumerate(zip(description.inputs, description.actuated, strict=True)):
+        motor = SubElement(actuators, "motor", name=name, joint=joint, gear="1")
+        limit = float(description.effort_limits[i])
+        if np.isfinite(limit):
+            motor.set("forcelimited", "true")
+            motor.set("forcerange", row([-limit, limit]))
+    for pair in description.pairs:
+        if set(pair.names) <= body_of.keys():
+            element = SubElement(contacts, "pair", geom1=pair.names[0], geom2=pair.names[1], condim="3")
+            element.set("solimp", row([IMPEDANCE, IMPEDANCE, 0.001]))
+            if pair.friction is not None:
+                element.set("friction", row([pair.friction] * 2 + [0.0] * 3))
+            if inverse_masses and pair.stiffness:
+                s = pair.stiffness * (1 - IMPEDANCE) * sum(inverse_masses[body_of[name]] for name in pair.names)
+                element.set("solref", row([-s, -2 * np.sqrt(s)]))
+    equality = SubElement(root, "equality") if description.followers else root
+    for each in description.followers:
+        element = SubElement(equality, "joint", joint1=each.joint, joint2=each.leader)
+        element.set("polycoef", row([each.offset, each.ratio, 0, 0, 0]))
+        element.set("solimp", row([STIFFEST, STIFFEST, 0.001]))
+    return xml_text(root)
+
+
+def _set_mjcf_pose(element: Element, X: RigidTransform) -> None:
+    element.set("pos", row(X.translation()))
+    element.set("quat", row(X.rotation().ToQuaternion().wxyz()))
+
+
+def _add_mjcf_body(parent: Element, link: Link) -> Element:
+    body = SubElement(parent, "body", name=link.body)
+    _set_mjcf_pose(body, link.on_parent @ link.on_child.inverse())
+    if link.mass > 0:
+        moments, turn = principal(link.inertia)
+        inertial = SubElement(body, "inertial", mass=row(link.mass), diaginertia=row(moments))
+        inertial.set("pos", row(link.center_of_mass))
+        inertial.set("quat", row(turn))
+    if link.kind == "quaternion_floating":
+        if link.parent != "world" or not all(x.IsExactlyIdentity() for x in (link.on_parent, link.on_child)):
+            raise ModelError(f"joint {link.joint}: a free body in MuJoCo must float in the world, by its own frame")
+        SubElement(body, "freejoint", name=link.joint)
+    elif link.kind != "weld":
+        joint = SubElement(body, "joint", name=link.joint, type="hinge" if link.kind == "revolute" else "slide")
+        joint.set("pos", row(link.on_child.translation()))
+        joint.set("axis", row(link.on_child.rotation().matrix() @ link.axis))
+        for name in ("damping", "armature", "stiffness"):
+            joint.set(name, row(getattr(link, name)))
+        joint.set("springref", row(link.rest))
+        limited = np.isfinite(link.lower) or np.isfinite(link.upper)
+        joint.set("limited", "true" if limited else "false")
+        if limited:
+            joint.set("range", row(np.clip([link.lower, link.upper], -UNLIMITED, UNLIMITED)))
+    return body
+
+
+def _add_mjcf_geometry(body: Element, geometry: Geometry) -> bool:
+    kind, sizes = shape_of(geometry)
+    if not sizes:
+        return False
+    if kind == "HalfSpace":
+        size = [0.0, 0.0, 1.0]
+    elif kind == "Box":
+        size = [side / 2 for side in sizes["size"]]
+    elif kind == "Ellipsoid":
+        size = sizes["radii"]
+    else:
+        size = [*sizes["radius"], *(length / 2 for length in sizes.get("length", []))]
+    name = {"HalfSpace": "plane"}.get(kind, kind.lower())
+    element = SubElement(body, "geom", name=geometry.name, type=name, size=row(size), contype="0", conaffinity="0")
+    element.set("mass", "0")
+    _set_mjcf_pose(element, geometry.pose)
+    return True
+
+
+SDF_KINDS = {"weld": "fixed", "prismatic": "prismatic", "revolute": "revolute"}
+GROUND = "fixed_to_the_world"  # the model of the world's own geometry
+
+
+def sdf(description: Description, time_step: float) -> str:
+    """The SDF text. Geometries that are no sphere, box, cylinder, capsule, ellipsoid or half space are left out.
+
+    Friction and softness of contact are written for each geometry as Drake reads them, and friction as others do
+    where all pairs have the same: these combine that of two geometries otherwise. Joints that follow others are written
+    as Drake reads them, and as SDF has them.
+    """
+    version = "1.11" if description.followers else "1.9"  # the first that has <mimic>
+    root = Element("sdf", {"version": version, "xmlns:drake": "http://drake.mit.edu"})
+    world = SubElement(root, "world", name="from_drake")
+    SubElement(SubElement(world, "physics", name="step", type="ode"), "max_step_size").text = row(time_step)
+    SubElement(world, "gravity").text = row(description.gravity)
+    model = SubElement(world, "model", name="from_drake")
+    zero = AtZero(description)
+    links = {link.body: _add_sdf_link(model, link, zero) for link in description.links}
+    for link in description.links:
+        if link.kind != "quaternion_floating":
+            _add_sdf_joint(model, description, link, zero)
+    frictions = {pair.friction for pair in description.pairs}
+    friction = frictions.pop() if len(frictions) == 1 else None
+    if any(g.body == "world" for g in description.geometries):
+        ground = SubElement(world, "model", name=GROUND)
+        SubElement(ground, "static").text = "true"
+        links["world"] = SubElement(ground, "link", name=GROUND)
+    for geometry in description.geometries:
+        _add_sdf_geometry(links[geometry.body], geometry, zero.in_frame(geometry.body) @ geometry.pose, friction)
+    return xml_text(root)
+
+
+def collision_name(geometry: str) -> str:
+    """SDF keeps :: for itself."""
+    return geometry.replace("::", "/")
+
+
+def _add_sdf_link(model: Element, link: Link, zero: AtZero) -> Element:
+    element = SubElement(model, "link", name=link.body)
+    SubElement(element, "pose").text = row([*zero.frames[link.body].translation(), 0, 0, 0])
+    center, turned = zero.inertia(link)
+    inertial = SubElement(element, "inertial")
+    SubElement(inertial, "pose").text = row([*center, 0, 0, 0])
+    SubElement(inertial, "mass").text = row(link.mass)
+    inertia = SubElement(inertial, "inertia")
+    for a, b in ("xx", "xy", "xz", "yy", "yz", "zz"):
+        SubElement(inertia, f"i{a}{b}").text = row(turned["xyz".index(a), "xyz".index(b)])
+    return element
+
+
+def _add_sdf_joint(model: Element, description: Description, link: Link, zero: AtZero) -> None:
+    joint = SubElement(model, "joint", name=link.joint, type=SDF_KINDS[link.kind])
+    SubElement(joint, "parent").text = link.parent
+    SubElement(joint, "child").text = link.body
+    if link.kind == "weld":
+        return
+    axis = SubElement(joint, "axis")
+    SubElement(axis, "xyz").text = row(zero.axis(link))
+    limits = [e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint]
+    limit, dynamics = SubElement(axis, "limit"), SubElement(axis, "dynamics")
+    numbers = {"lower": max(link.lower, -UNLIMITED), "upper": min(link.upper, UNLIMITED)}
+    for name, value in {**numbers, "effort": min([UNLIMITED, *limits]) if limits else 0.0}.items():
+        SubElement(limit, name).text = row(value)
+    numbers = {"damping": link.damping, "spring_reference": link.rest, "spring_stiffness": link.stiffness}
+    for name, value in numbers.items():
+        SubElement(dynamics, name).text = row(value)
+    for each in (each for each in description.followers if each.joint == link.joint):
+        numbers = {"multiplier": each.ratio, "offset": each.offset}
+        mimic = SubElement(axis, "mimic", joint=each.leader)
+        for name, value in {**numbers, "reference": 0.0}.items():
+            SubElement(mimic, name).text = row(value)
+        SubElement(joint, "drake:mimic", {"joint": each.leader, **{name: row(x) for name, x in numbers.items()}})
+    if link.armature:
+        SubElement(joint, "drake:rotor_inertia").text = row(link.armature)
+        SubElement(joint, "drake:gear_ratio").text = "1.0"
+
+
+def _add_sdf_geometry(link: Element, geometry: Geometry, X: RigidTransform, friction: float | None) -> None:
+    kind, sizes = shape_of(geometry)
+    if not sizes:
+        return
+    collision = SubElement(link, "collision", name=collision_name(geometry.name))
+    w, *xyz = X.rotation().ToQuaternion().wxyz()
+    pose = SubElement(collision, "pose", rotation_format="quat_xyzw")
+    pose.text = row([*X.translation(), *xyz, w])
+    name = "plane" if kind == "HalfSpace" else kind.lower()
+    element = SubElement(SubElement(collision, "geometry"), name)
+    for key, values in sizes.items():
+        SubElement(element, key).text = row(values)
+    if friction is not None:
+        ode = SubElement(SubElement(SubElement(collision, "surface"), "friction"), "ode")
+        SubElement(ode, "mu").text = SubElement(ode, "mu2").text = row(friction)
+    material = SubElement(collision, "drake:proximity_properties")
+    for quantity, value in geometry.material.items():
+        for name in PROXIMITY[quantity]:
+            SubElement(material, f"drake:{name}").text = row(value)

@@ -1,1 +1,0 @@
-"""MuJoCo and MJX."""
