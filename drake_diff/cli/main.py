@@ -11,14 +11,14 @@ from typing import Annotated
 import typer
 
 from drake_diff._base.signals import interrupt_alike
-from drake_diff.cli import models, planning, runs, trials
+from drake_diff.cli import models, plans, runs
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 
 USAGE, MISSING, INTERNAL = 2, 3, 4
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
-for noun in (runs, models, planning, trials):
-    noun.add_commands(app)
+for group in (runs, models, plans):
+    group.add_commands(app)
 
 
 def _print_version(asked: bool) -> None:

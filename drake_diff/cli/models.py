@@ -10,16 +10,14 @@ from drake_diff.cli.text import (
     as_options,
     floats_in,
     judged,
-    limits_in,
     names_in,
     names_option,
     numbers_in,
     out_option,
-    pairs_in,
     plain,
-    poses_in,
     progress_line,
     show,
+    split_pair,
     table,
     takes_model,
 )
@@ -203,18 +201,18 @@ def identify(
 
     directory = out or Path("artifacts") / f"identify_{file.stem}"
     names: Any = "all" if parameters is None else names_in(parameters)
-    given = numbers_in("--noise", noise or (), "STATE=DEVIATION")
-    priors = pairs_in("--prior", prior or (), "PARAMETER=MEAN,DEVIATION")
-    within = pairs_in("--bounds", bounds or (), "PARAMETER=LOWER,UPPER")
-    mounted = poses_in("--sensor", sensor or (), "LABEL=BODY:X,Y,Z or LABEL=BODY:X,Y,Z,ROLL,PITCH,YAW")
+    given = _deviations(noise)
+    priors = numbers_in("--prior", prior or (), "PARAMETER=MEAN,DEVIATION", counts=(2,))
+    limits = numbers_in("--bounds", bounds or (), "PARAMETER=LOWER,UPPER", counts=(2,))
+    mounted = dict(_sensor_pose(word) for word in sensor or ())
     try:
         part: float | str = float(held_out)
     except ValueError:
         part = held_out
-    asked: dict[str, Any] = {"noise": given or None, "held_out": part, "motion": motion, "sensors": mounted}
+    asked: dict[str, Any] = {"noise": given, "held_out": part, "motion": motion, "sensors": mounted}
     with written_whole(directory) as folder:
         with progress_line("fitting"):
-            found = estimate(model, list(recording), names, **asked, priors=priors, bounds=within)
+            found = estimate(model, list(recording), names, **asked, priors=priors, bounds=limits)
         record: Any = write_identification(found, folder)
     show(judged(record.verdict), record.sentence)
     rows = table("parameter", "before", "found", "95 % from", "to", "unit", "", left=1)
@@ -270,10 +268,11 @@ def excite(
     if out is not None and out.suffix != ".csv":
         raise InputError("--out", got=str(out), expected="a .csv file")
     names: Any = "all" if parameters is None else names_in(parameters)
+    limits = numbers_in("--limit", limit or (), "NAME=MOST or NAME=LOWER,UPPER", counts=(1, 2))
     asked: dict[str, Any] = {
         "x0": None if x0 is None else floats_in("--x0", x0, "numbers with commas between"),
-        "noise": numbers_in("--noise", noise or (), "STATE=DEVIATION") or None,
-        "limits": limits_in("--limit", limit or (), "NAME=MOST or NAME=LOWER,UPPER") or None,
+        "noise": _deviations(noise),
+        "limits": {name: ends if len(ends) > 1 else ends[0] for name, ends in limits.items()} or None,
         "harmonics": harmonics,
         "max_iterations": max_iterations,
         "seed": seed,
@@ -294,6 +293,19 @@ def excite(
     if out is not None:
         write_csv(found.recording(), model, out)
         show(f"wrote {out}")
+
+
+def _deviations(noise: list[str] | None) -> dict[str, float] | None:
+    return {name: n for name, (n,) in numbers_in("--noise", noise or (), "STATE=DEVIATION").items()} or None
+
+
+def _sensor_pose(word: str) -> tuple[str, tuple[str, list[float]]]:
+    expected = "LABEL=BODY:X,Y,Z or LABEL=BODY:X,Y,Z,ROLL,PITCH,YAW"
+    label, value = split_pair("--sensor", word, expected)
+    body, colon, numbers = value.rpartition(":")
+    if not (body and colon):
+        raise InputError("--sensor", got=repr(word), expected=expected)
+    return label, (body, floats_in("--sensor", numbers, expected))
 
 
 def export(

@@ -6,7 +6,7 @@ What a record or a model says may be a stranger's text: it is printed without ma
 import functools
 import inspect
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -107,7 +107,7 @@ def _load(
         "ground": _ground(ground),
         "gravity": gravity and [_number("--gravity", word, "three numbers") for word in gravity.split(",")],
         "actuators": _actuators(actuators),
-        "packages": dict(_split("--packages", words, "NAME=FOLDER") for words in packages) if packages else None,
+        "packages": dict(split_pair("--packages", words, "NAME=FOLDER") for words in packages) if packages else None,
     }
     options |= {
         "time_step": time_step,
@@ -159,63 +159,35 @@ def _actuators(words: str | None) -> str | list[str] | dict[str, float] | None:
     if not any("=" in name for name in names):
         return names
     efforts = [
-        _split("--actuators", name, "all, names of joints, or an effort for each: NAME=EFFORT") for name in names
+        split_pair("--actuators", name, "all, names of joints, or an effort for each: NAME=EFFORT") for name in names
     ]
     return {name: _number("--actuators", effort, "an effort limit [N or N m]") for name, effort in efforts}
 
 
-def _split(option: str, words: str, expected: str) -> tuple[str, str]:
+def split_pair(option: str, words: str, expected: str) -> tuple[str, str]:
+    """NAME and VALUE of "NAME=VALUE"."""
     name, sign, value = words.partition("=")
     if not (name and sign and value):
         raise InputError(option, got=repr(words), expected=expected)
     return name.strip(), value.strip()
 
 
-def numbers_in(option: str, words: Iterable[str], expected: str) -> dict[str, float]:
-    """Numbers by name, of "NAME=NUMBER" each."""
-    pairs = (_split(option, word, expected) for word in words)
-    return {name: _number(option, value, expected) for name, value in pairs}
-
-
-def pairs_in(option: str, words: Iterable[str], expected: str) -> dict[str, tuple[float, float]]:
-    """Two numbers by name, of "NAME=NUMBER,NUMBER" each."""
-    found = {}
+def numbers_in(option: str, words: Iterable[str], expected: str, *, counts: Container[int] = (1,)) -> dict[str, Any]:
+    """A tuple of numbers by name, of "NAME=NUMBER,NUMBER,..." each, as many as `counts` has."""
+    values: dict[str, Any] = {}
     for word in words:
-        name, value = _split(option, word, expected)
-        first, comma, second = value.partition(",")
-        if not comma:
+        name, text = split_pair(option, word, expected)
+        if name in values:
+            raise InputError(option, got=f"{name} twice", expected="each name once")
+        values[name] = tuple(floats_in(option, text, expected))
+        if len(values[name]) not in counts:
             raise InputError(option, got=repr(word), expected=expected)
-        found[name] = _number(option, first, expected), _number(option, second, expected)
-    return found
+    return values
 
 
 def floats_in(option: str, words: str, expected: str) -> list[float]:
     """The numbers in "1, 2"."""
     return [_number(option, word, expected) for word in words.split(",")]
-
-
-def limits_in(option: str, words: Iterable[str], expected: str) -> dict[str, float | tuple[float, float]]:
-    """By name, of "NAME=NUMBER" or "NAME=NUMBER,NUMBER" each, one number or two."""
-    found: dict[str, float | tuple[float, float]] = {}
-    for word in words:
-        name, value = _split(option, word, expected)
-        numbers = floats_in(option, value, expected)
-        if len(numbers) > 2:
-            raise InputError(option, got=repr(word), expected=expected)
-        found[name] = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
-    return found
-
-
-def poses_in(option: str, words: Iterable[str], expected: str) -> dict[str, tuple[str, list[float]]]:
-    """A body and numbers by name, of "NAME=BODY:NUMBER,NUMBER,..." each."""
-    found = {}
-    for word in words:
-        name, value = _split(option, word, expected)
-        body, colon, numbers = value.rpartition(":")
-        if not (body and colon):
-            raise InputError(option, got=repr(word), expected=expected)
-        found[name] = body, [_number(option, number, expected) for number in numbers.split(",")]
-    return found
 
 
 def _number(option: str, words: str, expected: str) -> float:

@@ -1,4 +1,4 @@
-"""Commands that try many times: robustness, panel."""
+"""Commands that plan, and that try many times: plan, robustness, panel."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -14,23 +14,115 @@ from drake_diff.cli.text import (
     RunDirectory,
     Seed,
     console,
+    floats_in,
     judged,
     names_in,
     names_option,
+    numbers_in,
     out_option,
     plain,
     progress_line,
     show,
+    survived,
     table,
 )
+from drake_diff.exceptions import InputError
 
-COLOURS = {"rigid answer": "green", "right": "green", "own law's": "yellow", "not asked": "dim", "none": "dim"}
+EXAMPLE = "panda"  # what `drake-diff plan` alone plans for
+
+Goals = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=NUMBERS", help="hand=0.4,0,0.5 for a frame or body, in metres, elbow=1.0 for a joint."),
+]
+
+Obstacles = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="SHAPE:NUMBERS", help="sphere:x,y,z,radius or box:x,y,z,length,width,height in metres; repeatable."
+    ),
+]
+NUMBERS = {"sphere": 4, "box": 6}
+
+
+def plan(
+    robot: Annotated[
+        Path | None, typer.Argument(metavar="ROBOT", help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file; else a Panda.")
+    ] = None,
+    goal: Goals = None,
+    avoid: Obstacles = None,
+    time: Annotated[str | None, typer.Option(help="least: as fast as can be; else with the least effort.")] = None,
+    out: Annotated[Path | None, out_option("artifacts/plan_<robot>")] = None,
+    seed: Seed = 0,
+    restarts: Annotated[int, typer.Option(min=0, help="More first guesses, to list other optima.")] = 0,
+) -> None:
+    """Plan a motion of ROBOT: mend its file, solve, write the run directory and verify it.
+
+    Without a goal it goes to a random state that the robot can reach. Exit status 0 only if the plan is verified.
+    """
+    expected = "NAME=x,y,z of a frame, or NAME=number of a joint: numbers with commas between"
+    numbers = numbers_in("--goal", goal or (), expected, counts=range(1, 100))
+    goals = {name: list(values) for name, values in numbers.items()}
+    shapes = [_shape(words) for words in avoid or ()]
+    if robot is not None and not robot.is_file():
+        raise InputError("ROBOT", got=str(robot), expected="a file that exists")
+    # Only here: what is wrong is refused before Drake is loaded.
+    from drake_diff.model.example import example_files
+    from drake_diff.optimize.problem.obstacles import BoxObstacle, SphereObstacle
+    from drake_diff.planning.planner import plan as planned
+    from drake_diff.planning.robot import TIME_STEP
+
+    obstacles = [SphereObstacle(n[:3], n[3]) if kind == "sphere" else BoxObstacle(n[:3], n[3:]) for kind, n in shapes]
+
+    file = robot or example_files()[EXAMPLE]
+    if robot is not None:
+        survived(robot, {"time_step": TIME_STEP})
+    try:
+        with _stages() as report:
+            done = planned(
+                file, goals=goals, avoid=obstacles, time=time, out=out, seed=seed, restarts=restarts, report=report
+            )
+    except KeyboardInterrupt as error:
+        show("; ".join(("interrupted", *getattr(error, "__notes__", ()))))
+        show("drake-diff recover measures the plan there, if there is one")
+        raise typer.Exit(INTERRUPTED) from None
+    show(judged("pass" if done.success else "fail"), f" {file.name}: {done.solution.status.value}")
+    for line in done.lines:
+        show(plain(line))
+    raise typer.Exit(0 if done.success else 1)
+
+
+def _shape(words: str) -> tuple[str, list[float]]:
+    kind, colon, values = words.partition(":")
+    expected = "sphere:x,y,z,radius or box:x,y,z,length,width,height"
+    if not colon or kind not in NUMBERS:
+        raise InputError("--avoid", got=repr(words), expected=expected)
+    numbers = floats_in("--avoid", values, f"numbers with commas between: {expected}")
+    if len(numbers) != NUMBERS[kind]:
+        raise InputError("--avoid", got=repr(words), expected=f"{NUMBERS[kind]} numbers: {expected}")
+    return kind, numbers
+
+
+@contextmanager
+def _stages() -> Iterator[Callable[[str, str], None]]:
+    """Progress by stage: rewritten on a terminal, a line for each stage elsewhere."""
+    last = ""
+    with progress_line("reading") as report:
+
+        def note(stage: str, sentence: str) -> None:
+            nonlocal last
+            if stage != last or console().is_terminal:
+                report(f"{stage:9} {sentence}")
+            last = stage
+
+        yield note
+
+
 EVERY = 5.0  # seconds between two lines of a panel's progress where there is no terminal
 
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to `app`."""
-    for command in (robustness, panel):
+    for command in (plan, robustness, panel):
         app.command()(command)
 
 
