@@ -40,7 +40,8 @@ def struck(random):
     impact = Impact(held, restitution=0.0 if not slides else e, at=floor.terms(x)[2])
     if (floor.terms(x)[1] @ x[model.nq :])[2] > 0:
         x[model.nq :] *= -1
-    if not impact.impulses(x)[-1] > 0:
+    P = impact.impulses(x)
+    if not P[-1] > 0.2 * np.linalg.norm(P):  # it pulls, or nearly does
         return None
     given = (impact.restitution, 0.0 if slides else 1e9)
     by_x = np.eye(model.nx)
