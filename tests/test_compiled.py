@@ -1,5 +1,7 @@
 """Compiled functions against other forms of the same: NumPy's of a tree, AutoDiffXd of a step."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.robots import example_robot, state_in_contact, state_in_range
@@ -8,29 +10,15 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.derivatives.contact import jacobian as of_contact
 from drake_diff.mechanics import compiled_tree as of_trees
+from drake_diff.mechanics import tree_kernel
 from drake_diff.mechanics.compiled_tree import compiled_tree
 from drake_diff.mechanics.description import describe_tree
-from drake_diff.mechanics.tree import tree_of
 
 pytest.importorskip("pinocchio")
 
 
 def _largest(a, b):
     return float(np.abs(a - b).max() / np.abs(b).max())
-
-
-@each_row("name", ["go2.urdf", "simple_humanoid.urdf", "panda.urdf", "allegro_left_hand.urdf"])
-def test_a_compiled_tree_is_numpys(name):
-    model, random = example_robot(name), np.random.default_rng(1)
-    xs, a = np.array([state_in_range(model, random) for _ in range(5)]), random.standard_normal((5, model.nv))
-    q, v = xs[:, : model.nq], xs[:, model.nq :]
-    q[:, :4] *= 1.3 if model.nq > model.nv else 1.0  # a quaternion's norm means nothing
-    ours, tree = compiled_tree(describe_tree(model))(q, v, a), tree_of(model, free=True)
-    moving = tree.moving(tree.place_all(model, q), v)
-    tau, by_q, by_v = moving.derivatives(a)
-    # Sums in another order, of terms up to a hundred times as large as what they amount to.
-    found = ((ours.S, moving.S), (ours.mass, moving.mass), (ours.tau, tau), (ours.by_q, by_q), (ours.by_v, by_v))
-    assert all(_largest(*pair) < 1e-12 for pair in found)
 
 
 def test_the_slope_of_a_trees_inertia_is_its_difference():
@@ -67,22 +55,21 @@ def test_steps_with_impulses_are_autodiffs(approximation, time_step):
 @each_row("table", ["mass", "center", "moves"])
 def test_a_wrong_number_in_the_tables_is_found_out(table, monkeypatch):
     """By Drake's solution, which does not solve such a step, or by AutoDiffXd's Jacobian."""
-    module, kind = (of_trees, "Tree") if table in ("mass", "center") else (of_contact, "Plant")
-    right = module.kernel
-
-    def planted(name):
-        module = right(name)
-        plain = getattr(module, kind)
-
-        class Patched:
-            def __getattr__(self, wanted):
-                return (lambda *a: _off(plain(*a), table)) if wanted == kind else getattr(module, wanted)
-
-        return Patched()
-
     model, random = example_robot("solo12.urdf", feet=True), np.random.default_rng(4)
     x, u = state_in_contact(model, random), random.uniform(-1, 1, model.nu)
-    monkeypatch.setattr(module, "kernel", planted)
+    if table in ("mass", "center"):
+        right = of_trees.compile_links
+        monkeypatch.setattr(
+            of_trees, "compile_links", lambda *a: replace(right(*a), tables=_off(right(*a).tables, table))
+        )
+    else:
+        module = of_contact.kernel(of_contact.KERNEL)
+
+        class Patched:
+            def __getattr__(self, name):
+                return (lambda *a: _off(module.Plant(*a), table)) if name == "Plant" else getattr(module, name)
+
+        monkeypatch.setattr(of_contact, "kernel", lambda name: Patched())
     assert dd.differentiate_step(model, x, u).method != "analytic"
 
 
@@ -102,6 +89,6 @@ def test_nothing_is_compiled_for_more_than_one_kind_of_arguments():
     dd.linearize(model, xs[:1], us[:1])
     dd.linearize(model, np.asfortranarray(xs), us)
     dd.differentiate_step(model, xs[0], us[0])
-    for module, names in ((of_trees, ["differentiate_tree"]), (of_contact, ["overlapping", "touch", "step_jacobians"])):
-        functions = [getattr(module.kernel(module.KERNEL), name) for name in names]
-        assert [len(function.signatures) for function in functions] == [1] * len(names)
+    of_steps = of_contact.kernel(of_contact.KERNEL)
+    functions = of_steps.overlapping, of_steps.touch, of_steps.step_jacobians, tree_kernel.differentiate_tree
+    assert [len(function.signatures) for function in functions] == [1, 1, 1, 1]

@@ -115,9 +115,8 @@ def test_a_form_that_moves_otherwise_is_found_out(wrong, monkeypatch):
     plain = smooth_roll.SmoothRoll.__call__
 
     def planted(self, *args):
-        tree = list(self.tree)
-        tree[8] = wrong * tree[8]  # the links' masses
-        return plain(SmoothRoll(self.smooth, tuple(tree), self.forces), *args)
+        tree = self.tree._replace(mass=wrong * self.tree.mass)
+        return plain(SmoothRoll(self.smooth, tree, self.forces), *args)
 
     monkeypatch.setattr(smooth_roll.SmoothRoll, "__call__", planted)
     result, xs, us = searched(problem)

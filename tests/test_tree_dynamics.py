@@ -1,9 +1,12 @@
 """Inverse dynamics of trees by their own formulas: closed forms, and Drake's AutoDiffXd entry by entry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.models import Plant, robot_file
 from helpers.plants import pd_pendulum, random_tree
+from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.tree import (
@@ -17,7 +20,8 @@ from pydrake.multibody.tree import (
 import drake_diff as dd
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import ModelWarning
-from drake_diff.mechanics.tree import TreeDynamics, tree_for, tree_of
+from drake_diff.mechanics.description import coordinates_of
+from drake_diff.mechanics.tree import ForwardDynamics, tree_for, tree_of
 from drake_diff.model.parameters import applied, select
 
 
@@ -25,7 +29,7 @@ def at(model, q, v, a):
     """The tree's inverse dynamics at states (N, n)."""
     tree = tree_of(model)
     q, v, a = (np.atleast_2d(z).astype(float) for z in (q, v, a))
-    return tree(tree.place(model, q), q, v, a)
+    return tree(q, v, a)
 
 
 def by_drake(model, x, a):
@@ -143,7 +147,8 @@ def test_a_tree_that_is_not_drakes_is_not_used(monkeypatch):
 
     def wrong(model):
         tree = real(model)
-        return TreeDynamics(**{**vars(tree), "inertia": tree.inertia * 1.001})
+        tables = tree.compiled.tables
+        return replace(tree, compiled=replace(tree.compiled, tables=tables._replace(inertia=1.001 * tables.inertia)))
 
     monkeypatch.setattr("drake_diff.mechanics.tree.tree_of", wrong)
     model = random_tree(5)
@@ -218,3 +223,47 @@ def test_a_tree_is_not_made_of_another_models_parameters(load, name):
             ours, drakes = (derivatives_along(set_model, x0, us, method=method) for method in ("implicit", "autodiff"))
         for a, b in zip(ours, drakes, strict=True):
             assert pytest.approx(b.A, abs=1e-10) == a.A
+
+
+@each_row("name", ["go2.urdf", "simple_humanoid.urdf"])
+def test_a_floating_robot_is_drakes_entry_by_entry(name):
+    """By small motion: the derivative by a quaternion, of any norm, is that by the turn that it is."""
+    model, random = example_robot(name), np.random.default_rng(1)
+    n, (tree, coordinates) = model.nv, (tree_of(model, free=True), coordinates_of(model))
+    x, a = state_in_range(model, random), random.standard_normal(n)
+    x[:4] *= 1.3
+    q, v = x[: model.nq], x[model.nq :]
+    ours = tree(q[None], v[None], a[None])
+    tau, gradient, mass = by_drake(model, x, a)
+    by_q = ours.by_q[0] @ coordinates.motion(q)
+    for found, wanted in ((ours.tau[0], tau), (by_q, gradient[:, : model.nq]), (ours.by_v[0], gradient[:, model.nq :])):
+        assert found == pytest.approx(wanted, abs=1e-11 * max(1.0, np.abs(wanted).max()))
+    assert ours.mass[0] == pytest.approx(mass, abs=1e-11)
+
+
+@each_row("name", ["panda.urdf", "go2.urdf"])
+def test_accelerations_and_their_derivatives_solve_inverse_dynamics(name):
+    """M a + bias = force; da/dforce = M^-1, and d a = -M^-1 d tau at that a. Second derivatives by differences."""
+    model, random = example_robot(name), np.random.default_rng(4)
+    tree, n = tree_of(model, free=True), model.nv
+    x, force, armature = state_in_range(model, random)[None], random.standard_normal((1, n)), random.uniform(0, 1, n)
+    q, v = x[:, : model.nq], x[:, model.nq :]
+    forward = ForwardDynamics(tree.compiled, armature)
+    by_q, by_v, inverse, a = (z[0] for z in forward.accelerate(q, v, force))
+    moved = tree.compiled(q, v, a[None])
+    np.testing.assert_allclose(moved.tau[0] + armature * a, force[0], atol=1e-9)
+    np.testing.assert_allclose(inverse @ (moved.mass[0] + np.diag(armature)), np.eye(n), atol=1e-9)
+    np.testing.assert_allclose(by_q, -inverse @ moved.by_q[0], atol=1e-9 * np.abs(by_q).max())
+    np.testing.assert_allclose(by_v, -inverse @ moved.by_v[0], atol=1e-9 * np.abs(by_v).max())
+    assert np.isnan(ForwardDynamics(tree.compiled, -1e3 * np.ones(n)).accelerate(q, v, force)[2]).all()
+    if model.nq == n:
+        along, h = random.standard_normal((1, n)), 1e-5
+        bent = forward.bend(q, v, a[None], along)
+        for k, move in enumerate(h * np.eye(n)):
+            ends = [tree.compiled(q + s * move, v, a[None]) for s in (1, -1)]
+            for found, name in zip(bent[:3], ("by_q", "by_v", "mass"), strict=True):
+                slope = (along[0] @ getattr(ends[0], name)[0] - along[0] @ getattr(ends[1], name)[0]) / (2 * h)
+                np.testing.assert_allclose(found[0][:, k], slope, atol=1e-5 * max(1.0, np.abs(slope).max()))
+            faster = [tree.compiled(q, v + s * move, a[None]).by_v[0] for s in (1, -1)]
+            slope = along[0] @ (faster[0] - faster[1]) / (2 * h)
+            np.testing.assert_allclose(bent[3][0][:, k], slope, atol=1e-5 * max(1.0, np.abs(slope).max()))

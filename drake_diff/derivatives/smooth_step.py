@@ -26,7 +26,7 @@ from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.compiled_tree import compiled_tree
 from drake_diff.mechanics.coordinates import Coordinates, native_positions, turn, turn_derivatives, turning
 from drake_diff.mechanics.description import Description, describe_tree
-from drake_diff.mechanics.tree import OwnDynamics, tree_of
+from drake_diff.mechanics.numpy_tree import OwnDynamics, tree_of
 from drake_diff.model.model import Model
 
 # What a limit or a controller at its limit changes in x' is larger; x' known to rounding alone, as x + gap, is not.

@@ -119,4 +119,4 @@ def compiled_forces(
     )
     whole = [own_array(np.array(t, dtype=np.int64) if isinstance(t, list) else t) for t in tables]
     names = {link.joint.body: i for i, link in enumerate(links)}
-    return CompiledForces(CompiledTree(tuple(whole), names, len(forces[1])), forces, own_array(inertial))
+    return CompiledForces(CompiledTree(kernel(TREE).Tree(*whole), names, len(forces[1])), forces, own_array(inertial))

@@ -15,7 +15,7 @@ from drake_diff._base.arrays import Array, cross, own_array, skew
 from drake_diff.identification.compiled import INERTIA, CompiledForces, compiled_forces
 from drake_diff.identification.tree import Grip, Mask, Numbers, Slopes, Tree
 from drake_diff.mechanics.coordinates import rotation
-from drake_diff.mechanics.tree import Moving, TreeDynamics
+from drake_diff.mechanics.numpy_tree import Moving, TreeDynamics
 
 Method = tuple[tuple[Array, ...], Array]  # of Runge and Kutta: the rows of its stages, and its weights
 

@@ -22,7 +22,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.identification.compiled import INERTIA
 from drake_diff.mechanics.description import Link, RigidLink, read_links, springs_of, without_welds
-from drake_diff.mechanics.tree import TreeDynamics, tree_of
+from drake_diff.mechanics.numpy_tree import TreeDynamics, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators
 

@@ -1,4 +1,4 @@
-"""The equations of motion of a tree of hinges and slides as CasADi functions of a knot z = [q, v, u].
+"""The equations of motion of a tree of hinges, slides and free bodies as CasADi functions of a knot z = [q, v, u].
 
     r(q, v, a) = M(q) a + C(q, v) v - gravity - springs + D v,    r(q, v, dv/dt) = B u
 
@@ -14,18 +14,18 @@ quadratic in v and linear in a stays so.
 Whatever the tree leaves out shows in the comparison with Drake's plant, and the model is then refused.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from drake_diff._base.arrays import Array, skew
+from drake_diff._base.arrays import Array
 from drake_diff._base.clock import Pace, check_time
 from drake_diff._base.refusal import Refusal
-from drake_diff.mechanics.description import Link, names_of, read_links, springs_of, without_welds
-from drake_diff.mechanics.tree import TreeDynamics, tree_for, tree_of
+from drake_diff.mechanics.description import Link, RigidLink, read_links, springs_of
+from drake_diff.mechanics.tree import Tree, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
@@ -78,13 +78,13 @@ def _compared(
     here = model.double.state()
     tail = np.zeros(0) if coordinates is None else coordinates.from_values(coordinates.start.values)
     symbols = ca.SX.sym("c", len(tail))
-    plant = _Plant(tree, model)
+    plant = SymbolicTree(tree)
     if vector is not None:
         values = ca.DM(np.asarray(vector.values)) if coordinates is None else _values(coordinates, symbols)
         unknown = plant.move(model, vector, values)
         if unknown:
             return Refusal(f"its parameter {unknown} is no symbol here")
-    functions = _functions(plant, tree, model, symbols, ca.DM(equations.actuation))
+    functions = _functions(plant, model, symbols, ca.DM(equations.actuation))
     probe = random.standard_normal((2, model.nx + model.nu))
     tails = tail + TRIED * random.uniform(0, 1, (2, len(tail))) * np.where(tail == 0, 1.0, tail)
     wanted = []
@@ -110,13 +110,14 @@ def _values(coordinates: ParameterCoordinates, c: Any) -> Any:
     return values
 
 
-def _functions(plant: "_Plant", tree: TreeDynamics, model: Model, c: Any, actuation: Any) -> PlantFunctions:
+def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> PlantFunctions:
     n, width, more = model.nv, model.nx + model.nu, c.numel()
     xu, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", 2 * n), ("mu", n), ("a", n)))
     knot = ca.vertcat(xu, c)
     q, v, u = xu[:n], xu[n : 2 * n], xu[2 * n :]
     pace = Pace()
-    mass, residual = mass_and_residual(plant, tree, q, v)
+    moving = plant.at(q, v)
+    mass, residual = moving.mass(), moving.residual
     pace.go_on()
     factors = ca.ldl(mass)
     solved = ca.ldl_solve(actuation @ u - residual(ca.SX.zeros(n)), *factors)
@@ -162,49 +163,51 @@ def _functions(plant: "_Plant", tree: TreeDynamics, model: Model, c: Any, actuat
     )
 
 
-def plant_of(tree: TreeDynamics, model: Model) -> "_Plant":
-    """The constants of the model's own parameters, for `mass_and_residual`."""
-    return _Plant(tree, model)
-
-
-def mass_and_residual(plant: "_Plant", tree: TreeDynamics, q: Any, v: Any) -> tuple[Any, Callable[[Any], Any]]:
-    """M(q) (n, n), and r (n,) as a function of the acceleration a (n,), at the SX columns q and v (n,)."""
-    coupling, all_q, all_v, E = tree.coupling, q, v, ca.DM.eye(q.numel())
-    if coupling is not None:
-        E = ca.sparsify(ca.DM(coupling.spread))
-        all_q, all_v = E @ q + ca.DM(coupling.offset), E @ v
-    links = _regrouped(plant.links, tree)
-    order = sorted(range(len(links)), key=lambda k: tree.ancestors[k].sum())  # parents first
-    frames = [_frame(link, tree.hinge[k], all_q[k]) for k, link in enumerate(links)]
-
-    def residual(a: Any) -> Any:
-        a = E @ a
-        motion = _inverse_dynamics(links, frames, tree.hinge, order, all_v, a, plant.gravity) + plant.reflected * a
-        return E.T @ (motion + plant.stiffness * (all_q - plant.rest) + plant.damping * all_v)
-
-    return E.T @ (_mass(links, frames, tree.hinge, order) + ca.diag(plant.reflected)) @ E, residual
-
-
 @dataclass(frozen=True, eq=False)
 class _Link:
     """A body in the frame at its joint: `rotation` and `offset` in the parent's at q = 0, and what it weighs."""
 
     parent: int  # -1: the world
+    kind: str  # of the joint
+    q: int  # where its positions start
+    v: int  # and its velocities
     rotation: Any
     offset: Any
     weight: tuple[Any, Any, Any]  # mass, mass times centre of mass, inertia about the joint's origin
 
+    @property
+    def dofs(self) -> range:
+        """Its degrees of freedom."""
+        return range(self.v, self.v + (6 if self.kind == "quaternion_floating" else 1))
 
-class _Plant:
+
+class SymbolicTree:
     """The numbers of a tree, of which `move` makes some symbols."""
 
-    def __init__(self, tree: TreeDynamics, model: Model):
+    def __init__(self, tree: Tree):
         self.tree = tree
-        self.links, self.frames, self.turns = _links(tree, model)
+        self.turns = [np.eye(3) if link.free else _with_z(link.axis) for link in tree.links]
+        self.links = [self._link(link, turn) for link, turn in zip(tree.links, self.turns, strict=True)]
         self.stiffness, self.rest, self.damping, self.reflected = (
             ca.SX(ca.DM(each)) for each in (tree.stiffness, tree.rest, tree.damping, tree.reflected)
         )
         self.gravity = ca.DM(tree.gravity)
+
+    def _link(self, link: RigidLink, turn: Array) -> _Link:
+        before = np.eye(3) if link.parent < 0 else self.turns[link.parent]
+        parts = (
+            before.T @ link.on_parent.rotation().matrix() @ turn,
+            before.T @ link.on_parent.translation(),
+            turn.T @ link.center_of_mass,
+            turn.T @ link.inertia @ turn,
+        )
+        rotation, offset, center, inertia = (ca.DM(np.where(np.abs(a) < ROUNDED, 0.0, a)) for a in parts)
+        weight = _weight(ca.DM(link.mass), center, inertia, about_center=True)
+        return _Link(link.parent, link.joint.kind, link.joint.q_start, link.joint.v_start, rotation, offset, weight)
+
+    def at(self, q: Any, v: Any) -> "MovingTree":
+        """The tree at the SX columns q (nq,) and v (nv,)."""
+        return MovingTree(self, q, v)
 
     def move(self, model: Model, vector: ParameterVector, values: Any) -> str:
         """Set the parameters of `vector` to `values` (np,), an SX; the name of one that it does not know, or ""."""
@@ -217,27 +220,23 @@ class _Plant:
             if quantity == "gravity":
                 self.gravity = value
             elif quantity in OF_JOINTS and label in joints:
-                k = joints[label].v_start
                 if quantity == "offset":
-                    self._shift(model, joints[label], k, value)
+                    self._shift(joints[label], value)
                 else:
-                    getattr(self, OF_JOINTS[quantity])[k] = value
+                    getattr(self, OF_JOINTS[quantity])[joints[label].v_start] = value
             elif quantity not in (*WEIGHS, *OF_MOTORS):
                 return f"{label}.{quantity}"
         self._reflect(model, given)
         self._weigh(listed, bodies_moved, given)
         return ""
 
-    def _shift(self, model: Model, joint: Link, k: int, value: Any) -> None:
-        """Put joint k to `value` (3,) on its parent."""
-        plant, names = model.plant, names_of(model.plant)[0]
-        body = next(plant.get_body(index) for index, name in names.items() if name == joint.parent)
-        plant.SetPositions(model.double.context, np.zeros(plant.num_positions()))
-        link = self.links[k]
-        R = self.frames[link.parent][0] if link.parent >= 0 else np.eye(3)
-        turn = R.T @ plant.EvalBodyPoseInWorld(model.double.context, body).rotation().matrix()
+    def _shift(self, joint: Link, value: Any) -> None:
+        """Put a joint to `value` (3,) on its parent."""
+        k = next(k for k, link in enumerate(self.tree.links) if link.joint.joint == joint.joint)
+        place, pose = self.tree.on[joint.parent]
+        turn = (np.eye(3) if place < 0 else self.turns[place]).T @ pose.rotation().matrix()
         moved = ca.DM(turn) @ (value - ca.DM(joint.on_parent.translation()))
-        self.links[k] = replace(link, offset=link.offset + moved)
+        self.links[k] = replace(self.links[k], offset=self.links[k].offset + moved)
 
     def _reflect(self, model: Model, given: dict[tuple[str, str], Any]) -> None:
         """The rotor inertia of each joint whose motors are among what is given."""
@@ -254,14 +253,11 @@ class _Plant:
 
     def _weigh(self, listed: list[Link], labels: set[str], given: dict[tuple[str, str], Any]) -> None:
         """What the bodies `labels` weigh, on the links that carry them."""
-        by_tree, on, _ = without_welds(listed)
         for body in listed:
-            place, pose = on[body.body]
-            if body.body not in labels or place < 0:
+            k, pose = self.tree.on[body.body]
+            if body.body not in labels or k < 0:
                 continue
-            carrier = by_tree[place].joint
-            k = carrier.v_start
-            turn = self.turns[k].T @ carrier.on_child.rotation().matrix()
+            turn = self.turns[k].T
             R, t = ca.DM(turn @ pose.rotation().matrix()), ca.DM(turn @ pose.translation())
             own = body.mass, body.center_of_mass, body.inertia
             before = _moved(_weight(*own, about_center=True), R, t)
@@ -300,27 +296,7 @@ def _weight_of(body: Link, given: dict[tuple[str, str], Any]) -> tuple[Any, Any,
     return _weight(mass, center, mass * own / body.mass if body.mass else own, about_center=False)  # its unit inertia
 
 
-def _links(tree: TreeDynamics, model: Model) -> tuple[list["_Link"], list[tuple[Array, Array]], list[Array]]:
-    """The bodies in the order of the joints, their frames in the world at q = 0, and how they lie in the bodies."""
-    poses = tree.place_all(model, np.zeros((1, len(tree.mass))))[0]
-    turns = [_with_z(axis) for axis in tree.axis]
-    frames = [(p[:, :3] @ t, p[:, :3] @ o + p[:, 3]) for p, t, o in zip(poses, turns, tree.origin, strict=True)]
-    links: list[_Link] = []
-    for k, turn in enumerate(turns):
-        above = [j for j in np.flatnonzero(tree.ancestors[k]) if j != k]
-        parent = max(above, key=lambda j: tree.ancestors[j].sum(), default=-1)
-        R, p = frames[parent] if above else (np.eye(3), np.zeros(3))
-        m, origin = tree.mass[k], tree.origin[k]
-        moment = tree.moment[k] - m * origin
-        h, o = skew(tree.moment[k]), skew(origin)
-        inertia = tree.inertia[k] + o @ h + h @ o - m * o @ o
-        parts = (R.T @ frames[k][0], R.T @ (frames[k][1] - p), turn.T @ moment, turn.T @ inertia @ turn)
-        rotation, offset, moment, inertia = (ca.DM(np.where(np.abs(a) < ROUNDED, 0.0, a)) for a in parts)
-        links.append(_Link(int(parent), rotation, offset, (ca.DM(m), moment, inertia)))
-    return links, frames, turns
-
-
-def _regrouped(links: list[_Link], tree: TreeDynamics) -> list[_Link]:
+def _regrouped(links: list[_Link]) -> list[_Link]:
     """The same motion with less to compute: inertia that the joint's motion does not show is put on the parent.
 
     Of a hinged body that is diag(Iyy, Iyy, 0), the mass, and the moment of the mass along the axis (Gautier
@@ -328,8 +304,10 @@ def _regrouped(links: list[_Link], tree: TreeDynamics) -> list[_Link]:
     Robotics and Automation 6(3), 1990).
     """
     links = list(links)
-    for k in sorted(np.flatnonzero(tree.hinge).tolist(), key=lambda k: -int(tree.ancestors[k].sum())):
+    for k in reversed(range(len(links))):
         link, (m, h, inertia) = links[k], links[k].weight
+        if link.kind != "revolute":
+            continue
         unseen = m, h[2] * Z, inertia[1, 1] * ca.diag(ca.DM([1, 1, 0]))
         own = inertia - unseen[2]
         links[k] = replace(link, weight=(0.0, ca.vertcat(h[0], h[1], 0), own))
@@ -352,64 +330,154 @@ def _sum(a: Any, b: Any) -> Any:
     return tuple(x + y for x, y in zip(a, b, strict=True))
 
 
-def _frame(link: _Link, hinge: bool, q: Any) -> tuple[Any, Any]:
-    """Rotation and origin of the body's frame in its parent's, at the joint's position q."""
-    if not hinge:
-        return link.rotation, link.offset + link.rotation[:, 2] * q
-    c, s = ca.cos(q), ca.sin(q)
-    turned = ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
-    return link.rotation @ turned, link.offset
+class MovingTree:
+    """A `SymbolicTree` at q and v: where its bodies are, its mass matrix, and its inverse dynamics."""
+
+    def __init__(self, plant: SymbolicTree, q: Any, v: Any):
+        self.plant, self.q, self.v, self.nv = plant, q, v, v.numel()
+        coupling, self.spread = plant.tree.coupling, ca.DM.eye(v.numel())
+        self.all_q, self.all_v = q, v
+        if coupling is not None:
+            self.spread = ca.sparsify(ca.DM(coupling.spread))
+            self.all_q, self.all_v = self.spread @ q + ca.DM(coupling.offset), self.spread @ v
+        self.links = _regrouped(plant.links)
+        self.frames: list[tuple[Any, Any]] = []  # rotation and origin in the parent's frame
+        self.motions: list[tuple[list[Any], list[Any]]] = []  # each dof, angular and linear
+        for link in self.links:
+            frame, motion = self._joint(link)
+            self.frames.append(frame)
+            self.motions.append(motion)
+
+    def _joint(self, link: _Link) -> tuple[tuple[Any, Any], tuple[list[Any], list[Any]]]:
+        none, q = ca.DM(3, 1), self.all_q[link.q]
+        if link.kind == "prismatic":
+            return (link.rotation, link.offset + link.rotation[:, 2] * q), ([none], [Z])
+        if link.kind == "revolute":
+            c, s = ca.cos(q), ca.sin(q)
+            turned = ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
+            return (link.rotation @ turned, link.offset), ([Z], [none])
+        R = quaternion_rotation(self.all_q[link.q : link.q + 4])
+        axes = ca.horzsplit(R.T)
+        place = link.offset + link.rotation @ self.all_q[link.q + 4 : link.q + 7]
+        return (link.rotation @ R, place), ([*axes, *(3 * [none])], [*(3 * [none]), *axes])
+
+    @property
+    def position_rates(self) -> Any:
+        """(nq,) q' of a tree without coupling."""
+        rates = ca.SX.zeros(self.q.numel())
+        for link in self.links:
+            if link.kind != "quaternion_floating":
+                rates[link.q] = self.v[link.v]
+                continue
+            w, x = self.v[link.v : link.v + 3], self.q[link.q : link.q + 4]
+            rates[link.q : link.q + 4] = ca.vertcat(-ca.dot(x[1:], w), x[0] * w - ca.cross(x[1:], w)) / 2
+            rates[link.q + 4 : link.q + 7] = self.v[link.v + 3 : link.v + 6]
+        return rates
+
+    def residual(self, a: Any) -> Any:
+        """(nv,) r at the acceleration a (nv,)."""
+        plant, a = self.plant, self.spread @ a
+        motion = self._inverse_dynamics(a) + plant.reflected * a + plant.damping * self.all_v
+        return self.spread.T @ (motion + plant.stiffness * self._stretch())
+
+    def _stretch(self) -> Any:
+        tree = self.plant.tree
+        stretched = ca.SX.zeros(len(tree.stiffness))
+        for k, i in enumerate(tree.positions):
+            if not tree.free[k]:
+                stretched[k] = self.all_q[int(i)] - self.plant.rest[k]
+        return stretched
+
+    def mass(self) -> Any:
+        """(nv, nv): column k are the forces that the bodies which joint k carries need for its acceleration alone."""
+        carried, n = [link.weight for link in self.links], self.all_v.numel()
+        mass = ca.SX.zeros(n, n)
+        for k in reversed(range(len(self.links))):
+            m, h, inertia = carried[k]
+            for dof, angular, linear in zip(self.links[k].dofs, *self.motions[k], strict=True):
+                force, moment = m * linear + ca.cross(angular, h), inertia @ angular + ca.cross(h, linear)
+                j = k
+                while j >= 0:
+                    for other, turn, slide in zip(self.links[j].dofs, *self.motions[j], strict=True):
+                        mass[other, dof] = mass[dof, other] = ca.dot(turn, moment) + ca.dot(slide, force)
+                    force, moment = _to_parent(force, moment, *self.frames[j])
+                    j = self.links[j].parent
+            parent = self.links[k].parent
+            if parent >= 0:
+                carried[parent] = _sum(carried[parent], _moved(carried[k], *self.frames[k]))
+        return self.spread.T @ (mass + ca.diag(self.plant.reflected)) @ self.spread
+
+    def _inverse_dynamics(self, acceleration: Any) -> Any:
+        """(n,) the joints' forces of the bodies' inertia and weight: motion outwards, forces inwards."""
+        zero = ca.DM(3, 1)
+        motions: dict[int, Any] = {-1: (zero, zero, -self.plant.gravity)}
+        forces: list[Any] = []
+        for k, link in enumerate(self.links):
+            R, p = self.frames[k]
+            w, dw, a = motions[link.parent]
+            a = R.T @ (a + ca.cross(dw, p) + ca.cross(w, ca.cross(w, p)))
+            w, dw = R.T @ w, R.T @ dw
+            spin = slide = push = pull = zero
+            for dof, turn, way in zip(link.dofs, *self.motions[k], strict=True):
+                spin, slide = spin + turn * self.all_v[dof], slide + way * self.all_v[dof]
+                push, pull = push + turn * acceleration[dof], pull + way * acceleration[dof]
+            a = a + 2 * ca.cross(w, slide) + pull
+            w, dw = w + spin, dw + ca.cross(w, spin) + push
+            motions[k] = w, dw, a
+            m, h, inertia = link.weight
+            force = m * a + ca.cross(dw, h) + ca.cross(w, ca.cross(w, h))
+            forces.append((force, inertia @ dw + ca.cross(w, inertia @ w) + ca.cross(h, a)))
+        tau = ca.SX.zeros(self.all_v.numel())
+        for k in reversed(range(len(self.links))):
+            force, moment = forces[k]
+            for dof, turn, way in zip(self.links[k].dofs, *self.motions[k], strict=True):
+                tau[dof] = ca.dot(turn, moment) + ca.dot(way, force)
+            parent = self.links[k].parent
+            if parent >= 0:
+                turned = _to_parent(force, moment, *self.frames[k])
+                forces[parent] = forces[parent][0] + turned[0], forces[parent][1] + turned[1]
+        return tau
+
+    @cached_property
+    def _in_world(self) -> tuple[list[tuple[Any, Any]], list[list[int]], Any]:
+        """Of each link rotation and origin, and the dofs that move it; and (6, nv) the motion of each dof in world.
+
+        [angular; linear] about the world's origin.
+        """
+        places: list[tuple[Any, Any]] = []
+        above: list[list[int]] = []
+        S = ca.SX(6, self.nv)
+        for link, (R, p), motion in zip(self.links, self.frames, self.motions, strict=True):
+            if link.parent >= 0:
+                R_up, p_up = places[link.parent]
+                R, p = R_up @ R, p_up + R_up @ p
+            places.append((R, p))
+            above.append([*(above[link.parent] if link.parent >= 0 else []), *link.dofs])
+            for dof, turn, way in zip(link.dofs, *motion, strict=True):
+                axis = R @ turn
+                S[:, dof] = ca.vertcat(axis, ca.cross(p, axis) + R @ way)
+        return places, above, S
+
+    @property
+    def S(self) -> Any:
+        """(6, nv) the motion of each degree of freedom at unit speed, [angular; linear] in world about its origin."""
+        return self._in_world[2]
+
+    def body(self, name: str) -> tuple[Any, Any, list[int]]:
+        """Rotation and origin of a body in world, and the degrees of freedom that move it."""
+        place, pose = self.plant.tree.on[name]
+        R, p = ca.DM(pose.rotation().matrix()), ca.DM(pose.translation())
+        if place < 0:
+            return R, p, []
+        places, above, _ = self._in_world
+        turn = places[place][0] @ ca.DM(self.plant.turns[place].T)
+        return turn @ R, places[place][1] + turn @ p, above[place]
 
 
-def _inverse_dynamics(
-    links: list[_Link], frames: list[Any], hinge: Any, order: list[int], v: Any, acceleration: Any, gravity: Any
-) -> Any:
-    """(n,) the joints' forces of the bodies' inertia and weight: motion outwards, forces inwards."""
-    n, zero = len(links), ca.DM.zeros(3)
-    motions: dict[int, Any] = {-1: (zero, zero, -gravity)}
-    forces: dict[int, Any] = {}
-    for k in order:
-        link, (R, p) = links[k], frames[k]
-        w, dw, a = motions[link.parent]
-        a = R.T @ (a + ca.cross(dw, p) + ca.cross(w, ca.cross(w, p)))
-        w, dw, spin, push = R.T @ w, R.T @ dw, Z * v[k], Z * acceleration[k]
-        if hinge[k]:
-            dw = dw + ca.cross(w, spin) + push
-            w = w + spin
-        else:
-            a = a + 2 * ca.cross(w, spin) + push
-        motions[k] = w, dw, a
-        m, h, inertia = link.weight
-        force = m * a + ca.cross(dw, h) + ca.cross(w, ca.cross(w, h))
-        moment = inertia @ dw + ca.cross(w, inertia @ w) + ca.cross(h, a)
-        forces[k] = force, moment
-    tau = ca.SX.zeros(n)
-    for k in reversed(order):
-        force, moment = forces[k]
-        tau[k] = moment[2] if hinge[k] else force[2]
-        if links[k].parent >= 0:
-            force, moment = _to_parent(force, moment, *frames[k])
-            f, m = forces[links[k].parent]
-            forces[links[k].parent] = f + force, m + moment
-    return tau
-
-
-def _mass(links: list[_Link], frames: list[Any], hinge: Any, order: list[int]) -> Any:
-    """(n, n): column k are the forces that the bodies which joint k carries need for its acceleration alone."""
-    carried = [link.weight for link in links]
-    mass = ca.SX.zeros(len(links), len(links))
-    for k in reversed(order):
-        m, h, inertia = carried[k]
-        force, moment = (ca.cross(Z, h), inertia @ Z) if hinge[k] else (m * Z, ca.cross(h, Z))
-        j = k
-        while j >= 0:
-            mass[j, k] = mass[k, j] = moment[2] if hinge[j] else force[2]
-            force, moment = _to_parent(force, moment, *frames[j])
-            j = links[j].parent
-        parent = links[k].parent
-        if parent >= 0:
-            carried[parent] = _sum(carried[parent], _moved(carried[k], *frames[k]))
-    return mass
+def quaternion_rotation(q: Any) -> Any:
+    """(3, 3) of a quaternion (w, x, y, z) of any norm, as Drake reads one."""
+    S, scale = ca.skew(q[1:]), 2 / ca.sumsqr(q)
+    return ca.SX.eye(3) + scale * (q[0] * S + S @ S)
 
 
 def _to_parent(force: Any, moment: Any, R: Any, p: Any) -> tuple[Any, Any]:

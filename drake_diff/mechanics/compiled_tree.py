@@ -1,13 +1,14 @@
 """The tables of a tree of hinges, slides and free bodies for `tree_kernel`, and what it makes of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_diff._base.arrays import Array, own_array
-from drake_diff._base.compiled import kernel
-from drake_diff.mechanics.description import Description
+from drake_diff.mechanics import tree_kernel
+from drake_diff.mechanics.description import Description, Link
 
 KERNEL = "drake_diff.mechanics.tree_kernel"
 
@@ -29,37 +30,37 @@ class Moved:
 class CompiledTree:
     """A tree whose kernel is compiled."""
 
-    tables: tuple[Array, ...]
+    tables: tree_kernel.Tree
     links: dict[str, int]  # by their bodies' names
     nv: int
 
     def __call__(self, q: Array, v: Array, a: Array, *, derivatives: bool = True) -> Moved:
         """At q (N, nq), v and a (each (N, nv)), in Drake's coordinates; `slope`, `by_q` and `by_v` are 0 without."""
-        N, n, compiled = len(q), self.nv, kernel(KERNEL)
+        N, n = len(q), self.nv
         point = own_array(q), own_array(v), own_array(a)
         poses, S, tau = np.empty((N, len(self.links), 3, 4)), np.empty((N, n, 6)), np.empty((N, n))
         mass, slope, by_q, by_v = np.empty((4, N, n, n))
-        compiled.differentiate_tree(
-            compiled.Tree(*self.tables), *point, derivatives, poses, S, mass, slope, tau, by_q, by_v
-        )
+        tree_kernel.differentiate_tree(self.tables, *point, derivatives, poses, S, mass, slope, tau, by_q, by_v)
         return Moved(poses, S, mass, slope, tau, by_q, by_v)
 
 
 def compiled_tree(description: Description) -> CompiledTree | None:
-    """None where Numba is not installed, or a free body is not joined to the world by its own frame."""
-    links, compiled = description.links, kernel(KERNEL)
+    """None where a free body is not joined to the world by its own frame."""
+    return compile_links(description.links, description.gravity, description.coordinates.nv)
+
+
+def compile_links(links: Sequence[Link], gravity: Array, nv: int) -> CompiledTree | None:
+    """Of all links, parents before their children; None as of `compiled_tree`."""
     identity = RigidTransform()
     for link in links:
-        own = link.on_parent.IsExactlyEqualTo(identity) and link.on_child.IsExactlyEqualTo(identity)
-        if link.kind == "quaternion_floating" and (link.parent != "world" or not own):
+        has_identity = link.on_parent.IsExactlyEqualTo(identity) and link.on_child.IsExactlyEqualTo(identity)
+        if link.kind == "quaternion_floating" and (link.parent != "world" or not has_identity):
             return None
-    if compiled is None:
-        return None
     kinds = {
-        "weld": compiled.WELD,
-        "revolute": compiled.HINGE,
-        "prismatic": compiled.SLIDE,
-        "quaternion_floating": compiled.FREE,
+        "weld": tree_kernel.WELD,
+        "revolute": tree_kernel.HINGE,
+        "prismatic": tree_kernel.SLIDE,
+        "quaternion_floating": tree_kernel.FREE,
     }
     number = {link.body: i for i, link in enumerate(links)}
     joint_of, parents, first, count = {"world": -1}, [], [], []
@@ -72,7 +73,7 @@ def compiled_tree(description: Description) -> CompiledTree | None:
             count.append(3 if len(starts) == 2 else 1)
             joint_of[link.body] = len(parents) - 1
     axes = [link.axis / (np.linalg.norm(link.axis) if link.kind in ("revolute", "prismatic") else 1) for link in links]
-    tables = (
+    tables: tuple[Array, ...] = (
         _whole([number.get(link.parent, -1) for link in links]),
         _whole([kinds[link.kind] for link in links]),
         _whole([joint_of[link.body] for link in links]),
@@ -87,9 +88,9 @@ def compiled_tree(description: Description) -> CompiledTree | None:
         _whole(parents),
         _whole(first),
         _whole(count),
-        np.array(description.gravity, dtype=float),
+        np.array(gravity, dtype=float),
     )
-    return CompiledTree(tuple(map(own_array, tables)), number, description.coordinates.nv)
+    return CompiledTree(tree_kernel.Tree(*map(own_array, tables)), number, nv)
 
 
 def _whole(numbers: list[int]) -> Array:

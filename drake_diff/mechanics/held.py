@@ -19,9 +19,9 @@ from pydrake.autodiffutils import InitializeAutoDiff
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
-from drake_diff.mechanics.casadi_tree import SAME_PLANT, agrees, mass_and_residual, plant_of
+from drake_diff.mechanics.casadi_tree import SAME_PLANT, SymbolicTree, agrees
 from drake_diff.mechanics.symbol import Symbol, called, symbols
-from drake_diff.mechanics.tree import TreeDynamics, tree_for, tree_of
+from drake_diff.mechanics.tree import Tree, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
@@ -54,7 +54,7 @@ class HeldPlant:
     speeds: Callable[[Any], Any]
     rows: Indices  # (m,) of those, that some joint moves
     equations: EquationsOfMotion
-    tree: TreeDynamics
+    tree: Tree
 
     def values(self, knots: Array) -> Array:
         """(K, nx) dx/dt at `knots` (K, nx + nu), by Drake's own mass matrix, bias and velocities."""
@@ -103,9 +103,9 @@ class HeldPlant:
         q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
         speed = _column(np.asarray(self.speeds(symbols(knot[: 2 * n]))).ravel()[self.rows])
         J = ca.jacobian(speed, v)
-        mass, residual = mass_and_residual(plant_of(self.tree, model), self.tree, q, v)
-        factors = ca.ldl(mass)
-        free = ca.ldl_solve(ca.DM(self.equations.actuation) @ u - residual(ca.SX.zeros(n)), *factors)
+        moving = SymbolicTree(self.tree).at(q, v)
+        factors = ca.ldl(moving.mass())
+        free = ca.ldl_solve(ca.DM(self.equations.actuation) @ u - moving.residual(ca.SX.zeros(n)), *factors)
         pushed = ca.ldl_solve(ca.SX(ca.densify(J.T)), *factors)
         inner = ca.ldl(ca.densify(J @ pushed))
         forces = ca.ldl_solve(-(ca.jacobian(speed, q) @ v + J @ free), *inner)

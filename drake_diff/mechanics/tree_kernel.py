@@ -1,6 +1,6 @@
 """A tree's places, motions, inertia and inverse dynamics with their derivatives, state by state: compiled.
 
-The formulas are those of `mechanics.tree`, which says what they are: spatial vectors are [angular; linear] in world
+The formulas are in `mechanics.tree`: spatial vectors are [angular; linear] in world
 about its origin. Each loop goes along a joint's own ancestors only. Kept apart as Numba compiles what is in here.
 """
 
@@ -38,6 +38,27 @@ class Tree(NamedTuple):
     first: Whole  # (J,) in v
     size: Whole  # (J,) degrees of freedom
     gravity: Array  # (3,)
+
+
+class Forces(NamedTuple):
+    """What acts beside the tree's own inertia and gravity, by its nv velocities."""
+
+    time_step: float
+    armature: Array  # (nv,)
+    stiffness: Array  # (nv,)
+    damping: Array  # (nv,)
+    rest: Array  # (nv,)
+    actuation: Array  # (nv, nu)
+    limit: Array  # (nu,) of inputs that are clipped
+
+
+class Bounds(NamedTuple):
+    """(nu,) each: from `lowest` down an input is on its lower bound, from `highest` up on its upper one."""
+
+    lowest: Array
+    highest: Array
+    lower: Array
+    upper: Array
 
 
 @compiled
@@ -339,9 +360,9 @@ def differentiate_tree(
 
 
 @compiled
-def solve(M: Array, a: Array) -> bool:
-    """a = M^-1 a by L D L', which takes M's place; False if it is not positive definite."""
-    n = len(a)
+def _factor(M: Array) -> bool:
+    """L D L' = M in the lower half of M, D on the diagonal; False if it is not positive definite."""
+    n = len(M)
     for i in range(n):
         for j in range(i):
             total = M[i, j]
@@ -356,6 +377,13 @@ def solve(M: Array, a: Array) -> bool:
         if not d > 0:
             return False
         M[i, i] = d
+    return True
+
+
+@compiled
+def _back_substitute(M: Array, a: Array) -> None:
+    """a = (L D L')^-1 a of what `_factor` left in M."""
+    n = len(a)
     for i in range(n):
         for k in range(i):
             a[i] -= M[i, k] * a[k]
@@ -364,4 +392,142 @@ def solve(M: Array, a: Array) -> bool:
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
             a[i] -= M[k, i] * a[k]
+
+
+@compiled
+def solve(M: Array, a: Array) -> bool:
+    """a = M^-1 a by L D L', which takes M's place; False if it is not positive definite."""
+    if not _factor(M):
+        return False
+    _back_substitute(M, a)
+    return True
+
+
+@compiled
+def differentiate_acceleration(
+    t: Tree,
+    q: Array,
+    v: Array,
+    force: Array,
+    armature: Array,
+    by_q: Array,
+    by_v: Array,
+    inverse: Array,
+    acceleration: Array,
+) -> None:
+    """At N states the accelerations a (N, nv) under generalized forces (N, nv), and their derivatives (N, nv, nv) each.
+
+    By small motion, by v, and by the forces, which is the inverse of the mass matrix with the `armature` (nv,). All are
+    NaN where that is not positive definite.
+    """
+    n, L = v.shape[1], len(t.kind)
+    poses, S, tau = np.empty((1, L, 3, 4)), np.empty((1, n, 6)), np.empty((1, n))
+    mass, slope, tau_q, tau_v = np.empty((1, n, n)), np.empty((1, n, n)), np.empty((1, n, n)), np.empty((1, n, n))
+    a, column = np.empty((1, n)), np.empty(n)
+    for k in range(len(q)):
+        a[0] = 0.0
+        differentiate_tree(t, q[k : k + 1], v[k : k + 1], a, False, poses, S, mass, slope, tau, tau_q, tau_v)
+        for i in range(n):
+            mass[0, i, i] += armature[i]
+        definite = _factor(mass[0])
+        for j in range(n):
+            for i in range(n):
+                column[i] = 0.0
+            column[j] = 1.0
+            _back_substitute(mass[0], column)
+            for i in range(n):
+                inverse[k, i, j] = column[i] if definite else np.nan
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += inverse[k, i, j] * (force[k, j] - tau[0, j])
+            a[0, i] = acceleration[k, i] = total
+        differentiate_tree(t, q[k : k + 1], v[k : k + 1], a, True, poses, S, mass, slope, tau, tau_q, tau_v)
+        for i in range(n):
+            for c in range(n):
+                by_q[k, i, c], by_v[k, i, c] = 0.0, 0.0
+            for j in range(n):
+                part = inverse[k, i, j]
+                for c in range(n):
+                    by_q[k, i, c] -= part * tau_q[0, j, c]
+                    by_v[k, i, c] -= part * tau_v[0, j, c]
+
+
+@compiled
+def roll(
+    tree: Tree,
+    forces: Forces,
+    bounds: Bounds,
+    old: Array,
+    gaps: Array,
+    wanted: Array,
+    gains: Array,
+    xs: Array,
+    us: Array,
+) -> bool:
+    """Fill us (N, nu) = wanted + gains (N, nu, nx) (xs - old), within bounds, and xs (N+1, nx) from xs[0] on.
+
+    Each step leads to what it leaves less its gap (N, nx). False where a mass matrix is not positive definite.
+    """
+    count, nu = us.shape
+    nx = xs.shape[1]
+    n, J, h = nx // 2, len(tree.parent), forces.time_step
+    parent, first = tree.parent, tree.first
+    poses, S, own = np.empty((len(tree.kind), 3, 4)), np.empty((n, 6)), np.empty((J, 10))
+    V, A, F, momentum = np.empty((J + 1, 6)), np.empty((J + 1, 6)), np.empty((J, 6)), np.empty((1, 6))
+    M, a = np.zeros((n, n)), np.empty(n)
+    V[J], A[J] = 0.0, 0.0  # the world's
+    for i in range(3):
+        A[J, 3 + i] = -tree.gravity[i]
+    for k in range(count):
+        x = xs[k]
+        for i in range(nu):
+            u = wanted[k, i]
+            for c in range(nx):
+                u += gains[k, i, c] * (x[c] - old[k, c])
+            if u <= bounds.lowest[i]:
+                u = bounds.lower[i]
+            elif u >= bounds.highest[i]:
+                u = bounds.upper[i]
+            us[k, i] = u
+        _place(tree, x[:n], poses, S, own)
+        for j in range(J):
+            s, up = first[j], parent[j] if parent[j] >= 0 else J
+            speed = x[n + s]
+            for i in range(6):
+                V[j, i], A[j, i], F[j, i], momentum[0, i] = V[up, i], A[up, i], 0.0, 0.0
+            _add_cross(V, up, S, s, momentum, 0)
+            for i in range(6):
+                V[j, i] += S[s, i] * speed
+                A[j, i] += momentum[0, i] * speed
+            _times(own, j, A, j, F, j)
+            _times(own, j, V, j, momentum, 0)
+            _add_cross_force(V, j, momentum, 0, F, j)
+        for j in range(J - 1, -1, -1):
+            s, up = first[j], parent[j]
+            total = forces.rest[s] - forces.damping[s] * x[n + s] - forces.stiffness[s] * x[s] - _dot(S, s, F, j)
+            for i in range(nu):
+                total += forces.actuation[s, i] * min(max(us[k, i], -forces.limit[i]), forces.limit[i])
+            a[s] = total
+            _times(own, j, S, s, momentum, 0)
+            M[s, s] = _dot(momentum, 0, S, s) + forces.armature[s]
+            above = up
+            while above >= 0:
+                c = first[above]
+                M[s, c] = M[c, s] = _dot(momentum, 0, S, c)
+                above = parent[above]
+            if up >= 0:
+                for i in range(10):
+                    own[up, i] += own[j, i]
+                for i in range(6):
+                    F[up, i] += F[j, i]
+        if not solve(M, a):
+            return False
+        for s in range(n):
+            v = x[n + s] + h * a[s]
+            xs[k + 1, n + s] = v - gaps[k, n + s]
+            xs[k + 1, s] = x[s] + h * v - gaps[k, s]
+        for r in range(n):
+            for c in range(n):
+                M[r, c] = 0.0
     return True

@@ -6,22 +6,19 @@ a search in the end is rolled out by Drake itself.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, own_array
-from drake_diff._base.compiled import kernel
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import ModelError
+from drake_diff.mechanics import tree_kernel
 from drake_diff.mechanics.compiled_tree import compiled_tree
 from drake_diff.mechanics.description import describe_tree
 from drake_diff.model.counted import stepped
 from drake_diff.model.model import Model
-
-KERNEL = "drake_diff.mechanics.roll_kernel"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,25 +26,25 @@ class SmoothRoll:
     """What does not change from motion to motion."""
 
     smooth: SmoothStep
-    tree: tuple[Array, ...]  # the tables of a `tree_kernel.Tree`
-    forces: tuple[Any, ...]  # those of `roll_kernel.Forces`
+    tree: tree_kernel.Tree
+    forces: tree_kernel.Forces
 
     def __call__(
         self, x0: Array, old: Array, gaps: Array, wanted: Array, gains: Array, bounds: tuple[Array, ...]
     ) -> tuple[Array, Array] | None:
         """(xs (N+1, nx), us (N, nu)), us = wanted + gains (xs - old) within bounds, each step less its gap (N, nx).
 
-        `gains` (N, nu, nx), `bounds` those of `roll_kernel.Bounds`. None where a joint comes to its limit, or anything
+        `gains` (N, nu, nx), `bounds` those of `tree_kernel.Bounds`. None where a joint comes to its limit, or anything
         is not finite.
         """
-        compiled, (count, nu), nx = kernel(KERNEL), wanted.shape, len(x0)
+        (count, nu), nx = wanted.shape, len(x0)
         xs, us = np.empty((count + 1, nx)), np.empty((count, nu))
         xs[0] = x0
         stepped(count)
-        told = [np.array(part, float, order="C") for part in (old, gaps, wanted, gains)]
-        compiled_bounds = compiled.Bounds(*(np.array(part, float, order="C") for part in bounds))
-        tables = compiled.Tree(*self.tree), compiled.Forces(*self.forces)
-        if not compiled.roll(*tables, compiled_bounds, *told, xs, us) or not np.isfinite(xs).all():
+        old, gaps, wanted, gains = (np.array(part, float, order="C") for part in (old, gaps, wanted, gains))
+        limits = tree_kernel.Bounds(*(np.array(part, float, order="C") for part in bounds))
+        is_solved = tree_kernel.roll(self.tree, self.forces, limits, old, gaps, wanted, gains, xs, us)
+        if not is_solved or not np.isfinite(xs).all():
             return None
         ends, n = xs[1:] + gaps, nx // 2
         ahead = xs[:-1, :n] + 2 * self.smooth.time_step * ends[:, n:]
@@ -85,5 +82,5 @@ def _make(model: Model) -> SmoothRoll | None:
         smooth.form.actuation,
         smooth.limit,
     )
-    forces = (float(model.time_step), *(own_array(np.asarray(part, dtype=float)) for part in arrays))
+    forces = tree_kernel.Forces(float(model.time_step), *(own_array(np.asarray(part, dtype=float)) for part in arrays))
     return SmoothRoll(smooth, tree.tables, forces)

@@ -81,9 +81,7 @@ def _work(plant: FlowPlant, flow: Flow, materials: Array) -> Array:
 def _powers(plant: FlowPlant, pushing: tuple[int, ...]) -> Any:
     """(x, u, materials) -> (3,) [W] of actuators, damping and contact."""
     description, tree = plant.description, plant.tree
-    limits = ca.DM(description.effort_limits)
-    effort = ca.fmin(ca.fmax(plant.u, -limits), limits) if plant.u.numel() else plant.u
-    driven = ca.DM(description.actuation) @ effort
+    driven = ca.DM(description.actuation) @ plant.effort
     push = ca.SX.zeros(plant.model.nv)
     for i in pushing:
         push += plant.touches[i].force

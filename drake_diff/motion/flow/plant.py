@@ -21,16 +21,18 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.derivatives.contact.active_contacts import ContactPairs, read_pairs
+from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.contact.active_contacts import read_pairs
 from drake_diff.derivatives.contact.laws import QUANTITIES, Material, MaterialChange, combine
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
-from drake_diff.mechanics.description import describe
+from drake_diff.mechanics.casadi_tree import SymbolicTree
+from drake_diff.mechanics.description import describe, names_of
+from drake_diff.mechanics.tree import tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import proximity_property
 from drake_diff.model.step import set_state
 from drake_diff.motion.dormand_prince import ERROR, STAGES
 from drake_diff.motion.flow.shapes import distance_of, edges_of
-from drake_diff.motion.flow.tree import Tree
 
 STICTION_SPEED = 1e-3  # v_s [m/s], Drake's default in continuous time
 MOST_PARTS = 200  # sets of contacts whose equations are kept
@@ -65,17 +67,21 @@ class FlowPlant:
         self.x, self.u, self.materials = (
             ca.SX.sym(name, size) for name, size in (("x", model.nx), ("u", model.nu), ("materials", 4 * count))
         )
-        self.tree = Tree(self.description, model, self.x)
-        self._force = self.tree.force(self.u)
+        tree = tree_of(model, free=True)
+        if isinstance(tree, Refusal):
+            raise ModelError(str(tree))
+        self.tree = SymbolicTree(tree).at(self.x[: model.nq], self.x[model.nq :])
+        limits = ca.DM(self.description.effort_limits)
+        self.effort = ca.fmin(ca.fmax(self.u, -limits), limits) if model.nu else self.u
+        self._force = ca.DM(self.description.actuation) @ self.effort - self.tree.residual(ca.SX.zeros(model.nv))
         self._factors = ca.ldl(self.tree.mass())
         acceleration = ca.SX.sym("a", model.nv)
-        by_force = self.tree.force_slopes(acceleration)
-        self._force_slopes = ca.Function("force_slopes", [self.x, acceleration], by_force)
+        needed = ca.vertsplit(self.tree.residual(acceleration)) if model.nv else []
+        by_x = ca.vertcat(*[-ca.gradient(row, self.x).T for row in needed])  # backwards, row by row, is shortest
+        self._force_slopes = ca.Function("force_slopes", [self.x, acceleration], [by_x])
         self._by_u = ca.jacobian(self._force, self.u)
         self._position_slopes = ca.jacobian(self.tree.position_rates, ca.vertcat(self.x, self.u))
-        self.touches = [
-            _touch(self.tree, self.pairs, i, self.materials[4 * i : 4 * i + 4], self.is_sap) for i in range(count)
-        ]
+        self.touches = [self._touch(i, self.materials[4 * i : 4 * i + 4]) for i in range(count)]
         switches = ca.vertcat(*[ca.vertcat(t.depth, t.bracket) for t in self.touches]) if count else ca.SX(0, 1)
         ahead = ca.SX.sym("rates", model.nx)
         self.edge_pairs = np.array([i for i, t in enumerate(self.touches) for _ in t.edges], dtype=int)
@@ -87,6 +93,33 @@ class FlowPlant:
         self._switch_slopes: dict[int, Any] = {}
         self._parts: dict[tuple[int, ...], FlowPart] = {}
         self._normals: Any = None
+
+    def _touch(self, i: int, material: Any) -> "_Touch":
+        """Pair `i`, of `material` (4,)."""
+        pairs, tree, names = self.pairs, self.tree, names_of(self.model.plant)[0]
+        mu, k, damping, part = (material[j] for j in range(4))
+        R, p, moves_sphere = tree.body(names[pairs.bodies[pairs.sphere_body[i]].index()])
+        center = p + R @ ca.DM(pairs.center[i])
+        R, p, moves_other = tree.body(names[pairs.bodies[pairs.other_body[i]].index()])
+        turn, origin = R @ ca.DM(pairs.rotation[i]), p + R @ ca.DM(pairs.position[i])
+        local = turn.T @ (center - origin)
+        distance, normal = distance_of(pairs, i, local)
+        normal, phi = turn @ normal, distance - pairs.radius[i]
+        point = center - (pairs.radius[i] + part * phi) * normal
+        J = ca.SX.zeros(3, tree.nv)
+        for sign, moves in ((1, moves_sphere), (-1, moves_other)):
+            for j in moves:
+                J[:, j] += sign * (tree.S[3:, j] + ca.cross(tree.S[:3, j], point))
+        velocity = J @ tree.v
+        rate = -ca.dot(normal, velocity)
+        slip = velocity + rate * normal
+        speed = ca.sqrt(ca.sumsqr(slip) + TINY)
+        r = ca.fmin(speed / STICTION_SPEED, 1.0)
+        drag = mu * r**3 * (10 - 15 * r + 6 * r**2) / speed
+        bracket = -phi + damping * rate if self.is_sap else 1 + damping * rate
+        push = k * bracket if self.is_sap else -k * phi * bracket
+        on_sphere = push * (normal - drag * slip)
+        return _Touch(-phi, bracket, J.T @ on_sphere, point, normal, on_sphere, speed, edges_of(pairs, i, local))
 
     @property
     def num_pairs(self) -> int:
@@ -152,8 +185,7 @@ class FlowPlant:
             by_x += ca.jacobian(touch.force, self.x)
             by_materials.append(ca.jacobian(touch.force, own))
         rates = ca.vertcat(self.tree.position_rates, self._solve(force + push))
-        by_q, by_v = self._force_slopes(self.x, rates[nq:])
-        by_x += ca.horzcat(by_q, by_v)
+        by_x += self._force_slopes(self.x, rates[nq:])
         slopes = ca.vertcat(self._position_slopes, self._solve(ca.horzcat(by_x, self._by_u)))
         by_materials = self._solve(ca.horzcat(*by_materials))
         no_change = ca.SX(nq, by_materials.shape[1])
@@ -210,33 +242,6 @@ class _Touch:
     push: Any  # (3,) [N] on the sphere where it pushes
     speed: Any  # [m/s] of the slip
     edges: list[Any]  # [m] where the nearest face of the other shape becomes another one
-
-
-def _touch(tree: Tree, pairs: ContactPairs, i: int, material: Any, is_sap: bool) -> _Touch:
-    """Pair `i`, of `material` (4,)."""
-    mu, k, damping, part = (material[j] for j in range(4))
-    R, p, moves_sphere = tree.body(pairs.bodies[pairs.sphere_body[i]].index())
-    center = p + R @ ca.DM(pairs.center[i])
-    R, p, moves_other = tree.body(pairs.bodies[pairs.other_body[i]].index())
-    turn, origin = R @ ca.DM(pairs.rotation[i]), p + R @ ca.DM(pairs.position[i])
-    local = turn.T @ (center - origin)
-    distance, normal = distance_of(pairs, i, local)
-    normal, phi = turn @ normal, distance - pairs.radius[i]
-    point = center - (pairs.radius[i] + part * phi) * normal
-    J = ca.SX.zeros(3, tree.nv)
-    for sign, moves in ((1, moves_sphere), (-1, moves_other)):
-        for j in moves:
-            J[:, j] += sign * (tree.S[3:, j] + ca.cross(tree.S[:3, j], point))
-    velocity = J @ tree.v
-    rate = -ca.dot(normal, velocity)
-    slip = velocity + rate * normal
-    speed = ca.sqrt(ca.sumsqr(slip) + TINY)
-    r = ca.fmin(speed / STICTION_SPEED, 1.0)
-    drag = mu * r**3 * (10 - 15 * r + 6 * r**2) / speed
-    bracket = -phi + damping * rate if is_sap else 1 + damping * rate
-    push = k * bracket if is_sap else -k * phi * bracket
-    on_sphere = push * (normal - drag * slip)
-    return _Touch(-phi, bracket, J.T @ on_sphere, point, normal, on_sphere, speed, edges_of(pairs, i, local))
 
 
 def _step_function(rates: Any) -> Any:

@@ -431,7 +431,7 @@ class PlantKnots:
             return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
         n, actuation = self.model.nv, self.equations.actuation
         q, values = knots[:, :n], self.values(knots)
-        d = self.tree(self.tree.place(self.model, q), q, values[:, :n], values[:, n:])
+        d = self.tree(q, values[:, :n], values[:, n:])
         by_u = np.broadcast_to(-actuation, (len(knots), *actuation.shape))
         rows = np.zeros((len(knots), 2 * n, knots.shape[1]))
         rows[:, :n, n : 2 * n] = np.eye(n)

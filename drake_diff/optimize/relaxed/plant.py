@@ -35,7 +35,7 @@ from drake_diff.derivatives.contact.laws import Material, read_material
 from drake_diff.derivatives.implicit import form_of
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
-from drake_diff.mechanics.tree import TreeDynamics, poses_of, tree_of
+from drake_diff.mechanics.numpy_tree import TreeDynamics, poses_of, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 
