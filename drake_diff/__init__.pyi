@@ -10,11 +10,8 @@ from . import model as model
 from . import motion as motion
 from . import optimize as optimize
 from . import panels as panels
-from . import record as record
+from . import runs as runs
 from . import trials as trials
-from .artifact.save import save as save
-from .artifact.trace import read_trace as read_trace
-from .artifact.verify import verify as verify
 from .certificates.audit import audit as audit
 from .certificates.certify import certify as certify
 from .certificates.rollout import certify_rollout as certify_rollout
@@ -57,5 +54,8 @@ from .optimize.sensitivity import sensitivity as sensitivity
 from .optimize.solution import Solution as Solution
 from .optimize.solution import Status as Status
 from .optimize.solve import solve as solve
-from .record.read import load_record as load_record
+from .runs.read import load_record as load_record
+from .runs.save import save as save
+from .runs.trace import read_trace as read_trace
+from .runs.verify import verify as verify
 from .trials.run import robustness as robustness

@@ -15,7 +15,7 @@ from helpers.models import MODELS  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
 from drake_diff._base.sandbox import Outcome  # noqa: E402
-from drake_diff.artifact import verify as verify_module  # noqa: E402
+from drake_diff.runs import verify as verify_module  # noqa: E402
 
 # A shell starts what runs in the background with Ctrl-C ignored, nohup with SIGHUP ignored, and what tests start and
 # interrupt would inherit that.
@@ -30,9 +30,14 @@ for public in dd.__all__:  # a module that is first loaded while a test has patc
 
 @pytest.fixture(autouse=True)
 def verify_in_this_process(request, monkeypatch):
-    """A child process imports Drake for two seconds; `test_sandbox` and the commands that tests start use one."""
-    if request.module.__name__ != "test_sandbox":
+    """A child process imports Drake for two seconds: tests that ask for `child_process` use one."""
+    if "child_process" not in request.fixturenames:
         monkeypatch.setattr(verify_module, "call", call_here)
+
+
+@pytest.fixture
+def child_process():
+    """What a stranger's model is read in."""
 
 
 def call_here(function, arguments, *_):
@@ -129,8 +134,8 @@ BLOCK = """<robot name="block">
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory):
     """A cart-pole pushed for 10 steps, its pole not driven: the model, its motion, and a folder with its trace."""
-    from drake_diff.artifact import measure
-    from drake_diff.artifact.trace import write_trace
+    from drake_diff.runs import measure
+    from drake_diff.runs.trace import write_trace
 
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0.3, 0, 0], num_steps=10, final_cost=lambda x: x[0] ** 2)

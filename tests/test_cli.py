@@ -17,14 +17,14 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.compiled import has_numba
-from drake_diff.artifact.listing import list_runs
-from drake_diff.artifact.recover import recover
 from drake_diff.cli import main as cli
 from drake_diff.cli.text import as_options
 from drake_diff.derivatives import METHODS
 from drake_diff.exceptions import ArtifactError
 from drake_diff.optimize import solve as solving
-from drake_diff.record import directory as directories
+from drake_diff.runs import directory as directories
+from drake_diff.runs.listing import list_runs
+from drake_diff.runs.save import recover
 
 PENDULUM = f"""
 import numpy as np

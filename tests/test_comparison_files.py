@@ -14,7 +14,7 @@ import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.comparison import files as comparison_trace
 from drake_diff.comparison.files import comparison_data, record_of
-from drake_diff.record.sealed import own_sha256
+from drake_diff.runs.sealed import own_sha256
 
 
 @pytest.fixture(scope="module")
@@ -35,12 +35,12 @@ def saved(ball, tmp_path_factory):
 
 def test_the_record_has_every_number_and_its_own_hash(ball, saved):
     folder, record = saved
-    fields = json.loads((folder / "comparison.json").read_text())
-    assert dd.record.ComparisonRecord.model_validate(fields) == record
+    fields = json.loads((folder / "record.json").read_text())
+    assert dd.runs.ComparisonRecord.model_validate(fields) == record
     assert own_sha256(fields) == fields["record_sha256"]
     for file in record.files.values():
         assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
-    assert set(record.files) == {"trace.mcap", "replay.html", "comparison.html", "comparison.schema.json"}
+    assert set(record.files) == {"trace.mcap", "replay.html", "comparison.html", "record.schema.json"}
     for e, found in zip(ball.engines, record.engines, strict=True):
         assert (found.engine, found.verdict, found.steps) == (e.engine, e.verdict, 30)
         assert found.largest_step_gap == e.step_gaps.max()
@@ -150,7 +150,7 @@ def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(ball, tmp_pat
     with pytest.raises(OSError, match="no space"):
         dd.comparison.save_comparison(ball, tmp_path / "out")
     (left,) = tmp_path.glob("out.partial-*")
-    assert json.loads((left / "comparison.json").read_text())["verdict"] == "incomplete"
+    assert json.loads((left / "record.json").read_text())["verdict"] == "incomplete"
     assert not (left / "comparison.html").exists()
     assert dd.load_record(tmp_path / "out") == before
     assert dd.verify(tmp_path / "out").verdict == "intact"
@@ -163,7 +163,7 @@ def test_the_command(tmp_path):
     found = CliRunner().invoke(app, [*words, "--out", str(out)])
     assert found.exit_code == 0, found.output
     assert "numpy and pinocchio: the same simulation as Drake" in found.output
-    assert {p.name for p in out.iterdir()} == {*dd.load_record(out).files, "comparison.json"}
+    assert {p.name for p in out.iterdir()} == {*dd.load_record(out).files, "record.json"}
 
 
 def test_the_command_fails_where_the_engines_do_not_agree(tmp_path, monkeypatch):

@@ -7,7 +7,6 @@ import pytest
 from helpers.legged import LEGGED, SOLO_FEET, legged_model, rest, robot_on_feet
 
 import drake_diff as dd
-from drake_diff.artifact.sections import rebuild_goal
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.parameters import select
 from drake_diff.model.step import advance
@@ -16,6 +15,7 @@ from drake_diff.optimize.replay import Plan, broken_variants, held, replays
 from drake_diff.optimize.scheduled.centroidal import plan_forces
 from drake_diff.optimize.scheduled.legs import Legs
 from drake_diff.optimize.scheduled.motion import LANDS, _slow_phases, _sunk, swings, touching
+from drake_diff.runs.sections import rebuild_goal
 
 H, G = 0.02, np.array([0.0, 0.0, -9.81])
 SQUARE = np.array([[0.2, 0.1, 0.0], [0.2, -0.1, 0.0], [-0.2, 0.1, 0.0], [-0.2, -0.1, 0.0]])

@@ -14,15 +14,15 @@ from helpers.table import each_row
 from typer.testing import CliRunner
 
 import drake_diff as dd
-import drake_diff.artifact.save as evidence
-from drake_diff.artifact import cross_check
-from drake_diff.artifact.cross_check import Follower, replays_in
-from drake_diff.artifact.verify import verify_own
+import drake_diff.runs.save as evidence
 from drake_diff.cli.main import app
 from drake_diff.engines.load import load_engine
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.optimize.solution import Solution, Status
-from drake_diff.record.solve import EvidenceRecord
+from drake_diff.runs import cross_check
+from drake_diff.runs.cross_check import Follower, replays_in
+from drake_diff.runs.fields import PlanRecord
+from drake_diff.runs.verify import verify_own
 
 FREE = math.nan
 G, MU, STIFF = 9.81, 0.4, 2e4
@@ -253,7 +253,7 @@ def test_a_record_that_lies_of_it_is_found(pushed, tmp_path, monkeypatch):
     def lying(measurement, folder):
         fields = honest(measurement, folder).model_dump()
         fields["replays"][-1].update(goal_error=0.0)
-        return EvidenceRecord.model_validate(fields)
+        return PlanRecord.model_validate(fields)
 
     monkeypatch.setattr(evidence, "record_of", lying)
     dd.save(pushed, tmp_path / "run")

@@ -10,13 +10,13 @@ from helpers.models import MODELS
 from pydantic import ValidationError
 
 import drake_diff as dd
-from drake_diff.artifact.sections import asked
 from drake_diff.exceptions import ArtifactError
-from drake_diff.record.embodiment import embodiment_of
-from drake_diff.record.parts import DataBoundary, DataUse
-from drake_diff.record.read import KINDS
-from drake_diff.record.sealed import READING, SCHEMA_VERSION, canonical
-from drake_diff.record.solve import EvidenceRecord
+from drake_diff.runs.fields import DataBoundary, DataUse, canonical
+from drake_diff.runs.plan_record import PlanRecord
+from drake_diff.runs.provenance import embodiment_of
+from drake_diff.runs.read import KINDS
+from drake_diff.runs.sealed import READING, SCHEMA_VERSION
+from drake_diff.runs.sections import asked
 
 
 @pytest.fixture(scope="module")
@@ -105,11 +105,11 @@ def test_the_panel_is_that_of_the_replays_and_its_hash_is_its_own(record):
     told = record.model_dump(mode="json")
     told["panel"]["cases"] = told["panel"]["cases"][1:]
     with pytest.raises(ValidationError, match="panel: expected the 6 replays, got 5"):
-        EvidenceRecord.model_validate(told)
+        PlanRecord.model_validate(told)
 
 
 def test_every_published_schema_says_how_other_versions_are_read():
-    for kind in KINDS:
+    for kind in KINDS.values():
         schema = json.loads(kind.published_schema())
         assert schema["$comment"] == READING
         assert schema["properties"]["schema_version"]["default"] == SCHEMA_VERSION
@@ -119,7 +119,7 @@ def test_every_published_schema_says_how_other_versions_are_read():
 
 def test_a_record_of_the_schema_before_is_read_with_what_it_lacks_empty(record, tmp_path):
     """2.1 had no embodiment, data and panel: as in the reference run of that time."""
-    old = record.model_dump(mode="json") | {"schema_version": "2.1.0"}
+    old = record.model_dump(mode="json") | {"schema_version": "2.1.0", "kind": "solve"}
     for name in ("embodiment", "data", "panel"):
         del old[name]
     (tmp_path / "record.json").write_text(canonical(old))

@@ -10,12 +10,12 @@ import pytest
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.artifact.save import begin
-from drake_diff.artifact.trace import read_trace
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.pages.meshcat import write_replay
 from drake_diff.pages.scene import scene_of
+from drake_diff.runs.save import begin
+from drake_diff.runs.trace import read_trace
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.trial import FALSE_NAME
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
-from drake_diff.record.comparison import ComparisonRecord
+from drake_diff.runs.read import load_record
 
 sys.path.append(str(Path(__file__).parent / "benchmarks"))
 
@@ -356,7 +356,7 @@ def test_a_comparison_with_a_recording_names_the_cause(pendulum, tmp_path):
     out = tmp_path / "out"
     done = CliRunner().invoke(app, ["compare", str(pendulum.source), "--engines", "numpy", *logs, "--out", str(out)])
     assert done.exit_code == 1, done.output
-    each = {e.engine: e.cause for e in ComparisonRecord.read(out).engines}
+    each = {e.engine: e.cause for e in load_record(out).engines}
     assert each["lab"].explained
     assert ["hinge.damping"] in [each["lab"].names, *each["lab"].alternatives]
     ((low, high),) = each["lab"].intervals["hinge.damping"]

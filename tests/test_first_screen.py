@@ -9,10 +9,10 @@ import pytest
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.artifact import measure
-from drake_diff.artifact.first_screen import _of_replays, asked_for, checks_of
-from drake_diff.artifact.page import alike
-from drake_diff.artifact.save import record_of
+from drake_diff.runs import measure
+from drake_diff.runs.first_screen import _of_replays, asked_for, checks_of
+from drake_diff.runs.page import alike
+from drake_diff.runs.save import record_of
 
 CONTROLS = ("Inputs alone (open loop)", "With feedback (TVLQR)")
 

@@ -17,7 +17,7 @@ import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.logs.mcap_file import read_mcap
-from drake_diff.record.sealed import own_sha256
+from drake_diff.runs.sealed import own_sha256
 
 
 def write_swing(path, *, damping=0.15, seed=0, friction=0.0):
@@ -60,7 +60,7 @@ def copy(run, tmp_path):
 
 def test_the_record_says_what_was_found_and_where_the_data_end(found, run, log):
     record = dd.load_record(run)
-    assert (record.kind, record.verdict, record.explained) == ("identification", "pass", True)
+    assert (record.kind, record.verdict, record.explained) == ("fit", "pass", True)
     (estimate,) = record.estimates
     assert (estimate.name, estimate.unit, estimate.before) == ("hinge.damping", "N m s/rad", 0.1)
     assert estimate.value == found.values["hinge.damping"]
@@ -86,7 +86,7 @@ def test_the_trace_has_both_motions_on_one_axis_of_time(run):
     before = trace.arrays("/0/before/state")
     assert before["time"][0] == pytest.approx(0.96)
     assert "/tf" in trace.messages
-    assert "identification.json" in trace.attachments
+    assert "record.json" in trace.attachments
 
 
 def test_the_report_has_every_part_and_names_stay_text(run):
@@ -122,7 +122,7 @@ def test_arrays_in_place_of_a_file_are_kept_and_hold(tmp_path):
 
 def reseal(directory, change):
     """The record with a change in it, and all hashes as they have to be."""
-    path = directory / "identification.json"
+    path = directory / "record.json"
     fields = json.loads(path.read_text())
     change(fields)
     for name, evidence in fields["files"].items():

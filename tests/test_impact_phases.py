@@ -15,7 +15,8 @@ from drake_diff.exceptions import InputError, ModelWarning
 from drake_diff.optimize import HeldContacts, Impact, PhasedProblem
 from drake_diff.optimize.phased import _across, judged_phases
 from drake_diff.optimize.program import NlpResult, Outcome
-from drake_diff.record.sealed import canonical, own_sha256
+from drake_diff.runs.fields import canonical
+from drake_diff.runs.sealed import own_sha256
 
 G, RESTITUTION = 9.81, 0.7
 FOOT = [0, 0, -0.05]
@@ -242,9 +243,9 @@ def test_a_landing_is_made_again_and_a_forged_one_is_not(landed, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         assert dd.verify(tmp_path / "run").verdict == "holds"
-        fields = json.loads((tmp_path / "run" / "phases.json").read_text())
-        assert fields["links"][0]["reset"]["impact"]["points"]["foot"] == FOOT
-        fields["links"][0]["reset"]["impact"]["restitution"] = 0.01
+        fields = json.loads((tmp_path / "run" / "record.json").read_text())
+        assert fields["phases"]["links"][0]["reset"]["impact"]["points"]["foot"] == FOOT
+        fields["phases"]["links"][0]["reset"]["impact"]["restitution"] = 0.01
         fields["record_sha256"] = own_sha256(fields)
-        (tmp_path / "run" / "phases.json").write_text(canonical(fields))
+        (tmp_path / "run" / "record.json").write_text(canonical(fields))
         assert dd.verify(tmp_path / "run").verdict == "broken"

@@ -6,10 +6,10 @@ from helpers.models import MODELS
 from pydrake.geometry import Box, Sphere
 
 import drake_diff as dd
-from drake_diff.artifact.live import scene_of_run
 from drake_diff.exceptions import UnknownNameError
 from drake_diff.optimize.marks import drawn_goals, meaning_of
 from drake_diff.pages.scene import scene_of
+from drake_diff.runs.view import scene_of_run
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +73,7 @@ def test_a_run_has_its_goals_in_its_live_view_too(model, tmp_path):
     problem = dd.Problem(model, x0=[0.1, 0], num_steps=4, goals=[goal], final_cost=dd.QuadraticCost(Q=np.eye(2)))
     xs = np.array(dd.rollout(model, [0.1, 0], us).xs)
     dd.save(dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", xs, us), tmp_path)
-    scene, notes = scene_of_run(tmp_path)
-    assert notes == ()
+    scene = scene_of_run(tmp_path)
     np.testing.assert_allclose(scene.marks[0].pose.translation(), [0.2, 0, 0])
     assert meaning_of([goal])[0][2] in (tmp_path / "report.html").read_text()
 

@@ -13,7 +13,7 @@ from pydrake.multibody.tree import MultibodyForces
 import drake_diff as dd
 from drake_diff.exceptions import ModelError
 from drake_diff.model.plant import actuators, joints
-from drake_diff.record.provenance import named_files
+from drake_diff.runs.provenance import named_files
 
 GEOM = '<geom size="0.1" mass="1"/>'
 AGREE = 1e-9  # relative: both sum up a chain of a few bodies in double precision

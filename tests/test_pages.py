@@ -14,11 +14,11 @@ from helpers.models import MODELS
 from helpers.table import each_row, slow_after
 
 import drake_diff as dd
-from drake_diff.artifact.first_screen import Check
-from drake_diff.artifact.live import scene_of_run
-from drake_diff.artifact.verify import recalled
 from drake_diff.pages import html
 from drake_diff.pages.html import render, write_page
+from drake_diff.runs.first_screen import Check
+from drake_diff.runs.verify import recalled
+from drake_diff.runs.view import scene_of_run
 
 PACKAGE = Path(dd.__file__).parent
 EVIL = "</script><script>document.title = 'evil'</script><img src=x onerror=\"document.title = 'evil'\">'"
@@ -139,7 +139,7 @@ def test_a_script_that_was_put_into_a_page_is_refused(pages, browser, tmp_path, 
 
 
 def test_a_live_view_has_no_hostile_path(pages):
-    scene, _ = scene_of_run(pages["report"].parent)
+    scene = scene_of_run(pages["report"].parent)
     for path in (*scene.poses, *(shape.body for shape in scene.shapes)):
         assert re.fullmatch(r"[A-Za-z0-9_.-]*", path)
 

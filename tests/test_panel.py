@@ -20,14 +20,14 @@ from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff._base.statistics import success_rate
-from drake_diff.artifact import list_runs
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
 from drake_diff.panels.evaluation import row_of
 from drake_diff.panels.panel_file import expand, load_panel
 from drake_diff.panels.results import ranked
-from drake_diff.record.sealed import canonical as sealed_canonical
-from drake_diff.record.sealed import own_sha256
+from drake_diff.runs import list_runs
+from drake_diff.runs.fields import canonical as sealed_canonical
+from drake_diff.runs.sealed import own_sha256
 
 FUNCTIONS = """
 import os, random, time
@@ -468,22 +468,23 @@ def test_every_trial_has_a_record_that_is_the_same_for_any_number_of_workers(wri
     one, two = ({p.name: p.read_bytes() for p in (f.directory / "trials").iterdir()} for f in found)
     assert one == two
     assert set(one) == {f"{row['id']}.json" for row in found[0].rows}
-    told = {record["id"]: record for record in map(json.loads, one.values())}
+    told = {record["trial"]["id"]: record for record in map(json.loads, one.values())}
     for row in found[0].rows:
         record = told[row["id"]]
-        assert record["inputs"]["seed"] == row["seed"]
-        assert record["cell"] == {"method": "a", "level": row["level"]}
+        assert record["trial"]["inputs"]["seed"] == row["seed"]
+        assert record["trial"]["cell"] == {"method": "a", "level": row["level"]}
         assert record["verdict"] == ("fail" if row["level"] == 2 else "pass")
-        assert ("error" in record["result"]) == (row["level"] == 2)
-        assert record["panel"]["evaluate"] == "trials.py:fails"
+        assert ("error" in record["trial"]["result"]) == (row["level"] == 2)
+        assert record["trial"]["conditions"]["evaluate"] == "trials.py:fails"
         assert own_sha256(record) == record["record_sha256"]
 
 
 def test_a_panel_and_its_trials_are_records(write, tmp_path):
     done = dd.panels.run_panel(write("fails"), out=tmp_path / "runs" / "mine", workers=1)
     record = dd.load_record(done.directory)
-    assert (record.kind, record.verdict, record.trials, record.errors) == ("panel", "fail", len(done.rows), done.errors)
-    assert record.ranking[0]["name"] in record.sentence
+    assert (record.subject, record.verdict) == ("panel", "fail")
+    assert (record.panel.trials, record.panel.errors) == (len(done.rows), done.errors)
+    assert record.panel.ranking[0]["name"] in record.sentence
     found = dd.verify(done.directory)
     assert (found.verdict, found.complaints) == ("intact", ())
     assert "no trial was evaluated again" in found.unchecked[0]
@@ -494,11 +495,11 @@ def test_a_panel_and_its_trials_are_records(write, tmp_path):
     assert [t.kind for t in trials] == ["trial"] * len(done.rows)
     for row in done.rows:
         path = done.directory / "trials" / f"{row['id']}.json"
-        assert dd.load_record(path).result == {k: v for k, v in row.items() if k in ("cost", "error", "threads")}
+        assert dd.load_record(path).trial.result == {k: v for k, v in row.items() if k in ("cost", "error", "threads")}
         assert dd.verify(path).verdict == "intact"
     (tmp_path / "trials").mkdir()  # a directory of that name need not be of a panel
-    (tmp_path / "trials" / "robustness.json").write_text("{}")
-    assert [line.kind for line in list_runs(tmp_path)] == ["robustness"]
+    (tmp_path / "trials" / "record.json").write_text("{}")
+    assert [line.verdict for line in list_runs(tmp_path)] == ["unreadable"]
     listed = CliRunner().invoke(app, ["list", str(done.directory)])
     assert listed.exit_code == 0
     assert "method=a level=2" in listed.output
@@ -506,7 +507,10 @@ def test_a_panel_and_its_trials_are_records(write, tmp_path):
 
 def sealed_again(path, **changes):
     """Whoever changes a record can take its hash again."""
-    fields = {**json.loads(path.read_bytes()), **changes}
+    fields = json.loads(path.read_bytes())
+    for name, value in changes.items():
+        section = next((fields[s] for s in ("trial", "panel") if fields[s] and name in fields[s]), fields)
+        section[name] = value
     path.write_text(sealed_canonical({**fields, "record_sha256": own_sha256(fields)}))
 
 
@@ -538,14 +542,14 @@ def test_a_panel_whose_files_do_not_follow_from_its_journal_is_broken(write, tmp
     }
     broken(lambda d: sealed_again(d / in_trials, **better), "its result or its panel is not that of trials.jsonl")
     broken(lambda d: sealed_again(d / in_trials, **better), "is not that of trials.jsonl", of=in_trials)
-    other = {**one["inputs"], "seed": 1}
+    other = {**one["trial"]["inputs"], "seed": 1}
     broken(lambda d: sealed_again(d / in_trials, inputs=other), "its inputs are those of trial", of=in_trials)
     wrong = (made / "table.csv").read_text().replace("ValueError", "Nothing")
     broken(lambda d: (d / "table.csv").write_text(wrong), "table.csv: it does not come out")
     broken(lambda d: (d / in_trials).write_text(trial.read_text().replace("a level", "b level")), "record_sha256",
            of=in_trials)  # fmt: skip
-    ranking = [{**row, "place": 1} for row in dd.load_record(made).ranking]
-    broken(lambda d: sealed_again(d / "panel.json", ranking=ranking), "panel.json: ranking is not what the table says")
+    ranking = [{**row, "place": 1} for row in dd.load_record(made).panel.ranking]
+    broken(lambda d: sealed_again(d / "record.json", ranking=ranking), "record.json: panel is not what the table says")
 
     def cut(directory):
         lines = (directory / "trials.jsonl").read_bytes().splitlines(keepends=True)

@@ -9,8 +9,8 @@ import pytest
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.record.phases import PhasesRecord
-from drake_diff.record.sealed import canonical, own_sha256
+from drake_diff.runs.fields import canonical
+from drake_diff.runs.sealed import own_sha256
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 
@@ -82,13 +82,17 @@ def sealed_again(folder, name):
     (folder / name).write_text(canonical(fields))
 
 
-def forged(folder, change, name="phases.json"):
+def forged(folder, change, name="record.json"):
     fields = json.loads((folder / name).read_text())
-    change(fields)
+    section = fields["phases"] or {}
+    flat = {**fields, **section}
+    change(flat)
+    fields |= {key: value for key, value in flat.items() if key not in section}
+    fields["phases"] = {key: flat[key] for key in section} or None
     (folder / name).write_text(canonical(fields))
-    if name != "phases.json":
+    if name != "record.json":
         sealed_again(folder / name.split("/")[0], "record.json")
-    sealed_again(folder, "phases.json")
+    sealed_again(folder, "record.json")
     return dd.verify(folder)
 
 
@@ -97,8 +101,8 @@ def test_a_run_in_phases_is_made_again(swung):
     assert found.verdict == "holds", repr(found)
     assert found.checked > 500
     record = dd.load_record(swung)
-    assert isinstance(record, PhasesRecord)
-    assert [phase.name for phase in record.phases] == ["up", "on"]
+    assert (record.kind, record.subject) == ("plan", "phases")
+    assert [phase.name for phase in record.phases.phases] == ["up", "on"]
 
 
 @pytest.mark.slow
@@ -164,7 +168,7 @@ def test_a_plan_that_was_moved_is_refused(swung, tmp_path, seed):
     np.savez(buffer, **dict(sorted(arrays.items())))
     (phase / "plan.npz").write_bytes(buffer.getvalue())
     sealed_again(phase, "record.json")
-    sealed_again(folder, "phases.json")
+    sealed_again(folder, "record.json")
     assert dd.verify(folder).verdict == "broken"
 
 
@@ -178,14 +182,14 @@ def metric(name, value):
 @pytest.mark.parametrize(
     ("what", "where", "change"),
     [
-        ("a link's error", "phases.json", of_links),
+        ("a link's error", "record.json", of_links),
         ("a goal error", "phase_1/record.json", metric("goal error", 1e-7)),
         ("a start", "phase_0/record.json", metric("initial state error", 1e-7)),
         ("another goal", "phase_1/record.json", lambda f: f["problem"].update(x_goal=[0.7, 0.0])),
         ("another start", "phase_0/record.json", lambda f: f["problem"].update(x0=[1.1, 0.0])),
         ("tighter bounds", "phase_0/record.json", lambda f: f["problem"].update(x_lower=[0.5, None])),
-        ("a phase's cost", "phases.json", lambda f: f["phases"][0].update(cost=1.0)),
-        ("another reset", "phases.json", lambda f: f["links"][0]["reset"]["matrix"]["rows"][1].__setitem__(1, -0.9)),
+        ("a phase's cost", "record.json", lambda f: f["phases"][0].update(cost=1.0)),
+        ("another reset", "record.json", lambda f: f["links"][0]["reset"]["matrix"]["rows"][1].__setitem__(1, -0.9)),
     ],
 )
 def test_what_functions_do_not_decide_is_refused_where_they_are_unknown(bounced, tmp_path, what, where, change):
@@ -202,10 +206,10 @@ def test_a_failed_run_is_saved_as_one(tmp_path):
     record = dd.save(solution, tmp_path / "run")
     assert record.verdict == "fail"
     assert not solution.success
-    fields = json.loads((tmp_path / "run" / "phases.json").read_text())
+    fields = json.loads((tmp_path / "run" / "record.json").read_text())
     fields["verdict"] = "pass"
-    (tmp_path / "run" / "phases.json").write_text(canonical(fields))
-    sealed_again(tmp_path / "run", "phases.json")
+    (tmp_path / "run" / "record.json").write_text(canonical(fields))
+    sealed_again(tmp_path / "run", "record.json")
     found = dd.verify(tmp_path / "run")
     assert found.verdict == "broken"
     assert 'a verdict "pass" with' in found.complaints[0]

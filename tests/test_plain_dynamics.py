@@ -10,10 +10,10 @@ from helpers.table import each_row
 from helpers.transcription import BLOCK, heavy_pendulum, own_derivatives, push
 
 import drake_diff as dd
-from drake_diff.artifact.live import scene_of_run
 from drake_diff.exceptions import ArtifactError, InputError, ModelError
 from drake_diff.optimize.program import Outcome
 from drake_diff.optimize.transcription.collocation import Transcription
+from drake_diff.runs.view import scene_of_run
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 

@@ -11,7 +11,7 @@ from drake_diff.planning import plan
 from drake_diff.planning.posture import TOUCHING, share_to_hold
 from drake_diff.planning.robot import load_robot
 from drake_diff.planning.task import Task, postures
-from drake_diff.record.parts import Failure
+from drake_diff.runs.fields import Failure
 
 G = 9.81
 INERTIA = '<inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/>'
@@ -155,8 +155,8 @@ def test_a_robot_of_joints_without_a_way_to_go_is_refused(tmp_path):
 
 def test_a_plan_whose_record_would_not_hold_is_none(tmp_path, monkeypatch):
     """The first attempt is said to miss a metric: the next one is tried, and both are told."""
-    from drake_diff.artifact.measurement import measure
     from drake_diff.planning import planner
+    from drake_diff.runs.measurement import measure
 
     seen = []
 

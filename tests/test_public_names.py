@@ -16,7 +16,7 @@ import drake_diff
 
 PACKAGE = Path(drake_diff.__file__).parent
 ROOMS = """
-certificates comparison engines export identification logs loop model motion optimize panels record trials
+certificates comparison engines export identification logs loop model motion optimize panels runs trials
 """.split()
 MODULES = [*ROOMS, "exceptions", "quantities"]
 PUBLIC = """

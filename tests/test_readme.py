@@ -89,7 +89,7 @@ SOURCES = {
         **dict.fromkeys(("1", "0.2", "-1.867", "-13.18", "-1.437", "0.3739", "-0.9686", "0.2648"), BOUNCES),
         "97": "tests/test_readme.py::test_the_network_of_the_example_has_97_weights",
         "1e-6": SAP,
-        "60": "drake_diff.artifact.verify:WAITED",
+        "60": "drake_diff.runs.verify:WAITED",
     },
     "CONTRIBUTING.md": {},
     "docs/certificates.md": {
@@ -159,8 +159,8 @@ SOURCES = {
     "docs/gradients.md": {},
     "docs/logs.md": {
         "1": "tests/test_verify.py::",
-        "1e-6": "drake_diff.artifact.differences:RELATIVE",
-        "1e-9": "drake_diff.artifact.differences:ABSOLUTE",
+        "1e-6": "drake_diff.runs.differences:RELATIVE",
+        "1e-9": "drake_diff.runs.differences:ABSOLUTE",
     },
     "docs/models.md": {
         "0.5": "drake_diff.model.repairs:GROUND_FRICTION",

@@ -18,15 +18,14 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, JsonValue, ValidationError
 
 import drake_diff as dd
-from drake_diff.artifact import measure
-from drake_diff.artifact.sections import describe_problem, rebuild_problem
 from drake_diff.exceptions import ArtifactError
-from drake_diff.record.panel import PanelTrialRecord
-from drake_diff.record.parts import DataBoundary, Metric
-from drake_diff.record.provenance import named_files
-from drake_diff.record.read import KINDS
-from drake_diff.record.sealed import SCHEMA_VERSION, canonical, own_sha256
-from drake_diff.record.solve import EvidenceRecord, FollowedEvidence
+from drake_diff.runs import measure
+from drake_diff.runs.fields import DataBoundary, Metric, canonical
+from drake_diff.runs.plan_record import PlanRecord, RolloutSection
+from drake_diff.runs.provenance import named_files
+from drake_diff.runs.read import KINDS, parse_record
+from drake_diff.runs.sealed import SCHEMA_VERSION, own_sha256
+from drake_diff.runs.sections import describe_problem, rebuild_problem
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 JSON = st.recursive(
@@ -67,13 +66,13 @@ def records_of(model):
         return metrics()
     if "reason" in fields and "value" in fields:
         fields["reason"] = st.text(min_size=1, max_size=12)
-    if model is EvidenceRecord:
+    if model is PlanRecord:
         fields |= {"schema_version": st.just(SCHEMA_VERSION), "verdict": st.just("fail")}
-        fields |= {"evaluations": st.just([]), "panel": st.none()}  # they rest on metrics and replays
+        fields |= {"panel": st.none()}  # it rests on replays
+    if model is RolloutSection:
+        fields |= dict.fromkeys(("columns", "derivative", "verdicts"), st.just([]))
     if model is DataBoundary:
         fields["held_out"] = st.just([])
-    if model is FollowedEvidence:
-        return st.builds(model, **fields | {"holds": st.just(False), "measured": st.just(False)})
     return st.builds(model, **fields)
 
 
@@ -100,7 +99,7 @@ def metrics(draw):
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
-@given(records_of(EvidenceRecord))
+@given(records_of(PlanRecord))
 def test_any_record_comes_back_as_it_was(record):
     import json
 
@@ -108,7 +107,7 @@ def test_any_record_comes_back_as_it_was(record):
     fields = json.loads(sealed.to_json())
     assert canonical(fields) == sealed.to_json()
     assert own_sha256(fields) == sealed.record_sha256
-    assert EvidenceRecord.parse(Path("record.json"), fields) == sealed
+    assert parse_record(Path("record.json"), fields) == sealed
     assert list(sealed.as_row()) == ["section", "tool", "observation", "action", "metric", "perturbation"]
 
 
@@ -125,14 +124,14 @@ def pendulum(**changes):
 
 
 def test_the_published_schema_is_what_pydantic_generates():
-    for kind in (*KINDS, PanelTrialRecord):
+    for kind in KINDS.values():
         assert kind.published_schema() == kind.generated_schema()
 
 
 def test_the_schema_is_in_the_run_and_printed_by_the_command(record):
-    assert record.files["record.schema.json"].sha256 == sha256(EvidenceRecord.published_schema()).hexdigest()
+    assert record.files["record.schema.json"].sha256 == sha256(PlanRecord.published_schema()).hexdigest()
     command = [sys.executable, "-m", "drake_diff.cli.main", "schema"]
-    assert subprocess.run(command, capture_output=True, check=True).stdout == EvidenceRecord.published_schema()
+    assert subprocess.run(command, capture_output=True, check=True).stdout == PlanRecord.published_schema()
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -142,7 +141,7 @@ def test_a_number_that_json_does_not_have_is_refused_anywhere(record, bad):
         key = "duration_s" if "duration_s" in place else "value"
         kept, place[key] = place.get(key), bad
         with pytest.raises(ValidationError, match="finite"):
-            EvidenceRecord.model_validate(fields)
+            PlanRecord.model_validate(fields)
         place[key] = kept
         if kept is None:
             del place[key]
@@ -164,8 +163,8 @@ def test_a_pass_with_a_failure_a_failed_metric_or_another_status_is_refused(reco
     ]
     for change in changes:
         with pytest.raises(ValidationError):
-            EvidenceRecord.model_validate({**fields, **change})
-    assert EvidenceRecord.model_validate(fields) == record
+            PlanRecord.model_validate({**fields, **change})
+    assert PlanRecord.model_validate(fields) == record
 
 
 def test_a_metric_whose_verdict_is_not_that_of_its_value_is_refused():
@@ -180,16 +179,16 @@ def test_a_metric_whose_verdict_is_not_that_of_its_value_is_refused():
 
 def test_another_major_version_is_refused_by_name_and_a_later_minor_one_is_read(record):
     fields = record.model_dump(mode="json")
-    for version in ("1.0.0", "3.0.0", None):
-        with pytest.raises(ArtifactError, match=r"schema_version .*; this drake_diff reads 2\.x\.y"):
-            EvidenceRecord.parse(Path("record.json"), {**fields, "schema_version": version})
-    later = {**fields, "schema_version": "2.7.0", "weather": "fine"}
+    for version in ("1.0.0", "4.0.0", None):
+        with pytest.raises(ArtifactError, match=r"schema_version .*; this drake_diff reads 2\.x\.y and 3\.x\.y"):
+            parse_record(Path("record.json"), {**fields, "schema_version": version})
+    later = {**fields, "schema_version": "3.7.0", "weather": "fine"}
     later["metrics"] = [{**later["metrics"][0], "colour": "blue"}, *later["metrics"][1:]]
-    assert EvidenceRecord.parse(Path("record.json"), later).metrics == record.metrics
+    assert parse_record(Path("record.json"), later).metrics == record.metrics
     with pytest.raises(ArtifactError, match="weather"):
-        EvidenceRecord.parse(Path("record.json"), {**fields, "weather": "fine"})
+        parse_record(Path("record.json"), {**fields, "weather": "fine"})
     with pytest.raises(ArtifactError, match="verdict"):
-        EvidenceRecord.parse(Path("record.json"), {**later, "verdict": "great"})
+        parse_record(Path("record.json"), {**later, "verdict": "great"})
 
 
 def test_every_number_of_a_contract_and_a_problem_has_a_unit(record):
@@ -401,11 +400,11 @@ def test_all_the_energy_that_damping_takes_is_counted(tmp_path):
 
 def test_records_print_in_a_few_lines_and_their_text_is_escaped(record):
     lines = repr(record).splitlines()
-    assert lines[0] == "EvidenceRecord pendulum: pass"
+    assert lines[0] == "PlanRecord pendulum: pass"
     assert len(lines) < 8
     assert str(record) == f"pendulum: pass, {record.sentence}"
     evil = record.model_copy(update={"name": "<script>", "sentence": "<b>"})
     assert "<script>" not in evil._repr_html_()
     assert "&lt;script&gt;" in evil._repr_html_()
-    certified = dd.record.certify_model(pendulum().model, states=2)
+    certified = dd.runs.certify_model(pendulum().model, states=2)
     assert "states: 2 agree" in repr(certified)

@@ -1,17 +1,21 @@
 """What records of all kinds say of the robot and of their data, and how records of before are read."""
 
 import json
+import shutil
 from hashlib import sha256
+from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.models import MODELS
+from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
-from drake_diff.record.embodiment import embodiment_of
-from drake_diff.record.sealed import SCHEMA_VERSION, canonical, own_sha256
+from drake_diff.runs.fields import canonical
+from drake_diff.runs.provenance import embodiment_of
+from drake_diff.runs.sealed import SCHEMA_VERSION, own_sha256
 
 H = 0.02
+OLD = ROOT / "tests" / "data" / "pendulum_2_4"
 
 
 @pytest.fixture(scope="module")
@@ -19,11 +23,11 @@ def written(tmp_path_factory):
     """A directory of each kind, of the pendulum."""
     folder = tmp_path_factory.mktemp("kinds")
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=H)
-    dd.record.certify_model(model, states=1, directory=folder / "certification")
+    dd.runs.certify_model(model, states=1, directory=folder / "certification")
     still = dd.Recording("lab", "1", H * np.arange(3), np.zeros((3, 2)), np.zeros((2, 1)))
     dd.comparison.save_comparison(dd.compare(model, ["numpy"], recordings=(still,)), folder / "comparison")
     certificate = dd.certify_rollout(model, [0.5, 0], np.zeros((5, 1)), lambda x: x[0])
-    dd.record.save_rollout(certificate, model, folder / "rollout")
+    dd.runs.save_rollout(certificate, model, folder / "rollout")
     cost = dd.QuadraticCost(R=[[1.0]])
     problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost)
     result = dd.robustness(dd.solve(problem, method="shooting"), {"mass": [0.05], "latency": [1, 2]}, trials=2)
@@ -64,33 +68,54 @@ def test_the_panel_of_robustness_names_every_level(written):
     assert other.hashed().sha256 != panel.sha256
 
 
-def before(folder, copy, version):
-    """The directory as a drake_diff of schema `version` wrote it: without what came later, with its own hash."""
-    copy.mkdir()
-    for path in folder.rglob("*"):
-        if path.is_file():
-            (copy / path.relative_to(folder)).parent.mkdir(parents=True, exist_ok=True)
-            (copy / path.relative_to(folder)).write_bytes(path.read_bytes())
-    kind = type(dd.load_record(folder))
-    fields = json.loads((copy / kind.FILE).read_bytes())
-    fields = {key: value for key, value in fields.items() if key not in ("embodiment", "data", "panel")}
-    if kind is dd.record.ComparisonRecord:
-        del fields["recordings"]
-    fields["schema_version"] = version
-    (copy / kind.FILE).write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
+def downgraded(folder, copy):
+    """The directory as schema 2.2 wrote it: under the names of then, without what came later, with its own hash."""
+    shutil.copytree(folder, copy)
+    fields = json.loads((copy / "record.json").read_bytes())
+    subject = dd.load_record(folder).subject
+    kind = "identification" if subject == "fit" else subject
+    fields = {key: value for key, value in fields.items() if key not in ("embodiment", "data", "panel", "recordings")}
+    if subject == "fit":
+        fields["recordings"] = json.loads((copy / "record.json").read_bytes())["recordings"]
+    fields |= fields.pop(subject, None) or {}
+    for name in ("phases", "certification", "rollout", "robustness", "trial"):
+        fields.pop(name, None)
+    (copy / "record.json").unlink()
+    fields |= {"schema_version": "2.2.0", "kind": kind}
+    (copy / f"{kind}.json").write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
     return copy
 
 
 @pytest.mark.parametrize("kind", ["certification", "comparison", "rollout", "robustness", "identification"])
-def test_a_record_of_an_earlier_minor_version_is_read_with_nulls(written, tmp_path, kind):
-    old = before(written[1] / kind, tmp_path / kind, "2.2.0")
-    record = dd.load_record(old)
+def test_a_record_of_version_2_is_converted(written, tmp_path, kind):
+    record, new = dd.load_record(downgraded(written[1] / kind, tmp_path / kind)), dd.load_record(written[1] / kind)
     assert (record.embodiment, record.data, record.schema_version) == (None, None, "2.2.0")
-    found = dd.verify(old)
+    assert (type(record), record.subject, record.verdict) == (type(new), new.subject, new.verdict)
+    apart = ("schema_version", "embodiment", "data", "panel", "recordings", "record_sha256")
+    same = {"exclude": {name for name in apart if kind != "identification" or name != "recordings"}}
+    assert record.model_dump(**same) == new.model_dump(**same)
+    found = dd.verify(tmp_path / kind)
     # What it lacks differs from what is made again: that may be the version's doing, and is told.
     rerun = kind in ("certification", "identification")
     assert found.verdict == ("undecided" if rerun else "intact"), found.lines
-    assert any(f"recorded by schema 2.2.0, whose fields are not those of {SCHEMA_VERSION}" in n for n in found.notes)
-    gone = before(written[1] / kind, tmp_path / "other", "1.9.0")
-    with pytest.raises(dd.exceptions.ArtifactError, match=r"schema_version '1\.9\.0'; this drake_diff reads 2\.x\.y"):
-        dd.load_record(gone)
+    assert f"recorded by schema 2.2.0, and converted to {SCHEMA_VERSION}" in found.notes
+
+
+def test_a_run_of_version_2_4_is_read_and_holds():
+    """tests/data/pendulum_2_4 is artifacts/pendulum_swing_up as the version before wrote it."""
+    record = dd.load_record(OLD)
+    assert (record.kind, record.schema_version, record.verdict) == ("plan", "2.4.0", "pass")
+    assert record.solver.status == "converged"
+    found = dd.verify(OLD)
+    assert found.verdict == "holds", found.lines
+    assert found.checked > 1000
+
+
+def test_a_lie_in_a_run_of_version_2_4_is_found(tmp_path):
+    copy = Path(shutil.copytree(OLD, tmp_path / "run"))
+    fields = json.loads((copy / "record.json").read_bytes())
+    fields["solver"]["iterations"] += 1
+    (copy / "record.json").write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
+    found = dd.verify(copy)
+    assert found.verdict == "undecided"  # the version that wrote it is another
+    assert any("solver.iterations" in line for line in found.undecided)

@@ -310,7 +310,7 @@ def test_our_own_trace_is_a_recording_to_the_bit(run, load):
 
 def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
     pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
-    from drake_diff.artifact.ros2 import export_ros2
+    from drake_diff.runs.ros2 import export_ros2
 
     model, motion, folder = run
     export_ros2(folder, tmp_path / "bag")
@@ -323,7 +323,7 @@ def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
 
 def test_a_damaged_bag_is_no_recording(run, tmp_path):
     pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
-    from drake_diff.artifact.ros2 import export_ros2
+    from drake_diff.runs.ros2 import export_ros2
 
     model, _, folder = run
     export_ros2(folder, tmp_path / "bag")
@@ -552,9 +552,9 @@ def test_a_body_that_is_missing_at_one_time_is_named(tmp_path):
 
 def test_the_exported_bag_of_two_free_bodies_is_a_recording(tmp_path):
     pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
-    from drake_diff.artifact import measure
-    from drake_diff.artifact.ros2 import export_ros2
-    from drake_diff.artifact.trace import write_trace
+    from drake_diff.runs import measure
+    from drake_diff.runs.ros2 import export_ros2
+    from drake_diff.runs.trace import write_trace
 
     model = two_bases(tmp_path)
     x0 = np.array(model.default_state)

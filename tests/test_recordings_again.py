@@ -11,17 +11,18 @@ from helpers.models import MODELS
 from helpers.pendulum import swing
 
 import drake_diff as dd
-from drake_diff.artifact import recordings_again
-from drake_diff.artifact.differences import Compared
-from drake_diff.artifact.recordings_again import ENDED, RecordingsAgain, compare_causes
-from drake_diff.artifact.verify import verify_own
 from drake_diff.comparison.files import PAGE, hash_of_arrays
 from drake_diff.comparison.recordings import place_of, read_arrays, with_own_names, write_arrays
 from drake_diff.exceptions import ArtifactError, InputError
+from drake_diff.identification import recorded_causes
 from drake_diff.identification.cause import cause_of
+from drake_diff.identification.recorded_causes import ENDED, as_recorded
 from drake_diff.identification.words import Words
-from drake_diff.record.comparison import CauseEvidence, ComparisonRecord
-from drake_diff.record.sealed import canonical, own_sha256
+from drake_diff.runs.fields import canonical
+from drake_diff.runs.other_records import CauseEvidence
+from drake_diff.runs.read import load_record
+from drake_diff.runs.sealed import own_sha256
+from drake_diff.runs.verify import verify_own
 
 TIMES = np.linspace(0, 0.6, 61)
 
@@ -58,12 +59,12 @@ def once(known, monkeypatch):
         known[key] = known.get(key) or cause_of(model, recording)
         return known[key]
 
-    monkeypatch.setattr(recordings_again, "cause_of", found)
+    monkeypatch.setattr(recorded_causes, "cause_of", found)
 
 
 def forge(folder, **changes):
     """The record with another row of the recording, all hashes made to fit."""
-    record = ComparisonRecord.read(folder)
+    record = load_record(folder)
     row = record.engines[-1]
     rows = [*record.engines[:-1], row.model_copy(update=changes)]
     record.model_copy(update={"engines": rows}).write(folder)
@@ -78,7 +79,7 @@ def test_a_cause_comes_out_again_in_a_process_of_its_own(saved):
     assert any("cause of lab: " in line and "hinge.damping is 0.2" in line for line in found.claimed)
 
 
-def test_beyond_its_limit_of_time_nothing_is_decided(saved):
+def test_beyond_its_limit_of_time_nothing_is_decided(saved, child_process):
     found = dd.verify(saved, time_limit=0.01)
     assert (found.verdict, found.complaints) == ("undecided", ())
     assert "did not end within 0.01 s" in str(found)
@@ -88,7 +89,7 @@ def test_beyond_its_limit_of_time_nothing_is_decided(saved):
 def test_whatever_number_or_name_of_a_cause_is_planted_it_is_refused(saved, seed):
     """A hundredth of half the interval, or of a number that has none, is a lie; a thousandth of it is rounding."""
     rng = np.random.default_rng(seed)
-    told = ComparisonRecord.read(saved).engines[-1].cause
+    told = load_record(saved).engines[-1].cause
     for _ in range(50):
         fields = told.model_dump()
         part = rng.choice(["names", "alternatives", "explained", "values", "intervals", "sentence"])
@@ -106,37 +107,32 @@ def test_whatever_number_or_name_of_a_cause_is_planted_it_is_refused(saved, seed
             fields[part] = f"{told.sentence[:i]}{letter}{told.sentence[i + 1 :]}"
         else:
             fields[part] = {"names": ["hinge.armature"], "alternatives": [["hinge.armature"]], "explained": False}[part]
-        again = RecordingsAgain(Compared("comparison.json"))
-        compare_causes(again, "lab", CauseEvidence.model_validate(fields), told)
-        refused = [d for d in again.compared.differing if not d.allowed]
-        assert refused, (part, fields[part])
-        assert f"engines.lab.cause.{part}" in str(refused[0])
+        assert as_recorded("lab", CauseEvidence.model_validate(fields), told) == (told, []), (part, fields[part])
         if within is not None:
             numbers[k] = small
-            again = RecordingsAgain(Compared("comparison.json"))
-            compare_causes(again, "lab", CauseEvidence.model_validate(fields), told)
-            assert [d.allowed for d in again.compared.differing] == [True]
+            near = CauseEvidence.model_validate(fields)
+            assert as_recorded("lab", near, told) == (near, [])
 
 
 def test_a_search_that_its_limit_ended_is_undecided(saved):
-    told = ComparisonRecord.read(saved).engines[-1].cause
+    told = load_record(saved).engines[-1].cause
     ended = Words(None, SimpleNamespace(ended_early=True)).end
     assert ended.strip().startswith(ENDED)
-    again = RecordingsAgain(Compared("comparison.json"))
-    compare_causes(again, "lab", told.model_copy(update={"sentence": told.sentence + ended}), told)
-    assert not again.compared.differing
-    assert "is not repeated" in again.undecided[0]
+    early = told.model_copy(update={"sentence": told.sentence + ended})
+    again, doubts = as_recorded("lab", early, told)
+    assert again == early
+    assert "is not repeated" in doubts[0]
 
 
 def test_a_row_of_a_recording_that_lies_is_refused(copy):
-    record = ComparisonRecord.read(copy)
+    record = load_record(copy)
     row = record.engines[-1]
     gap = row.largest_step_gap
     for lie in ({"verdict": "other model"}, {"largest_step_gap": gap * (1 + 1e-5)}, {"sentence": "It is the same."}):
         (key,) = lie
         found = forge(copy, **lie)
         assert found.verdict == "broken", lie
-        assert any(f"engines.lab.{key}" in line for line in found.complaints), found.complaints
+        assert any(f"engines[lab].{key}" in line for line in found.complaints), found.complaints
         forge(copy, **{key: getattr(row, key)})
     assert verify_own(copy).verdict == "intact"
     numpy = record.engines[1].model_copy(update={"cause": row.cause})
@@ -145,58 +141,58 @@ def test_a_row_of_a_recording_that_lies_is_refused(copy):
 
 
 def test_a_cause_that_lies_is_refused(copy):
-    cause = ComparisonRecord.read(copy).engines[-1].cause
+    cause = load_record(copy).engines[-1].cause
     found = forge(copy, cause=cause.model_copy(update={"names": ["hinge.armature"]}))
     assert found.verdict == "broken"
-    assert any("engines.lab.cause.names" in line for line in found.complaints)
+    assert any("engines[lab].cause.names" in line for line in found.complaints)
 
 
 def test_another_recording_is_refused_however_much_was_made_to_fit(copy):
-    record, other = ComparisonRecord.read(copy), recorded(damping=0.25)
+    record, other = load_record(copy), recorded(damping=0.25)
     write_arrays(copy / place_of(0), other)
     record.write(copy)
     found = verify_own(copy)
-    assert any("is not the recording that comparison.json says was compared" in line for line in found.complaints)
+    assert any("is not the recording that record.json says was compared" in line for line in found.complaints)
     hashed = hash_of_arrays(other.times, other.xs, other.us)
     uses = [use.model_copy(update={"sha256": hashed}) if use.name == "lab" else use for use in record.data.judged_on]
     record.model_copy(update={"data": record.data.model_copy(update={"judged_on": uses})}).write(copy)
     found = verify_own(copy)
-    for key in ("trace.mcap: the motion of lab", "lab.largest_step_gap", "lab.cause.values.hinge.damping"):
+    for key in ("trace.mcap: the motion of lab", "[lab].largest_step_gap", "[lab].cause.values.hinge.damping"):
         assert any(key in line for line in found.complaints), (key, found.complaints)
     fewer = [record.recordings[0].model_copy(update={"samples": 60})]
     record.model_copy(update={"recordings": fewer}).write(copy)
-    assert any("61 samples, and comparison.json says 60" in line for line in verify_own(copy).complaints)
+    assert any("61 samples, and record.json says 60" in line for line in verify_own(copy).complaints)
     (copy / place_of(0)).write_bytes(b"no arrays")
     record.write(copy)
     assert verify_own(copy).verdict == "broken"
 
 
 def test_another_model_is_refused_however_much_was_made_to_fit(copy):
-    record = ComparisonRecord.read(copy)
+    record = load_record(copy)
     path = copy / "pendulum.urdf"
     path.write_text(path.read_text().replace('damping="0.1"', 'damping="0.12"'))
     record.write(copy)
     assert "is not the one that the record describes" in str(verify_own(copy))
-    file = record.model.file.model_copy(update=vars(ComparisonRecord.read(copy).files["pendulum.urdf"]))
+    file = record.model.file.model_copy(update=vars(load_record(copy).files["pendulum.urdf"]))
     other = dd.load_model(path, time_step=0.01)
     fitting = {"model": record.model.model_copy(update={"file": file}), "contract": other.contract.to_dict()}
     record.model_copy(update=fitting).write(copy)
     found = verify_own(copy)
-    assert any("lab.cause.sentence" in line for line in found.complaints), found.complaints
+    assert any("[lab].cause.sentence" in line for line in found.complaints), found.complaints
 
 
 def test_a_page_that_says_another_cause_is_refused(copy):
-    text, cause = (copy / PAGE).read_text(), ComparisonRecord.read(copy).engines[-1].cause
+    text, cause = (copy / PAGE).read_text(), load_record(copy).engines[-1].cause
     assert escape(cause.sentence) in text
     (copy / PAGE).write_text(text.replace(escape(cause.sentence), "The robot is right."))
-    ComparisonRecord.read(copy).write(copy)
-    assert f"{PAGE}: it does not say what comparison.json says of the cause of lab" in str(verify_own(copy))
+    load_record(copy).write(copy)
+    assert f"{PAGE}: it does not say what record.json says of the cause of lab" in str(verify_own(copy))
 
 
 def test_a_record_of_before_says_that_its_cause_was_not_looked_for_again(copy):
     shutil.rmtree(copy / "recordings")
     (copy / "pendulum.urdf").unlink()
-    record = ComparisonRecord.read(copy).model_copy(update={"recordings": [], "schema_version": "2.3.0"})
+    record = load_record(copy).model_copy(update={"recordings": [], "schema_version": "2.3.0"})
     fields = json.loads(record.write(copy).to_json())
     del fields["recordings"]
     (copy / record.FILE).write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
@@ -228,6 +224,6 @@ def test_arrays_come_back_to_the_last_bit_and_names_are_kept_apart(saved, tmp_pa
     assert [one.name for one in with_own_names([log, log, log])] == ["lab", "lab 2", "lab 3"]
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
     twice = dd.compare(model, [], recordings=[recorded(), recorded()])
-    cause = ComparisonRecord.read(saved).engines[-1].cause
+    cause = load_record(saved).engines[-1].cause
     with pytest.raises(InputError, match="two called lab"):
         dd.comparison.save_comparison(twice, tmp_path / "run", causes={"lab": cause})

@@ -13,16 +13,15 @@ import pytest
 from helpers.browser import browsing, colours, errors, move_slider, open_page, set_screen, view_of, wait_for_frame
 from helpers.models import MODELS
 from helpers.table import slow_after
-from pydrake.planning import RobotDiagramBuilder
 
 import drake_diff as dd
-from drake_diff.artifact import measure
-from drake_diff.artifact.live import scene_of_run, serve
-from drake_diff.artifact.page import plots_of
 from drake_diff.exceptions import ArtifactError, UnknownNameError
 from drake_diff.pages.html import page_data
 from drake_diff.pages.meshcat import frames_of
 from drake_diff.pages.scene import ARROW_PART, scene_of
+from drake_diff.runs import measure
+from drake_diff.runs.page import plots_of
+from drake_diff.runs.view import scene_of_run, serve
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -252,28 +251,19 @@ def test_a_run_is_shown_from_its_directory_alone(hostile, tmp_path):
     text = source.read_text()
     source.unlink()
     try:
-        scene, notes = scene_of_run(run)
+        scene = scene_of_run(run)
     finally:
         source.write_text(text)
-    assert notes == ()
     assert len(scene.shapes) > 0
     assert np.ptp(scene.trail, axis=0).max() > 0.1  # [m] it moves
 
 
-def test_a_run_of_a_users_own_diagram_is_shown_as_balls(tmp_path):
-    """No model file is in its trace. The ball is at the origin of the body, the hinge, which does not move."""
-    builder = RobotDiagramBuilder(time_step=0.02)
-    builder.parser().AddModels(str(MODELS / "pendulum.urdf"))
-    builder.plant().SetUseSampledOutputPorts(False)
-    builder.plant().Finalize()
-    model = dd.model_from_diagram(builder.Build())
+def test_of_a_run_whose_model_cannot_be_rebuilt_its_page_is_named(tmp_path):
+    model = dd.model_from_diagram(dd.load_model(MODELS / "pendulum.urdf", time_step=0.02).diagram)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=10, running_cost=dd.QuadraticCost(R=[[1.0]]))
     dd.save(dd.solve(problem, method="shooting"), tmp_path)
-    scene, notes = scene_of_run(tmp_path)
-    assert "a ball stands for each body" in notes[0]
-    assert [drawn.body for drawn in scene.shapes] == list(scene.poses)
-    assert len(scene.shapes) == 1
-    assert np.ptp(scene.trail, axis=0).max() < 1e-12
+    with pytest.raises(ArtifactError, match=r"a user's own diagram .* replay.html in it shows the motion"):
+        scene_of_run(tmp_path)
 
 
 def test_the_live_view_shows_the_plan_where_only_feedback_keeps_it(tmp_path):
@@ -284,7 +274,7 @@ def test_the_live_view_shows_the_plan_where_only_feedback_keeps_it(tmp_path):
     solution = dd.solve(problem, method="collocation")
     assert solution.judged_replay.control == "TVLQR"
     dd.save(solution, tmp_path / "run")
-    scene, _ = scene_of_run(tmp_path / "run")
+    scene = scene_of_run(tmp_path / "run")
     (poses,) = (found for path, found in scene.poses.items() if "pole" in path)
     hinge = [np.arctan2(pose.rotation().matrix()[0, 2], pose.rotation().matrix()[0, 0]) for pose in poses]
     assert np.cos(np.array(hinge) - solution.xs[:, 0]) == pytest.approx(1.0, abs=1e-9)

@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff._base.statistics import success_rate
-from drake_diff.artifact.verify import recalled
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
-from drake_diff.record.sealed import own_sha256
+from drake_diff.runs.sealed import own_sha256
+from drake_diff.runs.verify import recalled
 from drake_diff.trials import page as robustness_page
 from drake_diff.trials.files import record_of
 from drake_diff.trials.page import robustness_data
@@ -55,13 +55,13 @@ def saved(result, run, tmp_path_factory):
 
 def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
     folder, record = saved
-    fields = json.loads((folder / "robustness.json").read_text())
-    assert dd.record.RobustnessRecord.model_validate(fields) == record
+    fields = json.loads((folder / "record.json").read_text())
+    assert dd.runs.PlanRecord.model_validate(fields) == record
     assert own_sha256(fields) == fields["record_sha256"]
     for file in record.files.values():
         assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
     expected = {
-        "robustness.schema.json",
+        "record.schema.json",
         "robustness.html",
         "trials.csv",
         *(f"worst/{name}/{file}" for name in WORST for file in TRIAL_FILES),
@@ -69,11 +69,11 @@ def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
     assert set(record.files) == expected
     assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == {
         *expected,
-        "robustness.json",
+        "record.json",
     }
-    assert record.run.record_sha256 == dd.load_record(run).record_sha256
-    assert [p.name for p in record.perturbations] == list(LEVELS)
-    for p in record.perturbations:
+    assert record.robustness.run.record_sha256 == dd.load_record(run).record_sha256
+    assert [p.name for p in record.robustness.perturbations] == list(LEVELS)
+    for p in record.robustness.perturbations:
         assert p.margin == result.margins[p.name]
         for c, cell in zip(p.cells, result.of(p.name), strict=True):
             assert (c.level, c.successes, c.trials, c.rate) == (cell.level, cell.rate[0], 6, cell.rate.value)
@@ -85,7 +85,7 @@ def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
             )
             assert c.distinct == (1 if p.name in ("time_step", "actuator_delay") else 6 if p.name == "mass" else 1)
     assert record.verdict == ("pass" if result.success else "fail")
-    assert record.loop.latency_budget_s == 0.02
+    assert record.robustness.loop.latency_budget_s == 0.02
     assert record.wall_clock.controller_steps == 20 * (1 + len(result.cells))
 
 
@@ -164,7 +164,7 @@ def test_what_a_controller_raises_stands_in_record_and_table(run, tmp_path):
         found = dd.robustness(solution, {"mass": [0.02]}, trials=2, controller=lambda *_: lambda x, t: 1 / 0)
         record = dd.trials.save_robustness(found, tmp_path / "out", run)
     assert record.verdict == "fail"
-    assert record.perturbations[0].cells[0].controller_errors == {"ZeroDivisionError: division by zero": 2}
+    assert record.robustness.perturbations[0].cells[0].controller_errors == {"ZeroDivisionError: division by zero": 2}
     rows = list(csv.DictReader((tmp_path / "out" / "trials.csv").open()))
     assert [row["label"] for row in rows] == ["control_error"] * 2
     assert all("the controller failed: ZeroDivisionError: division by zero" in row["reason"] for row in rows)
@@ -266,7 +266,7 @@ def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(result, tmp_p
     with pytest.raises(OSError, match="no space"):
         dd.trials.save_robustness(result, tmp_path / "out")
     (left,) = tmp_path.glob("out.partial-*")
-    assert json.loads((left / "robustness.json").read_text())["verdict"] == "incomplete"
+    assert json.loads((left / "record.json").read_text())["verdict"] == "incomplete"
     assert not (left / "robustness.html").exists()
     assert dd.load_record(tmp_path / "out") == before
     assert dd.verify(tmp_path / "out").verdict == "intact"
@@ -287,11 +287,11 @@ def test_a_loop_of_ones_own_is_not_said_to_run_again(cart, run, tmp_path):
         loop=dd.loop.Loop(sensor=dd.loop.Sensor(noise=0.01), latency_budget=1),
     )
     record = dd.trials.save_robustness(result, tmp_path, run)
-    trial = json.loads((tmp_path / record.perturbations[0].worst / "trial.json").read_text())
+    trial = json.loads((tmp_path / record.robustness.perturbations[0].worst / "trial.json").read_text())
     assert trial["run"] is None
-    assert record.loop.sensor["noise"] == 0.01
-    assert (record.loop.latency_budget_s, record.loop.latency_budget_is) == (1.0, "stated")
-    assert record.loop.actuator["upper"] is None
+    assert record.robustness.loop.sensor["noise"] == 0.01
+    assert (record.robustness.loop.latency_budget_s, record.robustness.loop.latency_budget_is) == (1.0, "stated")
+    assert record.robustness.loop.actuator["upper"] is None
     with pytest.raises(InputError, match="trial: run"):
         evaluate(trial)
 
@@ -306,10 +306,10 @@ def test_a_run_that_breaks_off_at_once_and_one_with_a_fallback_are_kept(cart, tm
     solution = pushed_and_stopped(cart)
     result = dd.robustness(solution, {"mass": [0.1]}, trials=1, controller=made)
     record = dd.trials.save_robustness(result, tmp_path / "broken")
-    assert record.nominal.ended.endswith("no answer")
-    assert record.perturbations[0].cells[0].labels == {"control_error": 1}
-    assert record.loop.controller == "a user's function"
-    assert record.run is None
+    assert record.robustness.nominal.ended.endswith("no answer")
+    assert record.robustness.perturbations[0].cells[0].labels == {"control_error": 1}
+    assert record.robustness.loop.controller == "a user's function"
+    assert record.robustness.run is None
     loop = dd.loop.Loop(fallback=dd.loop.Fallback("stop"))
     found = dd.robustness(solution, {"mass": [0.1]}, trials=1, controller=made, loop=loop)
     dd.trials.save_robustness(found, tmp_path / "kept")
@@ -331,12 +331,12 @@ def test_what_runs_away_is_kept(cart, tmp_path, levels):
     )
     record = dd.trials.save_robustness(result, tmp_path)
     worst = result.cells[0].worst
-    fields = json.loads((tmp_path / record.perturbations[0].worst / "trial.json").read_text())
+    fields = json.loads((tmp_path / record.robustness.perturbations[0].worst / "trial.json").read_text())
     assert fields["label"] == worst.label
     assert (fields["goal_error"] is None) == (worst.label == "evaluation_error")
-    log = dd.logs.read_mcap(tmp_path / record.perturbations[0].worst / "trace.mcap")
+    log = dd.logs.read_mcap(tmp_path / record.robustness.perturbations[0].worst / "trace.mcap")
     assert np.array_equal(log.arrays("/state")["q"], worst.outcome.run.motion.xs[:, :1])
-    replay = (tmp_path / record.perturbations[0].worst / "replay.html").read_text()
+    replay = (tmp_path / record.robustness.perturbations[0].worst / "replay.html").read_text()
     assert "drawn up to 1e+06 only" in replay
 
 
@@ -351,8 +351,8 @@ def test_plants_with_contact_finer_steps_and_no_inputs_are_kept(thrown, tmp_path
     assert len(log.arrays("/state")["q"]) == len(log.arrays("/planned/state")["q"]) == 121
     assert len(log.arrays("/estimate")["q"]) == 60
     assert log.messages["/contacts"]
-    assert record.loop.judged_by == "the plan's end"
-    assert all(c.distinct == 1 for p in record.perturbations[1:2] for c in p.cells)
+    assert record.robustness.loop.judged_by == "the plan's end"
+    assert all(c.distinct == 1 for p in record.robustness.perturbations[1:2] for c in p.cells)
 
 
 def test_names_are_escaped(tmp_path):
@@ -414,9 +414,10 @@ def test_the_command(run, tmp_path):
     assert found.exit_code == 0, found.output
     assert "Unperturbed it succeeds" in found.output
     out = tmp_path / "mine_robustness"
-    record = json.loads((out / "robustness.json").read_text())
-    assert (record["verdict"], record["trials"], record["seed"]) == ("pass", 3, 1)
-    assert [p["name"] for p in record["perturbations"]] == ["mass", "sensor_bias"]
+    record = json.loads((out / "record.json").read_text())
+    trials = record["robustness"]
+    assert (record["verdict"], trials["trials"], trials["seed"]) == ("pass", 3, 1)
+    assert [p["name"] for p in trials["perturbations"]] == ["mass", "sensor_bias"]
     assert dd.verify(here).holds  # nothing is written into the run
 
 
@@ -431,7 +432,7 @@ def test_the_command_fails_where_the_plan_does_not_survive(run, tmp_path):
 def test_the_command_takes_mpc(run, tmp_path):
     found = call(run, "--trials", 1, "--perturbations", "mass", "--controller", "mpc", "--out", tmp_path / "out")
     assert found.exit_code == 0, found.output
-    assert json.loads((tmp_path / "out" / "robustness.json").read_text())["loop"]["controller"] == "mpc"
+    assert json.loads((tmp_path / "out" / "record.json").read_text())["robustness"]["loop"]["controller"] == "mpc"
 
 
 def test_the_command_refuses_what_it_cannot_try(run, tmp_path):

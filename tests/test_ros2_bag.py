@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.artifact.ros2 import export_ros2
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
+from drake_diff.runs.ros2 import export_ros2
 
 pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
 
@@ -65,8 +65,8 @@ def test_frames_inputs_and_diagnostics_are_the_trace_s(run, bag):
 
 def test_contacts_and_events_are_the_trace_s(load, tmp_path):
     """Of a hopper that stands on its foot."""
-    from drake_diff.artifact import measure
-    from drake_diff.artifact.trace import write_trace
+    from drake_diff.runs import measure
+    from drake_diff.runs.trace import write_trace
 
     model = load("hopper.sdf", time_step=0.005)
     x0 = model.default_state

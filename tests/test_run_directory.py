@@ -34,9 +34,6 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff._base import files
 from drake_diff._base.clock import check_time
-from drake_diff.artifact import recover
-from drake_diff.artifact.listing import list_runs
-from drake_diff.artifact.save import begin, keep_plan
 from drake_diff.cli import main as cli
 from drake_diff.exceptions import ArtifactError, InputError, ModelError, WriteError
 from drake_diff.logs.mcap_file import read_mcap
@@ -44,9 +41,12 @@ from drake_diff.optimize import phased
 from drake_diff.optimize import run as optimize_run
 from drake_diff.optimize.solve import _best_of
 from drake_diff.optimize.transcription.collocation import Transcription
-from drake_diff.record.directory import RECORDS, writing, written_whole
-from drake_diff.record.read import KINDS
-from drake_diff.record.sealed import canonical, own_sha256
+from drake_diff.runs import recover
+from drake_diff.runs.directory import writing, written_whole
+from drake_diff.runs.fields import canonical
+from drake_diff.runs.listing import list_runs
+from drake_diff.runs.save import begin, keep_plan
+from drake_diff.runs.sealed import own_sha256
 
 OLD, NEW = 0.2, 0.3  # the goals of the two runs
 SEARCHES = {
@@ -168,10 +168,6 @@ def test_a_link_to_a_run_stays_and_an_empty_directory_is_taken(run, solutions, t
         assert goal_of(target) == NEW
     assert (tmp_path / "link").is_symlink()
     assert goal_of(run) == NEW
-
-
-def test_every_kind_of_record_is_known_by_its_name():
-    assert {kind.FILE for kind in KINDS} <= set(RECORDS)
 
 
 def test_a_panel_leaves_others_files_alone(tmp_path):
@@ -403,7 +399,7 @@ def test_a_signal_that_comes_while_a_plan_is_kept_waits_for_it(solutions, tmp_pa
         signal.raise_signal(signal.SIGINT)
         begun(path, data)
 
-    monkeypatch.setattr("drake_diff.artifact.rerun.write_whole", interrupted)
+    monkeypatch.setattr("drake_diff.runs.rerun.write_whole", interrupted)
     with pytest.raises(KeyboardInterrupt):
         keep_plan(solutions[1], partial)
     assert has_plan(partial, solutions[1])

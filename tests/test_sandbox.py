@@ -16,13 +16,15 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.sandbox import call
-from drake_diff.artifact.live import scene_of_run
-from drake_diff.artifact.verify import recalled
 from drake_diff.exceptions import ArtifactError, InputError, ModelError
+from drake_diff.runs.verify import recalled
+from drake_diff.runs.view import scene_of_run
 
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
 from fuzz_directories import Canaries, fuzz, models, with_attachment
 from trust_verify import seal
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 
 def give(value):
@@ -123,7 +125,7 @@ def test_no_model_leads_out_of_a_directory_or_ends_this_process(run, tmp_path):
 
 
 def test_a_model_that_ends_drake_breaks_the_run(run, monkeypatch):
-    monkeypatch.setattr("drake_diff.artifact.verify.call", lambda *_: ask(end, monkeypatch))
+    monkeypatch.setattr("drake_diff.runs.verify.call", lambda *_: ask(end, monkeypatch))
     found = dd.verify(run)
     assert found.verdict == "broken"
     assert "the model cannot be read or run: the process that did so ended by SIGABRT" in found.sentence

@@ -7,7 +7,7 @@ from helpers.table import each_row
 from pydrake.multibody.tree import JointIndex
 
 import drake_diff as dd
-from drake_diff.artifact import measure
+from drake_diff.runs import measure
 
 
 def by_hand(model, random, x0=None, steps=8, off=0.01):

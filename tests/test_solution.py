@@ -11,11 +11,11 @@ from helpers.plants import block
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.artifact import measure
 from drake_diff.exceptions import InputError
 from drake_diff.optimize.checks import check
 from drake_diff.optimize.messages import controls
 from drake_diff.optimize.replay import deciding, judged_replay
+from drake_diff.runs import measure
 
 METHODS = ("collocation", "shooting", "ilqr")
 OPEN, CLOSED = "open loop", "TVLQR"

@@ -22,9 +22,9 @@ import drake_diff as dd
 from drake_diff._base import untrusted
 from drake_diff._base.sandbox import memory_at_most
 from drake_diff._base.untrusted import arrays_of, files_in, read_plain
-from drake_diff.artifact import list_runs
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.mcap_file import read_mcap, recover_mcap
+from drake_diff.runs import list_runs
 
 RUN = ROOT / "artifacts" / "pendulum_swing_up"
 MIB = 2**20
@@ -77,7 +77,7 @@ def test_a_run_with_such_a_file_is_broken_and_listed(tmp_path, told, name):
 def test_a_run_whose_files_are_too_much_to_read_is_broken(tmp_path, monkeypatch):
     """A thousand files of 1 GiB that are holes take no room, and an hour."""
     folder = Path(shutil.copytree(RUN, tmp_path / "run"))
-    monkeypatch.setattr("drake_diff.artifact.verify.MOST_READ", (folder / "plan.npz").stat().st_size)
+    monkeypatch.setattr("drake_diff.runs.verify.MOST_READ", (folder / "plan.npz").stat().st_size)
     found = dd.verify(folder)
     assert found.verdict == "broken"
     assert "and the files before it have more than" in found.sentence

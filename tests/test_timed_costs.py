@@ -9,10 +9,10 @@ from helpers.table import each_row
 from pydrake.trajectories import PiecewisePolynomial
 
 import drake_diff as dd
-from drake_diff.artifact.sections import describe_problem
 from drake_diff.exceptions import InputError, ShapeError
 from drake_diff.loop import MPC, closed_loop
 from drake_diff.optimize import TrackingCost
+from drake_diff.runs.sections import describe_problem
 
 METHODS = ["collocation", "ilqr", "shooting"]
 

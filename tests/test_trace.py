@@ -17,11 +17,11 @@ from mcap.reader import make_reader
 
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
-from drake_diff.artifact import measure
-from drake_diff.artifact.trace import write_trace
 from drake_diff.exceptions import ArtifactError
 from drake_diff.optimize.program import Iteration
 from drake_diff.optimize.solution import Solution
+from drake_diff.runs import measure
+from drake_diff.runs.trace import write_trace
 
 
 def pendulum(folder=MODELS, name="pendulum.urdf", **options):

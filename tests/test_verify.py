@@ -23,15 +23,15 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import Writer
 
 import drake_diff as dd
-import drake_diff.artifact.save as evidence
-from drake_diff.artifact import measure
-from drake_diff.artifact.differences import is_near, is_near_text
-from drake_diff.artifact.listing import list_runs
-from drake_diff.artifact.save import begin
-from drake_diff.artifact.trace import write_trace
+import drake_diff.runs.save as evidence
 from drake_diff.exceptions import ArtifactError
-from drake_diff.record.sealed import reproducible
-from drake_diff.record.solve import EvidenceRecord
+from drake_diff.runs import measure
+from drake_diff.runs.differences import is_near, is_near_text
+from drake_diff.runs.listing import list_runs
+from drake_diff.runs.plan_record import PlanRecord
+from drake_diff.runs.save import begin
+from drake_diff.runs.sealed import reproducible
+from drake_diff.runs.trace import write_trace
 
 FILES = ("plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap")
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -188,7 +188,7 @@ def lying(section, change):
         change(fields[section])
         if section in ("metrics", "replays"):  # whoever lies about them leaves out what says otherwise
             fields |= {"panel": None}
-        return EvidenceRecord.model_validate(fields)
+        return PlanRecord.model_validate(fields)
 
     return record_of
 
@@ -259,7 +259,7 @@ def test_a_run_that_stopped_far_from_its_goal_cannot_say_that_it_converged(solut
         fields["failures"] = []
         fields["events"] = [e for e in fields["events"] if e["kind"] != "failure"]
         fields["solver"] = {**fields["solver"], "status": "converged"}
-        return EvidenceRecord.model_validate({**fields, "verdict": "pass"})
+        return PlanRecord.model_validate({**fields, "verdict": "pass"})
 
     monkeypatch.setattr(evidence, "record_of", forged)
     assert dd.save(stopped, tmp_path / "run").verdict == "pass"
@@ -451,8 +451,8 @@ def test_no_directory_is_an_error_and_no_record_is_broken(tmp_path):
         dd.verify(tmp_path).require()
 
 
-KINDS = {"solve": "plan.npz", "comparison": "trace.mcap", "robustness": "worst/mass_0.1/trial.json"}
-KINDS["certification"] = "certification.schema.json"
+KINDS = {"plan": "plan.npz", "comparison": "trace.mcap", "robustness": "worst/mass_0.1/trial.json"}
+KINDS["certification"] = "record.schema.json"
 
 
 @pytest.fixture(scope="module")
@@ -460,19 +460,19 @@ def kinds(run, solution, tmp_path_factory):
     """A directory of each kind."""
     folder = tmp_path_factory.mktemp("kinds")
     model = solution.problem.model
-    shutil.copytree(run, folder / "solve")
+    shutil.copytree(run, folder / "plan")
     dd.comparison.save_comparison(dd.compare(model, ("numpy",), num_steps=5), folder / "comparison")
     tried = dd.robustness(solution, {"mass": [0.1]}, trials=2, controller="open_loop")
     dd.trials.save_robustness(tried, folder / "robustness")
-    dd.record.certify_model(model, states=2, directory=folder / "certification")
+    dd.runs.certify_model(model, states=2, directory=folder / "certification")
     return folder
 
 
 def test_every_kind_of_directory_is_known_read_and_listed(kinds):
     """Comparisons and trials are not run again, and nothing says that they hold."""
     verdicts = {kind: dd.verify(kinds / kind).verdict for kind in KINDS}
-    assert verdicts == {"solve": "holds", "comparison": "intact", "robustness": "intact", "certification": "holds"}
-    assert {kind: dd.load_record(kinds / kind).kind for kind in KINDS} == {kind: kind for kind in KINDS}
+    assert verdicts == {"plan": "holds", "comparison": "intact", "robustness": "intact", "certification": "holds"}
+    assert {kind: dd.load_record(kinds / kind).subject for kind in KINDS} == {kind: kind for kind in KINDS}
     assert {line.name: line.kind for line in list_runs(kinds)} == {kind: kind for kind in KINDS}
     found = dd.verify(kinds / "comparison")
     assert str(found) == "intact: the files are as they were written; the numbers were not taken again"
@@ -498,29 +498,31 @@ def test_a_changed_directory_of_any_kind_is_refused_and_the_file_named(kinds, ki
 
 def test_a_certification_that_lies_is_found_by_certifying_again(kinds, tmp_path):
     record = dd.load_record(kinds / "certification")
-    state = record.states[0]
+    state = record.certification.states[0]
     for lie, words in (
-        ({"largest": state.largest * (1 + 1e-5)}, "states[0].largest"),
-        ({"x": [x + 1e-3 for x in state.x]}, "states[0].x[0]"),
-        ({"gradient": state.gradient.model_copy(update={"entries": 99})}, "states[0].gradient.entries"),
+        ({"largest": state.largest * (1 + 1e-5)}, "certification.states[0].largest"),
+        ({"x": [x + 1e-3 for x in state.x]}, "certification.states[0].x[0]"),
+        ({"gradient": state.gradient.model_copy(update={"entries": 99})}, "certification.states[0].gradient.entries"),
     ):
         directory = Path(shutil.copytree(kinds / "certification", tmp_path / words[-6:]))
-        record.model_copy(update={"states": [state.model_copy(update=lie), *record.states[1:]]}).write(directory)
+        states = [state.model_copy(update=lie), *record.certification.states[1:]]
+        section = record.certification.model_copy(update={"states": states})
+        record.model_copy(update={"certification": section}).write(directory)
         found = dd.verify(directory)
         assert found.verdict == "broken"
-        assert any("certification.json" in complaint and words in complaint for complaint in found.complaints)
+        assert any("record.json" in complaint and words in complaint for complaint in found.complaints)
 
 
 @pytest.mark.slow
 def test_a_certification_carries_its_model_and_one_whose_mesh_changed_is_undecided(tmp_path):
     path = Path(shutil.copy(MODELS / "pendulum.urdf", tmp_path))
-    dd.record.certify_model(dd.load_model(path, time_step=0.02), states=1, directory=tmp_path / "certified")
+    dd.runs.certify_model(dd.load_model(path, time_step=0.02), states=1, directory=tmp_path / "certified")
     path.unlink()
     assert dd.verify(tmp_path / "certified").require().holds
     (tmp_path / "tetra.obj").write_text(TETRAHEDRON)
     (tmp_path / "m.urdf").write_text(EVIL.format(mesh="tetra.obj"))
     model = dd.load_model(tmp_path / "m.urdf", time_step=0.02)
-    dd.record.certify_model(model, states=1, directory=tmp_path / "meshed")
+    dd.runs.certify_model(model, states=1, directory=tmp_path / "meshed")
     assert "does not hold: models=FOLDER" in str(dd.verify(tmp_path / "meshed"))
     assert dd.verify(tmp_path / "meshed", models=tmp_path).require().holds
     (tmp_path / "tetra.obj").write_text(TETRAHEDRON + "\n")
@@ -533,18 +535,19 @@ def test_a_pass_with_an_engine_or_a_perturbation_that_does_not_hold_is_refused(k
     fields = dd.load_record(kinds / "comparison").model_dump()
     fields["engines"][1]["verdict"] = "unexplained"
     with pytest.raises(ValueError, match=r'"pass" with numpy'):
-        dd.record.ComparisonRecord.model_validate({**fields, "verdict": "pass"})
+        dd.runs.ComparisonRecord.model_validate({**fields, "verdict": "pass"})
     fields = dd.load_record(kinds / "robustness").model_dump()
-    for change in ({"nominal": None}, {"perturbations": [{**fields["perturbations"][0], "margin": 0.0}]}):
+    trials = fields["robustness"]
+    for change in ({"nominal": None}, {"perturbations": [{**trials["perturbations"][0], "margin": 0.0}]}):
         with pytest.raises(ValueError, match=r'"pass" with (an unperturbed run|mass)'):
-            dd.record.RobustnessRecord.model_validate({**fields, "verdict": "pass", **change})
+            dd.runs.PlanRecord.model_validate({**fields, "verdict": "pass", "robustness": {**trials, **change}})
 
 
 def test_a_pass_of_a_state_that_does_not_agree_is_no_certification(kinds):
     fields = dd.load_record(kinds / "certification").model_dump()
-    fields["states"][0]["gradient"] = None
-    with pytest.raises(ValueError, match="does not agree"):
-        dd.record.CertificationRecord.model_validate(fields)
+    fields["certification"]["states"][0]["gradient"] = None
+    with pytest.raises(ValueError, match="state 0 refused"):
+        dd.runs.PlanRecord.model_validate(fields)
 
 
 def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):

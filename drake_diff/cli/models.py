@@ -68,14 +68,14 @@ def certify(
 
     Writes certification.json. Exit status 0 only if every certificate agrees.
     """
-    from drake_diff.record.certification import certify_model
+    from drake_diff.runs.certificates import certify_model
 
     directory = out or Path("artifacts") / f"certify_{file.stem}"
     show(plain(file.name, "bold"), f"{model}, contact {model.contract.contact.model}")
     names = tuple(names_in(parameters) or ())
     record: Any = certify_model(model, states=states, seed=seed, parameters=names, method=method, directory=directory)
     rows = table("state", "motion", "contacts", "entries", "largest", "from", "noticed", "verdict")
-    for i, state in enumerate(record.states):
+    for i, state in enumerate(record.certification.states):
         modes = list(state.contact_modes.values())
         gradient, near = state.gradient, f", {len(state.mode_changes)} near" if state.mode_changes else ""
         rows.add_row(
@@ -89,7 +89,7 @@ def certify(
             plain(state.verdict + near, "green" if state.verdict == "agree" else "red"),
         )
     show(rows)
-    for i, state in enumerate(record.states):
+    for i, state in enumerate(record.certification.states):
         if state.verdict != "agree":
             show(f"state {i}: {state.refusal or state.gradient.worst}")
             for change in state.mode_changes[:3]:
@@ -121,7 +121,7 @@ def compare(
     from drake_diff.comparison.recordings import read_recording, with_own_names
     from drake_diff.comparison.side_by_side import compare as compare_engines
     from drake_diff.identification.cause import cause_of
-    from drake_diff.record.directory import written_whole
+    from drake_diff.runs.directory import written_whole
 
     directory = out or Path("artifacts") / f"compare_{file.stem}"
     recordings = with_own_names([read_recording(path, model) for path in recording or ()])
@@ -192,12 +192,12 @@ def identify(
 ) -> None:
     """Estimate parameters of MODEL from recordings: which differ, by how much, how sure, and what stays open.
 
-    Writes identification.json, the recordings, trace.mcap and report.html. Exit status 0 only if the values found
+    Writes record.json, the recordings, trace.mcap and report.html. Exit status 0 only if the values found
     explain the recordings.
     """
-    from drake_diff.artifact.identified import write_identification
+    from drake_diff.identification.files import write_identification
     from drake_diff.identification.identify import identify as estimate
-    from drake_diff.record.directory import written_whole
+    from drake_diff.runs.directory import written_whole
 
     directory = out or Path("artifacts") / f"identify_{file.stem}"
     names: Any = "all" if parameters is None else names_in(parameters)

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -140,8 +140,8 @@ def robustness(
     Exit status 0 only if it reaches the goal unperturbed, and each perturbation has a level at which 95 % of the
     trials succeed.
     """
-    from drake_diff.artifact.verify import recalled
-    from drake_diff.record.directory import written_whole
+    from drake_diff.runs.directory import written_whole
+    from drake_diff.runs.verify import recalled
     from drake_diff.trials.files import PAGE, write_robustness
     from drake_diff.trials.run import levels_named
     from drake_diff.trials.run import robustness as try_plan
@@ -153,10 +153,10 @@ def robustness(
         with written_whole(directory) as folder:
             with progress_line("trying", stderr=True) as report:
                 result = try_plan(solution, levels, trials=trials, controller=controller, seed=seed, progress=report)
-            record = write_robustness(result, folder, run)
+            record: Any = write_robustness(result, folder, run)
     columns = ("perturbation", "level", "success", "95 % interval", "goal error", "measured", "predicted", "labels")
     rows = table(*columns, wrap=False)
-    for p in record.perturbations:
+    for p in record.robustness.perturbations:
         for i, c in enumerate(p.cells):
             labels = ", ".join(f"{count} {label.removesuffix('_error')}" for label, count in c.labels.items())
             rows.add_row(
@@ -216,7 +216,7 @@ def panel(
     show(rows)
     show(f"{found.summary['trials']} trials, {found.errors} errors")
     show(
-        f"wrote {directory}: panel.json, table.csv, summary.json, trials.jsonl, panel.html, a record of each in trials"
+        f"wrote {directory}: record.json, table.csv, summary.json, trials.jsonl, panel.html, a record of each in trials"
     )
     raise typer.Exit(1 if found.errors else 0)
 

@@ -66,8 +66,8 @@ def run(
     claimed: list[Path] = []
     try:
         # Only here: a script that is missing is refused before Drake is loaded.
-        from drake_diff.record.directory import written_whole
-        from drake_diff.record.solve import record_without_problem
+        from drake_diff.runs.directory import written_whole
+        from drake_diff.runs.save import record_without_problem
 
         with written_whole(directory) as folder:
             claimed.append(folder)
@@ -86,7 +86,7 @@ def run(
             raise
         show(f"interrupted before {directory} was opened: nothing is written")
         raise typer.Exit(INTERRUPTED) from None
-    (_show_phases if record.kind == "phases" else _show_record)(record)
+    (_show_record if record.phases is None else _show_phases)(record)
     show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
     if shown:
         _wait_at(f"the plan is at {shown[0]}")
@@ -127,10 +127,10 @@ def _wait_at(place: str) -> None:
 
 def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str, Any], checked: bool) -> Any:
     """Solve, measure and write `folder`, which is to be `directory`; what is interrupted takes no other run's place."""
-    from drake_diff.artifact.cross_check import cross_check
-    from drake_diff.artifact.save import begin, begin_failure, begin_interrupted, keep_plan, plan_kept, write_run
     from drake_diff.optimize.solve import solve
-    from drake_diff.record.directory import is_taken
+    from drake_diff.runs.cross_check import cross_check
+    from drake_diff.runs.directory import is_taken
+    from drake_diff.runs.save import begin, begin_failure, begin_interrupted, keep_plan, plan_kept, write_run
 
     begun: list[Any] = []
 
@@ -149,7 +149,7 @@ def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str,
             with progress_line("replaying it in other plants"):
                 solution = cross_check(solution)
         with plan_kept(solution, directory.name, folder):
-            record = write_run(solution, folder)
+            record: Any = write_run(solution, folder)
     except KeyboardInterrupt:
         with held_interrupts():
             begin_interrupted(folder, problem)
@@ -170,14 +170,14 @@ def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str,
 
 def _show_phases(record: Any) -> None:
     show(judged(record.verdict), f" {record.solver.status}: {record.sentence}")
-    rows = table("phase", "ended", "cost", "steps" if record.counts_steps else "seconds")
-    for phase in record.phases:
+    rows = table("phase", "ended", "cost", "steps" if record.phases.counts_steps else "seconds")
+    for phase in record.phases.phases:
         rows.add_row(plain(phase.name), plain(phase.status), plain(phase.cost), plain(phase.duration))
     show(rows)
-    for link in record.links:
+    for link in record.phases.links:
         errors = [float("inf") if error is None else error for error in link.errors]
         show(f"link {link.before} to {link.after}: missed by {max(errors):.3g}, tolerance {link.tolerance:g}")
-    show(f"the chain of all phases: {plain(record.chain.told)}")
+    show(f"the chain of all phases: {plain(record.phases.chain.told)}")
 
 
 def _loaded(script: Path) -> ModuleType:
@@ -229,7 +229,7 @@ def verify(
     said of recordings is made again: how they compare, and their causes.
     RUN may be a stranger's: its model is read in a child process with limits of time and memory.
     """
-    from drake_diff.artifact.verify import verify as verify_run
+    from drake_diff.runs.verify import verify as verify_run
 
     found = verify_run(run, models=models, time_limit=time_limit, memory_limit=memory_limit)
     verdict = "unknown" if found.record is None else found.record.verdict
@@ -245,7 +245,7 @@ def list_all(
     directory: Annotated[Path, typer.Argument(metavar="DIRECTORY", help="Where the runs are.")] = Path("artifacts"),
 ) -> None:
     """List the records in DIRECTORY and their verdicts as written; `verify` checks them."""
-    from drake_diff.artifact.listing import list_runs
+    from drake_diff.runs.listing import list_runs
 
     rows = table("run", "verdict", "kind", "status", "cost", "model", "written")
     for line in list_runs(directory):
@@ -262,7 +262,7 @@ def recover_run(
 
     Exit status 0 only if the plan passes every check. No run is replaced.
     """
-    from drake_diff.artifact.recover import recover as complete
+    from drake_diff.runs.save import recover as complete
 
     record: Any = complete(run, out)
     show(judged(record.verdict), f" {record.sentence}")
@@ -283,7 +283,7 @@ def compare_runs(
     With --out, a page shows both plans in one replay and in the same plots as well.
     Exit status 1 if the two define a metric differently; such metrics are not compared.
     """
-    from drake_diff.artifact.listing import compare_runs as compare
+    from drake_diff.runs.listing import compare_runs as compare
 
     found = compare(a, b)
     for title in ("configuration", "versions", "metrics"):
@@ -297,7 +297,7 @@ def compare_runs(
     for line in found.refused:
         show(plain(f"not compared: {line}", "red"))
     if out is not None:
-        from drake_diff.artifact.runs_page import write_runs_page
+        from drake_diff.runs.runs_page import write_runs_page
 
         write_runs_page(out, a, b, models=models)
         show(f"wrote {out}")
@@ -306,14 +306,14 @@ def compare_runs(
 
 def schema() -> None:
     """Print the JSON Schema of record.json."""
-    from drake_diff.record.solve import EvidenceRecord
+    from drake_diff.runs.plan_record import PlanRecord
 
-    sys.stdout.write(EvidenceRecord.published_schema().decode())
+    sys.stdout.write(PlanRecord.published_schema().decode())
 
 
 def view(run: RunDirectory, models: ModelFolder = None) -> None:
     """Show the motion of RUN in a browser on this machine, until Ctrl-C."""
-    from drake_diff.artifact.live import serve
+    from drake_diff.runs.view import serve
 
     try:
         meshcat, notes = serve(run, models=models)
@@ -334,7 +334,7 @@ def export(
     ros2: Annotated[bool, typer.Option("--ros2", help="Write a bag for ROS 2.")] = False,
 ) -> None:
     """Write the motion in RUN for other tools."""
-    from drake_diff.artifact.ros2 import export_ros2
+    from drake_diff.runs.ros2 import export_ros2
 
     if not ros2:
         raise InputError("export", got="no format", expected="--ros2")

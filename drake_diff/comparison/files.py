@@ -23,12 +23,12 @@ from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.logs.messages import TYPES
 from drake_diff.model.model import Model
 from drake_diff.pages.html import Line, Plot, page_data, write_page
-from drake_diff.record import comparison as records
-from drake_diff.record.comparison import ComparisonRecord
-from drake_diff.record.directory import name_of, written_whole
-from drake_diff.record.embodiment import embodiment_of
-from drake_diff.record.parts import DataBoundary, DataUse
-from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
+from drake_diff.runs import other_records as records
+from drake_diff.runs.directory import name_of, written_whole
+from drake_diff.runs.fields import DataBoundary, DataUse
+from drake_diff.runs.other_records import ComparisonRecord
+from drake_diff.runs.provenance import embodiment_of, gradient_evidence, model_input, provenance_of, written_now
+from drake_diff.runs.sealed import WallClock
 
 TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
 MOTION = "motion"  # among the data: the name of what every engine was given
@@ -44,7 +44,7 @@ NONE: Mapping[str, records.CauseEvidence] = MappingProxyType({})
 def save_comparison(
     comparison: Comparison, directory: str | Path, *, causes: Mapping[str, records.CauseEvidence] | None = None
 ) -> ComparisonRecord:
-    """Write a comparison as a directory: comparison.json, trace.mcap, replay.html and comparison.html.
+    """Write a comparison as a directory: record.json, trace.mcap, replay.html and comparison.html.
 
     Recordings, where all of them take no more than 64 MiB, are kept in it, and with them the model file. All of it is
     written beside `directory`, and takes its place at the end.
@@ -55,7 +55,7 @@ def save_comparison(
         causes: by the name of a recording, what `dd.identification.cause_of` says of it.
 
     Returns:
-        The record in comparison.json, which `dd.verify` checks against the other files.
+        The record in record.json, which `dd.verify` checks against the other files.
 
     Raises:
         InputError: `directory` holds what no run wrote, or two recordings with causes have the same name.
@@ -122,7 +122,7 @@ def record_of(
             for i, r in enumerate(_kept(comparison))
         ],
         "refused": [records.RefusedEvidence(**vars(refused)) for refused in comparison.refused],
-        "wall_clock": records.ComparisonClock(
+        "wall_clock": WallClock(
             written_utc=written_now(),
             seconds_per_step={e.engine: e.seconds_per_step for e in comparison.engines},
             seconds_per_jacobian={e.engine: e.seconds_per_jacobian for e in comparison.engines},
@@ -141,7 +141,7 @@ def _begun(name: str, model: Model) -> ComparisonRecord:
         embodiment=embodiment_of(model.contract), contract=model.contract.to_dict(),
         time_step_s=model.time_step, state_names=list(model.state_names), input_names=list(model.input_names),
         states=[], engines=[], refused=[], provenance=provenance_of(),
-        wall_clock=records.ComparisonClock(written_utc=written_now()),
+        wall_clock=WallClock(written_utc=written_now()),
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import DrakeDiffError
 from drake_diff.identification.explain import explain
 from drake_diff.model.model import Model
-from drake_diff.record.comparison import CauseEvidence, Numbers
+from drake_diff.runs.other_records import CauseEvidence, Numbers
 
 
 def cause_of(model: Model, recording: Recording) -> CauseEvidence:

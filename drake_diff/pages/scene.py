@@ -103,7 +103,7 @@ def scene_of(
     xs: Array,
     *,
     us: Array | None = None,
-    contacts: Sequence[Sequence[ContactPoint]] = (),
+    contacts: Sequence[Sequence[ContactPoint | Force]] = (),
     ghosts: Mapping[str, tuple[Array, Rgba]] | None = None,
     frame: str | None = None,
     marks: Sequence[Drawn] = (),

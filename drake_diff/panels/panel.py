@@ -9,7 +9,7 @@ from drake_diff._base.arrays import positive_int
 from drake_diff.panels.evaluation import TrialFunction, check_engine, evaluate
 from drake_diff.panels.panel_file import expand, load_panel
 from drake_diff.panels.results import PanelTable, begun_record, ended_record, journal, write_table
-from drake_diff.record.provenance import provenance_of
+from drake_diff.runs.provenance import provenance_of
 
 Progress = Callable[[int, int, int], None]
 

@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from drake_diff.exceptions import InputError
-from drake_diff.record.parts import FiniteTable
+from drake_diff.runs.fields import FiniteTable
 
 # Names of what drake_diff itself gives each trial; an axis, cell or fixed value cannot have them.
 OURS = ("id", "repeat", "seed")

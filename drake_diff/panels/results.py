@@ -24,10 +24,11 @@ from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.pages.html import page_data, write_page
 from drake_diff.panels.evaluation import Row
 from drake_diff.panels.panel_file import PanelTrial, canonical, cell_name
-from drake_diff.record.directory import is_taken
-from drake_diff.record.panel import TRIALS, PanelRecord, PanelTrialRecord, no_model, trial_record
-from drake_diff.record.provenance import provenance_of, written_now
-from drake_diff.record.sealed import WallClock
+from drake_diff.runs.directory import is_taken
+from drake_diff.runs.fields import ModelInput
+from drake_diff.runs.other_records import TRIALS, ComparisonRecord, PanelSection, trial_record
+from drake_diff.runs.provenance import provenance_of, written_now
+from drake_diff.runs.sealed import WallClock
 
 JOURNAL, TABLE, SUMMARY, PAGE = "trials.jsonl", "table.csv", "summary.json", "panel.html"
 RANKED = ("place", "name", "apart", "trials", "errors", "success", "numbers")  # of a cell in the record of a panel
@@ -186,36 +187,35 @@ def write_table(
     for trial in trials:
         record = trial_record(trial.id, trial.name, trial.cell, trial.fields, found[trial.id], made)
         write_whole(directory / TRIALS / f"{trial.id}.json", record.to_json().encode())
-    write_whole(directory / PanelTrialRecord.schema_file(), PanelTrialRecord.published_schema())
     write_ranking(directory / PAGE, summary)
     return PanelTable(directory, rows, summary)
 
 
-def begun_record(directory: Path, trials: int, made: Mapping[str, Any]) -> PanelRecord:
-    """What panel.json says while trials are missing."""
-    return PanelRecord(
+def begun_record(directory: Path, trials: int, made: Mapping[str, Any]) -> ComparisonRecord:
+    """The record while trials are missing."""
+    return ComparisonRecord(
         name=directory.name,
         verdict="incomplete",
         sentence="the panel has started and not finished: it is still running, or it was killed",
-        panel=dict(made),
-        trials=trials,
-        errors=None,
-        model=no_model(),
+        panel=PanelSection(conditions=dict(made), trials=trials, errors=None),
+        model=ModelInput(file=None, options=None),
         provenance=provenance_of(),
         wall_clock=WallClock(written_utc=written_now()),
     )
 
 
-def ended_record(begun: PanelRecord, table: PanelTable, seconds: float) -> PanelRecord:
-    """What panel.json says at the end; `seconds` is how long this call of the panel took."""
+def ended_record(begun: ComparisonRecord, table: PanelTable, seconds: float) -> ComparisonRecord:
+    """The record at the end; `seconds` is how long this call of the panel took."""
     by, rows = ranked(table.summary)
+    ranking = [{key: row[key] for key in RANKED if key in row} for row in rows]
+    found = {"errors": table.errors, "ranked_by": by, "ranking": ranking}
+    if begun.panel is None:
+        raise ArtifactError(f"{begun.name}: expected the record of a panel")
     return begun.model_copy(
         update={
             "verdict": "fail" if table.errors else "pass",
             "sentence": f"{rows[0]['name']} is the best of {len(rows)} cells, by {by}; {table.errors} errors",
-            "errors": table.errors,
-            "ranked_by": by,
-            "ranking": [{key: row[key] for key in RANKED if key in row} for row in rows],
+            "panel": begun.panel.model_copy(update=found),
             "wall_clock": WallClock(written_utc=written_now(), duration_s=seconds),
         }
     )

@@ -15,9 +15,6 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
-from drake_diff.artifact.measurement import measure
-from drake_diff.artifact.save import keep_plan, plan_kept, write_run
-from drake_diff.artifact.verify import Verification, verify_own
 from drake_diff.certificates.audit import audit
 from drake_diff.certificates.finding import Finding
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning, WriteError
@@ -37,8 +34,11 @@ from drake_diff.planning.robot import Robot, load_robot
 from drake_diff.planning.shifting import random_shift, shift_to
 from drake_diff.planning.standing import Legged, Rest
 from drake_diff.planning.task import Task, asked, postures
-from drake_diff.record.directory import check_place, is_taken, name_of, written_whole
-from drake_diff.record.solve import EvidenceRecord
+from drake_diff.runs.directory import check_place, is_taken, name_of, written_whole
+from drake_diff.runs.measurement import measure
+from drake_diff.runs.plan_record import PlanRecord
+from drake_diff.runs.save import keep_plan, plan_kept, write_run
+from drake_diff.runs.verify import Verification, verify_own
 
 TIMES = (None, "least")
 TRIED_TWICE = 36  # velocities: of a larger robot on its feet a second goal would take half a minute more
@@ -85,7 +85,7 @@ class Plan(ShowsItsRepr):
     repairs: tuple[str, ...]
     findings: tuple[Finding, ...]
     solution: Solution
-    record: EvidenceRecord
+    record: PlanRecord
     verification: Verification
     directory: Path
     tried: tuple[str, ...]

@@ -14,20 +14,20 @@ from drake_diff._base.files import write_whole
 from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
 from drake_diff.model.model import Model
-from drake_diff.record.directory import name_of, written_whole
-from drake_diff.record.embodiment import embodiment_of
-from drake_diff.record.parts import DataBoundary, DataUse
-from drake_diff.record.provenance import model_input, provenance_of, written_now
-from drake_diff.record.robustness import (
+from drake_diff.runs.directory import name_of, written_whole
+from drake_diff.runs.fields import DataBoundary, DataUse, EvaluationPanel
+from drake_diff.runs.plan_record import (
     CellEvidence,
     LoopEvidence,
     Nominal,
     PerturbationEvidence,
-    RobustnessClock,
-    RobustnessRecord,
+    PlanRecord,
+    RobustnessSection,
     RunEvidence,
 )
-from drake_diff.record.solve import EvaluationPanel, EvidenceRecord
+from drake_diff.runs.provenance import embodiment_of, model_input, provenance_of, written_now
+from drake_diff.runs.read import load_plan_record
+from drake_diff.runs.sealed import WallClock
 from drake_diff.trials.perturbation import perturbation_named
 from drake_diff.trials.run import Cell, Robustness
 from drake_diff.trials.trial import Task
@@ -38,7 +38,7 @@ PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
 PLAIN = Loop()
 
 
-def save_robustness(result: Robustness, directory: str | Path, run: str | Path | None = None) -> RobustnessRecord:
+def save_robustness(result: Robustness, directory: str | Path, run: str | Path | None = None) -> PlanRecord:
     """Write the directory of a robustness result: report, every trial's row, and the worst trials in full.
 
     robustness.html is the report, trials.csv has a row for each trial, and worst/NAME_LEVEL/ has, for each
@@ -52,7 +52,7 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
         run: the run directory that the plan is from, if there is one: its trials can then be run again from it.
 
     Returns:
-        The record, as in robustness.json.
+        The record, as in record.json.
 
     Raises:
         InputError: `directory` holds what no run wrote.
@@ -72,12 +72,12 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
         return write_robustness(result, folder, run)
 
 
-def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -> RobustnessRecord:
+def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -> PlanRecord:
     """Write what `save_robustness` does into `folder`, which `written_whole` gave."""
     from drake_diff.trials.page import write_robustness_page  # loads the page templates: not needed before
 
     task = result.task
-    source = None if run is None else RunEvidence(path=str(run), record_sha256=EvidenceRecord.read(run).record_sha256)
+    source = None if run is None else RunEvidence(path=str(run), record_sha256=load_plan_record(run).record_sha256)
     sentence = "the trials are still being written, or that was killed or broke off"
     _record(name_of(folder), task.model, "incomplete", sentence).begin(folder)
     record = record_of(result, name_of(folder), source)
@@ -93,17 +93,15 @@ def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -
     return record.write(folder)
 
 
-def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> RobustnessRecord:
+def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> PlanRecord:
     """The record of `result`, but for the files."""
     task, nominal = result.task, result.task.nominal
-    return _record(
+    record = _record(
         name,
         task.model,
         "pass" if result.success else "fail",
         result.sentence,
         run=run,
-        panel=_panel(result),
-        data=_data(result, run),
         trials=result.trials,
         seed=result.seed,
         loop=_loop(task),
@@ -124,8 +122,9 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
             )
             for name in result.names
         ],
-        wall_clock=_times(result),
     )
+    found = {"panel": _panel(result), "data": _data(result, run), "wall_clock": _times(result)}
+    return record.model_copy(update=found)
 
 
 def _panel(result: Robustness) -> EvaluationPanel:
@@ -151,19 +150,17 @@ def _data(result: Robustness, run: RunEvidence | None) -> DataBoundary:
     return DataBoundary(statement=statement, seen=[plan], judged_on=[trials], held_out=[trials.name])
 
 
-def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -> RobustnessRecord:
-    clock = RobustnessClock(written_utc=written_now())
-    unknown: dict[str, Any] = dict.fromkeys(("run", "trials", "seed", "loop", "nominal"))
-    return RobustnessRecord(
+def _record(name: str, model: Model, verdict: Any, sentence: str, **trials: Any) -> PlanRecord:
+    states, inputs = list(model.state_names), list(model.input_names)
+    return PlanRecord(
         name=name,
         verdict=verdict,
         sentence=sentence,
         model=model_input(model),
         embodiment=embodiment_of(model.contract),
-        state_names=list(model.state_names),
-        input_names=list(model.input_names),
         provenance=provenance_of(),
-        **{**unknown, "perturbations": [], "wall_clock": clock, **rest},
+        wall_clock=WallClock(written_utc=written_now()),
+        robustness=RobustnessSection(state_names=states, input_names=inputs, **trials),
     )
 
 
@@ -216,13 +213,13 @@ def _numbers(value: ArrayLike) -> float | list[float | None] | None:
     return [finite(float(v)) for v in np.asarray(value, dtype=float)]
 
 
-def _times(result: Robustness) -> RobustnessClock:
+def _times(result: Robustness) -> WallClock:
     runs = [result.task.nominal.run, *(c.worst.outcome.run for c in result.cells)]
     taken = np.concatenate([run.latencies for run in runs])
     if not len(taken):
-        return RobustnessClock(written_utc=written_now())
+        return WallClock(written_utc=written_now())
     budget = _loop(result.task).latency_budget_s
-    return RobustnessClock(
+    return WallClock(
         written_utc=written_now(),
         latency_median_s=float(np.median(taken)),
         latency_99_percent_s=float(np.quantile(taken, 0.99)),

@@ -9,7 +9,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.statistics import ENOUGH
 from drake_diff.pages.html import Line, Plot, page_data, write_page
-from drake_diff.record.robustness import RobustnessRecord
+from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.trials.perturbation import perturbed
 from drake_diff.trials.run import Robustness, agrees, sized
 from drake_diff.trials.trial import Task, Trial
@@ -18,7 +18,7 @@ from drake_diff.trials.trial_files import planned_states
 MOST_PLOTS = 12  # of coordinates; those that end furthest from the plan
 
 
-def write_robustness_page(path: Path, result: Robustness, record: RobustnessRecord, replay: Path) -> None:
+def write_robustness_page(path: Path, result: Robustness, record: PlanRecord, replay: Path) -> None:
     """Write the page of `result` with its `record` and `replay`, the page of the weakest point's worst trial."""
     trial = result.worst(result.weakest).worst
     ((name, level),) = trial.levels.items()

@@ -7,8 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from drake_diff.artifact.verify import recalled
 from drake_diff.exceptions import InputError
+from drake_diff.runs.verify import recalled
 from drake_diff.trials.perturbation import perturbation_named
 from drake_diff.trials.trial import Task, run_trial
 from drake_diff.trials.trial_files import result_of

@@ -25,7 +25,7 @@ from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.solution import Solution
-from drake_diff.record.parts import Label
+from drake_diff.runs.fields import Label
 from drake_diff.trials.perturbation import PERTURBATIONS, parameters_of, perturbation_named
 from drake_diff.trials.trial import MakeController, Task, Trial, run_trial
 

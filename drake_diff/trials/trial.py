@@ -39,7 +39,7 @@ from drake_diff.optimize.replay import (
     penetration_check,
     track,
 )
-from drake_diff.record.parts import Label
+from drake_diff.runs.fields import Label
 from drake_diff.trials.perturbation import Setup, perturbed
 
 CONTROLLERS = ("tvlqr", "mpc", "open_loop")

@@ -14,8 +14,8 @@ from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.logs.messages import TYPES
 from drake_diff.loop.run import OK
 from drake_diff.model.parameters import applied, select
-from drake_diff.record.robustness import EventEvidence, TrialEvidence
-from drake_diff.record.sealed import canonical
+from drake_diff.runs.fields import canonical
+from drake_diff.runs.plan_record import EventEvidence, TrialEvidence
 from drake_diff.trials.perturbation import Setup, perturbed
 from drake_diff.trials.trial import Task, Trial
 

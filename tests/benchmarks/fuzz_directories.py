@@ -42,10 +42,10 @@ from mcap.writer import Writer  # noqa: E402
 from trust_verify import leaves, rewrite, seal  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
-from drake_diff.artifact.live import scene_of_run  # noqa: E402
-from drake_diff.artifact.verify import recalled  # noqa: E402
 from drake_diff.cli import main as cli  # noqa: E402
 from drake_diff.exceptions import DrakeDiffError  # noqa: E402
+from drake_diff.runs.verify import recalled  # noqa: E402
+from drake_diff.runs.view import scene_of_run  # noqa: E402
 
 HANG = 90.0  # [s] the limit of the process apart is 60, and this machine may be busy
 OPENED, ACCESSED = 0x20, 0x1  # of inotify

@@ -15,10 +15,10 @@ from scipy.integrate import solve_ivp
 from trust import Figure
 
 import drake_diff as dd
-from drake_diff.artifact.cross_check import WIDER, Follower, replays_in
 from drake_diff.engines.load import load_engine
 from drake_diff.optimize.replay import STATE_TOLERANCE
 from drake_diff.optimize.solution import Solution, Status
+from drake_diff.runs.cross_check import WIDER, Follower, replays_in
 
 COUNT = 120
 G, RADIUS, FREE = 9.81, 0.1, np.nan

@@ -1,5 +1,0 @@
-"""The directory of one solve: measure it, write it, read it, verify it, list it, show it."""
-
-import lazy_loader as _lazy
-
-__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

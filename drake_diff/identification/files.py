@@ -1,0 +1,325 @@
+"""The directory of an identification: its record, the recordings themselves, trace.mcap and a report.
+
+The recordings are kept as they were read, so that `verify` fits them again.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.files import make_folder, write_whole
+from drake_diff._base.untrusted import read_plain
+from drake_diff.comparison.recordings import (
+    ARRAYS,
+    LARGEST,
+    RECORDINGS,
+    Recording,
+    read_arrays,
+    read_recording,
+    write_arrays,
+)
+from drake_diff.exceptions import ArtifactError, InputError
+from drake_diff.identification.identify import Asked, Identification, identify
+from drake_diff.identification.measured import hash_of
+from drake_diff.identification.page import joined
+from drake_diff.logs.channels import input_channel, state_channel, transform_channel
+from drake_diff.logs.mcap_file import Channel, write_mcap
+from drake_diff.model.parameters import applied, list_parameters, select
+from drake_diff.runs import other_records as records
+from drake_diff.runs.again import Again, contract_as, model_as
+from drake_diff.runs.directory import name_of, written_whole
+from drake_diff.runs.fields import DataBoundary, DataUse, canonical
+from drake_diff.runs.other_records import FitRecord
+from drake_diff.runs.provenance import embodiment_of, model_input, provenance_of, written_now
+from drake_diff.runs.rerun import TRACE, rebuilt
+from drake_diff.runs.sealed import WallClock, reproducible
+
+REPORT = "report.html"
+MADE = (TRACE, REPORT)  # what is made again, beside the record
+OF_RECORDINGS = (
+    "inputs, model and the recordings: they are what was asked, and whether a robot moved so is for who recorded it; "
+    "recordings[...].sha256 is the hash of the file that was read"
+)
+
+
+def save_identification(identification: Identification, directory: str | Path) -> FitRecord:
+    """Write the directory of an identification: record, recordings, model file, trace and report; see `save`.
+
+    Raises InputError where it did not come from `identify`, ArtifactError where a recording's file has changed since.
+    """
+    with written_whole(directory) as folder:
+        return write_identification(identification, folder)
+
+
+def write_identification(identification: Identification, folder: Path) -> FitRecord:
+    """Write what `save_identification` does into `folder`, which `written_whole` gave."""
+    asked, name = _asked(identification), name_of(folder)
+    kept = (folder.with_name(name) / RECORDINGS).resolve()
+    for recording, given in zip(asked.recordings, asked.files, strict=True):
+        if given is not None and given[0].resolve().is_relative_to(kept):
+            got = f"{given[0]}, which is in the directory to be written"
+            raise InputError(f"recording {recording.name}", got=got, expected="one elsewhere")
+        if given is not None and (not given[0].exists() or hash_of(given[0]) != given[1]):
+            raise ArtifactError(f"recording {recording.name}: {given[0]} has changed since it was read")
+        if given is not None and (size := _size(given[0])) > LARGEST:
+            expected = f"at most {LARGEST} bytes, as it is kept in the directory"
+            raise InputError(f"recording {recording.name}", got=f"{size} bytes", expected=expected)
+    _begun(name, asked).begin(folder)
+    for i, recording in enumerate(asked.recordings):
+        _keep(folder / _place(i, asked), recording, asked.files[i])
+    record = record_of(identification, name)
+    write_made(folder, identification, record)
+    if asked.model.source is not None:
+        write_whole(folder / asked.model.source.name, asked.model.source.read_bytes())
+    return record.write(folder)
+
+
+def _place(i: int, asked: Asked) -> str:
+    given = asked.files[i]
+    return f"{RECORDINGS}/{i}/{ARRAYS if given is None else given[0].name}"
+
+
+def _size(path: Path) -> int:
+    return sum(p.stat().st_size for p in ([path] if path.is_file() else path.rglob("*")) if p.is_file())
+
+
+def _keep(place: Path, recording: Recording, given: tuple[Path, str] | None) -> None:
+    make_folder(place.parent)
+    if given is None:
+        write_arrays(place, recording)
+    elif given[0].is_dir():
+        for path in sorted(given[0].rglob("*")):
+            if path.is_file():
+                make_folder((place / path.relative_to(given[0])).parent)
+                write_whole(place / path.relative_to(given[0]), path.read_bytes())
+    else:
+        write_whole(place, given[0].read_bytes())
+
+
+def _begun(name: str, asked: Asked) -> FitRecord:
+    parameters = asked.parameters if isinstance(asked.parameters, str) else list(asked.parameters)
+    return FitRecord(
+        name=name,
+        verdict="incomplete",
+        sentence="it is still being written, or that was killed or broke off",
+        model=model_input(asked.model),
+        embodiment=embodiment_of(asked.model.contract),
+        contract=asked.model.contract.to_dict(),
+        inputs=records.Asked(
+            parameters=parameters,
+            noise={key: float(value) for key, value in asked.noise.items()},
+            held_out=asked.held_out,
+            motion=asked.motion,
+            max_iterations=asked.max_iterations,
+            priors={key: [np.ravel(part).tolist() for part in pair] for key, pair in asked.priors.items()},
+            bounds={key: [_known(bound) for bound in pair] for key, pair in asked.bounds.items()},
+            sensors={
+                key: records.Mounted(body=body, pose=[float(value) for value in pose])
+                for key, (body, pose) in asked.sensors.items()
+            },
+        ),
+        recordings=[],
+        provenance=provenance_of(),
+        wall_clock=WallClock(written_utc=written_now()),
+    )
+
+
+def record_of(e: Identification, name: str) -> FitRecord:
+    """The record of an identification, but for the files."""
+    asked = _asked(e)
+    recordings = [_recording(i, e, asked) for i in range(len(asked.recordings))]
+    found: dict[str, Any] = {
+        "verdict": "pass" if e.explained else "fail",
+        "sentence": e.sentence,
+        "recordings": recordings,
+        "data": _data(recordings),
+        "estimates": estimates_of(e),
+        "unidentifiable": list(e.unidentifiable),
+        "noise": dict(e.noise),
+        "correlation": _correlation(e.covariance),
+        **{key: _known(getattr(e, key)) for key in ("error_before", "error_after", "score")},
+        **{key: getattr(e, key) for key in ("explained", "reason", "converged", "steps", "motion", "count")},
+    }
+    begun = _begun(name, asked)
+    return FitRecord(**{**{key: getattr(begun, key) for key in type(begun).model_fields}, **found})
+
+
+def _data(recordings: list[records.RecordingEvidence]) -> DataBoundary:
+    """Which spans of which recordings were fitted, and which were predicted only."""
+
+    def uses(r: records.RecordingEvidence, spans: list[list[float]], whole: bool) -> list[DataUse]:
+        hashed = r.sha256 if whole else None  # that of a file is of no part of it
+        return [
+            DataUse(name=f"{r.path}, {a:g} to {b:g} s", what=f"recording {r.name}", sha256=hashed) for a, b in spans
+        ]
+
+    seen = [use for r in recordings for use in uses(r, r.fitted_s, not r.held_out_s)]
+    held_out = [use for r in recordings for use in uses(r, r.held_out_s, not r.fitted_s)]
+    fitted, kept = ("1 span" if len(part) == 1 else f"{len(part)} spans" for part in (seen, held_out))
+    statement = f"parameters were fitted on {fitted}, and the fit is judged on {kept} that it did not see, and its own"
+    return DataBoundary(
+        statement=statement, seen=seen, judged_on=[*seen, *held_out], held_out=[use.name for use in held_out]
+    )
+
+
+def _asked(e: Identification) -> Asked:
+    if e.asked is None:
+        raise InputError("identification", got="one without what was asked", expected="what dd.identify returned")
+    return e.asked
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _bounds(pair: list[float | None]) -> tuple[float, float]:
+    low, high = pair
+    return -np.inf if low is None else low, np.inf if high is None else high
+
+
+def _recording(i: int, e: Identification, asked: Asked) -> records.RecordingEvidence:
+    recording, given = asked.recordings[i], asked.files[i]
+    pieces = [motion.piece for motion in e.motions if motion.piece.recording == i]
+    spans = [[float(p.times[0]), float(p.times[-1])] for p in pieces]
+    return records.RecordingEvidence(
+        name=recording.name,
+        version=recording.version,
+        facts=dict(recording.facts),
+        file=None if given is None else given[0].name,
+        path=_place(i, asked),
+        sha256=None if given is None else given[1],
+        samples=len(recording.times),
+        fitted_s=[span for span, piece in zip(spans, pieces, strict=True) if not piece.held_out],
+        held_out_s=[span for span, piece in zip(spans, pieces, strict=True) if piece.held_out],
+    )
+
+
+def estimates_of(e: Identification) -> list[records.Estimate]:
+    """Each entry of each value with its interval."""
+    found = []
+    for name, value in e.values.items():
+        now, was = np.atleast_1d(value), np.atleast_1d(e.start[name])
+        limits = np.reshape(e.intervals[name], (-1, 2))
+        for i, (low, high) in enumerate(limits):
+            label = name if len(now) == 1 else f"{name}[{i}]"
+            found.append(
+                records.Estimate(
+                    name=label, unit=e.units[name], before=float(was[i]), value=float(now[i]),
+                    lower=_known(low), upper=_known(high),
+                )
+            )  # fmt: skip
+    return found
+
+
+def _correlation(covariance: Array) -> list[list[float | None]]:
+    spread = np.sqrt(np.diag(covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = covariance / np.outer(spread, spread)
+    return [[_known(round(float(value), 9)) if np.isfinite(value) else None for value in row] for row in found]
+
+
+def write_made(folder: Path, e: Identification, record: FitRecord) -> None:
+    """Write `MADE`."""
+    from drake_diff.identification.page import write_page_of
+
+    fields = json.loads(canonical(record.model_dump(mode="json")))  # in the order in which the record is written
+    carried = {record.FILE: ("application/json", reproducible(fields).encode())}
+    write_identification_trace(folder / TRACE, e, carried)
+    write_page_of(folder / REPORT, e, fields)
+
+
+def write_identification_trace(path: Path, e: Identification, attachments: Mapping[str, tuple[str, bytes]]) -> None:
+    """Write what was measured and how the model moves with the values found, and with its own, on one axis of time.
+
+    Of recording k: /k/measured/state (NaN is what was not measured), /k/input, /k/fitted/state and, where it was looked
+    at, /k/before/state. The frames are those of the first recording.
+    """
+    model = _asked(e).model
+    contract = model.contract
+    names = {"recordings": ", ".join(r.name for r in _asked(e).recordings), "model": model.name}
+    own = {p.name for p in list_parameters(model)}
+    vector = select(model, {name: value for name, value in e.values.items() if name in own})
+    with applied(vector) if vector.parameters else nullcontext():
+        channels = [c for i in range(len(_asked(e).recordings)) for c in _channels_of(e, i)]
+        first = joined([m for m in e.motions if m.piece.recording == 0])
+        channels.append(transform_channel(model, first[0], {"": first[2]}))
+        write_mcap(path, channels, {**names, "time_axis": "recorded", "contract": contract.name}, attachments)
+
+
+def _channels_of(e: Identification, i: int) -> Iterator[Channel]:
+    contract = _asked(e).model.contract
+    times, ys, xs, before = joined([m for m in e.motions if m.piece.recording == i])
+    recording = _asked(e).recordings[i]
+    entries = contract.positions, contract.velocities
+    yield state_channel(f"/{i}/measured/state", times, ys, *entries)
+    yield input_channel(f"/{i}/input", (recording.times - recording.times[0])[:-1], recording.us, contract.inputs)
+    yield state_channel(f"/{i}/fitted/state", times, xs, *entries)
+    seen = ~np.isnan(before).all(axis=1)
+    if np.any(seen):
+        yield state_channel(f"/{i}/before/state", times[seen], before[seen], *entries)
+
+
+def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Again:
+    """The fit once more from the recordings in the directory, and all that was written of it."""
+    made, identification = _fitted_again(folder, record, models)
+    changed = {"contract": contract_as(made.contract, record.contract), "model": model_as(made.model, record.model)}
+    again = made.model_copy(update=changed)
+    with TemporaryDirectory() as place:
+        write_made(Path(place), identification, again)
+        files = {name: (Path(place) / name).read_bytes() for name in MADE}
+    problems = tuple(f"{name}: every fit is written with it, and the directory has none" for name in MADE
+                     if name not in record.files)  # fmt: skip
+    kept = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
+    carried = "" if record.model.file is None else record.model.file.path
+    fields = again.model_dump(mode="json")
+    return Again(fields, files, problems=problems, unchecked=(OF_RECORDINGS,), written=(carried, *kept, *MADE))
+
+
+def _fitted_again(folder: Path, record: FitRecord, models: Path | None) -> tuple[FitRecord, Identification]:
+    """The record of the fit run again from the directory's own recordings, and that fit.
+
+    ArtifactError where the directory does not have what the record says; ModelError where the model cannot be rebuilt,
+    `models` as in `rebuilt`.
+    """
+    if record.inputs.parameters == [] or not record.recordings:
+        raise ArtifactError(f"{record.FILE}: it names no parameters or no recordings")
+    carried = "" if record.model.file is None else record.model.file.path
+    attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
+    with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
+        given: list[Recording] = []
+        files: list[tuple[Path, str] | None] = []
+        for i, kept in enumerate(record.recordings):
+            name = ARRAYS if kept.file is None else kept.file
+            if kept.path != f"{RECORDINGS}/{i}/{name}" or Path(name).name != name or name in ("", "..", "."):
+                raise ArtifactError(f"{record.FILE}: recording {kept.name} is not where drake_diff keeps it")
+            path = folder / kept.path
+            if kept.file is None:
+                given.append(read_arrays(path, kept.name, kept.version, kept.facts))
+                files.append(None)
+            else:
+                if not path.exists() or hash_of(path) != kept.sha256:
+                    raise ArtifactError(f"{kept.path}: it is not the recording that {record.FILE} describes")
+                read = read_recording(path, model, gaps=True)
+                given.append(replace(read, name=kept.name, version=kept.version, facts=dict(kept.facts)))
+                files.append((path, str(kept.sha256)))
+        inputs = record.inputs
+        found = identify(
+            model, given, inputs.parameters, noise=inputs.noise or None, held_out=inputs.held_out, motion=inputs.motion,
+            max_iterations=inputs.max_iterations,
+            priors={key: (mean, deviation) for key, (mean, deviation) in inputs.priors.items()} or None,
+            bounds={key: _bounds(pair) for key, pair in inputs.bounds.items()} or None,
+            sensors={key: (one.body, one.pose) for key, one in inputs.sensors.items()} or None,
+        )  # fmt: skip
+        if found.asked is None:
+            raise ArtifactError("the fit does not say what was asked")
+        found = replace(found, asked=replace(found.asked, files=tuple(files)))
+        made = record_of(found, record.name)
+    kept_as = {name: getattr(record, name) for name in ("provenance", "wall_clock", "files", "record_sha256")}
+    return made.model_copy(update=kept_as), found

@@ -1,0 +1,196 @@
+"""The recordings of a comparison compared with Drake's steps once more, and their causes looked for again.
+
+A cause is found by a search that ends where its last step would gain no more than 1e-5 of the squares, in units of the
+noise. So a search that takes other steps, as on a machine that rounds otherwise, ends within sqrt(1e-5) of a standard
+deviation, 0.0016 of half a 95 % interval.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.untrusted import read_plain
+from drake_diff.comparison.files import MOTION, PAGE, REPLAY, TRACE, hash_of_arrays, row_of
+from drake_diff.comparison.recordings import Recording, place_of, read_arrays
+from drake_diff.comparison.result import slug
+from drake_diff.comparison.side_by_side import compare_recordings
+from drake_diff.identification.cause import cause_of
+from drake_diff.logs.mcap_file import read_mcap
+from drake_diff.model.model import Model
+from drake_diff.runs.again import Again, contract_as, model_as
+from drake_diff.runs.differences import ABSOLUTE, NUMBER, is_near
+from drake_diff.runs.other_records import CauseEvidence, ComparisonRecord, Numbers
+from drake_diff.runs.provenance import embodiment_of, model_input
+from drake_diff.runs.rerun import rebuilt
+
+SAME_VALUE = 2e-3  # of half the interval: see above
+SAME_DIGIT = 1.01  # of the last digit in a text: a number that lies between two is rounded to either
+ENDED = "The search was ended after"  # in the sentence of a cause: by the limit of processor time, which no run repeats
+LOST = "its cause was not looked for again: its recording is not in the directory"
+WRITTEN = (TRACE, REPLAY, PAGE)
+NEVER = (  # what is not checked
+    "model and recordings: they are what was asked, and whether a robot moved so is for who recorded it",
+    "all but the recordings, and the sentence of the whole, pages and frames: the engines were not run again",
+)
+
+
+def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Again:
+    """The rows and causes of a record's recordings made again from the directory alone; engines are not run.
+
+    ArtifactError where the directory does not have what the record says; ModelError where the model cannot be rebuilt,
+    `models` as in `rebuilt`.
+    """
+    if not record.recordings:
+        lost = (f"{e.engine}: {LOST}" for e in record.engines if e.cause is not None)
+        return Again({}, {}, unchecked=(*_functions_of(record), *lost))
+    problems, undecided, unchecked = [*_odd_recordings(record)], list[str](), [*NEVER, *_functions_of(record)]
+    carried = "" if record.model.file is None else record.model.file.path
+    written = (carried, *WRITTEN, *(r.path for r in record.recordings))
+    if problems:
+        return Again({}, {}, problems=tuple(problems), written=written)
+    given = [read_arrays(folder / r.path, r.name, r.version, r.facts) for r in record.recordings]
+    attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
+    with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
+        found = compare_recordings(model, given)
+        rows = [e for e in record.engines if not e.jacobians]
+        names = [[e.engine for e in engines] for engines in (rows, found.engines)]
+        if names[0] != names[1]:
+            problems.append(f"{record.FILE}: its recordings are {names[0]}, compared again {names[1]}")
+            return Again({}, {}, problems=tuple(problems), written=written)
+        problems += _odd_files(folder, record, found.recordings)
+        known = _motion_hash(record) == hash_of_arrays(found.x0, found.us)
+        if not known:
+            unchecked.append("engines[...].final_gap of recordings: the motion began elsewhere")
+        fields, engines = _of_the_model(record, model), list[dict[str, Any]]()
+        for row, now, recording in zip(rows, found.engines, found.recordings, strict=True):
+            cause = None if row.cause is None else cause_of(model, recording)
+            if row.cause is not None and cause is not None:
+                cause, doubts = as_recorded(row.engine, row.cause, cause)
+                undecided += doubts
+            made = row_of(now, cause)
+            made = made if known else made.model_copy(update={"final_gap": row.final_gap})
+            engines.append({"name": row.engine, **made.model_dump(mode="json")})
+    told = [{"name": row.engine, **row.model_dump(mode="json")} for row in rows]
+    recorded = {**{key: record.model_dump(mode="json")[key] for key in fields}, "engines": told}
+    return Again(
+        {**fields, "engines": engines},
+        {},
+        problems=tuple(problems),
+        undecided=tuple(undecided),
+        unchecked=tuple(unchecked),
+        written=written,
+        recorded=recorded,
+    )
+
+
+def _functions_of(record: ComparisonRecord) -> Iterator[str]:
+    """The users' functions that were compared, which no record holds."""
+    for e in record.engines:
+        if e.function is not None:
+            yield f"{e.engine}: a user's function ({e.function.name}), whose code the record does not hold"
+
+
+def _odd_recordings(record: ComparisonRecord) -> Iterator[str]:
+    """What cannot be so in what drake_diff writes."""
+    names = [r.name for r in record.recordings]
+    for i, r in enumerate(record.recordings):
+        if r.path != place_of(i) or r.path not in record.files:
+            yield f"{record.FILE}: recording {r.name} is not where drake_diff keeps it"
+    for e in record.engines:
+        if e.cause is not None and (e.jacobians or names.count(e.engine) != 1):
+            yield f"{record.FILE}: {e.engine} has a cause, and is not one recording in the directory"
+
+
+def _of_the_model(record: ComparisonRecord, model: Model) -> dict[str, Any]:
+    """What the record says of the model, of the model in the directory."""
+    changed: dict[str, Any] = {
+        "model": model_as(model_input(model), record.model),
+        "contract": contract_as(model.contract.to_dict(), record.contract),
+        "embodiment": embodiment_of(model.contract),
+        "time_step_s": model.time_step,
+        "state_names": list(model.state_names),
+        "input_names": list(model.input_names),
+    }
+    fields = record.model_copy(update=changed).model_dump(mode="json")
+    return {key: fields[key] for key in changed}
+
+
+def _odd_files(folder: Path, record: ComparisonRecord, given: Sequence[Recording]) -> Iterator[str]:
+    """What in the other files, or of the hashes of data, is not of the recordings in the directory."""
+    used = {(use.name, use.sha256) for use in record.data.judged_on} if record.data is not None else set()
+    log, page = read_mcap(folder / TRACE, links=False), unescape(read_plain(folder / PAGE).decode())
+    places = [i for i, e in enumerate(record.engines) if not e.jacobians]
+    for i, recording in zip(places, given, strict=True):
+        kept = next(r for r in record.recordings if r.name == recording.name)
+        if len(recording.times) != kept.samples:
+            yield f"{kept.path}: {len(recording.times)} samples, and {record.FILE} says {kept.samples}"
+        times = recording.times - recording.times[0]
+        if (recording.name, hash_of_arrays(times, recording.xs, recording.us)) not in used:
+            yield f"{kept.path}: it is not the recording that {record.FILE} says was compared"
+        motion = log.arrays(f"/{slug(i, recording.name)}/state")
+        if not np.array_equal(np.hstack([motion["q"], motion["v"]]), recording.xs):
+            yield f"{TRACE}: the motion of {recording.name} is not that in {kept.path}"
+        cause = record.engines[i].cause
+        if cause is not None and cause.sentence not in page:
+            yield f"{PAGE}: it does not say what {record.FILE} says of the cause of {recording.name}"
+
+
+def _motion_hash(record: ComparisonRecord) -> str | None:
+    uses = () if record.data is None else record.data.judged_on
+    return next((use.sha256 for use in uses if use.name == MOTION), None)
+
+
+def as_recorded(name: str, recorded: CauseEvidence, found: CauseEvidence) -> tuple[CauseEvidence, list[str]]:
+    """The cause that was found again, as it is recorded where it is the same within SAME_VALUE; and what is in doubt.
+
+    In doubt is what a search that its limit of processor time ended says: no run repeats that.
+    """
+    same = (recorded.names, recorded.alternatives, recorded.explained) == (
+        found.names,
+        found.alternatives,
+        found.explained,
+    )
+    same = same and all(
+        old.keys() == new.keys() and all(_is_same(old[q], new[q], found.intervals.get(q, [])) for q in new)
+        for old, new in ((recorded.values, found.values), (recorded.intervals, found.intervals))
+    )
+    same = same and _is_same_sentence(recorded.sentence, found.sentence)
+    if same or recorded == found:
+        return recorded, []
+    if ENDED in recorded.sentence or ENDED in found.sentence:
+        why = "a search that its limit of processor time ends is not repeated"
+        return recorded, [f"{name}: recorded {recorded.sentence!r}, again {found.sentence!r}: {why}"]
+    return found, []
+
+
+def _is_same(told: Any, found: Any, intervals: Sequence[Numbers]) -> bool:
+    """Whether the numbers of a value, or both ends of each interval, are those found again."""
+    if len(told) != len(found) or len(found) != len(intervals):
+        return False
+    for old, new, ends in zip(told, found, intervals, strict=True):
+        low, high = (None, None) if len(ends) != 2 else ends
+        least = 0.0 if low is None or high is None else SAME_VALUE * abs(high - low) / 2
+        pairs = zip(old, new, strict=True) if isinstance(old, list) and isinstance(new, list) else ((old, new),)
+        for a, b in pairs:
+            if a is None or b is None:
+                if a is not b:
+                    return False
+            elif not is_near(a, b, absolute=ABSOLUTE + least):
+                return False
+    return True
+
+
+def _is_same_sentence(told: str, found: str) -> bool:
+    """Whether two sentences have the same words, and numbers that are the same but for the fourth digit's rounding."""
+    if NUMBER.split(told) != NUMBER.split(found):
+        return False
+    pairs = [(float(a), float(b)) for a, b in zip(NUMBER.findall(told), NUMBER.findall(found), strict=True)]
+    return all(a == b or abs(a - b) <= SAME_DIGIT * _fourth_digit(max(abs(a), abs(b))) for a, b in pairs)
+
+
+def _fourth_digit(value: float) -> float:
+    return float(10.0 ** (math.floor(math.log10(value)) - 3))

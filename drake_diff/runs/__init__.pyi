@@ -1,0 +1,16 @@
+from .certificates import certify_model as certify_model
+from .certificates import save_rollout as save_rollout
+from .cross_check import cross_check as cross_check
+from .listing import RunComparison as RunComparison
+from .listing import RunLine as RunLine
+from .listing import compare_runs as compare_runs
+from .listing import list_runs as list_runs
+from .measurement import Measurement as Measurement
+from .measurement import measure as measure
+from .other_records import ComparisonRecord as ComparisonRecord
+from .other_records import FitRecord as FitRecord
+from .plan_record import PlanRecord as PlanRecord
+from .save import recover as recover
+from .sealed import SealedRecord as SealedRecord
+from .trace import Trace as Trace
+from .verify import Verification as Verification

@@ -1,0 +1,220 @@
+"""Certificates as records: of a model's step at sampled states, and of the gradient of a rollout."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff._base.arrays import finite_array, positive_int
+from drake_diff._base.files import write_whole
+from drake_diff.certificates.certify import certify
+from drake_diff.certificates.rollout import RolloutCertificate
+from drake_diff.certificates.sampled import SampledCertificate
+from drake_diff.certificates.truth import TrueSlope, Truth
+from drake_diff.derivatives.sources import check_method
+from drake_diff.exceptions import GradientError, InputError, SimulationError
+from drake_diff.model.contact import active_modes
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import Parameters, select
+from drake_diff.model.sampling import SampledState, sample_states
+from drake_diff.model.step import advance
+from drake_diff.runs.directory import written_whole
+from drake_diff.runs.plan_record import (
+    CertificationSection,
+    CertifiedState,
+    PlanRecord,
+    RolloutSection,
+    SlopeEvidence,
+    TruthEvidence,
+)
+from drake_diff.runs.provenance import embodiment_of, gradient_evidence, model_input, provenance_of, written_now
+from drake_diff.runs.sealed import Passed, WallClock
+
+
+def certify_model(
+    model: Model,
+    *,
+    states: int = 20,
+    seed: int = 0,
+    parameters: Parameters = (),
+    method: str = "auto",
+    directory: str | Path | None = None,
+) -> PlanRecord:
+    """Certify the derivatives of the step at sampled states, every other one in contact where the model can touch.
+
+    The same seed gives the same states, so that `verify` can take the certificates again.
+
+    Args:
+        model: The model to certify.
+        states: How many states to sample.
+        seed: Seed of the states.
+        parameters: Names of parameters whose derivatives are certified too.
+        method: How the derivative is taken: "auto", "autodiff", "implicit", "analytic" or "finite_difference".
+        directory: Where to write record.json and a copy of the model file; nothing is written without one. An
+            earlier run there is replaced when the last state is done.
+
+    Returns:
+        A `PlanRecord`, whose verdict is "pass" only where every certificate agrees.
+
+    Raises:
+        InputError: `states`, `seed`, `parameters` or `method` is not one that can be used, or `directory` holds what
+            no run wrote.
+        WriteError: The disk is full, or does not let `directory` be written.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> print(dd.runs.certify_model(model, states=2))
+        pendulum: pass, 2 of 2 sampled states have a certified derivative
+    """
+    start = time.monotonic()
+    check_method(method)
+    positive_int("states", states)
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
+    names = [p.name for p in select(model, parameters).parameters]
+
+    def record(verdict: Passed, sentence: str, certified: Sequence[CertifiedState] = ()) -> PlanRecord:
+        section = CertificationSection(seed=int(seed), method=method, parameters=names, states=list(certified))
+        seconds = time.monotonic() - start
+        return _record(model, verdict, sentence, seconds, certification=section, contract=model.contract.to_dict())
+
+    def certified() -> PlanRecord:
+        rows = [_certify_state(model, state, parameters, method) for state in sample_states(model, states, int(seed))]
+        agree = sum(row.verdict == "agree" for row in rows)
+        sentence = f"{agree} of {len(rows)} sampled states have a certified derivative"
+        return record("pass" if agree == len(rows) else "fail", sentence, rows)
+
+    if directory is None:
+        return certified().sealed()
+    with written_whole(directory) as folder:
+        sentence = "the run has started and not finished: it is still running, or it was killed"
+        record("incomplete", sentence).begin(folder)
+        made = certified()
+        if model.source is not None and made.model.file is not None:
+            write_whole(folder / model.source.name, model.source.read_bytes())  # to certify it again
+        return made.write(folder)
+
+
+def _certify_state(model: Model, state: SampledState, parameters: Parameters, method: str) -> CertifiedState:
+    modes: dict[str, str] = {}
+    point = {"kind": state.kind, "x": state.x.tolist(), "u": state.u.tolist()}
+    try:
+        advance(model.double, state.x, state.u)
+        modes = {" - ".join(pair): mode for pair, mode in sorted(active_modes(model).items())}
+        certificate = certify(model, state.x, state.u, parameters=parameters, method=method)
+    except (GradientError, SimulationError) as error:
+        return CertifiedState(**point, gradient=None, refusal=str(error), contact_modes=modes)
+    return CertifiedState(
+        **point,
+        gradient=gradient_evidence(certificate),
+        largest=float(np.abs(certificate.derivative).max(initial=0.0)),
+        contact_modes=modes,
+        mode_changes=[str(change) for change in certificate.mode_changes],
+    )
+
+
+def _record(model: Model, verdict: Passed, sentence: str, seconds: float | None = None, **sections: Any) -> PlanRecord:
+    return PlanRecord(
+        name=model.name,
+        verdict=verdict,
+        sentence=sentence,
+        model=model_input(model),
+        embodiment=embodiment_of(model.contract),
+        provenance=provenance_of(),
+        wall_clock=WallClock(written_utc=written_now(), duration_s=seconds),
+        **sections,
+    )
+
+
+def save_rollout(
+    certificate: RolloutCertificate | SampledCertificate, model: Model, directory: str | Path
+) -> PlanRecord:
+    """Write the certificate of a rollout's gradient, with its truth, as record.json.
+
+    Args:
+        certificate: What `certify_rollout` gave, not `sampled`.
+        model: The model that was rolled out.
+        directory: Where to write record.json and its schema; an earlier run there is replaced.
+
+    Returns:
+        A `PlanRecord`, whose verdict is "pass" only where every entry agrees.
+
+    Raises:
+        InputError: It is no certificate of a whole rollout, the rollout is of another model, or `directory` holds
+            what no run wrote.
+        WriteError: The disk is full, or does not let `directory` be written.
+
+    Example:
+        >>> import tempfile
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> certificate = dd.certify_rollout(model, [0.5, 0], np.zeros((20, 1)), lambda x: x[0], refine=True)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     record = dd.runs.save_rollout(certificate, model, folder)
+        >>> record.verdict, [slope.sign_agrees for slope in record.rollout.truth.slopes]
+        ('pass', [True, True, True])
+    """
+    if not isinstance(certificate, RolloutCertificate):
+        expected = "what certify_rollout gives, not sampled"
+        raise InputError("certificate", got=type(certificate).__name__, expected=expected)
+    motion, count = certificate.gradient, len(certificate.columns)
+    finite_array("the certificate's x0", motion.xs[0], (model.nx,))
+    agree = certificate.count("agree")
+    section = RolloutSection(
+        x0=_plain(motion.xs[0]),
+        us=[_plain(u) for u in motion.us],
+        loss=motion.loss,
+        columns=list(certificate.columns),
+        derivative=_plain(certificate.derivative[0]),
+        verdicts=[certificate.entry(0, j).verdict for j in range(count)],
+        certificate=gradient_evidence(certificate),
+        truth=None if certificate.truth is None else truth_evidence(certificate.truth),
+        no_truth=certificate.no_truth,
+    )
+    verdict: Passed = "pass" if certificate.verdict == "agree" else "fail"
+    record = _record(model, verdict, f"{agree} of {count} entries of the gradient agree", rollout=section)
+    with written_whole(directory) as folder:
+        return record.write(folder)
+
+
+def truth_evidence(truth: Truth) -> TruthEvidence:
+    """A truth as it stands in a record."""
+    return TruthEvidence(
+        law=truth.law,
+        touches=truth.touches,
+        loss=_known(truth.loss),
+        error=_known(truth.error),
+        ours=truth.ours,
+        other_law=truth.other_law,
+        by_other_law=_known(truth.by_other_law),
+        other_reason=truth.other_reason,
+        notes=list(truth.notes),
+        seconds=truth.seconds,
+        slopes=[_slope(one) for one in truth.slopes],
+    )
+
+
+def _slope(one: TrueSlope) -> SlopeEvidence:
+    return SlopeEvidence(
+        column=one.column,
+        ours=one.ours,
+        exists=one.exists,
+        value=_known(one.value),
+        error=_known(one.error),
+        sign_agrees=one.sign_agrees,
+        agrees=one.agrees,
+        widths=list(one.widths),
+        slopes=list(one.slopes),
+        reason=one.reason,
+        by_other_law=_known(one.by_other_law),
+    )
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _plain(values: ArrayLike) -> list[float]:
+    return [float(value) for value in np.asarray(values, dtype=float).ravel()]

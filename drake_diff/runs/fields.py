@@ -1,0 +1,380 @@
+"""The fields that records are made of: numbers with units and verdicts, files, failures, what was asked and measured.
+
+None of them is NaN or infinite: null stands for a number that is not there.
+"""
+
+import json
+from collections.abc import Mapping
+from hashlib import sha256
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, model_validator
+
+NOTHING_SOLVED = "nothing was solved"
+Label = Literal["perception_error", "state_error", "planning_error", "control_error", "evaluation_error"]
+Table = dict[str, JsonValue]
+
+
+def _finite(table: Any) -> Any:
+    """`table` as it is; ValueError where a number in it is none that JSON has."""
+    if isinstance(table, float) and table - table != 0:
+        raise ValueError("expected finite numbers, null where there is none")
+    for item in table.values() if isinstance(table, dict) else table if isinstance(table, list) else ():
+        _finite(item)
+    return table
+
+
+FiniteTable = Annotated[Table, AfterValidator(_finite)]
+
+
+def canonical(fields: Mapping[str, Any]) -> str:
+    """JSON with sorted keys: the same fields give the same text."""
+    return json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n"
+
+
+class Fields(BaseModel):
+    """The rules of all fields: no field that the schema does not have, no NaN, no infinity."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class Quantity(Fields):
+    """A number with its unit; `value` is null where there is no finite one, and `reason` says why."""
+
+    value: float | None
+    unit: str
+    reason: str | None = None
+
+    @model_validator(mode="after")
+    def _has_a_reason(self) -> "Quantity":
+        if self.value is None and not self.reason:
+            raise ValueError("a value of null: expected a reason")
+        return self
+
+
+class Metric(Fields):
+    """Something measured on the plant after the solve; with a tolerance it decides, without one it informs.
+
+    `verdict` is "pass" only where `value` keeps `tolerance`, and "info" where there is none; a value of null (there is
+    no finite one, and `reason` says why) passes nothing. `t_s` is where along the motion it is at its worst.
+    """
+
+    name: str
+    definition: str
+    unit: str
+    value: float | None
+    reason: str | None = None
+    tolerance: float | None = None
+    direction: Literal["at_most", "at_least", "info"] = "info"
+    verdict: Literal["pass", "fail", "undecided", "info"] = "info"
+    t_s: float | None = None
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> "Metric":
+        if self.value is None and not self.reason:
+            raise ValueError(f"metric {self.name}: a value of null: expected a reason")
+        if (self.tolerance is None) != (self.direction == "info") or (self.tolerance is None) != (
+            self.verdict == "info"
+        ):
+            raise ValueError(f'metric {self.name}: expected a tolerance, or "info" as direction and verdict')
+        if self.verdict == "pass" and not self.keeps(self.value):
+            raise ValueError(f'metric {self.name}: "pass", but {self.value} does not keep {self.tolerance}')
+        if self.verdict == "fail" and self.keeps(self.value):
+            raise ValueError(f'metric {self.name}: "fail", but {self.value} keeps {self.tolerance}')
+        return self
+
+    def keeps(self, value: float | None) -> bool:
+        """Whether `value` keeps the tolerance; no value keeps none."""
+        if value is None or self.tolerance is None:
+            return False
+        return value <= self.tolerance if self.direction == "at_most" else value >= self.tolerance
+
+
+class FileEvidence(Fields):
+    """A file of the run directory, or one the run was made from; `reason` says why it has no size and hash."""
+
+    path: str
+    bytes: int | None
+    sha256: str | None
+    reason: str | None = None
+
+
+class Failure(Fields):
+    """Why a run is no success: a case under one of the five labels, and what found it."""
+
+    label: Label
+    code: str
+    message: str
+    t_s: float | None = None  # along the motion, where the failure is at one time
+    detected_by: str
+    evidence: str | None = None  # the section of the record that shows it
+
+
+class Event(Fields):
+    """Something that happened; `t_s` [s] is simulated time, null for what happens before or after the motion.
+
+    No solver here reports a "recovery" yet; observations and actions, step by step, are in trace.mcap.
+    """
+
+    t_s: float | None
+    kind: Literal[
+        "solver_started",
+        "solver_ended",
+        "contact_made",
+        "contact_broken",
+        "saturation_begins",
+        "saturation_ends",
+        "recovery",
+        "failure",
+    ]
+    message: str
+
+
+class Certified(Fields):
+    """One certificate: what was compared, where the derivative came from, and the entry that is worst."""
+
+    subject: str
+    method: str
+    verdict: str
+    entries: int
+    counts: dict[str, int]
+    worst: str | None
+    power: float  # the smallest error that every entry's differences would have noticed, as a part of the entry
+    told: str  # whose differences they are
+
+
+class Provenance(Fields):
+    """With what the run was made."""
+
+    python: str
+    platform: str
+    packages: dict[str, str]
+    git: dict[str, str | bool] | None
+    command: list[str]
+
+
+class ModelInput(Fields):
+    """What the model was made from, and how; no `file` and no `options` where it is a user's own diagram.
+
+    `named` are the files that the model file names (meshes, included models), by the name that they have in it. Those
+    whose name is neither that of a mesh nor of a robot file are not read.
+    """
+
+    file: FileEvidence | None
+    named: list[FileEvidence] = Field(default_factory=list)
+    options: FiniteTable | None
+
+
+class DataUse(Fields):
+    """Data that a run used: what it is, and the hash of its bytes, null where it has none of its own."""
+
+    name: str
+    what: str
+    sha256: str | None = None
+
+
+class DataBoundary(Fields):
+    """Which data a run saw while it searched, and on which it was judged; `statement` says it in words.
+
+    `held_out` are the names of what it was judged on and did not see. What has the name or the bytes of data that was
+    seen is not held out: a record that says so is refused.
+    """
+
+    statement: str
+    seen: list[DataUse]
+    judged_on: list[DataUse]
+    held_out: list[str] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _holds_out_only_what_was_not_seen(self) -> "DataBoundary":
+        names, hashes = {use.name for use in self.seen}, {use.sha256 for use in self.seen if use.sha256}
+        new = [use.name for use in self.judged_on if use.name not in names and use.sha256 not in hashes]
+        wrong = [name for name in self.held_out if name not in new]
+        if wrong:
+            raise ValueError(f"held out: {', '.join(wrong)}, which the run saw, or was not judged on")
+        return self
+
+
+class Drive(Fields):
+    """An actuator: its joint, what it is commanded, and what it can do; null is no limit, and no gain."""
+
+    actuator: str
+    joint: str
+    command: str
+    unit: str
+    effort_limit: float | None
+    gear_ratio: float
+    rotor_inertia: float
+    kp: float | None
+    kd: float | None
+
+
+class Embodiment(Fields):
+    """The robot: its base, which joints are driven and how, which only move, what is fixed, sensed and can touch.
+
+    `other_inputs` are those that are no actuator, such as the thrust on a body. Units are those of the contract.
+    """
+
+    robot: str
+    base: str
+    driven: list[Drive]
+    other_inputs: list[str]
+    passive: list[str]
+    fixed: list[str]
+    sensed: str
+    touching: list[str]
+
+
+class Claim(Fields):
+    """What the run says is true, and what it does not say."""
+
+    statement: str = f"nothing: {NOTHING_SOLVED}"
+    limitations: list[str] = Field(default_factory=list)
+
+
+class Inputs(Fields):
+    """What the run started from, besides `problem`, which holds the initial state.
+
+    `search` are the arguments of `solve`, so that it can be called again; null where they are not known.
+    """
+
+    initial_guess: str = NOTHING_SOLVED
+    initial_guess_sha256: str | None = None  # of the bytes of xs (N+1, nx), then us (N, nu), as doubles
+    seed: int | None = None
+    random_generator: str = "numpy.random.default_rng"
+    search: FiniteTable | None = None
+
+
+class Solver(Fields):
+    """What solved the problem, and how it says it ended."""
+
+    method: str
+    solver: str
+    scheme: str
+    status: str
+    message: str
+    solver_message: str
+    options: FiniteTable
+    iterations: int
+
+
+class ParameterEvidence(Fields):
+    """One entry of the parameter vector: where it started, what was found, where its derivative came from."""
+
+    name: str
+    unit: str
+    derivative_source: str
+    start: float
+    value: float
+    optimized: bool
+    lower: float | None
+    upper: float | None
+
+
+class GradientColumn(Fields):
+    """One of the variables that the motion is differentiated by, and where that column of derivatives comes from."""
+
+    name: str
+    unit: str
+    source: str
+
+
+class GradientEvidence(Fields):
+    """What is differentiated, from where, and how far it agrees with differences."""
+
+    differentiated: list[str]
+    columns: list[GradientColumn]
+    smoothing: str
+    regularization: str
+    solver_tolerance: Quantity
+    horizon: Quantity
+    final_state_norm_definition: str  # or why there are none
+    final_state_norms: list[float | None] = Field(default_factory=list)  # by knot; null where one is not finite
+    lagrangian_norm_definition: str  # or why there are none
+    lagrangian_norms: list[float | None] = Field(default_factory=list)  # the same
+    stationarity: Quantity
+    certificates: list[Certified] = Field(default_factory=list)
+
+
+class ObservedVariable(Fields):
+    """One variable of the state as it is observed."""
+
+    name: str
+    unit: str
+    frame: str
+    uncertainty: Quantity
+
+
+class Observation(Fields):
+    """What is observed, in which frame, and when."""
+
+    variables: list[ObservedVariable] = Field(default_factory=list)
+    clock: str = NOTHING_SOLVED
+    start_s: float = 0.0
+    period_s: float = 0.0
+    count: int = 0
+
+
+class Command(Fields):
+    """One commanded input; null is no limit."""
+
+    name: str
+    unit: str
+    lower: float | None
+    upper: float | None
+
+
+NO_TIME = Quantity(value=None, unit="s", reason=NOTHING_SOLVED)
+
+
+class ActionInterface(Fields):
+    """How the inputs reach the plant."""
+
+    command_type: str = NOTHING_SOLVED
+    commands: list[Command] = Field(default_factory=list)
+    update_rate: Quantity = NO_TIME
+    latency_budget: Quantity = NO_TIME
+    safety_fallback: str = NOTHING_SOLVED
+
+
+class ReplayEvidence(Fields):
+    """One replay of the plan on the plant; a measure is None where the motion could not be taken."""
+
+    variant: str
+    control: str
+    time_step_s: float
+    contact_approximation: str
+    goal_error: float | None  # the largest, in the state's units
+    bound_violation: float | None  # the same
+    energy_error_J: float | None
+    penetration_m: float | None
+    holds: bool
+    failures: list[str]
+
+
+class PanelCase(Fields):
+    """One plant in which the plan was judged, and under which control; `decides` where the verdict rests on it."""
+
+    variant: str
+    control: str
+    time_step_s: float
+    contact_approximation: str
+    decides: bool
+
+
+class EvaluationPanel(Fields):
+    """Under what the plan was judged: plants, perturbations, latencies; runs of one `sha256` were judged alike.
+
+    The hash is that of the panel's canonical JSON with `sha256` empty.
+    """
+
+    statement: str
+    cases: list[PanelCase]
+    perturbations: list[str]
+    latencies_s: list[float]
+    sha256: str = ""
+
+    def hashed(self) -> "EvaluationPanel":
+        """The same with its hash."""
+        bare = self.model_copy(update={"sha256": ""})
+        return bare.model_copy(update={"sha256": sha256(canonical(bare.model_dump(mode="json")).encode()).hexdigest()})

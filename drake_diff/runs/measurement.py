@@ -1,0 +1,491 @@
+"""Everything that is measured of a solution, once: record.json, trace.mcap and the pages are written from it.
+
+Whatever a record says of a motion, `verify` computes again by the same function.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.refusal import Refusal
+from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
+from drake_diff.model.contact import thinnest_geometry
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import Parameter, ParameterVector, applied
+from drake_diff.model.plant import FLOATING, bodies, joints
+from drake_diff.model.step import set_state
+from drake_diff.motion.rollout import CONTINUOUS, STEPS, Rollout, drift, smooth_mean
+from drake_diff.optimize.measure import INTEGRATION_TOLERANCE
+from drake_diff.optimize.problem.names import units_of
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
+from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
+from drake_diff.optimize.solution import Solution, Status
+from drake_diff.optimize.transcription.between import violation_between_nodes
+from drake_diff.runs.fields import Event, Failure, Label, Metric, ReplayEvidence
+
+AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
+ON_THE_PLANT = {  # by the problem's motion
+    STEPS: "in the open-loop replay on the discrete plant",
+    CONTINUOUS: "in the open-loop replay in continuous time, integrated apart",
+}
+NO_REPLAY = "the plant could not be stepped along these inputs"
+HALF_STEP = "half-step end error"
+NEVER_FREE = "there is contact, or a limit, from the first step on"
+INVARIANTS = {
+    "free-motion energy drift": "J",
+    "free-motion energy oscillation": "J",
+    "linear momentum error": "N s",
+    "angular momentum error": "N m s",
+    "penetration": "m",
+    "limit violation": "",  # the positions' own
+    "friction-cone excess": "N",
+}
+FAILURES: dict[Status, tuple[Label, str]] = {
+    Status.CONVERGED_NOT_VERIFIED: ("planning_error", "not_verified"),
+    Status.ITERATION_LIMIT: ("planning_error", "solver_iteration_limit"),
+    Status.TIME_LIMIT: ("planning_error", "latency_budget_exceeded"),
+    Status.INFEASIBLE: ("planning_error", "solver_infeasible"),
+    Status.DIVERGED: ("state_error", "simulation_diverged"),
+    Status.NO_GRADIENT: ("planning_error", "gradient_vanishing"),
+    Status.INTERRUPTED: ("evaluation_error", "interrupted"),
+    Status.FAILED: ("planning_error", "solver_numerical"),
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the states or inputs: its name and unit, and the bounds that the problem sets."""
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement(ShowsItsRepr):
+    """What a solution is on Drake's plant; `measure` makes it.
+
+    Attributes:
+        solution: The plan, and how the solver came to it.
+        positions, velocities, inputs: The columns of its states and inputs.
+        times, xs, us: (N+1,), (N+1, nx), and (N, nu) or (N+1, nu): the plan at the problem's own knots.
+        motion: The plant's own motion under the planned inputs; None where it could not be taken.
+        integrated: (N+1, nx) where the equations lead from the first state, for a plan in continuous time.
+        penetration_limit: [m] how deep two geometries may overlap; `thinnest` is the geometry that decides it.
+        replays: The plan in every variant of the plant.
+        metrics: Every measure of the plan and of its replay; those with a tolerance decide.
+        invariants: What physics keeps along the replay.
+        failures: Why the run is no success; none for a success.
+        events: What happened, in order: the solver, contacts, inputs at their limits, failures.
+
+    Example:
+        >>> from drake_diff.runs import measure
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
+        >>> problem = dd.Problem(model, x0=[0.1, 0], num_steps=5, running_cost=dd.QuadraticCost(R=[[1.0]]))
+        >>> m = measure(dd.solve(problem, method="shooting"))
+        >>> [column.name for column in m.positions], m.xs.shape, len(m.failures)
+        (['hinge_q'], (6, 2), 0)
+    """
+
+    solution: Solution
+    positions: tuple[Column, ...]
+    velocities: tuple[Column, ...]
+    inputs: tuple[Column, ...]
+    times: Array
+    xs: Array
+    us: Array
+    motion: Rollout | None
+    integrated: Array | None
+    replays: tuple[Replay, ...]
+    penetration_limit: float
+    thinnest: str
+    metrics: tuple[Metric, ...]
+    invariants: tuple[Metric, ...]
+    failures: tuple[Failure, ...]
+    events: tuple[Event, ...]
+
+    @property
+    def state_unit(self) -> str:
+        """The unit of the worst of all states: "rad or rad/s"."""
+        return _unit((*self.positions, *self.velocities))
+
+    @property
+    def shown(self) -> tuple[Rollout | None, str]:
+        """The motion that the verdict rests on, and what it is; the open-loop one where none holds."""
+        judged = self.solution.judged_replay
+        if judged is None or judged.motion is None or judged.motion is self.motion:
+            return self.motion, "open loop"
+        return judged.motion, f"{judged.control}, {judged.variant}"
+
+    def __str__(self) -> str:
+        broken = [m.name for m in (*self.metrics, *self.invariants) if m.verdict in ("fail", "undecided")]
+        decided = sum(m.verdict != "info" for m in (*self.metrics, *self.invariants))
+        kept = f"{decided - len(broken)} of {decided} bounds are kept"
+        return f"{self.solution.status.value}: {kept}" + (f", not those of {', '.join(broken)}" if broken else "")
+
+    def __repr__(self) -> str:
+        lines = [f"Measurement: {self}", *(f"{f.label}: {f.message}" for f in self.failures)]
+        return "\n  ".join((*lines, *(f"{m.name}: {m.value} {m.unit} ({m.verdict})" for m in self.metrics)))
+
+
+@np.errstate(over="ignore", invalid="ignore")  # numbers of a run that diverged: they are measured as infinite
+def measure(solution: Solution) -> Measurement:
+    """Measure a solution on the plant: once, for all that is written of it.
+
+    Args:
+        solution: A result of `solve`.
+
+    Returns:
+        A `Measurement`.
+
+    Example:
+        >>> from drake_diff.runs import measure
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
+        >>> problem = dd.Problem(model, x0=[0.1, 0], num_steps=5, running_cost=dd.QuadraticCost(R=[[1.0]]))
+        >>> print(measure(dd.solve(problem, method="shooting")))
+        converged: 6 of 6 bounds are kept
+    """
+    problem, motion, knots, us = solution.problem, solution.replay, solution.knots, solution.inputs_at_knots
+    names, b = (*problem.state_names, *problem.input_names), problem.bounds
+    limits = np.append(b.x_lower, b.u_lower).tolist(), np.append(b.x_upper, b.u_upper).tolist()
+    columns = tuple(Column(*column) for column in zip(names, units_of(problem), *limits, strict=True))
+    states, inputs = columns[: problem.nx], columns[problem.nx :]
+    count = problem.model.nq if problem.has_model else problem.nx  # all states of plain dynamics are positions
+    positions, velocities = states[:count], states[count:]
+    metrics = [*_metrics_of_the_plan(solution, states, inputs)]
+    invariants: list[Metric] = []
+    limit, thinnest = math.inf, ""
+    if problem.has_model:
+        metrics += _metrics_of_the_replay(solution, motion, states, positions)
+        invariants += _invariants(solution.vector, motion, _unit(positions), ON_THE_PLANT[problem.motion])
+        limit, thinnest = thinnest_geometry(problem.model)
+    failures = tuple(_failures(solution, metrics))
+    return Measurement(
+        solution=solution,
+        positions=positions,
+        velocities=velocities,
+        inputs=inputs,
+        times=solution.times[knots],
+        xs=solution.xs[knots],
+        us=us if len(us) == problem.num_steps else us[knots],
+        motion=motion,
+        integrated=None if solution.integrated is None else solution.integrated[knots],
+        replays=solution.replays,
+        penetration_limit=PENETRATION_PART * limit,
+        thinnest=thinnest,
+        metrics=tuple(metrics),
+        invariants=tuple(invariants),
+        failures=failures,
+        events=tuple(_events(solution, motion, failures)),
+    )
+
+
+def _unit(columns: Sequence[Column | Parameter]) -> str:
+    """The units of the worst of several numbers: "rad or m"."""
+    return " or ".join(dict.fromkeys(column.unit for column in columns))
+
+
+def _metrics_of_the_plan(s: Solution, states: Sequence[Column], inputs: Sequence[Column]) -> Iterator[Metric]:
+    tolerance, x = FEASIBILITY_TOLERANCE, _unit(states)
+    bounded = _unit((*states, *inputs, *s.vector.parameters))
+    worst = int(np.argmax(s.defects)) if len(s.defects) else 0
+    when = float(s.times[min(worst, len(s.times) - 1)])
+    yield measured("cost", "objective of the states and inputs as the problem defines it", s.cost, "1")
+    yield measured("defect", "largest distance from the dynamics over one step", s.defect, x, tolerance, t_s=when)
+    yield measured("goal error", "largest distance of the final state from the goal", s.goal_error, x, tolerance)
+    yield measured("bound violation", "largest excess over a bound", s.bound_violation, bounded, tolerance)
+    yield measured("initial state error", "distance of the first state from x0", s.initial_state_error, x, tolerance)
+    excess = "largest excess over a bound of a constraint, or distance from a waypoint"
+    yield measured("constraint violation", excess, s.constraint_violation, "the constraint's", tolerance)
+    yield measured("horizon", "time from the first state to the last", s.horizon, "s")
+    if s.transcribed is None:
+        return
+    definition = "largest distance of a knot from an accurate integration from the knot before"
+    yield measured("integration error", definition, s.integration_error, x, INTEGRATION_TOLERANCE)
+    between = violation_between_nodes(s.transcribed)
+    excesses = ("state", between.state, x), ("input", between.input, _unit(inputs))
+    for name, value, unit in (*excesses, ("constraint", between.constraint, "the constraint's")):
+        definition = f"largest excess of the {name} over its bounds between the nodes, as the dynamics move there"
+        yield measured(f"{name} excess between nodes", definition, value, unit)
+    tolerances = (
+        "1e-3 of its range along the plan or 1e-5, and 1e-3 of the ranges of states and inputs to where it holds"
+    )
+    definition = f"the worst of these as a part of its tolerance, {tolerances}"
+    yield measured("excess between nodes", definition, between.worst, "1", 1.0)
+    if s.integrated is not None and not s.problem.has_model:
+        definition = "largest distance of the final state from where the equations lead from the first, unstable or not"
+        yield measured("open-loop end error", definition, float(np.abs(s.integrated[-1] - s.xs[-1]).max()), x)
+
+
+def _metrics_of_the_replay(
+    solution: Solution, motion: Rollout | None, states: Sequence[Column], positions: Sequence[Column]
+) -> Iterator[Metric]:
+    here, x, position = ON_THE_PLANT[solution.problem.motion], _unit(states), _unit(positions)
+    measures = (
+        ("replay end error", f"largest distance of the final state {here} from the plan's", x),
+        (HALF_STEP, "the same, in steps half as long", x),
+        ("energy drift", f"lasting energy that no force explains (actuators, damping, contact, limits), {here}", "J"),
+        ("energy oscillation", f"largest oscillation of that energy about its drift, {here}", "J"),
+        ("energy scale", f"range of kinetic plus potential energy {here}", "J"),
+        ("penetration", f"largest overlap of two geometries {here}", "m"),
+        ("joint limit violation", f"largest excess over a joint limit or of a quaternion's norm {here}", position),
+    )
+    values, reason = [math.inf] * len(measures), NO_REPLAY
+    if motion is not None:
+        reason = "not finite"
+        values = [
+            float(np.abs(motion.xs[-1] - solution.xs[-1]).max()),
+            solution.half_step_error,
+            abs(motion.energy_drift),
+            motion.energy_oscillation,
+            float(np.ptp(motion.energy)),
+            float(np.max(motion.penetration)),
+            float(np.max(motion.constraint_violation)),
+        ]
+    bounds = {}
+    judged = solution.judged_replay  # each that holds has kept its own energy
+    rests_on_it = judged is None or judged.motion is None or judged.motion is motion
+    if motion is not None and rests_on_it and np.all(np.isfinite(motion.constraint_violation)):  # which may take some
+        bounds["energy drift"] = energy_tolerance(motion)
+    for (name, definition, unit), value in zip(measures, values, strict=True):
+        if name == HALF_STEP and solution.problem.motion != STEPS:
+            continue  # it has no steps
+        yield measured(name, definition, value, unit, bounds.get(name), reason=reason)
+
+
+def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure]:
+    """None for a success; else the status, the first certificate and the metrics that do not hold."""
+    if not solution.success:
+        label, code = FAILURES[solution.status]
+        found_by = "the solver's status, measured again"
+        yield _failure(label, code, solution.message, found_by, "solver, metrics, replays")
+        bad = next((c for c in solution.certificates if c.verdict != "agree"), None)
+        if bad is not None:
+            message = f"{bad.subject}: {bad}"
+            yield _failure("planning_error", "gradient_mismatch", message, "certificate", "gradient.certificates")
+        return
+    broken = [metric.name for metric in metrics if metric.verdict in ("fail", "undecided")]
+    if broken:
+        message = f"{', '.join(broken)}: the solution says success, its metrics do not hold"
+        yield _failure("evaluation_error", "metric_does_not_hold", message, "metrics", "metrics")
+
+
+def gradient_norms(solution: Solution) -> tuple[Array | None, Array | None]:
+    """(N+1,) |d x_N / d x_k| and |d L / d x_k|, None where they are not known."""
+    ends, found = solution.final_state_norms, solution.optimality
+    return None if isinstance(ends, Refusal) else ends, None if isinstance(found, Refusal) else found.state_norms
+
+
+def replay_evidence(r: Replay) -> ReplayEvidence:
+    """A replay as it stands in a record."""
+    goal, bound, energy, depth = (
+        float(v) if math.isfinite(v) else None for v in (r.goal_error, r.bound_violation, r.energy_error, r.penetration)
+    )
+    return ReplayEvidence(
+        variant=r.variant,
+        control=r.control,
+        time_step_s=r.time_step,
+        contact_approximation=r.approximation,
+        goal_error=goal,
+        bound_violation=bound,
+        energy_error_J=energy,
+        penetration_m=depth,
+        holds=r.holds,
+        failures=list(r.failures),
+    )
+
+
+def failure_of(error: BaseException) -> Failure:
+    """The failure of a run that `error` ended before there was a solution."""
+    label: Label = "evaluation_error"
+    if isinstance(error, (SimulationError, GradientError)):
+        label = "state_error" if isinstance(error, SimulationError) else "planning_error"
+    code = "refused" if isinstance(error, DrakeDiffError) else "exception"
+    message = f"{type(error).__name__}: {error}".encode("utf-8", "replace").decode()
+    return _failure(label, code, message, "the exception that ended the run", None)
+
+
+def _failure(label: Label, code: str, message: str, detected_by: str, evidence: str | None) -> Failure:
+    return Failure(label=label, code=code, message=message, detected_by=detected_by, evidence=evidence)
+
+
+def _events(solution: Solution, motion: Rollout | None, failures: Sequence[Failure]) -> Iterator[Event]:
+    """Before the motion, along the replay in simulated time, and after it."""
+    yield Event(t_s=None, kind="solver_started", message=f"{solution.method} with {solution.solver}")
+    end = f"{solution.status.value} after {len(solution.iterations)} iterations: {solution.solver_message}"
+    yield Event(t_s=None, kind="solver_ended", message=end)
+    if motion is not None:
+        along = [*_contact_events(motion), *_saturation_events(solution, motion)]
+        yield from sorted(along, key=lambda event: event.t_s or 0.0)
+    for f in failures:
+        yield Event(t_s=f.t_s, kind="failure", message=f"{f.label}, {f.code}: {f.message}")
+
+
+def _contact_events(motion: Rollout) -> Iterator[Event]:
+    """Each pair of bodies that begins or ceases to push each other."""
+    before: set[tuple[str, str]] = set()
+    for time, contacts in zip(motion.times, motion.contacts, strict=False):
+        now = {(c.body_a, c.body_b) for c in contacts}
+        for a, b in sorted(now - before):
+            yield Event(t_s=float(time), kind="contact_made", message=f"{a} touches {b}")
+        for a, b in sorted(before - now):
+            yield Event(t_s=float(time), kind="contact_broken", message=f"{a} leaves {b}")
+        before = now
+
+
+def _saturation_events(solution: Solution, motion: Rollout) -> Iterator[Event]:
+    """Each input that reaches or leaves a bound of the problem or the effort limit of its actuator."""
+    bounds = solution.problem.bounds
+    for i, coordinate in enumerate(solution.problem.model.contract.inputs):
+        limits = (max(bounds.u_lower[i], coordinate.lower), min(bounds.u_upper[i], coordinate.upper))
+        us: Array = motion.us[:, i]
+        at_limit = np.zeros(us.shape, dtype=bool)
+        for limit in limits:
+            if np.isfinite(limit):
+                at_limit |= np.abs(us - limit) <= AT_LIMIT * abs(limit)
+        for k in np.flatnonzero(np.diff(at_limit, prepend=False)):
+            message = f"{coordinate.name} is at its limit" if at_limit[k] else f"{coordinate.name} leaves its limit"
+            yield Event(
+                t_s=float(motion.times[k]),
+                kind="saturation_begins" if at_limit[k] else "saturation_ends",
+                message=message,
+            )
+
+
+def measured(
+    name: str,
+    definition: str,
+    value: float,
+    unit: str,
+    tolerance: float | None = None,
+    *,
+    reason: str = "not finite",
+    t_s: float | None = None,
+) -> Metric:
+    """A metric that is to be at most `tolerance`, or that informs; `reason` is why where `value` is not finite."""
+    finite = math.isfinite(value)
+    return Metric(
+        name=name,
+        definition=definition,
+        unit=unit,
+        value=float(value) if finite else None,
+        reason=None if finite else reason,
+        tolerance=tolerance,
+        direction="info" if tolerance is None else "at_most",
+        verdict="info" if tolerance is None else "pass" if value <= tolerance else "fail",
+        t_s=t_s if finite else None,
+    )
+
+
+def _invariants(vector: ParameterVector, motion: Rollout | None, unit: str, here: str) -> Iterator[Metric]:
+    """Each invariant along the replay; null with a reason where it does not apply.
+
+    `vector` has the parameters' values that the motion is of, `unit` is that of the positions, `here` says which it is.
+    """
+    if motion is None:
+        for name, own in INVARIANTS.items():
+            yield measured(name, here, np.inf, own or unit, reason=NO_REPLAY)
+        return
+    positions, (lower, upper) = motion.xs[:, : vector.model.nq], vector.model.position_limits
+    limits = (positions <= lower) | (positions >= upper)
+    # A limit is implicit: it acts in the step before it is met.
+    held = np.array([bool(c) for c in motion.contacts]) | np.any(limits, axis=1)[1:]
+    free = int(np.argmax(held)) if held.any() else len(held)  # steps from the start with nothing in the way
+    yield from _energy(motion, free, here)
+    yield from _momentum(vector, motion, free)
+    yield _worst("penetration", f"largest overlap of two geometries {here}", "m", motion, motion.penetration)
+    definition = f"largest excess over a joint limit, or of a quaternion's norm over 1, {here}"
+    untold = "the plant has constraints (couplers, balls, welds), whose violation pydrake does not tell"
+    yield _worst("limit violation", definition, unit, motion, motion.constraint_violation, untold)
+    yield _friction_cone(vector, motion, here)
+
+
+def _worst(name: str, definition: str, unit: str, motion: Rollout, values: Array, reason: str = "not finite") -> Metric:
+    k = int(np.argmax(values))
+    return measured(name, definition, float(values[k]), unit, reason=reason, t_s=float(motion.times[k]))
+
+
+def _energy(motion: Rollout, free: int, here: str) -> Iterator[Metric]:
+    """Of the first, free part: what neither actuators nor damping explain, drift apart from oscillation."""
+    error = motion.energy_error[: free + 1]
+    part = f"over the {free} steps from the start without contact, {here}"
+    lasting = swing = math.inf
+    if free > 0:
+        lasting = drift(error)
+        swing = float(np.abs(error - smooth_mean(error) - lasting * np.linspace(-0.5, 0.5, len(error))).max())
+    definition = f"lasting part of the energy that neither actuators nor damping explain, {part}"
+    yield measured("free-motion energy drift", definition, lasting, "J", reason=NEVER_FREE)
+    definition = f"largest distance of that energy from its drift line, {part}"
+    yield measured("free-motion energy oscillation", definition, swing, "J", reason=NEVER_FREE)
+
+
+def _momentum(vector: ParameterVector, motion: Rollout, free: int) -> Iterator[Metric]:
+    """Of a system that nothing holds to the world: momentum less what gravity gave, and spin about the mass centre."""
+    linear = angular = math.inf
+    reason = _why_not_conserved(vector.model, free)
+    if not reason:
+        reason = "not finite"
+        with applied(vector) as model:
+            linear, angular = _momentum_errors(model, motion, free)
+    definition = "largest change of the linear momentum beyond gravity's, in free motion"
+    yield measured("linear momentum error", definition, linear, "N s", reason=reason)
+    definition = "largest change of the angular momentum about the centre of mass, in free motion"
+    yield measured("angular momentum error", definition, angular, "N m s", reason=reason)
+
+
+def _why_not_conserved(model: Model, free: int) -> str:
+    """Why momentum is not conserved in this model; empty where it is."""
+    for joint in joints(model.plant):
+        holds = model.plant.IsAnchored(joint.parent_body()) and not model.plant.IsAnchored(joint.child_body())
+        if holds and joint.type_name() not in FLOATING:
+            return f"{joint.name()} holds the model to the world, which takes up momentum"
+        if joint.type_name() in FLOATING and np.any(np.asarray(joint.default_damping_vector()) != 0):
+            return f"{joint.name()} is damped, which takes momentum away"
+    return "" if free > 0 else NEVER_FREE
+
+
+def _momentum_errors(model: Model, motion: Rollout, free: int) -> tuple[float, float]:
+    plant, context = model.plant, model.double.context
+    linear, angular = [], []
+    moving = [body for body in bodies(plant) if not plant.IsAnchored(body)]
+    masses = np.array([body.get_mass(context) for body in moving])
+    for x in motion.xs[: free + 1]:
+        set_state(model.double, x)
+        centres = [plant.EvalBodyPoseInWorld(context, b) @ b.CalcCenterOfMassInBodyFrame(context) for b in moving]
+        centre = masses @ np.array(centres) / masses.sum()
+        momentum = plant.CalcSpatialMomentumInWorldAboutPoint(context, centre)
+        linear.append(np.asarray(momentum.translational()))
+        angular.append(np.asarray(momentum.rotational()))
+    pull = masses.sum() * np.asarray(plant.gravity_field().gravity_vector())
+    change = np.array(linear) - linear[0] - motion.times[: free + 1, None] * pull
+    return float(np.abs(change).max()), float(np.abs(np.array(angular) - angular[0]).max())
+
+
+def _friction_cone(vector: ParameterVector, motion: Rollout, here: str) -> Metric:
+    """By how much a tangential contact force is larger than friction allows."""
+    name, definition = "friction-cone excess", f"largest |f_t| - mu f_n of a contact's force {here}"
+    if any(parameter.name.endswith(".friction") for parameter in vector.parameters):
+        return measured(name, definition, np.inf, "N", reason="friction is a parameter here, not the contract's")
+    coefficients: dict[str, set[Any]] = {}
+    for geometry in vector.model.contract.geometries:
+        coefficients.setdefault(geometry.body, set()).add(geometry.friction)
+    known = {body: of_body.pop() for body, of_body in coefficients.items() if len(of_body) == 1}
+    worst, when = -np.inf, 0.0
+    for time, contacts in zip(motion.times, motion.contacts, strict=False):
+        for contact in contacts:
+            a, b = known.get(contact.body_a), known.get(contact.body_b)
+            if a is None or b is None:
+                pair = f"{contact.body_a} and {contact.body_b}"
+                return measured(name, definition, np.inf, "N", reason=f"the friction between {pair} is not one number")
+            mu = 2 * a * b / (a + b) if a + b else 0.0  # Drake's coefficient for two bodies
+            push = float(contact.force @ contact.normal)
+            excess = float(np.linalg.norm(contact.force - push * contact.normal)) - mu * push
+            if excess > worst:
+                worst, when = excess, float(time)
+    return measured(name, definition, worst, "N", reason="nothing touches", t_s=when)

@@ -1,0 +1,164 @@
+"""The pages of a run, which open from a disk: the motion in 3D, and a report with the motion, plots and numbers."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.optimize.live import differ, scene_of_plan
+from drake_diff.optimize.marks import Colour, colours_of, meaning_of
+from drake_diff.pages.html import Line, Plot, page_data, write_page
+from drake_diff.pages.meshcat import write_replay
+from drake_diff.pages.scene import Scene
+from drake_diff.runs.first_screen import asked_for, checks_of
+from drake_diff.runs.measurement import Column, Measurement, gradient_norms
+
+SERIES_PER_PLOT = 6  # more lines cannot be told apart
+PHYSICS, SEARCH = "Energy and contact", "Search"
+
+
+def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str, Any]) -> None:
+    """Write the pages of a measurement, whose `record` is given as plain data.
+
+    Plain dynamics have nothing to draw in 3D, and so no page `replay`. The bytes are the same for the same solution,
+    but for the paragraph of wall-clock times.
+    """
+    plots, view, colours = list(plots_of(m)), "", list[Colour]()
+    if m.solution.problem.has_model:
+        scene = scene_of_plan(m.solution, m.shown[0])
+        write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value.replace('_', ' ')}")
+        view, colours = replay.read_text(encoding="utf-8"), [*_colours_of(scene), *meaning_of(m.solution.problem.goals)]
+    data = page_data(float(m.times[-1]), plots, m.solution.certificates)
+    judged = m.solution.judged_replay
+    write_page(
+        report,
+        "report.html.j2",
+        record=record,
+        data=data,
+        view=view,
+        asked=asked_for(m.solution.problem, m.times),
+        checks=checks_of(m, record),
+        cost=m.solution.cost,
+        certificates=alike(record["gradient"]["certificates"]),
+        replayed=m.shown[0] is not None,
+        control="open loop" if judged is None else judged.control,
+        variant=f"in steps of {m.solution.time_step:g} s" if judged is None else judged.variant,
+        open_loop_holds=all(r["holds"] for r in record["replays"] if r["control"] == "open loop"),
+        colours=colours,
+    )
+
+
+def _colours_of(scene: Scene) -> list[Colour]:
+    """What is drawn in a replay beside the robot."""
+    return colours_of(plan=bool(scene.ghosts), contacts=any(scene.contacts), thrusts=any(scene.thrusts))
+
+
+def alike(certificates: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each run of certificates that say the same; `power` is that of the one which would notice least."""
+    rows: list[dict[str, Any]] = []
+    for number, c in enumerate(certificates):
+        told = {name: c[name] for name in ("subject", "method", "verdict", "entries")} | {"agree": c["counts"]["agree"]}
+        if not rows or any(rows[-1][name] != value for name, value in told.items()):
+            rows.append({**told, "first": number, "count": 0, "power": 0.0})
+        row = rows[-1]
+        row["count"] += 1
+        row["power"] = max(row["power"], c["power"])
+        row["numbers"] = f"{row['first']} to {number}" if row["count"] > 1 else str(number)
+    return rows
+
+
+def plots_of(m: Measurement) -> Iterator[Plot]:
+    """What the report plots, over time and over the solver's iterations."""
+    yield from _state_plots(m, "Positions", 0, m.positions)
+    yield from _state_plots(m, "Velocities", len(m.positions), m.velocities)
+    yield from _input_plots(m)
+    motion = m.shown[0]
+    if motion is not None:
+        times, energy = motion.times, Line("total", motion.energy)
+        parts = [Line("kinetic", motion.kinetic_energy), Line("potential", motion.potential_energy), energy]
+        yield Plot("energy", "J", times, parts, group=PHYSICS)
+        note = "what neither actuators nor damping account for: the time stepping's error, and what contact takes"
+        yield Plot("unexplained energy", "J", times, [Line("error", motion.energy_error)], note=note, group=PHYSICS)
+        note = "nothing can touch"
+        if math.isfinite(m.penetration_limit):
+            note = f"limit {m.penetration_limit:.3g} m, a quarter of {m.thinnest}"
+        overlap = [Line("largest overlap", motion.penetration)]
+        yield Plot("penetration", "m", times, overlap, limits=(None, m.penetration_limit), note=note, group=PHYSICS)
+    yield from _replay_plots(m)
+    yield from _solver_plots(m)
+
+
+def _state_plots(m: Measurement, group: str, start: int, columns: Sequence[Column]) -> Iterator[Plot]:
+    """A plot for each column: the motion, and the plan where it is another. Plain dynamics have "states" alone."""
+    shown = m.shown[0]
+    motion = m.integrated if shown is None else shown.xs[:: _parts(m)]
+    differs = motion is not None and differ(motion, m.xs)
+    for i, c in enumerate(columns, start):
+        lines = [] if motion is None else [Line("motion", motion[:, i])]
+        if motion is None or differs:
+            lines.append(Line("plan", m.xs[:, i], dashed=differs))
+        yield Plot(c.name, c.unit, m.times, lines, limits=(c.lower, c.upper), group=group if m.velocities else "States")
+
+
+def _parts(m: Measurement) -> int:
+    """How many steps of the motion that is shown make one of the plan's intervals."""
+    motion = m.shown[0]
+    return 1 if motion is None else (len(motion.xs) - 1) // (len(m.xs) - 1)
+
+
+def _input_plots(m: Measurement) -> Iterator[Plot]:
+    """A plot for each input, as a part of its limit where it has one."""
+    held, motion = len(m.us) < len(m.times), m.shown[0]
+    for i, c in enumerate(m.inputs):
+        planned = Line("plan", _as_long(m.us[:, i], m.times), held=held)
+        lines = [planned]
+        if motion is not None:
+            applied = motion.us[:: _parts(m), i]
+            same = held and not differ(applied[:, None], m.us[:, i : i + 1])
+            ours = Line("motion", _as_long(applied, m.times), held=True)
+            lines = [ours] if same else [ours, replace(planned, dashed=True)]
+        yield Plot(f"input {c.name}", c.unit, m.times, lines, limits=(c.lower, c.upper), percent=True, group="Inputs")
+
+
+def _as_long(values: Array, times: Array) -> Array:
+    """`values` with as many entries as there are times, the last one held or missing ones NaN."""
+    missing = max(0, len(times) - len(values))
+    return np.append(values, np.full(missing, values[-1] if missing == 1 and len(values) else np.nan))
+
+
+def _replay_plots(m: Measurement) -> Iterator[Plot]:
+    lines = []
+    for r in m.replays:
+        if r.motion is not None:
+            parts = (len(r.motion.xs) - 1) // (len(m.xs) - 1)
+            lines.append(Line(f"{r.variant}, {r.control}", np.abs(r.motion.xs[::parts] - m.xs).max(axis=1)))
+    note = "the largest difference of a state, in its own unit, in each replay; 0 is not on a log scale"
+    for first in range(0, len(lines), SERIES_PER_PLOT):
+        part = lines[first : first + SERIES_PER_PLOT]
+        yield Plot("distance from the plan", "q, v", m.times, part, log=True, note=note, group="Replays")
+
+
+def _solver_plots(m: Measurement) -> Iterator[Plot]:
+    named = (("|d x_N / d x_k|", "x / x", "final"), ("|d L / d x_k|, L the Lagrangian", "cost / x", "Lagrangian"))
+    for (title, unit, name), norms in zip(named, gradient_norms(m.solution), strict=True):
+        if norms is None:
+            continue
+        zero = not np.any(norms > 0)
+        note = "0 at every knot" if zero else "0 is not on a log scale"
+        yield Plot(title, unit, m.times, [Line(name, norms)], log=not zero, note=note, group=SEARCH)
+    rows = m.solution.iterations
+    if not rows:
+        return
+    at, cost = [row.iteration for row in rows], [row.objective for row in rows]
+    positive = all(c > 0 for c in cost if math.isfinite(c))
+    yield Plot("cost per iteration", "1", at, [Line("cost", cost)], axis="iteration", log=positive, group=SEARCH)
+    violations = [
+        Line("constraint violation", [row.primal_infeasibility for row in rows]),
+        Line("optimality", [row.dual_infeasibility for row in rows]),
+    ]
+    note = "as the solver prints it; 0 is not on a log scale"
+    yield Plot("violation per iteration", "1", at, violations, axis="iteration", log=True, note=note, group=SEARCH)

@@ -1,0 +1,413 @@
+"""The record of a plan: one solve, in one phase or several, and what was certified or tried of a plan or its model."""
+
+from collections.abc import Iterator
+from typing import ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from drake_diff.runs.fields import (
+    ActionInterface,
+    Certified,
+    Claim,
+    EvaluationPanel,
+    Event,
+    Failure,
+    Fields,
+    FiniteTable,
+    GradientEvidence,
+    Inputs,
+    Label,
+    Metric,
+    Observation,
+    ParameterEvidence,
+    ReplayEvidence,
+    Solver,
+)
+from drake_diff.runs.sealed import SealedRecord
+
+
+class PhaseEvidence(Fields):
+    """One phase: its name, the directory of its own record, how it ended, its cost and duration."""
+
+    name: str
+    directory: str
+    status: str
+    cost: float | None  # null where it is not finite
+    duration: float  # [s], or steps of a map
+
+
+class LinkEvidence(Fields):
+    """From the last state of phase `before` to the first of phase `after`, by their places among the phases.
+
+    `reset` is {"identity": {}}, {"matrix": {"rows": ...}} or {"impact": {...}} (points, axes, restitution, places and
+    friction of a rigid impact); null is a user's function, whose name is `told`.
+    """
+
+    before: int
+    after: int
+    told: str
+    reset: FiniteTable | None
+    errors: list[float | None]  # of each state of the phase after, in its unit; null where one is not finite
+    tolerance: float
+    certificate: Certified | None
+
+
+class ChainEvidence(Fields):
+    """Where the dynamics lead from the first state of all through all phases, compared with the plan."""
+
+    holds: bool
+    control: str
+    told: str
+    worst: float | None  # distance from the plan or beyond a bound, as a part of the state's range
+
+
+class PhasesSection(Fields):
+    """A solve in phases: how they are linked, and what was measured of the links and of the chain of all phases.
+
+    What each phase was asked and what it measures is in the record of its own directory.
+    """
+
+    horizon_s: list[float] | None  # (lower, upper) of the sum of all durations
+    counts_steps: bool  # of maps, whose time counts steps
+    search: FiniteTable | None = None  # the arguments of `solve`
+    initial_guess: str | None = None  # null: none was given
+    cost: float | None = None
+    phases: list[PhaseEvidence] = Field(default_factory=list)
+    links: list[LinkEvidence] = Field(default_factory=list)
+    chain: ChainEvidence | None = None
+
+    def broken(self) -> Iterator[str]:
+        """Why the plan is no success."""
+        yield from (f"{p.name} {p.status}" for p in self.phases if p.status != "converged")
+        for link in self.links:
+            if not all(error is not None and error <= link.tolerance for error in link.errors):
+                yield f"the link from phase {link.before} to phase {link.after}"
+            if link.certificate is None or link.certificate.verdict != "agree":
+                yield f"the derivative of the reset from phase {link.before} to phase {link.after}"
+        if self.chain is None or not self.chain.holds or not self.phases:
+            yield "the chain of all phases"
+
+    def facts(self) -> dict[str, str]:
+        """The phases, and the cost of all of them."""
+        unit = "steps" if self.counts_steps else "s"
+        phases = ", ".join(f"{p.name} ({p.duration:.4g} {unit}, {p.status})" for p in self.phases)
+        return {"phases": phases or "none yet", "cost": "none" if self.cost is None else f"{self.cost:.6g}"}
+
+
+class CertifiedState(Fields):
+    """The certificate of one sampled state of a model."""
+
+    kind: Literal["free", "contact"]
+    x: list[float]
+    u: list[float]
+    gradient: Certified | None
+    refusal: str | None = None  # why there is no certificate
+    largest: float | None = None  # the largest entry of the derivative
+    contact_modes: dict[str, str] = Field(default_factory=dict)  # of the pairs that push each other
+    mode_changes: list[str] = Field(default_factory=list)  # within 1e-4 of the state
+
+    @property
+    def verdict(self) -> str:
+        """The certificate's, or "refused"."""
+        return self.gradient.verdict if self.gradient else "refused"
+
+
+class CertificationSection(Fields):
+    """Certificates of a model at sampled states, and all that it takes to take them again."""
+
+    seed: int
+    method: str
+    parameters: list[str]
+    states: list[CertifiedState]
+
+    def broken(self) -> Iterator[str]:
+        """The states whose certificate does not agree."""
+        yield from (f"state {i} {s.verdict}" for i, s in enumerate(self.states) if s.verdict != "agree")
+        if not self.states:
+            yield "no state"
+
+    def facts(self) -> dict[str, str]:
+        """How many states have which verdict."""
+        verdicts = [state.verdict for state in self.states]
+        counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts))
+        return {"states": counts or "none yet", "seed": str(self.seed), "method": self.method}
+
+
+class SlopeEvidence(Fields):
+    """One column beside the slope of the motion in continuous time; null is what is not known, or is not there."""
+
+    column: str
+    ours: float
+    exists: bool | None
+    value: float | None
+    error: float | None
+    sign_agrees: bool | None
+    agrees: bool | None
+    widths: list[float]  # to both sides
+    slopes: list[float]  # over them
+    reason: str
+    by_other_law: float | None  # what the other law adds to the slope
+
+    @model_validator(mode="after")
+    def _has_a_value_where_it_exists(self) -> "SlopeEvidence":
+        if bool(self.exists) != (self.value is not None and self.error is not None):
+            raise ValueError(f"{self.column}: expected value and error where the slope exists, and only there")
+        if not self.exists and not self.reason:
+            raise ValueError(f"{self.column}: expected a reason where there is no slope, or none is known")
+        return self
+
+
+class TruthEvidence(Fields):
+    """The loss and its slopes in continuous time, in `seconds` of work; null is what was not measured in them."""
+
+    law: str
+    touches: bool
+    loss: float | None
+    error: float | None
+    ours: float
+    other_law: str
+    by_other_law: float | None  # what it adds to the loss
+    other_reason: str
+    notes: list[str]
+    seconds: float
+    slopes: list[SlopeEvidence]
+
+
+class RolloutSection(Fields):
+    """The certificate of the gradient of a rollout's loss, with where it was taken."""
+
+    x0: list[float]
+    us: list[list[float]]
+    loss: float
+    columns: list[str]
+    derivative: list[float]
+    verdicts: list[str]
+    certificate: Certified
+    truth: TruthEvidence | None = None
+    no_truth: str = ""  # why there is none
+
+    @model_validator(mode="after")
+    def _has_a_verdict_for_each_column(self) -> "RolloutSection":
+        if not len(self.columns) == len(self.derivative) == len(self.verdicts):
+            raise ValueError("expected a derivative and a verdict for each column")
+        return self
+
+    def broken(self) -> Iterator[str]:
+        """The entries that do not agree."""
+        pairs = zip((*self.columns, "the certificate"), (*self.verdicts, self.certificate.verdict), strict=True)
+        yield from (f"{column} {verdict}" for column, verdict in pairs if verdict != "agree")
+
+    def facts(self) -> dict[str, str]:
+        """How many slopes are the truth."""
+        words = {True: "the truth", False: "not the truth", None: "not known, or without a slope"}
+        slopes = [words[slope.agrees] for slope in self.truth.slopes] if self.truth else []
+        counts = ", ".join(f"{slopes.count(name)} {name}" for name in dict.fromkeys(slopes))
+        return {"columns": counts or self.no_truth or "not compared with the truth"}
+
+
+class RunEvidence(Fields):
+    """The run directory whose plan was tried, and the hash of its record."""
+
+    path: str
+    record_sha256: str
+
+
+class CellEvidence(Fields):
+    """The trials at one level; null is no finite number. Displacements are root mean squares of the last state's."""
+
+    level: float
+    successes: int
+    trials: int
+    rate: float
+    lower_95: float  # Wilson's interval
+    upper_95: float
+    distinct: int  # how many of the trials end in a state of their own: 1 where nothing is drawn
+    labels: dict[str, int]
+    controller_errors: dict[str, int]  # "Type: message" of what the controller raised, and in how many trials
+    goal_error_median: float | None
+    goal_error_worst: float | None
+    displacement: float | None
+    predicted: float | None
+    ratio: float | None
+
+
+class PerturbationEvidence(Fields):
+    """One perturbation at all its levels; `margin` is the largest level up to which 95 % of the trials succeed."""
+
+    name: str
+    unit: str
+    meaning: str
+    margin: float
+    cells: list[CellEvidence]
+    worst: str  # the directory of its worst trial
+
+
+class EventEvidence(Fields):
+    """Something that happened in a loop, at simulated time."""
+
+    t_s: float
+    kind: str
+    message: str
+
+
+class TrialEvidence(Fields):
+    """One trial, with all that it takes to run it again: `loop.panel_trial.evaluate` takes it as it is.
+
+    `run` is null where the plan was not read from a run directory: the trial can be run again with it at hand alone.
+    """
+
+    run: str | None
+    controller: str
+    perturbation: str
+    level: float
+    seed: int
+    success: bool
+    label: Label | None
+    reason: str
+    failures: list[str]
+    goal_error: float | None
+    displacement: float | None
+    ended: str
+    plant_time_step_s: float
+    controller_period_s: float
+    parameters: dict[str, float | list[float]]  # of the plant, where another than the model's
+    start: list[float]
+    events: list[EventEvidence]
+
+
+class Nominal(Fields):
+    """The unperturbed run."""
+
+    success: bool
+    failures: list[str]
+    goal_error: float | None
+    ended: str
+
+
+class LoopEvidence(Fields):
+    """What is around the controller in every trial; numbers are for all coordinates, or one each."""
+
+    controller: str
+    period_s: float
+    steps: int
+    judged_by: str
+    sensor: dict[str, float | list[float | None] | None]
+    estimator: str
+    actuator: dict[str, float | list[float | None] | None]
+    fallback: str | None
+    latency_budget_s: float
+    latency_budget_is: Literal["stated", "the controller's period"]
+
+
+class RobustnessSection(Fields):
+    """A plan under perturbations."""
+
+    run: RunEvidence | None = None
+    state_names: list[str]
+    input_names: list[str]
+    trials: int | None = None
+    seed: int | None = None
+    loop: LoopEvidence | None = None
+    nominal: Nominal | None = None
+    perturbations: list[PerturbationEvidence] = Field(default_factory=list)
+
+    def broken(self) -> Iterator[str]:
+        """The perturbations that the plan does not survive."""
+        yield from (p.name for p in self.perturbations if p.margin <= 0)
+        if self.nominal is None or not self.nominal.success:
+            yield "an unperturbed run that is no success"
+
+    def facts(self) -> dict[str, str]:
+        """The margin of each perturbation."""
+        return {p.name: f"survived up to {p.margin:g} {p.unit}" for p in self.perturbations}
+
+
+Section = PhasesSection | CertificationSection | RolloutSection | RobustnessSection
+
+
+class PlanRecord(SealedRecord):
+    """Everything that it takes to judge one solve; the motion is in plan.npz and trace.mcap.
+
+    At most one of `phases`, `certification`, `rollout` and `robustness` is there: the record is then of that, and the
+    fields of a solve are empty but for what it states itself.
+    """
+
+    KIND: ClassVar[str] = "plan"
+
+    kind: Literal["plan"] = "plan"
+    claim: Claim = Claim()
+    inputs: Inputs = Inputs()
+    problem: FiniteTable = Field(default_factory=dict)
+    contract: FiniteTable = Field(default_factory=dict)
+    panel: EvaluationPanel | None = None  # null before anything was judged
+    units: dict[str, str] = Field(default_factory=dict)  # of numbers in `problem` and `contract`, by their key
+    solver: Solver | None = None
+    parameters: list[ParameterEvidence] = Field(default_factory=list)
+    metrics: list[Metric] = Field(default_factory=list)
+    invariants: list[Metric] = Field(default_factory=list)
+    gradient: GradientEvidence | None = None
+    observation: Observation = Observation()
+    action: ActionInterface = ActionInterface()
+    events: list[Event] = Field(default_factory=list)
+    replays: list[ReplayEvidence] = Field(default_factory=list)
+    failures: list[Failure] = Field(default_factory=list)
+    phases: PhasesSection | None = None
+    certification: CertificationSection | None = None
+    rollout: RolloutSection | None = None
+    robustness: RobustnessSection | None = None
+
+    @property
+    def section(self) -> Section | None:
+        """The section that the record is of; None of a solve in one phase."""
+        sections = (self.phases, self.certification, self.rollout, self.robustness)
+        return next((section for section in sections if section is not None), None)
+
+    @property
+    def subject(self) -> str:
+        """What the record is of: "plan", or the name of its section."""
+        names = ("phases", "certification", "rollout", "robustness")
+        return next((name for name in names if getattr(self, name) is not None), self.kind)
+
+    @model_validator(mode="after")
+    def _passes_only_what_holds(self) -> "PlanRecord":
+        if self.verdict != "pass":
+            return self
+        broken = [m.name for m in (*self.metrics, *self.invariants) if m.verdict in ("fail", "undecided")]
+        broken += [failure.code for failure in self.failures]
+        if self.section is not None:
+            broken += self.section.broken()
+        if self.subject in ("plan", "phases") and (self.solver is None or self.solver.status != "converged"):
+            broken.append(f"solver status {self.solver.status if self.solver else 'missing'}")
+        if broken:
+            raise ValueError(f'a verdict "pass" with {", ".join(broken)}')
+        return self
+
+    @model_validator(mode="after")
+    def _was_judged_on_its_panel(self) -> "PlanRecord":
+        judged = [(r.variant, r.control, r.time_step_s, r.contact_approximation) for r in self.replays]
+        cases = self.panel.cases if self.panel is not None else []
+        listed = [(c.variant, c.control, c.time_step_s, c.contact_approximation) for c in cases]
+        if self.panel is not None and listed != judged:
+            raise ValueError(f"panel: expected the {len(judged)} replays, got {len(listed)} others")
+        return self
+
+    def as_row(self) -> dict[str, str]:
+        """The textbook's view of the record: section, tool, observation, action, metric, perturbation."""
+        return {
+            "section": "differentiable physics",
+            "tool": f"drake {self.provenance.packages.get('drake', '?')}, {self.solver.method if self.solver else '-'}",
+            "observation": ", ".join(f"{x.name} [{x.unit}]" for x in self.observation.variables),
+            "action": ", ".join(f"{x.name} [{x.unit}]" for x in self.action.commands),
+            "metric": "; ".join(f"{m.name} {m.value} {m.unit}" for m in self.metrics),
+            "perturbation": "; ".join(dict.fromkeys(f"replayed {r.variant}" for r in self.replays)) or "none",
+        }
+
+    def facts(self) -> dict[str, str]:
+        """The section's, or the cost; the solver and the failures."""
+        cost = next((m.value for m in self.metrics if m.name == "cost"), None)
+        facts = {"cost": "none" if cost is None else f"{cost:.6g}"} if self.section is None else self.section.facts()
+        if self.solver is not None:
+            facts["solver"] = f"{self.solver.method}, {self.solver.status}"
+        if self.failures:
+            facts["failures"] = "; ".join(f"{f.label}: {f.code}" for f in self.failures)
+        return facts | super().facts()

@@ -1,0 +1,254 @@
+"""A plan written to plan.npz, exact to the bit, and a solution rebuilt from its run directory alone.
+
+The model is built from the file that trace.mcap carries, in a folder of its own. One that names other files (meshes) is
+built where it stood, and only if it and all of them are still what the record says: the artifact has their hashes, not
+their bytes. As a record may name any file, this is only done below a folder that the caller gives.
+"""
+
+import io
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, positive_float
+from drake_diff._base.files import write_whole
+from drake_diff._base.untrusted import arrays_of
+from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
+from drake_diff.model.load_file import FORMATS
+from drake_diff.model.model import Model, load_model
+from drake_diff.model.soft_contact import SoftContact
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import Iteration, Multipliers
+from drake_diff.optimize.solution import Search, Solution, Status
+from drake_diff.optimize.solve import solve
+from drake_diff.runs.fields import ModelInput
+from drake_diff.runs.plan_record import PlanRecord
+from drake_diff.runs.provenance import file_evidence, named_files, names_in
+from drake_diff.runs.sections import rebuild_problem
+
+ANYWHERE = Path("/")  # the folder of models of a directory that is one's own
+PLAN = "plan.npz"
+TRACE = "trace.mcap"
+REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "free_horizon")  # of a Solution
+ROWS = "iterations"  # the solver's table, of a run that is not measured yet: later trace.mcap has it
+COLUMNS = ("iteration", "objective", "primal_infeasibility", "dual_infeasibility", "step")  # of that
+START = "start_us"  # the first guess of the inputs that the problem has
+GUESS = "guess_"  # before the name of an array of the guess that `solve` was given
+GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps", "multipliers", "row_multipliers")
+
+
+def write_plan(path: Path, solution: Solution, *, partial: bool = False) -> None:
+    """Write the arrays of `solution` and those that its search started from: the same ones give the same bytes.
+
+    Of a `partial` run, of which nothing else has it yet, the table of the search's iterations too.
+    """
+    problem = solution.problem
+    given: dict[str, Any] = {"xs": solution.xs, "us": solution.us, "parameters": solution.vector.values}
+    given |= {name: getattr(solution, name) for name in OPTIONAL}
+    given[START] = problem.us if problem.optimizes_controls and np.any(problem.us) else None
+    guess = None if solution.search is None else solution.search.guess
+    if isinstance(guess, Solution):
+        found = {name: getattr(guess, name) for name in ("xs", "us", "us_mid", "u_final", "mesh", "horizon")}
+        found["num_steps"] = guess.problem.num_steps
+        if guess.multipliers is not None:
+            found |= {"multipliers": guess.multipliers.variables, "row_multipliers": guess.multipliers.rows}
+    else:
+        found = {} if guess is None else dict(zip(("xs", "us", "horizon"), guess, strict=False))
+    given |= {GUESS + name: value for name, value in found.items()}
+    if partial and solution.iterations:
+        given[ROWS] = [[getattr(row, name) for name in COLUMNS] for row in solution.iterations]
+    buffer = io.BytesIO()
+    arrays: dict[str, Any] = {name: np.asarray(v, dtype=float) for name, v in sorted(given.items()) if v is not None}
+    np.savez(buffer, **arrays)
+    write_whole(path, buffer.getvalue())
+
+
+def read_plan(path: Path, *, partial: bool = False) -> dict[str, Array]:
+    """The arrays in `path`, of a `partial` run or a whole one, by name. ArtifactError where it is no such file."""
+    found, known = arrays_of(path), {*REQUIRED, *OPTIONAL, START, *(GUESS + name for name in GUESSED)}
+    known |= {ROWS} if partial else set()
+    unknown, missing = found.keys() - known, set(REQUIRED) - found.keys()
+    if unknown or missing:
+        raise ArtifactError(f"{path}: unknown arrays {sorted(unknown)}, missing {sorted(missing)}")
+    return found
+
+
+def rows_of(plan: dict[str, Array]) -> tuple[Iteration, ...]:
+    """The search's iterations in the plan of a partial run; none where it is not such a table."""
+    rows = plan.get(ROWS, np.zeros((0, len(COLUMNS))))
+    if rows.shape[1:] != (len(COLUMNS),) or not np.isfinite(rows[:, 0]).all():
+        raise ArtifactError(f"{PLAN}: {ROWS} is no table of iterations: its shape is {rows.shape}")
+    return tuple(Iteration(int(row[0]), *map(float, row[1:])) for row in rows)
+
+
+def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
+    """Those of the arrays of a plan that are fields of a `Solution`."""
+    found: dict[str, Any] = {name: plan[name] for name in (*REQUIRED, *OPTIONAL) if name in plan}
+    if "free_horizon" in found:
+        found["free_horizon"] = float(found["free_horizon"])
+    return found
+
+
+@contextmanager
+def rebuilt(
+    given: ModelInput, source: Any, attachments: dict[str, bytes] | None, models: Path | None
+) -> Iterator[Model]:
+    """The model of a record, for as long as the block runs, from the files `attachments` that the directory carries.
+
+    Where there are none, or the model names other files, it is built from `source`, if that is below the folder
+    `models` and all of them are unchanged.
+
+    Raises ModelError, saying why, where it cannot be built again, ArtifactError where the artifact is damaged.
+    """
+    if given.file is None or given.options is None:
+        raise ModelError("the system is a user's own diagram or function, which no artifact can hold")
+    if given.named or attachments is None:
+        yield _load(*_source_if_unchanged(given, str(source), models))
+        return
+    name, data = given.file.path, attachments.get(given.file.path)
+    if data is None or sha256(data).hexdigest() != given.file.sha256:
+        raise ArtifactError(f"{TRACE}: the model file {name} in it is not the one that the record describes")
+    if Path(name).name != name or not name.endswith(FORMATS):
+        raise ArtifactError(f"record.json: {name!r} is not the name of a model file")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_bytes(data)
+        if names_in(path):
+            raise ArtifactError(f"record.json: it does not list the files that {name} names")
+        yield _load(path, {**given.options, "packages": None})
+
+
+def _source_if_unchanged(given: ModelInput, place: str, models: Path | None) -> tuple[Path, dict[str, Any]]:
+    """The model file where it stood, and its options; ModelError where a file is not the recorded one."""
+    if models is None:
+        what = f"names {len(given.named)} files, which the artifact does not hold" if given.named else "is not in it"
+        raise ModelError(
+            f"the model {what}: models=FOLDER, or --models, lets them be read below a folder that you give"
+        )
+    source, options = _below(models, place, "the model's file"), dict(given.options or {})
+    if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
+        raise ModelError(f"the model's file {source} is gone, and the artifact has no copy that could be used")
+    if file_evidence(source, given.file.path) != given.file:
+        raise ModelError(f"the model's file {source} is not what it was")
+    packages = options.get("packages")
+    if isinstance(packages, dict):
+        packages = {name: str(_below(models, str(folder), "the package's folder")) for name, folder in packages.items()}
+        options["packages"] = packages
+    now = named_files(source, packages if isinstance(packages, dict) else None)
+    changed = [was.path for was in given.named if was not in now]
+    if changed:
+        raise ModelError(f"the model names {changed[0]}, which is not what it was")
+    return source, options
+
+
+def _below(models: Path, place: str, what: str) -> Path:
+    """A path that a record has, a relative one in `models` or else from here; ModelError where it is not below that."""
+    found = models / place if (models / place).exists() else Path(place)
+    if not found.resolve().is_relative_to(models.resolve()):
+        raise ModelError(f"{what} {found} is not below {models}, the folder of models that was given")
+    return found
+
+
+def _load(path: Path, options: dict[str, Any]) -> Model:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
+            return load_model(path, **options)
+    except (InputError, TypeError) as error:
+        raise ArtifactError(f"record.json: the model cannot be loaded with the recorded options: {error}") from error
+
+
+def resolve(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Solution:
+    """The solution of a record, to be measured again; what the search came to is as the record tells it.
+
+    ArtifactError where plan and problem do not go together.
+    """
+    solver = record.solver
+    if solver is None:
+        raise ArtifactError("record.json: it has no solver")
+    _check_shapes(record, model, plan)
+    with _refusing_a_problem():
+        return Solution(
+            problem=rebuild_problem(record, model, plan["us"], plan.get(START)),
+            method=solver.method,
+            solver=solver.solver,
+            status=Status(solver.status),
+            message=solver.message,
+            scheme=solver.scheme,
+            **plan_fields(plan),
+        )
+
+
+def solve_again(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Solution:
+    """What `solve` comes to when it is called as the record says, from the guess that the plan has.
+
+    It gets all the time that it needs. ArtifactError where that is no problem that can be solved.
+    """
+    search = record.inputs.search
+    if search is None:
+        raise ArtifactError("record.json: it does not say what solve was called with")
+    _check_shapes(record, model, plan)
+    with _refusing_a_problem():
+        arguments: dict[str, Any] = dict(search)
+        kind, stages = arguments.pop("initial_guess"), arguments["continuation"]
+        if isinstance(stages, list):
+            arguments["continuation"] = [SoftContact(**stage) for stage in stages]
+        problem = rebuild_problem(record, model, plan["us"], plan.get(START))
+        limit, guess = arguments.pop("time_limit"), _rebuild_guess(problem, kind, plan)
+        limit = None if limit is None else positive_float("time_limit [s]", limit)
+        found = solve(problem, initial_guess=guess, **arguments)
+    asked = {**(found.search.arguments if found.search else {}), "time_limit": limit}
+    return found.told(options=found.options | {"time_limit": limit}, search=Search(asked, guess))
+
+
+def _rebuild_guess(problem: Problem, kind: Any, plan: dict[str, Array]) -> Any:
+    """The `initial_guess` whose kind a record tells; see `inputs.search`."""
+    given = {name: plan[GUESS + name] for name in GUESSED if GUESS + name in plan}
+    if kind is None and not given:
+        return None
+    if kind == "arrays":
+        return tuple(given[name] for name in ("xs", "us", "horizon") if name in given)
+    fields: dict[str, Any] = {name: given[name] for name in ("xs", "us", "us_mid", "u_final", "mesh") if name in given}
+    like = replace(
+        problem, num_steps=int(given["num_steps"]), us=None, waypoints={}, constraints=(), couplings=(), goals=()
+    )
+    horizon = float(given["horizon"])
+    if {"multipliers", "row_multipliers"} <= set(given):
+        fields["multipliers"] = Multipliers(given["multipliers"], given["row_multipliers"])
+    return Solution(
+        problem=like,
+        method="",
+        solver="",
+        status=Status.FAILED,
+        message="a guess",
+        scheme=str(kind),
+        free_horizon=None if horizon == like.start_horizon else horizon,
+        **fields,
+    )
+
+
+def _check_shapes(record: PlanRecord, model: Model, plan: dict[str, Array]) -> None:
+    count, xs, us = record.problem.get("num_steps"), plan["xs"], plan["us"]
+    if "mesh" in plan:
+        count = len(plan["mesh"]) - 1
+    if us.shape != (count, model.nu) or xs.shape != (len(us) + 1, model.nx):
+        got = f"xs {xs.shape}, us {us.shape}"
+        raise ArtifactError(f"{PLAN}: expected {count} steps of {model.nx} states and {model.nu} inputs, got {got}")
+
+
+@contextmanager
+def _refusing_a_problem() -> Iterator[None]:
+    try:
+        yield
+    except ModelError:  # what the model cannot do: see `rebuilt`
+        raise
+    except (DrakeDiffError, ValueError, KeyError, TypeError, AttributeError) as error:
+        told = f"{type(error).__name__}: {error}"
+        raise ArtifactError(f"record.json: its problem cannot be rebuilt: {told}") from error

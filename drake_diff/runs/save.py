@@ -1,0 +1,445 @@
+"""Write the directory of a solve: what was asked, what came out, what was measured again, and with which versions.
+
+It is written beside its place and moved there whole. record.json is complete last, so that a run that is killed leaves
+a record that says so. Of a solve in phases each phase has a directory phase_0, phase_1, ... in it.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from importlib import import_module
+from pathlib import Path
+from tempfile import gettempdir
+from typing import Any, overload
+
+import numpy as np
+
+from drake_diff._base.files import make_folder, remove_folder
+from drake_diff._base.signals import held_interrupts
+from drake_diff.exceptions import ArtifactError, InputError, WriteError
+from drake_diff.optimize.phased import Chain, PhasedSolution
+from drake_diff.optimize.problem.held import Impact
+from drake_diff.optimize.problem.phases import PhasedProblem, Switch
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
+from drake_diff.optimize.solution import Solution
+from drake_diff.runs.directory import is_partial, is_taken, move_into_place, name_of, partial_of, writing, written_whole
+from drake_diff.runs.fields import Claim, Event, ModelInput, Solver, canonical
+from drake_diff.runs.measurement import Measurement, failure_of, measure, replay_evidence
+from drake_diff.runs.other_records import FitRecord
+from drake_diff.runs.plan_record import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesSection, PlanRecord
+from drake_diff.runs.provenance import gradient_evidence, provenance_of, written_now
+from drake_diff.runs.read import load_record, record_path
+from drake_diff.runs.rerun import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve, rows_of, write_plan
+from drake_diff.runs.sealed import Passed, SealedRecord, WallClock, files_below, reproducible
+from drake_diff.runs.sections import asked, found, panel_of, unknown_functions
+
+LIMITATIONS = ["of the model in simulation only: nothing here was measured on a robot"]
+AT_THEIR_TIMES = (
+    "resets happen at the times of the plan, also in the chain of all phases: an event that comes early is not tried"
+)
+WHERE_GAPS_CLOSE = (
+    "rigid impacts come where their own gaps close, also in the chain of all phases: other contacts on the way are not "
+    "tried"
+)
+
+
+def directory_of(i: int) -> str:
+    """The directory of a phase."""
+    return f"phase_{i}"
+
+
+def save_phases(solution: PhasedSolution, folder: Path, save_phase: Callable[[Solution, Path], Any]) -> PlanRecord:
+    """Write the solution in phases into `folder`; `save_phase` writes that of one."""
+    for i, phase in enumerate(solution.phases):
+        save_phase(phase, folder / directory_of(i))
+    return _record_of_phases(folder, solution).write(folder)
+
+
+def phases_record(folder: Path, problem: PhasedProblem, verdict: Passed, sentence: str) -> PlanRecord:
+    """The record of a run without a solution."""
+    section = PhasesSection(**_asked_of_all(problem))
+    return PlanRecord(
+        name=name_of(folder), verdict=verdict, sentence=sentence, phases=section, **_asked_of_phases(problem)
+    )
+
+
+def _asked_of_phases(problem: PhasedProblem) -> dict[str, Any]:
+    names = ", then ".join(problem.names)
+    repeated = " and again from the start" if problem.periodic is not False else ""
+    rigid = [isinstance(switch.reset, Impact) and switch.reset.has_gap for switch in problem.switches]
+    limitations = [*LIMITATIONS, *([] if all(rigid) else [AT_THEIR_TIMES]), *([WHERE_GAPS_CLOSE] if any(rigid) else [])]
+    statement = (
+        f"{problem.name} in {len(problem.phases)} phases ({names}{repeated}), linked by resets, each as its record"
+    )
+    return {
+        "model": ModelInput(file=None, options=None),  # each phase has its own
+        "provenance": provenance_of(),
+        "wall_clock": WallClock(written_utc=written_now()),
+        "claim": Claim(statement=f"{statement} says", limitations=limitations),
+    }
+
+
+def _asked_of_all(problem: PhasedProblem) -> dict[str, Any]:
+    horizon = None if problem.horizon is None else list(problem.horizon)
+    return {"horizon_s": horizon, "counts_steps": problem.is_map}
+
+
+def _record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
+    given = None if solution.search is None else solution.search.guess
+    options = json.loads(json.dumps(solution.options, default=str), parse_constant=str)
+    asked = _asked_of_phases(solution.problem)
+    asked["wall_clock"] = WallClock(written_utc=written_now(), duration_s=solution.wall_time)
+    return PlanRecord(
+        name=name_of(folder),
+        verdict="pass" if solution.success else "fail",
+        sentence=solution.message,
+        solver=Solver(
+            method="collocation",
+            solver="ipopt",
+            scheme=solution.phases[0].scheme,
+            status=solution.status.value,
+            message=solution.message,
+            solver_message=solution.solver_message,
+            options=options,
+            iterations=len(solution.iterations),
+        ),
+        phases=PhasesSection(
+            search=None if solution.search is None else solution.search.arguments,
+            initial_guess=None if given is None else type(given).__name__,
+            cost=finite(solution.cost),
+            phases=[
+                PhaseEvidence(
+                    name=name,
+                    directory=directory_of(i),
+                    status=phase.status.value,
+                    cost=finite(phase.cost),
+                    duration=phase.horizon,
+                )
+                for i, (name, phase) in enumerate(zip(solution.problem.names, solution.phases, strict=True))
+            ],
+            links=[_link(solution, i, switch) for i, switch in enumerate(solution.problem.switches)],
+            chain=chain_evidence(solution.chain),
+            **_asked_of_all(solution.problem),
+        ),
+        **asked,
+    )
+
+
+def _link(solution: PhasedSolution, i: int, switch: Switch) -> LinkEvidence:
+    certificates = {c.subject: gradient_evidence(c) for c in solution.link_certificates}
+    return LinkEvidence(
+        before=switch.before,
+        after=switch.after,
+        told=switch.told,
+        reset=_reset(switch, solution.problem),
+        errors=[finite(error) for error in solution.link_errors[switch.label]],
+        tolerance=FEASIBILITY_TOLERANCE,
+        certificate=certificates.get(switch.label),
+    )
+
+
+def _reset(switch: Switch, problem: PhasedProblem) -> dict[str, Any] | None:
+    if switch.matrix is not None:
+        same = switch.told == "the state goes on"
+        return {"identity": {}} if same else {"matrix": {"rows": np.asarray(switch.matrix).tolist()}}
+    return {"impact": switch.reset.to_dict()} if isinstance(switch.reset, Impact) else None
+
+
+def chain_evidence(chain: Chain) -> ChainEvidence:
+    """The chain of all phases as it stands in a record."""
+    return ChainEvidence(holds=chain.holds, control=chain.control, told=chain.told, worst=finite(chain.worst))
+
+
+def finite(value: float) -> float | None:
+    """`value`, None where it is none that JSON has."""
+    return float(value) if np.isfinite(value) else None
+
+
+REPLAY, REPORT = "replay.html", "report.html"
+UNDER_WAY = "the run has started and not finished: it is still running, or it was killed or broke off"
+BEFORE_THE_SEARCH = "the run was interrupted before the search began: there is no plan"
+NOT_MEASURED = "the search has ended, and its plan is not measured yet"
+RECOVERED = "recovered from what a run left that did not end: its search is not made again"  # of such a run's sentence
+FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record and its schema
+
+
+def begin(folder: Path, problem: Problem | PhasedProblem, sentence: str = UNDER_WAY) -> None:
+    """Mark `folder` as a run that is under way: whatever happens next, its record says "incomplete"."""
+    if isinstance(problem, PhasedProblem):
+        phases_record(folder, problem, "incomplete", sentence).begin(folder)
+        return
+    _record(folder, verdict="incomplete", sentence=sentence, **asked(problem)).begin(folder)
+
+
+@overload
+def save(solution: Solution | PhasedSolution, directory: str | Path) -> PlanRecord: ...
+@overload
+def save(solution: Any, directory: str | Path) -> FitRecord: ...
+def save(solution: Any, directory: str | Path) -> PlanRecord | FitRecord:
+    """Measure a solution and write its directory: record, plan, trace, replay and report.
+
+    All of it is written beside `directory`, in a folder that is called `directory`.partial-..., and takes its place at
+    the end: at any moment a run that was there before is there whole, or the new one is. What breaks off leaves that
+    folder, with the plan.
+
+    Args:
+        solution: A result of `solve`, of any status. Of one in phases, record.json says how they are linked, and each
+            phase has a directory phase_0, phase_1, ... of its own with all these files; there is no page of the whole.
+            Or a result of `identify`: record.json, the recordings, the model file, trace.mcap and report.html
+            are written, and "pass" says that the values found explain the recordings.
+        directory: Where to write record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html.
+            It is made where there is none, and replaced where a run wrote it. Plain dynamics have nothing to draw in
+            3D, and so no replay.html.
+
+    Returns:
+        The record that was written. Its verdict is "pass" only where the solver converged and every metric keeps its
+        tolerance.
+
+    Raises:
+        InputError: It is none of these, or `directory` holds what no run wrote.
+        ArtifactError: Somebody else is writing `directory`, or the file of a recording has changed since `identify`
+            read it.
+        WriteError: The disk is full, or does not let a file be written; the message says where the plan is.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
+        >>> problem = dd.Problem(model, x0=[0.1, 0], num_steps=5, running_cost=dd.QuadraticCost(R=[[1.0]]))
+        >>> record = dd.save(dd.solve(problem, method="shooting"), mkdtemp())
+        >>> record.verdict, sorted(record.files)
+        ('pass', ['plan.npz', 'record.schema.json', 'replay.html', 'report.html', 'trace.mcap'])
+    """
+    if not isinstance(solution, (Solution, PhasedSolution)):
+        return _save_other(solution, directory)
+    with plan_kept(solution, Path(directory).resolve().name), written_whole(directory) as folder:
+        return write_run(solution, folder)
+
+
+def _save_other(result: Any, directory: str | Path) -> FitRecord:
+    fits = import_module("drake_diff.identification.files")  # above this package, and not loaded to save a solve
+    if not isinstance(result, fits.Identification):
+        raise InputError("solution", got=type(result).__name__, expected="a result of solve or of identify")
+    record: FitRecord = fits.save_identification(result, directory)
+    return record
+
+
+def write_run(solution: Solution | PhasedSolution, folder: Path) -> PlanRecord:
+    """Write what `save` does into `folder`, which `written_whole` gave."""
+    keep_plan(solution, folder)  # what is measured next may take long
+    if isinstance(solution, PhasedSolution):
+        return save_phases(solution, folder, write_run)
+    measurement = measure(solution)
+    record = record_of(measurement, folder)
+    write_files(folder, measurement, record)
+    return record.write(folder)
+
+
+def record_without_problem(name: str, sentence: str) -> PlanRecord:
+    """The record of a run that ended before there was a problem: it says that, when and with which versions."""
+    return PlanRecord(
+        name=name,
+        verdict="incomplete",
+        sentence=sentence,
+        model=ModelInput(file=None, options=None),
+        provenance=provenance_of(),
+        wall_clock=WallClock(written_utc=written_now()),
+        events=[Event(t_s=None, kind="failure", message=sentence)],
+    )
+
+
+def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
+    """Write the plan, with a record that says "incomplete", into `folder`: `recover` measures it from there.
+
+    A signal waits until both are there.
+    """
+    with held_interrupts():
+        sentence = f"{NOT_MEASURED}: {solution.message}"
+        if isinstance(solution, PhasedSolution):
+            for i, phase in enumerate(solution.phases):
+                keep_plan(phase, folder / directory_of(i))
+            phases_record(folder, solution.problem, "incomplete", sentence).begin(folder)
+            return
+        make_folder(folder)
+        write_plan(folder / PLAN, solution, partial=True)
+        sections = asked(solution.problem, solution) | found(solution, measured=False)
+        _record(folder, solution.wall_time, verdict="incomplete", sentence=sentence, **sections).begin(folder)
+
+
+@contextmanager
+def plan_kept(solution: Solution | PhasedSolution, name: str, folder: Path | None = None) -> Iterator[None]:
+    """Where a WriteError leaves no plan in `folder`, or where it says that files were kept, it is kept elsewhere."""
+    try:
+        yield
+    except WriteError as error:
+        kept = folder or error.kept
+        if kept is not None and _has_plan(kept, solution):
+            raise
+        raise WriteError(f"{error}; {_kept_elsewhere(solution, name)}") from error
+
+
+def _has_plan(folder: Path, solution: Solution | PhasedSolution) -> bool:
+    if isinstance(solution, PhasedSolution):
+        return all(_has_plan(folder / directory_of(i), phase) for i, phase in enumerate(solution.phases))
+    try:
+        plan = read_plan(folder / PLAN, partial=True)
+    except ArtifactError:
+        return False
+    return all(np.array_equal(plan[name], getattr(solution, name), equal_nan=True) for name in ("xs", "us"))
+
+
+def _kept_elsewhere(solution: Solution | PhasedSolution, name: str) -> str:
+    """Keep the plan in the first folder that takes it; a sentence says which."""
+    places: tuple[Callable[[], Path], ...] = (lambda: Path(gettempdir()), Path.cwd, Path.home)
+    for place in places:
+        try:
+            folder = partial_of(place() / name)
+            keep_plan(solution, folder)
+        except OSError:  # the next one, and the sentence says where it was
+            continue
+        return f"the plan is in {folder}"
+    return "the plan could be kept nowhere: no temporary folder can be written"
+
+
+def write_files(folder: Path, measurement: Measurement, record: PlanRecord) -> None:
+    """Write `FILES`, all but the record and its schema."""
+    from drake_diff.runs.page import write_pages
+    from drake_diff.runs.trace import write_trace  # what a script that saves nothing need not load
+
+    fields = json.loads(canonical(record.model_dump(mode="json")))  # in the order in which the record is written
+    write_plan(folder / PLAN, measurement.solution)
+    write_trace(folder / TRACE, measurement, {record.FILE: ("application/json", reproducible(fields).encode())})
+    write_pages(folder / REPLAY, folder / REPORT, measurement, fields)
+
+
+def begin_interrupted(folder: Path, problem: Problem | PhasedProblem) -> None:
+    """Say in the record of a run in `folder` that it was interrupted, before the search where there is none yet."""
+    if record_path(folder) is None:
+        begin(folder, problem, BEFORE_THE_SEARCH)
+        return
+    record = load_record(folder)
+    record.model_copy(update={"sentence": f"the run was interrupted; {record.sentence}"}).begin(folder)
+
+
+def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedProblem) -> None:
+    """Say in the record of a run that is under way in `folder` that `error` ended it before there was a solution."""
+    failure = failure_of(error)
+    sentence = f"the run ended with an error: {failure.message}"
+    if isinstance(problem, PhasedProblem):
+        phases_record(folder, problem, "incomplete", sentence).begin(folder)
+        return
+    told: dict[str, Any] = {
+        "verdict": "incomplete",
+        "sentence": sentence,
+        "failures": [failure],
+        "events": [Event(t_s=None, kind="failure", message=failure.message)],
+    }
+    _record(folder, **told, **asked(problem)).begin(folder)
+
+
+def record_of(m: Measurement, folder: Path) -> PlanRecord:
+    """The record of a measurement, but for the files; `folder` is where they are written."""
+    return _record(
+        folder,
+        m.solution.wall_time,
+        verdict="fail" if m.failures else "pass",
+        sentence=m.solution.message,
+        metrics=m.metrics,
+        invariants=m.invariants,
+        events=m.events,
+        replays=[replay_evidence(r) for r in (*m.replays, *m.solution.cross_checks)],
+        panel=panel_of(m.solution),
+        failures=m.failures,
+        **asked(m.solution.problem, m.solution),
+        **found(m.solution),
+    )
+
+
+def _record(folder: Path, duration: float | None = None, **fields: Any) -> PlanRecord:
+    clock = WallClock(written_utc=written_now(), duration_s=duration)
+    return PlanRecord(name=name_of(folder), provenance=provenance_of(), wall_clock=clock, **fields)
+
+
+def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecord:
+    """Complete a run from the directory NAME.partial-... that it left, as far as that can be done.
+
+    What was written whole takes its place. Of a solve whose plan is there, the plan is measured again and all files are
+    written. Its search is not made again, by `verify` either: whoever ran it had not told all that it came to.
+
+    Args:
+        directory: What the run left.
+        out: Where the run is to be; NAME where not given. No run is replaced.
+
+    Returns:
+        The record.
+
+    Raises:
+        InputError: `directory` is no such directory, or `out` is not empty.
+        ArtifactError: There is nothing in it that could be completed, or the run is still being written.
+        ModelError: The model's file is not what it was.
+        WriteError: The disk is full, or does not let a file be written.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> from drake_diff.runs import recover
+        >>> recover(mkdtemp())
+        Traceback (most recent call last):
+        drake_diff.exceptions.InputError: RUN: expected a directory NAME.partial-... that a run left, got ...
+    """
+    folder = Path(directory).resolve()
+    if not folder.is_dir() or not is_partial(folder):
+        beside = sorted(p.name for p in folder.parent.glob(f"{folder.name}.*") if p.is_dir() and is_partial(p))
+        got = f"{folder}" + (f", beside which are {', '.join(beside)}" if beside else "")
+        raise InputError("RUN", got=got, expected="a directory NAME.partial-... that a run left")
+    own = folder.with_name(name_of(folder))
+    target = own if out is None else Path(out).resolve()
+    with nullcontext() if target == own else writing(own):
+        if is_taken(target):
+            expected = "a new or empty directory, as no run is replaced: --out names another"
+            raise InputError("OUT", got=str(target), expected=expected)
+        record = load_record(folder)
+        if record.state == "complete" and files_below(folder, record.FILE) == record.files:
+            with writing(target):
+                move_into_place(folder, target)
+            return record
+        if (
+            not isinstance(record, PlanRecord)
+            or record.subject != "plan"
+            or record.solver is None
+            or not (folder / PLAN).is_file()
+        ):
+            raise ArtifactError(f"{folder}: there is no plan of a solve in it: run it again; {record.sentence}")
+        made = _measured(folder, record, target)
+        remove_folder(folder)
+    return made
+
+
+def _measured(folder: Path, record: PlanRecord, target: Path) -> PlanRecord:
+    """The plan in `folder` measured, and written to `target`."""
+    costs, constraints = unknown_functions(record)
+    if costs or constraints:
+        names = ", ".join((*costs, *constraints))
+        told = f"{names}: a user's function, which no directory holds; start the script again from the plan in {PLAN}"
+        raise ArtifactError(f"{folder}: {told}")
+    plan = read_plan(folder / PLAN, partial=True)
+    source = record.contract.get("source")
+    with rebuilt(record.model, source, None, ANYWHERE) as model, written_whole(target) as whole:
+        measurement = measure(resolve(record, model, plan).told(iterations=rows_of(plan)))
+        made = _with_the_search(record_of(measurement, whole), record)
+        write_files(whole, measurement, made)
+        return made.write(whole)
+
+
+def _with_the_search(made: PlanRecord, record: PlanRecord) -> PlanRecord:
+    """With what `record` says of the search, which only who ran it knew."""
+    told: dict[str, Any] = {
+        "sentence": f"{made.sentence}; {RECOVERED}",
+        "solver": record.solver,
+        "data": record.data,
+        "inputs": record.inputs.model_copy(update={"search": None}),
+        "wall_clock": made.wall_clock.model_copy(update={"duration_s": record.wall_clock.duration_s}),
+    }
+    if made.gradient is not None and record.gradient is not None:
+        known = {name: getattr(record.gradient, name) for name in ("columns", "certificates")}
+        told["gradient"] = made.gradient.model_copy(update=known)
+    return made.model_copy(update=told)

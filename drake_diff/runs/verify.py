@@ -1,0 +1,618 @@
+"""`verify`: make a directory again and compare all of it. `recalled` takes a run up again."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from drake_diff._base.arrays import positive_float
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.sandbox import Outcome, call
+from drake_diff._base.untrusted import MOST_READ, MOST_TEXT, files_in, read_plain, sha256_of
+from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, MissingDependencyError, ModelError
+from drake_diff.model.step import step
+from drake_diff.optimize.solution import Solution
+from drake_diff.runs.again import (
+    OF_RECOVERED,
+    SAME_PLAN,
+    SEARCH_TOPICS,
+    SEARCHED,
+    Again,
+    contract_as,
+    is_below,
+    made_again,
+    model_as,
+)
+from drake_diff.runs.certificates import certify_model
+from drake_diff.runs.claim import claims_of
+from drake_diff.runs.differences import (
+    Compared,
+    Difference,
+    compare_bytes,
+    compare_fields,
+    compare_text,
+    compare_traces,
+)
+from drake_diff.runs.directory import is_partial
+from drake_diff.runs.fields import FileEvidence, canonical
+from drake_diff.runs.other_records import ComparisonRecord, FitRecord, is_trial_file
+from drake_diff.runs.phases_again import PhasesAgain, inconsistencies, phases_again
+from drake_diff.runs.plan_record import PhasesSection, PlanRecord
+from drake_diff.runs.provenance import packages_here
+from drake_diff.runs.read import FILES as OLD_FILES
+from drake_diff.runs.read import load_plan_record, load_record, parse_record, record_path
+from drake_diff.runs.rerun import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve
+from drake_diff.runs.save import FILES
+from drake_diff.runs.sealed import SCHEMA_VERSION, SealedRecord, own_sha256, read_fields, reproducible
+from drake_diff.runs.trace import CONFIGURATION, Trace, read_trace
+
+MOST = 16  # lines of a kind that are printed
+WORDS = ("sentence", "message", "statement", "definition", "reason", "told")  # which versions choose
+OLD_SCHEMAS = tuple(name.replace(".json", ".schema.json") for name in OLD_FILES)
+MADE_APART = ("complaints", "undecided", "unchecked", "rounded")  # of a verification: told by the process apart
+# What nothing can make again, in every record, by key.
+UNCHECKED = (
+    "wall_clock: when the record was made, and how long that took",
+    "provenance: the versions, the commit, the machine and the command that made it",
+    "name and contract.source: what it was called, and where the model file was",
+)
+WAITED = 60.0  # [s] for a run to be made again, where nobody says else
+GIVEN = "problem, model and inputs.search: they are what was asked; a record that asks for less can be just as true"
+GIVEN_IN_PHASES = "in each phase's record problem and model, and here links and search: they are what was asked"
+WITHIN_PHASES = "the record does not say what solve was called with"  # of a phase: that of all says it
+OF_FUNCTIONS = (
+    "all that rests on the functions: only the plan's first and last state and its bounds were compared with the "
+    "metrics, and the plan with the trace"
+)
+NOT_RERUN = {
+    "comparison": "the engines were not run again",
+    "robustness": "the trials were not run again",
+    "rollout": "a loss is a function, and was not asked again",
+    "panel": "no trial was evaluated again: their function is not in the directory",
+    "trial": "it was not evaluated again: its function is not in the directory",
+}
+# The modules of packages above this one whose function `reproduce` makes such a directory again, as far as it can be.
+REPRODUCED_BY = {
+    "fit": "drake_diff.identification.files",
+    "comparison": "drake_diff.identification.recorded_causes",
+    "panel": "drake_diff.panels.reproduce",
+    "trial": "drake_diff.panels.reproduce",
+}
+
+
+@dataclass(frozen=True, repr=False)
+class Verification(ShowsItsRepr):
+    """What `verify` found in a directory.
+
+    `verdict` is "holds" where every file is as it was written and all of it came out again; "intact" where every file
+    is as it was written, and nothing, or only what rests on recordings, was made again; "undecided" where what the
+    record's verdict rests on could not be made again; "broken" where something is not what it was.
+
+    That a record holds says that it is true, not that the run was a success: that is `record.verdict`.
+
+    Attributes:
+        directory: What was verified.
+        record: The record in it; None where it cannot be read.
+        complaints: A sentence for each file that is not as it was written, and for each value that did not come out.
+        undecided: Why what the record's verdict rests on could not be made again.
+        claimed: What the record says was asked and came out. A weaker claim can be just as true.
+        unchecked: What was not checked, by key.
+        rounded: What differs by no more than machines round differently.
+        checked: How many values of record, trace and pages were compared with those made again.
+        notes: Versions that differ from those of the record.
+
+    Example:
+        >>> found = dd.verify("artifacts/pendulum_swing_up").require()
+        >>> found.verdict, found.complaints, found.checked > 1000
+        ('holds', (), True)
+    """
+
+    directory: Path
+    record: SealedRecord | None
+    complaints: tuple[str, ...] = ()
+    undecided: tuple[str, ...] = ()
+    claimed: tuple[str, ...] = ()
+    unchecked: tuple[str, ...] = ()
+    rounded: tuple[str, ...] = ()
+    checked: int = 0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> Literal["holds", "intact", "undecided", "broken"]:
+        """What can be said of the directory as a whole."""
+        if self.complaints:
+            return "broken"
+        if self.undecided:
+            return "undecided"
+        all_of_it = self.record is not None and self.record.subject not in NOT_RERUN
+        return "holds" if self.checked and all_of_it else "intact"
+
+    @property
+    def holds(self) -> bool:
+        """Whether the verdict is "holds"."""
+        return self.verdict == "holds"
+
+    @property
+    def sentence(self) -> str:
+        """What the verdict rests on."""
+        if self.verdict == "holds":
+            return f"run again, all {self.checked} values came out" + (" but for rounding" if self.rounded else "")
+        if self.verdict == "intact":
+            part = f"all {self.checked} values of the recordings and their causes came out again, "
+            rest = f"{part}and the engines were not run" if self.checked else "the numbers were not taken again"
+            return f"the files are as they were written; {rest}"
+        return "; ".join(self.complaints or self.undecided)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What was found, for a reader: what was claimed, what was not checked, what is wrong."""
+        groups = {
+            "claimed": self.claimed,
+            "not checked": self.unchecked,
+            "undecided": self.undecided,
+            "broken": self.complaints,
+            "rounded": self.rounded,
+            "note": self.notes,
+        }
+        told = []
+        for word, found in groups.items():
+            told += [f"{word}: {line}" for line in found[:MOST]]
+            told += [f"{word}: and {len(found) - MOST} more"] * (len(found) > MOST)
+        return tuple(told)
+
+    def require(self) -> "Verification":
+        """This verification where it holds; ArtifactError, with what does not, where it does not."""
+        if not self.holds:
+            raise ArtifactError(f"{self.directory}: {self}")
+        return self
+
+    def __str__(self) -> str:
+        return f"{self.verdict}: {self.sentence}"
+
+    def __repr__(self) -> str:
+        told = self.sentence if self.verdict in ("holds", "intact") else f"{len(self.complaints)} problems"
+        if self.verdict == "undecided":
+            told = "what the verdict rests on could not be made again"
+        return "\n  ".join((f"Verification of {self.directory}: {self.verdict}, {told}", *self.lines))
+
+
+def verify(
+    directory: str | Path, *, models: str | Path | None = None, time_limit: float = WAITED, memory_limit: float = 1.0
+) -> Verification:
+    """Check a directory's schema, hashes and files, then make it again and compare all of it.
+
+    A solve is run again as its record says `solve` was called; its plan is measured again, and record, trace and pages
+    are written again and compared, texts exactly and numbers as far as machines round alike. A certification is taken
+    again. So whoever changes a value and all hashes with it is found, and the message names the value. A record of an
+    easier task is as true as any: `claimed` says what was asked.
+
+    Comparisons, robustness trials, panels and rollouts' certificates are not run again: their verdict is at best
+    "intact". But recordings that were compared are compared again, and their causes looked for. Of a panel, and of the
+    record of one trial of it, what follows from its journal is made again. What cannot be run again (a model that came
+    from a diagram, a user's functions, a search that a time limit ended) makes the verdict "undecided", and so does
+    another version of Drake where numbers differ. It takes as long as the solve or the search for causes did, of which
+    it waits for 60 seconds where `time_limit` says nothing else.
+
+    The directory may be a stranger's. Its model is read and run in a child process with limits of time and memory, and
+    with the rights of this one (see docs/strangers.md). Where that process crashes the verdict is "broken", where it
+    reaches a limit "undecided".
+
+    Args:
+        directory: What `save`, `save_comparison`, `save_robustness`, `certify_model`, `run_panel` or `save_rollout`
+            wrote; or trials/ID.json of a panel.
+        models: A folder below which the model file and the meshes that it names may be read, where the directory does
+            not hold them: the one in which the model stood when the run was made. Without it none of them is read.
+        time_limit: How long it may take to make the run again, in seconds. Give more for a solve that took longer.
+        memory_limit: How much memory that may take, in GiB.
+
+    Returns:
+        A `Verification`: the verdict, what was claimed, what was not checked, and what does not hold.
+
+    Raises:
+        ArtifactError: There is no such directory.
+        InputError: A limit is not positive, or `models` is no folder.
+
+    Example:
+        >>> found = dd.verify("artifacts/pendulum_swing_up")
+        >>> found.verdict, found.complaints
+        ('holds', ())
+    """
+    folder = Path(directory)
+    if not (folder.is_dir() or is_trial_file(folder)):
+        raise ArtifactError(f"{folder}: expected a directory that drake_diff wrote, got no directory")
+    for name, value in (("time_limit", time_limit), ("memory_limit", memory_limit)):
+        positive_float(name, value)
+    found = _looked_at(folder)
+    if found.complaints or found.undecided or found.record is None:
+        return found
+    if found.record.subject in NOT_RERUN and not has_recordings(found.record):
+        return _run_again(found, found.record, None)
+    answer = call_with_limits("drake_diff.runs.verify:_apart", folder, models, float(time_limit), float(memory_limit))
+    if answer.exceeded:
+        more = "time_limit= and memory_limit=, or --time-limit and --memory-limit, give it more"
+        return replace(found, undecided=(f"it was not made again: {answer.exceeded}: {more}",))
+    if answer.sentence:
+        return _judged(found, [f"it cannot be made again: {answer.sentence}"], [])
+    texts: dict[str, Any] = {name: tuple(str(line) for line in answer.value[name]) for name in MADE_APART}
+    return replace(found, **texts, checked=int(answer.value["checked"]))
+
+
+def call_with_limits(
+    function: str, folder: Path, models: str | Path | None, seconds: float = WAITED, memory: float = 1.0
+) -> Outcome:
+    """Call `function(directory, models)` in a child process; InputError if `models` is no folder."""
+    if models is not None and not Path(models).is_dir():
+        raise InputError("models", got=str(models), expected="a folder that exists")
+    given = {"directory": str(folder.resolve()), "models": None if models is None else str(Path(models).resolve())}
+    return call(function, given, seconds, memory)
+
+
+def require_readable(function: str, folder: Path, models: str | Path | None) -> None:
+    """Call `function` in a child process first; ArtifactError where that does not survive it."""
+    answer = call_with_limits(function, folder, models)
+    if answer.sentence:
+        raise ArtifactError(f"{folder}: {answer.sentence}")
+
+
+def verify_own(directory: Path) -> Verification:
+    """What `verify` finds in a directory that this process has just made: here, without limits, its model anywhere."""
+    found = _looked_at(directory)
+    if found.complaints or found.undecided or found.record is None:
+        return found
+    return _run_again(found, found.record, ANYWHERE)
+
+
+def _apart(directory: str, models: str | None) -> dict[str, Any]:
+    """What `verify` finds, of a directory whose files are as they were written, in a process of its own."""
+    found = _looked_at(Path(directory))
+    if found.record is not None and not (found.complaints or found.undecided):
+        found = _run_again(found, found.record, None if models is None else Path(models))
+    return {name: getattr(found, name) for name in (*MADE_APART, "checked")}
+
+
+def _looked_at(folder: Path) -> Verification:
+    """What can be said of a directory without making anything again."""
+    path = record_path(folder)
+    if is_partial(folder):
+        return _of_a_part(folder)
+    if path is None:
+        return Verification(folder, None, complaints=(f"there is no record: no {SealedRecord.FILE}",))
+    try:
+        record, problems = _read_checked(path)
+    except ArtifactError as error:
+        return Verification(folder, None, complaints=(str(error),))
+    found = Verification(folder, record, problems, claimed=claims_of(record), notes=_other_versions(record))
+    if problems:
+        return replace(found, unchecked=("anything else: it is damaged",))
+    unsolved = record.subject in ("plan", "phases") and isinstance(record, PlanRecord) and record.solver is None
+    if record.state == "incomplete" or unsolved:
+        return replace(found, undecided=(f"there is nothing to run again: {record.sentence}",))
+    return found
+
+
+def _of_a_part(folder: Path) -> Verification:
+    """What can be said of a run that was not moved to its place."""
+    try:
+        record: SealedRecord | None = load_record(folder)
+    except ArtifactError:
+        record = None
+    why = "it has no record" if record is None else record.sentence
+    return Verification(folder, record, undecided=(f"it is incomplete, and never took its place: {why}",))
+
+
+def _run_again(found: Verification, record: SealedRecord, models: Path | None) -> Verification:
+    """The directory beside the same made again, where it can be."""
+    try:
+        if isinstance(record, PlanRecord) and record.phases is not None:
+            return _phases_again(found, record, record.phases, models)
+        again = _made_again(found.directory, record, models)
+        if again is not None:
+            return _compared(found, record, again)
+    except (ModelError, MissingDependencyError) as error:
+        return _without_its_functions(found, record, error)
+    except ArtifactError as error:
+        return _judged(found, [str(error)], [])
+    except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        # what a forger put together need not fit in any way
+        return _judged(found, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
+    return replace(found, unchecked=(f"every number: {NOT_RERUN[record.subject]}",))
+
+
+def _made_again(folder: Path, record: SealedRecord, models: Path | None) -> Again | None:
+    """What of the directory comes out of its inputs again; None where nothing does."""
+    if record.subject in REPRODUCED_BY:
+        again: Again | None = import_module(REPRODUCED_BY[record.subject]).reproduce(folder, record, models)
+        return again
+    if isinstance(record, PlanRecord) and record.certification is not None:
+        return _certified_again(folder, record, models)
+    if isinstance(record, PlanRecord) and record.subject == "plan":
+        plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
+        with rebuilt(record.model, record.contract.get("source"), trace.attachments, models) as model:
+            again = made_again(record, model, plan)
+        problems = tuple(_odd_trace(folder, trace, plan, record))
+        return replace(again, problems=problems, unchecked=(GIVEN, *again.unchecked), written=FILES)
+    return None
+
+
+def _certified_again(folder: Path, record: PlanRecord, models: Path | None) -> Again:
+    """The same states from the same seed, each certified again."""
+    c = record.certification
+    if c is None:
+        raise ArtifactError(f"{record.FILE}: expected the record of a certification")
+    carried = record.model.file.path if record.model.file is not None else ""
+    attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
+    with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
+        made = certify_model(model, states=len(c.states), seed=c.seed, parameters=c.parameters, method=c.method)
+    given = {name: getattr(record, name) for name in ("name", "provenance", "wall_clock", "files", "record_sha256")}
+    changed = {"contract": contract_as(made.contract, record.contract), "model": model_as(made.model, record.model)}
+    return Again(made.model_copy(update={**given, **changed}).model_dump(mode="json"), {}, written=(carried,))
+
+
+def has_recordings(record: SealedRecord) -> bool:
+    """Whether it is a comparison with recordings that can be compared again."""
+    return isinstance(record, ComparisonRecord) and bool(record.recordings)
+
+
+def _without_its_functions(found: Verification, record: SealedRecord, error: Exception) -> Verification:
+    """What the files of a run that cannot be made again say of each other."""
+    told = (f"not run again: {error}",)
+    if not isinstance(record, PlanRecord) or record.subject != "plan":
+        return replace(found, undecided=told, unchecked=("everything but the hashes",))
+    plan = read_plan(found.directory / PLAN)
+    try:
+        trace = read_trace(found.directory / TRACE)
+        problems = [
+            *_odd_schema(record),
+            *_odd_trace(found.directory, trace, plan, record),
+            *inconsistencies(record, plan),
+        ]
+    except (ArtifactError, KeyError, LookupError, TypeError, ValueError) as wrong:
+        problems = [f"its files do not go together: {type(wrong).__name__}: {wrong}"]
+    return _judged(replace(found, unchecked=(OF_FUNCTIONS,)), problems, told)
+
+
+@contextmanager
+def recalled(directory: str | Path, *, models: str | Path | None = None, trusted: bool = False) -> Iterator[Solution]:
+    """The solution in a run directory, its model rebuilt from there, for as long as the block runs.
+
+    The model is read by a process of its own first, with the limits of `verify`, unless it is `trusted`; `models` is as
+    there.
+
+    ArtifactError where there is none, it is damaged or it did not end, or that process does not survive it; ModelError
+    where it cannot be built again.
+    """
+    folder = Path(directory)
+    if not trusted:
+        require_readable("drake_diff.runs.verify:_recalled_apart", folder, models)
+    with _recalled(folder, None if models is None else Path(models)) as solution:
+        yield solution
+
+
+def _recalled_apart(directory: str, models: str | None) -> None:
+    try:
+        with _recalled(Path(directory), None if models is None else Path(models)) as solution:
+            step(solution.problem.model, solution.xs[0], solution.us[0])
+    except DrakeDiffError:
+        return  # which it is again where it is read for use
+
+
+@contextmanager
+def _recalled(folder: Path, models: Path | None) -> Iterator[Solution]:
+    record = load_plan_record(folder)
+    _refuse(folder, _read_checked(folder / record.FILE)[1])
+    _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
+    plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
+    with rebuilt(record.model, record.contract.get("source"), trace.attachments, models) as model:
+        _refuse(folder, (*_odd_trace(folder, trace, plan, record), *_odd_contract(record, model.contract.to_dict())))
+        yield resolve(record, model, plan)
+
+
+def _refuse(folder: Path, problems: Sequence[str]) -> None:
+    if problems:
+        raise ArtifactError(f"{folder}: {problems[0]}")
+
+
+def _read_checked(path: Path) -> tuple[SealedRecord, tuple[str, ...]]:
+    """The record in a file, and what of it and of the files beside it is damaged."""
+    problems = []
+    try:
+        fields = read_fields(path)
+        record = parse_record(path, fields)
+        if canonical(fields).encode() != read_plain(path, MOST_TEXT):
+            problems.append(f"{path.name}: its bytes are not those that drake_diff writes for its content")
+        if fields.get("schema_version") == SCHEMA_VERSION and fields != record.model_dump(mode="json"):
+            problems.append(f"{path.name}: a field is missing, or has another type than drake_diff writes")
+        if own_sha256(fields) != fields.get("record_sha256"):
+            problems.append(f"{path.name}: its content does not match its record_sha256: something in it was changed")
+    except RecursionError as error:
+        raise ArtifactError(f"{path.name}: nested too deep") from error
+    if record.subject != "trial":
+        problems += _damage_of_files(path, record)
+    return record, tuple(problems)
+
+
+def _damage_of_files(path_of_record: Path, record: SealedRecord) -> Iterator[str]:
+    """Whether the directory holds the recorded files, as they were, and no others. Nothing outside it is opened."""
+    paths, read, lister = files_in(path_of_record.parent), 0, path_of_record.name
+    paths.pop(lister, None)
+    for name in sorted(record.files.keys() - paths.keys()):
+        yield f"{name}: missing, {lister} lists it"
+    for name, path in sorted(paths.items()):
+        described = record.files.get(name)
+        if not path.is_file(follow_symlinks=False):
+            yield f"{name}: a link, or not a plain file"
+        elif described is None:
+            yield f"{name}: {lister} does not list it"
+        else:
+            size, found = path.stat(follow_symlinks=False).st_size, ""
+            if size == described.bytes:  # one of another size is not read
+                read += size
+                if read > MOST_READ:
+                    yield f"{name}: it and the files before it have more than {MOST_READ} bytes"
+                    return
+                size, found = sha256_of(Path(path.path))
+            if described != FileEvidence(path=name, bytes=size, sha256=found):
+                yield f"{name}: its {size} bytes are not those that {lister} describes"
+
+
+def _compared(found: Verification, record: SealedRecord, again: Again) -> Verification:
+    """Record and files of a directory beside the same made again."""
+    converted = record.schema_version != SCHEMA_VERSION
+    recorded, fields = record.model_dump(mode="json"), Compared(record.FILE)
+    made = {**again.fields, **({"schema_version": record.schema_version} if "schema_version" in again.fields else {})}
+    if made:
+        compare_fields(fields, again.recorded or {key: recorded[key] for key in made}, made)
+    reworded = [d for d in fields.differing if converted and d.key.split(".")[-1] in WORDS]
+    fields.differing = [d for d in fields.differing if d not in reworded]
+    nothing = record.subject in NOT_RERUN and not made
+    why = (f"every number: {NOT_RERUN[record.subject]}",) if nothing else (*UNCHECKED, *_others(record, again.written))
+    compared, unchecked = [fields], [*why, *again.unchecked]
+    unchecked += [f"{d.key}: schema {record.schema_version} has other words" for d in reworded]
+    for name in (name for name in again.written if name in again.files or (again.files and name in FILES)):
+        if name not in record.files:
+            unchecked += [f"{name}: the directory has none"] * (name in again.files)
+        elif name not in again.files:
+            unchecked.append(f"{name}: it has what was not run again")
+        elif converted and name.endswith(".html"):
+            unchecked.append(f"{name}: schema {record.schema_version} wrote it, whose pages are not those of this one")
+        else:
+            compared.append(_compared_file(found.directory / name, again))
+    return _told_of_a_solve(found, again, [*_odd_schema(record), *again.problems], compared, unchecked)
+
+
+def _compared_file(path: Path, again: Again) -> Compared:
+    compared, recorded = Compared(path.name), read_plain(path)
+    if path.suffix == ".mcap":
+        skip = SEARCH_TOPICS if again.unrepeated else ()
+        alike = (SealedRecord.FILE, CONFIGURATION) if again.unrepeated else (SealedRecord.FILE,)
+        compare_traces(compared, recorded, again.files[path.name], alike=alike, skip=skip)
+    elif path.suffix == ".html":
+        compare_text(compared, recorded, again.files[path.name])
+    else:
+        compare_bytes(compared, recorded, again.files[path.name])
+    return compared
+
+
+def _phases_again(found: Verification, record: PlanRecord, section: PhasesSection, models: Path | None) -> Verification:
+    """All phases, their links, and the chain of all; what no artifact holds is undecided."""
+
+    def of_phase(folder: Path) -> PhasesAgain:
+        own, problems = _read_checked(folder / PlanRecord.FILE)
+        one, again = _run_again(Verification(folder, own), own, models), PhasesAgain()
+        again.problems = [*problems, *one.complaints]
+        again.undecided = [line for line in one.undecided if WITHIN_PHASES not in line]
+        again.unchecked = [line for line in one.unchecked if line.startswith(OF_FUNCTIONS)]
+        again.rounded, again.checked = list(one.rounded), one.checked
+        return again
+
+    again = phases_again(found.directory, record, models, of_phase)
+    unchecked = (*UNCHECKED, GIVEN_IN_PHASES, *again.unchecked, *_other_directories(record, section))
+    told = replace(found, unchecked=unchecked, rounded=tuple(again.rounded), checked=again.checked)
+    return _judged(told, [*_odd_schema(record), *again.problems], again.undecided)
+
+
+def _other_directories(record: PlanRecord, section: PhasesSection) -> Iterator[str]:
+    """Files that were in the directory and are none that drake_diff writes there."""
+    written = (*FILES, PlanRecord.FILE, PlanRecord.SCHEMA_FILE)
+    known = {f"{phase.directory}/{name}" for phase in section.phases for name in written}
+    yield from _others(record, tuple(known))
+
+
+def _others(record: SealedRecord, known: Sequence[str]) -> Iterator[str]:
+    """Files that were in the directory and are none that drake_diff writes there."""
+    for name in sorted(record.files.keys() - {*known, record.SCHEMA_FILE, *OLD_SCHEMAS}):
+        yield f"{name}: nothing that drake_diff writes there"
+
+
+def _odd_schema(record: SealedRecord) -> Iterator[str]:
+    """A schema that is not the record's; that of an earlier version is not here to compare with."""
+    described = record.files.get(record.SCHEMA_FILE)
+    published = sha256(record.published_schema()).hexdigest()
+    if record.schema_version == SCHEMA_VERSION and (described is None or described.sha256 != published):
+        yield f"{record.SCHEMA_FILE}: it is not the schema {record.schema_version} of this drake_diff"
+
+
+def _told_of_a_solve(
+    found: Verification, again: Again, problems: list[str], compared: Sequence[Compared], unchecked: list[str]
+) -> Verification:
+    """The verdict on what differs, by what it rests on."""
+    undecided = [*again.undecided, *(f"the search was not run again: {why}" for why in again.unrepeated)]
+    if again.missing:
+        unchecked.append(f"what rests on the search: {', '.join(again.missing)}")
+    if again.apart > SAME_PLAN:
+        undecided.append(f"the search, run again, ends at another plan, {again.apart:.2g} of its largest number away")
+    differing = [d for one in compared for d in one.differing]
+    rounds_otherwise = again.apart > 0 or any(d.allowed for d in differing)
+    rounded = []
+    if 0 < again.apart <= SAME_PLAN:
+        rounded.append(f"{PLAN}: that of the search, run again, is {again.apart:.2g} of its largest number away")
+    for d in differing:
+        if is_below(d.key, again.missing) and d.file == SealedRecord.FILE:
+            continue
+        if d.allowed:
+            rounded.append(str(d))
+        elif rounds_otherwise and _is_searched(d):
+            undecided.append(f"{d}, which rests on the steps that the search takes on this machine")
+        else:
+            problems.append(str(d))
+    checked = sum(one.count for one in compared)
+    if OF_RECOVERED in again.unrepeated and not problems:
+        files = ", ".join(one.file for one in compared)
+        undecided.append(f"what holds: measured again from the plan, all {checked} other values of {files} came out")
+    told = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
+    return _judged(told, problems, undecided)
+
+
+def _is_searched(d: Difference) -> bool:
+    """Whether a difference is in what the search tells of itself, or in a page, which shows that too."""
+    if d.file == SealedRecord.FILE:
+        return is_below(d.key, SEARCHED)
+    return d.file != TRACE or d.key.startswith((*SEARCH_TOPICS, "part ", "message "))
+
+
+def _judged(found: Verification, problems: Sequence[str], undecided: Sequence[str]) -> Verification:
+    """With problems, which are none but a reason for doubt where other versions made the record."""
+    if found.notes and problems:
+        why = f"{'; '.join(found.notes)}: that may be why {len(problems)} things differ"
+        return replace(found, undecided=(*undecided, why, *problems))
+    return replace(found, complaints=tuple(problems), undecided=tuple(undecided))
+
+
+def _odd_trace(folder: Path, trace: Trace, plan: Mapping[str, Any], record: PlanRecord) -> Iterator[str]:
+    """What in the trace is not what record.json and plan.npz have."""
+    if trace.attachments.get(record.FILE) != reproducible(read_fields(folder / record.FILE)).encode():
+        yield f"{TRACE}: the record that it carries is not {record.FILE}"
+    inputs = np.vstack([plan["us"], plan["u_final"]]) if "u_final" in plan else plan["us"]
+    for topic, recorded, planned in (("state", trace.planned_xs, plan["xs"]), ("input", trace.planned_us, inputs)):
+        if not np.array_equal(recorded, planned, equal_nan=True):
+            yield f"{TRACE}: /planned/{topic} is not what {PLAN} has"
+
+
+def _odd_contract(record: PlanRecord, again: dict[str, Any]) -> Iterator[str]:
+    """Where the rebuilt model is another than the recorded contract; where the file was, and notes, do not matter."""
+    apart = ("source", "notes")
+    old, new = ({key: value for key, value in c.items() if key not in apart} for c in (record.contract, again))
+    compared = Compared(record.FILE)
+    compare_fields(compared, {"contract": old}, {"contract": new})
+    yield from (str(d) for d in compared.differing if not d.allowed)
+
+
+def _other_versions(record: SealedRecord) -> tuple[str, ...]:
+    was, now = record.provenance.packages, packages_here()
+    used = ["drake", "drake-diff", "numpy", "casadi"]
+    if isinstance(record, PlanRecord) and record.solver is not None:
+        engines = record.solver.options.get("cross_check")
+        used += map(str, engines) if isinstance(engines, list) else ()
+    if isinstance(record, FitRecord) or has_recordings(record):
+        used.append("numba")  # by which the motions are computed, where it is there
+    used = [n for n in used if n in was] if record.subject == "trial" else used  # it has those of its panel
+    names = [n for n in used if was.get(n) != now.get(n)]
+    told = [f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names]
+    if record.schema_version != SCHEMA_VERSION:
+        told.append(f"recorded by schema {record.schema_version}, and converted to {SCHEMA_VERSION}")
+    return tuple(told)
