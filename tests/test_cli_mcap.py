@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import InputError
+from drake_diff.logs.channels import TYPES
 from drake_diff.logs.mcap_file import Channel, write_mcap
-from drake_diff.logs.messages import TYPES
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs import measure
 from drake_diff.runs.trace import write_trace

@@ -21,7 +21,7 @@ from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.runs import cross_check
 from drake_diff.runs.cross_check import Follower, replays_in
-from drake_diff.runs.fields import PlanRecord
+from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.verify import verify_own
 
 FREE = math.nan

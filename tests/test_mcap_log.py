@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 from drake_diff.logs import mcap_file
+from drake_diff.logs.channels import MESSAGES, TYPES
 from drake_diff.logs.mcap_file import CHUNK_SIZE, Channel, read_mcap, recover_mcap, write_mcap
-from drake_diff.logs.messages import MESSAGES, TYPES
 
 STATE = TYPES["State"].cls
 

@@ -295,7 +295,8 @@ def test_pages_that_are_gone_are_told(run, copy):
 
 
 @pytest.mark.parametrize(
-    ("dropped", "told"), slow_after(1, [("message", "message 3"), ("metadata", "part"), ("attachment", "part")])
+    ("dropped", "told"),
+    slow_after(1, [("message", "/"), ("metadata", "metadata run"), ("attachment", "attachment configuration")]),
 )
 def test_a_trace_with_something_left_out_is_found(copy, dropped, told):
     """Written again by the mcap package alone, as whole as before."""

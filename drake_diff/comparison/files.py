@@ -18,9 +18,8 @@ from drake_diff.comparison.attribution import Attribution, EngineMotion
 from drake_diff.comparison.recordings import LARGEST, Recording, place_of, size_of, write_arrays
 from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison, slugs
 from drake_diff.exceptions import InputError
-from drake_diff.logs.channels import input_channel, nanoseconds, state_channel, transform_channel
+from drake_diff.logs.channels import TYPES, input_channel, nanoseconds, state_channel, transform_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
-from drake_diff.logs.messages import TYPES
 from drake_diff.model.model import Model
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.runs import other_records as records

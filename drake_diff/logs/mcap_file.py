@@ -162,16 +162,33 @@ def read_mcap(path: str | Path, *, links: bool = True) -> McapLog:
         >>> log.arrays("/state")["q"].shape[1]
         1
     """
-    path = Path(path)
-    data = read_plain(path, links=links)
+    return parse_mcap(read_plain(Path(path), links=links), str(path))
+
+
+def parse_mcap(data: bytes, name: str) -> McapLog:
+    """What the bytes of a file of that name hold; see `read_mcap`."""
     log = McapLog({}, {}, {}, {}, {})
     try:
         _collect(data, _check_crcs(data), log)
     except MemoryError:
         raise
     except Exception as error:  # a damaged file makes the reader fail in many ways; none of them is ours
-        raise ArtifactError(f"{path} is no whole MCAP file of this project: {type(error).__name__}: {error}") from error
+        raise ArtifactError(f"{name} is no whole MCAP file of this project: {type(error).__name__}: {error}") from error
     return log
+
+
+def fields_of(message: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """(name, value) of each number and text of a protobuf message: those of inner messages by path, lists by index."""
+    for described in message.DESCRIPTOR.fields:
+        name = f"{path}.{described.name}" if path else described.name
+        value, repeated = getattr(message, described.name), described.default_value == []
+        if described.cpp_type != described.CPPTYPE_MESSAGE:
+            yield from ((f"{name}[{i}]", v) for i, v in enumerate(value)) if repeated else ((name, value),)
+        elif repeated:
+            for i, inner in enumerate(value):
+                yield from fields_of(inner, f"{name}[{i}]")
+        elif message.HasField(described.name):
+            yield from fields_of(value, name)
 
 
 def recover_mcap(path: str | Path, out: str | Path) -> "Recovered":

@@ -14,7 +14,7 @@ from hashlib import sha256
 from itertools import zip_longest
 from typing import Any
 
-from drake_diff.logs.mcap_parts import fields_by, parts_of
+from drake_diff.logs.mcap_file import McapLog, fields_of, parse_mcap
 
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 READ = (1e-9, 1e-15)  # the same of what is read out of a file and not computed along a motion
@@ -162,58 +162,50 @@ def compare_text(compared: Compared, recorded: bytes, again: bytes) -> None:
 def compare_traces(
     compared: Compared, recorded: bytes, again: bytes, *, alike: Sequence[str] = (), skip: Sequence[str] = ()
 ) -> None:
-    """Two MCAP files: attachments, metadata, schemas and channels exactly, every message field by field, their order.
+    """Two MCAP files: attachments, metadata, schemas and channels exactly, every message field by field.
 
-    Of the attachments named in `alike` only that they are there is compared. Messages of topics that begin as one of
+    Of the attachments named in `alike` only that they are there is compared. Channels whose topics begin as one of
     `skip` are not compared.
     """
     before = len(compared.differing)
-    old, new = (parts_of(data, tuple(skip)) for data in (recorded, again))
-    compared.count += len(new.order) + len(new.others)
-    mine, theirs = ([_told(other, alike) for other in parts.others] for parts in (old, new))
-    for i, (one, other) in enumerate(zip_longest(mine, theirs)):
-        if one != other:
-            compared.differ(f"part {i}, {(one or other)[0]}", repr(one), repr(other))
-    if old.order != new.order:
-        at = next((i for i, (a, b) in enumerate(zip_longest(old.order, new.order)) if a != b), 0)
-        pair = (str(side[at]) if at < len(side) else "none" for side in (old.order, new.order))
-        compared.differ(f"message {at}", *pair)
-    for topic, messages in new.messages.items():
-        theirs_too = old.messages.get(topic, [])
-        if len(theirs_too) == len(messages) and theirs_too != messages:
-            _compare_messages(compared, topic, new.schemas[topic], theirs_too, messages)
-    if len(compared.differing) == before and old == new and not skip:
+    old, new = (parse_mcap(data, compared.file) for data in (recorded, again))
+    for kind, key in (("attachment", "attachments"), ("metadata", "metadata"), ("channel", "channel_metadata")):
+        theirs, ours = getattr(old, key), getattr(new, key)
+        for name in sorted(theirs.keys() | ours.keys()):
+            exempt = name in alike and name in theirs and name in ours
+            compared.count += 1
+            if theirs.get(name) != ours.get(name) and not exempt:
+                compared.differ(f"{kind} {name}", repr(theirs.get(name)), repr(ours.get(name)))
+    for topic in (t for t in new.messages if t in old.messages and not t.startswith(tuple(skip))):
+        _compare_messages(compared, topic, old, new)
+    if len(compared.differing) == before and old.attachments == new.attachments and not skip:
         compare_bytes(compared, recorded, again)  # what stands beside the data: indexes, empty space
 
 
-def _told(part: tuple[Any, ...], alike: Sequence[str]) -> tuple[Any, ...]:
-    """A part of a file to compare, without the data of an attachment that is compared elsewhere."""
-    if part[0] == "Attachment" and any(value in alike for value in part[1:] if isinstance(value, str)):
-        return tuple(value for value in part if not isinstance(value, bytes))
-    return part
-
-
-def _compare_messages(
-    compared: Compared, topic: str, schema: Any, recorded: Sequence[bytes], again: Sequence[bytes]
-) -> None:
+def _compare_messages(compared: Compared, topic: str, old: McapLog, new: McapLog) -> None:
     """The messages of one channel, field by field; a number may be off by a part of the largest of its field."""
-    fields = fields_by(schema)
-    rows = [fields(data) for data in again]
+    kinds = [log.message_types[topic].DESCRIPTOR.file.serialized_pb for log in (old, new)]
+    if kinds[0] != kinds[1]:
+        compared.differ(f"{topic} schema", repr(kinds[0]), repr(kinds[1]))
+        return
+    times = [[time for time, _ in log.messages[topic]] for log in (old, new)]
+    if times[0] != times[1]:
+        i = next((i for i, (a, b) in enumerate(zip_longest(*times)) if a != b), 0)
+        compared.differ(f"{topic} message {i}, of {len(times[1])}", *(str(side[i : i + 1]) for side in times))
+        return
+    pairs = list(zip(old.messages[topic], new.messages[topic], strict=True))
+    compared.count += len(pairs)
     largest: dict[str, float] = {}
-    for key, value in (pair for row in rows for pair in row.items()):
+    for key, value in (pair for _, (_, message) in pairs for pair in fields_of(message)):
         if isinstance(value, float) and math.isfinite(value):
             largest[_column(key)] = max(largest.get(_column(key), 0.0), abs(value))
-    for i, row in enumerate(rows):
-        if recorded[i] == again[i]:
-            continue
-        found, old = len(compared.differing), fields(recorded[i])
-        for key in sorted(old.keys() | row.keys()):
-            a, b = old.get(key), row.get(key)
+    for i, ((_, one), (_, other)) in enumerate(pairs):
+        theirs, ours = dict(fields_of(one)), dict(fields_of(other))
+        for key in sorted(theirs.keys() | ours.keys()):
+            a, b = theirs.get(key), ours.get(key)
             if not (a == b or (a != a and b != b)):
                 near = _is_near_value(a, b, largest.get(_column(key), 0.0))
                 compared.differ(f"{topic} {key} of message {i}", a, b, allowed=near)
-        if len(compared.differing) == found:
-            compared.differ(f"{topic}, the bytes of message {i}", recorded[i].hex()[:40], again[i].hex()[:40])
 
 
 def _is_near_value(recorded: Any, again: Any, largest: float) -> bool:

@@ -16,9 +16,16 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ArtifactError
-from drake_diff.logs.channels import Shown, input_channel, motion_channels, nanoseconds, state_channel
+from drake_diff.logs.channels import (
+    TYPES,
+    MessageType,
+    Shown,
+    input_channel,
+    motion_channels,
+    nanoseconds,
+    state_channel,
+)
 from drake_diff.logs.mcap_file import Channel, McapLog, read_mcap, write_mcap
-from drake_diff.logs.messages import TYPES, MessageType
 from drake_diff.model.parameters import applied
 from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.runs.fields import canonical

@@ -572,7 +572,7 @@ def _is_searched(d: Difference) -> bool:
     """Whether a difference is in what the search tells of itself, or in a page, which shows that too."""
     if d.file == SealedRecord.FILE:
         return is_below(d.key, SEARCHED)
-    return d.file != TRACE or d.key.startswith((*SEARCH_TOPICS, "part ", "message "))
+    return d.file != TRACE or d.key.startswith((*SEARCH_TOPICS, "attachment ", "metadata "))
 
 
 def _judged(found: Verification, problems: Sequence[str], undecided: Sequence[str]) -> Verification:

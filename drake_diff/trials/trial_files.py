@@ -9,9 +9,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import make_folder, write_whole
-from drake_diff.logs.channels import Shown, input_channel, motion_channels, nanoseconds, state_channel
+from drake_diff.logs.channels import TYPES, Shown, input_channel, motion_channels, nanoseconds, state_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
-from drake_diff.logs.messages import TYPES
 from drake_diff.loop.run import OK
 from drake_diff.model.parameters import applied, select
 from drake_diff.runs.fields import canonical
