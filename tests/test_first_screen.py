@@ -10,8 +10,8 @@ from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.runs import measure
-from drake_diff.runs.first_screen import _of_replays, asked_for, checks_of
-from drake_diff.runs.page import alike
+from drake_diff.runs.messages import asked_for
+from drake_diff.runs.page import _of_replays, alike, checks_of
 from drake_diff.runs.save import record_of
 
 CONTROLS = ("Inputs alone (open loop)", "With feedback (TVLQR)")

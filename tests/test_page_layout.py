@@ -27,7 +27,7 @@ from drake_diff.certificates.certificate import certify_jacobian
 from drake_diff.exceptions import ArtifactError
 from drake_diff.pages.html import MOST_ENTRIES, MOST_POINTS, Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import MOST_POSES, frames_of
-from drake_diff.runs.runs_page import write_runs_page
+from drake_diff.runs.compare import write_runs_page
 
 PHONE, DESK = (390, 844), (1280, 800)
 EVIL = "</script><img src=x onerror=\"document.title = 'evil'\">"

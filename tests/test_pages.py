@@ -16,7 +16,7 @@ from helpers.table import each_row, slow_after
 import drake_diff as dd
 from drake_diff.pages import html
 from drake_diff.pages.html import render, write_page
-from drake_diff.runs.first_screen import Check
+from drake_diff.runs.page import Check
 from drake_diff.runs.verify import recalled
 from drake_diff.runs.view import scene_of_run
 

@@ -42,9 +42,9 @@ from drake_diff.optimize import run as optimize_run
 from drake_diff.optimize.solve import _best_of
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.runs import recover
+from drake_diff.runs.compare import list_runs
 from drake_diff.runs.directory import writing, written_whole
 from drake_diff.runs.fields import canonical
-from drake_diff.runs.listing import list_runs
 from drake_diff.runs.save import begin, keep_plan
 from drake_diff.runs.sealed import own_sha256
 

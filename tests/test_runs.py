@@ -15,7 +15,7 @@ import drake_diff as dd
 from drake_diff.cli.main import main
 from drake_diff.cli.text import plain
 from drake_diff.exceptions import ArtifactError
-from drake_diff.runs.listing import compare_runs, list_runs
+from drake_diff.runs.compare import compare_runs, list_runs
 from drake_diff.runs.save import begin, begin_failure
 
 FAILED, OPEN = "failed.partial-1-0123abcd", "open.partial-22-0123abcd"

@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_are
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.optimize import Dwell, TerminalSet
-from drake_diff.runs.first_screen import asked_for
+from drake_diff.runs.messages import asked_for
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 METHODS = ["collocation", "shooting", "ilqr"]

@@ -26,8 +26,8 @@ import drake_diff as dd
 import drake_diff.runs.save as evidence
 from drake_diff.exceptions import ArtifactError
 from drake_diff.runs import measure
+from drake_diff.runs.compare import list_runs
 from drake_diff.runs.differences import is_near, is_near_text
-from drake_diff.runs.listing import list_runs
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.save import begin
 from drake_diff.runs.sealed import reproducible

@@ -245,7 +245,7 @@ def list_all(
     directory: Annotated[Path, typer.Argument(metavar="DIRECTORY", help="Where the runs are.")] = Path("artifacts"),
 ) -> None:
     """List the records in DIRECTORY and their verdicts as written; `verify` checks them."""
-    from drake_diff.runs.listing import list_runs
+    from drake_diff.runs.compare import list_runs
 
     rows = table("run", "verdict", "kind", "status", "cost", "model", "written")
     for line in list_runs(directory):
@@ -283,7 +283,7 @@ def compare_runs(
     With --out, a page shows both plans in one replay and in the same plots as well.
     Exit status 1 if the two define a metric differently; such metrics are not compared.
     """
-    from drake_diff.runs.listing import compare_runs as compare
+    from drake_diff.runs.compare import compare_runs as compare
 
     found = compare(a, b)
     for title in ("configuration", "versions", "metrics"):
@@ -297,7 +297,7 @@ def compare_runs(
     for line in found.refused:
         show(plain(f"not compared: {line}", "red"))
     if out is not None:
-        from drake_diff.runs.runs_page import write_runs_page
+        from drake_diff.runs.compare import write_runs_page
 
         write_runs_page(out, a, b, models=models)
         show(f"wrote {out}")

@@ -1,10 +1,10 @@
 from .certificates import certify_model as certify_model
 from .certificates import save_rollout as save_rollout
+from .compare import RunComparison as RunComparison
+from .compare import RunLine as RunLine
+from .compare import compare_runs as compare_runs
+from .compare import list_runs as list_runs
 from .cross_check import cross_check as cross_check
-from .listing import RunComparison as RunComparison
-from .listing import RunLine as RunLine
-from .listing import compare_runs as compare_runs
-from .listing import list_runs as list_runs
 from .measurement import Measurement as Measurement
 from .measurement import measure as measure
 from .other_records import ComparisonRecord as ComparisonRecord

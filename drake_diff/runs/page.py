@@ -1,8 +1,12 @@
-"""The pages of a run, which open from a disk: the motion in 3D, and a report with the motion, plots and numbers."""
+"""The pages of a run, which open from a disk: the motion in 3D, and a report.
+
+The first screen of the report says what was asked of which robot, and whether what was checked holds; plots and numbers
+follow.
+"""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +15,70 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.optimize.live import differ, scene_of_plan
 from drake_diff.optimize.marks import Colour, colours_of, meaning_of
+from drake_diff.optimize.solution import Status
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay
 from drake_diff.pages.scene import Scene
-from drake_diff.runs.first_screen import asked_for, checks_of
 from drake_diff.runs.measurement import Column, Measurement, gradient_norms
+from drake_diff.runs.messages import asked_for, joined
+
+CONTROLS = {"open loop": "Inputs alone (open loop)", "TVLQR": "With feedback (TVLQR)"}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was checked: its `title`, its `kind`, and what was found in words.
+
+    The kind is "pass", "fail", "undecided", "info", or "warn" where something fails that the verdict does not rest on.
+    """
+
+    title: str
+    kind: str
+    text: str
+
+
+def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[Check]:
+    """What was checked of a run, in the order in which it was."""
+    status, count = m.solution.status, record["solver"]["iterations"]
+    rounds = f"{count} iteration{'s' * (count != 1)} of {record['solver']['solver']}"
+    ended = "stopped at a solution" if status is Status.CONVERGED_NOT_VERIFIED else status.value.replace("_", " ")
+    stopped = status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
+    found = [Check("Solver", "pass" if stopped else "fail", f"{ended} after {rounds}")]
+    decided = [m for m in (*record["metrics"], *record["invariants"]) if m["verdict"] != "info"]
+    broken = [m["name"] for m in decided if m["verdict"] != "pass"]
+    failed = any(m["verdict"] == "fail" for m in decided)
+    text = f"not kept: {joined(broken)}" if broken else f"all {len(decided)} bounds are kept"
+    found.append(Check("Plan", "fail" if failed else "undecided" if broken else "pass", text))
+    found += _of_replays(m, record["replays"])
+    certificates = record["gradient"]["certificates"]
+    agree = sum(c["verdict"] == "agree" for c in certificates)
+    kind = "info" if not certificates else "pass" if agree == len(certificates) else "undecided"
+    told = f"{agree} of {len(certificates)} certificates agree" if certificates else "not certified"
+    if not certificates and record["problem"].get("motion") == "continuous" and status is Status.CONVERGED:
+        kind, told = (
+            "pass",
+            "that of the end is a slope of another integration",
+        )  # else the plan is none
+    found.append(Check("Gradients", kind, told))
+    return found
+
+
+def _of_replays(m: Measurement, replays: Sequence[Mapping[str, Any]]) -> Iterator[Check]:
+    judged = m.solution.judged_replay
+    failed = judged is None and not m.solution.success  # each replay may hold by one of the two, and neither by both
+    for control in dict.fromkeys(r["control"] for r in replays):
+        tried = [r for r in replays if r["control"] == control]
+        lost = [r for r in tried if not r["holds"]]
+        enough = judged is not None and judged.control == control
+        text = {1: "holds in its replay", 2: "holds in both replays"}.get(
+            len(tried), f"holds in all {len(tried)} replays"
+        )
+        if lost:
+            text = f"holds in {len(tried) - len(lost)} of {len(tried)} replays; {lost[0]['variant']}: "
+            text += lost[0]["failures"][0] if lost[0]["failures"] else "it fails"
+        kind = "pass" if enough or not lost else "fail" if failed else "warn"
+        yield Check(CONTROLS.get(control, control), kind, text)
+
 
 SERIES_PER_PLOT = 6  # more lines cannot be told apart
 PHYSICS, SEARCH = "Energy and contact", "Search"

@@ -29,7 +29,6 @@ from drake_diff.runs.again import (
     model_as,
 )
 from drake_diff.runs.certificates import certify_model
-from drake_diff.runs.claim import claims_of
 from drake_diff.runs.differences import (
     Compared,
     Difference,
@@ -40,6 +39,7 @@ from drake_diff.runs.differences import (
 )
 from drake_diff.runs.directory import is_partial
 from drake_diff.runs.fields import FileEvidence, canonical
+from drake_diff.runs.messages import claims_of
 from drake_diff.runs.other_records import ComparisonRecord, FitRecord, is_trial_file
 from drake_diff.runs.phases_again import PhasesAgain, inconsistencies, phases_again
 from drake_diff.runs.plan_record import PhasesSection, PlanRecord
