@@ -35,7 +35,7 @@ from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.runs import other_records as records
 from drake_diff.runs.again import Again, contract_as, model_as
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, canonical
+from drake_diff.runs.fields import DataBoundary, DataUse, canonical, finite
 from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.provenance import embodiment_of, model_input, provenance_of, written_now
 from drake_diff.runs.rerun import TRACE, rebuilt
@@ -119,7 +119,7 @@ def _begun(name: str, asked: Asked) -> FitRecord:
             motion=asked.motion,
             max_iterations=asked.max_iterations,
             priors={key: [np.ravel(part).tolist() for part in pair] for key, pair in asked.priors.items()},
-            bounds={key: [_known(bound) for bound in pair] for key, pair in asked.bounds.items()},
+            bounds={key: [finite(bound) for bound in pair] for key, pair in asked.bounds.items()},
             sensors={
                 key: records.Mounted(body=body, pose=[float(value) for value in pose])
                 for key, (body, pose) in asked.sensors.items()
@@ -144,7 +144,7 @@ def record_of(e: Identification, name: str) -> FitRecord:
         "unidentifiable": list(e.unidentifiable),
         "noise": dict(e.noise),
         "correlation": _correlation(e.covariance),
-        **{key: _known(getattr(e, key)) for key in ("error_before", "error_after", "score")},
+        **{key: finite(getattr(e, key)) for key in ("error_before", "error_after", "score")},
         **{key: getattr(e, key) for key in ("explained", "reason", "converged", "steps", "motion", "count")},
     }
     begun = _begun(name, asked)
@@ -173,10 +173,6 @@ def _asked(e: Identification) -> Asked:
     if e.asked is None:
         raise InputError("identification", got="one without what was asked", expected="what dd.identify returned")
     return e.asked
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _bounds(pair: list[float | None]) -> tuple[float, float]:
@@ -212,7 +208,7 @@ def estimates_of(e: Identification) -> list[records.Estimate]:
             found.append(
                 records.Estimate(
                     name=label, unit=e.units[name], before=float(was[i]), value=float(now[i]),
-                    lower=_known(low), upper=_known(high),
+                    lower=finite(low), upper=finite(high),
                 )
             )  # fmt: skip
     return found
@@ -222,7 +218,7 @@ def _correlation(covariance: Array) -> list[list[float | None]]:
     spread = np.sqrt(np.diag(covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         found = covariance / np.outer(spread, spread)
-    return [[_known(round(float(value), 9)) if np.isfinite(value) else None for value in row] for row in found]
+    return [[finite(round(float(value), 9)) if np.isfinite(value) else None for value in row] for row in found]
 
 
 def write_made(folder: Path, e: Identification, record: FitRecord) -> None:

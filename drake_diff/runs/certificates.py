@@ -13,7 +13,6 @@ from drake_diff._base.files import write_whole
 from drake_diff.certificates.certify import certify
 from drake_diff.certificates.rollout import RolloutCertificate
 from drake_diff.certificates.sampled import SampledCertificate
-from drake_diff.certificates.truth import TrueSlope, Truth
 from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import active_modes
@@ -22,6 +21,7 @@ from drake_diff.model.parameters import Parameters, select
 from drake_diff.model.sampling import SampledState, sample_states
 from drake_diff.model.step import advance
 from drake_diff.runs.directory import written_whole
+from drake_diff.runs.fields import evidence
 from drake_diff.runs.plan_record import (
     CertificationSection,
     CertifiedState,
@@ -161,7 +161,8 @@ def save_rollout(
         raise InputError("certificate", got=type(certificate).__name__, expected=expected)
     motion, count = certificate.gradient, len(certificate.columns)
     finite_array("the certificate's x0", motion.xs[0], (model.nx,))
-    agree = certificate.count("agree")
+    agree, truth = certificate.count("agree"), certificate.truth
+    slopes = [] if truth is None else [evidence(SlopeEvidence, slope) for slope in truth.slopes]
     section = RolloutSection(
         x0=_plain(motion.xs[0]),
         us=[_plain(u) for u in motion.us],
@@ -170,50 +171,13 @@ def save_rollout(
         derivative=_plain(certificate.derivative[0]),
         verdicts=[certificate.entry(0, j).verdict for j in range(count)],
         certificate=gradient_evidence(certificate),
-        truth=None if certificate.truth is None else truth_evidence(certificate.truth),
+        truth=None if truth is None else evidence(TruthEvidence, truth, slopes=slopes),
         no_truth=certificate.no_truth,
     )
     verdict: Passed = "pass" if certificate.verdict == "agree" else "fail"
     record = _record(model, verdict, f"{agree} of {count} entries of the gradient agree", rollout=section)
     with written_whole(directory) as folder:
         return record.write(folder)
-
-
-def truth_evidence(truth: Truth) -> TruthEvidence:
-    """A truth as it stands in a record."""
-    return TruthEvidence(
-        law=truth.law,
-        touches=truth.touches,
-        loss=_known(truth.loss),
-        error=_known(truth.error),
-        ours=truth.ours,
-        other_law=truth.other_law,
-        by_other_law=_known(truth.by_other_law),
-        other_reason=truth.other_reason,
-        notes=list(truth.notes),
-        seconds=truth.seconds,
-        slopes=[_slope(one) for one in truth.slopes],
-    )
-
-
-def _slope(one: TrueSlope) -> SlopeEvidence:
-    return SlopeEvidence(
-        column=one.column,
-        ours=one.ours,
-        exists=one.exists,
-        value=_known(one.value),
-        error=_known(one.error),
-        sign_agrees=one.sign_agrees,
-        agrees=one.agrees,
-        widths=list(one.widths),
-        slopes=list(one.slopes),
-        reason=one.reason,
-        by_other_law=_known(one.by_other_law),
-    )
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _plain(values: ArrayLike) -> list[float]:

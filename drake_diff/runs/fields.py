@@ -4,10 +4,12 @@ None of them is NaN or infinite: null stands for a number that is not there.
 """
 
 import json
+import math
 from collections.abc import Mapping
 from hashlib import sha256
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, model_validator
 
 NOTHING_SOLVED = "nothing was solved"
@@ -36,6 +38,25 @@ class Fields(BaseModel):
     """The rules of all fields: no field that the schema does not have, no NaN, no infinity."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+Section = TypeVar("Section", bound=Fields)
+
+
+def evidence(kind: type[Section], value: object, **given: Any) -> Section:
+    """A section of a record with the attributes of `value`, but for those `given`; null for what is not finite."""
+    return kind(**{name: _plain(getattr(value, name)) for name in kind.model_fields if name not in given}, **given)
+
+
+def finite(value: float) -> float | None:
+    """`value`, None where it is none that JSON has."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (float, np.floating)):
+        return finite(float(value))
+    return [_plain(item) for item in value] if isinstance(value, (tuple, list, np.ndarray)) else value
 
 
 class Quantity(Fields):

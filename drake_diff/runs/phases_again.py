@@ -20,11 +20,12 @@ from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
 from drake_diff.runs.again import SAME_PLAN, apart_from, why_not_repeated
+from drake_diff.runs.fields import finite
 from drake_diff.runs.plan_record import PhaseEvidence, PhasesSection, PlanRecord
 from drake_diff.runs.provenance import gradient_evidence
 from drake_diff.runs.read import load_plan_record
 from drake_diff.runs.rerun import PLAN, TRACE, read_plan, rebuilt, resolve
-from drake_diff.runs.save import chain_evidence, directory_of, finite
+from drake_diff.runs.save import chain_evidence, directory_of
 from drake_diff.runs.trace import read_trace
 
 ROUNDED = 1e-12  # of the largest number: what the same sum may differ by on another machine

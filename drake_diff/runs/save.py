@@ -24,7 +24,7 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs.directory import is_partial, is_taken, move_into_place, name_of, partial_of, writing, written_whole
-from drake_diff.runs.fields import Claim, Event, ModelInput, Solver, canonical
+from drake_diff.runs.fields import Claim, Event, ModelInput, Solver, canonical, finite
 from drake_diff.runs.measurement import Measurement, failure_of, measure, replay_evidence
 from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.plan_record import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesSection, PlanRecord
@@ -149,11 +149,6 @@ def _reset(switch: Switch, problem: PhasedProblem) -> dict[str, Any] | None:
 def chain_evidence(chain: Chain) -> ChainEvidence:
     """The chain of all phases as it stands in a record."""
     return ChainEvidence(holds=chain.holds, control=chain.control, told=chain.told, worst=finite(chain.worst))
-
-
-def finite(value: float) -> float | None:
-    """`value`, None where it is none that JSON has."""
-    return float(value) if np.isfinite(value) else None
 
 
 REPLAY, REPORT = "replay.html", "report.html"

@@ -15,7 +15,7 @@ from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
 from drake_diff.model.model import Model
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, EvaluationPanel
+from drake_diff.runs.fields import DataBoundary, DataUse, EvaluationPanel, finite
 from drake_diff.runs.plan_record import (
     CellEvidence,
     LoopEvidence,
@@ -31,7 +31,7 @@ from drake_diff.runs.sealed import WallClock
 from drake_diff.trials.perturbation import perturbation_named
 from drake_diff.trials.run import Cell, Robustness
 from drake_diff.trials.trial import Task
-from drake_diff.trials.trial_files import REPLAY, finite, write_trial
+from drake_diff.trials.trial_files import REPLAY, write_trial
 
 LATENCY = "latency"  # the perturbation whose levels are steps of the controller
 PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"

@@ -13,7 +13,7 @@ from drake_diff.logs.channels import TYPES, Shown, input_channel, motion_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.loop.run import OK
 from drake_diff.model.parameters import applied, select
-from drake_diff.runs.fields import canonical
+from drake_diff.runs.fields import canonical, finite
 from drake_diff.runs.plan_record import EventEvidence, TrialEvidence
 from drake_diff.trials.perturbation import Setup, perturbed
 from drake_diff.trials.trial import Task, Trial
@@ -87,10 +87,6 @@ def result_of(trial: Trial) -> dict[str, Any]:
         "failures": list(outcome.failures),
         "ended": outcome.run.ended,
     }
-
-
-def finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def write_trial_trace(path: Path, shown: Shown, trial: Trial) -> None:
