@@ -116,18 +116,6 @@ def test_a_gradient_that_is_not_its_own_steps_is_warned_of(load):
     assert len(comparison_data(found)["certificates"]) == 3
 
 
-def test_a_comparison_prints_in_a_few_lines(ball):
-    assert repr(ball).splitlines() == [
-        "sphere in 3 engines, 30 steps",
-        "  drake (sap, autodiff): the reference",
-        "  drake (lagged, autodiff): other law",
-        "  pinocchio: other model",
-        "  numpy: not compared",
-    ]
-    assert repr(ball.engines[1]).startswith("drake (lagged, autodiff): the same for 0.2")
-    assert repr(ball.engines[0].motion) == "31 states over 0.3 s: ok"
-
-
 def test_names_of_engines_are_escaped(load, tmp_path):
     model = load("pendulum.urdf")
     engine = Doctored(engine_of("drake", model), name="<script>alert(1)</script>")

@@ -1,7 +1,5 @@
 """What a record says of its own making: the robot, its data and its panel."""
 
-import json
-import re
 from hashlib import sha256
 
 import numpy as np
@@ -14,8 +12,6 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.runs.fields import DataBoundary, DataUse, canonical
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.provenance import embodiment_of
-from drake_diff.runs.read import KINDS
-from drake_diff.runs.sealed import READING, SCHEMA_VERSION
 from drake_diff.runs.sections import asked
 
 
@@ -106,15 +102,6 @@ def test_the_panel_is_that_of_the_replays_and_its_hash_is_its_own(record):
     told["panel"]["cases"] = told["panel"]["cases"][1:]
     with pytest.raises(ValidationError, match="panel: expected the 6 replays, got 5"):
         PlanRecord.model_validate(told)
-
-
-def test_every_published_schema_says_how_other_versions_are_read():
-    for kind in KINDS.values():
-        schema = json.loads(kind.published_schema())
-        assert schema["$comment"] == READING
-        assert schema["properties"]["schema_version"]["default"] == SCHEMA_VERSION
-    assert f"This is version {SCHEMA_VERSION}." in READING
-    assert re.search("earlier minor .* is read .* later minor .* is read .* major version is refused", READING)
 
 
 def test_a_record_of_the_schema_before_is_read_with_what_it_lacks_empty(record, tmp_path):

@@ -10,7 +10,6 @@ import pytest
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.pages.meshcat import write_replay
 from drake_diff.pages.scene import scene_of
@@ -45,10 +44,6 @@ def test_a_run_directory_holds_these_files_and_nothing_else(run):
     assert sorted(p.name for p in run.iterdir()) == names
 
 
-def test_the_record_comes_back_as_it_was_saved(swing_up, tmp_path):
-    assert dd.save(swing_up, tmp_path / "run") == dd.load_record(tmp_path / "run")
-
-
 def test_the_record_says_what_the_solution_measures(run, swing_up):
     record = dd.load_record(run)
     values = {metric.name: metric.value for metric in record.metrics}
@@ -77,13 +72,6 @@ def test_the_record_knows_contract_versions_and_model_file(run):
     assert record.contract["inputs"][0]["upper"] is None  # no limit: JSON knows no infinity
 
 
-def test_the_record_is_json_without_nan(run):
-    def refuse(constant):
-        raise AssertionError(constant)
-
-    json.loads((run / "record.json").read_text(), parse_constant=refuse)
-
-
 def test_the_hashes_in_the_record_are_the_files(run):
     files = dd.load_record(run).files
     assert set(files) == {"plan.npz", "record.schema.json", "trace.mcap", "replay.html", "report.html"}
@@ -100,13 +88,6 @@ def test_the_same_solve_gives_the_same_bytes_but_for_the_wall_clock(swing_up, ru
     assert (tmp_path / "pendulum" / "plan.npz").read_bytes() == (run / "plan.npz").read_bytes()
     apart = {"wall_clock", "files", "record_sha256"}
     assert record.model_dump(exclude=apart) == first.model_dump(exclude=apart)
-
-
-def test_as_row_has_the_keys_of_the_textbook(run):
-    row = dd.load_record(run).as_row()
-    assert list(row) == ["section", "tool", "observation", "action", "metric", "perturbation"]
-    assert "hinge_q [rad]" in row["observation"]
-    assert "motor [N m]" in row["action"]
 
 
 def test_an_unfinished_run_says_so(swing_up, tmp_path):
@@ -132,19 +113,6 @@ def test_a_motion_that_is_not_finite_is_recorded_as_missing_not_as_zero(swing_up
     assert (metrics["defect"].value, metrics["defect"].verdict) == (None, "fail")
     assert metrics["penetration"].value is None
     assert "could not be stepped" in metrics["penetration"].reason
-
-
-def test_a_record_that_was_edited_out_of_its_schema_is_refused(run, tmp_path):
-    text = (run / "record.json").read_text()
-    for old, new in (('"verdict": "pass"', '"verdict": "great"'), ('"schema_version"', '"schema"'), ("{", "")):
-        (tmp_path / "record.json").write_text(text.replace(old, new))
-        with pytest.raises(ArtifactError, match=r"record\.json"):
-            dd.load_record(tmp_path)
-
-
-def test_a_directory_without_a_record_is_refused(tmp_path):
-    with pytest.raises(ArtifactError, match="no such record"):
-        dd.load_record(tmp_path)
 
 
 def test_the_trace_gives_back_states_and_inputs_bit_for_bit(run, swing_up):
@@ -250,13 +218,6 @@ def test_a_refined_mesh_comes_back_and_is_measured_at_the_problem_s_own_knots(sw
     assert len(trace.xs) == 41
     assert dd.verify(tmp_path / "run").require().holds
     assert record.problem["num_steps"] == 40
-
-
-def test_the_replay_is_one_offline_page(run):
-    page = (run / "replay.html").read_text()
-    assert len(page) > 2_000_000  # the viewer is inside: a wheel without it shipped once
-    assert "<title>pendulum: converged</title>" in page
-    assert 'src="http' not in page
 
 
 def test_a_hostile_title_or_body_name_does_no_harm(tmp_path):

@@ -65,16 +65,6 @@ def test_the_same_content_gives_the_same_bytes(tmp_path):
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
-def test_a_channel_without_messages_is_still_there(tmp_path):
-    write(tmp_path / "a.mcap", [])
-    assert read_mcap(tmp_path / "a.mcap").messages == {"/state": []}
-
-
-def test_nothing_is_left_beside_the_file(tmp_path):
-    write(tmp_path / "a.mcap", states())
-    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
-
-
 def test_a_cut_file_is_refused(tmp_path):
     path = tmp_path / "a.mcap"
     write(path, states())
@@ -102,15 +92,6 @@ def test_a_file_that_is_no_mcap_or_missing_is_refused(tmp_path):
     for name in ("a.mcap", "missing.mcap"):
         with pytest.raises(ArtifactError, match=name):
             read_mcap(tmp_path / name)
-
-
-def test_a_logs_repr_is_short_and_its_html_is_escaped(tmp_path):
-    write_mcap(tmp_path / "a.mcap", [Channel("/<b>", STATE, states(5), {})], {}, {})
-    log = read_mcap(tmp_path / "a.mcap")
-    assert repr(log) == "McapLog: 5 messages in 1 channels, 0 attachments\n  /<b> (5)"
-    assert str(log) == "5 messages in 1 channels, 0 attachments"
-    assert "/&lt;b&gt; (5)" in log._repr_html_()
-    assert "<b>" not in log._repr_html_()
 
 
 def test_every_message_has_a_unit_for_every_number():

@@ -376,19 +376,6 @@ def test_a_millionth_is_what_machines_round_differently(recorded, again, near):
     assert is_near(recorded, again) == near
 
 
-def test_a_verification_prints_what_it_found(run, copy):
-    head, *lines = repr(dd.verify(run)).splitlines()
-    assert head.startswith(f"Verification of {run}: holds, run again, all ")
-    assert (
-        "  claimed: from hinge_q 0, hinge_w 0 to hinge_q 1, hinge_w 0 in 20 intervals of 0.02 s, horizon 0.4 s" in lines
-    )
-    assert any("not checked: wall_clock" in line for line in lines)
-    (copy / "<b>").write_text("x")
-    found = dd.verify(copy)
-    assert "<b>: record.json does not list it" in repr(found)
-    assert "&lt;b&gt;: record.json" in found._repr_html_()
-
-
 def test_a_plan_of_another_run_is_found_although_all_hashes_are_right(run, other_run, copy):
     shutil.copy(other_run / "plan.npz", copy / "plan.npz")
     dd.load_record(copy).write(copy)

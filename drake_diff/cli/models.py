@@ -66,7 +66,7 @@ def certify(
 ) -> None:
     """Compare the derivatives of MODEL's step with finite differences, entry by entry, at sampled states.
 
-    Writes certification.json. Exit status 0 only if every certificate agrees.
+    Writes record.json. Exit status 0 only if every certificate agrees.
     """
     from drake_diff.runs.certificates import certify_model
 
