@@ -21,7 +21,7 @@ import drake_diff as dd
 from drake_diff.exceptions import ArtifactError
 from drake_diff.runs import measure
 from drake_diff.runs.fields import DataBoundary, Metric, canonical
-from drake_diff.runs.plan_record import PlanRecord, RolloutSection
+from drake_diff.runs.plan_record import PlanRecord, RolloutSection, SlopeEvidence
 from drake_diff.runs.provenance import named_files
 from drake_diff.runs.read import KINDS, parse_record
 from drake_diff.runs.sealed import SCHEMA_VERSION, own_sha256
@@ -69,6 +69,8 @@ def records_of(model):
     if model is PlanRecord:
         fields |= {"schema_version": st.just(SCHEMA_VERSION), "verdict": st.just("fail")}
         fields |= {"panel": st.none()}  # it rests on replays
+    if model is SlopeEvidence:
+        fields |= dict.fromkeys(("exists", "value", "error"), st.none())
     if model is RolloutSection:
         fields |= dict.fromkeys(("columns", "derivative", "verdicts"), st.just([]))
     if model is DataBoundary:
@@ -263,7 +265,7 @@ def test_energy_from_nowhere_fails_where_the_verdict_rests_on_that_motion():
     potential = solution.replay.potential_energy + np.linspace(0, 100, len(solution.replay.times))
     off = with_replay(solution, potential_energy=potential)
     for rests_on, verdict in ((off.replay, "fail"), (solution.replay, "info")):
-        holding = [dataclasses.replace(r, failures=(), motion=rests_on) for r in solution.replays]
+        holding = [dataclasses.replace(r, checks=(), motion=rests_on) for r in solution.replays]
         vars(off)["replays"] = tuple(holding)
         found = {m.name: m for m in measure(off).metrics}["energy drift"]
         assert found.value > 40

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import finite_array, positive_int
 from drake_diff._base.files import write_whole
 from drake_diff.certificates.certify import certify
-from drake_diff.certificates.rollout import RolloutCertificate
-from drake_diff.certificates.sampled import SampledCertificate
+from drake_diff.certificates.rollout import RolloutCertificate, SampledCertificate
 from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import active_modes
