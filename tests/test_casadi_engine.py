@@ -1,13 +1,11 @@
 """adam's CasADi expressions against hand calculations and Drake, and the URDF that they are built from."""
 
-import subprocess
-import sys
 import warnings
 
 import numpy as np
 import pytest
 from helpers.contracts import different
-from helpers.engines import HERE, ROBOTS, G, assert_free_steps_agree, engine_of, needs
+from helpers.engines import G, assert_free_steps_agree, engine_of, needs
 from helpers.models import Plant, robot
 from helpers.table import each_row
 from pydrake.geometry import Role
@@ -54,17 +52,6 @@ def turned(*, free):
         add_joint(plant.plant, kind, f"{name}_joint", parent, body, axis)
         parent = body.body_frame()
     return plant.model()
-
-
-# 1e-12: M and bias are sums over a tree in another order than Drake's, solved once; Jacobians of the same.
-@each_row("file", HERE)
-def test_casadi_is_drake(load, file):
-    assert_free_steps_agree(load(file), "casadi", 1e-12, 1e-12)
-
-
-@each_row("name", ROBOTS)
-def test_casadi_is_drake_on_robots(tmp_path, name):
-    assert_free_steps_agree(robot(name, tmp_path), "casadi", 1e-12, 1e-12, states=2)
 
 
 @pytest.mark.parametrize("free", [False, True])
@@ -155,27 +142,6 @@ def test_a_free_body_of_another_body_is_refused():
     plant.plant.AddJoint(QuaternionFloatingJoint("lifted", base.body_frame(), top.body_frame()))
     with pytest.raises(ModelError, match="lifted"):
         engine_of("casadi", plant.model())
-
-
-def test_casadi_falls_through_the_ground_and_says_so(load):
-    model = load("sphere_on_ground.sdf")
-    engine, x = engine_of("casadi", model), model.default_state
-    x[6] = 0.05
-    assert engine.step(x, [])[12] == pytest.approx(-G * 0.01)
-    assert engine.contact_depth(x) == 0
-    assert "no contact" in different(dd.engines.load_engine("drake", model), engine)["contact law"]
-
-
-@pytest.mark.parametrize("module", ["adam", "liecasadi"])
-def test_a_missing_adam_is_named_with_its_extra(module):
-    code = f"""import sys; sys.modules[{module!r}] = None
-import drake_diff as dd
-from drake_diff.exceptions import MissingDependencyError
-try: dd.engines.load_engine("casadi", None)
-except dd.exceptions.MissingDependencyError as error: print(error)"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install 'drake-diff[engines]'" in done.stdout
-    assert module in done.stdout
 
 
 # ---- URDF ----------------------------------------------------------------------------------------------------------

@@ -3,23 +3,17 @@
 JAX compiles for seconds per model: all of them are slow.
 """
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from helpers.contracts import arms, different
 from helpers.engines import (
-    HERE,
     G,
-    assert_free_bodies_differ_by_the_exponential,
-    assert_free_steps_agree,
     engine_of,
     needs,
     on_tangent,
 )
 from helpers.forward_formula import free_box
-from helpers.models import MODELS, Plant, contact_properties, random_state, robot
+from helpers.models import MODELS, Plant, contact_properties, random_state
 from helpers.plants import block_on_rails
 from pydrake.geometry import Box, Cylinder
 from pydrake.math import RigidTransform
@@ -28,7 +22,7 @@ from pydrake.multibody.tree import SpatialInertia
 import drake_diff as dd
 from drake_diff.engines.closed_form import MassSpringDamper, NumpyEngine
 from drake_diff.engines.formats import mjcf
-from drake_diff.exceptions import GradientError, ModelError, SimulationError
+from drake_diff.exceptions import GradientError, ModelError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.tangent import tangent_space
 
@@ -69,26 +63,6 @@ def test_mass_spring_damper_by_hand_and_jax_is_left_as_it_was(load):
     import jax.numpy as jnp
 
     assert jnp.ones(1).dtype == jnp.float32
-
-
-# 1e-11: a step through soft limits that are not reached, solved by Newton to 1e-12 and not in closed form.
-@pytest.mark.parametrize("file", [f for f in HERE if f != "projectile.sdf"])
-def test_mjx_is_drake_where_no_body_is_free(load, file):
-    assert_free_steps_agree(load(file), "mjx", 1e-11, 1e-11)
-
-
-@pytest.mark.parametrize("name", ["ur5_robot.urdf", "double_pendulum_continuous.urdf"])
-def test_mjx_is_drake_on_fixed_robots(tmp_path, name):
-    assert_free_steps_agree(robot(name, tmp_path), "mjx", 1e-11, 1e-11, states=2)
-
-
-@pytest.mark.parametrize("name", ["panda.urdf", "solo12.urdf"])
-def test_mjx_differs_on_free_bodies_by_the_quaternions_exponential_alone(tmp_path, name):
-    assert_free_bodies_differ_by_the_exponential(robot(name, tmp_path), "mjx", states=1)
-
-
-def test_mjx_differs_on_a_projectile_by_the_quaternions_exponential_alone(load):
-    assert_free_bodies_differ_by_the_exponential(load("projectile.sdf"), "mjx")
 
 
 def test_a_turn_from_rest_has_its_derivative_and_says_that_mjx_has_it_not():
@@ -244,27 +218,3 @@ def test_other_friction_and_stiffness_are_found(tmp_path):
     assert "0.444" in found["friction"]
     same = different(dd.engines.load_engine("drake", needed), engine_of("mjx", needed))
     assert same.keys() == {"contact law", "solver tolerance", "integrator"}
-
-
-def test_effort_limits_cut_and_the_derivative_is_zero_there(load):
-    model = load("cart_pole.urdf")
-    engine, x, u = engine_of("mjx", model), [0.1, 0.4, 0.2, -0.3], [25.0]
-    np.testing.assert_allclose(engine.step(x, u), dd.engines.load_engine("drake", model).step(x, u), rtol=0, atol=1e-12)
-    assert np.abs(engine.differentiate_step(x, u).B).max() == 0
-
-
-def test_what_mjx_cannot_step_is_an_error(load):
-    engine = engine_of("mjx", load("mass_spring_damper.sdf"))
-    with pytest.raises(SimulationError, match="MJX"):
-        engine.step([0.0, 1e308], [0.0])
-
-
-@pytest.mark.parametrize("module", ["jax", "mujoco.mjx"])
-def test_a_missing_mjx_is_named_with_its_extra(module):
-    code = f"""import sys; sys.modules[{module!r}] = None
-import drake_diff as dd
-from drake_diff.exceptions import MissingDependencyError
-try: dd.engines.load_engine("mjx", None)
-except dd.exceptions.MissingDependencyError as error: print(error)"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install 'drake-diff[mjx]'" in done.stdout

@@ -68,7 +68,7 @@ def test_the_panel_in_the_documents_runs(tmp_path):
 NAMES = re.compile(r"Python 3\.1\d|\(3\.11, and 3\.12|ROS\s2|h/\d+|BSD-3|ICML 2022|Wild, 2011|\^2|_?invweight0")
 SAP = "drake_diff.model.contract:SAP_RELATIVE_TOLERANCE"
 TABLE = "tests/test_contact_table.py::test_the_table_in_the_documents_is_this_table"
-TURN = "tests/test_engines.py::test_mujoco_differs_on_free_bodies_by_the_quaternions_exponential_alone"
+TURN = "tests/test_engines.py::test_free_bodies_differ_by_the_quaternions_exponential_alone"
 RESTING = "tests/test_contact_contract.py::test_the_stiffness_that_is_read_is_that_on_which_a_weight_rests_in_mujoco"
 FORWARD = "tests/test_contact_table.py::test_what_the_documents_say_of_physx_and_newton"
 BOUNCES = "tests/test_impact_cases.py::test_the_readmes_table_of_a_bounce_and_a_toss"
@@ -131,13 +131,13 @@ SOURCES = {
         "0.01": "tests/test_gradient_panel.py::test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order",
     },
     "docs/engines.md": {
-        "1e-13": "tests/test_engines.py::test_the_hand_calculation_is_drake",
-        "1e-12": "tests/test_engines.py::test_pinocchio_is_drake",
-        "1e-10": "tests/test_engines.py::test_mujoco_is_drake_where_no_body_is_free",
-        "1e-11": "tests/test_mjx_engine.py::test_mjx_is_drake_where_no_body_is_free",
+        "1e-13": "tests/test_engines.py::test_the_step_and_its_jacobian_are_drakes",
+        "1e-12": "tests/test_engines.py::test_the_step_and_its_jacobian_are_drakes",
+        "1e-10": "tests/test_engines.py::test_the_step_and_its_jacobian_are_drakes",
+        "1e-11": "tests/test_engines.py::test_the_step_and_its_jacobian_are_drakes",
         "8": TURN,
-        "4e-6": "tests/test_newton_engine.py::",
-        "1e-6": "tests/test_sapien_engine.py::",
+        "4e-6": "tests/test_engines.py::test_without_explicit_damping_the_step_is_drakes_and_else_the_formula",
+        "1e-6": "tests/test_engines.py::test_without_explicit_damping_the_step_is_drakes_and_else_the_formula",
         "1": RESTING,
     },
     "docs/limitations.md": {

@@ -15,16 +15,23 @@ ROBOTS = ["panda.urdf", "ur5_robot.urdf", "solo12.urdf", "double_pendulum_contin
 G = 9.81
 
 
+# The modules that an engine needs, and the extra that has them.
+NEEDED = {
+    "mujoco": (["mujoco"], "engines"),
+    "pinocchio": (["pinocchio"], "engines"),
+    "casadi": (["adam", "liecasadi"], "engines"),
+    "mjx": (["jax", "mujoco.mjx", "mujoco"], "mjx"),
+    "newton": (["newton"], "forward"),
+    "sapien": (["sapien"], "forward"),
+    "pybullet": (["pybullet"], "forward"),
+}
+
+
 def needs(engine):
     """Skip, saying what is missing, where the engine is not installed."""
-    modules = {
-        "mujoco": ["mujoco"],
-        "pinocchio": ["pinocchio"],
-        "casadi": ["adam", "liecasadi"],
-        "mjx": ["mujoco", "mujoco.mjx", "jax"],
-    }.get(engine, [])
-    if any(find_spec(module) is None for module in modules):
-        pytest.skip(f"{engine} is not installed: pip install 'drake-diff[{'mjx' if engine == 'mjx' else 'engines'}]'")
+    modules, extra = NEEDED.get(engine, ([], ""))
+    if any(find_spec(module.split(".")[0]) is None or find_spec(module) is None for module in modules):
+        pytest.skip(f"{engine} is not installed: pip install 'drake-diff[{extra}]'")
 
 
 def engine_of(name, model, **options):
