@@ -22,7 +22,7 @@ import drake_diff as dd
 from drake_diff._base.statistics import success_rate
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
-from drake_diff.panels.evaluation import row_of
+from drake_diff.panels.panel import row_of
 from drake_diff.panels.panel_file import expand, load_panel
 from drake_diff.panels.results import ranked
 from drake_diff.runs import list_runs

@@ -31,6 +31,7 @@ from drake_diff.runs.fields import FiniteTable
 
 # Names of what drake_diff itself gives each trial; an axis, cell or fixed value cannot have them.
 OURS = ("id", "repeat", "seed")
+Row = dict[str, Any]  # what came of a trial, in JSON's types
 
 
 class Panel(BaseModel):

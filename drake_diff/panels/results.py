@@ -22,8 +22,7 @@ from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import success_rate
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.pages.html import page_data, write_page
-from drake_diff.panels.evaluation import Row
-from drake_diff.panels.panel_file import PanelTrial, canonical, cell_name
+from drake_diff.panels.panel_file import PanelTrial, Row, canonical, cell_name
 from drake_diff.runs.directory import is_taken
 from drake_diff.runs.fields import ModelInput
 from drake_diff.runs.other_records import TRIALS, ComparisonRecord, PanelSection, trial_record
