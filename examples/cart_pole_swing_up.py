@@ -16,7 +16,7 @@ import drake_diff as dd
 
 MODEL = Path(__file__).parent.parent / "models" / "cart_pole.urdf"
 HORIZON = 2.0  # [s]
-solve_options: dict[str, Any] = {"method": "shooting", "solver": "ipopt"}
+solve_options: dict[str, Any] = {"method": "shooting"}
 
 
 def problem(num_steps: int = 100) -> dd.Problem:
@@ -35,7 +35,7 @@ def main() -> None:
     print("the best motion known of the continuous problem has J = 57.9448; from u = 0 another is found, of 58.8077")
     for num_steps in (50, 100):
         for method in ("collocation", "shooting"):
-            solution = dd.solve(problem(num_steps), method=method, solver="ipopt")
+            solution = dd.solve(problem(num_steps), method=method)
             if solution.replay is None:
                 raise SystemExit(solution.message)
             gap = np.abs(solution.replay.xs[-1] - solution.xs[-1]).max()

@@ -73,7 +73,6 @@ POSITIVE = {
 COUNTS = {
     "num_steps": lambda m, v: problem(m, num_steps=v),
     "max_iterations": lambda m, v: dd.solve(problem(m), max_iterations=v),
-    "segments": lambda m, v: dd.solve(problem(m), method="shooting", segments=v),
     "max_num_steps": lambda m, v: dd.solve(problem(m), max_num_steps=v),
     "waypoints": lambda m, v: problem(m, waypoints=v if isinstance(v, (list, np.ndarray)) else {v: [0, 0]}),
 }

@@ -153,7 +153,7 @@ def test_a_bug_in_the_script_exits_with_4_and_its_traceback(tmp_path, monkeypatc
 
 
 def test_ctrl_c_ends_the_run_with_the_best_motion_so_far(tmp_path):
-    options = {"method": "shooting", "solver": "ipopt", "tolerance": 1e-14, "max_iterations": 100000}
+    options = {"method": "shooting", "tolerance": 1e-14, "max_iterations": 100000}
     running = start(script(tmp_path, num_steps=400, options=options), tmp_path)
     wait_until(lambda: list((tmp_path / "artifacts").glob("task.partial-*/record.json")))
     time.sleep(2.0)
@@ -225,7 +225,7 @@ def test_what_is_interrupted_stays_beside_an_earlier_run(tmp_path, number):
     earlier, runs = script(tmp_path, num_steps=5), tmp_path / "artifacts"
     start(earlier, tmp_path).wait(timeout=60)
     before = dd.load_record(runs / "task")
-    options = {"method": "shooting", "solver": "ipopt", "tolerance": 1e-14, "max_iterations": 100000}
+    options = {"method": "shooting", "tolerance": 1e-14, "max_iterations": 100000}
     running = start(script(tmp_path, num_steps=400, options=options), tmp_path)
     wait_until(lambda: list(runs.glob("task.partial-*/record.json")))
     time.sleep(1.0)

@@ -1,4 +1,4 @@
-"""Waypoints and constraints by iLQR and by shooting, single and multiple, against closed forms."""
+"""Waypoints and constraints by iLQR and by shooting, against closed forms."""
 
 import dataclasses
 
@@ -16,8 +16,7 @@ from drake_diff.optimize.solution import Status
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 METHODS = {
     "ilqr": {"method": "ilqr"},
-    "single": {"method": "shooting", "solver": "ipopt"},
-    "multiple": {"method": "shooting", "solver": "snopt", "segments": 5},
+    "shooting": {"method": "shooting"},
 }
 by_each_method = pytest.mark.parametrize("method", METHODS)
 
@@ -65,8 +64,7 @@ def test_a_waypoint_is_the_kkt_systems_solution(method):
 
 
 @by_each_method
-def test_a_waypoint_where_segments_meet_is_kept_too(method):
-    """5 segments of 20 steps meet at 12."""
+def test_a_waypoint_of_a_whole_state_is_kept_too(method):
     S = double_integrator(20)
     us = least_effort(20, np.vstack([S[20], S[12]]), np.array([1, 0, 0.2, -0.5]))
     solution = solved(move(waypoints={12: [0.2, -0.5]}), method)

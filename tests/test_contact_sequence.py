@@ -11,7 +11,7 @@ import drake_diff as dd
 from drake_diff.model.soft_contact import separations
 from drake_diff.model.step import set_state
 from drake_diff.optimize.ilqr.through_contact import MARGIN, beginnings, restore_goal
-from drake_diff.optimize.shooting import ShootingVariables, state_sensitivities
+from drake_diff.optimize.shooting import ShootingVariables
 from drake_diff.optimize.solution import Status
 
 
@@ -122,7 +122,10 @@ def test_a_minimum_at_a_jump_meets_the_conditions_of_one_on_its_side(elastic):
     apart = distance[knot] > 0
     assert f"held by pusher and ball {'apart' if apart else 'touching'} at knot {knot} (beyond: " in note
     variables = ShootingVariables(problem)
-    by_u = state_sensitivities(variables, variables.pack(solution.xs[0], solution.us))
+    by_u = [np.zeros((problem.nx, solution.us.size))]
+    for k, d in enumerate(variables.linearization(variables.pack(solution.xs[0], solution.us))):
+        by_u.append(d.A @ by_u[-1])
+        by_u[-1][:, k : k + 1] += d.B
     slopes = np.stack([by_u[-1][1], by_u[knot][1] - by_u[knot][0]], axis=1)
     u = solution.us.ravel()
     multipliers = np.linalg.lstsq(slopes, u)[0]

@@ -245,13 +245,13 @@ def test_a_derivative_that_another_integration_does_not_have_is_no_plans(monkeyp
     model = ball_on_rails(gravity=9.81, time_step=0.02)
     right = slope.final_sensitivity
     monkeypatch.setattr(slope, "final_sensitivity", lambda *at: 1.02 * right(*at))
-    off = dd.solve(thrown(model), method="shooting", solver="ipopt")
+    off = dd.solve(thrown(model), method="shooting")
     assert off.status is dd.Status.CONVERGED_NOT_VERIFIED
     assert "off the slope that another integration has" in off.message
     monkeypatch.setattr(slope, "final_sensitivity", right)
     measured, factors = slope._slope, iter([1.5, 0.4, 1.7] * 9)
     monkeypatch.setattr(slope, "_slope", lambda *at: next(factors) * measured(*at))
-    tumbles = dd.solve(thrown(model), method="shooting", solver="ipopt")
+    tumbles = dd.solve(thrown(model), method="shooting")
     assert tumbles.status is dd.Status.NO_GRADIENT
     assert "that of a point alone" in tumbles.message
 

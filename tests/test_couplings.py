@@ -10,7 +10,6 @@ from helpers.models import MODELS
 import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.optimize import Coupling, Periodic
-from drake_diff.optimize.shooting import SegmentedMotion, limits_of_coupling
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.optimize.transcription.program import TranscribedProgram
 
@@ -91,24 +90,12 @@ def test_what_cannot_be_traced_is_called_back():
     assert abs(solution.xs[15, 0] - solution.xs[5, 0] - 0.4) < 1e-6
 
 
-@pytest.mark.parametrize(("method", "segments"), [("collocation", 1), ("shooting", 1), ("shooting", 4)])
-def test_a_pendulum_swings_in_a_period(method, segments):
-    solution = dd.solve(swing(), method=method, segments=segments)
+@pytest.mark.parametrize("method", ["collocation", "shooting"])
+def test_a_pendulum_swings_in_a_period(method):
+    solution = dd.solve(swing(), method=method)
     assert solution.success
     assert np.max(np.abs(solution.xs[-1] - solution.xs[0])) < 1e-6
     assert abs(solution.xs[20, 0] - 0.8) < 1e-6
-
-
-def test_rows_of_a_rollout_have_the_slopes_of_differences():
-    both = Coupling(lambda a, b, u, w: [a[0] * b[1] + u[0], np.sin(b[0]) * w[0]], knots=(3, 8), upper=1.0)
-    problem = swing(num_steps=12, waypoints=None, couplings=[both, Periodic(name="repeats")], us=np.full((12, 1), 0.3))
-    motion = SegmentedMotion(problem, 3)
-    z = np.random.default_rng(1).normal(0, 0.5, motion.size)
-    for coupling in problem.coupled(input_at_end=False):
-        rows = limits_of_coupling(motion, coupling)
-        steps = 1e-6 * np.eye(motion.size)
-        wanted = np.array([(rows.values(z + e) - rows.values(z - e)) / 2e-6 for e in steps]).T
-        assert np.max(np.abs(rows.jacobian(z) - wanted)) < 1e-7
 
 
 def test_a_motion_that_does_not_repeat_is_refused():

@@ -169,8 +169,6 @@ def test_what_a_page_draws_is_where_the_goal_is():
         ("collocation", {"scheme": "trapezoid"}),
         ("collocation", {"scheme": "drake"}),
         ("shooting", {}),
-        ("shooting", {"solver": "ipopt"}),
-        ("shooting", {"segments": 4}),
         ("ilqr", {}),
     ],
 )

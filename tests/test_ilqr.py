@@ -105,7 +105,7 @@ def test_a_swing_up_within_bounds_meets_them_and_the_conditions_of_an_optimum():
     assert np.abs(gradient[np.abs(us) < 2.5]).max() < 1e-6
     assert np.all(gradient[us == 2.5] <= 0)
     assert np.all(gradient[us == -2.5] >= 0)
-    shooting = dd.solve(problem, method="shooting", solver="snopt")
+    shooting = dd.solve(problem, method="shooting")
     assert shooting.success, shooting.message
     assert shooting.cost == pytest.approx(solution.cost, rel=1e-6)
 
@@ -297,7 +297,7 @@ def test_a_velocity_limit_is_met_and_pays():
     apart = falls[slack > 1e-3]
     assert np.ptp(apart) < 1e-6
     assert falls.min() > apart.max() - 1e-6 or falls.max() < apart.min() + 1e-6
-    shooting = dd.solve(problem, method="shooting", solver="ipopt")
+    shooting = dd.solve(problem, method="shooting")
     assert shooting.success, shooting.message
     assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
 
@@ -306,7 +306,7 @@ def test_a_velocity_limit_is_met_and_pays():
 def test_input_bounds_with_a_goal_give_the_optimum_of_ipopt(bounds):
     problem = move(**bounds)
     a = dd.solve(problem, method="ilqr")
-    b = dd.solve(problem, method="shooting", solver="ipopt")
+    b = dd.solve(problem, method="shooting")
     assert a.success, a.message
     assert a.us.min() == bounds["u_lower"][0]
     assert a.cost == pytest.approx(b.cost, rel=1e-6)
@@ -340,7 +340,7 @@ def test_a_floating_body_is_turned_upright_and_stopped():
     problem = dd.Problem(model, x0=tilted(model), x_goal=goal, num_steps=40, running_cost=cost)
     solution = dd.solve(problem, method="ilqr")
     assert solution.success, solution.message
-    shooting = dd.solve(problem, method="shooting", solver="ipopt")
+    shooting = dd.solve(problem, method="shooting")
     assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
 
 
@@ -392,7 +392,7 @@ def test_a_free_initial_velocity_drifts_to_the_goal():
         bounds=dd.Bounds(x_upper=[np.inf, 0.7]),
         **fields,
     )
-    a, b = dd.solve(slow, method="ilqr"), dd.solve(slow, method="shooting", solver="ipopt")
+    a, b = dd.solve(slow, method="ilqr"), dd.solve(slow, method="shooting")
     assert a.success, a.message
     assert a.xs[0, 1] == pytest.approx(0.7, abs=1e-12)
     assert a.cost == pytest.approx(b.cost, rel=1e-6)
@@ -464,7 +464,7 @@ def test_a_swing_up_converges_as_newtons_method_does():
     solution = dd.solve(problem, method="ilqr")
     assert solution.success, solution.message
     assert len(solution.iterations) < 70
-    shooting = dd.solve(problem, method="shooting", solver="ipopt", initial_guess=solution)
+    shooting = dd.solve(problem, method="shooting", initial_guess=solution)
     assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
 
 
@@ -546,7 +546,7 @@ def test_limits_cost_few_steps(seed):
     assert result.outcome is Outcome.SOLVED
     assert len(result.iterations) <= 61
     assert np.max(np.maximum(xs - upper, lower - xs)[1:]) < 1e-8
-    shooting = dd.solve(problem, method="shooting", solver="ipopt", initial_guess=(xs, us))
+    shooting = dd.solve(problem, method="shooting", initial_guess=(xs, us))
     assert problem.objective(xs, us) <= shooting.cost * (1 + 1e-6)
 
 

@@ -1,7 +1,5 @@
 """What callbacks get of a search: the motion at which the solver stands, and never an earlier one."""
 
-import itertools
-
 import numpy as np
 import pytest
 from helpers.models import MODELS
@@ -44,22 +42,19 @@ def searched(problem, **options):
 
 @pytest.mark.usefixtures("every_point")
 @pytest.mark.parametrize(
-    "options",
-    [{"method": "ilqr"}, {"method": "shooting"}, {"method": "shooting", "solver": "snopt", "segments": 4}],
-    ids=["ilqr", "ipopt", "snopt"],
+    "method",
+    ["ilqr", "shooting"],
 )
-def test_states_are_those_of_the_inputs_whose_cost_is_told(swing, options):
-    """The cost is h sum u^2, and the states are what Drake's steps make of the inputs, segment by segment."""
-    rows, solution = searched(swing, **options)
-    ends = np.linspace(0, 20, options.get("segments", 1) + 1).astype(int)
+def test_states_are_those_of_the_inputs_whose_cost_is_told(swing, method):
+    """The cost is h sum u^2, and the states are where Drake's steps lead, to the violation that is told."""
+    rows, solution = searched(swing, method=method)
     for row in rows:
         assert row.objective == pytest.approx(0.05 * float(np.sum(row.us**2)), rel=1e-12)
         np.testing.assert_allclose(row.times, 0.05 * np.arange(21), atol=1e-15)
-        for a, b in itertools.pairwise(ends):
-            rolled = dd.rollout(swing.model, row.xs[a], row.us[a:b]).xs
-            last = b + (b == 20)
+        for x, u, after in zip(row.xs, row.us, row.xs[1:], strict=False):
             # iLQR tries motions by the compiled form of the step, which is Drake's but for rounding
-            np.testing.assert_allclose(row.xs[a:last], rolled[: last - a], atol=1e-9)
+            allowed = max(1e-9, 1.01 * row.primal_infeasibility)
+            np.testing.assert_allclose(dd.step(swing.model, x, u), after, atol=allowed)
     assert len({row.us.tobytes() for row in rows}) > 1
     np.testing.assert_allclose(rows[-1].us, solution.us, atol=1e-3)
 

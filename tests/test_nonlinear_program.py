@@ -1,4 +1,4 @@
-"""SNOPT and IPOPT behind one function: outcomes in one vocabulary, limits and Ctrl-C kept, their tables read."""
+"""SNOPT on a program of Drake: outcomes in our vocabulary, limits and Ctrl-C kept, its table read; and the watch."""
 
 import math
 import signal
@@ -7,13 +7,12 @@ import threading
 import numpy as np
 import pytest
 from helpers.table import each_row
-from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver
+from pydrake.solvers import MathematicalProgram, SnoptSolver
 
-from drake_diff.exceptions import GradientError, MissingDependencyError, SimulationError, UnknownNameError
-from drake_diff.optimize.drake_program import _ipopt_rows, _snopt_rows, solve_program
+from drake_diff.exceptions import GradientError, MissingDependencyError, SimulationError
 from drake_diff.optimize.program import Limits, Outcome, Report, Watch
+from drake_diff.optimize.transcription.drake import _snopt_rows, _solve_snopt
 
-SOLVERS = ("ipopt", "snopt")
 UNLIMITED = Limits(max_iterations=500, time_limit=math.inf, tolerance=1e-8)
 
 
@@ -39,54 +38,47 @@ def flat_bowl(z):
     return (z[0] - 1) ** 4 + (z[1] + 2) ** 4
 
 
-def run(p, *, solver, guess=(0.0, 0.0), limits=UNLIMITED, report=None):
-    return solve_program(p, np.array(guess), solver=solver, limits=limits, report=Report(report))
+def run(p, *, guess=(0.0, 0.0), limits=UNLIMITED, report=None):
+    return _solve_snopt(p, np.array(guess), limits, Report(report), lambda z: ())
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_minimum_on_a_circle_is_found(solver):
+def test_a_minimum_on_a_circle_is_found():
     """min -x - y on x^2 + y^2 = 2 is at (1, 1)."""
     p = program(lambda z: -z[0] - z[1], constraint=lambda z: z[0] ** 2 + z[1] ** 2, lower=2, upper=2)
-    result = run(p, solver=solver, guess=(1.5, 0.5))
+    result = run(p, guess=(1.5, 0.5))
     assert result.outcome is Outcome.SOLVED, result.message
     assert result.z == pytest.approx([1, 1], abs=1e-6)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_constraints_that_no_point_meets_are_infeasible(solver):
+def test_constraints_that_no_point_meets_are_infeasible():
     p = program(lambda z: z @ z, constraint=lambda z: z[0] ** 2 + z[1] ** 2, lower=-5, upper=-1)
-    result = run(p, solver=solver, guess=(1.0, 1.0))
+    result = run(p, guess=(1.0, 1.0))
     assert result.outcome is Outcome.INFEASIBLE
     assert result.message
 
 
 def test_snopt_says_that_a_cost_has_no_bottom():
     p = program(lambda z: -z[0], constraint=lambda z: z[0] - z[1] ** 2, lower=0, upper=np.inf)
-    assert run(p, solver="snopt", guess=(1.0, 1.0)).outcome is Outcome.UNBOUNDED
+    assert run(p, guess=(1.0, 1.0)).outcome is Outcome.UNBOUNDED
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_solver_that_stops_short_of_its_tolerance_is_inaccurate(solver):
-    """IPOPT calls it an acceptable point: a solution at 1e-6, whatever tolerance was asked for."""
-    result = run(program(flat_bowl), solver=solver, limits=Limits(500, math.inf, 1e-30))
+def test_a_solver_that_stops_short_of_its_tolerance_is_inaccurate():
+    result = run(program(flat_bowl), limits=Limits(500, math.inf, 1e-30))
     assert result.outcome is Outcome.INACCURATE, result.message
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_the_iteration_limit_is_told(solver):
-    result = run(program(rosenbrock), solver=solver, guess=(-1.2, 1.0), limits=Limits(3, math.inf, 1e-8))
+def test_the_iteration_limit_is_told():
+    result = run(program(rosenbrock), guess=(-1.2, 1.0), limits=Limits(3, math.inf, 1e-8))
     assert result.outcome is Outcome.ITERATION_LIMIT
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_the_time_limit_ends_it_at_the_best_point_so_far(solver):
-    result = run(program(rosenbrock), solver=solver, guess=(-1.2, 1.0), limits=Limits(500, 1e-6, 1e-8))
+def test_the_time_limit_ends_it_at_the_best_point_so_far():
+    result = run(program(rosenbrock), guess=(-1.2, 1.0), limits=Limits(500, 1e-6, 1e-8))
     assert result.outcome is Outcome.TIME_LIMIT
     assert rosenbrock(result.z) <= rosenbrock(np.array([-1.2, 1.0]))
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_the_best_point_is_a_feasible_one_where_there_is_one(solver, monkeypatch):
+def test_the_best_point_is_a_feasible_one_where_there_is_one(monkeypatch):
     """Ctrl-C a few evaluations in: the guess is feasible, and no infeasible point may win by its lower cost."""
     monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     p = program(lambda z: z[0] + z[1], constraint=lambda z: z[0] ** 2 + z[1] ** 2, lower=2, upper=2)
@@ -97,14 +89,13 @@ def test_the_best_point_is_a_feasible_one_where_there_is_one(solver, monkeypatch
         if len(lines) == 3:
             signal.raise_signal(signal.SIGINT)
 
-    result = run(p, solver=solver, guess=(math.sqrt(2), 0.0), report=report)
+    result = run(p, guess=(math.sqrt(2), 0.0), report=report)
     assert result.outcome is Outcome.INTERRUPTED
     assert result.z @ result.z == pytest.approx(2, abs=1e-6)
     assert result.z.sum() <= math.sqrt(2) + 1e-6
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_ctrl_c_puts_the_former_handler_back(solver, monkeypatch):
+def test_ctrl_c_puts_the_former_handler_back(monkeypatch):
     monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
 
     def mine(*_):
@@ -114,7 +105,6 @@ def test_ctrl_c_puts_the_former_handler_back(solver, monkeypatch):
     try:
         result = run(
             program(rosenbrock),
-            solver=solver,
             guess=(-1.2, 1.0),
             report=lambda line: signal.raise_signal(signal.SIGINT),
         )
@@ -125,72 +115,39 @@ def test_ctrl_c_puts_the_former_handler_back(solver, monkeypatch):
     assert np.all(np.isfinite(result.z))
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_solve_works_outside_the_main_thread(solver):
+def test_a_solve_works_outside_the_main_thread():
     """Where no signal handler can be set."""
     found = []
-    thread = threading.Thread(target=lambda: found.append(run(program(bowl), solver=solver)))
+    thread = threading.Thread(target=lambda: found.append(run(program(bowl))))
     thread.start()
     thread.join()
     assert found[0].outcome is Outcome.SOLVED
     assert found[0].z == pytest.approx([1, -2], abs=1e-6)
 
 
-@each_row("solver", SOLVERS)
 @each_row(
     "error, outcome",
     [(SimulationError, Outcome.DIVERGED), (GradientError, Outcome.NO_GRADIENT)],
 )
-def test_a_refusal_inside_the_callback_is_told_in_its_own_words(solver, error, outcome):
+def test_a_refusal_inside_the_callback_is_told_in_its_own_words(error, outcome):
     def cost(z):
         raise error("the ground opened")
 
-    result = run(program(cost), solver=solver, guess=(3.0, 4.0))
+    result = run(program(cost), guess=(3.0, 4.0))
     assert result.outcome is outcome
     assert "the ground opened" in result.message
     assert "Traceback" not in result.message
     assert result.z.tolist() == [3.0, 4.0]
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_the_table_is_read(solver):
-    rows = run(program(rosenbrock), solver=solver, guess=(-1.2, 1.0)).iterations
+def test_the_table_is_read():
+    rows = run(program(rosenbrock), guess=(-1.2, 1.0)).iterations
     assert len(rows) >= 3
     assert rows[0].objective == pytest.approx(24.2, rel=1e-6)  # 100 (1 - 1.44)^2 + 2.2^2
     assert rows[-1].objective < 1e-8
     assert all(math.isfinite(row.objective) for row in rows)
     numbers = [row.iteration for row in rows]
     assert numbers == sorted(set(numbers))
-
-
-def test_no_row_is_lost_where_the_cost_is_negative_in_ipopts_restoration_phase():
-    """Its r for restoration stands against the minus sign; without the -50 there are some 17 rows."""
-    p = program(lambda z: z @ z - 50, constraint=lambda z: z[0] ** 2 + z[1] ** 2, lower=-5, upper=-1)
-    numbers = [row.iteration for row in run(p, solver="ipopt", guess=(1.0, 1.0)).iterations]
-    assert numbers == list(range(len(numbers)))
-    assert len(numbers) > 10
-
-
-IPOPT_TABLE = """
-iter    objective    inf_pr   inf_du lg(mu)  ||d||  lg(rg) alpha_du alpha_pr  ls
-   0  2.4200000e+01 3.00e+00 1.00e+02   0.0 0.00e+00    -  0.00e+00 0.00e+00   0
-   1  4.7318843e+00 2.50e-01 2.15e+00  -1.0 3.81e-01    -  1.00e+00 9.81e-01f  1
-  12r-4.0873987e+00 9.99e-01 3.14e+02  -0.6 0.00e+00   4.1 0.00e+00 4.77e-07R 22
- 103  3.2286726e-11 0.00e+00 1.20e-09  -8.6 2.00e-06  -4.0 1.00e+00 1.00e+00h  1
-
-Number of Iterations....: 103
-"""
-
-
-def test_ipopts_rows_are_read_with_their_letters():
-    """A tag for the step, an r for the restoration phase, which may stand against the objective's sign."""
-    rows = list(_ipopt_rows(IPOPT_TABLE.splitlines()))
-    assert [(r.iteration, r.objective, r.primal_infeasibility, r.dual_infeasibility, r.step) for r in rows] == [
-        (0, 24.2, 3.0, 100.0, 0.0),
-        (1, 4.7318843, 0.25, 2.15, 0.981),
-        (12, -4.0873987, 0.999, 314.0, 4.77e-07),
-        (103, 3.2286726e-11, 0.0, 1.2e-09, 1.0),
-    ]
 
 
 SNOPT_TABLE = """
@@ -213,21 +170,14 @@ def test_snopts_rows_are_read_where_their_columns_stand():
     assert [row.step for row in rows[1:]] == [0.05, 1.0]
 
 
-@pytest.mark.parametrize("reader", [_ipopt_rows, _snopt_rows])
-def test_text_without_a_table_gives_no_rows(reader):
-    assert list(reader(["", "EXIT: Optimal Solution Found.", "   12 constraints, 3 variables"])) == []
+def test_text_without_a_table_gives_no_rows():
+    assert list(_snopt_rows(["", "EXIT: Optimal Solution Found.", "   12 constraints, 3 variables"])) == []
 
 
-def test_an_unknown_solver_is_named():
-    with pytest.raises(UnknownNameError, match="solver: expected one of ipopt, snopt, got 'gurobi'"):
-        run(program(bowl), solver="gurobi")
-
-
-@pytest.mark.parametrize(("solver", "engine"), [("ipopt", IpoptSolver), ("snopt", SnoptSolver)])
-def test_a_solver_that_this_drake_lacks_is_named(solver, engine, monkeypatch):
-    monkeypatch.setattr(engine, "available", lambda self: False)
-    with pytest.raises(MissingDependencyError, match=f"the solver {solver} is not in this Drake"):
-        run(program(bowl), solver=solver)
+def test_a_drake_without_snopt_is_named(monkeypatch):
+    monkeypatch.setattr(SnoptSolver, "available", lambda self: False)
+    with pytest.raises(MissingDependencyError, match="SNOPT is not in this Drake"):
+        run(program(bowl))
 
 
 def watch(time_limit=math.inf):

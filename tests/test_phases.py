@@ -309,7 +309,6 @@ def test_what_does_not_fit_is_refused_early():
         (lambda: dd.solve(problem, method="ilqr"), "method"),
         (lambda: dd.solve(problem, method="shooting"), "method"),
         (lambda: dd.solve(problem, scheme="drake"), "scheme"),
-        (lambda: dd.solve(problem, segments=3), "segments"),
         (lambda: dd.solve(problem, initial_guess=[None]), "initial_guess"),
     ]
     for make_it, words in bad:

@@ -40,7 +40,7 @@ def swing_up(name):
     model = dd.load_model(MODELS / FILES[name], time_step=0.05 if name == "acrobot" else 0.02)
     problem = dd.Problem(model, **fields)
     guess = dd.solve(problem, method="collocation")
-    solution = dd.solve(problem, method="shooting", segments=10, solver="ipopt", initial_guess=guess)
+    solution = dd.solve(problem, method="shooting", initial_guess=guess)
     assert solution.defect < 1e-7, solution.message
     return solution
 

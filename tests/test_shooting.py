@@ -3,7 +3,6 @@
 import math
 import signal
 import sys
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -16,18 +15,12 @@ from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 import drake_diff as dd
 from drake_diff._base.autodiff import WIDE, chain, chain_rows
 from drake_diff.exceptions import GradientError, SimulationError
-from drake_diff.optimize.program import Limits, Outcome
-from drake_diff.optimize.shooting import (
-    RolloutCost,
-    ShootingVariables,
-    final_sensitivity,
-    limits_of_states,
-    solve_shooting,
-    state_sensitivities,
-)
+from drake_diff.optimize.problem.coupling import Coupling
+from drake_diff.optimize.program import Limits
+from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 from drake_diff.optimize.solution import Status
+from drake_diff.optimize.transcription import steps
 
-SOLVERS = ("ipopt", "snopt")
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
@@ -51,104 +44,176 @@ def test_the_sensitivities_of_a_block_are_the_closed_form():
         optimize=("controls", "initial_state"),
         initial_state_mask=[False, True],
     )
-    variables = ShootingVariables(problem)
-    S = state_sensitivities(variables, np.linspace(-1, 1, 7))[-1]
+    S = final_sensitivity(ShootingVariables(problem), np.linspace(-1, 1, 7))
     position = np.concatenate([[count * h], h**2 * (count - np.arange(count)) / mass])
     velocity = np.concatenate([[1.0], np.full(count, h / mass)])
     assert pytest.approx(np.array([position, velocity]), rel=1e-12) == S
 
 
-def grown(running_cost, most):
-    """Bytes that `most` iterations of a swing-up leave behind in Python, over those that 20 do; and how many rows."""
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.2)
-    problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=10, running_cost=running_cost)
-    xs, us = np.zeros((11, 4)), 0.5 * np.random.default_rng(0).standard_normal((10, 1))
-    kept, rows = [], []
-    for count in (most, 20, most):  # the first fills what is kept of a model, and the interpreter's caches
-        if rows:
-            tracemalloc.start()
-        found = solve_shooting(problem, xs, us, solver="snopt", limits=Limits(count, 1e3, 1e-30), report=None)
-        rows.append(len(found[0].iterations))
-        kept.append(tracemalloc.get_traced_memory()[0])
-        tracemalloc.stop()
-    return kept[2] - kept[1], rows[2] - rows[1]
+def everything(**changes):
+    """30 steps whose initial speed, inputs and damping move; limits of every kind."""
+    given = {
+        "num_steps": 30,
+        "final_cost": lambda x: np.cos(x[0]) + x[1] ** 2,
+        "optimize": ("controls", "initial_state", "parameters"),
+        "initial_state_mask": [False, True],
+        "parameters": ["hinge.damping"],
+        "bounds": dd.Bounds(x_upper=[9, 4]),
+        "waypoints": {10: [0.3, np.nan], 14: [np.nan, 0.2]},
+        "constraints": [
+            dd.Constraint(lambda x, u: u[0] * x[1], upper=5),
+            dd.Constraint(lambda x: np.sin(x[0]), lower=-0.9, upper=0.9, knots=[0, 9, 10, -1]),
+        ],
+        "couplings": [Coupling(lambda a, b, u, w: a[0] * b[1] + u[0] * w[0], knots=(3, 8), upper=1.0, name="joined")],
+    }
+    return pendulum(**given | changes)
+
+
+JOINED = {"trajectory_cost": lambda xs, us: xs[3, 0] * xs[9, 1] + us[2, 0] ** 3}
+
+
+@pytest.mark.parametrize("changes", [{}, JOINED], ids=["plain", "trajectory_cost"])
+def test_every_derivative_of_the_program_is_its_difference(changes):
+    """Differences of 1e-6 leave 1e-8 or so; steps do not lead from state to state, as in the midst of a search."""
+    program, random = steps.StepProgram(everything(**changes)), np.random.default_rng(0)
+    z = program.pack(0.3 * random.standard_normal((31, 2)), 0.3 * random.standard_normal((30, 1)))
+    multipliers, sigma = random.standard_normal(len(program.sides[0])), np.array([0.7])
+
+    def both(z):
+        cost, rows = program._values(z)
+        return np.append(rows, cost)
+
+    def slope(z):
+        rows = np.array(program._jacobian(z, None)[1])
+        return sigma[0] * program._gradient(z, None)[1] + multipliers @ rows
+
+    columns = 1e-6 * np.eye(len(z))
+    differences = np.array([(both(z + d) - both(z - d)) / 2e-6 for d in columns]).T
+    np.testing.assert_allclose(np.array(program._jacobian(z, None)[1]), differences[:-1], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(program._gradient(z, None)[1], differences[-1], rtol=1e-6, atol=1e-6)
+    if not changes:
+        upper = np.array(program._hessian(z, None, sigma, multipliers)[0])
+        curvature = np.array([(slope(z + d) - slope(z - d)) / 2e-6 for d in columns])
+        found = upper + upper.T - np.diag(np.diag(upper))
+        cut = np.zeros(len(z), dtype=bool)
+        cut[program.states_at[-1]] = True  # a final cost's curvature is cut where it is negative
+        np.testing.assert_allclose(found[~cut][:, ~cut], curvature[~cut][:, ~cut], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("error", [GradientError, SimulationError])
+def test_a_point_without_a_derivative_is_a_step_that_was_too_long(monkeypatch, error):
+    """A swing-up whose trial points go faster than guess and optimum ever do: halfway there derivatives end."""
+    true, limit, fastest = steps.StepProgram._steps, [np.inf], []
+
+    def some(self, z):
+        found = true(self, z)
+        fastest.append(np.abs(z[self.states_at][:, 1]).max())
+        if fastest[-1] > limit[0]:
+            raise error("no derivative here")
+        return found
+
+    monkeypatch.setattr(steps.StepProgram, "_steps", some)
+    problem = pendulum(num_steps=60)
+    random = np.random.default_rng(0)
+    guess = np.zeros((61, 2)), 5 * random.standard_normal((60, 1))
+    free = shoot(problem, initial_guess=guess)
+    needed = np.abs(free.xs[:, 1]).max()
+    assert max(fastest) > 1.02 * needed
+    limit[0] = (needed + max(fastest)) / 2
+    solution = shoot(problem, initial_guess=guess)
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(free.cost, rel=1e-6)
+    assert "that could not be stepped or differentiated, the last: no derivative here" in solution.solver_message
+
+
+def test_a_guess_without_a_derivative_is_the_end(monkeypatch):
+    def none(self, z):
+        raise GradientError("no derivative here")
+
+    monkeypatch.setattr(steps.StepProgram, "_steps", none)
+    guess, limits = (np.zeros((11, 2)), np.zeros((10, 1))), Limits(50, 60.0, 1e-8)
+    with pytest.raises(GradientError, match="no derivative here"):
+        steps.solve_shooting(pendulum(num_steps=10), *guess, limits=limits, report=None)
 
 
 @pytest.mark.slow
-def test_memory_is_flat_in_iterations():
-    """A row of five numbers is 250 bytes, Drake 1.51 leaves some 400 more; one motion's derivatives are above 5000."""
-    growth, rows = grown(EFFORT, 100)
-    assert rows > 50
-    assert growth < 2000 * rows
-    seen = []
-    growth, rows = grown(lambda x, u: (seen.append(np.array(x)), u @ u)[1], 30)
-    assert growth > 2000 * rows > 0
+def test_an_acrobot_swings_up_from_rest():
+    """Open loop at half the step it falls over."""
+    model = dd.load_model(MODELS / "acrobot.xml", time_step=0.05)
+    solution = shoot(dd.Problem(model, x0=np.zeros(4), x_goal=[np.pi, 0, 0, 0], num_steps=100, running_cost=EFFORT))
+    assert solution.status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED), solution.message
+    assert not solution.plan_checks.failing
+    assert solution.goal_error < 1e-7
+    assert solution.defect < 1e-7
 
 
-@pytest.mark.parametrize("optimize", [("controls",), ("initial_state",), ("controls", "initial_state")])
-def test_the_costs_gradient_is_its_central_difference_in_every_entry(optimize):
-    """A pole in full swing; differences of 1e-6 of a cost near 1e2 leave 1e-7 of rounding and less of truncation."""
+@pytest.mark.parametrize("limit", [None, 8.0])
+def test_a_cart_pole_swings_up(limit):
+    """67.095 without a limit and at most 41.234 in 3 s within it, by fatrop on the same program."""
+    model, bounds = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04), None
+    if limit is not None:
+        bounds = dd.Bounds(u_lower=[-limit], u_upper=[limit])
+    count, cost = (50, 67.0951254) if limit is None else (75, 41.2331700)
+    goal = [0, np.pi, 0, 0]
+    problem = dd.Problem(model, x0=np.zeros(4), x_goal=goal, num_steps=count, running_cost=EFFORT, bounds=bounds)
+    solution = shoot(problem)
+    assert not solution.plan_checks.failing
+    assert solution.cost <= cost * (1 + 1e-7)
+    assert solution.goal_error < 1e-7
+
+
+def test_a_mass_is_chosen_together_with_the_inputs():
+    """The effort 12 m^2 / (1 - 1 / N^2) is least for the least mass allowed, 0.5 kg."""
     problem = dd.Problem(
-        dd.load_model(MODELS / "cart_pole.urdf", time_step=0.05),
-        x0=[0.1, 0.5, -0.3, 1.0],
-        num_steps=12,
-        running_cost=lambda x, u: np.sin(x[1]) ** 2 + x[0] * u[0] + 0.1 * u[0] ** 2,
-        final_cost=lambda x: np.cos(x[1]) + x[2] * x[3],
-        optimize=optimize,
-        us=np.linspace(-2, 3, 12)[:, None],
+        block(time_step=0.05),
+        x0=[0, 0],
+        x_goal=[1, 0],
+        num_steps=20,
+        running_cost=EFFORT,
+        optimize=("controls", "parameters"),
+        parameters=["block_0.mass"],
+        parameter_bounds={"block_0.mass": (0.5, 2)},
     )
-    variables = ShootingVariables(problem)
-    cost = RolloutCost(problem, variables)
-    z = variables.pack(problem.x0, problem.us)
-    value, gradient = cost.differentiate(z)
-    assert value == pytest.approx(cost.value(z), rel=1e-13)
-    differences = [(cost.value(z + d) - cost.value(z - d)) / 2e-6 for d in 1e-6 * np.eye(len(z))]
-    assert gradient == pytest.approx(np.array(differences), rel=1e-6, abs=1e-7)
+    solution = shoot(problem)
+    assert solution.success, solution.message
+    assert solution.parameters == pytest.approx([0.5], abs=1e-7)
+    assert solution.cost == pytest.approx(12 * 0.25 / (1 - 1 / 400), rel=1e-6)
 
 
-def test_the_last_sensitivity_is_had_without_all_the_others():
-    """Of 300 states (2,) by 300 inputs all take 301 * 2 * 300 doubles, 1.4 MB, the last alone 5 kB and a copy."""
-    problem = dd.Problem(block(time_step=0.01), x0=[0, 0], num_steps=300, x_goal=[1, 0])
-    variables = ShootingVariables(problem)
-    z = variables.pack(problem.x0, np.ones((300, 1)))
-    every = state_sensitivities(variables, z)
-    goal = limits_of_states(problem, variables)
-    tracemalloc.start()
-    last, by_goal = final_sensitivity(variables, z), goal.jacobian(z)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    np.testing.assert_allclose(last, every[-1], rtol=1e-13)  # the same products from the other end, rounded otherwise
-    assert np.array_equal(by_goal, every[-1])
-    # Symplectic Euler of 1 kg: d x_N / d u_k = h^2 (N - k), d v_N / d u_k = h.
-    assert last == pytest.approx(np.array([1e-4 * np.arange(300, 0, -1), np.full(300, 0.01)]), rel=1e-9)
-    assert peak < every.nbytes / 10
+def test_all_of_it_together_is_solved():
+    solution = shoot(everything(x_goal=None))
+    assert solution.success, solution.message
+    assert solution.xs[10, 0] == pytest.approx(0.3, abs=1e-6)
 
 
-@each_row("solver", SOLVERS)
+def test_states_that_no_step_joins_are_told_by_the_defect():
+    solution = shoot(pendulum(), max_iterations=1)
+    assert solution.status is Status.ITERATION_LIMIT
+    assert solution.defect > 1e-5
+
+
 @each_row("count", [2, 4, 10, 20])
-def test_the_block_moves_by_symplectic_eulers_optimum(solver, count):
+def test_the_block_moves_by_symplectic_eulers_optimum(count):
     """The least effort of moving 1 kg by 1 m in 1 s is 12 / (1 - 1/N^2)."""
     model = block(time_step=1 / count)
-    solution = shoot(dd.Problem(model, x0=[0, 0], x_goal=[1, 0], running_cost=EFFORT, num_steps=count), solver=solver)
+    solution = shoot(dd.Problem(model, x0=[0, 0], x_goal=[1, 0], running_cost=EFFORT, num_steps=count))
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(12 / (1 - 1 / count**2), rel=1e-8)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_lqr_by_shooting_has_the_riccati_recursions_cost(solver):
+def test_lqr_by_shooting_has_the_riccati_recursions_cost():
     """From a given guess, so that iLQR does not help; 1e-12 since the cost is flat at its minimum."""
     problem = lqr(*DOUBLE_INTEGRATOR)
     count = problem.num_steps
     us = 10 * np.random.default_rng(5).standard_normal((count, 1))
-    solution = shoot(problem, solver=solver, initial_guess=(np.zeros((count + 1, 2)), us))
+    solution = shoot(problem, initial_guess=(np.zeros((count + 1, 2)), us))
     assert solution.success, solution.message
     assert solution.options["initial_guess"] == "given"
     assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)
     assert solution.us[0, 0] == pytest.approx(-2.61821518, abs=1e-6)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_initial_state_and_inputs_together_are_the_dense_kkt_solution(solver):
+def test_initial_state_and_inputs_together_are_the_dense_kkt_solution():
     """min sum_k (x'Qx + R u^2) + x_N'Qf x_N over v_0 and u with x_0 = 0.2 fixed and x_N = 1 required."""
     h, count, Q, R, Qf = 0.1, 8, np.diag([1.0, 0.5]), 0.2, np.diag([2.0, 3.0])
     A, B = np.array([[1, h], [0, 1]]), np.array([h**2, h])
@@ -175,7 +240,7 @@ def test_initial_state_and_inputs_together_are_the_dense_kkt_solution(solver):
         optimize=("controls", "initial_state"),
         initial_state_mask=[False, True],
     )
-    solution = shoot(problem, solver=solver)
+    solution = shoot(problem)
     assert solution.success, solution.message
     # The solver meets the goal to 1e-8, which its multiplier of 5 or so turns into cost.
     assert solution.cost == pytest.approx(z @ hessian @ z + 2 * slope @ z + constant, rel=1e-8)
@@ -204,8 +269,7 @@ def test_the_projectile_lands_at_six_metres(by):
     assert solution.us.shape == (300, 0)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_speed_limit_and_a_force_limit_are_used_up(solver):
+def test_a_speed_limit_and_a_force_limit_are_used_up():
     """|u| <= 1 and v <= 0.5 on 1 kg for 1 s: x_N = 0.1 (0.1 + 0.2 + 0.3 + 0.4 + 6 * 0.5) = 0.4 at the most."""
     problem = dd.Problem(
         block(),
@@ -214,18 +278,17 @@ def test_a_speed_limit_and_a_force_limit_are_used_up(solver):
         final_cost=lambda x: (x[0] - 1) ** 2,
         bounds=dd.Bounds(x_upper=[9, 0.5], u_lower=[-1], u_upper=[1]),
     )
-    solution = shoot(problem, solver=solver)
+    solution = shoot(problem)
     assert solution.success, solution.message
     assert solution.xs[-1, 0] == pytest.approx(0.4, abs=1e-6)
     assert solution.bound_violation < 1e-6
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_pendulum_too_weak_and_too_late_is_infeasible(solver):
+def test_a_pendulum_too_weak_and_too_late_is_infeasible():
     """0.6 s and |u| <= 0.5, where hanging straight out takes 4.9: the energy of half a turn is out of reach."""
-    solution = shoot(pendulum(num_steps=30, bounds=dd.Bounds(u_lower=[-0.5], u_upper=[0.5])), solver=solver)
+    solution = shoot(pendulum(num_steps=30, bounds=dd.Bounds(u_lower=[-0.5], u_upper=[0.5])))
     assert solution.status is Status.INFEASIBLE
-    assert any(c.what == "goal" for c in solution.plan_checks.failing)
+    assert any(c.what == "defect" for c in solution.plan_checks.failing)
     assert np.all(np.isfinite(solution.xs))
     assert np.abs(solution.us).max() <= 0.5 + 1e-6
 
@@ -283,13 +346,12 @@ def test_a_goal_that_nothing_moves_may_be_reached_already():
     assert solution.xs[-1] == pytest.approx([1, 0, 0, 0], abs=1e-6)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_ctrl_c_ends_it_with_a_motion(solver, monkeypatch):
+def test_ctrl_c_ends_it_with_a_motion(monkeypatch):
     monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     before = signal.getsignal(signal.SIGINT)
-    solution = shoot(pendulum(), solver=solver, progress=lambda line: signal.raise_signal(signal.SIGINT))
+    solution = shoot(pendulum(), progress=lambda line: signal.raise_signal(signal.SIGINT))
     assert solution.status is Status.INTERRUPTED
-    assert solution.defect == 0.0
+    assert np.isfinite(solution.defect)
     assert np.all(np.isfinite(solution.us))
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -324,45 +386,6 @@ def test_fixed_inputs_act_while_the_initial_state_is_free():
     assert solution.success, solution.message
     assert solution.xs[0] == pytest.approx([0, 0.725], abs=1e-6)
     assert np.array_equal(solution.us, np.full((10, 1), 0.5))
-
-
-@pytest.mark.parametrize("error", slow_after(1, [GradientError, SimulationError]))
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_point_without_a_derivative_is_a_step_that_was_too_long(monkeypatch, solver, error):
-    """A swing-up whose trial points go faster than guess and optimum ever do: halfway there derivatives end."""
-    true, limit, fastest = ShootingVariables.linearization, [np.inf], []
-
-    def linearization(self, z):
-        found = true(self, z)
-        fastest.append(max(abs(d.x_next[1]) for d in found))
-        if fastest[-1] > limit[0]:
-            raise error("no derivative here")
-        return found
-
-    monkeypatch.setattr(ShootingVariables, "linearization", linearization)
-    problem = pendulum(num_steps=60)
-    free = shoot(problem, solver=solver)
-    needed = np.abs(free.xs[:, 1]).max()
-    assert max(fastest) > 1.2 * needed
-    limit[0] = (needed + max(fastest)) / 2
-    solution = shoot(problem, solver=solver)
-    assert solution.success, solution.message
-    assert solution.cost == pytest.approx(free.cost, rel=1e-6)
-    assert "backed off from points that were refused" in solution.solver_message
-    assert solution.solver_message.endswith("the last: no derivative here")
-    assert ("started again" in solution.solver_message) == (solver == "snopt")  # IPOPT's own line search is told
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_guess_without_a_derivative_is_the_end(monkeypatch, solver):
-    def linearization(self, z):
-        raise GradientError("no derivative here")
-
-    monkeypatch.setattr(ShootingVariables, "linearization", linearization)
-    guess, limits = (np.zeros((11, 2)), np.zeros((10, 1))), Limits(50, 60.0, 1e-8)
-    result = solve_shooting(pendulum(num_steps=10), *guess, solver=solver, limits=limits, report=None)[0]
-    assert result.outcome is Outcome.NO_GRADIENT
-    assert "no derivative here" in result.message
 
 
 @each_row("count", [3, WIDE + 1])

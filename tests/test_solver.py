@@ -59,10 +59,9 @@ SOFT = {
 }
 
 
-@pytest.mark.parametrize("solver", slow_after(1, ["ipopt", "snopt"]))
-def test_pendulum_with_a_hard_goal_by_shooting(load, solver):
+def test_pendulum_with_a_hard_goal_by_shooting(load):
     """J = 8.826541704941 by a solve of the same steps beside Drake; inputs to the digits that a tolerance leaves."""
-    solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting", solver=solver)
+    solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting")
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(8.826541704941, rel=1e-10)
     assert solution.us[:3, 0] == pytest.approx([-1.52719898, -1.74962353, -1.96009648], abs=2e-6)
@@ -71,18 +70,13 @@ def test_pendulum_with_a_hard_goal_by_shooting(load, solver):
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])
 def test_pendulum_with_a_soft_goal(load, method):
     """J* = 1.88951695347 by a solve of the same steps beside Drake."""
-    solution = dd.solve(pendulum(load, **SOFT), method=method)
+    solution = dd.solve(pendulum(load, **SOFT), method=method, tolerance=1e-10)
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(1.88951695347, rel=1e-10)
     assert solution.us[:4, 0] == pytest.approx([3.31679908, 3.64914248, 3.96280849, 4.25531903], abs=1e-5)
 
 
-def test_shooting_says_that_its_guess_was_improved(load):
-    solution = dd.solve(pendulum(load, **SOFT), method="shooting")
-    assert "iLQR: solved" in solution.options["initial_guess"]
-
-
-def test_active_input_bounds_give_the_same_optimum_by_ilqr_and_by_snopt(load):
+def test_active_input_bounds_give_the_same_optimum_by_ilqr_and_by_shooting(load):
     problem = pendulum(load, **SOFT, bounds=dd.Bounds(u_lower=[-4.0], u_upper=[4.0]))
     a, b = (dd.solve(problem, method=m) for m in ("ilqr", "shooting"))
     assert a.success, a.message
@@ -209,12 +203,12 @@ def test_too_small_a_force_ends_without_success_and_says_so(load):
         assert np.all(np.isfinite(solution.xs))
 
 
-@pytest.mark.parametrize(("method", "solver"), [("collocation", "ipopt"), ("shooting", "snopt"), ("shooting", "ipopt")])
-def test_limits_end_a_solve_and_are_named(load, method, solver):
+@pytest.mark.parametrize("method", ["collocation", "shooting"])
+def test_limits_end_a_solve_and_are_named(load, method):
     problem = swing_up(load, 40)
-    short = dd.solve(problem, method=method, solver=solver, max_iterations=2)
+    short = dd.solve(problem, method=method, max_iterations=2)
     assert short.status is Status.ITERATION_LIMIT
-    late = dd.solve(problem, method=method, solver=solver, time_limit=0.001)
+    late = dd.solve(problem, method=method, time_limit=0.001)
     assert late.status is Status.TIME_LIMIT
     assert np.all(np.isfinite(late.xs))
 
@@ -239,7 +233,7 @@ def test_a_solver_that_lies_is_not_believed(load, monkeypatch):
     monkeypatch.setattr("drake_diff.optimize.run.solve_shooting", liar)
     solution = dd.solve(swing_up(load, 20), method="shooting")
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
-    assert any(c.what == "goal" for c in solution.plan_checks.failing)
+    assert any(c.what == "defect" for c in solution.plan_checks.failing)
 
 
 def test_a_wrong_derivative_is_named_and_keeps_a_solve_from_success(load, monkeypatch):
@@ -263,29 +257,19 @@ def test_a_refused_derivative_ends_as_no_gradient(load, monkeypatch):
     assert "expected a finite number of at most" in solution.message
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
-def test_ctrl_c_keeps_the_motion_and_puts_the_handler_back(load, solver):
+def test_ctrl_c_keeps_the_motion_and_puts_the_handler_back(load):
     before = signal.getsignal(signal.SIGINT)
     threading.Timer(0.6, signal.raise_signal, [signal.SIGINT]).start()
     problem = swing_up(load, 400)
-    solution = dd.solve(problem, method="shooting", solver=solver, tolerance=1e-13)
+    solution = dd.solve(problem, method="shooting", tolerance=1e-13)
     assert solution.status is Status.INTERRUPTED
     assert np.all(np.isfinite(solution.xs))
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_ctrl_c_while_the_guess_is_improved_ends_the_solve(load):
-    """1 000 steps: the improvement by iLQR alone takes many seconds."""
-    problem = pendulum(load, **SOFT, num_steps=1000)
-    threading.Timer(1.5, signal.raise_signal, [signal.SIGINT]).start()
-    solution = dd.solve(problem, method="shooting")
-    assert solution.status is Status.INTERRUPTED
-    assert "iLQR: interrupted" in solution.message
-
-
 @pytest.mark.parametrize(
     ("method", "solver"),
-    slow_after(2, [("collocation", "ipopt"), ("shooting", "snopt"), ("collocation", "snopt"), ("shooting", "ipopt")]),
+    slow_after(2, [("collocation", "ipopt"), ("shooting", None), ("collocation", "snopt")]),
 )
 def test_the_solvers_own_table_is_kept(load, method, solver):
     scheme = "drake" if (method, solver) == ("collocation", "snopt") else None
@@ -313,9 +297,8 @@ def test_the_same_seed_gives_the_same_bits(load):
 
 @pytest.mark.slow
 def test_a_solution_is_a_warm_start(load):
-    first = dd.solve(swing_up(load, 40), method="shooting", solver="snopt")
-    again = dd.solve(swing_up(load, 40), method="shooting", solver="snopt", initial_guess=first)
-    assert again.solver_message == "SNOPT info 1: kSolutionFound"
+    first = dd.solve(swing_up(load, 40), method="shooting")
+    again = dd.solve(swing_up(load, 40), method="shooting", initial_guess=first)
     assert len(again.iterations) < len(first.iterations) / 2
     assert again.cost == pytest.approx(first.cost, rel=1e-8)
 
@@ -471,13 +454,8 @@ def acrobot_swing_up(load):
     return dd.Problem(model, x0=np.zeros(4), x_goal=[np.pi, 0, 0, 0], num_steps=80, running_cost=EFFORT, bounds=bounds)
 
 
-@each_row("solver", ["ipopt", "snopt"])
-@each_row(
-    "error, status",
-    [(SimulationError, Status.DIVERGED), (GradientError, Status.NO_GRADIENT)],
-)
-def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, solver, error, status):
-    """SNOPT, in Drake, cannot be told that a step was too long, and wraps what is raised with its traceback."""
+@each_row("error, status", [(SimulationError, Status.DIVERGED), (GradientError, Status.NO_GRADIENT)])
+def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, error, status):
     original, calls = derivatives_along, []
 
     def refusing(*args, **options):
@@ -487,25 +465,8 @@ def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, sol
         return original(*args, **options)
 
     monkeypatch.setattr("drake_diff.motion.intervals.derivatives_along", refusing)
-    monkeypatch.setattr(
-        "drake_diff.optimize.shooting.ShootingVariables.attempt", lambda self, evaluate, failed: evaluate()
-    )
-    solution = dd.solve(swing_up(load, 20), method="shooting", solver=solver)
+    solution = dd.solve(swing_up(load, 20), method="shooting")
     assert solution.status is status
     assert "this far and no further" in solution.message
     assert "Traceback" not in solution.message
     assert np.all(np.isfinite(solution.xs))
-
-
-def test_a_motion_that_leaves_every_finite_number_is_no_success(load):
-    """Whether the state overflows, its derivative does, or the search backs off to its last iteration is rounding."""
-    solution = dd.solve(acrobot_swing_up(load), method="shooting", solver="snopt", max_iterations=50)
-    assert solution.status in (Status.DIVERGED, Status.NO_GRADIENT, Status.ITERATION_LIMIT)
-    assert "Traceback" not in solution.message
-    assert np.all(np.isfinite(solution.xs))
-
-
-@pytest.mark.slow
-def test_ipopt_shortens_a_step_that_cannot_be_simulated(load):
-    solution = dd.solve(acrobot_swing_up(load), method="shooting", solver="ipopt", max_iterations=20)
-    assert solution.status is Status.ITERATION_LIMIT

@@ -328,7 +328,7 @@ def _checked(problem: PhasedProblem, asked: dict[str, Any]) -> tuple[Limits, str
         raise InputError("method", got=repr(asked["method"]), expected=expected)
     if asked["solver"] not in (None, "ipopt"):
         raise InputError("solver", got=repr(asked["solver"]), expected='"ipopt" for a PhasedProblem')
-    for name, none in (("segments", 1), ("continuation", None)):
+    for name, none in (("continuation", None),):
         if asked[name] != none:
             raise InputError(name, got=repr(asked[name]), expected="none for a PhasedProblem")
     scheme = default_scheme(problem.phases[0]) if asked["scheme"] is None else asked["scheme"]

@@ -18,18 +18,19 @@ from drake_diff.certificates.certify import certify_steps
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import TIME_STEP
+from drake_diff.motion.intervals import roll
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.certified import certify_equations, first_knots, telling_knots
 from drake_diff.optimize.continuation import Stages, solve_continuation
 from drake_diff.optimize.guess import Guess
-from drake_diff.optimize.ilqr.ilqr import solve_ilqr
+from drake_diff.optimize.ilqr.ilqr import solve_ilqr, takes
 from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through_jumps
 from drake_diff.optimize.optimality import HOLDS, doubt_of_the_slope, out_of_reach, why_blind
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report, heard
-from drake_diff.optimize.shooting import ShootingVariables, roll_segments, solve_shooting
+from drake_diff.optimize.shooting import ShootingVariables
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
@@ -40,6 +41,7 @@ from drake_diff.optimize.transcription.collocation import (
     kept,
 )
 from drake_diff.optimize.transcription.drake import solve_collocation
+from drake_diff.optimize.transcription.steps import solve_shooting
 from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, refused, status_of, unmeasured
 
 CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
@@ -47,6 +49,7 @@ FINER_ROUNDS = 6  # of a mesh whose plan does not hold
 GRACE = 0.05  # of the time limit, beyond it: for measures of what a search found that the limit ended
 # What a solve is made of, in this order; a time limit names what it cut.
 STAGES = ("certificates of the guess", "the search", "certificates of the result", "replays and other measures")
+FEW_STEPS = 50  # of iLQR, for the guess of a search by shooting
 PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 
 Searcher = Callable[[Problem, Array, Array, Array], tuple[NlpResult, Array, Array]]
@@ -228,7 +231,7 @@ class Run:
                 return refused(self._of_guess(guess), error)
             self._reach(1)
             result, xs, us, u_final = solve_collocation(
-                self.problem, guess.xs, guess.us, solver=self.solver, limits=self._left(), report=self.report
+                self.problem, guess.xs, guess.us, limits=self._left(), report=self.report
             )
         self._offer(self._draft(xs, us, u_final=u_final), result)
         self._reach(2, self._draft(xs, us, u_final=u_final, certificates=certificates), result)
@@ -283,28 +286,28 @@ class Run:
         around = given and not stages  # a robot that falls open loop says nothing of the motion that was given
         return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages), around=around)
 
-    def shoot(self, guess: Guess, segments: int, *, improve: bool) -> Solution:
-        """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along.
+    def shoot(self, guess: Guess, *, given: bool) -> Solution:
+        """From the states of the guess.
 
-        Several `segments` are looked at around their own states, which defects part.
+        Where none is `given`, the rollout of inputs that the problem has, and a motion in continuous time, comes first,
+        and a few steps of iLQR, which keeps to the motions there are.
         """
-        report, xs, us = self.report, guess.xs, guess.us
-        if segments > 1:
-            try:
-                xs = roll_segments(self.problem, xs, us, segments)
-            except SimulationError as error:
-                return refused(self._draft(xs, us), error)
+        problem = self.problem
+        multipliers = guess.multipliers if given else None
+        rolled = not given and (not problem.optimizes_controls or bool(np.any(problem.us)) or problem.motion != STEPS)
 
         def search(problem: Problem, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
-            if improve:
-                result, xs, us = solve_ilqr(problem, xs, us, limits=self._left(), report=report)
+            if rolled and takes(problem):
+                few = dataclasses.replace(self._left(), max_iterations=min(FEW_STEPS, self.limits.max_iterations))
+                result, xs, us = solve_ilqr(problem, xs, us, limits=few, report=self.report, values=values)
                 self.options["initial_guess"] = f"default, then {result.message}"
+                values = values if result.parameters is None else result.parameters
                 if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
                     return result, xs, us
-            options: dict[str, Any] = {"solver": self.solver, "segments": segments, "values": values}
-            return solve_shooting(problem, xs, us, limits=self._left(), report=report, **options)
+            options: dict[str, Any] = {"values": values, "begun": multipliers}
+            return solve_shooting(problem, xs, us, limits=self._left(), report=self.report, **options)
 
-        return self._through_steps(xs, us, search, guess, segmented=segments > 1)
+        return self._through_steps(guess.xs, guess.us, search, guess, around=not rolled)
 
     def _through_steps(
         self,
@@ -313,12 +316,11 @@ class Run:
         search: Searcher,
         guess: Guess,
         *,
-        segmented: bool = False,
         may_be_blind: bool = False,
         around: bool = False,
     ) -> Solution:
         """See `_searched`; a signal that comes before the search ends that at its start, with what it begins with."""
-        options = {"segmented": segmented, "may_be_blind": may_be_blind, "around": around}
+        options = {"may_be_blind": may_be_blind, "around": around}
         with ExitStack() as until_found:
             interrupted = until_found.enter_context(noted_interrupts())
             return self._searched(xs, us, search, guess, interrupted, until_found.close, **options)
@@ -332,32 +334,35 @@ class Run:
         interrupted: threading.Event,
         found: Callable[[], None],
         *,
-        segmented: bool,
         may_be_blind: bool,
         around: bool,
     ) -> Solution:
-        """Certify, search, call `found`, certify again, on Drake's own steps; at rollouts, or at states as they are.
+        """Certify, search, call `found`, certify again, on Drake's own steps: at the states that a search gives.
 
-        The latter if the motion is `segmented`; `around` its first states the guess alone.
+        Of the guess at its rollout, or `around` its states as they are.
         """
-        given, values = xs if segmented or around else None, self._first_values(guess)
-        variables = ShootingVariables(self.problem, around=given)
+        values, begun = self._first_values(guess), xs
+        try:
+            with until_set(interrupted):
+                ends = self._with_its_end(xs, us, values) if around else None
+        except SimulationError:  # what no input can hold says nothing of the goal
+            ends = xs
+        variables = ShootingVariables(self.problem, around=ends)
         try:
             with until_set(interrupted):
                 xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values), found=False)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us), error)
+        xs = begun if around else xs
         if blindness and not may_be_blind:
             return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
         self._reach(1, self._draft(xs, us, certificates=before))
         try:
             result, xs, us = self._keeping_clear(search, xs, us, values)
             self._reach(2, self._draft(xs, us, certificates=before, multipliers=result.multipliers), result)
-            variables = ShootingVariables(self.problem, around=xs if segmented else None)
+            variables = ShootingVariables(self.problem, around=xs if self.method == "shooting" else None)
             z = variables.pack(xs[0], us, result.parameters)
             result = heard(result, interrupted)
-            if self.method == "shooting" and len(result.z) == variables.size:
-                z = np.clip(result.z, *variables.limits())  # which solvers keep within their tolerance
             if self.report is not None and self.report.plan is not None:  # else it need not be rolled out
                 drawn = variables.states(z), variables.unpack(z)[1]
                 self._offer(self._draft(*drawn, **self._design_of(variables, z)), result)
@@ -370,6 +375,11 @@ class Run:
         told = {"certificates": before + after, **self._design_of(variables, z)}
         solution = self._judge(self._draft(xs, us, multipliers=result.multipliers, **told), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
+
+    def _with_its_end(self, xs: Array, us: Array, values: Array) -> Array:
+        """(N+1, nx) the states of a guess with the last one where its inputs lead: its own may be the goal itself."""
+        with self.problem.intervals(self.problem.design.vector.at(values)) as intervals:
+            return np.vstack([xs[:-1], roll(intervals, xs[0], us)[-1:]])
 
     def _design_of(self, variables: ShootingVariables, z: Array) -> dict[str, Any]:
         """The parameters and the horizon in z."""
@@ -412,10 +422,7 @@ class Run:
 
     def _values_of(self, result: NlpResult, first: Array) -> Array:
         """(np,) what a search found, that began at `first`."""
-        if result.parameters is not None:
-            return result.parameters
-        variables = ShootingVariables(self.problem)
-        return variables.parameters(result.z).values if len(result.z) == variables.size else first
+        return first if result.parameters is None else result.parameters
 
     def _reach(self, stage: int, draft: Solution | None = None, result: NlpResult | None = None) -> None:
         """Note the stage that begins, and what there is by then."""

@@ -171,7 +171,7 @@ class _Plan:
         """Where the second derivatives came from."""
         if not isinstance(program, StepProgram):
             return "symbolic"
-        return f"differences of the steps' Jacobians by {' and '.join(sorted(program.methods))}"
+        return f"the steps' Jacobians by {' and '.join(sorted(program.methods))}"
 
 
 def _plan(solution: Solution) -> _Plan:
@@ -190,6 +190,8 @@ def _plan(solution: Solution) -> _Plan:
             raise ModelError(f"{problem.name}: no second derivatives: {program.functions.why_not}")
         z = program.pack(np.asarray(motion.nodes), motion.horizon, motion.task.coordinates)
         return _Plan(problem, collocated, z, False)
+    if problem.trajectory_cost is not None:
+        raise InputError("trajectory_cost", got="given", expected="none: it joins all states, and no step does")
     rounds = solution.options.get("clearance_rounds", ())
     if rounds:  # what it was searched with besides
         more = swept(problem.kept, solution.time_step, int(rounds[-1][0]))

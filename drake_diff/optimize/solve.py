@@ -21,9 +21,8 @@ from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.optimize.advice import advice
 from drake_diff.optimize.apart import is_kept_apart, kept_apart
 from drake_diff.optimize.continuation import check_schedule
-from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.guess import another_guess, first_guess, sampled
-from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained
+from drake_diff.optimize.ilqr.ilqr import check_problem, takes
 from drake_diff.optimize.optima import distinct
 from drake_diff.optimize.phased import PhasedSolution, solve_phased
 from drake_diff.optimize.problem.phases import PhasedProblem
@@ -31,8 +30,6 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.timed import TimedCost
 from drake_diff.optimize.program import Iteration, Limits, Report
 from drake_diff.optimize.run import PLANS, Run
-from drake_diff.optimize.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
-from drake_diff.optimize.shooting import check_segments
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.transcription.collocation import (
     MeshRefinement,
@@ -42,8 +39,9 @@ from drake_diff.optimize.verification import overlaps
 
 COMPILED = 0.5  # [s] that are worth a word
 LARGEST_TOLERANCE = 1e3
+SOLVERS = ("ipopt", "snopt")
 METHODS = ("auto", "collocation", "shooting", "ilqr")
-DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
+DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": "ipopt", "ilqr": "riccati"}
 OTHER_GUESSES = 8  # of a collocation that finds no motion from a straight line
 OTHER_ITERATIONS = 200  # of each
 OTHER_GUESS = "another first guess"
@@ -69,7 +67,6 @@ def solve(
     time_limit: float | None = None,
     tolerance: float = 1e-8,
     seed: int = 0,
-    segments: int = 1,
     continuation: Any = None,
     refine: bool | None = None,
     error_tolerance: float = 1e-6,
@@ -112,7 +109,6 @@ def solve(
     time_limit: float | None = None,
     tolerance: float = 1e-8,
     seed: int = 0,
-    segments: int = 1,
     continuation: Any = None,
     refine: bool | None = None,
     error_tolerance: float = 1e-6,
@@ -143,13 +139,11 @@ def solve(
             (N+1, nu), and a third entry, the horizon [s]. In phases: a PhasedSolution, or a list, one for each phase.
         scheme: of collocation: "hermite_simpson" (order 4, the default), "trapezoid" (order 2), or "drake", which is
             what Drake's DirectCollocation transcribes.
-        solver: "ipopt" or "snopt"; the latter with method="shooting", or with scheme="drake", which then is Drake's
-            own DirectCollocation.
+        solver: "ipopt", or "snopt" with scheme="drake", which then is Drake's own DirectCollocation.
         max_iterations: of the solver, and of each round of a refinement.
         time_limit: [s] of the whole solve, but for what Numba compiles, once on a machine; the message says how long.
         tolerance: the solver's, on feasibility and optimality.
         seed: of the noise in a default guess, and of the other first guesses.
-        segments: of multiple shooting, whose first states are variables too; 1 is single shooting.
         continuation: finds contact that the guess does not make, by stages of a force at a distance before the true
             plant: "auto" or a sequence of SoftContacts, with method="ilqr"; or "relaxed": by inverse dynamics over the
             positions of the guess, with contact and friction at a distance, of hinges, slides and free bodies that
@@ -217,7 +211,6 @@ def solve(
         "time_limit": None if time_limit is None else limits.time_limit,
         "tolerance": limits.tolerance,
         "seed": int(seed),
-        "segments": positive_int("segments", segments),
         "continuation": _plain_stages(continuation),
         "refine": refine,
         "error_tolerance": refinement.tolerance,
@@ -225,7 +218,7 @@ def solve(
     }
     if count("restarts", restarts, 0):
         arguments["restarts"] = int(restarts)
-    asked = Attempt(method, "asked for", scheme, solver, segments, continuation, int(seed), refine, refinement)
+    asked = Attempt(method, "asked for", scheme, solver, continuation, int(seed), refine, refinement)
     options: dict[str, Any] = {"limits": limits, "restarts": restarts}
     compiled = uncounted()
     if view is False:
@@ -274,11 +267,10 @@ def _solved(
             raise InputError("restarts", got=restarts, expected="0 for a PhasedProblem")
         return solve_phased(problem, arguments, initial_guess, report, on_start)
     task = _Task(problem, limits, asked.seed, report, on_start)
-    method, segments, continuation = asked.method, asked.segments, asked.continuation
-    if method == "auto" and continuation is not None:
+    if asked.method == "auto" and asked.continuation is not None:
         asked = replace(asked, method="ilqr", reason="a continuation is asked for")
     initial_guess = sampled(problem, asked.method, initial_guess)
-    in_chain = asked.method in ("auto", "collocation") and segments == 1
+    in_chain = asked.method in ("auto", "collocation")
     make = partial(_solve_in_chain, task, asked, initial_guess) if in_chain else task.prepare(asked, initial_guess)
     solution = make()
     if restarts:
@@ -340,7 +332,6 @@ class Attempt:
     reason: str
     scheme: str | None = None
     solver: str | None = None
-    segments: int = 1
     continuation: Any = None
     seed: int = 0
     refine: bool | None = None
@@ -377,7 +368,6 @@ class _Task:
         scheme = _check_attempt(problem, attempt)
         guess = first_guess(problem, method, given, self.seed)
         xs, us = guess.xs, guess.us
-        check_segments(problem, method, attempt.segments)
         if attempt.continuation is not None and method != "ilqr":
             expected = f'none for method="{method}"; method="ilqr" takes it'
             raise InputError("continuation", got="given", expected=expected)
@@ -394,7 +384,6 @@ class _Task:
             "time_limit": None if np.isinf(self.limits.time_limit) else self.limits.time_limit,
             "tolerance": self.limits.tolerance,
             "seed": self.seed,
-            "segments": attempt.segments,
             "method_reason": attempt.reason,
             "initial_guess": "default" if given is None else "given",
             "initial_guess_sha256": sha256(xs.tobytes() + us.tobytes()).hexdigest(),
@@ -408,8 +397,7 @@ class _Task:
             elif method == "ilqr":
                 search = partial(run.sweep, guess, given=given is not None, stages=stages)
             else:
-                improve = given is None and attempt.segments == 1 and is_unconstrained(problem)
-                search = partial(run.shoot, guess, attempt.segments, improve=improve)
+                search = partial(run.shoot, guess, given=given is not None)
             return run.within_time(search, guess, self.begin)
 
         return make
@@ -517,7 +505,7 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
     if problem.motion == CONTINUOUS:
         yield from _in_continuous_time(problem, replace(asked, method=method, reason=reason), given, found)
         return
-    first = replace(asked, method=method, reason=reason, solver=None if method == "ilqr" else asked.solver)
+    first = replace(asked, method=method, reason=reason, solver=asked.solver if method == "collocation" else None)
     told = "nothing touches at first, and every coordinate is driven"
     free = replace(asked, method="collocation", reason=told)
     by_steps = method == "ilqr" or (method == "shooting" and problem.couplings)
@@ -547,12 +535,8 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
 def _in_continuous_time(
     problem: Problem, first: Attempt, given: Any, found: list[Solution]
 ) -> Iterator[tuple[Attempt, Any]]:
-    """One method, shooting from what iLQR found, and other first guesses: one that touches nothing has no slope.
-
-    Shooting is by IPOPT where no solver is asked for: a juggling paddle takes it a tenth of SNOPT's time.
-    """
-    solver = None if first.method == "ilqr" else first.solver or "ipopt"
-    first = replace(first, solver=solver)
+    """One method, shooting from what iLQR found, and other first guesses: one that touches nothing has no slope."""
+    first = replace(first, solver=None)
     yield first, given
     for number in range(OTHER_GUESSES + 1):
         if number:
@@ -566,7 +550,7 @@ def _in_continuous_time(
             and np.all(np.isfinite(last.xs))
         ):
             reason = "from the motion that iLQR found"
-            yield replace(first, method="shooting", solver="ipopt", reason=reason), last
+            yield replace(first, method="shooting", reason=reason), last
 
 
 def _rolled_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
@@ -635,6 +619,8 @@ def _check_attempt(problem: Problem, attempt: Attempt) -> str:
     if method == "collocation":
         return _check_collocation(problem, attempt)
     takes = 'method="collocation" takes it'
+    if attempt.solver == "snopt":
+        raise InputError("solver", got='"snopt"', expected=f'none for method="{method}": scheme="drake" takes it')
     if scheme is not None:
         raise InputError("scheme", got=repr(scheme), expected=f'none for method="{method}"')
     if not problem.has_model:
@@ -720,7 +706,7 @@ def choose_method(problem: Problem) -> tuple[str, str]:
     contract = problem.model.contract
     if problem.motion == CONTINUOUS:
         told = "the motion is in continuous time, which collocation does not take"
-        return "ilqr" if is_unconstrained(problem) else "shooting", told
+        return "ilqr" if takes(problem) else "shooting", told
     if problem.horizon is not None and not _touches_at_first(problem):
         return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
     if not problem.optimizes_controls:

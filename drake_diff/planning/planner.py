@@ -59,7 +59,6 @@ NOTHING = "no motion was found to begin with that its motors make and that keeps
 GENTLY = ((0.25, 100), (0.1, 100))
 COMES_TO_REST = 400  # steps of GENTLE
 WIDTH, DRAWS = 0.3, 30  # of a coordinate's range, and postures: another one to begin in
-SEGMENT = 5  # steps of multiple shooting
 
 Report = Callable[[str, str], None]
 
@@ -386,11 +385,7 @@ def _collocated(robot: Robot, task: Task, guess: Guess, least: str | None) -> _A
 def _feasible(robot: Robot, task: Task, guess: Guess) -> _Attempt:
     """Any motion to where the guess ends that keeps all limits: the guess itself, if it does."""
     problem = _problem(task, guess, guess.xs[-1])
-    # From states on the way: rolled out from the first alone, what is upright falls in seconds, by rounding.
-    segments = max(1, guess.num_steps // SEGMENT)
-    return _Attempt(
-        guess.name, robot, problem, guess, {"method": "shooting", "segments": segments, "time_limit": BUDGET}
-    )
+    return _Attempt(guess.name, robot, problem, guess, {"method": "shooting", "time_limit": BUDGET})
 
 
 def _problem(task: Task, guess: Guess, x_goal: Array, **asked: Any) -> Problem:

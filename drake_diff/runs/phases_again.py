@@ -197,7 +197,7 @@ def _solve_again(found: PhasesAgain, whole: PlanRecord, records: list[PlanRecord
         return
     arguments: dict[str, Any] = dict(record.search)
     arguments.pop("time_limit", None)
-    for name in ("solver", "segments", "continuation"):
+    for name in ("solver", "continuation"):
         arguments.pop(name, None)
     solved = solve(problem, **arguments)
     apart = max(apart_from(one, other) for one, other in zip(solved.phases, solutions, strict=True))

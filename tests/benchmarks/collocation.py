@@ -49,11 +49,11 @@ def verified(problem: dd.Problem, scheme: str) -> Row:
     return seconds, solution.status.value, solution.cost, len(solution.iterations) - 1
 
 
-def drakes(problem: dd.Problem, solver: str) -> Row:
+def drakes(problem: dd.Problem) -> Row:
     xs = np.linspace(problem.x0, problem.x_goal, problem.num_steps + 1)
     us = np.zeros((problem.num_steps, problem.model.nu))
     start = time.process_time()
-    result, xs, us, last = solve_collocation(problem, xs, us, solver=solver, limits=LIMITS, report=None)
+    result, xs, us, last = solve_collocation(problem, xs, us, limits=LIMITS, report=None)
     seconds = time.process_time() - start
     told = "limit" if result.outcome in (Outcome.TIME_LIMIT, Outcome.ITERATION_LIMIT) else result.outcome.value
     return seconds, told, problem.objective(xs, np.vstack([us, last])), len(result.iterations)

@@ -32,10 +32,9 @@ def solved(names: list[str], quick: bool) -> Iterator[Row | Missing]:
 
 
 def _collocated(name: str, problem: dd.Problem, budget: float) -> Iterator[Row]:
-    base = "Drake DirectCollocation, IPOPT"
+    base = "Drake DirectCollocation, SNOPT"
     calls: dict[str, Callable[[], collocation.Row]] = {
-        base: lambda: collocation.drakes(problem, "ipopt"),
-        "Drake DirectCollocation, SNOPT": lambda: collocation.drakes(problem, "snopt"),
+        base: lambda: collocation.drakes(problem),
         "drake_diff, verified (dd.solve)": lambda: collocation.verified(problem, "hermite_simpson"),
         "drake_diff, Drake's scheme": lambda: collocation.ours(problem, "drake"),
         "drake_diff, Hermite-Simpson": lambda: collocation.ours(problem, "hermite_simpson"),

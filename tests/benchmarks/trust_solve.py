@@ -263,7 +263,7 @@ def double_pendulum_moves(random):
 
 def double_pendulum_in_segments(random):
     start, goal = (np.concatenate([random.uniform(-1, 1, 2), np.zeros(2)]) for _ in range(2))
-    options = {"method": "shooting", "segments": 4, "solver": "ipopt"}
+    options = {"method": "shooting"}
     return swing("double_pendulum.urdf", start, goal, 40.0, 0.02, 30, **options)
 
 

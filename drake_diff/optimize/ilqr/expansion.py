@@ -86,6 +86,11 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
         final_gradient = final_gradient + gradient[-1, : model.nx]
         final_hessian = final_hessian + curvature[-1, : model.nx, : model.nx]
     bounds, free = problem.bounds, problem.initial_state_mask
+    lower, upper = bounds.u_lower - us, bounds.u_upper - us
+    if not problem.optimizes_controls:  # they stay: any curvature will do
+        lower, upper, nx = np.zeros_like(us), np.zeros_like(us), model.nx
+        gradients[:, nx:], hessians[:, nx:], hessians[:, :, nx:] = 0.0, 0.0, 0.0
+        hessians[:, nx:, nx:] = np.eye(us.shape[1])
     found = LinearQuadratic(
         F=jacobians,
         gaps=motion.gaps,
@@ -93,8 +98,8 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
         hessians=hessians,
         final_gradient=final_gradient,
         final_hessian=final_hessian,
-        lower=bounds.u_lower - us,
-        upper=bounds.u_upper - us,
+        lower=lower,
+        upper=upper,
         start_lower=np.where(free, bounds.x_lower - xs[0], 0.0),
         start_upper=np.where(free, bounds.x_upper - xs[0], 0.0),
     )

@@ -81,15 +81,12 @@ def check_problem(problem: Problem) -> None:
         raise InputError(subject, got="given", expected='none for method="ilqr"; method="shooting" takes it')
 
 
-def is_unconstrained(problem: Problem) -> bool:
-    """Whether iLQR can solve `problem` in one minimization: costs and input bounds alone, from the given x0."""
-    hard = AugmentedLagrangian(problem).any or problem.initial_state_mask.any() or problem.design.count > 0
-    return not hard and not list(_unkept(problem))
+def takes(problem: Problem) -> bool:
+    """Whether iLQR can keep all that `problem` asks for."""
+    return not list(_unkept(problem))
 
 
 def _unkept(problem: Problem) -> Iterator[str]:
-    if not problem.optimizes_controls:
-        yield "fixed controls"
     if problem.trajectory_cost is not None:
         yield "trajectory_cost"
     if problem.couplings:
@@ -164,6 +161,8 @@ def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: 
 def _smooth_roll(problem: Problem) -> SmoothRoll | None:
     """What motions of the problem are tried by; None where that is Drake's step itself."""
     if not problem.has_model or problem.motion != STEPS or problem.design.vector.parameters or problem.design.count:
+        return None
+    if not problem.optimizes_controls:
         return None
     return smooth_roll_of(problem.model)
 
@@ -469,7 +468,7 @@ class _Search:
     def _take_in(self, xs: Array, us: Array, c: Array) -> Motion:
         """The guess, its inputs taken inside their bounds and its first state the problem's, and its gaps."""
         free = self.problem.initial_state_mask
-        xs, us = np.array(xs), self._inside(us)
+        xs, us = np.array(xs), self._inside(us if self.problem.optimizes_controls else np.array(self.problem.us))
         xs[0] = self._inside_start(np.where(free, xs[0], self.problem.x0))
         gaps = np.empty_like(xs[1:])
         quaternions = tangent_space(self.problem.model).quaternions
@@ -483,7 +482,9 @@ class _Search:
         return Motion(xs, us, gaps, c)
 
     def _inside(self, us: Array) -> Array:
-        """`us` (..., nu) within its bounds, and on a bound where rounding alone parts it from one."""
+        """`us` (..., nu) within its bounds, and on a bound where rounding alone parts it from one; given ones stay."""
+        if not self.problem.optimizes_controls:
+            return us
         bounds, (lowest, highest) = self.problem.bounds, self.inner
         return np.where(us <= lowest, bounds.u_lower, np.where(us >= highest, bounds.u_upper, us))
 

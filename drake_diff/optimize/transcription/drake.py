@@ -1,25 +1,33 @@
-"""Direct collocation: Drake's DirectCollocation over the model's equations of motion in continuous time."""
+"""Drake's own DirectCollocation over the model's equations of motion in continuous time, solved by SNOPT."""
 
-from collections.abc import Callable
+import math
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydrake import solvers
 from pydrake.autodiffutils import ExtractValue
-from pydrake.solvers import MathematicalProgram
+from pydrake.solvers import MathematicalProgram, SnoptSolver, SolutionResult
 
 from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff._base.autodiff import chain
+from drake_diff._base.clock import TimeIsUpError, check_time, now, until_set
+from drake_diff._base.signals import noted_interrupts
+from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 from drake_diff.model.equations import ContinuousSystem, EquationsOfMotion
-from drake_diff.optimize.drake_program import solve_program
 from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.cost import QuadraticCost, differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Limits, NlpResult, Report
+from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch
 
 
 def solve_collocation(
-    problem: Problem, xs: Array, us: Array, *, solver: str, limits: Limits, report: Report | None
+    problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None
 ) -> tuple[NlpResult, Array, Array, Array | None]:
     """Solve `problem` from the guess xs (N+1, nx), us (N, nu); gives (result, xs, us, u_final).
 
@@ -49,7 +57,7 @@ def solve_collocation(
         xs, us = frozen(z[places[0]]), frozen(z[places[1][:-1]])
         return (Iterate(problem, frozen(h * np.arange(count + 1)), xs, us, problem.parameters, by_steps=False),)
 
-    result = solve_program(program, guess, solver=solver, limits=limits, report=report, motions=motions)
+    result = _solve_snopt(program, guess, limits, report, motions)
     xs, us = (result.z[at] for at in places)
     return result, xs, us[:-1], us[-1]
 
@@ -114,3 +122,165 @@ class _Cost:
     def __call__(self, z: Any) -> Any:
         value, gradient = self.differentiate(z if z.dtype == float else ExtractValue(z).ravel())
         return self.weight * value if z.dtype == float else chain(self.weight * value, self.weight * gradient, z)
+
+
+class _Stop(Exception):  # noqa: N818  (a signal, not an error)
+    """Raised in the callback to end a solve."""
+
+
+def _solve_snopt(
+    program: MathematicalProgram,
+    guess: Array,
+    limits: Limits,
+    report: Report | None,
+    motions: Callable[[Array], tuple[Iterate, ...]],
+) -> NlpResult:
+    """Solve `program` from `guess` (n,).
+
+    `report` gets a line of progress a few times a second, with what `motions` makes of the point. Ctrl-C and the time
+    limit end the solve with the best iterate so far.
+    """
+    engine, options = SnoptSolver(), solvers.SolverOptions()
+    if not (engine.available() and engine.enabled()):
+        raise MissingDependencyError('SNOPT is not in this Drake: take Drake\'s wheel, or solver="ipopt"')
+    with tempfile.TemporaryDirectory() as folder, noted_interrupts() as interrupted:
+        watch, print_file = Watch(limits, interrupted), Path(folder) / "log"
+        options.SetOption(solvers.CommonSolverOption.kPrintFileName, str(print_file))
+        tolerance, most = limits.tolerance, limits.max_iterations
+        chosen: dict[str, float] = {"Major iterations limit": most, "Iterations limit": 1000 * most}
+        chosen |= {"Major feasibility tolerance": tolerance, "Major optimality tolerance": tolerance}
+        for option, value in chosen.items():
+            options.SetOption(SnoptSolver.id(), option, value)
+        callback = _Callback(program, watch, report, motions)
+        program.AddVisualizationCallback(callback, program.decision_variables())
+        try:
+            with until_set(interrupted):
+                result = engine.Solve(program, guess, options)
+        except (DrakeDiffError, RuntimeError, _Stop, TimeIsUpError) as error:
+            outcome, message = _explain_exception(watch, error)
+            callback.look_back()
+            ended = NlpResult(watch.best_of(guess), outcome, message, ())
+        else:
+            outcome, message = _explain(result)
+            ended = NlpResult(np.asarray(result.GetSolution(program.decision_variables())), outcome, message, ())
+        return replace(ended, iterations=_read_table(print_file))
+
+
+class _Callback:
+    """Called by the solver at every evaluation: reports, keeps the best iterate, raises to stop."""
+
+    def __init__(
+        self, program: MathematicalProgram, watch: Watch, report: Report | None, motions: Callable[[Array], Any]
+    ):
+        self.program, self.watch, self.report, self.motions = program, watch, report, motions
+        self.evaluations, self.called = 0, now()
+        self.current: Array | None = None
+        self.before: Array | None = None  # the last point but this at which everything could be evaluated
+
+    def __call__(self, z: Array) -> None:
+        self.evaluations += 1
+        before, self.called = self.called, now()
+        if self.current is None or not np.array_equal(z, self.current):
+            self.before, self.current = self.current, np.array(z)
+        if self.evaluations == 1:
+            self.watch.offer(z, math.inf, 0.0)  # better than none: what it costs has not been asked yet
+        if self.watch.look_up():
+            self._look(z)
+        if self.watch.stopped_by is not None:
+            raise _Stop
+        if self.evaluations > 2:  # the next one takes as long as the last, but for the first, which loads what it needs
+            check_time(ahead=self.called - before)
+
+    def look_back(self) -> None:
+        """Keep the point before the one that ended the solve, if it is the best."""
+        if self.before is not None:
+            try:
+                self._look(self.before)
+            except (DrakeDiffError, TimeIsUpError):
+                return  # nor can it be evaluated: the best that was seen stays
+
+    def _look(self, z: Array) -> None:
+        cost = sum(float(self.program.EvalBinding(binding, z)[0]) for binding in self.program.GetAllCosts())
+        violations = []
+        for binding in self.program.GetAllConstraints():
+            constraint, values = binding.evaluator(), self.program.EvalBinding(binding, z)
+            beyond = np.maximum(constraint.lower_bound() - values, values - constraint.upper_bound())
+            violations.append(float(np.max(beyond, initial=0)))
+        violation = max(violations, default=0.0)
+        self.watch.offer(z, cost, violation)
+        row = Iteration(self.evaluations, cost, violation, math.nan, math.nan)
+        if self.report is not None:
+            point = np.array(z)
+            self.report.row(row, lambda: self.motions(point), printed=False)
+            cost_told, violation_told = f"cost {cost:12.6g}", f"violation {violation:9.2e}"
+            self.report.say(
+                f"evaluation {self.evaluations:5d}  {cost_told}  {violation_told}  {self.watch.elapsed:6.1f} s"
+            )
+
+
+def _explain_exception(watch: Watch, error: Exception) -> tuple[Outcome, str]:
+    """SNOPT wraps our exceptions in a RuntimeError: flags and names tell, not types."""
+    if watch.stopped_by is None and watch.interrupted.is_set():  # in the middle of an evaluation
+        watch.stopped_by = Outcome.INTERRUPTED
+    if watch.stopped_by is not None:
+        return watch.stopped_by, f"stopped: {watch.stopped_by.value}"
+    text = f"{type(error).__name__}: {error}"
+    if TimeIsUpError.__name__ in text:  # in the middle of an evaluation
+        return Outcome.TIME_LIMIT, f"stopped: {Outcome.TIME_LIMIT.value}"
+    for name, outcome in (("SimulationError", Outcome.DIVERGED), ("GradientError", Outcome.NO_GRADIENT)):
+        if name in text:
+            return outcome, text[text.rindex(name) :].strip()  # SNOPT's text holds the traceback first
+    return Outcome.FAILED, text
+
+
+_RESULTS = {
+    SolutionResult.kSolutionFound: Outcome.SOLVED,
+    SolutionResult.kIterationLimit: Outcome.ITERATION_LIMIT,
+    SolutionResult.kInfeasibleConstraints: Outcome.INFEASIBLE,
+    SolutionResult.kInfeasibleOrUnbounded: Outcome.INFEASIBLE,
+    SolutionResult.kUnbounded: Outcome.UNBOUNDED,
+}
+# Feasible, or not better: "requested accuracy could not be achieved", "current point cannot be improved".
+_SNOPT_INACCURATE = (3, 41)
+_SNOPT_INFEASIBLE = (11, 12, 13, 14, 15, 16)
+
+
+def _explain(result: Any) -> tuple[Outcome, str]:
+    """The outcome and the solver's own words for it."""
+    outcome = _RESULTS.get(result.get_solution_result(), Outcome.FAILED)
+    info = result.get_solver_details().info
+    if info in _SNOPT_INACCURATE:
+        outcome = Outcome.INACCURATE
+    elif info in _SNOPT_INFEASIBLE:
+        outcome = Outcome.INFEASIBLE
+    return outcome, f"SNOPT info {info}: {result.get_solution_result().name}"
+
+
+def _read_table(print_file: Path) -> tuple[Iteration, ...]:
+    if not print_file.is_file():
+        return ()
+    rows = _snopt_rows(print_file.read_text(errors="replace").splitlines())
+    return tuple({row.iteration: row for row in rows}.values())  # SNOPT repeats an iteration whose Hessian it resets
+
+
+def _snopt_rows(lines: list[str]) -> Iterator[Iteration]:
+    """Columns are read where their header stands: the first row leaves some of them blank."""
+    ends: dict[str, tuple[int, int]] = {}
+    for line in lines:
+        if "Itns" in line and "Major" in line and "Feasible" in line:
+            previous = 0
+            for match in re.finditer(r"\S+", line):
+                ends[match.group()] = (previous, match.end())
+                previous = match.end()
+        elif ends and re.match(r"^\s+\d+\s+\d+\s", line):
+            objective = next((n for n in ("MeritFunction", "Objective") if n in ends), "")
+            cell = {name: line[a:b].strip(" ()") for name, (a, b) in ends.items()}
+            numbers = (_number(cell.get(name, "")) for name in (objective, "Feasible", "Optimal", "Step"))
+            yield Iteration(int(cell["Major"]), *numbers)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

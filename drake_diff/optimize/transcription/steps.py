@@ -1,34 +1,90 @@
-"""A plan by Drake's own steps as a sparse program: z = [x_0, u_0, x_1, u_1, ..., x_N, parameters], each step a row.
+"""Shooting: a plan by Drake's own steps as a sparse program, z = [x_0, u_0, x_1, u_1, ..., x_N, parameters].
 
     g = x_(k+1) - f(x_k, u_k, p),    d^2 (lambda' g) = -sum_k lambda_k' d^2 f
 
-First derivatives are those of the steps, exact; second ones are central differences of these, by blocks, as no two
-states are in one step's Jacobian but the first and the last of it. It says what is an optimum of plans by iLQR and by
-shooting alike, and IPOPT solves it again.
+Every state is a variable and every step a row, so that what a late input does need not be seen through all the steps
+before it (Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", 1984, with a
+step to a segment). First derivatives are those of the steps, exact. Second ones are by blocks, as no two states are in
+one step's Jacobian but the first and the last of it: known, or central differences of the Jacobians, or learned from
+iteration to iteration. The same program says what is an optimum of plans by iLQR and by shooting alike.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from drake_diff._base.arrays import Array, Indices
-from drake_diff.derivatives.step import StepDerivatives, derivatives_along
-from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.model.parameters import ParameterVector, applied
-from drake_diff.optimize.ilqr.expansion import expand_running_cost
+from drake_diff._base.arrays import Array, Indices, frozen
+from drake_diff.derivatives.step import StepDerivatives
+from drake_diff.exceptions import GradientError, SimulationError
+from drake_diff.model.parameters import ParameterVector
+from drake_diff.motion.intervals import roll
+from drake_diff.motion.loss import differentiate_loss
+from drake_diff.optimize.ilqr.expansion import Motion, curvature_along, expand_running_cost
+from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import differentiate_final_cost, final_cost_hessian
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome, Report
+from drake_diff.optimize.transcription.program import solve_ipopt
 
 DIFFERENCE = 1e-5  # of max(1, |z|): of exact Jacobians, known to 1e-12
 ROUGH_DIFFERENCE = 1e-4  # of Jacobians that are differences themselves
 ROUGH = "finite_difference"
+CHEAP = {
+    "analytic",
+    "implicit",
+}  # of all steps in one call: second derivatives by differences cost less than iterations
+SMALLEST_MOVE, SAFE_DIVISOR = 1e-7, 1e-6  # where symmetric rank one is not defined, or of rounding
 # Beyond a limit the plant cuts inputs off; CasADi makes no derivatives of what is called back.
 CALLED_BACK = {"ipopt.bound_relax_factor": 0.0, "no_nlp_grad": True}
+SAME_MOTION = 1e-8  # of a state's range: a rollout that stays so near to the states of a program is its motion
+
+
+def solve_shooting(
+    problem: Problem,
+    xs: Array,
+    us: Array,
+    *,
+    limits: Limits,
+    report: Report | None,
+    values: Array | None = None,
+    begun: Multipliers | None = None,
+) -> tuple[NlpResult, Array, Array]:
+    """Solve `problem` from the guess xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us).
+
+    `values` (np,) are those of the problem's `design` to begin with, its own where None; `begun` the multipliers of a
+    search like this one. The states are the rollout of the inputs where that stays at those of the program, and else
+    these themselves, which steps lead from to within the tolerance: an unstable motion leaves them open loop. A point
+    that cannot be stepped or differentiated is a step that was too long, which the message counts; raises GradientError
+    or SimulationError if the guess is such a point.
+    """
+    program = StepProgram(problem, lenient=True)
+    guess = np.clip(program.pack(xs, us, values), program.lower, program.upper)
+    program.require(guess)
+    known = begun if begun is not None and begun.sizes == (program.size, len(program.sides[0])) else None
+    exact = not program.functions.why_not
+    result = solve_ipopt(
+        program, guess, limits, report, exact=exact, begun=known, more=CALLED_BACK, motions=program.iterates
+    )
+    if program.refusals:
+        count = f"{program.refusals} point{'s' * (program.refusals > 1)}"
+        told = f"; backed off from {count} that could not be stepped or differentiated, the last: {program.refusal}"
+        refused = result.outcome is Outcome.FAILED
+        outcome = Outcome.NO_GRADIENT if refused else result.outcome
+        result = replace(result, message=result.message + told, outcome=outcome)
+    xs, us, found = program.motion(np.clip(result.z, program.lower, program.upper))
+    result = replace(result, parameters=found)
+    try:
+        with problem.intervals(problem.design.vector.at(found)) as intervals:
+            rolled = roll(intervals, xs[0], us)
+    except SimulationError:
+        return result, xs, us
+    is_same = np.all(np.abs(rolled - xs) <= SAME_MOTION * problem.ranges(xs))
+    return result, rolled if is_same else xs, us
 
 
 @dataclass(eq=False)
@@ -42,13 +98,13 @@ class Called:
 class StepProgram:
     """The program of a `Problem` whose model takes discrete steps, with derivatives as CasADi's nlpsol takes them.
 
-    `states_at` (N+1, nx), `inputs_at` (N, nu) and `parameters_at` (np,) say where in z they are.
+    `states_at` (N+1, nx), `inputs_at` (N, nu) and `parameters_at` (np,) say where in z they are. `refusals` counts the
+    points that could not be stepped or differentiated, and `refusal` says why the last one could not. If `lenient`, the
+    Hessian goes without the steps' curvature where a point beside z is such a point.
     """
 
-    def __init__(self, problem: Problem):
-        if problem.trajectory_cost is not None:
-            raise InputError("trajectory_cost", got="given", expected="none: it joins all states, and no step does")
-        self.problem = problem
+    def __init__(self, problem: Problem, *, lenient: bool = False):
+        self.problem, self.lenient, self.refusals, self.refusal = problem, lenient, 0, ""
         nx, nu, count = problem.nx, problem.nu, problem.num_steps
         self.design = problem.design
         width, free = nx + nu, self.design.count
@@ -61,11 +117,13 @@ class StepProgram:
         single = [(c, np.array([k])) for c in problem.kept for k in problem.knots_of(c, input_at_end=False)]
         several = [(c.rows, at) for c in problem.coupled_steps() for at in c.knots]
         self.paths = [_Path(self, rows, at) for rows, at in (*single, *several)]
-        self.functions: Any = Called()
+        joins_all = problem.trajectory_cost is not None
+        self.functions: Any = Called("trajectory_cost joins all states" if joins_all else "")
         self.z = ca.MX.sym("z", self.size)
         self.lower, self.upper = self._bounds(0), self._bounds(1)  # equal where a variable is given
         self.methods: set[str] = set()  # where Jacobians came from
         self._kept: tuple[bytes, list[StepDerivatives]] = b"", []
+        self._last: tuple[Array, Array, Array] | None = None  # a point, its Jacobians, and the curvature learned so far
         self._callbacks: list[Any] = []  # CasADi holds no reference to its callbacks
         self._blocks = [self._block(k) for k in range(count + 1)]
         self._set_places()
@@ -86,6 +144,20 @@ class StepProgram:
         z[self.states_at], z[self.inputs_at] = xs, us
         z[self.parameters_at] = self.design.of_values(self.design.vector.values if values is None else values)
         return z
+
+    def motion(self, z: Array) -> tuple[Array, Array, Array]:
+        """xs (N+1, nx), us (N, nu) and the values (np,) of the problem's `design` at z (n,)."""
+        return z[self.states_at], z[self.inputs_at], self.design.values(z[self.parameters_at])
+
+    def require(self, z: Array) -> None:
+        """Raise GradientError or SimulationError where a step at z (n,) cannot be taken or differentiated."""
+        self._steps(z)
+
+    def iterates(self, z: Array) -> tuple[Iterate, ...]:
+        """The motion at z, for callbacks."""
+        xs, us, values = self.motion(z)
+        times = frozen(self.design.time_step(values) * np.arange(len(xs)))
+        return (Iterate(self.problem, times, frozen(xs), frozen(us), self.vector(z), by_steps=True),)
 
     def _bounds(self, side: int) -> Array:
         problem, b = self.problem, self.problem.bounds
@@ -176,8 +248,8 @@ class StepProgram:
     def _steps(self, z: Array) -> list[StepDerivatives]:
         if self._kept[0] != z.tobytes():
             (xs, us, _), vector = self._read(z), self.vector(z)
-            with applied(vector) as model:
-                found = derivatives_along(model, xs[0], us, vector=vector, xs=xs[:-1])
+            with self.problem.intervals(vector) as intervals:
+                found = intervals.derivatives(xs[0], us, xs[:-1])
             self.methods |= {d.method for d in found}
             self._kept = z.tobytes(), found
         return self._kept[1]
@@ -201,6 +273,11 @@ class StepProgram:
         if final is not None:
             paid, by_end = differentiate_final_cost(final, xs[-1])
             gradient[self.states_at[-1]] += by_end
+        if self.problem.trajectory_cost is not None:
+            value, by_xs, by_us = differentiate_loss(self.problem.trajectory_cost, xs, us)
+            gradient[self.states_at] += by_xs
+            gradient[self.inputs_at] += by_us
+            paid += value
         rates = (self.problem.objective(xs, us, h) - paid) / h  # of a running cost, whose steps are all of one length
         gradient[self.parameters_at] = self._by_coordinates(at) + rates * self._by_step(at)
         return [self._cost(z), gradient]
@@ -249,10 +326,37 @@ class StepProgram:
 
     def _curvature(self, z: Array, weights: Array) -> Array:
         """(N, w, w), w = nx + nu + np: the second derivatives of weights (N, nx) times the steps."""
+        steps, (xs, us) = self._steps(z), self._read(z)[:2]
+        if not self.design.vector.parameters and self.problem.has_model:
+            known = curvature_along(self.problem, Motion(xs, us, np.array([d.x_next for d in steps]) - xs[1:]), weights)
+            if known is not None and known[1].all():
+                return known[0]
+        if self.lenient and not {d.method for d in steps} <= CHEAP:
+            return self._learned(z, weights)
+        return self._differences(z, weights)
+
+    def _learned(self, z: Array, weights: Array) -> Array:
+        """The same as far as the Jacobians at the points before tell, block by block, by symmetric rank one.
+
+        Griewank and Toint, "Partitioned variable metric updates for large structured optimization problems", 1982.
+        """
+        at, jacobians = z[np.array(self._blocks[:-1])], self._jacobians(z)
+        if self._last is None:
+            self._last = at, jacobians, np.zeros((*at.shape, at.shape[1]))
+        before, old, learned = self._last
+        step = at - before
+        off = np.einsum("kij,ki->kj", jacobians - old, weights) - np.einsum("kij,kj->ki", learned, step)
+        divisor, length = np.einsum("ki,ki->k", off, step), np.linalg.norm(step, axis=1)
+        safe = (length > SMALLEST_MOVE) & (np.abs(divisor) > SAFE_DIVISOR * length * np.linalg.norm(off, axis=1))
+        learned[safe] += off[safe, :, None] * off[safe, None, :] / divisor[safe, None, None]
+        self._last = at, jacobians, learned
+        return np.array(learned)
+
+    def _differences(self, z: Array, weights: Array) -> Array:
+        """The same by central differences of the Jacobians."""
         at, b = np.array(self._blocks[:-1]), self.problem.bounds
         lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         lower[self.inputs_at], upper[self.inputs_at] = b.u_lower, b.u_upper  # beyond them the plant may cut off
-        self._steps(z)
         part = ROUGH_DIFFERENCE if ROUGH in self.methods else DIFFERENCE
         found = np.zeros((*at.shape, at.shape[1]))
         for j, column in enumerate(at.T):
@@ -261,7 +365,14 @@ class StepProgram:
                 moved = np.array(z)
                 moved[where] += side * part * np.maximum(1.0, np.abs(z[where]))
                 moved = np.clip(moved, lower, upper)
-                ends.append((moved[column], np.einsum("kij,ki->kj", self._jacobians(moved), weights)))
+                try:
+                    slopes = self._jacobians(moved)
+                except (GradientError, SimulationError) as error:
+                    if not self.lenient:
+                        raise
+                    self.refusals, self.refusal, self._kept = self.refusals + 1, str(error), (b"", [])
+                    return np.zeros_like(found)
+                ends.append((moved[column], np.einsum("kij,ki->kj", slopes, weights)))
             (low, before), (high, after) = ends
             apart = np.where(high > low, high - low, np.inf)
             found[:, :, j] = (after - before) / apart[:, None]
@@ -340,7 +451,8 @@ class _Callback(ca.Callback):  # type: ignore[misc]
         """The outputs; an error that is none of a step is kept for the solve to raise, as C++ must not see it."""
         try:
             found = self.evaluate(*[np.asarray(a).ravel() for a in arguments])
-        except (GradientError, SimulationError):
+        except (GradientError, SimulationError) as error:
+            self.owner.refusals, self.owner.refusal = self.owner.refusals + 1, str(error)
             return [ca.DM(sparsity, np.nan) for sparsity in self.outputs]
         except Exception as error:
             self.owner.functions.error = self.owner.functions.error or error
