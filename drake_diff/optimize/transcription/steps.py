@@ -274,7 +274,7 @@ class StepProgram:
             paid, by_end = differentiate_final_cost(final, xs[-1])
             gradient[self.states_at[-1]] += by_end
         if self.problem.trajectory_cost is not None:
-            value, by_xs, by_us = differentiate_loss(self.problem.trajectory_cost, xs, us)
+            value, by_xs, by_us, _method = differentiate_loss(self.problem.trajectory_cost, xs, us)
             gradient[self.states_at] += by_xs
             gradient[self.inputs_at] += by_us
             paid += value
