@@ -1,5 +1,7 @@
 """A look along a few random directions: what it passes is right, and what is wrong, or no slope, is left in doubt."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.models import MODELS
@@ -40,7 +42,7 @@ def test_what_would_have_been_noticed_is_noticed():
     random, seen = np.random.default_rng(5), 0
     for _ in range(200):  # errors of all entries together, the size of each what matters
         error = 0.0101 * taken.size * random.choice([-1.0, 1.0], WEIGHT.shape)
-        seen += taken.of(WEIGHT + error).doubt() != ""
+        seen += replace(taken, derivative=WEIGHT + error).doubt() != ""
     assert seen == 200
 
 
@@ -102,7 +104,7 @@ def test_robots_on_their_feet_pass_at_once_and_a_wrong_entry_is_named(name, appr
         for i, j in random.permutation(np.argwhere(np.abs(a) >= look.look.size * (1 - 1e-12)))[:100]:
             wrong = a.copy()
             wrong[i, j] *= 1.0101
-            assert look.look.of(wrong).doubt() != "", (i, j)
+            assert replace(look.look, derivative=wrong).doubt() != "", (i, j)
         assert look.certificate.derivative * scale == pytest.approx(a)
 
 

@@ -115,14 +115,14 @@ def test_one_smooth_step_is_known_only_where_it_leads_where_it_is_said_to():
     smooth, (x, u) = analytic_of(model), (np.array(POINT[0]), np.array([0.4, -0.3, 2.0]))
     x_next = dd.step(model, x, u)
     A, B, _ = equal(model, x[None], u[None])
-    np.testing.assert_allclose(smooth.one(x, u, x_next), np.hstack([A[0], B[0]]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(smooth.single(x, u, x_next), np.hstack([A[0], B[0]]), rtol=0, atol=1e-12)
     for i in range(model.nx):
-        assert smooth.one(x, u, x_next + 1e-8 * np.eye(model.nx)[i]) is None
-    assert smooth.one(x, u, x_next * np.nan) is None
-    assert smooth.one(x, np.array([0.4, 3.1, 2.0]), dd.step(model, x, [0.4, 3.1, 2.0])) is None  # clipped
+        assert smooth.single(x, u, x_next + 1e-8 * np.eye(model.nx)[i]) is None
+    assert smooth.single(x, u, x_next * np.nan) is None
+    assert smooth.single(x, np.array([0.4, 3.1, 2.0]), dd.step(model, x, [0.4, 3.1, 2.0])) is None  # clipped
     free = floating(None, 0)
     x = random_state(free, np.random.default_rng(0))
-    assert analytic_of(free).one(x, np.zeros(1), dd.step(free, x, [0.0])) is None  # a free body
+    assert analytic_of(free).single(x, np.zeros(1), dd.step(free, x, [0.0])) is None  # a free body
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -8,7 +8,7 @@ from helpers.table import each_row
 from pydrake import math as drake_math
 
 import drake_diff as dd
-from drake_diff._base.reverse import UntraceableError, traced_gradient
+from drake_diff._base.autodiff import UntraceableError, traced_gradient
 from drake_diff.exceptions import GradientError
 from drake_diff.motion.loss import _by_autodiff, differentiate_loss
 

@@ -60,7 +60,7 @@ def _of_numbers(subject: str, values: Any) -> Array:
     try:
         array = np.array(values)
         plain = array.dtype.kind in NUMBERS or (
-            array.dtype.kind == "O" and all(each is None or isinstance(each, Real) for each in array.flat)
+            array.dtype.kind == "O" and all(entry is None or isinstance(entry, Real) for entry in array.flat)
         )
         if not plain or isinstance(values, np.ma.MaskedArray):
             raise TypeError("no numbers")

@@ -97,9 +97,9 @@ def make_folder(path: Path) -> None:
             if folder.is_dir():
                 break
         missing = [p for p in (*reversed(path.parents), path) if p != folder and p.is_relative_to(folder)]
-        for each in missing:
-            each.mkdir(exist_ok=True)
-            sync_folder(each.parent)
+        for folder_to_make in missing:
+            folder_to_make.mkdir(exist_ok=True)
+            sync_folder(folder_to_make.parent)
 
 
 def sync_folder(path: Path) -> None:
@@ -135,10 +135,10 @@ def exchange(one: Path, other: Path) -> bool:
 @cache
 def _renameat2() -> Any:
     """The function of the C library, None where it has none (macOS, musl before 1.2.6)."""
-    found = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if found is not None:
-        found.argtypes = (ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint)
-    return found
+    function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if function is not None:
+        function.argtypes = (ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint)
+    return function
 
 
 def take_mode(folder: Path, of: Path) -> None:

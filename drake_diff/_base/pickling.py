@@ -20,25 +20,25 @@ class PicklesItsFields:
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
-        found = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        values = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
         if INSIDE.get():  # once for all, so that what two parts share is one thing afterwards too
-            return _empty, (type(self),), found
+            return _empty, (type(self),), values
         token = INSIDE.set(True)
         try:
             return pickle.loads, (cloudpickle.dumps(self),)
         except DrakeDiffError:
             raise
         except Exception as error:  # whatever a user's object raises
-            for name, value in found.items():
+            for name, value in values.items():
                 _check(f"{type(self).__name__}.{name}", value)
             raise InputError(type(self).__name__, got=f"{error}", expected="what can be pickled") from error
         finally:
             INSIDE.reset(token)
 
     def __copy__(self: Made) -> Made:
-        found: Made = object.__new__(type(self))
-        vars(found).update(vars(self))
-        return found
+        copy: Made = object.__new__(type(self))
+        vars(copy).update(vars(self))
+        return copy
 
 
 def _empty(kind: type[Made]) -> Made:

@@ -115,8 +115,8 @@ def held_interrupts() -> Iterator[None]:
     finally:
         for number in taken:
             signal.signal(number, former[number])
-        for each in came:
-            signal.raise_signal(each)
+        for caught in came:
+            signal.raise_signal(caught)
 
 
 def _hush(number: int) -> None:

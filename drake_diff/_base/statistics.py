@@ -42,9 +42,9 @@ def success_rate(successes: int, trials: int) -> Rate:
 
 def margin(levels: Sequence[float], rates: Sequence[Rate]) -> float:
     """The largest level up to which, itself included, 95 % of the trials succeed; 0 where already the first fails."""
-    found = 0.0
+    largest = 0.0
     for level, rate in sorted(zip(levels, rates, strict=True)):
         if rate.value < ENOUGH:
             break
-        found = level
-    return found
+        largest = level
+    return largest

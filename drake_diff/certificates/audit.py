@@ -64,82 +64,82 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
           -> stay inside the limit (the bounds of a Problem do), or raise it in the file
     """
     x = model.default_state if x is None else x
-    place = Place(model, *check_point(model, x, np.zeros(model.nu) if u is None and model.nu else u))
-    checks = _CHECKS if place.has_poses else _CHECKS_WITHOUT_POSES
-    found = [finding for check in checks for finding in check(place)]
+    point = Place(model, *check_point(model, x, np.zeros(model.nu) if u is None and model.nu else u))
+    checks = _CHECKS if point.has_poses else _CHECKS_WITHOUT_POSES
+    findings = [finding for check in checks for finding in check(point)]
     if not model.can_rebuild:  # a diagram has no arguments
-        found = [replace(finding, arguments={}) for finding in found]
-    return Findings(sorted(found, key=lambda f: (SEVERITIES.index(f.severity), f.subject, f.code)))
+        findings = [replace(finding, arguments={}) for finding in findings]
+    return Findings(sorted(findings, key=lambda f: (SEVERITIES.index(f.severity), f.subject, f.code)))
 
 
 Found = Iterator[Finding]
 
 
-def _no_step(place: Place) -> Found:
-    if place.step_error is not None:
+def _no_step(point: Place) -> Found:
+    if point.step_error is not None:
         remedy = "choose x and u that `step` can take; if it names contact, see the finding pair_refused"
-        yield Finding("error", "no_step", "step", f"the double step fails here: {_short(place.step_error)}", remedy)
+        yield Finding("error", "no_step", "step", f"the double step fails here: {_short(point.step_error)}", remedy)
 
 
-def _pd_gains(place: Place) -> Found:
-    plant = place.model.plant
+def _pd_gains(point: Place) -> Found:
+    plant = point.model.plant
     for instance in instances(plant):
         with_gains = [a for a in actuators(plant) if a.model_instance() == instance and a.has_controller()]
         if not with_gains:
             continue
         message = "Drake's conversion to AutoDiffXd drops these PD gains; drake_diff puts them back"
-        if place.model.feeds(plant.get_desired_state_input_port(instance)):
+        if point.model.feeds(plant.get_desired_state_input_port(instance)):
             message += "; their target is what your diagram feeds the desired state port"
         else:
-            target = ", ".join(f"{value:g}" for value in place.model.pd_targets[instance])
+            target = ", ".join(f"{value:g}" for value in point.model.pd_targets[instance])
             message += f"; their target [q; v] is fixed at ({target}), the default position at rest"
         remedy = "set the joints' default positions to move the target, or put the PD law in a policy of the rollout"
         yield Finding("info", "pd_gains", ", ".join(a.name() for a in with_gains), message, remedy)
 
 
-def _identity_frame(place: Place) -> Found:
-    found = []
-    for joint in joints(place.model.plant):
+def _identity_frame(point: Place) -> Found:
+    names = []
+    for joint in joints(point.model.plant):
         frame = joint.frame_on_parent()
         if isinstance(frame, FixedOffsetFrame) and not isinstance(joint, WeldJoint):
-            found += [joint.name()] if frame.GetFixedPoseInBodyFrame().IsExactlyIdentity() else []
-    if found:
+            names += [joint.name()] if frame.GetFixedPoseInBodyFrame().IsExactlyIdentity() else []
+    if names:
         message = (
             "the frame on the parent is exactly the identity, where Drake drops the derivative by the joint's offset; "
             f"drake_diff keeps it by an offset of {IDENTITY_OFFSET:g} m"
         )
         remedy = "nothing to do with drake_diff; in your own AutoDiffXd code add that offset"
-        yield Finding("info", "identity_frame", ", ".join(found), message, remedy)
+        yield Finding("info", "identity_frame", ", ".join(names), message, remedy)
 
 
-def _joint_limit(place: Place) -> Found:
-    names, limits = place.model.position_names, zip(*place.model.position_limits, strict=True)
-    for name, q, (low, high) in zip(names, place.x[: place.model.nq], limits, strict=True):
+def _joint_limit(point: Place) -> Found:
+    names, limits = point.model.position_names, zip(*point.model.position_limits, strict=True)
+    for name, q, (low, high) in zip(names, point.x[: point.model.nq], limits, strict=True):
         if q <= low + AT_LIMIT or q >= high - AT_LIMIT:
             message = f"{q:.9g} is at or beyond its limits [{low:g}, {high:g}]: the derivative is that of one side"
             remedy = "start inside the limits, or use `smooth_step`, which averages over both sides"
             yield Finding("warning", "joint_limit", name, message, remedy)
 
 
-def _saturated_effort(place: Place) -> Found:
-    model, plant, twin = place.model, place.model.plant, place.model.double
+def _saturated_effort(point: Place) -> Found:
+    model, plant, twin = point.model, point.model.plant, point.model.double
     remedy = "stay inside the limit (the bounds of a Problem do), or raise it in the file"
     yield from _left_out_actuators(model)
     if not model.nu:
         return
-    own = [actuators(plant)[i] for i in model.inputs.actuator[model.inputs.actuator >= 0]]
-    u_own = place.u[model.inputs.actuator >= 0]
+    driven = [actuators(plant)[i] for i in model.inputs.actuator[model.inputs.actuator >= 0]]
+    u_own = point.u[model.inputs.actuator >= 0]
     effort = u_own  # [N or N m] what the actuators apply: u with PD control, clamped; u alone if no step succeeds
-    if place.step_error is None:
-        advance(twin, place.x, place.u)
+    if point.step_error is None:
+        advance(twin, point.x, point.u)
         net = np.array(plant.get_net_actuation_output_port().Eval(twin.context))
         effort = net[model.inputs.actuator[model.inputs.actuator >= 0]]
-    set_state(twin, np.concatenate([place.x[: model.nq], np.zeros(model.nv)]))
-    twin.set_input(place.u)
+    set_state(twin, np.concatenate([point.x[: model.nq], np.zeros(model.nv)]))
+    twin.set_input(point.u)
     # The effort nearest to what no acceleration at rest takes.
     B = model.actuation[:, model.inputs.actuator >= 0]
     hold = np.linalg.lstsq(B, twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
-    for actuator, u, now, rest in zip(own, u_own, effort, hold, strict=True):
+    for actuator, u, now, rest in zip(driven, u_own, effort, hold, strict=True):
         limit = float(actuator.effort_limit())
         if abs(now) >= limit:
             corner = abs(u) == limit and not actuator.has_controller()
@@ -163,19 +163,19 @@ def _left_out_actuators(model: Model) -> Found:
             yield Finding("error", "saturated_effort", joint[1], message, remedy, {"actuators": [joint[1]]})
 
 
-def _jacobian(place: Place) -> Found:
-    if place.step_error is not None:
+def _jacobian(point: Place) -> Found:
+    if point.step_error is not None:
         return
-    result: StepDerivatives | DrakeDiffError = place.by_autodiff
+    result: StepDerivatives | DrakeDiffError = point.by_autodiff
     if isinstance(result, ModelError):
         remedy = "give that system a scalar conversion (TemplateSystem), take it out, or accept differences"
         yield Finding("error", "autodiff_refused", "diagram", str(result), remedy)
-    elif isinstance(result, SimulationError) and not any(pair.refused for pair in place.pairs):
+    elif isinstance(result, SimulationError) and not any(pair.refused for pair in point.pairs):
         remedy = "leave out what it names, or accept differences (method finite_difference)"
         yield Finding("error", "autodiff_refused", "step", f"the AutoDiffXd step throws: {_short(result)}", remedy)
     if isinstance(result, ModelError | SimulationError):
         try:
-            result = differentiate_step(place.model, place.x, place.u, method="finite_difference")
+            result = differentiate_step(point.model, point.x, point.u, method="finite_difference")
         except (GradientError, SimulationError) as error:
             result = error
     if isinstance(result, DrakeDiffError):
@@ -185,8 +185,8 @@ def _jacobian(place: Place) -> Found:
     jacobian = np.abs(np.hstack([result.A, result.B]))
     row, column = np.unravel_index(int(np.argmax(jacobian)), jacobian.shape)
     if jacobian[row, column] > HUGE:
-        names, count = place.model.state_names, int(np.sum(jacobian > HUGE))
-        entry = f"d {names[row]} / d {(*names, *place.model.input_names)[column]}"
+        names, count = point.model.state_names, int(np.sum(jacobian > HUGE))
+        entry = f"d {names[row]} / d {(*names, *point.model.input_names)[column]}"
         message = f"{entry} is {jacobian[row, column]:.3g} (by {result.method}), {count} entries are above {HUGE:g}"
         remedy = (
             "contact_approximation sap has the tamest Jacobians; otherwise a shorter time step, softer contact or a "
@@ -195,18 +195,18 @@ def _jacobian(place: Place) -> Found:
         yield Finding("warning", "huge_jacobian", entry, message, remedy)
 
 
-def _mechanism(place: Place) -> Found:
-    plant, context = place.model.plant, place.model.double.context
-    mimics = () if place.model.coupling is not None else _mimics(place.model)
+def _mechanism(point: Place) -> Found:
+    plant, context = point.model.plant, point.model.double.context
+    mimics = () if point.model.coupling is not None else _mimics(point.model)
     if mimics:
-        told = "; ".join(map(str, mimics))
-        message = f"joints follow others, and stay in the state, held by constraints: {told}"
+        listed = "; ".join(map(str, mimics))
+        message = f"joints follow others, and stay in the state, held by constraints: {listed}"
         if not all(m.in_drake for m in mimics):
-            message = f"joints should follow others, but Drake does not read that, and they move freely: {told}"
+            message = f"joints should follow others, but Drake does not read that, and they move freely: {listed}"
         remedy = 'mimic="reduce" takes them out of the state, "fix" welds them; collocation and other engines need that'
         followers = ", ".join(m.follower for m in mimics)
         yield Finding("warning", "mimic_joint", followers, message, remedy, {"mimic": "reduce"})
-    if place.model.num_constraints:
+    if point.model.num_constraints:
         message = f"constraints in every step ({plant.num_constraints()}), which the implicit method cannot handle"
         remedy = "nothing to do: method auto takes autodiff; `certify` one state, as a few kinds have no AutoDiffXd"
         yield Finding("info", "constraints", "plant", message, remedy)
@@ -226,34 +226,34 @@ def _mimics(model: Model) -> tuple[Mimic, ...]:
     return tuple(mimic for mimic in model.file_facts.followers.values() if mimic.follower in moving)
 
 
-def _pair_refused(place: Place) -> Found:
+def _pair_refused(point: Place) -> Found:
     severity: Severity = "error"
     remedy = (
         'load_model(..., contact_geometry="corner_spheres") replaces boxes, cylinders and capsules by spheres, '
         '"hydroelastic" gives every geometry a mesh, "differences" differences the step by choice; or filter the pair '
         "(CollisionFilterDeclaration, or <drake:collision_filter_group> in the file) if it never touches"
     )
-    if place.model.contact_geometry == "differences":
+    if point.model.contact_geometry == "differences":
         severity = "info"
         remedy = "nothing to do: it is differenced by choice, which needs method auto or finite_difference"
     groups: dict[tuple[str, str], list[Pair]] = {}
-    for pair in place.pairs:
+    for pair in point.pairs:
         if pair.refused:
             groups.setdefault(pair.bodies, []).append(pair)
     by_choice = severity == "info"
     named, rest = list(groups)[:PAIRS_TOLD], list(groups)[PAIRS_TOLD:]
     for bodies in named:
-        arguments = {} if by_choice else _route(place.model, groups[bodies])
-        told = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
-        message = _refusal(place, groups[bodies])
-        yield Finding(severity, "pair_refused", " - ".join(bodies), message, told, arguments)
+        arguments = {} if by_choice else _route(point.model, groups[bodies])
+        advice = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
+        message = _refusal(point, groups[bodies])
+        yield Finding(severity, "pair_refused", " - ".join(bodies), message, advice, arguments)
     if rest:
         pairs = [pair for bodies in rest for pair in groups[bodies]]
-        arguments = {} if by_choice else _route(place.model, pairs)
-        told = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
+        arguments = {} if by_choice else _route(point.model, pairs)
+        advice = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
         listed = ", ".join(" - ".join(bodies) for bodies in rest[:PAIRS_TOLD])
         message = f"of such shapes, too: {listed}" + (" ..." if len(rest) > PAIRS_TOLD else "")
-        yield Finding(severity, "pair_refused", f"{len(rest)} more pairs of links", message, told, arguments)
+        yield Finding(severity, "pair_refused", f"{len(rest)} more pairs of links", message, advice, arguments)
 
 
 def _route(model: Model, pairs: list[Pair]) -> dict[str, Any]:
@@ -269,9 +269,9 @@ def _route(model: Model, pairs: list[Pair]) -> dict[str, Any]:
     return {"contact_geometry": "differences"}
 
 
-def _refusal(place: Place, pairs: list[Pair]) -> str:
+def _refusal(point: Place, pairs: list[Pair]) -> str:
     sides = (dict.fromkeys(p.a.label for p in pairs), dict.fromkeys(p.b.label for p in pairs))
-    names, error = " against ".join(", ".join(side) for side in sides), place.by_autodiff
+    names, error = " against ".join(", ".join(side) for side in sides), point.by_autodiff
     if any(pair.contact == "none" for pair in pairs):
         why = "hydroelastic contact alone needs properties on both, one of them not rigid; the double step throws too"
     else:
@@ -285,25 +285,25 @@ def _refusal(place: Place, pairs: list[Pair]) -> str:
     return f"{names}: {why}. At x the AutoDiffXd step throws over another pair: {_short(error)}."
 
 
-def _aligned_faces(place: Place) -> Found:
+def _aligned_faces(point: Place) -> Found:
     remedy = (
         'load_model(..., contact_model="point", contact_geometry="corner_spheres") replaces one of them by spheres; '
         "or start tilted by 0.03 rad or more and `certify` the "
         "poses in contact: near the aligned pose too (measured: up to 1e-3 rad, cylinder on cylinder up to 0.04) the "
         "meshes' edges make the step jump"
     )
-    for pair in place.pairs:
+    for pair in point.pairs:
         angle, gap = _alignment(pair) if pair.contact == "hydroelastic" else (None, np.inf)
         if angle is None:
             continue
         severity: Severity = "info"
-        told = "tilted now; if they come to lie flat the hydroelastic step jumps"
+        consequence = "tilted now; if they come to lie flat the hydroelastic step jumps"
         if angle <= PARALLEL and gap <= REACH:
             severity = "error"
-            told = "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
+            consequence = "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
         elif angle <= NEARLY_PARALLEL:
-            severity, told = "warning", "if they meet like this the hydroelastic step jumps"
-        message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: {told}"
+            severity, consequence = "warning", "if they meet like this the hydroelastic step jumps"
+        message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: {consequence}"
         arguments = {} if severity == "info" else {"contact_model": "point", "contact_geometry": "corner_spheres"}
         yield Finding(severity, "aligned_faces", pair.label, message, remedy, arguments)
 
@@ -314,9 +314,9 @@ def _alignment(pair: Pair) -> tuple[float | None, float]:
     The gap is negative where the boxes overlap. Drake's mesh of a round shape counts as flat too, where its centre
     lies in a plane of symmetry of a box's mesh or in an upright one of a cylinder's.
     """
-    for one, other in ((pair.a, pair.b), (pair.b, pair.a)):
-        if one.kind in ROUND and other.kind in ("Box", "Cylinder"):
-            offset = other.pose.inverse() @ one.pose.translation()
+    for first, other in ((pair.a, pair.b), (pair.b, pair.a)):
+        if first.kind in ROUND and other.kind in ("Box", "Cylinder"):
+            offset = other.pose.inverse() @ first.pose.translation()
             if np.min(np.abs(offset[: 3 if other.kind == "Box" else 2])) > IN_PLANE:
                 return None, np.inf
     faces = [(n, m) for n in _normals(pair.a, pair.b) for m in _normals(pair.b, pair.a)]
@@ -338,10 +338,10 @@ def _normals(collider: Collider, other: Collider) -> list[Array]:
     return [collider.axis(2)] if upright else []
 
 
-def _cylinder_axis(place: Place) -> Found:
+def _cylinder_axis(point: Place) -> Found:
     beside: dict[str, float] = {}  # [m]
     remedy = "move the sphere off the axis by 1e-6 m or more, or replace the cylinder by a box"
-    for pair in place.pairs:
+    for pair in point.pairs:
         both = pair.of_kinds(Sphere, Cylinder)
         if both is None or pair.contact != "point":
             continue
@@ -350,21 +350,21 @@ def _cylinder_axis(place: Place) -> Found:
         if distance >= ON_AXIS:
             beside[pair.label] = distance
             continue
-        told = "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
-        message = f"the sphere's centre is {distance:.3g} m from the cylinder's axis: {told}"
+        consequence = "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
+        message = f"the sphere's centre is {distance:.3g} m from the cylinder's axis: {consequence}"
         yield Finding("error", "cylinder_axis", pair.label, message, remedy)
     if beside:
         subject = next(iter(beside)) if len(beside) == 1 else f"{len(beside)} pairs"
-        told = "exactly on it AutoDiffXd would be singular"
-        message = f"the sphere's centre is {min(beside.values()):.3g} m from the cylinder's axis: {told}"
+        consequence = "exactly on it AutoDiffXd would be singular"
+        message = f"the sphere's centre is {min(beside.values()):.3g} m from the cylinder's axis: {consequence}"
         yield Finding("info", "cylinder_axis", subject, message, remedy)
 
 
-def _default_decides(place: Place) -> Found:
-    sap = place.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
+def _default_decides(point: Place) -> Found:
+    sap = point.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
     groups: dict[tuple[str, ...], list[Collider]] = {}
-    for collider in place.colliders.values():
-        contacts = {pair.contact for pair in place.pairs if collider in (pair.a, pair.b)}
+    for collider in point.colliders.values():
+        contacts = {pair.contact for pair in point.pairs if collider in (pair.a, pair.b)}
         read = ["friction", "relaxation_time" if sap else "dissipation"]  # by the step
         read += ["stiffness"] * ("point" in contacts)
         read += ["hydroelastic_modulus"] * ("hydroelastic" in contacts and collider.compliance == "compliant")
@@ -373,8 +373,8 @@ def _default_decides(place: Place) -> Found:
             groups.setdefault(missing, []).append(collider)
     for missing, colliders in groups.items():
         values = {name: _value(colliders[0], name) for name in missing}
-        told = ", ".join(f"{PROXIMITY[name][1]} {value}" for name, value in values.items())
-        message = f"not given, so the scene graph's default decides: {told}"
+        defaults = ", ".join(f"{PROXIMITY[name][1]} {value}" for name, value in values.items())
+        message = f"not given, so the scene graph's default decides: {defaults}"
         if values.get("relaxation_time") == "0.1 s":
             message += " (with which a ball hardly bounces)"
         tags = ", ".join(f"drake:{'mu_dynamic' if name == 'friction' else PROXIMITY[name][1]}" for name in missing)
@@ -390,12 +390,12 @@ def _value(collider: Collider, name: str) -> str:
     return f"{value.dynamic_friction() if name == 'friction' else value:g}{UNITS[name]}"
 
 
-def _touching(place: Place) -> Found:
-    set_state(place.model.double, place.x)
+def _touching(point: Place) -> Found:
+    set_state(point.model.double, point.x)
     unmeasured = []
-    for pair in place.pairs:
+    for pair in point.pairs:
         try:
-            distance = place.query.ComputeSignedDistancePairClosestPoints(pair.a.id, pair.b.id).distance
+            distance = point.query.ComputeSignedDistancePairClosestPoints(pair.a.id, pair.b.id).distance
         except RuntimeError:  # no such distance between these shapes
             unmeasured.append(pair.label)
             continue

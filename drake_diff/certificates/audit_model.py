@@ -41,13 +41,13 @@ HARMLESS = (
 
 
 def _listed(names: Any) -> str:
-    found = list(dict.fromkeys(names))
-    more = f" and {len(found) - NAMES_TOLD} more" if len(found) > NAMES_TOLD else ""
-    return ", ".join(found[:NAMES_TOLD]) + more
+    unique = list(dict.fromkeys(names))
+    more = f" and {len(unique) - NAMES_TOLD} more" if len(unique) > NAMES_TOLD else ""
+    return ", ".join(unique[:NAMES_TOLD]) + more
 
 
-def _no_actuator(place: Place) -> Found:
-    model, facts = place.model, place.model.file_facts
+def _no_actuator(point: Place) -> Found:
+    model, facts = point.model, point.model.file_facts
     if model.source is None:
         return
     driven = {actuator.joint().index() for actuator in actuators(model.plant)}
@@ -70,8 +70,8 @@ def _no_actuator(place: Place) -> Found:
         yield Finding("info", "undriven", _listed(meant), message, remedy, {"actuators": meant})
 
 
-def _lost_armature(place: Place) -> Found:
-    plant, facts = place.model.plant, place.model.file_facts
+def _lost_armature(point: Place) -> Found:
+    plant, facts = point.model.plant, point.model.file_facts
     driven = {actuator.joint().index() for actuator in actuators(plant)}
     lost = [
         name
@@ -85,13 +85,13 @@ def _lost_armature(place: Place) -> Found:
         yield Finding("warning", "lost_armature", _listed(lost), message, remedy, {"actuators": lost})
 
 
-def _left_out_actuators(place: Place) -> Found:
-    plant, facts = place.model.plant, place.model.file_facts
-    for note in place.model.notes:
-        found = re.match(r"(\d+ actuators left out)[^:]*: (.*)\.$", note)
-        if not found:
+def _left_out_actuators(point: Place) -> Found:
+    plant, facts = point.model.plant, point.model.file_facts
+    for note in point.model.notes:
+        match = re.match(r"(\d+ actuators left out)[^:]*: (.*)\.$", note)
+        if not match:
             continue
-        message = f"{found[1]}, of kinds or transmissions that Drake does not read: {found[2]}"
+        message = f"{match[1]}, of kinds or transmissions that Drake does not read: {match[2]}"
         remedy = "drive joints with a torque of their own, load_model(..., actuators=), or write the file with motors"
         driven = {actuator.joint().index() for actuator in actuators(plant)}
         missing = [
@@ -107,18 +107,18 @@ def _left_out_actuators(place: Place) -> Found:
             yield Finding("warning", "left_out", "actuators", message, remedy, arguments)
 
 
-def _switched_off(place: Place) -> Found:
-    facts, gravity = place.model.file_facts, place.model.plant.gravity_field().gravity_vector()
+def _switched_off(point: Place) -> Found:
+    facts, gravity = point.model.file_facts, point.model.plant.gravity_field().gravity_vector()
     begin = "the file switches it off, and Drake has it all the same"
-    if facts.disabled & {"contact", "constraint"} and place.pairs:
+    if facts.disabled & {"contact", "constraint"} and point.pairs:
         yield Finding("warning", "switched_off", "contact", begin, "load_model(..., contact=False)", {"contact": False})
     if "gravity" in facts.disabled and np.any(gravity):
         remedy = "load_model(..., gravity=[0, 0, 0])"
         yield Finding("warning", "switched_off", "gravity", begin, remedy, {"gravity": [0.0, 0.0, 0.0]})
 
 
-def _massless(place: Place) -> Found:
-    plant = place.model.plant
+def _massless(point: Place) -> Found:
+    plant = point.model.plant
     for base in sorted(plant.GetFloatingBaseBodies()):
         held = plant.GetBodiesWeldedTo(plant.get_body(base))
         if sum(body.default_mass() for body in held) == 0:
@@ -130,8 +130,8 @@ def _massless(place: Place) -> Found:
                     {"base": "weld"},
                 )
             yield Finding("error", "massless_root", plant.get_body(base).name(), message, remedy, arguments)
-    set_state(place.model.double, place.x)
-    mass = np.diag(plant.CalcMassMatrix(place.model.double.context))
+    set_state(point.model.double, point.x)
+    mass = np.diag(plant.CalcMassMatrix(point.model.double.context))
     light = [
         name
         for name, joint in labelled(joints(plant)).items()
@@ -140,7 +140,7 @@ def _massless(place: Place) -> Found:
     if light:
         message = "nothing that they move has a mass or an inertia, so that the step is singular"
         remedy = "give the links a mass in the file"
-        arguments = _fixed(place.model, light)
+        arguments = _fixed(point.model, light)
         if arguments:
             remedy = f"load_model(..., fix_joints=) fixes them, or {remedy}"
         yield Finding("error", "massless_joint", _listed(light), message, remedy, arguments)
@@ -151,26 +151,26 @@ def _fixed(model: Model, names: list[str]) -> dict[str, Any]:
     return {"fix_joints": names} if len(names) < model.plant.num_velocities() else {}
 
 
-def _lost_shapes(place: Place) -> Found:
-    model, scene_graph = place.model, place.model.double.scene_graph
+def _lost_shapes(point: Place) -> Found:
+    model, scene_graph = point.model, point.model.double.scene_graph
     for note in model.notes:
         if re.search(r"\bmeshes skipped", note):
             severity: Severity = "warning" if "collision" in note else "info"
             remedy = (
                 'load_model(..., meshes="convex") or "spheres" takes collision meshes; packages= says where they are'
             )
-            told = note.split(":")[0].split("; ")[0]
+            summary = note.split(":")[0].split("; ")[0]
             arguments = {"meshes": "spheres"} if SKIPPED.match(note) else {}
-            yield Finding(severity, "meshes_skipped", "meshes", told, remedy, arguments)
+            yield Finding(severity, "meshes_skipped", "meshes", summary, remedy, arguments)
     if scene_graph is None or (model.options or {}).get("contact") is False:
         return
-    found = {body.index() for body, _ in collision_geometries(model.plant, scene_graph)}
+    with_shapes = {body.index() for body, _ in collision_geometries(model.plant, scene_graph)}
     lost, given = [], 0
     for body in bodies(model.plant):
         says = model.file_facts.links.get((model.plant.GetModelInstanceName(body.model_instance()), body.name()))
         if says is not None and says.collisions:
             given += 1
-            lost += [] if body.index() in found else [body.name()]
+            lost += [] if body.index() in with_shapes else [body.name()]
     if lost:
         much = "no collision shape of the file is left" if len(lost) == given else "they have lost all collision shapes"
         remedy = 'load_model(..., meshes="convex") or "spheres"; contact=False says that nothing is to touch'
@@ -179,8 +179,8 @@ def _lost_shapes(place: Place) -> Found:
         yield Finding("warning", "collision_gone", _listed(lost), message, remedy, mends)
 
 
-def _never_apart(place: Place) -> Found:
-    model, scene_graph = place.model, place.model.double.scene_graph
+def _never_apart(point: Place) -> Found:
+    model, scene_graph = point.model, point.model.double.scene_graph
     if scene_graph is None or not model.contract.contact.collision_pairs:
         return
     try:
@@ -202,18 +202,18 @@ def _has_usable_meshes(model: Model) -> bool:
     return any(SKIPPED.match(note) for note in model.notes)
 
 
-def _falls(place: Place) -> Found:
-    plant = place.model.plant
-    if not np.any(plant.gravity_field().gravity_vector()) or place.model.double.scene_graph is None:
+def _falls(point: Place) -> Found:
+    plant = point.model.plant
+    if not np.any(plant.gravity_field().gravity_vector()) or point.model.double.scene_graph is None:
         return
     fixed = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
     floating = {joint.child_body().index(): joint for joint in joints(plant) if joint.type_name() in FLOATING}
     for base in sorted(plant.GetFloatingBaseBodies()):
         affected = plant.GetBodiesKinematicallyAffectedBy([floating[base].index()])
         tree = {plant.get_body(index).name() for index in affected}
-        shapes = {body.name() for body, _ in collision_geometries(plant, place.model.double.scene_graph)}
+        shapes = {body.name() for body, _ in collision_geometries(plant, point.model.double.scene_graph)}
         moving = sum(j.num_velocities() > 0 and j.child_body().name() in tree for j in joints(plant)) > 1
-        standing = any(set(pair.bodies) & tree and set(pair.bodies) & fixed for pair in place.pairs)
+        standing = any(set(pair.bodies) & tree and set(pair.bodies) & fixed for pair in point.pairs)
         if standing or not (moving or shapes & tree):
             continue
         name = plant.get_body(base).name()
@@ -224,17 +224,17 @@ def _falls(place: Place) -> Found:
             why = "nothing of it can touch, as it has no collision shapes"
             remedy = 'load_model(..., meshes="convex" or "spheres", ground=True), base="weld", or nothing if it flies'
             arguments = {"base": "weld"}
-            if _has_usable_meshes(place.model):
+            if _has_usable_meshes(point.model):
                 arguments = {"meshes": "spheres", "ground": True}
         yield Finding("warning", "falls", name, f"it floats and falls for ever: {why}", remedy, arguments)
 
 
-def _invented_inertia(place: Place) -> Found:
-    plant = place.model.plant
+def _invented_inertia(point: Place) -> Found:
+    plant = point.model.plant
     fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
     kinds: dict[tuple[Severity, str], list[str]] = {}
     for body in bodies(plant):
-        says = place.model.file_facts.links.get((plant.GetModelInstanceName(body.model_instance()), body.name()))
+        says = point.model.file_facts.links.get((plant.GetModelInstanceName(body.model_instance()), body.name()))
         if says is None or int(body.index()) in fixed:
             continue
         inertia = body.default_spatial_inertia()
@@ -264,12 +264,12 @@ def _invented_inertia(place: Place) -> Found:
         yield Finding(severity, "invented_inertia", _listed(names), message, remedy)
 
 
-def _unread_compliance(place: Place) -> Found:
-    sap = place.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
+def _unread_compliance(point: Place) -> Found:
+    sap = point.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
     given, read = ("dissipation", "relaxation_time") if sap else ("relaxation_time", "dissipation")
     names = [
         collider.label
-        for collider in place.colliders.values()
+        for collider in point.colliders.values()
         if collider.own.HasProperty(*PROXIMITY[given]) and not collider.own.HasProperty(*PROXIMITY[read])
     ]
     if names:
@@ -280,9 +280,9 @@ def _unread_compliance(place: Place) -> Found:
         yield Finding("warning", "unread_compliance", _listed(names), message, remedy, {"contact_approximation": other})
 
 
-def _ignored(place: Place) -> Found:
+def _ignored(point: Place) -> Found:
     kinds: dict[str, list[str]] = {}
-    for note in place.model.notes:
+    for note in point.model.notes:
         first = re.sub(r"^.*?warning: ", "", note.splitlines()[0])
         first = re.sub(r"(Skipping transmission since it's attached to a fixed joint).*", r"\1", first)
         if IGNORED.search(first) and "meshes skipped" not in first:
@@ -290,18 +290,18 @@ def _ignored(place: Place) -> Found:
                 re.sub(r"(joint|link|geom) '?[\w/.:-]+'?(?= has)|'-?[\d.eE+-]+'", r"\1 ...", first), []
             ).append(note)
     for kind, notes in kinds.items():
-        found = re.search(r"'([^']+)'", kind)
+        quoted = re.search(r"'([^']+)'", kind)
         severity: Severity = "info" if any(word in kind for word in HARMLESS) else "warning"
         message = f"{len(notes)} times in the file, and Drake does not read it: {kind}"
         remedy = (
             "nothing if it does not matter, else say it in a way that Drake reads, or change the plant in a diagram"
         )
-        yield Finding(severity, "ignored", found[1] if found else "file", message, remedy)
+        yield Finding(severity, "ignored", quoted[1] if quoted else "file", message, remedy)
 
 
-def _zero_limits(place: Place) -> Found:
-    plant, kinds = place.model.plant, dict[tuple[str, str], list[str]]()
-    followers = place.model.file_facts.followers
+def _zero_limits(point: Place) -> Found:
+    plant, kinds = point.model.plant, dict[tuple[str, str], list[str]]()
+    followers = point.model.file_facts.followers
     driven = {actuator.joint().index() for actuator in actuators(plant)}
     for name, joint in labelled(joints(plant)).items():
         if not can_be_driven(joint):
@@ -316,7 +316,7 @@ def _zero_limits(place: Place) -> Found:
             how = "" if mended == "actuators" and low else mended
             kinds.setdefault((f"the position limits are both {low:g}", how), []).append(name)
     for (kind, mended), names in kinds.items():
-        arguments = _fixed(place.model, names)
+        arguments = _fixed(point.model, names)
         remedy = "load_model(..., fix_joints=) fixes such joints there" if arguments else "give it limits in the file"
         if mended == "actuators":
             remedy = (
@@ -329,10 +329,10 @@ def _zero_limits(place: Place) -> Found:
         yield Finding("error", "zero_limit", _listed(names), message, remedy, arguments)
 
 
-def _corners_on_both_sides(place: Place) -> Found:
-    trees = _trees(place.model.plant)
+def _corners_on_both_sides(point: Place) -> Found:
+    trees = _trees(point.model.plant)
     met: dict[str, None] = {}
-    for pair in place.pairs:
+    for pair in point.pairs:
         both = [re.sub(r" \(Sphere\)$", "", label) for label in (pair.a.label, pair.b.label)]
         if all(CORNER.search(label) for label in both) and trees[pair.a.body] != trees[pair.b.body]:
             met[" - ".join(sorted(pair.bodies))] = None

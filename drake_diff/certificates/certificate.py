@@ -42,7 +42,7 @@ class VerdictOptions:
     resolved: float = 1e-4  # of an entry: a smaller corner is none
     corner: float = 0.25
     jump: float = -0.5  # one-sided quotients part as h^corner or less at a corner, and grow as h^jump at a jump
-    told: float = 30.0  # times the scatter: what can be told from it
+    significant: float = 30.0  # times the scatter: what can be told from it
     jitter_change: float = 0.1  # of an entry, 1e-9 beside the point
     mixed: float = 1e-9  # of the largest entry of all: what as large a mixed derivative makes 1e-9 beside the point
 
@@ -126,8 +126,8 @@ def _nearest(around: Neighbourhood, a: Array, second: Scales | None) -> tuple[Ar
     first, doubt = (np.take_along_axis(numbers, nearest, axis=0) for numbers in (values, uncertainty))
     stands = np.abs(values - first) <= LIMITS.trusted * (uncertainty + doubt)
     best = np.argmin(np.where(stands, uncertainty, np.inf), axis=0)[None]
-    found, doubt = (np.take_along_axis(numbers, best, axis=0)[0] for numbers in (values, uncertainty))
-    return found, doubt
+    nearest_value, doubt = (np.take_along_axis(numbers, best, axis=0)[0] for numbers in (values, uncertainty))
+    return nearest_value, doubt
 
 
 def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales | None) -> tuple[Array, Array]:
@@ -144,33 +144,33 @@ def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales 
     - what the smallest step of the widest plateau leaves of the rounding of the value, which is measured, up to 1e-6
       of the largest entry of the row.
     """
-    found = np.abs(difference)
-    small = _negligible(found, second)
-    rounding = (LIMITS.told * around.finest / DIFFERENCES.steps[3] / LIMITS.power)[:, None]
-    rounding = np.minimum(rounding, LIMITS.rounded * found.max(axis=1, keepdims=True, initial=0))
+    magnitude = np.abs(difference)
+    small = _negligible(magnitude, second)
+    rounding = (LIMITS.significant * around.finest / DIFFERENCES.steps[3] / LIMITS.power)[:, None]
+    rounding = np.minimum(rounding, LIMITS.rounded * magnitude.max(axis=1, keepdims=True, initial=0))
     widest = LIMITS.vanishing * np.maximum(np.abs(around.forward[0]), np.abs(around.backward[0]))
-    least = np.maximum(np.maximum(small, widest), rounding) + EPS * found.max(initial=0) + TINY
-    return np.maximum(np.maximum(np.abs(a), found), least), least
+    least = np.maximum(np.maximum(small, widest), rounding) + EPS * magnitude.max(initial=0) + TINY
+    return np.maximum(np.maximum(np.abs(a), magnitude), least), least
 
 
 def weighed(a: Array, second: Scales | None) -> Array:
     """(m, n) what an error of each entry of `a` is measured by: see `_matters`; nothing is excused by rounding."""
-    found = np.abs(a)
-    return np.maximum(found, _negligible(found, second) + EPS * found.max(initial=0) + TINY)
+    magnitude = np.abs(a)
+    return np.maximum(magnitude, _negligible(magnitude, second) + EPS * magnitude.max(initial=0) + TINY)
 
 
-def _negligible(found: Array, second: Scales | None) -> Array:
+def _negligible(magnitude: Array, second: Scales | None) -> Array:
     """(m, n) the least that matters of entries of these magnitudes."""
-    small = _small(found)
+    small = _small(magnitude)
     if second is not None:
         unit = second[0][:, None] / second[1]
-        small = np.minimum(small, unit * _small(found / unit))
-    return np.maximum(small, LIMITS.unseen * found.max(axis=1, keepdims=True, initial=0))
+        small = np.minimum(small, unit * _small(magnitude / unit))
+    return np.maximum(small, LIMITS.unseen * magnitude.max(axis=1, keepdims=True, initial=0))
 
 
-def _small(found: Array) -> Array:
+def _small(magnitude: Array) -> Array:
     """(m, n) what is negligible beside the largest of the row and of the column."""
-    by_row, by_column = found.max(axis=1, keepdims=True, initial=0), found.max(axis=0, keepdims=True, initial=0)
+    by_row, by_column = magnitude.max(axis=1, keepdims=True, initial=0), magnitude.max(axis=0, keepdims=True, initial=0)
     return np.asarray(LIMITS.negligible * np.minimum(by_row, by_column))
 
 
@@ -178,8 +178,8 @@ def _broken(around: Neighbourhood, a: Array, difference: Array, size: Array) -> 
     """Entries at a corner or a jump of the function, and the numbers that tell it."""
     forward, backward = around.forward, around.backward
     values = around.size + np.max(np.abs(forward[0]), axis=1, initial=0) * DIFFERENCES.steps[0]
-    noise = np.maximum(LIMITS.told * around.finest, LIMITS.visible * values)
-    found: dict[tuple[int, int], str] = {}
+    noise = np.maximum(LIMITS.significant * around.finest, LIMITS.visible * values)
+    reasons: dict[tuple[int, int], str] = {}
     least = LIMITS.resolved * np.maximum(np.abs(a), np.abs(difference)) + LIMITS.power * size
     # A jump that is the same on both sides shows in no gap, but in quotients that grow without end.
     for gap, steepest in ((np.abs(forward - backward), LIMITS.corner), (np.abs(forward + backward) / 2, LIMITS.jump)):
@@ -188,8 +188,8 @@ def _broken(around: Neighbourhood, a: Array, difference: Array, size: Array) -> 
             grows = gap[s, i, j] > 3 * gap[s - 2, i, j]  # tenfold at a jump, over a decade
             jump = f"the value jumps by {(ahead + behind) * h:.3g}" if steepest == LIMITS.jump else "the value jumps"
             kind = jump if grows else "the slope has a corner"
-            found.setdefault((i, j), f"{kind}: {ahead:.6g} ahead, {behind:.6g} behind, with steps of {h:.1g}")
-    return found
+            reasons.setdefault((i, j), f"{kind}: {ahead:.6g} ahead, {behind:.6g} behind, with steps of {h:.1g}")
+    return reasons
 
 
 def _does_not_shrink(gap: Array, least: Array, noise: Array, steepest: float) -> list[tuple[int, int, int]]:
@@ -207,22 +207,22 @@ def _does_not_shrink(gap: Array, least: Array, noise: Array, steepest: float) ->
     # Where it would still tell at the next smaller step, and does not: it is beside the point.
     after = np.minimum(last + 1, len(DIFFERENCES.steps) - 1)
     ends_early = (last + 1 < len(DIFFERENCES.steps)) & (gaps[-1] * np.array(DIFFERENCES.steps)[after] > 2 * noise[i])
-    told = ~ends_early & (gaps[-1] > least[i, j]) & (gaps.min(axis=0, initial=np.inf) > 0)
+    significant = ~ends_early & (gaps[-1] > least[i, j]) & (gaps.min(axis=0, initial=np.inf) > 0)
     # The slope of the line through the four points; their steps are half a decade apart.
-    slope = np.array([1.5, 0.5, -0.5, -1.5]) @ np.log(gaps[:, told]) / (5 * np.log(10) / 2)
-    i, j, last = (numbers[told][slope < steepest] for numbers in (i, j, last))
+    slope = np.array([1.5, 0.5, -0.5, -1.5]) @ np.log(gaps[:, significant]) / (5 * np.log(10) / 2)
+    i, j, last = (numbers[significant][slope < steepest] for numbers in (i, j, last))
     return list(zip(i.tolist(), j.tolist(), last.tolist(), strict=True))
 
 
 def _stairs(around: Neighbourhood, size: Array) -> dict[tuple[int, int], str]:
     """The entries of rows on a staircase whose slope is another on the stair than over many; else the whole row."""
-    found: dict[tuple[int, int], str] = {}
+    reasons: dict[tuple[int, int], str] = {}
     values, _ = around.plateaus()
     for i, why in around.stairs.items():
         differs = np.max(np.abs(values[:, i] - values[-1, i]), axis=0) > LIMITS.power * size[i]
         for j in np.flatnonzero(differs if differs.any() else np.ones(len(differs), dtype=bool)):
-            found[i, int(j)] = why
-    return found
+            reasons[i, int(j)] = why
+    return reasons
 
 
 def _jittery(around: Neighbourhood, a: Array, beside: Array) -> Flags:
@@ -443,7 +443,7 @@ def certify_jacobian(
     at_x, beside = np.asarray(jacobian(x) if callable(jacobian) else jacobian, dtype=float), None
     if callable(jacobian):
         beside = np.asarray(jacobian(x + jitter(scale)), dtype=float) * scale
-    many = f if batched else one_by_one(lambda at: np.asarray(f(at), dtype=float))
+    many = f if batched else one_by_one(lambda point: np.asarray(f(point), dtype=float))
     unsolved: Array | float = 0.0
     if solver_tolerance:
         unsolved = solver_tolerance * np.maximum(1.0, np.abs(np.asarray(many(x[None]), dtype=float)[0]))
@@ -505,12 +505,12 @@ def certificate_of(
     **named: Any,
 ) -> Certificate:
     """The verdict on a `derivative` (m, n) by the scaled displacements; see `judge`."""
-    found = judge(around, derivative, beside, stopped, second)
-    numbers = (derivative, found.difference, found.tolerance, found.noticeable, found.size)
+    judgement = judge(around, derivative, beside, stopped, second)
+    numbers = (derivative, judgement.difference, judgement.tolerance, judgement.noticeable, judgement.size)
     a, d, t, noticeable, size = (frozen(some / scale) for some in numbers)
     return Certificate(
-        derivative=a, difference=d, tolerance=t, noticeable=noticeable, size=size, codes=found.codes,
-        reasons=found.reasons, around=around, scale=scale, stopped=stopped, second=second, **named,
+        derivative=a, difference=d, tolerance=t, noticeable=noticeable, size=size, codes=judgement.codes,
+        reasons=judgement.reasons, around=around, scale=scale, stopped=stopped, second=second, **named,
     )  # fmt: skip
 
 

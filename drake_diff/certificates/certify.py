@@ -91,8 +91,8 @@ def _certified(
 
         step = StepAround(model, vector, space, point, scale)
 
-        def on_tangent(at: Array, d: StepDerivatives) -> Array:
-            return space.jacobian(at[: model.nx], d.x_next, d.A, d.B, d.C) * scale
+        def on_tangent(point: Array, d: StepDerivatives) -> Array:
+            return space.jacobian(point[: model.nx], d.x_next, d.A, d.B, d.C) * scale
 
         d, beside = derivatives or step_jacobians(model, vector, x, u, method), None
         if look_beside and not vector.parameters:
@@ -100,9 +100,9 @@ def _certified(
             d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
             beside = on_tangent(jittered, d_beside)
         derivative = on_tangent(point, d)
-        around, told, left = step.look_around()
+        around, note, left = step.look_around()
         if "finite_difference" in (d.method, *d.sources):
-            told = "; ".join(text for text in (told, SHARED) if text)
+            note = "; ".join(text for text in (note, SHARED) if text)
         certificate = certificate_of(
             around,
             derivative,
@@ -112,7 +112,7 @@ def _certified(
             columns=space.names + model.input_names + vector.names,
             method=" + ".join(dict.fromkeys((d.method, *d.sources))),
             subject=f"the step of {model.name}",
-            told=told,
+            told=note,
             stopped=left,
             second=in_steps(model, space, len(scale)),
         )
@@ -126,13 +126,13 @@ def _certified(
 
 def _at_limits(model: Model, x: Array) -> str:
     """Which positions are at or beyond a joint limit, where a step has a corner and its forces are stiff."""
-    found = []
+    limits = []
     for name, q, low, high in zip(model.position_names, x, *model.position_limits, strict=False):
         reach = NEIGHBOURHOOD * max(1.0, abs(q))
         if q <= low + reach or q >= high - reach:
             where = "beyond" if q < low or q > high else "at"
-            found.append(f"{name} is {q:.6g}, {where} its limits [{low:g}, {high:g}]")
-    return f"joint limits act: {', '.join(found)}" if found else ""
+            limits.append(f"{name} is {q:.6g}, {where} its limits [{low:g}, {high:g}]")
+    return f"joint limits act: {', '.join(limits)}" if limits else ""
 
 
 def certify_inside(
@@ -145,16 +145,16 @@ def certify_inside(
     are those on the inner side, where they are known.
     """
     inside = with_room(model, u)
-    found = _certified(model, x, inside, select(model, parameters), "auto", derivatives, look_beside=True)
+    certificate = _certified(model, x, inside, select(model, parameters), "auto", derivatives, look_beside=True)
     moved = inside != u
     if not moved.any():
-        return found
-    told = "; ".join(text for text in (found.told, beside_limits(model, moved)) if text)
+        return certificate
+    note = "; ".join(text for text in (certificate.told, beside_limits(model, moved)) if text)
     leap = leap_at_limits(model, x, u, np.sign(inside - u), parameters)
-    if np.any(np.abs(leap) > LEAP * found.size):
-        told += f", at which the derivative is another one, by up to {np.max(np.abs(leap)):.3g}"
-        found = replace(found.of(found.derivative + leap), mode_changes=found.mode_changes)
-    return replace(found, told=told)
+    if np.any(np.abs(leap) > LEAP * certificate.size):
+        note += f", at which the derivative is another one, by up to {np.max(np.abs(leap)):.3g}"
+        certificate = replace(certificate.of(certificate.derivative + leap), mode_changes=certificate.mode_changes)
+    return replace(certificate, told=note)
 
 
 def beside_limits(model: Model, at_limit: NDArray[np.bool_]) -> str:
@@ -174,8 +174,8 @@ def leap_at_limits(model: Model, x: Array, u: Array, inward: Array, parameters: 
     vector, both = select(model, parameters), []
     with applied(vector) as model:
         space = tangent_space(model)
-        for at in (u, u + JITTER * np.maximum(1.0, np.abs(u)) * inward):
-            d = step_jacobians(model, vector, x, at, "auto")
+        for inputs in (u, u + JITTER * np.maximum(1.0, np.abs(u)) * inward):
+            d = step_jacobians(model, vector, x, inputs, "auto")
             both.append(space.jacobian(x, d.x_next, d.A, d.B, d.C))
     return np.asarray(both[0] - both[1])
 
@@ -214,12 +214,12 @@ class StepAround:
 
         def solved(displacements: Array) -> Array:
             moved, nx, end = np.array([self.moved(d) for d in displacements]), model.nx, model.nx + model.nu
-            found = refine_steps(model, self.vector, moved[:, :nx], moved[:, nx:end], moved[:, end:])
-            for refusal in found.refused.values():
+            refined = refine_steps(model, self.vector, moved[:, :nx], moved[:, nx:end], moved[:, end:])
+            for refusal in refined.refused.values():
                 raise _RefusedError(str(refusal))
-            left.append(float(found.left[0]))
-            left.append(float(np.max(found.left)))
-            return found.x_next
+            left.append(float(refined.left[0]))
+            left.append(float(np.max(refined.left)))
+            return refined.x_next
 
         try:
             solved(np.zeros((1, n)))  # what is never known is told by the first
@@ -253,7 +253,7 @@ def _find_mode_changes(
     `f` takes a scaled displacement (n,) and leaves the double twin at the step; `derivative` (m, n) is by it.
     """
     directions = np.eye(derivative.shape[1])
-    centre, found = f(np.zeros(len(directions))), []
+    centre, changes = f(np.zeros(len(directions))), []
     here = active_modes(model)
     for j, column in enumerate(space.names + model.input_names):
         for reach in (NEIGHBOURHOOD, -NEIGHBOURHOOD):
@@ -266,8 +266,8 @@ def _find_mode_changes(
             touched = tuple(name for name, miss in zip(space.names, missed, strict=True) if miss)
             for pair in sorted(pair for pair in here.keys() | there.keys() if here.get(pair) != there.get(pair)):
                 before, after = here.get(pair, SEPARATED), there.get(pair, SEPARATED)
-                found.append(ModeChange(pair, before, after, column, float(reach * scale[j]), touched))
-    return tuple(found)
+                changes.append(ModeChange(pair, before, after, column, float(reach * scale[j]), touched))
+    return tuple(changes)
 
 
 def solver_tolerance(model: Model, x: Array, u: Array) -> float:
@@ -321,7 +321,7 @@ def certify_steps(model: Model, xs: Array, us: Array, *, parameters: Parameters 
     What is in doubt is looked at as it is, not taken anew.
     """
     inside = with_room(model, us)
-    found = []
+    certificates = []
     for x, u, within, look in zip(xs, us, inside, first_looks(model, xs, inside, parameters), strict=True):
         sure = look.certificate
         at_limit = within != u
@@ -333,8 +333,8 @@ def certify_steps(model: Model, xs: Array, us: Array, *, parameters: Parameters 
                 sure = replace(sure, told=f"{sure.told}; {beside_limits(model, at_limit)}")
         if sure is None:
             sure = certify_inside(model, x, u, parameters=parameters, derivatives=look.derivatives)
-        found.append(sure)
-    return tuple(found)
+        certificates.append(sure)
+    return tuple(certificates)
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,7 +379,7 @@ def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> l
             derivative = space.jacobian(x, d.x_next, d.A, d.B, d.C) * scale
             plans.append(LookAt(derivative, in_steps(model, space, len(scale))))
         every = zip(steps, derivatives, looks(steps, plans), strict=True)
-        return [StepLook(step, d, *found) for step, d, found in every]
+        return [StepLook(step, d, *looked) for step, d, looked in every]
 
 
 Looked = tuple[FirstLook | None, float, str]  # as in a StepLook
@@ -390,27 +390,29 @@ def looks(steps: list[StepAround], plans: list[LookAt]) -> list[Looked]:
 
     A step in doubt is looked at once more, nearer to the point.
     """
-    found = _taken(steps, plans)
-    for k, (step, (look, _, doubt)) in enumerate(zip(steps, found, strict=True)):
+    looked = _taken(steps, plans)
+    for k, (step, (look, _, doubt)) in enumerate(zip(steps, looked, strict=True)):
         if look is not None and doubt:
             nearer = _look_nearer(step, look)
-            found[k] = found[k] if nearer[2] else nearer
-    return found
+            looked[k] = looked[k] if nearer[2] else nearer
+    return looked
 
 
 def _taken(steps: list[StepAround], plans: list[LookAt]) -> list[Looked]:
     first, nx = steps[0], steps[0].model.nx
-    xs, us = (np.array([step.point[part] for step in steps]) for part in (slice(nx), slice(nx, nx + first.model.nu)))
+    xs, us = (
+        np.array([step.point[columns] for step in steps]) for columns in (slice(nx), slice(nx, nx + first.model.nu))
+    )
     points = [np.array([step.moved(d) for d in plan.displacements]) for step, plan in zip(steps, plans, strict=True)]
     try:
         ends = ends_around(first.model, first.vector, xs, us, points)
     except SimulationError as error:  # of one of them, which its certificate tells
         ends = [(np.zeros(0), -1.0, str(error))] * len(points)
-    found = list[Looked]()
+    looked = list[Looked]()
     for plan, (values, left, why) in zip(plans, ends, strict=True):
         look = None if why else plan.taken(values, first.space.minus)
-        found.append((look, left, why if look is None else look.doubt()))
-    return found
+        looked.append((look, left, why if look is None else look.doubt()))
+    return looked
 
 
 def _look_nearer(step: StepAround, look: FirstLook) -> Looked:
@@ -430,7 +432,7 @@ def _look_nearer(step: StepAround, look: FirstLook) -> Looked:
         ((ends, _, why),) = ends_around(step.model, step.vector, row[:, :nx], row[:, nx:end], [points])
         if why:
             raise SimulationError(why)
-        return np.array([step.space.minus(each, ends[0]) for each in ends[1:]])
+        return np.array([step.space.minus(x_next, ends[0]) for x_next in ends[1:]])
 
     try:
         return near, left, is_broken(changes, len(step.scale))
@@ -447,13 +449,13 @@ def ends_around(
     They leave what Drake's own leaves at the first point, so that they begin there.
     """
     nx, end = model.nx, model.nx + model.nu
-    found: list[tuple[Array, float, str]] = [(np.zeros(0), -1.0, "")] * len(points)
+    results: list[tuple[Array, float, str]] = [(np.zeros(0), -1.0, "")] * len(points)
     solved = [k for k, (x, u) in enumerate(zip(xs, us, strict=True)) if solver_tolerance(model, x, u)]
     for k in set(range(len(points))).difference(solved):
-        ends = [step_at(model, vector, at[:nx], at[nx:end], at[end:]) for at in points[k]]
-        found[k] = (np.array(ends), -1.0, "")
+        ends = [step_at(model, vector, row[:nx], row[nx:end], row[end:]) for row in points[k]]
+        results[k] = (np.array(ends), -1.0, "")
     if not solved:
-        return found
+        return results
     first = np.array([points[k][0] for k in solved])
     here = refine_steps(model, vector, first[:, :nx], first[:, nx:end], first[:, end:])
     every, counts = np.vstack([points[k] for k in solved]), [len(points[k]) for k in solved]
@@ -461,7 +463,7 @@ def ends_around(
     there = refine_steps(model, vector, every[:, :nx], every[:, nx:end], every[:, end:], held)
     begins = np.cumsum([0, *counts])
     for i, k in enumerate(solved):
-        part = slice(int(begins[i]), int(begins[i + 1]))
-        whys = [str(why) for at, why in there.refused.items() if part.start <= at < part.stop]
-        found[k] = (there.x_next[part], float(np.max(there.left[part])), whys[0] if whys else "")
-    return found
+        rows = slice(int(begins[i]), int(begins[i + 1]))
+        whys = [str(why) for row, why in there.refused.items() if rows.start <= row < rows.stop]
+        results[k] = (there.x_next[rows], float(np.max(there.left[rows])), whys[0] if whys else "")
+    return results

@@ -31,7 +31,7 @@ class DifferenceOptions:
     orders: tuple[int, ...] = (4, 5, 6)  # of the differences that tell scatter
     last_place: float = 1.1e-16  # half a unit in the last place of 1
     safety: float = 3.0  # scatter is a standard deviation, from a few values
-    told: float = 30.0  # times the scatter: a corner or jump that can be told from it
+    significant: float = 30.0  # times the scatter: a corner or jump that can be told from it
     visible: float = 1e-10  # of a value: smaller stairs are its rounding, magnified
     fine: float = 1e-5  # for this and the next see `_stairs`
     flat: float = 1e-2
@@ -122,13 +122,13 @@ def is_broken(changes: Many, n: int) -> str:
 
     It is a staircase, or has a corner or a jump within 1e-6 of the point; empty where it is neither.
     """
-    direction, found = _line(n), changes(_along(n))
-    unsolved = np.zeros(found.shape[1])
-    along, rounding, by_spacing = _scattered(found, unsolved + 1)
+    direction, line_changes = _line(n), changes(_along(n))
+    unsolved = np.zeros(line_changes.shape[1])
+    along, rounding, by_spacing = _scattered(line_changes, unsolved + 1)
     still = np.maximum(by_spacing[:, 0].min(axis=0), rounding[:, DIFFERENCES.near - 1].max(axis=0))
     for k in range(DIFFERENCES.near):
         through = np.concatenate([along[1, k, ::-1], np.zeros((1, len(unsolved))), along[0, k]])
-        if np.any(_scatter(through) > DIFFERENCES.told * still):
+        if np.any(_scatter(through) > DIFFERENCES.significant * still):
             return "it is broken beside the point"
     some = _stairs(lambda t: changes(np.multiply.outer(t, direction)), along, by_spacing, rounding, unsolved)
     return next(iter(some.values()), "")
@@ -157,11 +157,11 @@ def _line(n: int) -> Array:
 
 def _scatter(values: Array) -> Array:
     """(..., m) the standard deviation of equally spaced `values` (..., k, m) around a smooth curve."""
-    found = []
+    deviations = []
     for order in DIFFERENCES.orders:
         differences = np.diff(values, order, axis=-2)
-        found.append((differences**2).mean(axis=-2) / comb(2 * order, order))
-    return np.asarray(np.sqrt(np.median(found, axis=0)))
+        deviations.append((differences**2).mean(axis=-2) / comb(2 * order, order))
+    return np.asarray(np.sqrt(np.median(deviations, axis=0)))
 
 
 def _stairs(
@@ -172,12 +172,12 @@ def _stairs(
     `along_line` gives the changes (k, m) at k places of the line, `scatter` is (2, spacings, m).
     """
     slope = (along[0, 0, -1] - along[1, 0, -1]) / (2 * DIFFERENCES.values * DIFFERENCES.spacings[0])
-    found: dict[int, str] = {}
+    reasons: dict[int, str] = {}
     for k in range(1, len(DIFFERENCES.spacings) if len(slope) else 0):
         finest = np.maximum(scatter[:, 0].max(axis=0), rounding[:, k].max(axis=0)) + TINY
         values = 2 * rounding[:, k].max(axis=0) / DIFFERENCES.last_place
         least, both = (
-            np.maximum(np.maximum(DIFFERENCES.told * finest, unsolved), DIFFERENCES.visible * values),
+            np.maximum(np.maximum(DIFFERENCES.significant * finest, unsolved), DIFFERENCES.visible * values),
             scatter[:, k].min(axis=0),
         )
         # Where contact's onsets are as close, only what is flat between its jumps is stairs.
@@ -187,7 +187,7 @@ def _stairs(
                 np.abs(slope) * DIFFERENCES.values * DIFFERENCES.spacings[k] <= DIFFERENCES.flat * risen, both, 0.0
             )
         row = int(np.argmax(both / finest))
-        if row in found or not both[row] > least[row]:
+        if row in reasons or not both[row] > least[row]:
             continue
         jumps = [
             _jumps(along_line, row, sign, k, along[s, k, :, row], slope[row], least[row])
@@ -195,10 +195,10 @@ def _stairs(
         ]
         if all(len(some) >= DIFFERENCES.stairs for some in jumps):
             (up, here), (down, there) = jumps[0][0], jumps[1][0]
-            found[row] = (
+            reasons[row] = (
                 f"it jumps by {up:.2g} at {here:.2g} and by {down:.2g} at {there:.2g} of a line through the point"
             )
-    return found
+    return reasons
 
 
 def _jumps(
@@ -210,7 +210,7 @@ def _jumps(
         np.concatenate([[0.0], values]),
     )
     off = np.abs(np.diff(heights) - slope * np.diff(places))
-    found: list[tuple[float, float]] = []
+    jumps: list[tuple[float, float]] = []
     for i in np.argsort(-off, kind="stable")[: DIFFERENCES.stairs]:
         ends, ends_at = places[i : i + 2].copy(), heights[i : i + 2].copy()
         for _ in range(DIFFERENCES.halvings):
@@ -222,5 +222,5 @@ def _jumps(
         jump = ends_at[1] - ends_at[0]
         if not abs(jump) > max(least, off[i] / 100):
             break
-        found.append((float(jump), float(ends.mean())))
-    return found
+        jumps.append((float(jump), float(ends.mean())))
+    return jumps

@@ -99,7 +99,7 @@ class FirstLook:
         return np.asarray(self.derivative - error * self._per_weight)
 
     @property
-    def told(self) -> str:
+    def statement(self) -> str:
         """What the certificate rests on."""
         points = 2 * len(self.widths) * SCREEN.directions + 2 * len(SCREEN.wide) + 3
         near = f"within {self.widths[0]:.1g} of the scales, beyond which something changes, " if self.is_nearer else ""
@@ -121,16 +121,16 @@ class FirstLook:
         gaps, moved = self._gaps(), self.weights > 0
         allowed = LIMITS.power * np.min((self.weights * self.size)[:, moved], axis=1, initial=np.inf)  # (m,)
         bounds = self._bound(gaps)
-        told = bounds <= allowed
+        significant = bounds <= allowed
         hidden = self._bound(np.broadcast_to(self.rounding / self.widths[-1], gaps[0].shape))
-        if not np.all(told.any(axis=0)):
-            return f"along random directions row {int(np.argmin(told.any(axis=0)))} is another one"
+        if not np.all(significant.any(axis=0)):
+            return f"along random directions row {int(np.argmin(significant.any(axis=0)))} is another one"
         # The smallest steps decide: where they say something else it is rounding, or there is something at the point.
-        if not np.all(told[-1] | (bounds[-1] <= hidden)):
+        if not np.all(significant[-1] | (bounds[-1] <= hidden)):
             return "along random directions slopes are others over smaller steps"
         corners = self._corners()
-        told = corners <= np.maximum(allowed, hidden)
-        if not np.all(told[-1] & (corners <= allowed).any(axis=0) | (corners <= hidden).all(axis=0)):
+        significant = corners <= np.maximum(allowed, hidden)
+        if not np.all(significant[-1] & (corners <= allowed).any(axis=0) | (corners <= hidden).all(axis=0)):
             return "slopes ahead and behind do not approach each other"
         if np.any(self._stairs()):
             return "a row is flat here, and changes farther away"
@@ -139,14 +139,14 @@ class FirstLook:
     def _stairs(self) -> Flags:
         """(m,) rows that are flat here and change to both sides farther away, not as smooth curves do, h^2 and h^3."""
         risen = np.abs(self.wide).max(axis=0).min(axis=0)
-        said = np.linalg.norm(self.derivative * np.minimum(self.weights, 1.0), axis=1) * SCREEN.wide[0]
+        predicted = np.linalg.norm(self.derivative * np.minimum(self.weights, 1.0), axis=1) * SCREEN.wide[0]
         ahead, behind = self.wide[:, 0], self.wide[:, 1]
-        left = said + SCREEN.flat * risen + self.rounding
+        left = predicted + SCREEN.flat * risen + self.rounding
         bent = np.ones(len(risen), dtype=bool)
-        for part, order in (((ahead + behind) / 2, 2), ((ahead - behind) / 2, 3)):
-            expected = part[0] * (SCREEN.wide[1] / SCREEN.wide[0]) ** order
-            bent &= np.abs(part[1] - expected) <= SCREEN.alike * np.abs(expected) + left
-        return np.asarray((said <= SCREEN.flat * risen) & (risen > self.rounding) & ~bent)
+        for half, order in (((ahead + behind) / 2, 2), ((ahead - behind) / 2, 3)):
+            expected = half[0] * (SCREEN.wide[1] / SCREEN.wide[0]) ** order
+            bent &= np.abs(half[1] - expected) <= SCREEN.alike * np.abs(expected) + left
+        return np.asarray((predicted <= SCREEN.flat * risen) & (risen > self.rounding) & ~bent)
 
     @property
     def _per_weight(self) -> Array:
@@ -165,17 +165,12 @@ class FirstLook:
 
         Of three neighbouring widths each.
         """
-        bend, found = (self.ahead - self.behind) / 2, []
+        bend, corners = (self.ahead - self.behind) / 2, []
         for first in range(len(self.widths) - 2):
             h = np.array(self.widths[first : first + 3])
             terms = np.stack([np.ones_like(h), h, h**3])
-            found.append(np.tensordot(np.linalg.solve(terms, [1.0, 0.0, 0.0]), bend[first : first + 3], axes=1))
-        return self._bound(np.array(found))
-
-    def of(self, derivative: Array) -> "FirstLook":
-        """The same of another derivative that is zero in the same columns."""
-        parts = {name: getattr(self, name) for name in FirstLook.__dataclass_fields__}
-        return FirstLook(**parts | {"derivative": derivative})
+            corners.append(np.tensordot(np.linalg.solve(terms, [1.0, 0.0, 0.0]), bend[first : first + 3], axes=1))
+        return self._bound(np.array(corners))
 
 
 def certificate_by(
@@ -204,7 +199,7 @@ def certificate_by(
         scale=scale,
         stopped=0.0,
         second=look.second,
-        told="; ".join(text for text in (look.told, told) if text),
+        told="; ".join(text for text in (look.statement, told) if text),
         method=method,
         subject=subject,
     )
@@ -263,11 +258,11 @@ def _weights(a: Array, size: Array) -> Array:
     w = np.where(moved, 1.0, 0.0)
     if not moved.any():
         return w
-    found = np.abs(a)
-    rows = found.max(axis=1) > 0
-    found, least = found[rows], 1 / size[rows]
+    magnitude = np.abs(a)
+    rows = magnitude.max(axis=1) > 0
+    magnitude, least = magnitude[rows], 1 / size[rows]
     for _ in range(SCREEN.rounds):
-        need = ((found * w).max(axis=1)[:, None] * least).max(axis=0)
+        need = ((magnitude * w).max(axis=1)[:, None] * least).max(axis=0)
         last, w = w, np.where(moved, np.sqrt(w * need / _middle(need[moved])), 0.0)
         if np.all(np.abs(w - last) <= SCREEN.balanced * w):
             break
@@ -325,11 +320,11 @@ class Gaps:
         return len(self.gap)
 
     def __str__(self) -> str:
-        at = int(np.argmax(np.abs(self.gap)))
-        stated, found = self.stated[at], self.stated[at] - self.gap[at]
+        worst = int(np.argmax(np.abs(self.gap)))
+        stated, differenced = self.stated[worst], self.stated[worst] - self.gap[worst]
         return (
-            f"along direction {at} the gradient states {stated:.6g} and differences say {found:.6g}, in units of an "
-            "entry that matters"
+            f"along direction {worst} the gradient states {stated:.6g} and differences say {differenced:.6g}, in units "
+            "of an entry that matters"
         )
 
     @property
@@ -414,13 +409,13 @@ def judge(first: Gaps, second: Gaps | None, doubt: float) -> tuple[str, str]:
             else ("undecided", "no second step size is possible")
         )
     fine, coarse = sorted((first, second), key=lambda gaps: gaps.step)
-    grown, told = coarse.step / fine.step, max(doubt, 100 * fine.rounding)
+    grown, threshold = coarse.step / fine.step, max(doubt, 100 * fine.rounding)
     for near, far, why in (
         (fine.bend, coarse.bend, "the loss has a corner: the slopes to both sides do not approach each other"),
         (fine.bend, grown * coarse.bend, "the loss jumps: its quotients grow as the step shrinks"),
         (fine.gap, grown * coarse.gap, "the loss jumps: its quotients grow as the step shrinks"),
     ):
-        if fine.kink > SAMPLE.limit and _steady(near, far) and _size(near) > told:
+        if fine.kink > SAMPLE.limit and _steady(near, far) and _size(near) > threshold:
             return "discontinuous", why
     if min(first.bound, second.bound) <= SAMPLE.limit:
         return "agree", ""

@@ -109,22 +109,22 @@ class Displaced:
         (count, nu), size = self.us.shape, self.space.size
         given = count * nu if self.policy is None else 0
         units = np.eye(len(self.scale)) / self.scale
-        found = [
+        lines = [
             Line(self.columns[j], np.array([j]), float(self.scale[j]), units[j], WIDEST * float(self.scale[j]))
             for j in (*range(size), *range(size + given, len(self.scale)))
         ]
         if self.policy is not None:
-            return tuple(found)
+            return tuple(lines)
         limits = self.model.inputs.of_actuators([a.effort_limit() for a in actuators(self.model.plant)])
         cut = np.where(self.model.inputs.actuator >= 0, limits, np.inf)
         for j in range(nu):
             columns, sizes = size + j + nu * np.arange(count), np.abs(self.us[:, j])
             name, room = f"{self.model.input_names[j]} at all times", float(np.abs(cut[j] - sizes).min())
             scale = max(1.0, float(sizes.max()))
-            found.insert(size + j, Line(name, columns, scale, units[columns].sum(axis=0), room))
-        return tuple(found)
+            lines.insert(size + j, Line(name, columns, scale, units[columns].sum(axis=0), room))
+        return tuple(lines)
 
-    def at(self, displacement: Array) -> Point:
+    def point(self, displacement: Array) -> Point:
         """What is rolled out at a displacement (n,)."""
         point = move(self.space, self.model.nx, np.concatenate([self.x0, self._values]), self.scale * displacement)
         sizes = self.model.nx, self.us.size, len(policy_parameters(self.policy))
@@ -133,7 +133,7 @@ class Displaced:
 
     def gradient(self, displacement: Array) -> RolloutGradient:
         """The gradient at a displacement (n,)."""
-        x0, us, parameters, values = self.at(displacement)
+        x0, us, parameters, values = self.point(displacement)
         options: dict[str, Any] = {"parameters": values, "method": self.method}
         if self.policy is None:
             return differentiate_rollout(self.model, x0, us, self.loss, **options)
@@ -150,7 +150,7 @@ class Displaced:
         return np.array([[self._roll(d, policy)] for d in displacements])
 
     def _roll(self, displacement: Array, policy: Any) -> float:
-        x0, us, parameters, values = self.at(displacement)
+        x0, us, parameters, values = self.point(displacement)
         ask = self.inputs(us, parameters, policy)
         xs, inputs = np.empty((len(us) + 1, self.model.nx)), np.empty((len(us), self.model.nu))
         xs[0] = x0
@@ -166,10 +166,10 @@ class Displaced:
         Raises NotSolvedError where a step is not known to rounding.
         """
         with applied(self.vector) as model:
-            found = refine_steps(model, self.vector, g.xs[:-1], g.us)
-        _check_solved(found)
-        left = [self.space.minus(*pair) for pair in zip(found.drake, found.x_next, strict=True)]
-        return np.array(left), float(np.max(found.left))
+            refined = refine_steps(model, self.vector, g.xs[:-1], g.us)
+        _check_solved(refined)
+        left = [self.space.minus(*pair) for pair in zip(refined.drake, refined.x_next, strict=True)]
+        return np.array(left), float(np.max(refined.left))
 
     def solved_losses(self, left: Array, displacements: Array) -> Array:
         """(K, 1) as `losses`, of rollouts whose every step is solved to rounding and then moved by `left` (N, size).
@@ -178,11 +178,11 @@ class Displaced:
         and differences are of the steps' equation there. Raises NotSolvedError as `left_by_drake`.
         """
         parts = np.array_split(displacements, -(-len(displacements) // MANY))
-        return np.vstack([self._solved(left, part) for part in parts])
+        return np.vstack([self._solved(left, chunk) for chunk in parts])
 
     def _solved(self, left: Array, displacements: Array) -> Array:
         count, size = len(self.us), len(displacements)
-        points = [self.at(d) for d in displacements]
+        points = [self.point(d) for d in displacements]
         asks = [self.inputs(us, parameters, None) for _, us, parameters, _ in points]
         values = np.array([vector.values for *_, vector in points])
         times = [self.vector.time_step(row) for row in values]
@@ -191,9 +191,9 @@ class Displaced:
         with applied(self.vector) as model:
             for k in range(count):
                 inputs[:, k] = [ask(x, k, h) for ask, x, h in zip(asks, xs[:, k], times, strict=True)]
-                found = refine_steps(model, self.vector, xs[:, k], inputs[:, k], values)
-                _check_solved(found)
-                xs[:, k + 1] = [self.space.plus(x_next, left[k]) for x_next in found.x_next]
+                refined = refine_steps(model, self.vector, xs[:, k], inputs[:, k], values)
+                _check_solved(refined)
+                xs[:, k + 1] = [self.space.plus(x_next, left[k]) for x_next in refined.x_next]
         return np.array([[evaluate_loss(self.loss, *motion)] for motion in zip(xs, inputs, strict=True)])
 
     def solver_tolerance(self, g: RolloutGradient) -> float:
@@ -209,9 +209,9 @@ class Displaced:
         return lambda x, k, h: finite_array("policy(x, t)", asked(x.copy(), k * h), (nu,))
 
 
-def _check_solved(found: RefinedSteps) -> None:
-    for k, refusal in found.refused.items():
-        raise NotSolvedError(f"{refusal} (step {k})" if len(found.refused) < len(found.left) else str(refusal))
+def _check_solved(refined: RefinedSteps) -> None:
+    for k, refusal in refined.refused.items():
+        raise NotSolvedError(f"{refusal} (step {k})" if len(refined.refused) < len(refined.left) else str(refusal))
 
 
 SHARED = ("pydrake.", "drake_diff.model.")  # packages whose objects a copy shares with the original: models and plants
@@ -238,7 +238,7 @@ def _copied(thing: Any, known: dict[int, Any]) -> Any:
     if isinstance(thing, types.MethodType):
         return types.MethodType(thing.__func__, _copied(thing.__self__, known))
     if isinstance(thing, partial):
-        arguments = (_copied(one, known) for one in thing.args)
+        arguments = (_copied(argument, known) for argument in thing.args)
         return partial(_copied(thing.func, known), *arguments, **_copied(thing.keywords, known))
     if isinstance(thing, dict | list | deque | set | np.ndarray):
         return _copied_container(thing, known)
@@ -314,16 +314,16 @@ def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_
 
         u, by_x, by_parameters = differentiate_policy(policy, x, t, nu)
         stated = np.hstack([by_x @ space.derivative_of_plus(x), by_parameters[:, acting] * scale])
-        found = [central_differences(moved, len(columns), h) for h in STEPS]
-        size = np.maximum(np.abs(stated), np.abs(found[-1])).max(axis=1, initial=0.0, keepdims=True)
+        quotients = [central_differences(moved, len(columns), h) for h in STEPS]
+        size = np.maximum(np.abs(stated), np.abs(quotients[-1])).max(axis=1, initial=0.0, keepdims=True)
         size = np.maximum(size, LEAST * np.maximum(1.0, np.abs(u))[:, None])
-        gap = np.minimum(*(np.abs(stated - some) for some in found)) / size
+        gap = np.minimum(*(np.abs(stated - some) for some in quotients)) / size
         if np.max(gap, initial=0.0) > MISSED:
             i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
             unit = np.concatenate([np.ones(space.size), scale])[j]
             return (
                 f"the policy states a wrong derivative: at t = {t:g} s that of u[{i}] by {columns[j]} is "
-                f"{stated[i, j] / unit:.6g}, differences of the policy say {found[-1][i, j] / unit:.6g}"
+                f"{stated[i, j] / unit:.6g}, differences of the policy say {quotients[-1][i, j] / unit:.6g}"
             )
     return ""
 
@@ -350,12 +350,12 @@ def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
     def along(s: float) -> float:
         return evaluate_loss(loss, g.xs + s * states, g.us + s * inputs)
 
-    if not (found := _stairs(along, 0.0)):
+    if not (jump := _stairs(along, 0.0)):
         return ""
-    size = along(found[1]) - along(found[0])
+    size = along(jump[1]) - along(jump[0])
     return (
-        f"the loss is a staircase: of {CELLS} parts of a line through the motion {found[2]} jump, one by {size:.3g} "
-        f"at {found[0]:.3g}"
+        f"the loss is a staircase: of {CELLS} parts of a line through the motion {jump[2]} jump, one by {size:.3g} "
+        f"at {jump[0]:.3g}"
     )
 
 
@@ -372,12 +372,12 @@ def stairs_of_policy(policy: Callable[..., Array], g: RolloutGradient, space: Ta
         def along(s: float, u: Callable[[float], Array] = u) -> float:
             return float(weight @ u(s))
 
-        if found := _stairs(along, SINGLE * float(np.abs(g.us[k]).sum())):
-            change = u(found[1]) - u(found[0])
+        if jump := _stairs(along, SINGLE * float(np.abs(g.us[k]).sum())):
+            change = u(jump[1]) - u(jump[0])
             i = int(np.argmax(np.abs(change)))
             return (
-                f"the policy is a staircase: at t = {t:g} s, of {CELLS} parts of a line through x {found[2]} jump, "
-                f"u[{i}] by {change[i]:.3g} at {found[0]:.3g}"
+                f"the policy is a staircase: at t = {t:g} s, of {CELLS} parts of a line through x {jump[2]} jump, "
+                f"u[{i}] by {change[i]:.3g} at {jump[0]:.3g}"
             )
     return ""
 
@@ -395,10 +395,12 @@ def _stairs(f: Callable[[float], float], least: float) -> tuple[float, float, in
             ends = np.linspace(-length, length, CELLS + 1)
             try:
                 values = np.array([f(float(s)) for s in ends])
-                told = max(least, ROUNDED * float(np.max(np.abs(values))), PART * float(np.ptp(values)))
-                if not np.max(np.abs(np.diff(values, 3))) > told:  # which is nothing where a function is smooth
+                threshold = max(least, ROUNDED * float(np.max(np.abs(values))), PART * float(np.ptp(values)))
+                if not np.max(np.abs(np.diff(values, 3))) > threshold:  # which is nothing where a function is smooth
                     continue
-                jumps = [found for i in range(CELLS) if (found := _jump(f, ends[i : i + 2], values[i : i + 2], told))]
+                jumps = [
+                    jump for i in range(CELLS) if (jump := _jump(f, ends[i : i + 2], values[i : i + 2], threshold))
+                ]
             except OUTSIDE:
                 return None
             if len(jumps) >= STAIRS:

@@ -129,9 +129,9 @@ class Pair:
 
     def of_kinds(self, a: type, b: type) -> tuple[Collider, Collider] | None:
         """The two in the order of the shapes that are asked for."""
-        for one, other in ((self.a, self.b), (self.b, self.a)):
-            if isinstance(one.shape, a) and isinstance(other.shape, b):
-                return one, other
+        for first, other in ((self.a, self.b), (self.b, self.a)):
+            if isinstance(first.shape, a) and isinstance(other.shape, b):
+                return first, other
         return None
 
 
@@ -180,12 +180,12 @@ class Place:
     def colliders(self) -> dict[Any, Collider]:
         """Those that can collide, by id, at x."""
         set_state(self.model.double, self.x)
-        found = {}
+        colliders = {}
         for id_ in sorted({g for pair in self.candidates for g in pair}, key=lambda g: g.get_value()):
-            inspector, own = self.query.inspector(), self.model.double.scene_graph.model_inspector()
+            inspector, model_inspector = self.query.inspector(), self.model.double.scene_graph.model_inspector()
             body = self.model.plant.GetBodyFromFrameId(inspector.GetFrameId(id_))
             shape, body_name = inspector.GetShape(id_), body.name() if body is not None else "?"
-            found[id_] = Collider(
+            colliders[id_] = Collider(
                 id=id_,
                 label=f"{body_name}/{inspector.GetName(id_).split('::')[-1]} ({type(shape).__name__})",
                 body=body_name,
@@ -193,10 +193,10 @@ class Place:
                 pose=self.query.GetPoseInWorld(id_),
                 box=inspector.GetObbInGeometryFrame(id_),
                 compliance=_compliance(self, id_, shape),
-                own=own.GetProximityProperties(id_),
+                own=model_inspector.GetProximityProperties(id_),
                 all=inspector.GetProximityProperties(id_),
             )
-        return found
+        return colliders
 
     @cached_property
     def candidates(self) -> list[tuple[Any, Any]]:
@@ -212,14 +212,14 @@ class Place:
         return [Pair(self.colliders[a], self.colliders[b], contact) for a, b in self.candidates]
 
 
-def _compliance(place: Place, id_: Any, shape: Any) -> Literal["none", "rigid", "compliant"]:
+def _compliance(point: Place, id_: Any, shape: Any) -> Literal["none", "rigid", "compliant"]:
     """How hydroelastic contact sees a geometry. Python cannot read Drake's compliance_type, so by its mesh."""
-    scene_graph = place.model.double.scene_graph
+    scene_graph = point.model.double.scene_graph
     if not isinstance(shape, HalfSpace):
-        mesh = place.query.inspector().maybe_get_hydroelastic_mesh(id_)
+        mesh = point.query.inspector().maybe_get_hydroelastic_mesh(id_)
         return "none" if mesh is None else "compliant" if isinstance(mesh, VolumeMesh) else "rigid"
-    own = scene_graph.model_inspector().GetProximityProperties(id_)
-    if own.HasProperty("hydroelastic", "compliance_type"):
-        return "compliant" if own.HasProperty("hydroelastic", "slab_thickness") else "rigid"
+    properties = scene_graph.model_inspector().GetProximityProperties(id_)
+    if properties.HasProperty("hydroelastic", "compliance_type"):
+        return "compliant" if properties.HasProperty("hydroelastic", "slab_thickness") else "rigid"
     default = scene_graph.get_config().default_proximity_properties.compliance_type
     return "none" if default == "undefined" else "compliant" if default == "compliant" else "rigid"

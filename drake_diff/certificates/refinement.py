@@ -54,17 +54,17 @@ class Slope:
     missing: tuple[str, ...]
 
     def __str__(self) -> str:
-        found = []
+        texts = []
         if np.isfinite(self.secant):
-            found.append(f"over +-{self.width:.2g} the loss itself rises by {self.secant:.4g}")
+            texts.append(f"over +-{self.width:.2g} the loss itself rises by {self.secant:.4g}")
         if np.isfinite(self.continuous):
             sure = (
                 f"(+-{self.spread:.1g})"
                 if np.isfinite(self.spread)
                 else "over its narrowest width, and does not settle"
             )
-            found.append(f"the continuous motion's slope is {self.continuous:.4g} {sure}")
-        return ", ".join((*found, *self.missing))
+            texts.append(f"the continuous motion's slope is {self.continuous:.4g} {sure}")
+        return ", ".join((*texts, *self.missing))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class Motions:
 
     def _states(self, line: Line, s: float) -> tuple[Array, Array]:
         """xs (parts N + 1, nx) of the discrete motion moved by `s` along the line, and its us (N, nu)."""
-        x0, us, _, values = self.moved.at(s * line.vector)
+        x0, us, _, values = self.moved.point(s * line.vector)
         with applied(select(self._finer, values.to_dict())) as finer:
             return roll_states(finer, x0, np.repeat(us, self.parts, axis=0)), us
 
@@ -115,8 +115,8 @@ class Motions:
         width = WIDTH * line.scale
         if self._touches:
             teeth = self._teeth(line)
-            told = teeth[teeth <= ALIKE * np.min(teeth, initial=np.inf)]
-            width = max(width, TEETH * float(np.max(told, initial=0.0)))
+            moved = teeth[teeth <= ALIKE * np.min(teeth, initial=np.inf)]
+            width = max(width, TEETH * float(np.max(moved, initial=0.0)))
         if width > line.room:
             why = f"{TEETH:g} steps' way is +-{width:.2g}" if width > WIDTH * line.scale else f"+-{width:.2g}"
             raise SimulationError(f"{why}, and it may not be moved by more than {line.room:.2g}")
@@ -124,13 +124,13 @@ class Motions:
 
     def _teeth(self, line: Line) -> Array:
         """(n,) how far the direction has to move each touch to make it a step later; none where it does not."""
-        step, found = PILOT * line.scale, []
+        step, teeth = PILOT * line.scale, []
         (ahead, _), (behind, _) = self._states(line, step), self._states(line, -step)
         for k, pair, way in self._touches:
             by = (self._depths(ahead[k]).get(pair, 0.0) - self._depths(behind[k]).get(pair, 0.0)) / (2 * step)
             if abs(by) > 0:
-                found.append(way / abs(by))
-        return np.array(found)
+                teeth.append(way / abs(by))
+        return np.array(teeth)
 
     @cached_property
     def _finer(self) -> Model:
@@ -147,7 +147,7 @@ class Motions:
             return []
         with applied(select(self._finer, self.moved.vector.to_dict())) as finer:
             xs = roll_states(finer, self.moved.x0, np.repeat(self.moved.us, self.parts, axis=0))
-        found: list[tuple[int, tuple[int, int], float]] = []
+        touches: list[tuple[int, tuple[int, int], float]] = []
         before: dict[tuple[int, int], float] = {}
         for k, x in enumerate(xs):
             now = self._depths(x, ahead=False)
@@ -155,9 +155,9 @@ class Motions:
             for pair in now.keys() - before.keys():
                 way = later.get(pair, 0.0) - now[pair]
                 if way > 0 and (k > 0 or now[pair] <= way):  # what starts deeper did not just touch
-                    found.append((k, pair, way))
+                    touches.append((k, pair, way))
             before = now
-        return found
+        return touches
 
     def _depths(self, x: Array, *, ahead: bool = True) -> dict[tuple[int, int], float]:
         """[m] by pair of geometries that overlap in the state `x`, or where its velocity takes it in a step."""
@@ -190,8 +190,8 @@ class Compared:
     disagree: tuple[str, ...]  # which of the slopes the first of them is not
 
     def __str__(self) -> str:
-        said = f"; the gradient is not {' and not '.join(self.disagree)}" if self.disagree else ""
-        return f"along {self.slope.line.name} {_row(self.gradient)}, {self.slope}{said}"
+        text = f"; the gradient is not {' and not '.join(self.disagree)}" if self.disagree else ""
+        return f"along {self.slope.line.name} {_row(self.gradient)}, {self.slope}{text}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +220,8 @@ class Refinement:
         j = self.worst
         levels = ", ".join(f"{level:.4g}" for level in self.levels)
         if self.converged.all():
-            said = f"converges with {self.by} ({levels}): by {self.columns[j]} {_row(self.values[:, j])}, "
-            parts = [f"{said}limit {self.limit[j]:.4g}"]
+            text = f"converges with {self.by} ({levels}): by {self.columns[j]} {_row(self.values[:, j])}, "
+            parts = [f"{text}limit {self.limit[j]:.4g}"]
         else:
             count = int((~self.converged).sum())
             parts = [
@@ -275,9 +275,9 @@ def refine_by_time_step(moved: Displaced, first: Array, truth: Truth | None, no_
     """
     values = np.array([first, *at_finer_steps(moved)])
     levels = tuple(moved.model.time_step / m for m in REFINEMENTS)
-    found = judge_levels("time step", levels, moved.columns, values, kinds_of(moved))
+    refinement = judge_levels("time step", levels, moved.columns, values, kinds_of(moved))
     motions = Motions(moved, REFINEMENTS[-1], truth, no_truth)
-    return beside_slopes(found, [motions.slope(line) for line in moved.lines])
+    return beside_slopes(refinement, [motions.slope(line) for line in moved.lines])
 
 
 def refine_by_stiffness(moved: Displaced, first: Array) -> Refinement:
@@ -318,16 +318,16 @@ def judge_levels(
     return Refinement(by, levels, tuple(columns), frozen(values), frozen(limit), frozen(scale), converged)
 
 
-def beside_slopes(found: Refinement, slopes: Sequence[Slope]) -> Refinement:
-    """`found`, in which only what agrees with every slope of the loss that there is, and with one at least, converges.
+def beside_slopes(refinement: Refinement, slopes: Sequence[Slope]) -> Refinement:
+    """`refinement`, in which only what agrees with every slope of the loss that there is, one at least, converges.
 
     The gradient at the first level has to be within 10 % of both; of inputs at all times, of the sum of their sizes.
     """
-    converged, compared = found.converged.copy(), []
+    converged, compared = refinement.converged.copy(), []
     for slope in slopes:
         columns = slope.line.columns
-        along = found.values[:, columns].sum(axis=1)
-        size = float(found.scale[columns].sum())
+        along = refinement.values[:, columns].sum(axis=1)
+        size = float(refinement.scale[columns].sum())
         disagree = []
         if np.isfinite(slope.secant) and abs(along[0] - slope.secant) > TRUSTED * max(size, abs(slope.secant)):
             disagree.append("the slope over many steps' way")
@@ -341,4 +341,4 @@ def beside_slopes(found: Refinement, slopes: Sequence[Slope]) -> Refinement:
             disagree.append("compared with anything")
         converged[columns] &= not disagree
         compared.append(Compared(frozen(along), slope, tuple(disagree)))
-    return replace(found, converged=converged, compared=tuple(compared))
+    return replace(refinement, converged=converged, compared=tuple(compared))

@@ -112,7 +112,7 @@ def certify_sampled(moved: Displaced, g: RolloutGradient, seed: int, spent: int,
     derivative = moved.flat(g) * moved.scale
     weight = weights(np.abs(derivative), moved.kinds)
     budget = _Budget(spent)
-    tolerance, told = moved.solver_tolerance(g), ""
+    tolerance, note = moved.solver_tolerance(g), ""
     drake = Probe(budget.counting(lambda d: moved.losses(d)[:, 0]), derivative, weight, seed)
     first, second, probe = None, None, drake
     if tolerance:
@@ -121,20 +121,20 @@ def certify_sampled(moved: Displaced, g: RolloutGradient, seed: int, spent: int,
             budget.spent += 1
             probe = Probe(budget.counting(lambda d: moved.solved_losses(left, d)[:, 0]), derivative, weight, seed)
             first, second = _two(probe, g.loss, budget)
-            told = differences_of_solved(worst)
+            note = differences_of_solved(worst)
         except NotSolvedError as why:
-            told = differences_of_drake(str(why))
+            note = differences_of_drake(str(why))
             probe = drake
     doubt = DOUBT * float(np.linalg.norm(derivative * weight)) if probe is drake and tolerance else 0.0
     if first is None:
         first, second = _two(drake, g.loss, budget)
     verdict, reason = judge(first, second, doubt)
     if verdict == "agree" and probe is not drake and second is None and budget.left >= 2 * SAMPLE.second:
-        own = drake.gaps(g.loss, first.step, SAMPLE.second)
-        told += f"; differences of those alone would have told {100 * own.bound:.1g} %"
+        drakes_gaps = drake.gaps(g.loss, first.step, SAMPLE.second)
+        note += f"; differences of those alone would have told {100 * drakes_gaps.bound:.1g} %"
     best = min((gaps for gaps in (first, second) if gaps is not None), key=lambda gaps: gaps.bound)
-    if verdict == "disagree" and (one := probe.alone(best)):
-        j, error = one
+    if verdict == "disagree" and (explanation := probe.alone(best)):
+        j, error = explanation
         stated, right = (value / moved.scale[j] for value in (derivative[j], derivative[j] - error))
         reason += f"; by {moved.columns[j]} alone it would be explained: {stated:.6g} is stated, {right:.6g} is right"
     if verdict != "agree":
@@ -152,7 +152,7 @@ def certify_sampled(moved: Displaced, g: RolloutGradient, seed: int, spent: int,
         seed=seed,
         method=" + ".join(dict.fromkeys((*g.methods, *g.parameter_sources))),
         subject=subject,
-        told=told,
+        told=note,
     )
 
 
@@ -297,8 +297,8 @@ def certify_rollout(
         truth, no_truth = _truth(moved, gradient, seconds)
     refinements = []
     if refine and (model.can_rebuild or truth is None):
-        found = refine_by_time_step(moved, flat, truth, no_truth)
-        refinements.append(found)
+        refinement = refine_by_time_step(moved, flat, truth, no_truth)
+        refinements.append(refinement)
     if refine_stiffness:
         refinements.append(refine_by_stiffness(moved, flat))
     method = " + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources)))
@@ -403,8 +403,8 @@ def _with_refinements(
     """The parts of a certificate whose entries that do not converge, are not the truth, or on stairs, do not agree."""
     codes, reasons = np.array(certificate.codes), dict(certificate.reasons)
     wrong = np.zeros(codes.shape[1], dtype=bool)
-    for found in refinements:
-        wrong |= ~found.converged
+    for refinement in refinements:
+        wrong |= ~refinement.converged
     for slope in truth.slopes if truth is not None else ():
         wrong[list(slope.columns)] |= slope.agrees is not True
     codes[0, wrong] = np.maximum(codes[0, wrong], VERDICTS.index("not_converged"))

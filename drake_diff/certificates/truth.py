@@ -127,12 +127,12 @@ class Truth(ShowsItsRepr):
 
     def slope(self, column: str) -> TrueSlope:
         """That of a column; KeyError where there is none of that name."""
-        return {one.column: one for one in self.slopes}[column]
+        return {slope.column: slope for slope in self.slopes}[column]
 
     @property
     def wrong(self) -> tuple[TrueSlope, ...]:
         """Those that ours is not."""
-        return tuple(one for one in self.slopes if one.agrees is False)
+        return tuple(slope for slope in self.slopes if slope.agrees is False)
 
     def __repr__(self) -> str:
         formula = f" ({self.law}, {FORMULAS[self.law]})" if self.touches else ""
@@ -141,20 +141,20 @@ class Truth(ShowsItsRepr):
             f"error of the step {self.ours - self.loss:.3g}"
         ]
         if self.other_law:
-            told = self.other_reason or f"the loss changes by {self.by_other_law:.3g}"
-            lines.append(f"difference of the laws, to {self.other_law} of Drake's continuous plant: {told}")
+            difference = self.other_reason or f"the loss changes by {self.by_other_law:.3g}"
+            lines.append(f"difference of the laws, to {self.other_law} of Drake's continuous plant: {difference}")
         groups: dict[str, list[TrueSlope]] = {"wrong": [], "none": [], "unknown": [], "right": []}
-        for one in self.slopes:
-            key = {None: "unknown", False: "none", True: "right" if one.agrees else "wrong"}[one.exists]
-            groups[key].append(one)
-        for key, said in (
+        for slope in self.slopes:
+            key = {None: "unknown", False: "none", True: "right" if slope.agrees else "wrong"}[slope.exists]
+            groups[key].append(slope)
+        for key, label in (
             ("wrong", "not ours"),
             ("none", "without a slope"),
             ("unknown", "not known"),
             ("right", "ours"),
         ):
             if ones := groups[key]:
-                lines.append(f"{len(ones)} of {len(self.slopes)} {said}, first {ones[0]!r}")
+                lines.append(f"{len(ones)} of {len(self.slopes)} {label}, first {ones[0]!r}")
         return "; ".join([*lines, *self.notes])
 
 
@@ -165,12 +165,12 @@ def truth_of(
 
     Raises ModelError or SimulationError, which say why, where the motion has no continuous form.
     """
-    found = _Measurement(moved, moved.flat(gradient), gradient.loss, seconds, columns).truth()
-    if CONTINUOUS in gradient.methods or found.law != KELVIN_VOIGT:
-        return found
+    truth = _Measurement(moved, moved.flat(gradient), gradient.loss, seconds, columns).truth()
+    if CONTINUOUS in gradient.methods or truth.law != KELVIN_VOIGT:
+        return truth
     with applied(moved.vector) as model:
         softer = softest_contact(model, gradient.xs)
-    return found if softer is None else replace(found, notes=(softer,))
+    return truth if softer is None else replace(truth, notes=(softer,))
 
 
 def softest_contact(model: Model, xs: Array) -> str | None:
@@ -181,15 +181,15 @@ def softest_contact(model: Model, xs: Array) -> str | None:
     Permenter and Han, "An unconstrained convex formulation of compliant contact", 2022).
     """
     motion, h, beta = ContinuousMotion(model), model.time_step, model.plant.get_sap_near_rigid_threshold()
-    worst, told = 1.0, None
+    worst, note = 1.0, None
     for x in xs:
         for name, k, tau, inverse in motion.touches_at(x):
             stated = 1 / (h * (h + tau) * k)
             factor = beta**2 * float(np.linalg.norm(inverse)) / 3 / (4 * np.pi**2) / stated
             if factor > worst:
                 worst = factor
-                told = f"the steps make {name} {factor:.3g} times softer than it is stated: near-rigid at h = {h:g} s"
-    return told
+                note = f"the steps make {name} {factor:.3g} times softer than it is stated: near-rigid at h = {h:g} s"
+    return note
 
 
 @dataclass(eq=False)
@@ -222,8 +222,8 @@ class _Measurement:
         )
         slopes = tuple(judged(measured[x.name], noise, least / x.scale) for x in self.lines)
         loss, error = losses[-1] if losses else np.nan, abs(losses[-1] - losses[-2]) if losses[1:] else np.nan
-        found = Truth(law, loss, error, self.ours, slopes, self.seconds, self.touches)
-        return self._beside_other_law(found) if law == KELVIN_VOIGT and self.touches else found
+        truth = Truth(law, loss, error, self.ours, slopes, self.seconds, self.touches)
+        return self._beside_other_law(truth) if law == KELVIN_VOIGT and self.touches else truth
 
     def _beyond(self) -> str:
         return f"not measured within the budget of {self.seconds:g} s"
@@ -237,7 +237,7 @@ class _Measurement:
         return [line for line in self.moved.lines if self.columns is None or line.name in self.columns]
 
     def _loss(self, displacement: Array, tolerance: float, law: str | None = None) -> float:
-        x0, us, parameters, values = self.moved.at(displacement)
+        x0, us, parameters, values = self.moved.point(displacement)
         ask = self.moved.inputs(us, parameters, None)
         with applied(values) as model:
             motion = ContinuousMotion(model, law)
@@ -269,89 +269,91 @@ class _Measurement:
     def _measured(self, line: Line) -> TrueSlope:
         """The slopes along a line, from wide to narrow; not judged."""
         widths = list(self._widths())
-        found = TrueSlope(line.name, tuple(line.columns.tolist()), self._ours(line))
+        measured = TrueSlope(line.name, tuple(line.columns.tolist()), self._ours(line))
         if widths[0] * line.scale > line.room:
-            return replace(found, reason=f"not measured: moved by {widths[0] * line.scale:.2g} it is cut off")
+            return replace(measured, reason=f"not measured: moved by {widths[0] * line.scale:.2g} it is cut off")
         try:
             over = [self._slope(line, w) for w in widths]
             if not abs(over[0][0] - over[1][0]) <= TRUTH.settled * max(abs(slope) for slope, _ in over):
                 widths.insert(1, widths[0] * TRUTH.between / TRUTH.widths[0])
                 over.insert(1, self._slope(line, widths[1]))
         except TimeoutError:
-            return replace(found, reason=self._beyond())
+            return replace(measured, reason=self._beyond())
         except DrakeDiffError as error:
-            return replace(found, reason=f"not measured: a little away there is no motion: {error}")
+            return replace(measured, reason=f"not measured: a little away there is no motion: {error}")
         slopes, corners = zip(*over, strict=True)
-        return replace(found, widths=tuple(w * line.scale for w in widths), slopes=slopes, corners=corners)
+        return replace(measured, widths=tuple(w * line.scale for w in widths), slopes=slopes, corners=corners)
 
-    def _beside_other_law(self, found: Truth) -> Truth:
+    def _beside_other_law(self, truth: Truth) -> Truth:
         """With what Drake's continuous plant would do, which has Hunt and Crossley's law whatever the steps have."""
         still, slopes, tolerance = (
             np.zeros(len(self.moved.scale)),
-            list(found.slopes),
+            list(truth.slopes),
             TRUTH.tolerance * TRUTH.widths[1],
         )
-        found = replace(found, other_law=HUNT_CROSSLEY)
+        truth = replace(truth, other_law=HUNT_CROSSLEY)
         try:
             loss = self._loss(still, tolerance, HUNT_CROSSLEY)
         except TimeoutError:
-            return replace(found, other_reason=self._beyond())
+            return replace(truth, other_reason=self._beyond())
         except DrakeDiffError as error:
-            return replace(found, other_reason=f"not measured: {error}")
-        for i, (one, line) in enumerate(zip(slopes, self.lines, strict=True)):
-            if not one.exists:
+            return replace(truth, other_reason=f"not measured: {error}")
+        for i, (slope, line) in enumerate(zip(slopes, self.lines, strict=True)):
+            if not slope.exists:
                 continue
             try:
-                slopes[i] = replace(one, by_other_law=self._slope(line, TRUTH.widths[1], HUNT_CROSSLEY)[0] - one.value)
+                slopes[i] = replace(
+                    slope, by_other_law=self._slope(line, TRUTH.widths[1], HUNT_CROSSLEY)[0] - slope.value
+                )
             except (TimeoutError, DrakeDiffError):
                 break  # NaN: not measured
-        return replace(found, slopes=tuple(slopes), by_other_law=loss - found.loss)
+        return replace(truth, slopes=tuple(slopes), by_other_law=loss - truth.loss)
 
 
-def judged(one: TrueSlope, noise: Array, least: float) -> TrueSlope:
+def judged(slope: TrueSlope, noise: Array, least: float) -> TrueSlope:
     """Whether the slope exists, and its value; `noise` (3,) is how wrong a loss is at each of three widths."""
-    if not one.slopes:
-        return replace(one, size=max(abs(one.ours), least))
-    (wide, *between, middle, narrow), w = one.slopes, np.array([*one.widths[:1], *one.widths[-2:]])
+    if not slope.slopes:
+        return replace(slope, size=max(abs(slope.ours), least))
+    (wide, *between, middle, narrow), w = slope.slopes, np.array([*slope.widths[:1], *slope.widths[-2:]])
     hidden = TRUTH.sure * noise / w  # of each slope
     size = max(abs(narrow), abs(middle), least)
-    found = replace(one, size=max(size, abs(one.ours)) if size > 0 else abs(one.ours))
+    sized = replace(slope, size=max(size, abs(slope.ours)) if size > 0 else abs(slope.ours))
     if least > 0 and hidden[-1] > TRUTH.known * size and hidden[-1] > abs(narrow - middle):
-        return replace(found, reason=f"not known: the integration's error is {hidden[-1]:.1g} of it")
+        return replace(sized, reason=f"not known: the integration's error is {hidden[-1]:.1g} of it")
     narrows = abs(narrow - middle) <= TRUTH.settled * size + hidden[1] + hidden[2]
     gap, slack = wide - middle, TRUTH.settled * size + hidden[0] + hidden[1]
     bends = (
         bool(between) and abs(gap - TRUTH.curve * (between[0] - middle)) <= TRUTH.bent * abs(gap) + TRUTH.curve * slack
     )
-    corner, before = abs(one.corners[-1]), abs(one.corners[-2])
+    corner, before = abs(slope.corners[-1]), abs(slope.corners[-2])
     if corner > TRUTH.settled * size + 4 * hidden[2] and corner > TRUTH.shrinks * before:
-        ahead, behind = (narrow + s * one.corners[-1] / 2 for s in (1, -1))
-        return replace(found, exists=False, reason=f"it has a corner here, {ahead:.4g} ahead and {behind:.4g} behind")
+        ahead, behind = (narrow + s * slope.corners[-1] / 2 for s in (1, -1))
+        return replace(sized, exists=False, reason=f"it has a corner here, {ahead:.4g} ahead and {behind:.4g} behind")
     if narrows and (abs(gap) <= slack or bends):
-        return replace(found, exists=True, value=narrow, error=abs(narrow - middle) + hidden[2])
-    return replace(found, exists=False, reason="the slopes do not settle")
+        return replace(sized, exists=True, value=narrow, error=abs(narrow - middle) + hidden[2])
+    return replace(sized, exists=False, reason="the slopes do not settle")
 
 
 def by_truth(truth: Truth, subject: str) -> dict[str, Any]:
     """The parts of a certificate of one row, the loss, and a column for each of the slopes."""
     slopes, shape = truth.slopes, (1, len(truth.slopes))
     ours, value, error, size = (
-        np.array([getattr(one, name) for one in slopes], dtype=float).reshape(shape)
+        np.array([getattr(slope, name) for slope in slopes], dtype=float).reshape(shape)
         for name in ("ours", "value", "error", "size")
     )
     size = np.maximum(size, TINY)
-    known = np.array([bool(one.exists) for one in slopes]).reshape(shape)
+    known = np.array([bool(slope.exists) for slope in slopes]).reshape(shape)
     gap, tolerance = np.abs(ours - value), TRUTH.close * size + error
     codes = np.full(shape, VERDICTS.index("undecided"))
     codes[known & (gap <= tolerance) & (gap + tolerance <= TRUTH.right * size)] = VERDICTS.index("agree")
     codes[known & (gap > TRUTH.right * size + error)] = VERDICTS.index("disagree")
     reasons = {}
-    for j, one in enumerate(slopes):
-        if one.exists is False:
-            codes[0, j], reasons[0, j] = VERDICTS.index("discontinuous"), repr(one)
+    for j, slope in enumerate(slopes):
+        if slope.exists is False:
+            codes[0, j], reasons[0, j] = VERDICTS.index("discontinuous"), repr(slope)
     unknown = TRUTH.unknown * size
     return {
-        "rows": ("loss",), "columns": tuple(one.column for one in slopes), "derivative": frozen(ours),
+        "rows": ("loss",), "columns": tuple(slope.column for slope in slopes), "derivative": frozen(ours),
         "difference": frozen(np.where(known, value, np.nan)), "tolerance": frozen(np.where(known, tolerance, unknown)),
         "noticeable": frozen(np.where(known, gap + tolerance, unknown)), "size": frozen(size), "codes": codes,
         "reasons": reasons, "method": CONTINUOUS, "subject": subject, "around": None, "stopped": 0.0, "second": None,

@@ -73,7 +73,7 @@ class Analytic:
         else:
             values, known = np.zeros((len(steps), steps.model.nx, steps.width)), np.zeros(len(steps), dtype=bool)
             if len(free):
-                values[free, :, : steps.model.nx + steps.model.nu], known[free] = smooth(steps.part(free))
+                values[free, :, : steps.model.nx + steps.model.nu], known[free] = smooth(steps.subset(free))
         refused = _refusals(known, free, "contact, a limit or a constraint acts")
         notes: dict[int, str] = {}
         if np.count_nonzero(known) == len(known):
@@ -94,12 +94,12 @@ class Analytic:
         smooth = analytic_of(model.whole)
         if isinstance(smooth, Refusal):
             return smooth
-        reduced = model.cache("reduced steps", lambda: Reduced.of(model, coupling, smooth), of_structure=True)
+        reduced = model.cache("reduced steps", lambda: Reduced.build(model, coupling, smooth), of_structure=True)
         whole, same = reduced.whole(steps)
-        found = self.differentiate(whole)
-        if isinstance(found, Refusal):
-            return found
-        values, refused = reduced.jacobians(steps, whole, found.values), dict(found.refused)
+        of_whole = self.differentiate(whole)
+        if isinstance(of_whole, Refusal):
+            return of_whole
+        values, refused = reduced.jacobians(steps, whole, of_whole.values), dict(of_whole.refused)
         refused |= {int(k): NotSmoothError("it leads elsewhere") for k in np.flatnonzero(~same)}
         trial = model.cache("trial of reduced steps", _Trial, of_structure=True)
         for k in range(len(steps)):
@@ -107,11 +107,11 @@ class Analytic:
                 _certify(steps, k, values[k], [trial] if trial.left and not trial.refusal else [], iterated=False)
                 if trial.refusal:
                     return Refusal(trial.refusal)
-        return Jacobians(values, refused, found.notes)
+        return Jacobians(values, refused, of_whole.notes)
 
 
-def _refusals(known: Flags, of: NDArray[np.intp], why: str) -> dict[int, DrakeDiffError]:
-    return {int(k): NotSmoothError(why) for k in of[~known[of]]}
+def _refusals(known: Flags, which: NDArray[np.intp], why: str) -> dict[int, DrakeDiffError]:
+    return {int(k): NotSmoothError(why) for k in which[~known[which]]}
 
 
 def analytic_of(model: Model) -> SmoothStep | Refusal:
@@ -129,11 +129,11 @@ def analytic_of(model: Model) -> SmoothStep | Refusal:
 
 
 def one_smooth_step(model: Model, steps: Steps) -> Array | None:
-    """(nx, nx + nu) of one step in which nothing touches; None where it takes more than `SmoothStep.one` to know it."""
+    """(nx, nx + nu) of one step in which nothing touches; None where `SmoothStep.single` does not know it."""
     if model.coupling is not None or model.num_constraints:
         return None
     smooth = analytic_of(model)
-    return None if isinstance(smooth, Refusal) else smooth.one(steps.xs[0], steps.us[0], steps.x_next[0])
+    return None if isinstance(smooth, Refusal) else smooth.single(steps.xs[0], steps.us[0], steps.x_next[0])
 
 
 def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:
@@ -228,15 +228,15 @@ def _with_impulses(
     whys: list[str] = []
     refused: dict[int, str] = {}
     for touch in (True, False):
-        part = which[steps.touching[which] == touch]
-        if len(part):
-            found = _certified_impulses(smooth, steps.part(part), touch)
-            if isinstance(found, Refusal):
-                whys.append(found.reason)
+        subset = which[steps.touching[which] == touch]
+        if len(subset):
+            certified_steps = _certified_impulses(smooth, steps.subset(subset), touch)
+            if isinstance(certified_steps, Refusal):
+                whys.append(certified_steps.reason)
             else:
-                values[part], known[part] = found.values, found.known
-                notes |= {int(part[k]): note for k, note in found.notes.items()}
-                refused |= {int(part[k]): why for k, why in found.refused.items()}
+                values[subset], known[subset] = certified_steps.values, certified_steps.known
+                notes |= {int(subset[k]): note for k, note in certified_steps.notes.items()}
+                refused |= {int(subset[k]): why for k, why in certified_steps.refused.items()}
     return "; ".join(dict.fromkeys(whys)), refused
 
 
@@ -251,35 +251,36 @@ def _certified_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> _WithI
     material = material_of(model, form)
     change = material_change(form.pairs, material, vector, model.double) if vector.parameters else None
     values, known, refused, placed = contact_jacobians(form, smooth, steps, material, change)
-    found = _WithImpulses(values, known, {}, refused)
+    result = _WithImpulses(values, known, {}, refused)
     trials: dict[str, _Trial] = model.cache("impulse trials", dict, of_structure=True)
-    own = form.pairs.kinds(placed, len(steps)) if touch else [{JOINT_LIMITS}] * len(steps)
+    kinds = form.pairs.kinds(placed, len(steps)) if touch else [{JOINT_LIMITS}] * len(steps)
 
     def led(k: int, x_next: Array) -> Array | None:
-        one = steps.part(np.array([k])) if len(steps) > 1 else steps
-        jacobians, known, *_ = contact_jacobians(form, smooth, replace(one, x_next=x_next[None]), material, change)
+        single = steps.subset(np.array([k])) if len(steps) > 1 else steps
+        jacobians, known, *_ = contact_jacobians(form, smooth, replace(single, x_next=x_next[None]), material, change)
         return jacobians[0] if known[0] else None
 
-    for k in np.flatnonzero(found.known):
-        of_step = [trials.setdefault(kind, _Trial()) for kind in sorted(own[k])]
+    for k in np.flatnonzero(result.known):
+        of_step = [trials.setdefault(kind, _Trial()) for kind in sorted(kinds[k])]
         if all(trial.is_settled for trial in of_step):
             continue
         _certify(
             steps,
             int(k),
-            found.values[k],
+            result.values[k],
             [trial for trial in of_step if trial.left and not trial.refusal],
             led,
-            iterated=any(map(is_iterated, own[k])),
+            iterated=any(map(is_iterated, kinds[k])),
         )
         why, note = (
-            "; ".join(dict.fromkeys(filter(None, (getattr(t, of) for t in of_step)))) for of in ("refusal", "note")
+            "; ".join(dict.fromkeys(filter(None, (getattr(t, attribute) for t in of_step))))
+            for attribute in ("refusal", "note")
         )
         if why:
-            found.known[k], found.refused[int(k)] = False, why
+            result.known[k], result.refused[int(k)] = False, why
         elif note:
-            found.notes[int(k)] = note
-    return found
+            result.notes[int(k)] = note
+    return result
 
 
 def _certify(
@@ -335,7 +336,7 @@ def _unlike_differences(steps: Steps, k: int, jacobian: Array, led: Led | None, 
         ):
             return "", f"with impulses equal to {STEP_DIFFERENCES}, but for where Drake's solver stops"
         mine = jacobian[:, : central.shape[1]]
-        gaps += [np.abs(mine - of).max(axis=0) / np.abs(mine).max() for of in (forward, backward, central)]
+        gaps += [np.abs(mine - side).max(axis=0) / np.abs(mine).max() for side in (forward, backward, central)]
     gap = float(np.max(np.min(gaps, axis=0)))
     if iterated and gap <= SAME_WHERE_ITERATED:
         return (
@@ -357,13 +358,13 @@ def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array, Arra
     point = np.concatenate([steps.xs[k], steps.us[k]])
     size = width * np.maximum(1.0, np.abs(point))
     points = np.concatenate([point + np.diag(size), point - np.diag(size), point[None]])
-    found = refine_steps(model, steps.vector, points[:, : model.nx], points[:, model.nx :])
-    for why in found.refused.values():
+    refined = refine_steps(model, steps.vector, points[:, : model.nx], points[:, model.nx :])
+    for why in refined.refused.values():
         return why
-    here = found.x_next[-1]
+    here = refined.x_next[-1]
     return (
-        np.asarray(((found.x_next[:count] - here) / size[:, None]).T),
-        np.asarray(((here - found.x_next[count:-1]) / size[:, None]).T),
+        np.asarray(((refined.x_next[:count] - here) / size[:, None]).T),
+        np.asarray(((here - refined.x_next[count:-1]) / size[:, None]).T),
         here,
     )
 
@@ -385,7 +386,7 @@ class Reduced:
     smooth: SmoothStep
 
     @classmethod
-    def of(cls, model: Model, coupling: Coupling, smooth: SmoothStep) -> "Reduced":
+    def build(cls, model: Model, coupling: Coupling, smooth: SmoothStep) -> "Reduced":
         """Of the smooth step of `model.whole`; raises ModelError where its tree is none of ours."""
         tree = compiled_tree(describe_tree(model.whole))
         if tree is None:
@@ -396,12 +397,15 @@ class Reduced:
         """The same steps of the whole plant, and which (N,) of them lead where these do."""
         model = steps.model
         xs = self.coupling.state(steps.xs)
-        found, same = take_steps(model.whole, steps.vector, xs[0], steps.us, xs), np.empty(len(steps), dtype=bool)
+        steps_of_whole, same = (
+            take_steps(model.whole, steps.vector, xs[0], steps.us, xs),
+            np.empty(len(steps), dtype=bool),
+        )
         for k, (x, x_next) in enumerate(zip(steps.xs, steps.x_next, strict=True)):
             set_state(model.double, x)
-            gap = np.abs(model.double.next_state(found.x_next[k]) - x_next)
+            gap = np.abs(model.double.next_state(steps_of_whole.x_next[k]) - x_next)
             same[k] = bool(np.all(gap <= SAME_END * np.maximum(1.0, np.abs(x_next))))
-        return found, same
+        return steps_of_whole, same
 
     def jacobians(self, steps: Steps, whole: Steps, of_whole: Array) -> Array:
         """(N, nx, nx + nu) from those of the whole plant."""

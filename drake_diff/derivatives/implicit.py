@@ -112,12 +112,12 @@ def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, num
         moved = model.time_step * velocities
         moved[form.diagonal] += 1.0
         return np.asarray(moved)
-    own = np.eye(model.nq, velocities.shape[1])
+    moved_positions = np.eye(model.nq, velocities.shape[1])
     twin = model.autodiff
     q_dot = twin.rates(np.array([AutoDiffXd(v) for v in v_next]))
-    own[:, : model.nx] += model.time_step * gradient_rows(q_dot, model.nx + num_parameters)[:, : model.nx]
+    moved_positions[:, : model.nx] += model.time_step * gradient_rows(q_dot, model.nx + num_parameters)[:, : model.nx]
     n = np.array([model.double.rates(e) for e in np.eye(model.nv)]).T
-    return np.asarray(own + model.time_step * n @ velocities)
+    return np.asarray(moved_positions + model.time_step * n @ velocities)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,30 +163,30 @@ def form_of(model: Model) -> Form:
 
 
 def _read_form(model: Model) -> Form:
-    found, inputs = actuators(model.plant), model.inputs
-    joined = [(a.joint().velocity_start(), a.joint().position_start(), a.effort_limit()) for a in found]
-    at = inputs.of_actuators(np.reshape(joined, (len(found), 3)))
-    velocity, position = at[:, 0].astype(int), at[:, 1].astype(int)
-    controlled = inputs.of_actuators([a.has_controller() for a in found]).astype(bool)
+    plant_actuators, inputs = actuators(model.plant), model.inputs
+    joined = [(a.joint().velocity_start(), a.joint().position_start(), a.effort_limit()) for a in plant_actuators]
+    starts_and_limits = inputs.of_actuators(np.reshape(joined, (len(plant_actuators), 3)))
+    velocity, position = starts_and_limits[:, 0].astype(int), starts_and_limits[:, 1].astype(int)
+    controlled = inputs.of_actuators([a.has_controller() for a in plant_actuators]).astype(bool)
     if model.coupling is not None:  # of inputs with PD control only, which such a model has not
         velocity, position = model.coupling.of_v[velocity], model.coupling.of_q[position]
-    references = np.zeros((2, len(found)))
+    references = np.zeros((2, len(plant_actuators)))
     for instance, target in model.pd_targets.items():
-        driven = [i for i, a in enumerate(found) if a.model_instance() == instance]
+        driven = [i for i, a in enumerate(plant_actuators) if a.model_instance() == instance]
         references[:, driven] = np.asarray(target).reshape(2, len(driven))
     why = _why_driven(model)
     return Form(
         excluded="constraints act at every step" if model.num_constraints else why or model.systems_act,
         driven=why,
-        actuators=found,
+        actuators=plant_actuators,
         velocity=velocity,
         position=position,
         actuation=model.actuation,
-        limit=np.where(inputs.actuator >= 0, at[:, 2], np.inf),
-        cut=np.where((inputs.actuator >= 0) & ~controlled, at[:, 2], np.inf),
+        limit=np.where(inputs.actuator >= 0, starts_and_limits[:, 2], np.inf),
+        cut=np.where((inputs.actuator >= 0) & ~controlled, starts_and_limits[:, 2], np.inf),
         reference=references,
         diagonal=np.diag_indices(model.nv),
-        pd=any(a.has_controller() for a in found),
+        pd=any(a.has_controller() for a in plant_actuators),
         q_dot_is_v=bool(model.plant.IsVelocityEqualToQDot()),
     )
 

@@ -50,16 +50,14 @@ class JointImpulses:
     compliance: Array  # (S,) R [1/kg or 1/(kg m^2)]
     lower: Array  # (S,) [N s or N m s]
     upper: Array
-    near_rigid: NDArray[np.bool_]  # (S,) whether R is b w
 
-    def part(self, which: NDArray[np.intp], position: NDArray[np.intp]) -> "JointImpulses":
+    def subset(self, which: NDArray[np.intp], position: NDArray[np.intp]) -> "JointImpulses":
         """Some of them, in the problems that `position` says."""
         target, compliance = self.target[which], self.compliance[which]
         bounds = self.lower[which], self.upper[which]
-        direction, near_rigid = self.direction[which], self.near_rigid[which]
-        return JointImpulses(position, direction, target, compliance, *bounds, near_rigid)
+        return JointImpulses(position, self.direction[which], target, compliance, *bounds)
 
-    def at(self, v: Array) -> tuple[Array, Array]:
+    def evaluate(self, v: Array) -> tuple[Array, Array]:
         """The impulses (S,) at the velocities v (N, nv), and their derivatives (S,) by -j . v', none at a bound."""
         wanted = (self.target - (self.direction * v[self.problem]).sum(axis=1)) / self.compliance
         free = (wanted > self.lower) & (wanted < self.upper)
@@ -70,9 +68,9 @@ def gather(parts: Sequence[JointImpulses], nv: int) -> JointImpulses:
     """All of some parts as one."""
     if not parts:
         none = np.zeros(0)
-        return JointImpulses(np.zeros(0, dtype=np.intp), np.zeros((0, nv)), none, none, none, none, none > 0)
-    names = ("problem", "direction", "target", "compliance", "lower", "upper", "near_rigid")
-    return JointImpulses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return JointImpulses(np.zeros(0, dtype=np.intp), np.zeros((0, nv)), none, none, none, none)
+    names = ("problem", "direction", "target", "compliance", "lower", "upper")
+    return JointImpulses(*(np.concatenate([getattr(impulses, name) for impulses in parts]) for name in names))
 
 
 def limit_impulses(limits: Array, q: Array, v: Array, free: Array, diagonal: Array, h: float) -> list[JointImpulses]:
@@ -81,7 +79,7 @@ def limit_impulses(limits: Array, q: Array, v: Array, free: Array, diagonal: Arr
     `limits` (2, nv) are infinite where there are none, `diagonal` (N, nv) is that of A.
     """
     window = LIMIT_WINDOW * h * np.maximum(np.abs(v), np.abs(free))
-    found = []
+    impulses = []
     for sign, limit in ((1.0, limits[0]), (-1.0, limits[1])):
         with np.errstate(invalid="ignore"):
             distance = sign * (q - limit)  # infinite where there is no limit
@@ -95,8 +93,8 @@ def limit_impulses(limits: Array, q: Array, v: Array, free: Array, diagonal: Arr
         compliance = np.maximum(NEAR_RIGID * w, stiffest)
         none, all_ = np.zeros(len(problem)), np.full(len(problem), np.inf)
         target = -distance[problem, dof] / (2 * h)
-        found.append(JointImpulses(problem, direction, target, compliance, none, all_, compliance > stiffest))
-    return found
+        impulses.append(JointImpulses(problem, direction, target, compliance, none, all_))
+    return impulses
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +118,7 @@ class Controllers:
         direction[np.arange(len(problem)), dof] = 1.0
         effort = us.ravel() - kp * (q[problem, dof] - self.reference[0, which]) + kd * self.reference[1, which]
         total, bound = h * kp + kd, h * self.limit[which]
-        near_rigid = (lowered < 1).ravel()
-        return JointImpulses(problem, direction, effort / total, 1 / (h * total), -bound, bound, near_rigid)
+        return JointImpulses(problem, direction, effort / total, 1 / (h * total), -bound, bound)
 
 
 PROBES = 3  # two to read, one more to check
@@ -143,7 +140,7 @@ class Couplers:
         infinite = np.full(count * rows, np.inf)
         direction = np.broadcast_to(self.direction, (count, rows, nv)).reshape(-1, nv)
         problem = np.repeat(np.arange(count), rows)
-        return JointImpulses(problem, direction, -off / (2 * h), NEAR_RIGID * w, -infinite, infinite, infinite > 0)
+        return JointImpulses(problem, direction, -off / (2 * h), NEAR_RIGID * w, -infinite, infinite)
 
 
 def couplers_of(model: Model) -> Couplers | Refusal:
@@ -153,15 +150,15 @@ def couplers_of(model: Model) -> Couplers | Refusal:
         return model.cache("couplers", lambda: _known(model), of_structure=True)
 
     def read() -> Couplers | Refusal:
-        found = []
+        couplers = []
         for constraint in model.plant.GetConstraintIds():
             if not model.plant.GetConstraintActiveStatus(model.double.context, constraint):
                 continue
             coupler = _read(model, constraint)
             if isinstance(coupler, Refusal):
                 return coupler
-            found.append(coupler)
-        directions, offsets = [d for d, _ in found], [o for _, o in found]
+            couplers.append(coupler)
+        directions, offsets = [d for d, _ in couplers], [o for _, o in couplers]
         return Couplers(np.array(directions).reshape(-1, model.nv), np.array(offsets, dtype=float))
 
     return model.cache("couplers", read, of_structure=True)
@@ -241,6 +238,6 @@ def _probe(model: Model, context: Any, random: np.random.Generator) -> tuple[Arr
 
 def _single(model: Model) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The indices in q and in v of the joints with one of each."""
-    found = [j for j in joints(model.plant) if j.num_positions() == j.num_velocities() == 1]
-    positions, velocities = [j.position_start() for j in found], [j.velocity_start() for j in found]
+    single_joints = [j for j in joints(model.plant) if j.num_positions() == j.num_velocities() == 1]
+    positions, velocities = [j.position_start() for j in single_joints], [j.velocity_start() for j in single_joints]
     return np.array(positions, dtype=np.intp), np.array(velocities, dtype=np.intp)

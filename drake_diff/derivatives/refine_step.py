@@ -60,11 +60,11 @@ class ContactImpulses:
     jacobian: Array  # (M, nv, 3) J'
     law: ContactLaw
 
-    def part(self, which: Indices, position: Indices) -> "ContactImpulses":
+    def subset(self, which: Indices, position: Indices) -> "ContactImpulses":
         """Some of them, in the problems that `position` says."""
-        return ContactImpulses(position, self.jacobian[which], self.law.part(which))
+        return ContactImpulses(position, self.jacobian[which], self.law.subset(which))
 
-    def at(self, v: Array) -> tuple[Array, Array]:
+    def evaluate(self, v: Array) -> tuple[Array, Array]:
         """The impulses (M, 3) at the velocities v (N, nv), and their derivatives (M, 3, 3) by -J v'."""
         impulse, slope = self.law.impulses((v[self.problem][:, None, :] @ self.jacobian)[:, 0])
         return impulse, -slope
@@ -83,9 +83,9 @@ def _add_squares(total: Array, where: Indices, size: Array, vectors: Array) -> N
         return
     order, begins, rows = _grouped(where)
     counts = np.diff(begins, append=len(where))
-    at = np.repeat(np.arange(len(rows)), counts), np.arange(len(where)) - np.repeat(begins, counts)
+    index = np.repeat(np.arange(len(rows)), counts), np.arange(len(where)) - np.repeat(begins, counts)
     stacked = np.zeros((2, len(rows), int(np.max(counts)), vectors.shape[1]))
-    stacked[0][at], stacked[1][at] = vectors[order], (size[:, None] * vectors)[order]
+    stacked[0][index], stacked[1][index] = vectors[order], (size[:, None] * vectors)[order]
     total[rows] += stacked[0].swapaxes(1, 2) @ stacked[1]
 
 
@@ -115,16 +115,16 @@ class ConvexSteps:
     joints: JointImpulses
     same_tree: NDArray[np.bool_]  # (nv, nv)
 
-    def part(self, which: Indices) -> "ConvexSteps":
+    def subset(self, which: Indices) -> "ConvexSteps":
         """Some of the problems."""
         position = np.full(len(self.A), -1, dtype=np.intp)
         position[which] = np.arange(len(which))
         contacts, joints = self.contacts, self.joints
-        own = np.flatnonzero(position[joints.problem] >= 0)
-        joints = joints.part(own, position[joints.problem[own]])
+        acting = np.flatnonzero(position[joints.problem] >= 0)
+        joints = joints.subset(acting, position[joints.problem[acting]])
         if contacts is not None:
-            own = np.flatnonzero(position[contacts.problem] >= 0)
-            contacts = contacts.part(own, position[contacts.problem[own]])
+            acting = np.flatnonzero(position[contacts.problem] >= 0)
+            contacts = contacts.subset(acting, position[contacts.problem[acting]])
         return ConvexSteps(self.A[which], self.momentum[which], contacts, joints, self.same_tree)
 
     def taking_part(self) -> NDArray[np.bool_]:
@@ -135,14 +135,14 @@ class ConvexSteps:
         np.logical_or.at(reached, self.joints.problem, self.joints.direction != 0)
         return np.asarray(reached @ self.same_tree)
 
-    def at(self, v: Array) -> Balance:
+    def evaluate(self, v: Array) -> Balance:
         """The balance at v (N, nv)."""
         given, curvature = np.zeros_like(v), np.array(self.A)
         if self.contacts is not None:
-            J, (impulse, slope) = self.contacts.jacobian, self.contacts.at(v)
+            J, (impulse, slope) = self.contacts.jacobian, self.contacts.evaluate(v)
             _add(given, self.contacts.problem, (J @ impulse[..., None])[..., 0])
             _add(curvature, self.contacts.problem, J @ slope @ J.swapaxes(-1, -2))
-        j, (pull, stiffness) = self.joints.direction, self.joints.at(v)
+        j, (pull, stiffness) = self.joints.direction, self.joints.evaluate(v)
         _add(given, self.joints.problem, j * pull[:, None])
         _add_squares(curvature, self.joints.problem, stiffness, j)
         had = (self.A @ v[..., None])[..., 0]
@@ -157,41 +157,41 @@ class ConvexSteps:
         had = (self.A @ v[..., None])[..., 0]
         return np.asarray(np.maximum(self.norm(had), self.norm(given)))
 
-    def rounding(self, v: Array, at: Balance) -> Array:
+    def rounding(self, v: Array, balance: Balance) -> Array:
         """(N,) what of the momentum rounding may leave at v (N, nv): of sums, and of stiff impulses.
 
         The sums may be far larger than what they amount to, as where a heavy tree has a light link.
         """
-        of_sums = (np.abs(at.curvature) @ np.abs(v)[..., None])[..., 0] + np.abs(self.momentum)
-        return np.maximum(SOLVED * self.scale(v, at.given), ROUNDING * self.norm(of_sums)) + np.finfo(float).tiny
+        of_sums = (np.abs(balance.curvature) @ np.abs(v)[..., None])[..., 0] + np.abs(self.momentum)
+        return np.maximum(SOLVED * self.scale(v, balance.given), ROUNDING * self.norm(of_sums)) + np.finfo(float).tiny
 
-    def solve(self, v: Array, at: Balance) -> tuple[Array, NDArray[np.bool_]]:
+    def solve(self, v: Array, balance: Balance) -> tuple[Array, NDArray[np.bool_]]:
         """v' (N, nv) to rounding from v (N, nv) with its balance, and whether it was reached (N,)."""
         v, reached = np.array(v), np.zeros(len(v), dtype=bool)
         open_, problems = np.arange(len(v)), self
         for _ in range(MAX_STEPS):
-            own = v[open_]
-            size = problems.norm(at.missing)
-            step = np.array(-np.linalg.solve(at.curvature, at.missing[..., None])[..., 0], dtype=float)
-            ahead = problems.at(own + step)
+            v_open = v[open_]
+            size = problems.norm(balance.missing)
+            step = np.array(-np.linalg.solve(balance.curvature, balance.missing[..., None])[..., 0], dtype=float)
+            ahead = problems.evaluate(v_open + step)
             ahead_size = problems.norm(ahead.missing)
-            near = size <= problems.rounding(own, at)
+            near = size <= problems.rounding(v_open, balance)
             last = near & (ahead_size >= size / 2)  # as far as rounding lets it
             slope = (ahead.missing * step).sum(axis=1)
             search = ~near & (slope > 0) & (ahead_size > size / 2)  # beyond the minimum along the step
             if search.any():
                 which = np.flatnonzero(search)
-                step[which] *= _along(problems.part(which), own[which], step[which])[:, None]
+                step[which] *= _along(problems.subset(which), v_open[which], step[which])[:, None]
             better = ~last | (ahead_size < size)
-            v[open_[better]] = (own + step)[better]
+            v[open_[better]] = (v_open + step)[better]
             reached[open_[last]] = True
             if last.all():
                 break
             if search.any() or last.any():
-                open_, problems = open_[~last], problems.part(np.flatnonzero(~last))
-                at = problems.at(v[open_])
+                open_, problems = open_[~last], problems.subset(np.flatnonzero(~last))
+                balance = problems.evaluate(v[open_])
             else:
-                at = ahead
+                balance = ahead
         return v, reached
 
 
@@ -200,7 +200,7 @@ def _along(problems: ConvexSteps, v: Array, step: Array) -> Array:
     lower, upper = np.zeros(len(v)), np.ones(len(v))
     for _ in range(BISECTIONS):
         middle = (lower + upper) / 2
-        falls = (problems.at(v + middle[:, None] * step).missing * step).sum(axis=1) < 0
+        falls = (problems.evaluate(v + middle[:, None] * step).missing * step).sum(axis=1) < 0
         lower, upper = np.where(falls, middle, lower), np.where(falls, upper, middle)
     return (lower + upper) / 2
 
@@ -228,8 +228,8 @@ def refine_step(model: Model, vector: ParameterVector, x: Array, u: Array) -> Ar
 
     Raises SimulationError where Drake cannot take the step.
     """
-    found = refine_steps(model, vector, x[None], u[None])
-    return found.refused.get(0, found.x_next[0])
+    refined = refine_steps(model, vector, x[None], u[None])
+    return refined.refused.get(0, refined.x_next[0])
 
 
 def refine_steps(
@@ -260,13 +260,18 @@ def refine_steps(
         which = np.flatnonzero(times == h)
         points = xs[which], us[which], values[which], None if held is None else held[which]
         if h == model.time_step:
-            part = _refine(model, vector, *points)
+            refined = _refine(model, vector, *points)
         else:
             with applied(vector.at(points[2][0])) as other:
-                part = _refine(other, vector.at(points[2][0]), *points)
-        x_next[which], drake[which], left[which], acts[which] = part.x_next, part.drake, part.left, part.acts
-        missing[which] = part.missing
-        refused |= {int(which[k]): why for k, why in part.refused.items()}
+                refined = _refine(other, vector.at(points[2][0]), *points)
+        x_next[which], drake[which], left[which], acts[which] = (
+            refined.x_next,
+            refined.drake,
+            refined.left,
+            refined.acts,
+        )
+        missing[which] = refined.missing
+        refused |= {int(which[k]): why for k, why in refined.refused.items()}
     return RefinedSteps(x_next, drake, acts, left, missing, refused)
 
 
@@ -334,11 +339,11 @@ def _refine_whole(
             if not why:
                 if settings is None or values is not None:
                     settings = _settings(model, form)
-                found = _read(model, settings, k)
-                if isinstance(found, Refusal):
-                    refused[k] = found
+                answer = _read(model, settings, k)
+                if isinstance(answer, Refusal):
+                    refused[k] = answer
                 else:
-                    read.append(found)
+                    read.append(answer)
     finally:
         if values is not None:
             vector.write(model.double, vector.values)
@@ -350,9 +355,9 @@ def _refine_whole(
         which = np.array([r.step for r in read], dtype=np.intp)
         problems = _problems(model, form, read, xs[which], us[which], couplers)
         acts[which] = problems.taking_part().any(axis=1)
-        own = None if held is None else held[which]
+        held_open = None if held is None else held[which]
         v_next, missing[which], left[which], whys = _solved(
-            problems, xs[which, model.nq :], drake[which, model.nq :], own
+            problems, xs[which, model.nq :], drake[which, model.nq :], held_open
         )
         refused |= {int(which[i]): Refusal(why) for i, why in whys.items()}
         x_next[which] = _states(model, xs[which], v_next)
@@ -390,10 +395,10 @@ def _read(model: Model, settings: _Settings, k: int) -> _Read | Refusal:
     twin, plant = model.double, model.plant
     contacts: list[tuple[Array, ...]] = []
     if model.contract.contact.collision_pairs:
-        found = _contacts(model, settings)
-        if isinstance(found, Refusal):
-            return found
-        contacts = found
+        answer = _contacts(model, settings)
+        if isinstance(answer, Refusal):
+            return answer
+        contacts = answer
     mass = plant.CalcMassMatrix(twin.context)
     return _Read(k, settings, mass, twin.inverse_dynamics(np.zeros(model.nv)), contacts)
 
@@ -405,7 +410,7 @@ def _contacts(model: Model, settings: _Settings) -> list[tuple[Array, ...]] | Re
     if results.num_hydroelastic_contacts():
         return Refusal("hydroelastic contact acts")
     motions: dict[Any, tuple[Array, Array]] = {}
-    found: list[tuple[Array, ...]] = []
+    contacts: list[tuple[Array, ...]] = []
     for i in range(results.num_point_pair_contacts()):
         info = results.point_pair_contact_info(i)
         pair = info.point_pair()
@@ -418,8 +423,8 @@ def _contacts(model: Model, settings: _Settings) -> list[tuple[Array, ...]] | Re
             if index not in motions:
                 motions[index] = _motions(model, plant.get_body(index))
             moves += motions[index]
-        found.append((*moves, info.contact_point(), pair.nhat_BA_W, np.array(-pair.depth), np.array(sides)))
-    return found
+        contacts.append((*moves, info.contact_point(), pair.nhat_BA_W, np.array(-pair.depth), np.array(sides)))
+    return contacts
 
 
 def _motions(model: Model, body: Any) -> tuple[Array, Array]:
@@ -510,17 +515,17 @@ def _same_tree(model: Model) -> NDArray[np.bool_]:
 
 
 def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array) -> ContactImpulses | None:
-    found = [(i, *contact) for i, r in enumerate(read) for contact in r.contacts]
-    if not found:
+    contacts = [(i, *contact) for i, r in enumerate(read) for contact in r.contacts]
+    if not contacts:
         return None
-    at, *columns = zip(*found, strict=True)
+    numbers, *columns = zip(*contacts, strict=True)
     moves_a, origin_a, moves_b, origin_b, point, normal, phi, sides = (np.array(column) for column in columns)
     J = _at_point(moves_a, point - origin_a) - _at_point(moves_b, point - origin_b)
     moving = (J != 0).any(axis=(1, 2))  # two parts of one body may overlap: Drake leaves them to no motion
     if not moving.any():
         return None
     problem, J, normal, phi, sides = (
-        np.array(at, dtype=np.intp)[moving],
+        np.array(numbers, dtype=np.intp)[moving],
         J[moving],
         normal[moving],
         phi[moving],
@@ -558,16 +563,16 @@ def _solved(
 
     Without impulses the step is a sum, rounded by its larger terms: from `before` (N, nv) it may end at rest.
     """
-    at, solved = problems.at(drake), problems.taking_part()
-    missing = problems.norm(at.missing * solved), problems.norm(at.missing * ~solved)
-    moving = np.maximum(problems.scale(before, at.given), problems.scale(drake, at.given))
-    had = problems.scale(drake * solved, at.given) + AT_REST, moving
+    balance, solved = problems.evaluate(drake), problems.taking_part()
+    missing = problems.norm(balance.missing * solved), problems.norm(balance.missing * ~solved)
+    moving = np.maximum(problems.scale(before, balance.given), problems.scale(drake, balance.given))
+    had = problems.scale(drake * solved, balance.given) + AT_REST, moving
     left, elsewhere = (np.divide(m, p, out=np.zeros_like(m), where=m > 0) for m, p in zip(missing, had, strict=True))
     if held is None:
-        v_next, reached = problems.solve(drake, at)
+        v_next, reached = problems.solve(drake, balance)
     else:
         problems_held = replace(problems, momentum=problems.momentum + held)
-        v_next, reached = problems_held.solve(drake, replace(at, missing=at.missing - held))
+        v_next, reached = problems_held.solve(drake, replace(balance, missing=balance.missing - held))
     whys = {}
     for i in np.flatnonzero(~(left <= DRAKES_STOP)):
         whys[int(i)] = (
@@ -578,7 +583,7 @@ def _solved(
         whys[int(i)] = f"Drake's step without impulses differs by {elsewhere[i]:.2g} of the momentum"
     for i in np.flatnonzero(~reached):
         whys.setdefault(int(i), "Newton's method does not solve the step to rounding")
-    return v_next, at.missing, left, whys
+    return v_next, balance.missing, left, whys
 
 
 def _states(model: Model, xs: Array, v_next: Array) -> Array:

@@ -125,7 +125,7 @@ class SmoothStep:
         v_next = v + h * a
         return jacobians, np.concatenate([q + h * v_next, v_next], axis=1)
 
-    def one(self, x: Array, u: Array, x_next: Array) -> Array | None:
+    def single(self, x: Array, u: Array, x_next: Array) -> Array | None:
         """(nx, nx + nu) of the step from x (nx,) under u (nu,) to x_next (nx,), in a third of the time of `__call__`.
 
         None of free bodies, where an input is at its limit or beyond, and where a smooth step leads elsewhere.
@@ -170,14 +170,14 @@ class SmoothStep:
         w = h * (along[:, n:] + h * along[:, :n])
         by_qq, by_vq, by_aq, by_vv = self.dynamics.bend(q, v, a, (inverse @ w[:, :, None])[:, :, 0])
         parts = by_q - inverse * self.stiffness, by_v - inverse * self.damping, self._by_input(inverse, clipped)
-        through_q, through_v, through_u = (by_aq.swapaxes(1, 2) @ part for part in parts)
-        found = np.zeros((len(xs), 2 * n + us.shape[1], 2 * n + us.shape[1]))
-        found[:, :n, :n] = -(by_qq + by_qq.swapaxes(1, 2)) / 2 - through_q - through_q.swapaxes(1, 2)
-        found[:, :n, n : 2 * n] = -by_vq.swapaxes(1, 2) - through_v
-        found[:, :n, 2 * n :] = -through_u
-        found[:, n:, :n] = found[:, :n, n:].swapaxes(1, 2)
-        found[:, n : 2 * n, n : 2 * n] = -by_vv
-        return found
+        through_q, through_v, through_u = (by_aq.swapaxes(1, 2) @ derivative for derivative in parts)
+        hessian = np.zeros((len(xs), 2 * n + us.shape[1], 2 * n + us.shape[1]))
+        hessian[:, :n, :n] = -(by_qq + by_qq.swapaxes(1, 2)) / 2 - through_q - through_q.swapaxes(1, 2)
+        hessian[:, :n, n : 2 * n] = -by_vq.swapaxes(1, 2) - through_v
+        hessian[:, :n, 2 * n :] = -through_u
+        hessian[:, n:, :n] = hessian[:, :n, n:].swapaxes(1, 2)
+        hessian[:, n : 2 * n, n : 2 * n] = -by_vv
+        return hessian
 
     def at_a_limit(self, steps: Steps) -> NDArray[np.bool_]:
         """(N,) whether a joint limit pushes: Drake's does where phi + 2 h phi' < 0, phi being how far it is."""
@@ -207,33 +207,33 @@ class SmoothStep:
         return Native(q, v, Q, native_positions(self.turned, q), (Q @ v[..., None])[..., 0])
 
     def _velocities(
-        self, at: Native, solved: tuple[Array, ...], clipped: NDArray[np.bool_] | None
+        self, native_state: Native, solved: tuple[Array, ...], clipped: NDArray[np.bool_] | None
     ) -> tuple[Array, Array]:
         """(N, nv, 2 nv + nu) the derivative of v' by small motion, v and u, and v' (N, nv)."""
-        c, h, Q = self.coordinates, self.time_step, at.Q
+        c, h, Q = self.coordinates, self.time_step, native_state.Q
         by_q, by_v, inverse, native = solved
-        into, out, out_v = turn_derivatives(self.turned, at.Q, at.v, native)
+        into, out, out_v = turn_derivatives(self.turned, native_state.Q, native_state.v, native)
         Q_t = Q.swapaxes(-1, -2)
         by_motion = Q_t @ (by_q @ Q + by_v @ into - inverse * self.stiffness) + out
         by_velocity = Q_t @ (by_v @ Q - inverse * self.damping) + out_v
-        found = h * np.concatenate([by_motion, by_velocity, Q_t @ self._by_input(inverse, clipped)], axis=2)
-        found[:, :, c.nv : 2 * c.nv] += np.eye(c.nv)
-        return found, self._v_next(at, native)
+        velocities = h * np.concatenate([by_motion, by_velocity, Q_t @ self._by_input(inverse, clipped)], axis=2)
+        velocities[:, :, c.nv : 2 * c.nv] += np.eye(c.nv)
+        return velocities, self._v_next(native_state, native)
 
-    def assemble(self, at: Native, velocities: Array, v_next: Array) -> tuple[Array, Array]:
+    def assemble(self, native_state: Native, velocities: Array, v_next: Array) -> tuple[Array, Array]:
         """(N, nx, nx + nu) and x' (N, nx), from the derivative of v' by small motion, v and u, and v'."""
         c, h = self.coordinates, self.time_step
-        lower = np.concatenate([velocities[:, :, : c.nv] @ c.motion(at.q), velocities[:, :, c.nv :]], axis=2)
-        N = c.rate(at.q)
+        lower = np.concatenate([velocities[:, :, : c.nv] @ c.motion(native_state.q), velocities[:, :, c.nv :]], axis=2)
+        N = c.rate(native_state.q)
         upper = h * N @ lower
         upper[:, :, : c.nq] += np.eye(c.nq) + h * c.rate_by_position(v_next)
-        q_next = at.q + h * (N @ v_next[..., None])[..., 0]
+        q_next = native_state.q + h * (N @ v_next[..., None])[..., 0]
         return np.concatenate([upper, lower], axis=1), np.concatenate([q_next, v_next], axis=1)
 
-    def _v_next(self, at: Native, native: Array) -> Array:
+    def _v_next(self, native_state: Native, native: Array) -> Array:
         """(N, nv) v' by the accelerations (N, nv)."""
-        a = (at.Q.swapaxes(-1, -2) @ native[..., None])[..., 0] + turning(self.turned, at.v)
-        return np.asarray(at.v + self.time_step * a)
+        a = (native_state.Q.swapaxes(-1, -2) @ native[..., None])[..., 0] + turning(self.turned, native_state.v)
+        return np.asarray(native_state.v + self.time_step * a)
 
 
 def build_analytic(model: Model) -> SmoothStep:
@@ -282,5 +282,5 @@ def _dynamics(model: Model, description: Description, added: Array) -> tuple[Dyn
         tree = tree_of(model, free=True)
         if isinstance(tree, Refusal):
             raise ModelError(f"{error}; our own equations: {tree}") from error
-        own = OwnDynamics(tree, model, armature, compiled_tree(description))
-        return own, Coordinates((), tuple((0, j) for j in range(model.nv)))
+        dynamics = OwnDynamics(tree, model, armature, compiled_tree(description))
+        return dynamics, Coordinates((), tuple((0, j) for j in range(model.nv)))

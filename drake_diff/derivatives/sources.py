@@ -114,9 +114,9 @@ class Differences:
 
     def differentiate(self, steps: Steps) -> Jacobians:
         """Step by step."""
-        found = [_by_differences(steps, k) for k in range(len(steps))]
-        notes = {k: note for k, (_, note) in enumerate(found) if note}
-        return Jacobians(np.array([jacobian for jacobian, _ in found]), {}, notes)
+        answer = [_by_differences(steps, k) for k in range(len(steps))]
+        notes = {k: note for k, (_, note) in enumerate(answer) if note}
+        return Jacobians(np.array([jacobian for jacobian, _ in answer]), {}, notes)
 
 
 def _by_differences(steps: Steps, k: int) -> tuple[Array, str]:
@@ -129,8 +129,8 @@ def _by_differences(steps: Steps, k: int) -> tuple[Array, str]:
         sweep = sweep_of(lambda d: ends(d @ moves), width, (step,))
         return np.asarray((sweep.forward + sweep.backward)[0] / (2 * scale))
 
-    found, note = _differenced(steps, k, by_point)
-    return np.hstack([found, _parameter_differences(steps, k, np.arange(len(steps.vector.values)))]), note
+    jacobian, note = _differenced(steps, k, by_point)
+    return np.hstack([jacobian, _parameter_differences(steps, k, np.arange(len(steps.vector.values)))]), note
 
 
 def _parameter_differences(steps: Steps, k: int, entries: NDArray[np.int64]) -> Array:
@@ -143,22 +143,22 @@ def _parameter_differences(steps: Steps, k: int, entries: NDArray[np.int64]) -> 
     def by_parameters(ends: Many, step: float) -> Array:
         moves = np.eye(len(vector.values))[entries] * scale[:, None]
         timed = entries == vector.step_entry
-        found = np.empty((steps.model.nx, len(entries)))
+        columns = np.empty((steps.model.nx, len(entries)))
         for which in (timed, ~timed):
-            own, count = moves[which], int(np.count_nonzero(which))
+            moved, count = moves[which], int(np.count_nonzero(which))
             if not count:
                 continue
 
-            def led(d: Array, own: Array = own) -> Array:
-                return ends(np.hstack([np.zeros((len(d), width)), d @ own]))
+            def led(d: Array, moved: Array = moved) -> Array:
+                return ends(np.hstack([np.zeros((len(d), width)), d @ moved]))
 
             if which is timed:  # each size of a difference needs models of its own: two, extrapolated, and no plateau
                 sweep = sweep_of(led, count, (TIME_STEP_DIFFERENCE, TIME_STEP_DIFFERENCE / 2))
                 coarse, fine = (sweep.forward + sweep.backward) / 2
-                found[:, which] = fine + (fine - coarse) / 3
+                columns[:, which] = fine + (fine - coarse) / 3
             else:
-                found[:, which] = plateau(led, count)
-        return found / scale
+                columns[:, which] = plateau(led, count)
+        return columns / scale
 
     return _differenced(steps, k, by_parameters)[0]
 
@@ -177,9 +177,9 @@ def _differenced(steps: Steps, k: int, quotients: Callable[[Many, float], Array]
         return points[:, : model.nx], points[:, model.nx : model.nx + model.nu], points[:, model.nx + model.nu :]
 
     def to_rounding(displacements: Array) -> Array:
-        found = refine_steps(model, vector, *apart(displacements))
-        refused.extend(found.refused.values())
-        return found.x_next
+        refined = refine_steps(model, vector, *apart(displacements))
+        refused.extend(refined.refused.values())
+        return refined.x_next
 
     def drakes_own(displacements: Array) -> Array:
         return np.array([step_at(model, vector, *row) for row in zip(*apart(displacements), strict=True)])
@@ -189,9 +189,9 @@ def _differenced(steps: Steps, k: int, quotients: Callable[[Many, float], Array]
     if not refused and not here.acts[0]:
         return quotients(drakes_own, DIFFERENCE_STEP), ""
     if not refused:
-        found = quotients(to_rounding, REFINED_STEP)
+        quotient = quotients(to_rounding, REFINED_STEP)
         if not refused:
-            return found, "of the step solved to rounding"
+            return quotient, "of the step solved to rounding"
     return quotients(drakes_own, DIFFERENCE_STEP), f"of Drake's own step, {refused[0]}"
 
 
@@ -225,12 +225,12 @@ class CertifiedImplicit(Implicit):
         trial = steps.model.cache("implicit trial", _Trial, of_structure=True)
         if trial.refusal:
             return Refusal(trial.refusal)
-        found = super().differentiate(steps)
-        if not isinstance(found, Refusal) and not trial.passed:
-            smooth = next((k for k in range(len(steps)) if k not in found.refused), None)
+        answer = super().differentiate(steps)
+        if not isinstance(answer, Refusal) and not trial.passed:
+            smooth = next((k for k in range(len(steps)) if k not in answer.refused), None)
             if smooth is not None:
-                _compare(trial, steps, smooth, found.values[smooth])
-        return Refusal(trial.refusal) if trial.refusal else found
+                _compare(trial, steps, smooth, answer.values[smooth])
+        return Refusal(trial.refusal) if trial.refusal else answer
 
 
 def _compare(trial: _Trial, steps: Steps, k: int, jacobian: Array) -> None:
@@ -308,21 +308,21 @@ def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], 
         return choose(take_steps(steps.model, steps.vector, steps.xs[0], steps.us, steps.xs), method)
     source = order[0]
     try:
-        found = source.differentiate(steps)
+        answer = source.differentiate(steps)
     except ModelError as no_twin:
-        error, found = no_twin, Refusal(str(no_twin))
-    if isinstance(found, Refusal):
-        return _ask(order[1:], steps, method, [f"{why}not {source.name}: {found}; " for why in whys], error)
+        error, answer = no_twin, Refusal(str(no_twin))
+    if isinstance(answer, Refusal):
+        return _ask(order[1:], steps, method, [f"{why}not {source.name}: {answer}; " for why in whys], error)
     vector = steps.vector
     # What Drake's AutoDiffXd does not carry; without parameters not even that is asked, at every single step.
     if vector.parameters and len(vector.differenced) and source.name not in OF_ONE_KIND:
-        _fill_in(steps, found)
-    reasons = [_reason(source, steps, method, why, found.notes.get(k, "")) for k, why in enumerate(whys)]
-    chosen = Chosen(found.values, [source.name] * len(whys), reasons)
-    if found.refused:
-        left = np.array(sorted(found.refused))
-        whys = [f"{whys[k]}not {source.name}: {found.refused[k]}; " for k in left]
-        others = _ask(order[1:], steps.part(left), method, whys, found.refused[left[-1]])
+        _fill_in(steps, answer)
+    reasons = [_reason(source, steps, method, why, answer.notes.get(k, "")) for k, why in enumerate(whys)]
+    chosen = Chosen(answer.values, [source.name] * len(whys), reasons)
+    if answer.refused:
+        left = np.array(sorted(answer.refused))
+        whys = [f"{whys[k]}not {source.name}: {answer.refused[k]}; " for k in left]
+        others = _ask(order[1:], steps.subset(left), method, whys, answer.refused[left[-1]])
         if len(left) == len(steps):
             return others
         chosen.values[left] = others.values
@@ -331,15 +331,15 @@ def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], 
     return chosen
 
 
-def _fill_in(steps: Steps, found: Jacobians) -> None:
+def _fill_in(steps: Steps, answer: Jacobians) -> None:
     """Set the columns of the parameters that a source does not know, by differences."""
     entries = steps.vector.differenced
-    if found.timed:
+    if answer.timed:
         entries = entries[entries != steps.vector.step_entry]
     if len(entries):
         columns = steps.model.nx + steps.model.nu + entries
-        for k in sorted(set(range(len(steps))) - found.refused.keys()):
-            found.values[k][:, columns] = _parameter_differences(steps, k, entries)
+        for k in sorted(set(range(len(steps))) - answer.refused.keys()):
+            answer.values[k][:, columns] = _parameter_differences(steps, k, entries)
 
 
 def _reason(source: Source, steps: Steps, method: str, why: str, note: str) -> str:

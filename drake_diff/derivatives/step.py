@@ -181,14 +181,14 @@ def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
     _check_derivatives(model, chosen.values)
     nx, end, names = model.nx, model.nx + model.nu, vector.names
     x_next, values = frozen(steps.x_next), frozen(chosen.values)  # what is taken of them is read-only too
-    found, rows = [], zip(x_next, values, chosen.methods, chosen.reasons, strict=True)
+    derivatives, rows = [], zip(x_next, values, chosen.methods, chosen.reasons, strict=True)
     for end_state, jacobian, used, reason in rows:
         A, B, C = jacobian[:, :nx], jacobian[:, nx:end], jacobian[:, end:]
         sources = (used,) * len(names) if used in OF_ONE_KIND else vector.sources
         if used == IMPLICIT.name and vector.step_entry is not None:
             sources = (*sources[: vector.step_entry], used, *sources[vector.step_entry + 1 :])
-        found.append(StepDerivatives(end_state, A, B, C, names, sources, used, reason))
-    return found
+        derivatives.append(StepDerivatives(end_state, A, B, C, names, sources, used, reason))
+    return derivatives
 
 
 def smooth_jacobians(model: Model, xs: Array, us: Array, x_next: Array | None = None) -> Array | None:
@@ -199,11 +199,11 @@ def smooth_jacobians(model: Model, xs: Array, us: Array, x_next: Array | None = 
     steps = take_steps(model, vector, xs[0], us, xs) if x_next is None else known_steps(model, vector, xs, us, x_next)
     if steps.some_touch:
         return None
-    found = ANALYTIC.differentiate(steps)
-    if isinstance(found, Refusal) or found.refused:
+    answer = ANALYTIC.differentiate(steps)
+    if isinstance(answer, Refusal) or answer.refused:
         return None
-    _check_derivatives(model, found.values)
-    return found.values
+    _check_derivatives(model, answer.values)
+    return answer.values
 
 
 def _check_derivatives(model: Model, jacobians: Array) -> None:

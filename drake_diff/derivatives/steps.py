@@ -47,7 +47,7 @@ class Steps:
         """Whether a contact acts in any of them."""
         return self.touching is not FREE and bool(np.count_nonzero(self.touching))  # a sixth of the time of any()
 
-    def part(self, which: NDArray[np.intp]) -> "Steps":
+    def subset(self, which: NDArray[np.intp]) -> "Steps":
         """Some of the steps."""
         if len(which) == len(self.xs):
             return self

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.autodiff import gradient_of
-from drake_diff._base.reverse import traced_gradient
+from drake_diff._base.autodiff import gradient_of, traced_gradient
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.motion.policy import policy_parameters

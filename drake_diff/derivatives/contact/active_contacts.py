@@ -43,12 +43,12 @@ class Touches:
     normal: Array  # (M, 3) from the other shape to the sphere
     change: Array  # (M, 7, 6) of [middle; normal; phi], as moved with the other shape, by the sphere's twist in it
 
-    def at(self, part: Array) -> tuple[Array, Array]:
+    def contact_points(self, other_part: Array) -> tuple[Array, Array]:
         """Where the contacts act (M, 3), and (M, 7, 6) as `change`, of that point and by the twist there.
 
-        `part` (M,) is the other shape's of the two stiffnesses.
+        `other_part` (M,) is the other shape's of the two stiffnesses.
         """
-        n, share = self.normal, (part - 0.5)[:, None]
+        n, share = self.normal, (other_part - 0.5)[:, None]
         back = share * self.phi[:, None] * n  # from the point to the middle
         change = np.array(self.change)
         change[:, :, 3:] -= self.change[:, :, :3] @ skew(back)
@@ -94,15 +94,15 @@ class ContactPairs:
         of_pairs = kernel(KERNEL).Pairs(
             sides, np.zeros((len(self.bodies), 0)), none, none, none, none, halves, np.zeros((5, count, 0))
         )
-        found = self.overlapping(of_pairs, own_array(poses))
-        state = np.repeat(np.arange(len(poses)), np.diff(found.first))
-        return Touches(state, found.pair, found.point, found.phi, found.normal, found.change)
+        contacts = self.overlapping(of_pairs, own_array(poses))
+        state = np.repeat(np.arange(len(poses)), np.diff(contacts.first))
+        return Touches(state, contacts.pair, contacts.point, contacts.phi, contacts.normal, contacts.change)
 
 
 def read_pairs(model: Model, *, cylinders: bool = False) -> ContactPairs:
     """The pairs of spheres of `model`, none where there are none; with cylinders, which `touching` does not know."""
     plant, inspector = model.plant, model.double.inspector
-    ids, at, radius, boxes, rounds = [], [], [], [], []
+    ids, body_numbers, radius, boxes, rounds = [], [], [], [], []
     bodies: dict[Any, tuple[int, Any]] = {}
     for pair in sorted(inspector.GetCollisionCandidates()) if inspector is not None else ():
         shapes = [inspector.GetShape(i) for i in pair]
@@ -115,10 +115,10 @@ def read_pairs(model: Model, *, cylinders: bool = False) -> ContactPairs:
         radius.append(shapes[first].radius())
         boxes.append(box)
         rounds.append(isinstance(other, Cylinder))
-        own = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in ids[-1]]
-        at.append([bodies.setdefault(body.index(), (len(bodies), body))[0] for body in own])
+        pair_bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in ids[-1]]
+        body_numbers.append([bodies.setdefault(body.index(), (len(bodies), body))[0] for body in pair_bodies])
     poses = [[inspector.GetPoseInFrame(i) for i in pair] for pair in ids]
-    count, of_body = len(ids), np.array(at, dtype=np.intp).reshape(-1, 2)
+    count, of_body = len(ids), np.array(body_numbers, dtype=np.intp).reshape(-1, 2)
     return ContactPairs(
         bodies=tuple(body for _, body in bodies.values()),
         ids=tuple(ids),
@@ -171,14 +171,14 @@ def topology_of(description: Description) -> Topology:
     moves, before, turns = np.zeros((nv, nv)), np.zeros((nv, nv)), np.ones(nv)
     bodies = {"world": np.zeros(nv)}
     for link in description.links:
-        own = link.v_start + np.arange({"weld": 0, "quaternion_floating": 6}.get(link.kind, 1))
+        dofs = link.v_start + np.arange({"weld": 0, "quaternion_floating": 6}.get(link.kind, 1))
         above = np.flatnonzero(bodies[link.parent])
-        moves[np.ix_(above, own)] = before[np.ix_(own, above)] = before[np.ix_(own, own)] = 1.0
-        if len(own) > 1:
-            moves[np.ix_(own[3:], own[:3])] = 1.0
-            turns[own[3:]] = 0.0
+        moves[np.ix_(above, dofs)] = before[np.ix_(dofs, above)] = before[np.ix_(dofs, dofs)] = 1.0
+        if len(dofs) > 1:
+            moves[np.ix_(dofs[3:], dofs[:3])] = 1.0
+            turns[dofs[3:]] = 0.0
         bodies[link.body] = np.array(bodies[link.parent])
-        bodies[link.body][own] = 1.0
+        bodies[link.body][dofs] = 1.0
     return Topology(moves, before, turns, bodies)
 
 
@@ -215,17 +215,17 @@ class Contacts:
     def displacement(self) -> tuple[Array, Array, Array]:
         """How p (M, nv, 3), the normal (M, nv, 3) and phi (M, nv) move with each degree of freedom."""
         twist = np.concatenate([self.at_point, self.angular], axis=-1)
-        found = (self.side[..., None] * twist) @ self.change.swapaxes(-1, -2)
+        moved = (self.side[..., None] * twist) @ self.change.swapaxes(-1, -2)
         other = self.other[..., None]
-        normal = found[..., 3:6] + other * cross(self.angular, self.touch.normal[:, None, :])
-        return found[..., :3] + other * self.at_point, normal, found[..., 6]
+        normal = moved[..., 3:6] + other * cross(self.angular, self.touch.normal[:, None, :])
+        return moved[..., :3] + other * self.at_point, normal, moved[..., 6]
 
     def velocity_change(self, v: Array, point: Array) -> Array:
         """(M, nv, 3) the change of J v with the degrees of freedom for fixed v (M, nv); p changes by (M, nv, 3)."""
         u = v * self.side
-        found = cross(u[:, None, :] @ self.angular, point)
+        turned = cross(u[:, None, :] @ self.angular, point)
         after = (self.moves * u[:, None, :]) @ np.concatenate([self.at_point, self.angular], axis=-1)
-        return np.asarray(found + cross(self.angular, after[..., :3]) + cross(self.at_point, after[..., 3:]))
+        return np.asarray(turned + cross(self.angular, after[..., :3]) + cross(self.at_point, after[..., 3:]))
 
     def force_change(self, force: Array, point: Array) -> Array:
         """(M, nv, nv) the change of J' f for fixed f (M, 3), likewise."""
@@ -264,32 +264,32 @@ class AllPairs:
     spheres: ContactPairs
     others: NearestPointPairs
 
-    def place(self, steps: Steps, poses: Array) -> Placed:
+    def locate(self, steps: Steps, poses: Array) -> Placed:
         """At the steps' states, where the bodies are at `poses` (N, bodies, 3, 4)."""
-        found: list[tuple[int, int, Array]] = []
+        overlaps: list[tuple[int, int, Array]] = []
         for k in np.flatnonzero(steps.touching & bool(self.others.ids)).tolist():
             steps.stand_at(k)
-            found += [(k, len(self.spheres.ids) + i, of) for i, of in self.others.find(steps.model)]
-        state, pair = (np.array([row[i] for row in found], dtype=np.intp) for i in (0, 1))
-        return Placed(poses, state, pair, np.array([of for *_, of in found]).reshape(-1, 7))
+            overlaps += [(k, len(self.spheres.ids) + i, overlap) for i, overlap in self.others.find(steps.model)]
+        state, pair = (np.array([row[i] for row in overlaps], dtype=np.intp) for i in (0, 1))
+        return Placed(poses, state, pair, np.array([overlap for *_, overlap in overlaps]).reshape(-1, 7))
 
     def kinds(self, placed: Placed, count: int) -> list[set[str]]:
         """Of each of `count` states with contact what kinds of shapes touch: spheres, or two others by their names.
 
         Those whose change is known to one side only are kinds of their own.
         """
-        found: list[set[str]] = [set() for _ in range(count)]
+        shapes_that_touch: list[set[str]] = [set() for _ in range(count)]
         for state, pair in zip(placed.state, placed.pair, strict=True):
             shapes = self.others.shapes[pair - len(self.spheres.ids)]
             side = " and to one side" if int(state) in placed.to_one_side else ""
-            found[state].add(" and ".join(sorted(type(shape).__name__ for shape in shapes)) + side)
-        return [kinds or {SPHERES} for kinds in found]
+            shapes_that_touch[state].add(" and ".join(sorted(type(shape).__name__ for shape in shapes)) + side)
+        return [kinds or {SPHERES} for kinds in shapes_that_touch]
 
-    def found(self, placed: Placed) -> Touches:
+    def of_scene_graph(self, placed: Placed) -> Touches:
         """What SceneGraph found."""
-        found = placed.found
-        nothing = np.full((len(found), 7, 6), np.nan)
-        return Touches(placed.state, placed.pair, found[:, :3], found[:, 6], found[:, 3:6], nothing)
+        overlaps = placed.found
+        nothing = np.full((len(overlaps), 7, 6), np.nan)
+        return Touches(placed.state, placed.pair, overlaps[:, :3], overlaps[:, 6], overlaps[:, 3:6], nothing)
 
     def complete(self, touch: Touches, placed: Placed, twists: Array) -> dict[int, str]:
         """Say of what SceneGraph found how it changes; the states of which it is not known, and why.
@@ -300,8 +300,8 @@ class AllPairs:
         for pair in np.unique(touch.pair[touch.pair >= count]):
             which = np.flatnonzero(touch.pair == pair)
             a, b = (placed.poses[touch.state[which], side] for side in self.sides[pair])
-            of = np.concatenate([touch.middle[which], touch.normal[which], touch.phi[which, None]], axis=1)
-            touch.change[which], known, sided = self.others.change(int(pair) - count, (a, b), of, twists[which])
+            overlaps = np.concatenate([touch.middle[which], touch.normal[which], touch.phi[which, None]], axis=1)
+            touch.change[which], known, sided = self.others.change(int(pair) - count, (a, b), overlaps, twists[which])
             names = " and a ".join(type(shape).__name__ for shape in self.others.shapes[pair - count])
             bodies = " and ".join(body.name() for body in self.others.bodies[pair - count])
             for state in touch.state[which[~known]]:
@@ -316,7 +316,7 @@ def read_all_pairs(model: Model) -> AllPairs:
     others = read_nearest_point_pairs(model, set(spheres.ids))
     bodies = {body.index(): body for body in (*spheres.bodies, *(b for both in others.bodies for b in both))}
     order = {index: i for i, index in enumerate(bodies)}
-    own = np.stack([spheres.sphere_body, spheres.other_body], axis=1)
+    of_spheres = np.stack([spheres.sphere_body, spheres.other_body], axis=1)
     sides = np.array([[order[b.index()] for b in both] for both in others.bodies], dtype=np.intp).reshape(-1, 2)
     ids = (*spheres.ids, *others.ids)
-    return AllPairs(tuple(bodies.values()), ids, np.concatenate([own, sides]), spheres, others)
+    return AllPairs(tuple(bodies.values()), ids, np.concatenate([of_spheres, sides]), spheres, others)

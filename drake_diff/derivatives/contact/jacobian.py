@@ -61,17 +61,17 @@ class ContactForm:
         spheres = self.pairs.spheres.overlapping(of_pairs, placed.poses)
         if not len(placed.found):
             return spheres, {}
-        touch = self.pairs.found(placed)
+        touch = self.pairs.of_scene_graph(placed)
         first, second = self.by_body[self.pairs.sides[touch.pair].T]
         angular, linear = S[touch.state, :, :3], S[touch.state, :, 3:]
         twists = np.concatenate([linear + cross(angular, touch.middle[:, None, :]), angular], axis=-1)
         unknown = self.pairs.complete(touch, placed, (first - second)[..., None] * twists)
-        point, change = touch.at(material.other_part[touch.pair])
+        point, change = touch.contact_points(material.other_part[touch.pair])
         state = np.concatenate([np.repeat(np.arange(len(S)), np.diff(spheres.first)), touch.state])
         order = np.argsort(state, kind="stable")
         parts = zip(spheres[1:], (touch.pair, point, touch.normal, touch.phi, change), strict=True)
         begins = np.searchsorted(state[order], np.arange(len(S) + 1))
-        return type(spheres)(own_array(begins), *(own_array(np.concatenate(part)[order]) for part in parts)), unknown
+        return type(spheres)(own_array(begins), *(own_array(np.concatenate(array)[order]) for array in parts)), unknown
 
 
 def contact_form(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
@@ -94,7 +94,10 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
     topology, coordinates = topology_of(description), smooth.coordinates
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
     names = [labels.get(body.index(), "world") for body in pairs.bodies]
-    starts = (np.array(found, dtype=np.int64).reshape(-1, 2) for found in (coordinates.free, coordinates.single))
+    starts = (
+        np.array(pairs_of_starts, dtype=np.int64).reshape(-1, 2)
+        for pairs_of_starts in (coordinates.free, coordinates.single)
+    )
     plant = (
         model.time_step,
         laws.LAWS[contact.approximation],
@@ -116,7 +119,7 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
         pairs=pairs,
         unknown=unknown,
         tree=tree,
-        plant=tuple(own_array(part) if isinstance(part, np.ndarray) else part for part in plant),
+        plant=tuple(own_array(value) if isinstance(value, np.ndarray) else value for value in plant),
         sides=own_array(pairs.sides),
         by_body=own_array(np.array([topology.bodies[name] for name in names]).reshape(-1, model.nv)),
         carriers=np.array([tree.links.get(name, -1) for name in names], dtype=np.intp),
@@ -125,9 +128,9 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
 
 def _of_controllers(smooth: SmoothStep) -> Array:
     """(nv,) h (kd + h kp): a controller within its effort limit is a spring and a damper that act on v'."""
-    (kp, kd), h, found = smooth.form.gains(), smooth.time_step, np.zeros(smooth.coordinates.nv)
-    np.add.at(found, smooth.form.velocity, h * (kd + h * kp))
-    return found
+    (kp, kd), h, added = smooth.form.gains(), smooth.time_step, np.zeros(smooth.coordinates.nv)
+    np.add.at(added, smooth.form.velocity, h * (kd + h * kp))
+    return added
 
 
 def material_of(model: Model, form: ContactForm) -> Material:
@@ -146,9 +149,9 @@ def contact_jacobians(
     """
     nq, compiled, N = smooth.coordinates.nq, kernel(KERNEL), len(steps)
     parts = steps.xs[:, :nq], steps.xs[:, nq:], steps.x_next[:, nq:]
-    q, v, v_next = (own_array(part) for part in parts)
+    q, v, v_next = (own_array(array) for array in parts)
     moved = form.tree(q, v, (v_next - v) / smooth.time_step)
-    placed = form.pairs.place(steps, form.poses(moved.poses))
+    placed = form.pairs.locate(steps, form.poses(moved.poses))
     count = 0 if change is None else change.friction.shape[1]
     changes = np.zeros((5, len(form.sides), 0)) if change is None else own_array(change.stacked)
     of_pairs = compiled.Pairs(form.sides, form.by_body, *map(own_array, material.of_pairs), changes)

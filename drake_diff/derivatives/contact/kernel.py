@@ -74,12 +74,14 @@ class Plant(NamedTuple):
 
 
 @compiled
-def _center_in(X: Array, center: Array, Y: Array, rotation: Array, position: Array, own: Array, local: Array) -> None:
+def _center_in(
+    X: Array, center: Array, Y: Array, rotation: Array, position: Array, in_world: Array, local: Array
+) -> None:
     """A sphere's centre in world (own) and in the other shape's frame (local), its bodies being at X and Y (3, 4)."""
     d, in_body = np.empty(3), np.empty(3)
     for a in range(3):
-        own[a] = X[a, 0] * center[0] + X[a, 1] * center[1] + X[a, 2] * center[2] + X[a, 3]
-        d[a] = own[a] - Y[a, 3]
+        in_world[a] = X[a, 0] * center[0] + X[a, 1] * center[1] + X[a, 2] * center[2] + X[a, 3]
+        d[a] = in_world[a] - Y[a, 3]
     for a in range(3):
         in_body[a] = Y[0, a] * d[0] + Y[1, a] * d[1] + Y[2, a] * d[2] - position[a]
     for a in range(3):
@@ -147,13 +149,13 @@ def _nearest(local: Array, lower: Array, upper: Array, normal: Array, across: Ar
 @compiled
 def touch(s: Spheres, p: Pairs, poses: Array, c: Touching) -> None:
     """Fill in where the contacts of spheres act, and how that changes."""
-    own, local, flat, across, R = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    center, local, flat, across, R = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     half, skew, back = np.empty((3, 3)), np.zeros((3, 3)), np.empty(3)
     for k in range(len(poses)):
         for m in range(c.first[k], c.first[k + 1]):
             i, n, change = c.pair[m], c.normal[m], c.change[m]
             Y, radius = poses[k, p.sides[i, 1]], s.radius[i]
-            _center_in(poses[k, p.sides[i, 0]], s.center[i], Y, s.rotation[i], s.position[i], own, local)
+            _center_in(poses[k, p.sides[i, 0]], s.center[i], Y, s.rotation[i], s.position[i], center, local)
             phi = _nearest(local, s.lower[i], s.upper[i], flat, across) - s.rounding[i] - radius
             for a in range(3):
                 for b in range(3):
@@ -167,7 +169,7 @@ def touch(s: Spheres, p: Pairs, poses: Array, c: Touching) -> None:
             reach, share = radius + phi / 2, p.other_part[i] - 0.5
             for a in range(3):
                 back[a] = share * phi * n[a]
-                c.point[m, a] = own[a] - reach * n[a] - back[a]
+                c.point[m, a] = center[a] - reach * n[a] - back[a]
             c.phi[m] = phi
             # By the twist at the middle, where the centre moves by [1, -reach n^]; then at the point.
             skew[0, 1], skew[0, 2], skew[1, 2] = -n[2], n[1], -n[0]
@@ -221,7 +223,7 @@ def _add_contact(
     sphere, other = pairs.by_body[pairs.sides[i_pair, 0]], pairs.by_body[pairs.sides[i_pair, 1]]
     mu, k_c, d, tau = pairs.friction[i_pair], pairs.stiffness[i_pair], pairs.dissipation[i_pair], pairs.time[i_pair]
     sigma = p.constants[0]
-    at, u, du, dn, g = np.zeros(23), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    solved, u, du, dn, g = np.zeros(23), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     W, G, turned_sum, zero = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.zeros(3)
     u_0 = 0.0
     for j in range(nv):  # the velocities L of all degrees of freedom at p, and J's W
@@ -243,8 +245,8 @@ def _add_contact(
     size = np.sqrt(size)
     w = size / 3
     phi = c.phi[m]
-    solve_law(law, h, p.near_rigid, p.constants, n, phi, mu, k_c, tau, d, w, u, u_0, at)
-    f0, f1, f2 = at[0], at[1], at[2]
+    solve_law(law, h, p.near_rigid, p.constants, n, phi, mu, k_c, tau, d, w, u, u_0, solved)
+    f0, f1, f2 = solved[0], solved[1], solved[2]
     for j in range(nv):  # how p, the normal and phi move, f x a, and what the weight's change is made of
         s = sphere[j] - other[j]
         a0, a1, a2 = S[j, 0], S[j, 1], S[j, 2]
@@ -282,13 +284,13 @@ def _add_contact(
             va2 += s * v[j] * S[j, 2]
     for a in range(3):  # the impulse's slope by the velocity
         du[a] = 1.0
-        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, at, du, zero, SAME_STATE, SAME_MATERIAL, g)
+        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, solved, du, zero, SAME_STATE, SAME_MATERIAL, g)
         for b in range(3):
             G[b, a] = g[b]
         du[a] = 0.0
     g_0 = np.zeros(3)
     if law != SAP:
-        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, at, zero, zero, (0.0, 0.0, 1.0), SAME_MATERIAL, g_0)
+        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, solved, zero, zero, (0.0, 0.0, 1.0), SAME_MATERIAL, g_0)
     for j in range(nv):
         a0, a1, a2, l0, l1, l2 = S[j, 0], S[j, 1], S[j, 2], L[j, 0], L[j, 1], L[j, 2]
         p0, p1, p2 = point[j, 0], point[j, 1], point[j, 2]
@@ -331,17 +333,17 @@ def _add_contact(
         d_w = 2 * d_w - by_slope
         dn[0], dn[1], dn[2] = point[j, 3], point[j, 4], point[j, 5]
         of_state = (point[j, 6], d_w, d_before)
-        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, at, du, dn, of_state, SAME_MATERIAL, g)
+        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, solved, du, dn, of_state, SAME_MATERIAL, g)
         for i in range(nv):
             s = sphere[i] - other[i]
             if s == 0:
                 continue
-            found = L[i, 0] * g[0] + L[i, 1] * g[1] + L[i, 2] * g[2]
-            found += across[i, 0] * p0 + across[i, 1] * p1 + across[i, 2] * p2
+            total = L[i, 0] * g[0] + L[i, 1] * g[1] + L[i, 2] * g[2]
+            total += across[i, 0] * p0 + across[i, 1] * p1 + across[i, 2] * p2
             if moves[j, i] != 0:
-                found += across[j, 0] * L[i, 0] + across[j, 1] * L[i, 1] + across[j, 2] * L[i, 2]
-                found -= across[i, 0] * l0 + across[i, 1] * l1 + across[i, 2] * l2
-            right[i, j] += s * found
+                total += across[j, 0] * L[i, 0] + across[j, 1] * L[i, 1] + across[j, 2] * L[i, 2]
+                total -= across[i, 0] * l0 + across[i, 1] * l1 + across[i, 2] * l2
+            right[i, j] += s * total
     begin = right.shape[1] - pairs.changes.shape[2]
     for r in range(pairs.changes.shape[2]):  # by parameters of the material: through the law, and as the point moves
         by = pairs.changes[:, i_pair, r]
@@ -351,13 +353,13 @@ def _add_contact(
         d_w = -2 * (m0 * turned_sum[0] + m1 * turned_sum[1] + m2 * turned_sum[2])
         d_before = n[0] * (va1 * m2 - va2 * m1) + n[1] * (va2 * m0 - va0 * m2) + n[2] * (va0 * m1 - va1 * m0)
         of_state, of_material = (0.0, d_w, d_before), (by[0], by[1], by[2], by[3])
-        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, at, du, zero, of_state, of_material, g)
+        change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, solved, du, zero, of_state, of_material, g)
         for i in range(nv):
             s = sphere[i] - other[i]
             if s != 0:
-                found = L[i, 0] * g[0] + L[i, 1] * g[1] + L[i, 2] * g[2]
-                found += across[i, 0] * m0 + across[i, 1] * m1 + across[i, 2] * m2
-                right[i, begin + r] += s * found
+                total = L[i, 0] * g[0] + L[i, 1] * g[1] + L[i, 2] * g[2]
+                total += across[i, 0] * m0 + across[i, 1] * m1 + across[i, 2] * m2
+                right[i, begin + r] += s * total
     for i in range(nv):
         s = sphere[i] - other[i]
         if s == 0:
@@ -431,17 +433,17 @@ def _solve(L: Array, B: Array) -> None:
     n, m = B.shape
     for i in range(n):
         for k in range(i):
-            part = L[i, k]
+            factor = L[i, k]
             for j in range(m):
-                B[i, j] -= part * B[k, j]
+                B[i, j] -= factor * B[k, j]
         inverse = 1.0 / L[i, i]
         for j in range(m):
             B[i, j] *= inverse
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
-            part = L[k, i]
+            factor = L[k, i]
             for j in range(m):
-                B[i, j] -= part * B[k, j]
+                B[i, j] -= factor * B[k, j]
         inverse = 1.0 / L[i, i]
         for j in range(m):
             B[i, j] *= inverse

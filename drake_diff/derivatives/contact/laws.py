@@ -69,14 +69,14 @@ class ContactLaw:
     def impulses(self, velocity: Array) -> tuple[Array, Array]:
         """(M, 3) [N s] on the sphere's side and (M, 3, 3) their derivative, at velocities (M, 3) after the step."""
         impulse, slope = np.empty((len(self.phi), 3)), np.empty((len(self.phi), 3, 3))
-        of = (self.normal, self.phi, self.friction, self.stiffness, self.time, self.dissipation, self.weight)
+        arrays = (self.normal, self.phi, self.friction, self.stiffness, self.time, self.dissipation, self.weight)
         constants = SIGMA, SOFT_NORM, STICTION_TOLERANCE
         kernel(KERNEL).impulses(
             LAWS[self.approximation],
             self.time_step,
             self.near_rigid,
             constants,
-            *map(own_array, of),
+            *map(own_array, arrays),
             own_array(velocity),
             own_array(self.before),
             impulse,
@@ -84,7 +84,7 @@ class ContactLaw:
         )
         return impulse, slope
 
-    def part(self, which: Indices) -> "ContactLaw":
+    def subset(self, which: Indices) -> "ContactLaw":
         """Some of the contacts."""
         arrays: dict[str, Any] = {n: v[which] for n, v in vars(self).items() if isinstance(v, np.ndarray)}
         return replace(self, **arrays)

@@ -65,7 +65,7 @@ class Shape:
     pose: Array
 
     @classmethod
-    def of(cls, inspector: Any, geometry: Any) -> "Shape | None":
+    def read(cls, inspector: Any, geometry: Any) -> "Shape | None":
         """That of a geometry, None where it is none of KINDS."""
         shape, size, vertices = inspector.GetShape(geometry), np.zeros(3), np.zeros((0, 3))
         if isinstance(shape, Sphere):
@@ -83,7 +83,7 @@ class Shape:
             return None
         return cls(KINDS.index(type(shape)), size, vertices, inspector.GetPoseInFrame(geometry).GetAsMatrix34())
 
-    def at(self, normal: Array, flat: float) -> "Feature":
+    def feature(self, normal: Array, flat: float) -> "Feature":
         """What is outermost along `normal` (M, 3), in the shape's frame; what of it is below `flat` counts as 0."""
         return _FEATURES[self.kind](self, normal, flat)
 
@@ -113,61 +113,61 @@ def _sphere(shape: Shape, normal: Array, flat: float) -> Feature:
 
 
 def _half_space(shape: Shape, normal: Array, flat: float) -> Feature:
-    found = _feature(normal)
-    found.flat[:] = np.eye(3)[:, :2]
-    return found
+    feature = _feature(normal)
+    feature.flat[:] = np.eye(3)[:, :2]
+    return feature
 
 
 def _box(shape: Shape, normal: Array, flat: float) -> Feature:
-    found, zero = _feature(normal), np.abs(normal) < flat
-    found.point[:] = np.where(zero, 0.0, np.sign(normal) * shape.size)
+    feature, zero = _feature(normal), np.abs(normal) < flat
+    feature.point[:] = np.where(zero, 0.0, np.sign(normal) * shape.size)
     which, axis = np.nonzero(zero)
-    found.flat[which, axis, np.cumsum(zero, axis=1)[which, axis] - 1] = 1.0
-    return found
+    feature.flat[which, axis, np.cumsum(zero, axis=1)[which, axis] - 1] = 1.0
+    return feature
 
 
 def _cylinder(shape: Shape, normal: Array, flat: float) -> Feature:
-    found, (radius, half, _) = _feature(normal), shape.size
+    feature, (radius, half, _) = _feature(normal), shape.size
     across = np.sqrt((normal[:, :2] ** 2).sum(axis=1))
     cap, side = across < flat, np.abs(normal[:, 2]) < flat
     out = normal[:, :2] / np.where(cap, 1.0, across)[:, None]
-    found.point[:, :2] = np.where(cap[:, None], 0.0, radius * out)
-    found.point[:, 2] = np.where(side, 0.0, np.sign(normal[:, 2]) * half)
-    found.flat[cap] = np.eye(3)[:, :2]
-    found.flat[side, 2, 0] = 1.0
+    feature.point[:, :2] = np.where(cap[:, None], 0.0, radius * out)
+    feature.point[:, 2] = np.where(side, 0.0, np.sign(normal[:, 2]) * half)
+    feature.flat[cap] = np.eye(3)[:, :2]
+    feature.flat[side, 2, 0] = 1.0
     along = np.stack([-out[:, 1], out[:, 0], np.zeros(len(out))], axis=1)
-    found.curve[:] = (
+    feature.curve[:] = (
         along[:, :, None] * along[:, None, :] * np.where(cap, 0.0, radius / np.where(cap, 1.0, across))[:, None, None]
     )
-    return found
+    return feature
 
 
 def _capsule(shape: Shape, normal: Array, flat: float) -> Feature:
-    found, (radius, half, _) = _feature(normal), shape.size
+    feature, (radius, half, _) = _feature(normal), shape.size
     side = np.abs(normal[:, 2]) < flat
-    found.point[:] = radius * normal
-    found.point[:, 2] += np.where(side, 0.0, np.sign(normal[:, 2]) * half)
-    found.flat[side, 2, 0] = 1.0
-    found.curve[:] = radius * _round(normal)
-    found.curve[side, 2] = found.curve[side, :, 2] = 0.0
-    return found
+    feature.point[:] = radius * normal
+    feature.point[:, 2] += np.where(side, 0.0, np.sign(normal[:, 2]) * half)
+    feature.flat[side, 2, 0] = 1.0
+    feature.curve[:] = radius * _round(normal)
+    feature.curve[side, 2] = feature.curve[side, :, 2] = 0.0
+    return feature
 
 
 def _ellipsoid(shape: Shape, normal: Array, flat: float) -> Feature:
-    found, square = _feature(normal), shape.size**2
+    feature, square = _feature(normal), shape.size**2
     size = np.sqrt((square * normal**2).sum(axis=1))
-    found.point[:] = square * normal / size[:, None]
-    found.curve[:] = (np.diag(square) - found.point[:, :, None] * found.point[:, None, :]) / size[:, None, None]
-    return found
+    feature.point[:] = square * normal / size[:, None]
+    feature.curve[:] = (np.diag(square) - feature.point[:, :, None] * feature.point[:, None, :]) / size[:, None, None]
+    return feature
 
 
 def _mesh(shape: Shape, normal: Array, flat: float) -> Feature:
-    found = _feature(normal)
+    feature = _feature(normal)
     heights = normal @ shape.vertices.T
     extent = float(np.max(np.ptp(shape.vertices, axis=0)))
     for i, row in enumerate(heights):
         top = shape.vertices[row >= row.max() - flat * extent]
-        found.point[i] = top.mean(axis=0)
+        feature.point[i] = top.mean(axis=0)
         edges = top[1:] - top[0]
         if len(edges):
             first = edges[np.argmax((edges**2).sum(axis=1))]
@@ -175,10 +175,10 @@ def _mesh(shape: Shape, normal: Array, flat: float) -> Feature:
             rest = edges - np.outer(edges @ first, first)
             second = rest[np.argmax((rest**2).sum(axis=1))]
             size = float(np.linalg.norm(second))
-            found.flat[i, :, 0] = first
+            feature.flat[i, :, 0] = first
             if size > PROPER * extent:
-                found.flat[i, :, 1] = second / size
-    return found
+                feature.flat[i, :, 1] = second / size
+    return feature
 
 
 _FEATURES = (_sphere, _half_space, _box, _cylinder, _capsule, _ellipsoid, _mesh, _mesh)
@@ -199,31 +199,35 @@ class NearestPointPairs:
         order = {pair: (i, 1.0) for i, pair in enumerate(self.ids)}
         order |= {(b, a): (i, -1.0) for (a, b), (i, _) in order.items()}
         query = model.plant.get_geometry_query_input_port().Eval(model.double.context)
-        found = []
-        for of in query.ComputePointPairPenetration():
-            if (of.id_A, of.id_B) in order:
-                i, sign = order[of.id_A, of.id_B]
-                middle = (of.p_WCa + of.p_WCb) / 2
-                found.append((i, np.concatenate([middle, sign * of.nhat_BA_W, [-of.depth]])))
-        return found
+        overlaps = []
+        for penetration in query.ComputePointPairPenetration():
+            if (penetration.id_A, penetration.id_B) in order:
+                i, sign = order[penetration.id_A, penetration.id_B]
+                middle = (penetration.p_WCa + penetration.p_WCb) / 2
+                overlaps.append((i, np.concatenate([middle, sign * penetration.nhat_BA_W, [-penetration.depth]])))
+        return overlaps
 
-    def change(self, pair: int, poses: tuple[Array, Array], of: Array, twists: Array) -> tuple[Array, Flags, Flags]:
-        """(M, 7, 6) of `pairs.Touches`, which (M,) are known and which to one side only, of M overlaps `of` (M, 7).
+    def change(
+        self, pair: int, poses: tuple[Array, Array], overlaps: Array, twists: Array
+    ) -> tuple[Array, Flags, Flags]:
+        """(M, 7, 6) of `Touches`, which (M,) are known and which to one side only, of M overlaps (M, 7).
 
         With the bodies at `poses` (M, 3, 4) each, and the twists (M, nv, 6) of the first in the second at the middle.
         """
         a, b = self.known[pair]
         if a is None or b is None:
-            return np.zeros((len(of), 7, 6)), *np.zeros((2, len(of)), dtype=bool)
+            return np.zeros((len(overlaps), 7, 6)), *np.zeros((2, len(overlaps)), dtype=bool)
         placed = _times(poses[0], a.pose), _times(poses[1], b.pose)
-        change, known = overlap_change(a, b, Overlaps(placed, of[:, :3], of[:, 3:6], of[:, 6]))
-        to_one_side = np.zeros(len(of), dtype=bool)
+        change, known = overlap_change(a, b, Overlaps(placed, overlaps[:, :3], overlaps[:, 3:6], overlaps[:, 6]))
+        to_one_side = np.zeros(len(overlaps), dtype=bool)
         for k in np.flatnonzero(~known):
             if pair not in self.scenes:
                 self.scenes[pair] = PairScene(*self.shapes[pair])
             R, X_a, X_b = placed[1][k, :, :3], RigidTransform(placed[0][k]), RigidTransform(placed[1][k])
-            own = np.concatenate([twists[k, :, :3] @ R, twists[k, :, 3:] @ R], axis=1)
-            local, to_one_side[k] = self.scenes[pair].change(X_b.inverse() @ X_a, own[np.abs(own).max(axis=1) > FLAT])
+            local_twists = np.concatenate([twists[k, :, :3] @ R, twists[k, :, 3:] @ R], axis=1)
+            local, to_one_side[k] = self.scenes[pair].change(
+                X_b.inverse() @ X_a, local_twists[np.abs(local_twists).max(axis=1) > FLAT]
+            )
             if local is not None:
                 known[k] = True
                 turned = np.concatenate([local[:, :3] @ R.T, local[:, 3:] @ R.T], axis=1)
@@ -234,8 +238,8 @@ class NearestPointPairs:
 def _times(pose: Array, other: Array) -> Array:
     """(M, 3, 4) of poses (M, 3, 4) and a pose (3, 4) in them."""
     R = pose[:, :, :3]
-    at = (R @ other[:, 3])[..., None] + pose[:, :, 3:]
-    return np.concatenate([R @ other[:, :3], at], axis=2)
+    position = (R @ other[:, 3])[..., None] + pose[:, :, 3:]
+    return np.concatenate([R @ other[:, :3], position], axis=2)
 
 
 def read_nearest_point_pairs(model: Model, without: set[tuple[Any, Any]]) -> NearestPointPairs:
@@ -247,7 +251,7 @@ def read_nearest_point_pairs(model: Model, without: set[tuple[Any, Any]]) -> Nea
             ids.append(pair)
     bodies = tuple(tuple(plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in pair) for pair in ids)
     shapes = tuple((inspector.GetShape(a), inspector.GetShape(b)) for a, b in ids)
-    known = tuple((Shape.of(inspector, a), Shape.of(inspector, b)) for a, b in ids)
+    known = tuple((Shape.read(inspector, a), Shape.read(inspector, b)) for a, b in ids)
     return NearestPointPairs(tuple(ids), bodies, shapes, known, {})
 
 
@@ -261,39 +265,39 @@ class Overlaps:
     phi: Array  # (M,)
 
 
-def overlap_change(a: Shape, b: Shape, of: Overlaps) -> tuple[Array, Flags]:
-    """(M, 7, 6) of `pairs.Touches`, and which (M,) are known: those at whose points the overlap is the smallest."""
-    n = of.normal
+def overlap_change(a: Shape, b: Shape, overlaps: Overlaps) -> tuple[Array, Flags]:
+    """(M, 7, 6) of `Touches`, and which (M,) are known: those at whose points the overlap is the smallest."""
+    n = overlaps.normal
     sides = []
-    for shape, pose, out, sign in ((a, of.poses[0], -n, 0.5), (b, of.poses[1], n, -0.5)):
+    for shape, pose, out, sign in ((a, overlaps.poses[0], -n, 0.5), (b, overlaps.poses[1], n, -0.5)):
         R = pose[:, :, :3]
         local = (out[:, None, :] @ R)[:, 0]
-        feature = shape.at(local, FLAT)
+        feature = shape.feature(local, FLAT)
         point = (R @ feature.point[:, :, None])[..., 0] + pose[:, :, 3]
         flat, curve = R @ feature.flat, R @ feature.curve @ R.swapaxes(-1, -2)
-        touching = of.middle + sign * of.phi[:, None] * n
+        touching = overlaps.middle + sign * overlaps.phi[:, None] * n
         sides.append((point - touching, flat, curve))
     (off_a, F_a, C_a), (off_b, F_b, C_b) = sides
     tangent = _tangent(n)
     T_t = tangent.swapaxes(-1, -2)
     f_a, f_b = T_t @ F_a, T_t @ F_b
-    H = T_t @ (C_a + C_b) @ tangent + of.phi[:, None, None] * np.eye(2)
+    H = T_t @ (C_a + C_b) @ tangent + overlaps.phi[:, None, None] * np.eye(2)
     left, known = _system(H, f_a, f_b)
     for off, F in ((off_a, F_a), (off_b, F_b)):
         beside = off - (F @ (F.swapaxes(-1, -2) @ off[:, :, None]))[..., 0]
         known &= (np.abs(beside) <= SAME_POINT).all(axis=1)
     turn = -skew(n)  # w x n
     at_a = np.zeros((len(n), 3, 6))
-    at_a[..., :3], at_a[..., 3:] = np.eye(3), -skew(of.phi[:, None] / 2 * n)
+    at_a[..., :3], at_a[..., 3:] = np.eye(3), -skew(overlaps.phi[:, None] / 2 * n)
     at_a[..., 3:] += C_a @ turn
     right = np.zeros((len(n), 6, 6))
     right[:, :2] = T_t @ at_a
     right[:, 2:4, 3:] = f_a.swapaxes(-1, -2) @ T_t @ turn
     left[~known] = np.eye(6)
-    found = np.linalg.solve(left, right)
-    normal = tangent @ found[:, :2]
-    point_a = at_a - C_a @ normal + F_a @ found[:, 2:4]
-    point_b = C_b @ normal + F_b @ found[:, 4:]
+    solution = np.linalg.solve(left, right)
+    normal = tangent @ solution[:, :2]
+    point_a = at_a - C_a @ normal + F_a @ solution[:, 2:4]
+    point_b = C_b @ normal + F_b @ solution[:, 4:]
     change = np.concatenate([(point_a + point_b) / 2, normal, np.zeros((len(n), 1, 6))], axis=1)
     change[:, 6, :3] = n
     return change, known
@@ -355,12 +359,12 @@ class PairScene:
         """(7,) the middle, the normal and phi in b's frame with a at `pose` in it; NaN where they do not overlap."""
         self._poses.set_value(self._frame, pose)
         self._port.FixValue(self._context, self._poses)
-        found = self._scene_graph.get_query_output_port().Eval(self._context).ComputePointPairPenetration()
-        if not found:
+        overlaps = self._scene_graph.get_query_output_port().Eval(self._context).ComputePointPairPenetration()
+        if not overlaps:
             return np.full(7, np.nan)
-        sign = 1.0 if found[0].id_A == self._a else -1.0
-        middle = (found[0].p_WCa + found[0].p_WCb) / 2
-        return np.concatenate([middle, sign * found[0].nhat_BA_W, [-found[0].depth]])
+        sign = 1.0 if overlaps[0].id_A == self._a else -1.0
+        middle = (overlaps[0].p_WCa + overlaps[0].p_WCb) / 2
+        return np.concatenate([middle, sign * overlaps[0].nhat_BA_W, [-overlaps[0].depth]])
 
     def change(self, pose: RigidTransform, twists: Array) -> tuple[Array | None, bool]:
         """(7, 6) the derivative along the span of `twists` (K, 6) of a at the middle, 0 across it; None where none is.
@@ -406,8 +410,8 @@ class PairScene:
         """What is found after a small motion (6,) of a, about the middle."""
         angle = float(np.linalg.norm(motion[3:]))
         R = RotationMatrix(AngleAxis(angle, motion[3:] / angle)) if angle else RotationMatrix()
-        at = R @ (pose.translation() - here[:3]) + here[:3] + motion[:3]
-        return self.find(RigidTransform(R @ pose.rotation(), at))
+        position = R @ (pose.translation() - here[:3]) + here[:3] + motion[:3]
+        return self.find(RigidTransform(R @ pose.rotation(), position))
 
 
 def move_apart(model: Model, pair: tuple[Any, Any]) -> bool:

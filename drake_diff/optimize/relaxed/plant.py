@@ -136,7 +136,7 @@ class RelaxedPlant:
 
     def _contacts(self, poses: Array, S: Array, v_next: Array, soft: Softness) -> tuple[Contacts, "Law"]:
         touch = _within(self.pairs, poses, FAR * soft.reach)
-        own, (point, change) = S[touch.state], touch.at(np.full(len(touch.pair), 0.5))
+        own, (point, change) = S[touch.state], touch.contact_points(np.full(len(touch.pair), 0.5))
         linear, angular = own[..., :3], own[..., 3:]
         contacts = Contacts(
             touch=touch,
