@@ -84,7 +84,7 @@ def test_an_attempt_that_was_cut_short_is_named_with_all_its_iterations(monkeypa
 
 @each_row("status", [s for s in dd.Status if s not in (dd.Status.CONVERGED, dd.Status.INTERRUPTED)])
 def test_every_status_that_is_no_success_has_something_to_try(status):
-    from drake_diff.optimize.advice import advice
+    from drake_diff.optimize.verification import advice
 
     solution = dd.solve(swing_up(), method="ilqr", max_iterations=1).told(status=status)
     assert advice(solution, {"max_iterations": 1, "time_limit": 1.0}, []).startswith("to try: ")

@@ -10,7 +10,7 @@ from helpers.robots import example_robot, state_in_contact
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.motion.replayed import replayed
-from drake_diff.optimize import slope
+from drake_diff.optimize import optimality
 
 ENERGY = 1e-7  # [J] of a few: steps of 1e-9 each, some hundred of them in contact
 
@@ -243,14 +243,14 @@ def test_a_forged_run_in_continuous_time_is_refused(thrown_run, tmp_path, forge)
 def test_a_derivative_that_another_integration_does_not_have_is_no_plans(monkeypatch):
     """2 % off at every width, which nothing explains; and slopes that do not settle, as where a body tumbles."""
     model = ball_on_rails(gravity=9.81, time_step=0.02)
-    right = slope.final_sensitivity
-    monkeypatch.setattr(slope, "final_sensitivity", lambda *at: 1.02 * right(*at))
+    right = optimality.final_sensitivity
+    monkeypatch.setattr(optimality, "final_sensitivity", lambda *at: 1.02 * right(*at))
     off = dd.solve(thrown(model), method="shooting")
     assert off.status is dd.Status.CONVERGED_NOT_VERIFIED
     assert "off the slope that another integration has" in off.message
-    monkeypatch.setattr(slope, "final_sensitivity", right)
-    measured, factors = slope._slope, iter([1.5, 0.4, 1.7] * 9)
-    monkeypatch.setattr(slope, "_slope", lambda *at: next(factors) * measured(*at))
+    monkeypatch.setattr(optimality, "final_sensitivity", right)
+    measured, factors = optimality._slope, iter([1.5, 0.4, 1.7] * 9)
+    monkeypatch.setattr(optimality, "_slope", lambda *at: next(factors) * measured(*at))
     tumbles = dd.solve(thrown(model), method="shooting")
     assert tumbles.status is dd.Status.NO_GRADIENT
     assert "that of a point alone" in tumbles.message
@@ -274,6 +274,8 @@ def test_a_hopper_lands_and_stands(monkeypatch):
     solution = dd.solve(problem, method="ilqr", initial_guess=guess)
     assert solution.status is dd.Status.CONVERGED, solution.message
     assert np.abs(solution.replay.xs[-1, [1, 5, 7]] - [stands, 0, 0]).max() < 1e-4
-    right = slope.final_sensitivity
-    monkeypatch.setattr(slope, "final_sensitivity", lambda *at: 1.03 * right(*at))
-    assert slope.doubt_of_the_slope(solution) is not None
+    right = optimality.final_sensitivity
+    monkeypatch.setattr(optimality, "final_sensitivity", lambda *at: 1.03 * right(*at))
+    assert (
+        optimality.doubt_of_the_slope(solution.problem, solution.step_vector, solution.xs[0], solution.us) is not None
+    )

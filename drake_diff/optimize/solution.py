@@ -152,17 +152,15 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     def __repr__(self) -> str:
         how = ", ".join(name for name in (self.scheme, self.solver) if name not in ("step", ""))
-        beyond = f"bound violation {self.bound_violation:.2g}, constraint violation {self.constraint_violation:.2g}"
         verdicts = Counter(certificate.verdict for certificate in self.certificates)
-        told = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()) or "none"
+        certified = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()) or "none"
+        length = "" if self.problem.is_map else f"{self.horizon:g} s in "
         lines = [
             f"Solution of {self.problem.name} by {self.method}{f' ({how})' if how else ''}: {self.status.value}",
             self.message,
-            f"cost {self.cost:.6g} over "
-            + (f"{len(self.us)} steps" if self.problem.is_map else f"{self.horizon:g} s in {len(self.us)} intervals"),
-            f"defect {self.defect:.2g}, integration error {self.integration_error:.2g}",
-            f"goal error {self.goal_error:.2g}, {beyond}",
-            f"{len(self.iterations)} iterations in {self.wall_time:.2g} s; certificates: {told}",
+            f"cost {self.cost:.6g} over {length}{len(self.us)} intervals",
+            *(str(c) for c in self.plan_checks.failing),
+            f"{len(self.iterations)} iterations in {self.wall_time:.2g} s; certificates: {certified}",
         ]
         if "replays" in vars(self) and self.replays:  # they take time: a printed line starts none
             lines.append(f"replays: {sum(r.holds for r in self.replays)} of {len(self.replays)} hold")

@@ -18,7 +18,6 @@ from drake_diff.model.soft_contact import SoftContact
 from drake_diff.model.step import set_state
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.rollout import CONTINUOUS
-from drake_diff.optimize.advice import advice
 from drake_diff.optimize.apart import is_kept_apart, kept_apart
 from drake_diff.optimize.continuation import check_schedule
 from drake_diff.optimize.guess import another_guess, first_guess, sampled
@@ -35,7 +34,7 @@ from drake_diff.optimize.transcription.collocation import (
     MeshRefinement,
 )
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
-from drake_diff.optimize.verification import overlaps
+from drake_diff.optimize.verification import advice, overlaps
 
 COMPILED = 0.5  # [s] that are worth a word
 LARGEST_TOLERANCE = 1e3
