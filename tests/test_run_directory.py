@@ -399,7 +399,7 @@ def test_a_signal_that_comes_while_a_plan_is_kept_waits_for_it(solutions, tmp_pa
         signal.raise_signal(signal.SIGINT)
         begun(path, data)
 
-    monkeypatch.setattr("drake_diff.runs.rerun.write_whole", interrupted)
+    monkeypatch.setattr("drake_diff.runs.rebuild.write_whole", interrupted)
     with pytest.raises(KeyboardInterrupt):
         keep_plan(solutions[1], partial)
     assert has_plan(partial, solutions[1])

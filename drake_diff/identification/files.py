@@ -33,12 +33,12 @@ from drake_diff.logs.channels import input_channel, state_channel, transform_cha
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.runs import other_records as records
-from drake_diff.runs.again import Again, contract_as, model_as
 from drake_diff.runs.directory import name_of, written_whole
 from drake_diff.runs.fields import DataBoundary, DataUse, canonical, finite
 from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.provenance import embodiment_of, model_input, provenance_of, written_now
-from drake_diff.runs.rerun import TRACE, rebuilt
+from drake_diff.runs.rebuild import TRACE, rebuilt
+from drake_diff.runs.reproduce import Reproduced, contract_as, model_as
 from drake_diff.runs.sealed import WallClock, reproducible
 
 REPORT = "report.html"
@@ -262,7 +262,7 @@ def _channels_of(e: Identification, i: int) -> Iterator[Channel]:
         yield state_channel(f"/{i}/before/state", times[seen], before[seen], *entries)
 
 
-def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Again:
+def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduced:
     """The fit once more from the recordings in the directory, and all that was written of it."""
     made, identification = _fitted_again(folder, record, models)
     changed = {"contract": contract_as(made.contract, record.contract), "model": model_as(made.model, record.model)}
@@ -275,7 +275,7 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Again:
     kept = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
     carried = "" if record.model.file is None else record.model.file.path
     fields = again.model_dump(mode="json")
-    return Again(fields, files, problems=problems, unchecked=(OF_RECORDINGS,), written=(carried, *kept, *MADE))
+    return Reproduced(fields, files, problems=problems, unchecked=(OF_RECORDINGS,), written=(carried, *kept, *MADE))
 
 
 def _fitted_again(folder: Path, record: FitRecord, models: Path | None) -> tuple[FitRecord, Identification]:

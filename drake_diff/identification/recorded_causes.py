@@ -21,11 +21,11 @@ from drake_diff.comparison.side_by_side import compare_recordings
 from drake_diff.identification.cause import cause_of
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.model import Model
-from drake_diff.runs.again import Again, contract_as, model_as
 from drake_diff.runs.differences import ABSOLUTE, NUMBER, is_near
 from drake_diff.runs.other_records import CauseEvidence, ComparisonRecord, Numbers
 from drake_diff.runs.provenance import embodiment_of, model_input
-from drake_diff.runs.rerun import rebuilt
+from drake_diff.runs.rebuild import rebuilt
+from drake_diff.runs.reproduce import Reproduced, contract_as, model_as
 
 SAME_VALUE = 2e-3  # of half the interval: see above
 SAME_DIGIT = 1.01  # of the last digit in a text: a number that lies between two is rounded to either
@@ -38,7 +38,7 @@ NEVER = (  # what is not checked
 )
 
 
-def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Again:
+def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Reproduced:
     """The rows and causes of a record's recordings made again from the directory alone; engines are not run.
 
     ArtifactError where the directory does not have what the record says; ModelError where the model cannot be rebuilt,
@@ -46,12 +46,12 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Ag
     """
     if not record.recordings:
         lost = (f"{e.engine}: {LOST}" for e in record.engines if e.cause is not None)
-        return Again({}, {}, unchecked=(*_functions_of(record), *lost))
+        return Reproduced({}, {}, unchecked=(*_functions_of(record), *lost))
     problems, undecided, unchecked = [*_odd_recordings(record)], list[str](), [*NEVER, *_functions_of(record)]
     carried = "" if record.model.file is None else record.model.file.path
     written = (carried, *WRITTEN, *(r.path for r in record.recordings))
     if problems:
-        return Again({}, {}, problems=tuple(problems), written=written)
+        return Reproduced({}, {}, problems=tuple(problems), written=written)
     given = [read_arrays(folder / r.path, r.name, r.version, r.facts) for r in record.recordings]
     attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
     with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
@@ -60,7 +60,7 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Ag
         names = [[e.engine for e in engines] for engines in (rows, found.engines)]
         if names[0] != names[1]:
             problems.append(f"{record.FILE}: its recordings are {names[0]}, compared again {names[1]}")
-            return Again({}, {}, problems=tuple(problems), written=written)
+            return Reproduced({}, {}, problems=tuple(problems), written=written)
         problems += _odd_files(folder, record, found.recordings)
         known = _motion_hash(record) == hash_of_arrays(found.x0, found.us)
         if not known:
@@ -76,7 +76,7 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Ag
             engines.append({"name": row.engine, **made.model_dump(mode="json")})
     told = [{"name": row.engine, **row.model_dump(mode="json")} for row in rows]
     recorded = {**{key: record.model_dump(mode="json")[key] for key in fields}, "engines": told}
-    return Again(
+    return Reproduced(
         {**fields, "engines": engines},
         {},
         problems=tuple(problems),

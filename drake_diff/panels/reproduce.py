@@ -11,18 +11,18 @@ from drake_diff._base.untrusted import MOST_TEXT, read_plain
 from drake_diff.exceptions import ArtifactError
 from drake_diff.panels.panel_file import PanelTrial, canonical
 from drake_diff.panels.results import JOURNAL, SUMMARY, TABLE, ended_record, read_journal, write_table
-from drake_diff.runs.again import Again
 from drake_diff.runs.other_records import TRIALS, ComparisonRecord, TrialSection
 from drake_diff.runs.read import parse_record
+from drake_diff.runs.reproduce import Reproduced
 from drake_diff.runs.sealed import read_fields
 
 SAID = ("panel", "verdict", "sentence")  # of the record, by the table
 
 
-def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Again:
+def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Reproduced:
     """What of a panel's directory, or of the record of one trial at `folder`, does not follow from the journal."""
     problems = [*_odd_panel(folder, record)] if record.trial is None else [*_odd_trial(folder, record.trial)]
-    return Again({}, {}, problems=tuple(problems))
+    return Reproduced({}, {}, problems=tuple(problems))
 
 
 def _odd_trial(path: Path, record: TrialSection) -> Iterator[str]:

@@ -19,7 +19,7 @@ from drake_diff.runs.directory import is_partial
 from drake_diff.runs.other_records import TRIALS, ComparisonRecord, is_trial_file
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.read import load_plan_record, load_record, record_path
-from drake_diff.runs.rerun import TRACE
+from drake_diff.runs.rebuild import TRACE
 from drake_diff.runs.trace import read_trace
 from drake_diff.runs.view import PLAN, scene_of_run
 

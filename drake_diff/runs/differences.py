@@ -28,6 +28,7 @@ READ_SECTIONS = (
     "model",
     "observation",
     "panel",
+    "phases",
     "problem",
     "units",
 )

@@ -30,7 +30,7 @@ from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.plan_record import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesSection, PlanRecord
 from drake_diff.runs.provenance import gradient_evidence, provenance_of, written_now
 from drake_diff.runs.read import load_record, record_path
-from drake_diff.runs.rerun import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve, rows_of, write_plan
+from drake_diff.runs.rebuild import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve, rows_of, write_plan
 from drake_diff.runs.sealed import Passed, SealedRecord, WallClock, files_below, reproducible
 from drake_diff.runs.sections import asked, found, panel_of, unknown_functions
 
@@ -53,7 +53,7 @@ def save_phases(solution: PhasedSolution, folder: Path, save_phase: Callable[[So
     """Write the solution in phases into `folder`; `save_phase` writes that of one."""
     for i, phase in enumerate(solution.phases):
         save_phase(phase, folder / directory_of(i))
-    return _record_of_phases(folder, solution).write(folder)
+    return record_of_phases(folder, solution).write(folder)
 
 
 def phases_record(folder: Path, problem: PhasedProblem, verdict: Passed, sentence: str) -> PlanRecord:
@@ -85,7 +85,8 @@ def _asked_of_all(problem: PhasedProblem) -> dict[str, Any]:
     return {"horizon_s": horizon, "counts_steps": problem.is_map}
 
 
-def _record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
+def record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
+    """The record of a solution in phases, but for the files; `folder` is where they are written."""
     given = None if solution.search is None else solution.search.guess
     options = json.loads(json.dumps(solution.options, default=str), parse_constant=str)
     asked = _asked_of_phases(solution.problem)

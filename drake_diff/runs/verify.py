@@ -1,14 +1,11 @@
 """`verify`: make a directory again and compare all of it. `recalled` takes a run up again."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
 
 from drake_diff._base.arrays import positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
@@ -17,18 +14,6 @@ from drake_diff._base.untrusted import MOST_READ, MOST_TEXT, files_in, read_plai
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, MissingDependencyError, ModelError
 from drake_diff.model.step import step
 from drake_diff.optimize.solution import Solution
-from drake_diff.runs.again import (
-    OF_RECOVERED,
-    SAME_PLAN,
-    SEARCH_TOPICS,
-    SEARCHED,
-    Again,
-    contract_as,
-    is_below,
-    made_again,
-    model_as,
-)
-from drake_diff.runs.certificates import certify_model
 from drake_diff.runs.differences import (
     Compared,
     Difference,
@@ -41,15 +26,25 @@ from drake_diff.runs.directory import is_partial
 from drake_diff.runs.fields import FileEvidence, canonical
 from drake_diff.runs.messages import claims_of
 from drake_diff.runs.other_records import ComparisonRecord, FitRecord, is_trial_file
-from drake_diff.runs.phases_again import PhasesAgain, inconsistencies, phases_again
 from drake_diff.runs.plan_record import PhasesSection, PlanRecord
 from drake_diff.runs.provenance import packages_here
 from drake_diff.runs.read import FILES as OLD_FILES
 from drake_diff.runs.read import load_plan_record, load_record, parse_record, record_path
-from drake_diff.runs.rerun import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve
+from drake_diff.runs.rebuild import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve
+from drake_diff.runs.reproduce import (
+    OF_RECOVERED,
+    SAME_PLAN,
+    SEARCH_TOPICS,
+    SEARCHED,
+    Reproduced,
+    is_below,
+    odd_metrics,
+    odd_trace,
+    reproduce,
+)
 from drake_diff.runs.save import FILES
-from drake_diff.runs.sealed import SCHEMA_VERSION, SealedRecord, own_sha256, read_fields, reproducible
-from drake_diff.runs.trace import CONFIGURATION, Trace, read_trace
+from drake_diff.runs.sealed import SCHEMA_VERSION, SealedRecord, own_sha256, read_fields
+from drake_diff.runs.trace import CONFIGURATION, read_trace
 
 MOST = 16  # lines of a kind that are printed
 WORDS = ("sentence", "message", "statement", "definition", "reason", "told")  # which versions choose
@@ -62,8 +57,6 @@ UNCHECKED = (
     "name and contract.source: what it was called, and where the model file was",
 )
 WAITED = 60.0  # [s] for a run to be made again, where nobody says else
-GIVEN = "problem, model and inputs.search: they are what was asked; a record that asks for less can be just as true"
-GIVEN_IN_PHASES = "in each phase's record problem and model, and here links and search: they are what was asked"
 WITHIN_PHASES = "the record does not say what solve was called with"  # of a phase: that of all says it
 OF_FUNCTIONS = (
     "all that rests on the functions: only the plan's first and last state and its bounds were compared with the "
@@ -75,13 +68,6 @@ NOT_RERUN = {
     "rollout": "a loss is a function, and was not asked again",
     "panel": "no trial was evaluated again: their function is not in the directory",
     "trial": "it was not evaluated again: its function is not in the directory",
-}
-# The modules of packages above this one whose function `reproduce` makes such a directory again, as far as it can be.
-REPRODUCED_BY = {
-    "fit": "drake_diff.identification.files",
-    "comparison": "drake_diff.identification.recorded_causes",
-    "panel": "drake_diff.panels.reproduce",
-    "trial": "drake_diff.panels.reproduce",
 }
 
 
@@ -306,13 +292,15 @@ def _of_a_part(folder: Path) -> Verification:
 
 
 def _run_again(found: Verification, record: SealedRecord, models: Path | None) -> Verification:
-    """The directory beside the same made again, where it can be."""
+    """The directory beside the same reproduced, where it can be."""
     try:
-        if isinstance(record, PlanRecord) and record.phases is not None:
-            return _phases_again(found, record, record.phases, models)
-        again = _made_again(found.directory, record, models)
-        if again is not None:
-            return _compared(found, record, again)
+        made = reproduce(found.directory, record, models)
+        if made is None:
+            return replace(found, unchecked=(f"every number: {NOT_RERUN[record.subject]}",))
+        compared = _compared(found, record, made)
+        if isinstance(record, PlanRecord) and record.phases is not None and not made.problems:
+            return _with_phases(compared, record.phases, models)
+        return compared
     except (ModelError, MissingDependencyError) as error:
         return _without_its_functions(found, record, error)
     except ArtifactError as error:
@@ -320,37 +308,27 @@ def _run_again(found: Verification, record: SealedRecord, models: Path | None) -
     except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
         # what a forger put together need not fit in any way
         return _judged(found, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
-    return replace(found, unchecked=(f"every number: {NOT_RERUN[record.subject]}",))
 
 
-def _made_again(folder: Path, record: SealedRecord, models: Path | None) -> Again | None:
-    """What of the directory comes out of its inputs again; None where nothing does."""
-    if record.subject in REPRODUCED_BY:
-        again: Again | None = import_module(REPRODUCED_BY[record.subject]).reproduce(folder, record, models)
-        return again
-    if isinstance(record, PlanRecord) and record.certification is not None:
-        return _certified_again(folder, record, models)
-    if isinstance(record, PlanRecord) and record.subject == "plan":
-        plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
-        with rebuilt(record.model, record.contract.get("source"), trace.attachments, models) as model:
-            again = made_again(record, model, plan)
-        problems = tuple(_odd_trace(folder, trace, plan, record))
-        return replace(again, problems=problems, unchecked=(GIVEN, *again.unchecked), written=FILES)
-    return None
-
-
-def _certified_again(folder: Path, record: PlanRecord, models: Path | None) -> Again:
-    """The same states from the same seed, each certified again."""
-    c = record.certification
-    if c is None:
-        raise ArtifactError(f"{record.FILE}: expected the record of a certification")
-    carried = record.model.file.path if record.model.file is not None else ""
-    attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
-    with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
-        made = certify_model(model, states=len(c.states), seed=c.seed, parameters=c.parameters, method=c.method)
-    given = {name: getattr(record, name) for name in ("name", "provenance", "wall_clock", "files", "record_sha256")}
-    changed = {"contract": contract_as(made.contract, record.contract), "model": model_as(made.model, record.model)}
-    return Again(made.model_copy(update={**given, **changed}).model_dump(mode="json"), {}, written=(carried,))
+def _with_phases(found: Verification, section: PhasesSection, models: Path | None) -> Verification:
+    """What was found of all phases, and of the directory of each."""
+    complaints, undecided, unchecked, rounded = (
+        [*found.complaints],
+        [*found.undecided],
+        [*found.unchecked],
+        [*found.rounded],
+    )
+    checked = found.checked
+    for name in (phase.directory for phase in section.phases):
+        own, problems = _read_checked(found.directory / name / PlanRecord.FILE)
+        phase = _run_again(Verification(found.directory / name, own), own, models)
+        complaints += [f"{name}: {line}" for line in (*problems, *phase.complaints)]
+        undecided += [f"{name}: {line}" for line in phase.undecided if WITHIN_PHASES not in line]
+        unchecked += [f"{name}: {line}" for line in phase.unchecked if line.startswith(OF_FUNCTIONS)]
+        rounded += [f"{name}: {line}" for line in phase.rounded]
+        checked += phase.checked
+    told = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
+    return _judged(told, complaints, undecided)
 
 
 def has_recordings(record: SealedRecord) -> bool:
@@ -368,8 +346,8 @@ def _without_its_functions(found: Verification, record: SealedRecord, error: Exc
         trace = read_trace(found.directory / TRACE)
         problems = [
             *_odd_schema(record),
-            *_odd_trace(found.directory, trace, plan, record),
-            *inconsistencies(record, plan),
+            *odd_trace(found.directory, trace, plan, record),
+            *odd_metrics(record, plan),
         ]
     except (ArtifactError, KeyError, LookupError, TypeError, ValueError) as wrong:
         problems = [f"its files do not go together: {type(wrong).__name__}: {wrong}"]
@@ -408,7 +386,7 @@ def _recalled(folder: Path, models: Path | None) -> Iterator[Solution]:
     _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
     plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
     with rebuilt(record.model, record.contract.get("source"), trace.attachments, models) as model:
-        _refuse(folder, (*_odd_trace(folder, trace, plan, record), *_odd_contract(record, model.contract.to_dict())))
+        _refuse(folder, (*odd_trace(folder, trace, plan, record), *_odd_contract(record, model.contract.to_dict())))
         yield resolve(record, model, plan)
 
 
@@ -460,7 +438,7 @@ def _damage_of_files(path_of_record: Path, record: SealedRecord) -> Iterator[str
                 yield f"{name}: its {size} bytes are not those that {lister} describes"
 
 
-def _compared(found: Verification, record: SealedRecord, again: Again) -> Verification:
+def _compared(found: Verification, record: SealedRecord, again: Reproduced) -> Verification:
     """Record and files of a directory beside the same made again."""
     converted = record.schema_version != SCHEMA_VERSION
     recorded, fields = record.model_dump(mode="json"), Compared(record.FILE)
@@ -485,7 +463,7 @@ def _compared(found: Verification, record: SealedRecord, again: Again) -> Verifi
     return _told_of_a_solve(found, again, [*_odd_schema(record), *again.problems], compared, unchecked)
 
 
-def _compared_file(path: Path, again: Again) -> Compared:
+def _compared_file(path: Path, again: Reproduced) -> Compared:
     compared, recorded = Compared(path.name), read_plain(path)
     if path.suffix == ".mcap":
         skip = SEARCH_TOPICS if again.unrepeated else ()
@@ -496,31 +474,6 @@ def _compared_file(path: Path, again: Again) -> Compared:
     else:
         compare_bytes(compared, recorded, again.files[path.name])
     return compared
-
-
-def _phases_again(found: Verification, record: PlanRecord, section: PhasesSection, models: Path | None) -> Verification:
-    """All phases, their links, and the chain of all; what no artifact holds is undecided."""
-
-    def of_phase(folder: Path) -> PhasesAgain:
-        own, problems = _read_checked(folder / PlanRecord.FILE)
-        one, again = _run_again(Verification(folder, own), own, models), PhasesAgain()
-        again.problems = [*problems, *one.complaints]
-        again.undecided = [line for line in one.undecided if WITHIN_PHASES not in line]
-        again.unchecked = [line for line in one.unchecked if line.startswith(OF_FUNCTIONS)]
-        again.rounded, again.checked = list(one.rounded), one.checked
-        return again
-
-    again = phases_again(found.directory, record, models, of_phase)
-    unchecked = (*UNCHECKED, GIVEN_IN_PHASES, *again.unchecked, *_other_directories(record, section))
-    told = replace(found, unchecked=unchecked, rounded=tuple(again.rounded), checked=again.checked)
-    return _judged(told, [*_odd_schema(record), *again.problems], again.undecided)
-
-
-def _other_directories(record: PlanRecord, section: PhasesSection) -> Iterator[str]:
-    """Files that were in the directory and are none that drake_diff writes there."""
-    written = (*FILES, PlanRecord.FILE, PlanRecord.SCHEMA_FILE)
-    known = {f"{phase.directory}/{name}" for phase in section.phases for name in written}
-    yield from _others(record, tuple(known))
 
 
 def _others(record: SealedRecord, known: Sequence[str]) -> Iterator[str]:
@@ -539,7 +492,7 @@ def _odd_schema(record: SealedRecord) -> Iterator[str]:
 
 
 def _told_of_a_solve(
-    found: Verification, again: Again, problems: list[str], compared: Sequence[Compared], unchecked: list[str]
+    found: Verification, again: Reproduced, problems: list[str], compared: Sequence[Compared], unchecked: list[str]
 ) -> Verification:
     """The verdict on what differs, by what it rests on."""
     undecided = [*again.undecided, *(f"the search was not run again: {why}" for why in again.unrepeated)]
@@ -582,16 +535,6 @@ def _judged(found: Verification, problems: Sequence[str], undecided: Sequence[st
         why = f"{'; '.join(found.notes)}: that may be why {len(problems)} things differ"
         return replace(found, undecided=(*undecided, why, *problems))
     return replace(found, complaints=tuple(problems), undecided=tuple(undecided))
-
-
-def _odd_trace(folder: Path, trace: Trace, plan: Mapping[str, Any], record: PlanRecord) -> Iterator[str]:
-    """What in the trace is not what record.json and plan.npz have."""
-    if trace.attachments.get(record.FILE) != reproducible(read_fields(folder / record.FILE)).encode():
-        yield f"{TRACE}: the record that it carries is not {record.FILE}"
-    inputs = np.vstack([plan["us"], plan["u_final"]]) if "u_final" in plan else plan["us"]
-    for topic, recorded, planned in (("state", trace.planned_xs, plan["xs"]), ("input", trace.planned_us, inputs)):
-        if not np.array_equal(recorded, planned, equal_nan=True):
-            yield f"{TRACE}: /planned/{topic} is not what {PLAN} has"
 
 
 def _odd_contract(record: PlanRecord, again: dict[str, Any]) -> Iterator[str]:

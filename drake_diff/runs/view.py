@@ -16,7 +16,7 @@ from drake_diff.optimize.solution import Solution
 from drake_diff.pages.meshcat import draw
 from drake_diff.pages.scene import BLUE, Force, Scene, scene_of
 from drake_diff.runs.read import load_plan_record
-from drake_diff.runs.rerun import TRACE
+from drake_diff.runs.rebuild import TRACE
 from drake_diff.runs.save import REPLAY
 from drake_diff.runs.verify import recalled
 
