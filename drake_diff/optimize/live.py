@@ -11,8 +11,8 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import DrakeDiffError, InputError
 from drake_diff.model.parameters import applied
 from drake_diff.motion.rollout import STEPS, Rollout
+from drake_diff.optimize.goal_markers import colours_of, drawn_goals, meaning_of
 from drake_diff.optimize.iterate import Iterate
-from drake_diff.optimize.marks import colours_of, drawn_goals, meaning_of
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Report

@@ -6,6 +6,7 @@ from typing import Any
 # {name} and {time} are the two parts of a check's `where` that " at " joins.
 CLAUSES = {
     "bound": "{name} is {value} beyond its bound at {time}, tolerance {tolerance}",
+    "chain": "through all phases, {where}, {value} of its range, tolerance {tolerance}",
     "clearance": "{name} come {value} nearer than their margin at {time}, tolerance {tolerance}",
     "constraint": "{name} is broken by {value} at {time}, tolerance {tolerance}",
     "cost": "the cost is not finite",
@@ -16,7 +17,10 @@ CLAUSES = {
     "energy": "{value} of energy are {where}, tolerance {tolerance}",
     "following": "{name} is {value} from the plan at {time}, tolerance {tolerance}",
     "goal": "{where} ends {value} from its goal, tolerance {tolerance}",
+    "horizon": "{where} take {value} beyond the horizon, tolerance {tolerance}",
+    "impact": "{where}",
     "integration": "an accurate integration from {time} misses the next in {name} by {value}, tolerance {tolerance}",
+    "link": "{name} is missed by {value} in {time}, tolerance {tolerance}",
     "model": "another plant: {where}",
     "motion": "{where}",
     "overlap": "geometries overlap by {value} at {time}, and collocation leaves contact out",

@@ -21,12 +21,15 @@ from drake_diff._base.signals import noted_interrupts
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.optimize.certified import certify_equations
+from drake_diff.optimize.checks import Check, Checks, check
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
-from drake_diff.optimize.measure import INTEGRATION_TOLERANCE
+from drake_diff.optimize.measure import INTEGRATION_TOLERANCE, derivative_check
+from drake_diff.optimize.messages import under
 from drake_diff.optimize.problem.held import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report, heard
+from drake_diff.optimize.replay import FEEDBACK, OPEN_LOOP
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
@@ -134,40 +137,44 @@ class PhasedSolution(PicklesItsFields, ShowsItsRepr):
         return max((float(np.max(errors)) for errors in self.link_errors.values()), default=0.0)
 
     @cached_property
-    def chain(self) -> "Chain":
-        """Where the dynamics lead from the first state of all through all phases, open loop or under TVLQR."""
-        return _chained(self)
+    def chain(self) -> Check:
+        """Where the dynamics lead from the first state of all through all phases: open loop, and else under TVLQR.
+
+        The value is the largest distance from the plan or beyond a bound, as a part of the state's range in its phase.
+        """
+        return _chain_check(self)
+
+    @cached_property
+    def link_checks(self) -> Checks:
+        """What is checked of resets, their derivatives and the sum of all durations."""
+        return Checks(_link_checks(self))
+
+    @property
+    def checks(self) -> Checks:
+        """Everything that was checked, the worst first: of each phase, the links and the chain."""
+        named = zip(self.problem.names, self.phases, strict=True)
+        rows = [replace(c, where=f"{name}: {c.where}") for name, phase in named for c in phase.checks]
+        return Checks([*rows, *self.link_checks, self.chain])
 
 
-@dataclass(frozen=True)
-class Chain:
-    """Whether the chain of all phases follows the plan, under which control, and in words how far it is from it."""
-
-    holds: bool
-    control: str
-    told: str
-    worst: float  # the largest distance from the plan or beyond a bound, as a part of the state's range in its phase
-
-
-def _chained(solution: PhasedSolution) -> Chain:
+def _chain_check(solution: PhasedSolution) -> Check:
     motions = [phase.transcribed for phase in solution.phases]
-    tried = []
-    for control in ("open loop", "TVLQR"):
-        if any(motion is None for motion in motions):
-            return Chain(False, control, "a phase has entries that are no numbers", float("inf"))
-        worst, where = _led_through(solution, [m for m in motions if m is not None], control)
-        how = control if control == "open loop" else f"under {control}"
-        told = f"{how} through all phases, {where}, {worst:.1%} of its range, of {INTEGRATION_TOLERANCE:.0%} allowed"
-        tried.append(Chain(worst <= INTEGRATION_TOLERANCE, control, told, worst))
-        if tried[-1].holds:
-            return tried[-1]
-    return min(tried, key=lambda chain: chain.worst)
+    if any(motion is None for motion in motions):
+        return check("chain", "a phase has entries that are no numbers", np.inf, INTEGRATION_TOLERANCE)
+    rows = list[Check]()
+    for feedback in (None, FEEDBACK):
+        worst, where = _led_through(solution, [m for m in motions if m is not None], feedback or OPEN_LOOP)
+        row = check("chain", where, worst, INTEGRATION_TOLERANCE)
+        rows.append(replace(row, plant="continuous time", feedback=feedback))
+        if rows[-1].passes:
+            return rows[-1]
+    return min(rows, key=lambda row: row.value)
 
 
 def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], control: str) -> tuple[float, str]:
     """The largest distance from the plan, or beyond a bound, as a part of the state's range, and where it is."""
     problem = solution.problem
-    gains = [None] * len(motions) if control == "open loop" else _gains(problem, motions)
+    gains = [None] * len(motions) if control == OPEN_LOOP else _gains(problem, motions)
     x, worst, where = np.asarray(motions[0].xs[0]), -1.0, ""
     for i, (name, motion) in enumerate(zip(problem.names, motions, strict=True)):
         b, ranges, names = motion.task.bounds, motion.task.problem.ranges(motion.xs), motion.task.dynamics.state_names
@@ -493,7 +500,7 @@ class _PhasedRun:
         coarse = [motion.largest_error > until for motion in motions]
         if not self.asked["refine"]:
             of_phases = [may_be_too_coarse(phase) for phase in solution.phases]
-            drifts = solution.status is not Status.CONVERGED and not any(of_phases) and not solution.chain.holds
+            drifts = solution.status is not Status.CONVERGED and not any(of_phases) and not solution.chain.passes
             exceeded = [bool(violation_between_nodes(motion).intervals) for motion in motions]
             every = zip(of_phases, coarse, exceeded, strict=True)
             coarse = [(wanted or drifts) and (far or beyond) for wanted, far, beyond in every]
@@ -587,7 +594,7 @@ def _arrays(motion: Transcribed) -> dict[str, Any]:
 
 def judged_phases(draft: PhasedSolution, result: NlpResult) -> PhasedSolution:
     """The draft, whose phases are judged, with the status that they, the links and the chain allow."""
-    statuses, complaints = [phase.status for phase in draft.phases], list(_broken_links(draft))
+    statuses, complaints = [phase.status for phase in draft.phases], [str(c) for c in draft.link_checks.failing]
     details = [
         f"{name}: {phase.message.removeprefix(phase.status.sentence).removeprefix(': ')}"
         for name, phase in zip(draft.problem.names, draft.phases, strict=True)
@@ -598,34 +605,27 @@ def judged_phases(draft: PhasedSolution, result: NlpResult) -> PhasedSolution:
         failed = status_of(result.outcome)
     if failed is not None:
         return _ended(draft, failed, [*complaints, *details] or [result.message])
-    if not complaints and not details:
-        (complaints if not draft.chain.holds else details).append(
-            f"{'mapped step by step' if draft.problem.is_map else 'integrated accurately'} {draft.chain.told}"
-        )
-        if not complaints:
-            return _ended(draft, Status.CONVERGED, details)
-    return _ended(draft, Status.CONVERGED_NOT_VERIFIED, [*complaints, *details])
+    if complaints or details:
+        return _ended(draft, Status.CONVERGED_NOT_VERIFIED, [*complaints, *details])
+    status = Status.CONVERGED if draft.chain.passes else Status.CONVERGED_NOT_VERIFIED
+    return _ended(draft, status, [f"integrated {under(draft.chain.feedback or OPEN_LOOP)} {draft.chain}"])
 
 
-def _broken_links(draft: PhasedSolution) -> Iterator[str]:
-    """Resets that the plan does not keep, a sum of durations that is none, derivatives that do not agree."""
+def _link_checks(draft: PhasedSolution) -> Iterator[Check]:
+    """Resets that the plan keeps, derivatives that agree, and a sum of durations."""
     for s in draft.problem.switches:
         errors = draft.link_errors[s.label]
         i = int(np.argmax(errors))
-        if not errors[i] <= FEASIBILITY_TOLERANCE:
-            yield f"{s.label} is missed by {errors[i]:.3g} in {s.rows[i]}, above {FEASIBILITY_TOLERANCE:g}"
+        yield check("link", f"{s.label} at {s.rows[i]}", errors[i], FEASIBILITY_TOLERANCE)
         impact = _impact_of(s)
         if impact is not None:
             for rule in impact.broken_rules(draft.phases[s.before].xs[-1]):
-                yield f"{s.label}: {rule}"
+                yield check("impact", f"{s.label}: {rule}", np.inf, 0.0)
     if draft.problem.horizon is not None:
         lower, upper = draft.problem.horizon
-        beyond = max(lower - draft.horizon, draft.horizon - upper)
-        if not beyond <= FEASIBILITY_TOLERANCE:
-            yield f"all phases take {draft.horizon:.6g} s, {beyond:.3g} s beyond the horizon [{lower:g}, {upper:g}]"
-    for certificate in draft.link_certificates:
-        if certificate.verdict != "agree":
-            yield f"the certificate of {certificate.subject} says {certificate.verdict}: {certificate.worst}"
+        beyond = max(lower - draft.horizon, draft.horizon - upper, 0.0)
+        yield check("horizon", "all phases", beyond, FEASIBILITY_TOLERANCE, "s")
+    yield from (derivative_check(certificate) for certificate in draft.link_certificates)
 
 
 def _ended(draft: PhasedSolution, status: Status, details: Sequence[str]) -> PhasedSolution:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.optimize.goal_markers import Colour, colours_of, meaning_of
 from drake_diff.optimize.live import differ, scene_of_plan
-from drake_diff.optimize.marks import Colour, colours_of, meaning_of
 from drake_diff.optimize.solution import Status
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay

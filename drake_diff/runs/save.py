@@ -17,7 +17,9 @@ import numpy as np
 from drake_diff._base.files import make_folder, remove_folder
 from drake_diff._base.signals import held_interrupts
 from drake_diff.exceptions import ArtifactError, InputError, WriteError
-from drake_diff.optimize.phased import Chain, PhasedSolution
+from drake_diff.optimize.checks import Check
+from drake_diff.optimize.messages import under
+from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.held import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
@@ -147,9 +149,12 @@ def _reset(switch: Switch, problem: PhasedProblem) -> dict[str, Any] | None:
     return {"impact": switch.reset.to_dict()} if isinstance(switch.reset, Impact) else None
 
 
-def chain_evidence(chain: Chain) -> ChainEvidence:
+def chain_evidence(chain: Check) -> ChainEvidence:
     """The chain of all phases as it stands in a record."""
-    return ChainEvidence(holds=chain.holds, control=chain.control, told=chain.told, worst=finite(chain.worst))
+    control = chain.feedback or "open loop"
+    return ChainEvidence(
+        holds=chain.passes, control=control, told=f"{under(control)} {chain}", worst=finite(chain.value)
+    )
 
 
 REPLAY, REPORT = "replay.html", "report.html"

@@ -10,8 +10,8 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from drake_diff.exceptions import ArtifactError, ModelError
 from drake_diff.logs.mcap_file import McapLog, read_mcap
 from drake_diff.model.parameters import applied
+from drake_diff.optimize.goal_markers import drawn_goals
 from drake_diff.optimize.live import differ
-from drake_diff.optimize.marks import drawn_goals
 from drake_diff.optimize.solution import Solution
 from drake_diff.pages.meshcat import draw
 from drake_diff.pages.scene import BLUE, Force, Scene, scene_of

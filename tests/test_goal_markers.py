@@ -7,7 +7,7 @@ from pydrake.geometry import Box, Sphere
 
 import drake_diff as dd
 from drake_diff.exceptions import UnknownNameError
-from drake_diff.optimize.marks import drawn_goals, meaning_of
+from drake_diff.optimize.goal_markers import drawn_goals, meaning_of
 from drake_diff.pages.scene import scene_of
 from drake_diff.runs.view import scene_of_run
 
