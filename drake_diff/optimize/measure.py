@@ -15,7 +15,7 @@ from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.names import units_of
 from drake_diff.optimize.problem.obstacles import along_steps, clearances
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
-from drake_diff.optimize.transcription.between import passed_between_steps, violation_between_nodes
+from drake_diff.optimize.transcription.between import passed_between_steps
 from drake_diff.optimize.transcription.collocation import SUBSTEPS, Collocated
 
 # Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
@@ -70,7 +70,7 @@ def _interval_checks(s: Any, motion: Collocated) -> Iterator[Check]:
     knot, i = np.unravel_index(int(np.argmax(motion.gaps / tolerance)), motion.gaps.shape)
     where = f"{s.problem.state_names[i]} at knot {knot}"
     yield check("integration", where, motion.gaps[knot, i], tolerance[i], units_of(s.problem)[i])
-    yield from violation_between_nodes(motion).checks
+    yield from s.between_nodes.checks
 
 
 def _overlap_check(s: Any, motion: Collocated) -> Check:

@@ -28,6 +28,7 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.replay import OPEN_LOOP, Plan, Replay, held, judged_replay, replays
 from drake_diff.optimize.shooting import ShootingVariables
+from drake_diff.optimize.transcription.between import Excess, violation_between_nodes
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
 # Fields that no measure depends on.
@@ -364,6 +365,11 @@ class Solution(PicklesItsFields, ShowsItsRepr):
     def constraint_violation(self) -> float:
         """The largest excess over a bound of a constraint, or distance from a waypoint, in its own unit."""
         return max((excess for excess, _ in self.constraint_excess.values()), default=0.0)
+
+    @cached_property
+    def between_nodes(self) -> Excess | None:
+        """How far a collocated motion leaves bounds and constraints between its nodes; None of a discrete method."""
+        return None if self.transcribed is None else violation_between_nodes(self.transcribed)
 
     @cached_property
     def plan_checks(self) -> Checks:

@@ -25,7 +25,6 @@ from drake_diff.optimize.problem.names import units_of
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
 from drake_diff.optimize.solution import Solution, Status
-from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.runs.fields import Event, Failure, Label, Metric, ReplayEvidence
 
 AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
@@ -204,11 +203,11 @@ def _metrics_of_the_plan(s: Solution, states: Sequence[Column], inputs: Sequence
     excess = "largest excess over a bound of a constraint, or distance from a waypoint"
     yield measured("constraint violation", excess, s.constraint_violation, "the constraint's", tolerance)
     yield measured("horizon", "time from the first state to the last", s.horizon, "s")
-    if s.transcribed is None:
+    between = s.between_nodes
+    if between is None:
         return
     definition = "largest distance of a knot from an accurate integration from the knot before"
     yield measured("integration error", definition, s.integration_error, x, INTEGRATION_TOLERANCE)
-    between = violation_between_nodes(s.transcribed)
     excesses = ("state", between.state, x), ("input", between.input, _unit(inputs))
     for name, value, unit in (*excesses, ("constraint", between.constraint, "the constraint's")):
         definition = f"largest excess of the {name} over its bounds between the nodes, as the dynamics move there"
