@@ -91,7 +91,7 @@ def derivative_check(c: Certificate) -> Check:
     if not c.codes.size:  # a derivative by nothing has no entry
         return check("derivative", f"{c.subject}: {c.verdict}", 0.0, 0.0, verdict=_verdict(c.verdict))
     e = c.worst
-    where = f"d {e.row} / d {e.column} of {c.subject}: {c.verdict}{f' ({e.reason})' if e.reason else ''}"
+    where = f"d {e.row} / d {e.column}: {c.verdict}{f' ({e.reason})' if e.reason else ''}"
     return check("derivative", where, abs(e.derivative - e.difference), e.tolerance, verdict=_verdict(c.verdict))
 
 

@@ -625,7 +625,9 @@ def _link_checks(draft: PhasedSolution) -> Iterator[Check]:
         lower, upper = draft.problem.horizon
         beyond = max(lower - draft.horizon, draft.horizon - upper, 0.0)
         yield check("horizon", "all phases", beyond, FEASIBILITY_TOLERANCE, "s")
-    yield from (derivative_check(certificate) for certificate in draft.link_certificates)
+    for certificate in draft.link_certificates:
+        row = derivative_check(certificate)
+        yield replace(row, where=f"{certificate.subject}: {row.where}")
 
 
 def _ended(draft: PhasedSolution, status: Status, details: Sequence[str]) -> PhasedSolution:

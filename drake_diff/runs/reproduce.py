@@ -395,7 +395,7 @@ def _solved_in_phases(
             problem, Status(record.solver.status if record.solver else ""), record.sentence, phases
         )
         return recorded, 0.0, ("it began from a guess that the directory does not have",)
-    left_out = ("time_limit", "solver", "continuation")
+    left_out = ("time_limit", "solver", "segments", "continuation")  # segments: of records before 3
     arguments: dict[str, Any] = {name: value for name, value in section.search.items() if name not in left_out}
     solved = solve(problem, **arguments)
     apart = max(_distance(one, other) for one, other in zip(solved.phases, phases, strict=True))
