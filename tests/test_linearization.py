@@ -22,7 +22,7 @@ from drake_diff.derivatives.joint_impulses import NEAR_RIGID
 from drake_diff.derivatives.refine_step import refine_step
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
-from drake_diff.mechanics.tree import OwnDynamics
+from drake_diff.mechanics.numpy_tree import OwnDynamics
 from drake_diff.model.parameters import applied, select
 
 NAMES = sorted(path.name for path in MODELS.iterdir())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,43 +85,31 @@ def _certified(
 ) -> Certificate:
     """`certify`; `look_beside` the point too, at the derivative 1e-9 away by `method`."""
     with applied(vector) as model:
-        space = tangent_space(model)
-        point = np.concatenate([x, u, vector.values])
-        scale = np.concatenate([state_scale(space, x), np.maximum(1.0, np.abs(u)), vector.difference_scale()])
-
-        step = StepAround(model, vector, space, point, scale)
-
-        def on_tangent(point: Array, d: StepDerivatives) -> Array:
-            return space.jacobian(point[: model.nx], d.x_next, d.A, d.B, d.C) * scale
-
+        step, nx = StepAround.of_point(model, vector, tangent_space(model), x, u), model.nx
         d, beside = derivatives or step_jacobians(model, vector, x, u, method), None
         if look_beside and not vector.parameters:
-            jittered = move(space, model.nx, point, jitter(scale))
-            d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
-            beside = on_tangent(jittered, d_beside)
-        derivative = on_tangent(point, d)
+            jittered = step.moved(jitter(np.ones_like(step.scale)))
+            beside = step.jacobian(step_jacobians(model, vector, jittered[:nx], jittered[nx:], method), jittered[:nx])
+        derivative = step.jacobian(d, x)
         around, note, left = step.look_around()
-        if "finite_difference" in (d.method, *d.sources):
-            note = "; ".join(text for text in (note, SHARED) if text)
         certificate = certificate_of(
             around,
             derivative,
             beside,
-            scale=scale,
-            rows=space.names,
-            columns=space.names + model.input_names + vector.names,
-            method=" + ".join(dict.fromkeys((d.method, *d.sources))),
-            subject=f"the step of {model.name}",
-            told=note,
             stopped=left,
-            second=in_steps(model, space, len(scale)),
+            second=in_steps(model, step.space, len(step.scale)),
+            **step.labels(d, note),
         )
         limits = _at_limits(model, x) if certificate.verdict != "agree" else ""
-        if limits:
-            certificate = replace(certificate, told="; ".join(text for text in (certificate.told, limits) if text))
+        certificate = replace(certificate, told=_joined(certificate.told, limits))
         if not model.contract.contact.collision_pairs:
             return certificate
-        return replace(certificate, mode_changes=_find_mode_changes(model, space, step.drake, derivative, scale))
+        return replace(certificate, mode_changes=_find_mode_changes(step, derivative))
+
+
+def _joined(*texts: str) -> str:
+    """Those that are not empty, as one."""
+    return "; ".join(text for text in texts if text)
 
 
 def _at_limits(model: Model, x: Array) -> str:
@@ -149,7 +137,7 @@ def certify_inside(
     moved = inside != u
     if not moved.any():
         return certificate
-    note = "; ".join(text for text in (certificate.told, beside_limits(model, moved)) if text)
+    note = _joined(certificate.told, beside_limits(model, moved))
     leap = leap_at_limits(model, x, u, np.sign(inside - u), parameters)
     if np.any(np.abs(leap) > LEAP * certificate.size):
         note += f", at which the derivative is another one, by up to {np.max(np.abs(leap)):.3g}"
@@ -193,6 +181,27 @@ class StepAround:
     space: TangentSpace
     point: Array
     scale: Array
+
+    @classmethod
+    def of_point(cls, model: Model, vector: ParameterVector, space: TangentSpace, x: Array, u: Array) -> StepAround:
+        """Around the step from x (nx,) under u (nu,), `vector` being applied."""
+        scale = np.concatenate([state_scale(space, x), np.maximum(1.0, np.abs(u)), vector.difference_scale()])
+        return cls(model, vector, space, np.concatenate([x, u, vector.values]), scale)
+
+    def jacobian(self, d: StepDerivatives, x: Array) -> Array:
+        """(size, n) of derivatives at x (nx,), by scaled displacements."""
+        return self.space.jacobian(x, d.x_next, d.A, d.B, d.C) * self.scale
+
+    def labels(self, d: StepDerivatives, note: str) -> dict[str, Any]:
+        """What a certificate of `d` is called, and what it rests on."""
+        return {
+            "scale": self.scale,
+            "rows": self.space.names,
+            "columns": self.space.names + self.model.input_names + self.vector.names,
+            "method": " + ".join(dict.fromkeys((d.method, *d.sources))),
+            "subject": f"the step of {self.model.name}",
+            "told": _joined(note, SHARED if "finite_difference" in (d.method, *d.sources) else ""),
+        }
 
     def moved(self, displacement: Array) -> Array:
         """(nx + nu + np,) the point at a displacement (n,)."""
@@ -245,28 +254,24 @@ def differences_of_drake(why: str) -> str:
     return f"differences of Drake's own steps, which end at {SAP_RELATIVE_TOLERANCE:g} of the momentum: {why}"
 
 
-def _find_mode_changes(
-    model: Model, space: TangentSpace, f: Callable[[Array], Array], derivative: Array, scale: Array
-) -> tuple[ModeChange, ...]:
-    """Displace each state and input by 1e-4 of its scale to both sides and compare the modes of the step `f`.
-
-    `f` takes a scaled displacement (n,) and leaves the double twin at the step; `derivative` (m, n) is by it.
-    """
+def _find_mode_changes(step: StepAround, derivative: Array) -> tuple[ModeChange, ...]:
+    """Displace each state and input by 1e-4 of its scale to both sides and compare the modes of Drake's step."""
+    model, space, f = step.model, step.space, step.drake
     directions = np.eye(derivative.shape[1])
     centre, changes = f(np.zeros(len(directions))), []
     here = active_modes(model)
     for j, column in enumerate(space.names + model.input_names):
         for reach in (NEIGHBOURHOOD, -NEIGHBOURHOOD):
-            step = reach * directions[j]
-            change = space.minus(f(step), centre)
+            move_by = reach * directions[j]
+            change = space.minus(f(move_by), centre)
             there = active_modes(model)
-            predicted = derivative @ step
+            predicted = derivative @ move_by
             size = np.maximum(np.abs(predicted), np.abs(change))
             missed = np.abs(change - predicted) > TOUCHED * np.maximum(size, 1e-6 * size.max(initial=0.0))
             touched = tuple(name for name, miss in zip(space.names, missed, strict=True) if miss)
             for pair in sorted(pair for pair in here.keys() | there.keys() if here.get(pair) != there.get(pair)):
                 before, after = here.get(pair, SEPARATED), there.get(pair, SEPARATED)
-                changes.append(ModeChange(pair, before, after, column, float(reach * scale[j]), touched))
+                changes.append(ModeChange(pair, before, after, column, float(reach * step.scale[j]), touched))
     return tuple(changes)
 
 
@@ -352,18 +357,8 @@ class StepLook:
         """That the derivative is the step's; None where that is in doubt."""
         if self.look is None or self.doubt:
             return None
-        d, model, names = self.derivatives, self.step.model, self.step.space.names
         solved = differences_of_solved(self.left) if self.left >= 0 else ""
-        shared = SHARED if "finite_difference" in (d.method, *d.sources) else ""
-        return certificate_by(
-            self.look,
-            scale=self.step.scale,
-            rows=names,
-            columns=names + model.input_names + self.step.vector.names,
-            told="; ".join(text for text in (solved, shared) if text),
-            method=" + ".join(dict.fromkeys((d.method, *d.sources))),
-            subject=f"the step of {model.name}",
-        )
+        return certificate_by(self.look, **self.step.labels(self.derivatives, solved))
 
 
 def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> list[StepLook]:
@@ -372,12 +367,11 @@ def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> l
     with applied(vector) as model:
         space = tangent_space(model)
         derivatives = derivatives_along(model, xs[0], us, vector=vector, xs=xs)
-        steps, plans = [], []
-        for x, u, d in zip(xs, us, derivatives, strict=True):
-            scale = np.concatenate([state_scale(space, x), np.maximum(1.0, np.abs(u)), vector.difference_scale()])
-            steps.append(StepAround(model, vector, space, np.concatenate([x, u, vector.values]), scale))
-            derivative = space.jacobian(x, d.x_next, d.A, d.B, d.C) * scale
-            plans.append(LookAt(derivative, in_steps(model, space, len(scale))))
+        steps = [StepAround.of_point(model, vector, space, x, u) for x, u in zip(xs, us, strict=True)]
+        plans = [
+            LookAt(step.jacobian(d, x), in_steps(model, space, len(step.scale)))
+            for step, d, x in zip(steps, derivatives, xs, strict=True)
+        ]
         every = zip(steps, derivatives, looks(steps, plans), strict=True)
         return [StepLook(step, d, *looked) for step, d, looked in every]
 

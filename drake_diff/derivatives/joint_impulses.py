@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import CollisionFilterDeclaration, GeometrySet
 from pydrake.multibody.tree import MultibodyForces
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.refusal import Refusal
 from drake_diff.model.mimic import joints_of_mimics
 from drake_diff.model.model import Model
@@ -193,7 +193,8 @@ def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
         probes = [_probe(model, context, random) for _ in range(PROBES)]
     except RuntimeError as error:
         return Refusal(f"a constraint acts, which could not be read: {error}")
-    position, velocity = _single(model)
+    positions, _, single = single_joints(model)
+    position, velocity = positions[single], np.flatnonzero(single)
     impulse = probes[0][2]
     coupled = np.flatnonzero(np.abs(impulse) > SAME * np.abs(impulse).max())
     if len(coupled) != 2 or not np.isin(coupled, velocity).all():
@@ -223,7 +224,8 @@ def _probe(model: Model, context: Any, random: np.random.Generator) -> tuple[Arr
         np.clip(side, -1.0, 1.0) for side in (plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
     )
     q = np.array(plant.GetPositions(context))
-    position, _ = _single(model)
+    positions, _, single = single_joints(model)
+    position = positions[single]
     q[position] = (lower + random.uniform(0.3, 0.7, len(q)) * (upper - lower))[position]
     plant.SetPositions(context, q)
     plant.SetVelocities(context, np.zeros(model.nv))
@@ -236,8 +238,20 @@ def _probe(model: Model, context: Any, random: np.random.Generator) -> tuple[Arr
     return q, v_next, A @ v_next, A
 
 
-def _single(model: Model) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The indices in q and in v of the joints with one of each."""
-    single_joints = [j for j in joints(model.plant) if j.num_positions() == j.num_velocities() == 1]
-    positions, velocities = [j.position_start() for j in single_joints], [j.velocity_start() for j in single_joints]
-    return np.array(positions, dtype=np.intp), np.array(velocities, dtype=np.intp)
+def single_joints(model: Model) -> tuple[Indices, Array, NDArray[np.bool_]]:
+    """Of each degree of freedom its index in q (nv,), its limits (2, nv), and whether (nv,) it is a joint of its own.
+
+    Of others, as of free bodies, the first are 0 and infinite.
+    """
+
+    def read() -> tuple[Indices, Array, NDArray[np.bool_]]:
+        positions, limits = np.zeros(model.nv, dtype=np.intp), np.array([[-np.inf], [np.inf]]) * np.ones(model.nv)
+        single = np.zeros(model.nv, dtype=bool)
+        for joint in joints(model.plant):
+            if joint.num_positions() == joint.num_velocities() == 1:
+                i = joint.velocity_start()
+                positions[i], single[i] = joint.position_start(), True
+                limits[:, i] = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        return positions, limits, single
+
+    return model.cache("single joints", read, of_structure=True)

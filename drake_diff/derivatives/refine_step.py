@@ -39,6 +39,7 @@ from drake_diff.derivatives.joint_impulses import (
     couplers_of,
     gather,
     limit_impulses,
+    single_joints,
 )
 from drake_diff.model.contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.model.model import Model
@@ -464,7 +465,7 @@ def _problems(
     v, weights = xs[:, nq:], A[:, diagonal, diagonal]
     momentum = (A @ v[..., None])[..., 0] + h * force
     free = np.linalg.solve(A, momentum[..., None])[..., 0]
-    positions, limits = _single(model)
+    positions, limits, _ = single_joints(model)
     q = xs[:, positions]
     parts = limit_impulses(limits, q, v, free, weights, h)
     if controlled.any():
@@ -477,24 +478,6 @@ def _problems(
     return ConvexSteps(
         A, momentum, _contact_impulses(model, read, v, weights), gather(parts, model.nv), _same_tree(model)
     )
-
-
-def _single(model: Model) -> tuple[NDArray[np.intp], Array]:
-    """The index in q (nv,) of each degree of freedom that is a joint of its own, and its limits (2, nv).
-
-    Of others, as of free bodies, these are 0 and infinite.
-    """
-
-    def read() -> tuple[NDArray[np.intp], Array]:
-        positions, limits = np.zeros(model.nv, dtype=np.intp), np.array([[-np.inf], [np.inf]]) * np.ones(model.nv)
-        for joint in joints(model.plant):
-            if joint.num_positions() == joint.num_velocities() == 1:
-                i = joint.velocity_start()
-                positions[i] = joint.position_start()
-                limits[:, i] = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-        return positions, limits
-
-    return model.cache("single joints", read, of_structure=True)
 
 
 def _same_tree(model: Model) -> NDArray[np.bool_]:
