@@ -304,11 +304,15 @@ def compare_runs(
     raise typer.Exit(0 if found.comparable else 1)
 
 
-def schema() -> None:
-    """Print the JSON Schema of record.json."""
-    from drake_diff.runs.plan_record import PlanRecord
+def schema(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="plan, fit or comparison.")] = "plan",
+) -> None:
+    """Print the JSON Schema of record.json, of one kind of record."""
+    from drake_diff.runs.read import KINDS
 
-    sys.stdout.write(PlanRecord.published_schema().decode())
+    if kind not in KINDS:
+        raise UnknownNameError("KIND", got=kind, known=KINDS)
+    sys.stdout.write(KINDS[kind].published_schema().decode())
 
 
 def view(run: RunDirectory, models: ModelFolder = None) -> None:

@@ -104,11 +104,11 @@ def _build() -> dict[str, MessageType]:
             message.field.add(name=field, number=number, type=code, label=label)
     pool = DescriptorPool()
     pool.Add(file)
-    found = {}
+    result = {}
     for name, fields in MESSAGES.items():
         units = {field: unit for field, (_, unit) in fields.items() if unit}
-        found[name] = MessageType(GetMessageClass(pool.FindMessageTypeByName(f"drake_diff.{name}")), units)
-    return found
+        result[name] = MessageType(GetMessageClass(pool.FindMessageTypeByName(f"drake_diff.{name}")), units)
+    return result
 
 
 TYPES = _build()
@@ -165,8 +165,8 @@ def motion_channels(shown: Shown) -> Iterator[Channel]:
     ghost = not np.array_equal(shown.xs, shown.planned_xs)
     frames = {"": shown.xs, **({GHOST: shown.planned_xs} if ghost else {})}
     count = max(len(shown.xs), len(shown.planned_xs))
-    told = {"ghost": GHOST if ghost else "the motion is the plan"}
-    yield transform_channel(shown.model, shown.times(count), frames, told)
+    content = {"ghost": GHOST if ghost else "the motion is the plan"}
+    yield transform_channel(shown.model, shown.times(count), frames, content)
     yield _diagnostics(shown)
     yield _contacts(shown)
     yield _contact_scene(shown)
@@ -201,8 +201,8 @@ def input_channel(topic: str, times: Array, us: Array, inputs: Sequence[Coordina
 
 
 def _told(parts: Mapping[str, Sequence[Coordinate]]) -> dict[str, Any]:
-    units = {part: {c.name: c.unit for c in coordinates} for part, coordinates in parts.items()}
-    names = {part: [c.name for c in coordinates] for part, coordinates in parts.items()}
+    units = {piece: {c.name: c.unit for c in coordinates} for piece, coordinates in parts.items()}
+    names = {piece: [c.name for c in coordinates] for piece, coordinates in parts.items()}
     return {"units": {"time": "s", **units}, "names": names}
 
 
@@ -301,13 +301,13 @@ def _contacts(shown: Shown) -> Channel:
     kind = TYPES["Contacts"]
 
     def columns(contacts: tuple[ContactPoint, ...]) -> dict[str, list[Any]]:
-        found: dict[str, list[Any]] = {
+        result: dict[str, list[Any]] = {
             name: [getattr(c, name) for c in contacts] for name in ("body_a", "body_b", "depth", "slip_speed")
         }
         for vector in ("point", "normal", "force"):
             for i, axis in enumerate("xyz"):
-                found[vector[0] + axis] = [float(getattr(c, vector)[i]) for c in contacts]
-        return found
+                result[vector[0] + axis] = [float(getattr(c, vector)[i]) for c in contacts]
+        return result
 
     rows = ((nanoseconds(t), kind.cls(**columns(c))) for t, c in _steps_in_contact(shown))
     return Channel("/contacts", kind.cls, rows, {"units": kind.units})

@@ -80,8 +80,8 @@ def write_mcap(
                 encoding="protobuf",
                 data=bytes(descriptors.SerializeToString(deterministic=True)),
             )
-            told = {key: json.dumps(value, sort_keys=True) for key, value in sorted(channel.metadata.items())}
-            ids.append(writer.register_channel(channel.topic, "protobuf", schema, told))
+            content = {key: json.dumps(value, sort_keys=True) for key, value in sorted(channel.metadata.items())}
+            ids.append(writer.register_channel(channel.topic, "protobuf", schema, content))
         for time, rank, sequence, message in merge(*(_timed(rank, channel) for rank, channel in enumerate(channels))):
             data = message.SerializeToString(deterministic=True)
             writer.add_message(ids[rank], log_time=time, data=data, publish_time=time, sequence=sequence)
@@ -209,12 +209,12 @@ def recover_mcap(path: str | Path, out: str | Path) -> "Recovered":
             for opcode, body in records(data):
                 if opcode in READERS:
                     record = READERS[opcode].read(ReadDataStream(BytesIO(body)))
-                    for part in breakup_chunk(record, validate_crc=True) if opcode == CHUNK else [record]:
-                        copy.add(part)
+                    for piece in breakup_chunk(record, validate_crc=True) if opcode == CHUNK else [record]:
+                        copy.add(piece)
         except Exception as error:  # damage makes the reader fail in many ways; all of them end the copy
             stopped_at = f"{type(error).__name__}: {error}"
-        told = {"from": path.name, "messages": str(copy.messages), "stopped_at": stopped_at or "the end"}
-        copy.writer.add_metadata(RECOVERED, told)
+        content = {"from": path.name, "messages": str(copy.messages), "stopped_at": stopped_at or "the end"}
+        copy.writer.add_metadata(RECOVERED, content)
         copy.writer.finish()
     return Recovered(copy.messages, copy.attachments, stopped_at)
 
@@ -237,11 +237,11 @@ def records(data: bytes) -> Iterator[tuple[int, bytes]]:
     """
     if not data.startswith(MAGIC):
         raise ValueError("it does not begin as an MCAP file does")
-    at, unpacked, most = len(MAGIC), 0, min(MOST_UNPACKED, PACKED_AT_MOST * len(data) + PACKED_APART)
-    while at + RECORD.size <= len(data):
-        opcode, length = RECORD.unpack_from(data, at)
-        at += RECORD.size + length
-        body = data[at - length : at]
+    position, unpacked, most = len(MAGIC), 0, min(MOST_UNPACKED, PACKED_AT_MOST * len(data) + PACKED_APART)
+    while position + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, position)
+        position += RECORD.size + length
+        body = data[position - length : position]
         if len(body) < length:
             break
         if opcode == ATTACHMENT and CRC.unpack(body[-4:])[0] != zlib.crc32(body[:-4]):
@@ -264,11 +264,11 @@ def _unpacked_size(body: bytes, most: int) -> int:
         if packed not in (-1, chunk.uncompressed_size):  # -1: the frame does not say it, and no more is unpacked
             raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes unpacks to {packed}")
     else:
-        found: Any = chunk.data
+        result: Any = chunk.data
         if chunk.compression == "lz4":  # whose frames need not say it: unpacked as far as the chunk says, to be sure
-            found = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
-        if len(found) != chunk.uncompressed_size:
-            raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes has {len(found)}")
+            result = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
+        if len(result) != chunk.uncompressed_size:
+            raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes has {len(result)}")
     return int(chunk.uncompressed_size)
 
 
@@ -366,13 +366,13 @@ def _unpacked(data: bytes) -> Iterator[tuple[int, bytes]]:
             yield opcode, body
             continue
         stream, size = get_chunk_data_stream(kinds.Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
-        inner, at = stream.read(size), 0
-        while at < size:
-            opcode, length = RECORD.unpack_from(inner, at)
-            at += RECORD.size + length
-            if at > size:
+        inner, position = stream.read(size), 0
+        while position < size:
+            opcode, length = RECORD.unpack_from(inner, position)
+            position += RECORD.size + length
+            if position > size:
                 raise ValueError("a record in a chunk is cut short")
-            yield opcode, inner[at - length : at]
+            yield opcode, inner[position - length : position]
 
 
 def _declared(data: bytes, at: int) -> int:
@@ -381,12 +381,15 @@ def _declared(data: bytes, at: int) -> int:
         opcode, length = RECORD.unpack_from(data, at)
         at += RECORD.size + length
         if opcode == STATISTICS:
-            found = kinds.Statistics.read(ReadDataStream(BytesIO(data[at - length : at])))
-            most = {"messages": (found.message_count, MOST_MESSAGES), "channels": (found.channel_count, MOST_CHANNELS)}
+            result = kinds.Statistics.read(ReadDataStream(BytesIO(data[at - length : at])))
+            most = {
+                "messages": (result.message_count, MOST_MESSAGES),
+                "channels": (result.channel_count, MOST_CHANNELS),
+            }
             for what, (count, limit) in most.items():
                 if count > limit:
                     raise ValueError(f"it says that it holds {count} {what}: at most {limit} are read")
-            return int(found.message_count)
+            return int(result.message_count)
     raise ValueError("it has no statistics: it was cut short")
 
 

@@ -98,10 +98,10 @@ def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Cer
 def _drawn(plot: Plot) -> dict[str, Any]:
     """A plot for JSON, `points` of how many its series have; what is left out lies within what is drawn."""
     x, ys = numbers(plot.x), [numbers(line.y) for line in plot.series]
-    kept = _kept(ys, len(x)) if plot.marks == "lines" else range(len(x))
-    series = [{**vars(line), "y": [y[i] for i in kept]} for line, y in zip(plot.series, ys, strict=True)]
-    told = {"x": [x[i] for i in kept], "points": len(x), "series": series, "limits": numbers(plot.limits)}
-    return {**vars(plot), **told}
+    retained = _kept(ys, len(x)) if plot.marks == "lines" else range(len(x))
+    series = [{**vars(line), "y": [y[i] for i in retained]} for line, y in zip(plot.series, ys, strict=True)]
+    content = {"x": [x[i] for i in retained], "points": len(x), "series": series, "limits": numbers(plot.limits)}
+    return {**vars(plot), **content}
 
 
 def _kept(ys: Sequence[Sequence[float | None]], count: int) -> Sequence[int]:
@@ -110,12 +110,12 @@ def _kept(ys: Sequence[Sequence[float | None]], count: int) -> Sequence[int]:
     if count <= MOST_POINTS:
         return range(count)
     ends = [count * k // stretches for k in range(stretches + 1)]
-    kept = {0, count - 1}
+    retained = {0, count - 1}
     for start, end in pairwise(ends):
         for y in ys:
             known = [(value, i) for i, value in enumerate(y[start:end], start) if value is not None]
-            kept |= {min(known)[1], max(known)[1]} if known else {start}  # a gap stays one
-    return sorted(kept)
+            retained |= {min(known)[1], max(known)[1]} if known else {start}  # a gap stays one
+    return sorted(retained)
 
 
 def _map_of(c: Certificate) -> dict[str, Any]:
@@ -123,9 +123,9 @@ def _map_of(c: Certificate) -> dict[str, Any]:
     codes = c.codes.ravel()
     gap = np.abs(c.difference - c.derivative).ravel() / np.maximum(c.tolerance.ravel(), 1e-300)
     gap = np.nan_to_num(gap, nan=np.inf, posinf=np.inf)
-    told = np.lexsort((np.arange(len(codes)), -gap, -codes))[:MOST_ENTRIES]
-    told = np.arange(len(codes)) if len(codes) <= MOST_ENTRIES else told
-    entries = {name: numbers(getattr(c, name).ravel()[told], digits) for name, digits in ENTRY.items()}
+    content = np.lexsort((np.arange(len(codes)), -gap, -codes))[:MOST_ENTRIES]
+    content = np.arange(len(codes)) if len(codes) <= MOST_ENTRIES else content
+    entries = {name: numbers(getattr(c, name).ravel()[content], digits) for name, digits in ENTRY.items()}
     subject = {
         "subject": c.subject,
         "method": c.method,
@@ -133,7 +133,7 @@ def _map_of(c: Certificate) -> dict[str, Any]:
         "rows": [*c.rows],
         "columns": [*c.columns],
     }
-    return {**subject, "codes": "".join(str(code) for code in codes), "told": told.tolist(), **entries}
+    return {**subject, "codes": "".join(str(code) for code in codes), "told": content.tolist(), **entries}
 
 
 def _pooled(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -227,7 +227,7 @@ def short_number(value: float | None, digits: int = 6) -> str:
 
 def unit_of(unit: str) -> str:
     """A unit for a reader: nothing for pure numbers."""
-    return " or ".join(part for part in unit.split(" or ") if part != "1")
+    return " or ".join(piece for piece in unit.split(" or ") if piece != "1")
 
 
 def in_words(value: Any, digits: int = 6) -> str:

@@ -149,8 +149,8 @@ class LivePage:
         with self._changed:
             while self._next is None:
                 self._changed.wait()
-            found, self._next, self._drawing = self._next, None, True
-            return found
+            result, self._next, self._drawing = self._next, None, True
+            return result
 
 
 _PAGES: list[LivePage] = []  # one at most

@@ -102,7 +102,7 @@ class _Arrows:
     def place(self, meshcat: Meshcat, k: int, time: float | None) -> None:
         """The forces in the step from state k, or in the last step."""
         step = self.steps[min(k, len(self.steps) - 1)] if self.steps else ()
-        pushing = [one for one in step if np.linalg.norm(one.force) > 0]
+        pushing = [item for item in step if np.linalg.norm(item.force) > 0]
         for slot in range(self.slots):
             path, used = f"{self.root}/{slot}", slot < len(pushing)
             if used:
@@ -170,7 +170,7 @@ class Stills:
         if not _draw_tube(self.meshcat, "trail", scene.trail, radius):
             self.meshcat.Delete("trail")
         for root, steps, colour in (("contacts", scene.contacts, RED), ("thrusts", scene.thrusts, VIOLET)):
-            seen = [one for k in places[:-1] for one in (steps[k] if k < len(steps) else ()) if np.any(one.force)]
+            seen = [item for k in places[:-1] for item in (steps[k] if k < len(steps) else ()) if np.any(item.force)]
             arrows = _Arrows(root, [seen], colour, ARROW_PART * self.size, scene.reference_of([seen]))
             if arrows.slots > self.made[root]:
                 arrows.make(self.meshcat, radius)
@@ -260,9 +260,9 @@ def _draw_triangles(meshcat: Meshcat, path: str, mesh: Triangles, colour: Rgba) 
             mesh = Triangles(hull.corners, hull.triangles)
         except ModelError:  # a flat mesh is its own hull
             mesh = Triangles(mesh.vertices, mesh.faces)
-    for i, (part, own) in enumerate(mesh.parts()):
-        shown = colour if own is None else Rgba(*own, 1.0)
-        meshcat.SetTriangleMesh(f"{path}/{i}", part.vertices.T, part.faces.T.astype(np.int32), shown)
+    for i, (piece, inner) in enumerate(mesh.parts()):
+        shown = colour if inner is None else Rgba(*inner, 1.0)
+        meshcat.SetTriangleMesh(f"{path}/{i}", piece.vertices.T, piece.faces.T.astype(np.int32), shown)
 
 
 def _hull(shape: Mesh) -> tuple[Array, Any]:
@@ -301,7 +301,7 @@ def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> boo
 
 def _only(poses: Poses, shaped: set[str]) -> Poses:
     """Of the bodies that have a shape."""
-    return {path: found for path, found in poses.items() if path in shaped}
+    return {path: result for path, result in poses.items() if path in shaped}
 
 
 def _place(
@@ -309,8 +309,8 @@ def _place(
 ) -> None:
     """Bodies and ghosts as in state k, and the forces of the step from there."""
     for root, poses in motions.items():
-        for path, found in poses.items():
-            meshcat.SetTransform(f"{root}/{path}", found[k], time_in_recording=time)
+        for path, result in poses.items():
+            meshcat.SetTransform(f"{root}/{path}", result[k], time_in_recording=time)
     for some in arrows:
         some.place(meshcat, k, time)
 
@@ -367,7 +367,7 @@ def _look_at(meshcat: Meshcat, scene: Scene) -> None:
     cell = decade / (2 if scene.size > 3 * decade else 5)
     middle = np.round(centre[:2] / cell) * cell
     reach = cell * np.ceil(0.9 * scene.size / cell)
-    at = np.arange(-reach, reach + cell / 2, cell)
-    ends = [[(a, -reach), (a, reach)] for a in at] + [[(-reach, a), (reach, a)] for a in at]
+    position = np.arange(-reach, reach + cell / 2, cell)
+    ends = [[(a, -reach), (a, reach)] for a in position] + [[(-reach, a), (reach, a)] for a in position]
     points = np.array([[[*(middle + end), height] for end in pair] for pair in ends])
     meshcat.SetLineSegments("grid", points[:, 0].T, points[:, 1].T, 1.0, LINES)

@@ -69,14 +69,14 @@ class Scene:
     def balls(self) -> tuple[Array, Array]:
         """Centres (n, 3) and radii (n,) [m] of balls that hold the motion, framed ghosts and marks in the world."""
         trail = self.trail[:: max(1, len(self.trail) // LOOKED_AT)]
-        found = [(point, 0.0) for point in (*trail, self.trail[-1])]
+        result = [(point, 0.0) for point in (*trail, self.trail[-1])]
         motions = [self.poses, *(ghost.poses for ghost in self.ghosts if ghost.framed)]
         for drawn in self.shapes:
             for motion in motions:
                 poses = motion.get(drawn.body, ())
-                found += [(p @ drawn.centre, drawn.radius) for p in poses[:: max(1, len(poses) // LOOKED_AT)]]
-        found += [(mark.centre, min(mark.radius, LARGEST_MARK)) for mark in self.marks if not mark.body]
-        return np.array([centre for centre, _ in found]), np.array([radius for _, radius in found])
+                result += [(p @ drawn.centre, drawn.radius) for p in poses[:: max(1, len(poses) // LOOKED_AT)]]
+        result += [(mark.centre, min(mark.radius, LARGEST_MARK)) for mark in self.marks if not mark.body]
+        return np.array([centre for centre, _ in result]), np.array([radius for _, radius in result])
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
@@ -92,7 +92,7 @@ class Scene:
 
     def reference_of(self, forces: Sequence[Sequence[Force]]) -> float:
         """[N] the force whose arrow is ARROW_PART of the size: nine tenths of all `forces` are no larger."""
-        sizes = [float(np.linalg.norm(one.force)) for step in forces for one in step]
+        sizes = [float(np.linalg.norm(item.force)) for step in forces for item in step]
         pushing = [size for size in sizes if size > 0]
         return float(np.quantile(pushing, 0.9)) if pushing else 1.0
 
@@ -135,7 +135,7 @@ def scene_of(
         shapes=tuple(shapes or shapes_of(model.plant, model.double.context, drawn)),
         times=times,
         poses=poses,
-        ghosts=tuple(Ghost(name, found, (ghosts or {})[name][1]) for name, found in of_ghosts.items()),
+        ghosts=tuple(Ghost(name, result, (ghosts or {})[name][1]) for name, result in of_ghosts.items()),
         contacts=tuple(tuple(Force(c.point, c.force) for c in step) for step in contacts),
         trail=trail,
         marks=tuple(marks),
@@ -149,16 +149,16 @@ def _thrusts_of(model: Model, xs: Array, us: Array) -> tuple[tuple[Force, ...], 
     port = twin.plant.get_applied_spatial_force_input_port()
     if int(port.get_index()) not in twin.inputs.fed:
         return ()
-    found = []
+    result = []
     for x, u in zip(xs, us, strict=False):  # the last state has no input
         set_state(twin, x)
         twin.set_input(u)
         step = []
-        for one in port.Eval(twin.context):
-            pose = twin.plant.EvalBodyPoseInWorld(twin.context, twin.plant.get_body(one.body_index))
-            step.append(Force(pose @ one.p_BoBq_B, np.asarray(one.F_Bq_W.translational())))
-        found.append(tuple(step))
-    return tuple(found)
+        for item in port.Eval(twin.context):
+            pose = twin.plant.EvalBodyPoseInWorld(twin.context, twin.plant.get_body(item.body_index))
+            step.append(Force(pose @ item.p_BoBq_B, np.asarray(item.F_Bq_W.translational())))
+        result.append(tuple(step))
+    return tuple(result)
 
 
 def _poses_of(model: Model, moving: Sequence[Any], xs: Array) -> dict[str, list[RigidTransform]]:
@@ -179,7 +179,7 @@ def moving_bodies(plant: Any) -> list[Any]:
 def longest_path(poses: Poses, moving: Sequence[Any] = ()) -> Array:
     """(N+1, 3) the path of that centre of mass of the bodies `moving` that moves most; of the origins without any."""
     centres = {body_path(body): np.asarray(body.default_com()) for body in moving}
-    paths = [np.array([pose @ centres.get(name, np.zeros(3)) for pose in found]) for name, found in poses.items()]
+    paths = [np.array([pose @ centres.get(name, np.zeros(3)) for pose in result]) for name, result in poses.items()]
     return max(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
 
 

@@ -52,19 +52,19 @@ class Drawn:
 def shapes_of(plant: Any, context: Any, drawn: Sequence[Any]) -> list[Drawn]:
     """The shapes of the world and of the bodies `drawn`, with a skeleton of those bodies that have none."""
     port = plant.get_geometry_query_input_port()
-    found: dict[int, list[Drawn]] = {}
+    result: dict[int, list[Drawn]] = {}
     if port.HasValue(context):
         inspector = port.Eval(context).inspector()
         frames = [(body, plant.GetBodyFrameIdIfExists(body.index())) for body in [plant.world_body(), *drawn]]
         looks = _Looks(inspector, [frame for _, frame in frames if frame is not None])
         for body, frame in frames:
             if frame is not None:
-                found[int(body.index())] = looks.on(frame, body_path(body))
-    bare = [body for body in drawn if not found.get(int(body.index()))]
-    found |= _skeleton(plant, context, drawn, bare)
+                result[int(body.index())] = looks.on(frame, body_path(body))
+    bare = [body for body in drawn if not result.get(int(body.index()))]
+    result |= _skeleton(plant, context, drawn, bare)
     shapes = []
     for body in [plant.world_body(), *drawn]:
-        on_it = found.get(int(body.index()), [])
+        on_it = result.get(int(body.index()), [])
         if plant.IsAnchored(body):
             pose = plant.EvalBodyPoseInWorld(context, body)
             on_it = [replace(s, body="", pose=pose @ s.pose, centre=pose @ s.centre) for s in on_it]
@@ -87,9 +87,9 @@ class _Looks:
         """Of a frame's geometries those meant to be seen, or those that touch where there are none."""
         for role in ROLES:
             looks = (self._drawn(geometry, role, path) for geometry in self._inspector.GetGeometries(frame, role))
-            found = [d for d in looks if d is not None and isinstance(d.shape, DRAWN)]
-            if found:
-                return found
+            result = [d for d in looks if d is not None and isinstance(d.shape, DRAWN)]
+            if result:
+                return result
         return []
 
     def _file(self, geometry: Any) -> MeshFile | None:
@@ -129,14 +129,14 @@ class _Looks:
 @lru_cache(maxsize=4)  # a run is drawn when it is saved, and again when it is verified
 def _read_together(files: tuple[MeshFile, ...]) -> tuple[Triangles | None, ...]:
     """The meshes of a robot, with MOST_FACES faces together; None for a file that cannot be read."""
-    found: list[Triangles | None] = []
+    result: list[Triangles | None] = []
     for path, scale, *_ in files:
         try:
-            found.append(scaled(read_mesh(path), scale))
+            result.append(scaled(read_mesh(path), scale))
         except ModelError:
-            found.append(None)
-    fewer = iter(with_fewer_faces([mesh for mesh in found if mesh is not None], MOST_FACES))
-    return tuple(None if mesh is None else next(fewer) for mesh in found)
+            result.append(None)
+    fewer = iter(with_fewer_faces([mesh for mesh in result if mesh is not None], MOST_FACES))
+    return tuple(None if mesh is None else next(fewer) for mesh in result)
 
 
 def _skeleton(plant: Any, context: Any, drawn: Sequence[Any], bare: Sequence[Any]) -> dict[int, list[Drawn]]:
@@ -157,7 +157,7 @@ def _skeleton(plant: Any, context: Any, drawn: Sequence[Any], bare: Sequence[Any
         if behind <= seen:
             break
         seen |= behind
-    found = {}
+    result = {}
     for body in [b for b in bare if int(b.index()) in seen] or bare:
         index, path = int(body.index()), body_path(body)
         start = next((_place(j.frame_on_child(), context) for j, _, child in tree if child == index), np.zeros(3))
@@ -165,9 +165,9 @@ def _skeleton(plant: Any, context: Any, drawn: Sequence[Any], bare: Sequence[Any
         if not ends and body.default_mass() > 0:
             ends = [np.asarray(body.default_com())]
         ends = [end for end in ends if np.linalg.norm(end - start) > SHORTEST_BONE * size]
-        found[index] = [_bone(path, start, end, BONE_PART * size) for end in ends]
-        found[index] += [_ball(path, at, JOINT_PART * size) for at in (start, *ends)]
-    return found
+        result[index] = [_bone(path, start, end, BONE_PART * size) for end in ends]
+        result[index] += [_ball(path, position, JOINT_PART * size) for position in (start, *ends)]
+    return result
 
 
 def _place(frame: Any, context: Any) -> Array:
@@ -188,8 +188,8 @@ def _ball(path: str, at: Array, radius: float) -> Drawn:
 
 def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Drawn:
     """What stands for a body of which nothing is known, at `centre` (3,) [m] on it."""
-    at = np.asarray(centre, dtype=float)
-    return Drawn(path, Sphere(BALL), RigidTransform(at), GREY, at, BALL)
+    position = np.asarray(centre, dtype=float)
+    return Drawn(path, Sphere(BALL), RigidTransform(position), GREY, position, BALL)
 
 
 def body_path(body: Any) -> str:

@@ -161,25 +161,25 @@ def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
     first, second = load_plan_record(a), load_plan_record(b)
     ours = {m.name: m for m in (*first.metrics, *first.invariants)}
     theirs = {m.name: m for m in (*second.metrics, *second.invariants)}
-    found, refused = [], []
+    result, refused = [], []
     for name in dict.fromkeys([*ours, *theirs]):
         if name not in ours or name not in theirs:
             refused.append(f"{name}: only {'the first' if name in ours else 'the second'} run has it")
             continue
-        one, other = ours[name], theirs[name]
+        item, other = ours[name], theirs[name]
         keys = ("definition", "unit", "direction")
-        odd = next((key for key in keys if getattr(one, key) != getattr(other, key)), None)
+        odd = next((key for key in keys if getattr(item, key) != getattr(other, key)), None)
         if odd is not None:
-            refused.append(f"{name}: its {odd} differs: {getattr(one, odd)!r} and {getattr(other, odd)!r}")
+            refused.append(f"{name}: its {odd} differs: {getattr(item, odd)!r} and {getattr(other, odd)!r}")
             continue
-        if (one.value, one.verdict) != (other.value, other.verdict):
-            found.append(ChangedEntry(f"{name} [{one.unit}]", one.value, other.value))
-        if one.tolerance != other.tolerance:  # some follow from the motion
-            found.append(ChangedEntry(f"tolerance of {name} [{one.unit}]", one.tolerance, other.tolerance))
+        if (item.value, item.verdict) != (other.value, other.verdict):
+            result.append(ChangedEntry(f"{name} [{item.unit}]", item.value, other.value))
+        if item.tolerance != other.tolerance:  # some follow from the motion
+            result.append(ChangedEntry(f"tolerance of {name} [{item.unit}]", item.tolerance, other.tolerance))
     return RunComparison(
         configuration=_differences(first, second, CONFIGURATION, NO_CHOICE),
         versions=_differences(first, second, ("schema_version", "provenance"), ("provenance.command",)),
-        metrics=tuple(found),
+        metrics=tuple(result),
         refused=tuple(refused),
     )
 
@@ -187,11 +187,11 @@ def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
 def _differences(
     first: PlanRecord, second: PlanRecord, sections: tuple[str, ...], apart: tuple[str, ...]
 ) -> tuple[ChangedEntry, ...]:
-    one, other = first.model_dump(mode="json"), second.model_dump(mode="json")
-    found = differences({s: one[s] for s in sections}, {s: other[s] for s in sections})
+    item, other = first.model_dump(mode="json"), second.model_dump(mode="json")
+    result = differences({s: item[s] for s in sections}, {s: other[s] for s in sections})
     return tuple(
         ChangedEntry(key, was, now)
-        for key, was, now in found
+        for key, was, now in result
         if not (key.startswith(apart) or (is_number(was) and is_number(now) and is_near(was, now, *READ)))
     )
 
@@ -215,20 +215,20 @@ def write_runs_page(path: Path, a: str | Path, b: str | Path, *, models: str | P
     Raises:
         ArtifactError: One of them has no record or no trace that can be read.
     """
-    found, folders = compare_runs(a, b), (Path(a), Path(b))
+    result, folders = compare_runs(a, b), (Path(a), Path(b))
     records = [load_plan_record(folder) for folder in folders]
     names = [record.name for record in records]
     if names[0] == names[1]:
         names = [str(folder) for folder in folders]
     states, inputs = zip(*(_curves(r, folder) for r, folder in zip(records, folders, strict=True)), strict=True)
     plots = [*_plots("Positions and velocities", names, states), *_plots("Inputs", names, inputs, held=True)]
-    ends = [float(max(c.times[-1] for c in one.values())) for one in states]
+    ends = [float(max(c.times[-1] for c in item.values())) for item in states]
     view, caption = _replay(folders, names, models)
     runs = [
         {"name": n, "verdict": r.verdict, "sentence": r.sentence, "duration_s": end}
         for n, r, end in zip(names, records, ends, strict=True)
     ]
-    record = {"runs": runs, **asdict(found), "sentence": _sentence(names, states)}
+    record = {"runs": runs, **asdict(result), "sentence": _sentence(names, states)}
     data = page_data(max(ends), plots)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_page(path, "compare_runs.html.j2", record=record, data=data, view=view, caption=caption)
@@ -255,7 +255,7 @@ def _curves(record: PlanRecord, folder: Path) -> tuple[dict[str, _Curve], dict[s
 def _plots(group: str, names: Sequence[str], both: Sequence[dict[str, _Curve]], held: bool = False) -> Iterator[Plot]:
     """A plot for each column of either run; their limits where they are the same."""
     for title in dict.fromkeys([*both[0], *both[1]]):
-        curves = [one.get(title) for one in both]
+        curves = [item.get(title) for item in both]
         known = [c for c in curves if c is not None]
         times = np.unique(np.concatenate([c.times for c in known]))
         lines = [
@@ -272,28 +272,28 @@ def _plots(group: str, names: Sequence[str], both: Sequence[dict[str, _Curve]], 
 def _at(times: Array, curve: _Curve, held: bool) -> Array:
     """A curve at other times: along straight lines between its knots, or held from each; NaN after its end."""
     if held:
-        found = curve.values[np.searchsorted(curve.times, times, side="right") - 1]
+        result = curve.values[np.searchsorted(curve.times, times, side="right") - 1]
     else:
-        found = np.interp(times, curve.times, curve.values)
-    return np.where(times > curve.times[-1], np.nan, found)
+        result = np.interp(times, curve.times, curve.values)
+    return np.where(times > curve.times[-1], np.nan, result)
 
 
 def _sentence(names: Sequence[str], states: Sequence[dict[str, _Curve]]) -> str:
     """Where the plans are furthest apart, of the states that both have and as a part of what the first one moves."""
     shared = [name for name in states[0] if name in states[1]]
-    worst, told = -1.0, "the two plans have no state in common"
+    worst, sentence = -1.0, "the two plans have no state in common"
     for name in shared:
-        one, other = states[0][name], states[1][name]
-        times = np.unique(np.concatenate([one.times, other.times]))
-        gap = np.abs(_at(times, one, False) - _at(times, other, False))
+        item, other = states[0][name], states[1][name]
+        times = np.unique(np.concatenate([item.times, other.times]))
+        gap = np.abs(_at(times, item, False) - _at(times, other, False))
         if not np.any(np.isfinite(gap)):
             continue
         k = int(np.nanargmax(gap))
-        part = float(gap[k] / max(float(np.nanmax(np.abs(np.append(one.values, other.values)))), 1e-12))
-        if part > worst:
-            worst = part
-            told = f"the plans are furthest apart in {name}: by {gap[k]:.4g} {one.unit} at {times[k]:.4g} s"
-    return f"{names[0]} and {names[1]}: {told}" if worst else f"{names[0]} and {names[1]} have the same plan"
+        fraction = float(gap[k] / max(float(np.nanmax(np.abs(np.append(item.values, other.values)))), 1e-12))
+        if fraction > worst:
+            worst = fraction
+            sentence = f"the plans are furthest apart in {name}: by {gap[k]:.4g} {item.unit} at {times[k]:.4g} s"
+    return f"{names[0]} and {names[1]}: {sentence}" if worst else f"{names[0]} and {names[1]} have the same plan"
 
 
 def _replay(folders: Sequence[Path], names: Sequence[str], models: str | Path | None) -> tuple[str, str]:
@@ -317,7 +317,7 @@ def _together(first: Scene, second: Scene) -> Scene:
     step = min(float(np.min(np.diff(scene.times))) for scene in (first, second))
     times = np.linspace(0.0, end, max(2, round(end / step) + 1))
     poses = dict(_resampled(first, times))
-    poses |= {f"second.{path}": found for path, found in _resampled(second, times).items()}
+    poses |= {f"second.{path}": result for path, result in _resampled(second, times).items()}
     others = tuple(replace(d, body=f"second.{d.body}", colour=SECOND) for d in second.shapes if d.body)
     trail = longest_path(_resampled(first, times))
     marks = tuple(mark for mark in (*first.marks, *second.marks) if not mark.body)
@@ -330,4 +330,4 @@ def _resampled(scene: Scene, times: Array) -> Poses:
     poses = next((ghost.poses for ghost in scene.ghosts if ghost.name == PLAN), scene.poses)
     middles = (scene.times[:-1] + scene.times[1:]) / 2
     nearest = np.searchsorted(middles, times)
-    return {path: [found[k] for k in nearest] for path, found in poses.items()}
+    return {path: [result[k] for k in nearest] for path, result in poses.items()}

@@ -137,8 +137,8 @@ def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     if not parts or not value:
         yield path, value
-    for key, part in parts:
-        yield from leaves(part, f"{path}.{key}" if path else str(key))
+    for key, piece in parts:
+        yield from leaves(piece, f"{path}.{key}" if path else str(key))
 
 
 def compare_bytes(compared: Compared, recorded: bytes, again: bytes) -> None:
@@ -154,10 +154,10 @@ def compare_text(compared: Compared, recorded: bytes, again: bytes) -> None:
     if recorded == again:
         return
     old, new = recorded.decode(errors="replace"), again.decode(errors="replace")
-    at = next((i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b), min(len(old), len(new)))
+    position = next((i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b), min(len(old), len(new)))
     near = is_near_text(BLOB.sub("", old), BLOB.sub("", new))
-    key = f"the text from character {at} on" if not near else "digits and drawings"
-    compared.differ(key, old[at : at + 60], new[at : at + 60], allowed=near)
+    key = f"the text from character {position} on" if not near else "digits and drawings"
+    compared.differ(key, old[position : position + 60], new[position : position + 60], allowed=near)
 
 
 def compare_traces(
@@ -200,8 +200,8 @@ def _compare_messages(compared: Compared, topic: str, old: McapLog, new: McapLog
     for key, value in (pair for _, (_, message) in pairs for pair in fields_of(message)):
         if isinstance(value, float) and math.isfinite(value):
             largest[_column(key)] = max(largest.get(_column(key), 0.0), abs(value))
-    for i, ((_, one), (_, other)) in enumerate(pairs):
-        theirs, ours = dict(fields_of(one)), dict(fields_of(other))
+    for i, ((_, item), (_, other)) in enumerate(pairs):
+        theirs, ours = dict(fields_of(item)), dict(fields_of(other))
         for key in sorted(theirs.keys() | ours.keys()):
             a, b = theirs.get(key), ours.get(key)
             if not (a == b or (a != a and b != b)):

@@ -158,8 +158,8 @@ def partial_of(target: Path) -> Path:
 def name_of(folder: Path) -> str:
     """The name of the run in `folder`: that of the directory whose place it takes."""
     name = folder.resolve().name
-    found = PARTIAL.fullmatch(name)
-    return name if found is None else found["name"]
+    result = PARTIAL.fullmatch(name)
+    return name if result is None else result["name"]
 
 
 def is_partial(folder: Path) -> bool:
@@ -169,10 +169,10 @@ def is_partial(folder: Path) -> bool:
 
 def _others(folder: Path) -> Iterator[Path]:
     """What is in `folder` that the run there did not write; of one without the record of a run, everything."""
-    own = set(_written(folder))
-    folders = {parent for path in own for parent in path.parents}
+    local = set(_written(folder))
+    folders = {parent for path in local for parent in path.parents}
     for top, inner, files in os.walk(folder):
-        yield from (Path(top, name) for name in files if Path(top, name) not in own)
+        yield from (Path(top, name) for name in files if Path(top, name) not in local)
         yield from (Path(top, name) for name in inner if Path(top, name) not in folders)
 
 

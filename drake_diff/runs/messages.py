@@ -57,8 +57,8 @@ def _of_phases(record: PhasesSection) -> Iterator[str]:
         yield f"{phase.name}, {phase.duration:.6g} {unit}, {phase.status}: what it asks is in {phase.directory}"
     names = [phase.name for phase in record.phases]
     for link in record.links:
-        one, other = (names[i] if 0 <= i < len(names) else i for i in (link.before, link.after))
-        yield f"from {one} to {other}: {link.told}, {shown(link.reset)}, within {link.tolerance:g}"
+        item, other = (names[i] if 0 <= i < len(names) else i for i in (link.before, link.after))
+        yield f"from {item} to {other}: {link.told}, {shown(link.reset)}, within {link.tolerance:g}"
     if record.horizon_s is not None:
         yield f"in all {first_of(record.horizon_s)} s"
     search = ", ".join(f"{k} {shown(v)}" for k, v in sorted((record.search or {}).items()) if v is not None)
@@ -83,8 +83,11 @@ def _of_a_solve(record: PlanRecord) -> Iterator[str]:
     to = named(names, p.get("x_goal")) or "no goal"
     count = f"{p.get('num_steps')} intervals of {shown(p.get('time_step_s'))} s, horizon {horizon}"
     yield f"from {named(names, p.get('x0'))} to {to} in {count}"
-    bounds = [(side, named(of, p.get(side))) for side, of in zip(LIMITS, (names, names, inputs, inputs), strict=True)]
-    yield "bounds: " + ("; ".join(f"{side} {told}" for side, told in bounds if told) or "none")
+    bounds = [
+        (side, named(subject, p.get(side)))
+        for side, subject in zip(LIMITS, (names, names, inputs, inputs), strict=True)
+    ]
+    yield "bounds: " + ("; ".join(f"{side} {values}" for side, values in bounds if values) or "none")
     if p.get("held"):
         yield f"with points that are held: {shown(p['held'])}"
     if p.get("waypoints"):
@@ -114,8 +117,8 @@ def named(names: Any, values: Any) -> str:
     given = [(str(name), v) for name, v in zip(names, values, strict=False) if v is not None]
     if len(given) <= MOST:
         return first_of([f"{name} {shown(v)}" for name, v in given])
-    told = [f"{name} {shown(v)}" for name, v in given if v != 0]
-    return ", ".join([*told, f"the other {len(given) - len(told)} given ones 0"])
+    words = [f"{name} {shown(v)}" for name, v in given if v != 0]
+    return ", ".join([*words, f"the other {len(given) - len(words)} given ones 0"])
 
 
 def first_of(values: Sequence[Any]) -> str:
@@ -146,10 +149,10 @@ def asked_for(problem: Problem, times: Array) -> str:
         fast = isinstance(problem.running_cost, ConstantCost) and problem.final_cost is None
         time = f"{'as fast as it can' if fast else 'in a time of its own choice'}: {times[-1]:.3g} s"
     free = [name.replace("_", " ") for name in problem.optimize if name != "controls"]
-    found = f" Found beside the inputs: {' and '.join(free)}." if "controls" in problem.optimize and free else ""
+    result = f" Found beside the inputs: {' and '.join(free)}." if "controls" in problem.optimize and free else ""
     if "controls" not in problem.optimize:
-        found = f" Found: {' and '.join(free)}; the inputs were given."
-    return f"Task for {problem.name} ({size}): {joined(tasks)}, {time}.{found}"
+        result = f" Found: {' and '.join(free)}; the inputs were given."
+    return f"Task for {problem.name} ({size}): {joined(tasks)}, {time}.{result}"
 
 
 def _end(problem: Problem) -> Iterator[str]:
@@ -203,10 +206,14 @@ def _when(knots: Any, problem: Problem, times: Array) -> str:
     """At which times a goal holds, where it is not at the end."""
     if knots is None or not isinstance(knots, Sequence) or isinstance(knots, str):
         return ""
-    at = sorted({int(k) % (problem.num_steps + 1) for k in knots})
-    if at == [problem.num_steps]:
+    indices = sorted({int(k) % (problem.num_steps + 1) for k in knots})
+    if indices == [problem.num_steps]:
         return ""
-    return f" at {times[at[0]]:.3g} s" if len(at) == 1 else f" from {times[at[0]]:.3g} to {times[at[-1]]:.3g} s"
+    return (
+        f" at {times[indices[0]]:.3g} s"
+        if len(indices) == 1
+        else f" from {times[indices[0]]:.3g} to {times[indices[-1]]:.3g} s"
+    )
 
 
 def _place(position: Sequence[float | None]) -> str:

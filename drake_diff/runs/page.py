@@ -43,24 +43,24 @@ def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[Check]:
     rounds = f"{count} iteration{'s' * (count != 1)} of {record['solver']['solver']}"
     ended = "stopped at a solution" if status is Status.CONVERGED_NOT_VERIFIED else status.value.replace("_", " ")
     stopped = status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
-    found = [Check("Solver", "pass" if stopped else "fail", f"{ended} after {rounds}")]
+    result = [Check("Solver", "pass" if stopped else "fail", f"{ended} after {rounds}")]
     decided = [m for m in (*record["metrics"], *record["invariants"]) if m["verdict"] != "info"]
     broken = [m["name"] for m in decided if m["verdict"] != "pass"]
     failed = any(m["verdict"] == "fail" for m in decided)
     text = f"not kept: {joined(broken)}" if broken else f"all {len(decided)} bounds are kept"
-    found.append(Check("Plan", "fail" if failed else "undecided" if broken else "pass", text))
-    found += _of_replays(m, record["replays"])
+    result.append(Check("Plan", "fail" if failed else "undecided" if broken else "pass", text))
+    result += _of_replays(m, record["replays"])
     certificates = record["gradient"]["certificates"]
     agree = sum(c["verdict"] == "agree" for c in certificates)
     kind = "info" if not certificates else "pass" if agree == len(certificates) else "undecided"
-    told = f"{agree} of {len(certificates)} certificates agree" if certificates else "not certified"
+    content = f"{agree} of {len(certificates)} certificates agree" if certificates else "not certified"
     if not certificates and record["problem"].get("motion") == "continuous" and status is Status.CONVERGED:
-        kind, told = (
+        kind, content = (
             "pass",
             "that of the end is a slope of another integration",
         )  # else the plan is none
-    found.append(Check("Gradients", kind, told))
-    return found
+    result.append(Check("Gradients", kind, content))
+    return result
 
 
 def _of_replays(m: Measurement, replays: Sequence[Mapping[str, Any]]) -> Iterator[Check]:
@@ -124,9 +124,11 @@ def alike(certificates: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """A row for each run of certificates that say the same; `power` is that of the one which would notice least."""
     rows: list[dict[str, Any]] = []
     for number, c in enumerate(certificates):
-        told = {name: c[name] for name in ("subject", "method", "verdict", "entries")} | {"agree": c["counts"]["agree"]}
-        if not rows or any(rows[-1][name] != value for name, value in told.items()):
-            rows.append({**told, "first": number, "count": 0, "power": 0.0})
+        content = {name: c[name] for name in ("subject", "method", "verdict", "entries")} | {
+            "agree": c["counts"]["agree"]
+        }
+        if not rows or any(rows[-1][name] != value for name, value in content.items()):
+            rows.append({**content, "first": number, "count": 0, "power": 0.0})
         row = rows[-1]
         row["count"] += 1
         row["power"] = max(row["power"], c["power"])
@@ -201,8 +203,8 @@ def _replay_plots(m: Measurement) -> Iterator[Plot]:
             lines.append(Line(f"{r.variant}, {r.control}", np.abs(r.motion.xs[::parts] - m.xs).max(axis=1)))
     note = "the largest difference of a state, in its own unit, in each replay; 0 is not on a log scale"
     for first in range(0, len(lines), SERIES_PER_PLOT):
-        part = lines[first : first + SERIES_PER_PLOT]
-        yield Plot("distance from the plan", "q, v", m.times, part, log=True, note=note, group="Replays")
+        piece = lines[first : first + SERIES_PER_PLOT]
+        yield Plot("distance from the plan", "q, v", m.times, piece, log=True, note=note, group="Replays")
 
 
 def _solver_plots(m: Measurement) -> Iterator[Plot]:
@@ -216,12 +218,16 @@ def _solver_plots(m: Measurement) -> Iterator[Plot]:
     rows = m.solution.iterations
     if not rows:
         return
-    at, cost = [row.iteration for row in rows], [row.objective for row in rows]
+    iterations, cost = [row.iteration for row in rows], [row.objective for row in rows]
     positive = all(c > 0 for c in cost if math.isfinite(c))
-    yield Plot("cost per iteration", "1", at, [Line("cost", cost)], axis="iteration", log=positive, group=SEARCH)
+    yield Plot(
+        "cost per iteration", "1", iterations, [Line("cost", cost)], axis="iteration", log=positive, group=SEARCH
+    )
     violations = [
         Line("constraint violation", [row.primal_infeasibility for row in rows]),
         Line("optimality", [row.dual_infeasibility for row in rows]),
     ]
     note = "as the solver prints it; 0 is not on a log scale"
-    yield Plot("violation per iteration", "1", at, violations, axis="iteration", log=True, note=note, group=SEARCH)
+    yield Plot(
+        "violation per iteration", "1", iterations, violations, axis="iteration", log=True, note=note, group=SEARCH
+    )

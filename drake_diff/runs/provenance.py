@@ -141,27 +141,27 @@ def named_files(
     What is named by a robot file that it names, in turn, is called by both names. `above` are the files that lead here.
     Where they cannot be read out of it (Drake's parser forgives more than Python's) its own name has the reason.
     """
-    found = []
+    result = []
     try:
         names = sorted(_names(path))
     except (OSError, UnicodeDecodeError, ET.ParseError, ModelError) as error:
         return [_unread(path.name, f"the files that it names cannot be listed: {error}")]
     for name, folder in names:
         if not name.lower().endswith(READABLE):
-            found.append(_unread(name, "not read: its name is not that of a mesh or a robot file"))
+            result.append(_unread(name, "not read: its name is not that of a mesh or a robot file"))
             continue
         target = _resolve(path, name, folder, packages or {})
         target = target and (in_any_case(target.absolute()) or target)
         try:
-            found.append(file_evidence(target, name) if target and target.is_file() else _unread(name, "no such file"))
+            result.append(file_evidence(target, name) if target and target.is_file() else _unread(name, "no such file"))
         except OSError as error:
-            found.append(_unread(name, f"it cannot be read: {error.strerror}"))
+            result.append(_unread(name, f"it cannot be read: {error.strerror}"))
             continue
         here = (*above, path.resolve())
         if target and target.is_file() and target.name.endswith(FORMATS) and target.resolve() not in here:
             inner = [] if path.name.endswith(OF_MJCF) else named_files(target, packages, here)
-            found += [evidence.model_copy(update={"path": f"{name}: {evidence.path}"}) for evidence in inner]
-    return found
+            result += [evidence.model_copy(update={"path": f"{name}: {evidence.path}"}) for evidence in inner]
+    return result
 
 
 def names_in(path: Path) -> list[str]:
@@ -196,9 +196,9 @@ def _names(path: Path) -> set[tuple[str, str]]:
 def _named_in(root: ET.Element) -> set[tuple[str, str]]:
     folders = {key: element.get(key, "") for element in root.iter("compiler") for key in ("assetdir", "meshdir")}
     folder = folders.get("meshdir") or folders.get("assetdir") or ""
-    found = {(element.get(key, ""), folder) for element in root.iter() for key in ("filename", "file")}
-    found |= {((element.text or "").strip(), "") for element in root.iter("uri")}
-    return {(name, start) for name, start in found if name and not name.endswith(LIBRARIES)}
+    result = {(element.get(key, ""), folder) for element in root.iter() for key in ("filename", "file")}
+    result |= {((element.text or "").strip(), "") for element in root.iter("uri")}
+    return {(name, start) for name, start in result if name and not name.endswith(LIBRARIES)}
 
 
 def _resolve(path: Path, name: str, folder: str, packages: Mapping[str, Any]) -> Path | None:
@@ -216,7 +216,7 @@ def _resolve(path: Path, name: str, folder: str, packages: Mapping[str, Any]) ->
 
 def embodiment_of(contract: Contract) -> Embodiment:
     """The robot of a contract: its base, what of it is driven and how, what only moves, is fixed, sensed, can touch."""
-    inputs = {each.name: each for each in contract.inputs}
+    inputs = {entry.name: entry for entry in contract.inputs}
     names = {a.name for a in contract.actuators}
     driving = {a.joint for a in contract.actuators}
     moving = [j for j in contract.joints if j.type != WELD and not j.locked]
@@ -237,7 +237,7 @@ def embodiment_of(contract: Contract) -> Embodiment:
             )
             for a in contract.actuators
         ],
-        other_inputs=[f"{each.name} [{each.unit}]" for each in contract.inputs if each.name not in names],
+        other_inputs=[f"{entry.name} [{entry.unit}]" for entry in contract.inputs if entry.name not in names],
         passive=[j.name for j in moving if j.name not in driving and j.type not in FLOATING],
         fixed=[f"{j.name}: {j.child} on {j.parent}{', locked' if j.locked else ''}" for j in _fixed(contract)],
         sensed="the whole state, exactly: there is no sensor and no noise",
@@ -260,11 +260,11 @@ def _unit(actuator: str, joint: str, inputs: dict[str, CoordinateTerms], contrac
 def _base(contract: Contract, moving: list[JointTerms]) -> str:
     anchored, more = {WORLD}, True
     while more:  # what is fixed to what is fixed to the world is so too
-        found = {j.child for j in _fixed(contract) if j.parent in anchored}
-        more = not found <= anchored
-        anchored |= found
+        result = {j.child for j in _fixed(contract) if j.parent in anchored}
+        more = not result <= anchored
+        anchored |= result
     floating = [j.child for j in moving if j.type in FLOATING]
     held = [f"{j.child} by {j.name}" for j in moving if j.parent in anchored and j.type not in FLOATING]
-    told = [f"free: {', '.join(floating)}"] if floating else []
-    told += [f"held to the world: {', '.join(held)}"] if held else []
-    return "; ".join(told) or "fixed to the world"
+    words = [f"free: {', '.join(floating)}"] if floating else []
+    words += [f"held to the world: {', '.join(held)}"] if held else []
+    return "; ".join(words) or "fixed to the world"

@@ -51,12 +51,12 @@ def upgraded(fields: Mapping[str, Any]) -> dict[str, Any]:
     kind = fields.get("kind")
     names = SECTIONS.get(str(kind), ())
     moved = {name: fields[name] for name in names if name in fields}
-    found = {key: value for key, value in fields.items() if key not in moved and key not in DROPPED}
+    result = {key: value for key, value in fields.items() if key not in moved and key not in DROPPED}
     if kind in ("panel", "trial"):
         moved = {RENAMED.get(name, name): value for name, value in moved.items()}
     if names:
-        found[str(kind)] = moved
-    return {**found, "kind": KINDS_OF_2.get(str(kind), kind)}
+        result[str(kind)] = moved
+    return {**result, "kind": KINDS_OF_2.get(str(kind), kind)}
 
 
 KINDS: dict[str, type[SealedRecord]] = {kind.KIND: kind for kind in (PlanRecord, FitRecord, ComparisonRecord)}

@@ -45,25 +45,27 @@ def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
         written = {topic: (topic, *converted) for topic, converted in CONVERTED.items()}
         written |= _free_bodies(log.channel_metadata.get(STATE, {}))
         bags = {topic: bag.add_connection(topic, name, typestore=store) for topic, (_, name, _) in written.items()}
-        rows = [(time, topic, message) for topic, (own, *_) in written.items() for time, message in log.messages[own]]
+        rows = [
+            (time, topic, message) for topic, (inner, *_) in written.items() for time, message in log.messages[inner]
+        ]
         for time, topic, message in sorted(rows, key=itemgetter(0)):
-            own, name, convert = written[topic]
-            converted = convert(store.types, time, message, log.channel_metadata[own])
+            inner, name, convert = written[topic]
+            converted = convert(store.types, time, message, log.channel_metadata[inner])
             bag.write(bags[topic], time, store.serialize_cdr(converted, name))
-    return {topic: len(log.messages[own]) for topic, (own, *_) in written.items()}
+    return {topic: len(log.messages[inner]) for topic, (inner, *_) in written.items()}
 
 
 def _free_bodies(metadata: dict[str, Any]) -> dict[str, tuple[str, str, Convert]]:
     """By topic the channel, the type and the conversion of each free body, known by the names of its coordinates."""
     names: dict[str, list[str]] = metadata.get("names", {})
     q, v = names.get("q", []), names.get("v", [])
-    found: dict[str, tuple[str, str, Convert]] = {}
+    result: dict[str, tuple[str, str, Convert]] = {}
     for i, first in enumerate(q):
         body = first.removesuffix("_qw")
-        if q[i : i + 7] == [f"{body}_{part}" for part in QUATERNION_POSE] and f"{body}_wx" in v:
+        if q[i : i + 7] == [f"{body}_{piece}" for piece in QUATERNION_POSE] and f"{body}_wx" in v:
             convert = partial(_odometry, body=body, i=i, j=v.index(f"{body}_wx"))
-            found[f"/odometry/{re.sub(r'[^A-Za-z0-9_]', '_', body)}"] = (STATE, "nav_msgs/msg/Odometry", convert)
-    return found
+            result[f"/odometry/{re.sub(r'[^A-Za-z0-9_]', '_', body)}"] = (STATE, "nav_msgs/msg/Odometry", convert)
+    return result
 
 
 def _odometry(types: dict[str, Any], time: int, message: Any, _: dict[str, Any], *, body: str, i: int, j: int) -> Any:
@@ -106,8 +108,8 @@ def _transforms(types: dict[str, Any], time: int, message: Any, _: dict[str, Any
         )
 
     stamped = types["geometry_msgs/msg/TransformStamped"]
-    found = [stamped(_header(types, time, t.parent_frame_id), t.child_frame_id, pose(t)) for t in message.transforms]
-    return types["tf2_msgs/msg/TFMessage"](transforms=found)
+    result = [stamped(_header(types, time, t.parent_frame_id), t.child_frame_id, pose(t)) for t in message.transforms]
+    return types["tf2_msgs/msg/TFMessage"](transforms=result)
 
 
 def _input(types: dict[str, Any], _: int, message: Any, metadata: dict[str, Any]) -> Any:
@@ -124,8 +126,8 @@ def _diagnostics(types: dict[str, Any], time: int, message: Any, metadata: dict[
     pair = types["diagnostic_msgs/msg/KeyValue"]
     names = [field.name for field in message.DESCRIPTOR.fields]
     values = [pair(f"{name} [{units[name]}]", repr(getattr(message, name))) for name in names]
-    told = types["diagnostic_msgs/msg/DiagnosticStatus"]
-    status = told(level=0, name="drake_diff", message="", hardware_id="", values=values)
+    content = types["diagnostic_msgs/msg/DiagnosticStatus"]
+    status = content(level=0, name="drake_diff", message="", hardware_id="", values=values)
     return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(types, time), status=[status])
 
 
@@ -133,21 +135,21 @@ def _contacts(types: dict[str, Any], time: int, message: Any, metadata: dict[str
     """diagnostic_msgs/DiagnosticArray: a status for each contact, body a on body b; numbers as in `_diagnostics`."""
     units, pair = metadata["units"], types["diagnostic_msgs/msg/KeyValue"]
     names = [field.name for field in message.DESCRIPTOR.fields if field.name not in ("body_a", "body_b")]
-    found = [
+    result = [
         types["diagnostic_msgs/msg/DiagnosticStatus"](
             level=0, name=f"{a} on {b}", message="contact", hardware_id="",
             values=[pair(f"{name} [{units[name]}]", repr(getattr(message, name)[i])) for name in names],
         )
         for i, (a, b) in enumerate(zip(message.body_a, message.body_b, strict=True))
     ]  # fmt: skip
-    return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(types, time), status=found)
+    return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(types, time), status=result)
 
 
 def _event(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
     """rcl_interfaces/Log: a failure is an error, anything else information; its kind is the name."""
-    told = message.kind if not message.failure_label else f"{message.kind}: {message.failure_label}"
+    content = message.kind if not message.failure_label else f"{message.kind}: {message.failure_label}"
     return types["rcl_interfaces/msg/Log"](
-        stamp=_header(types, time).stamp, level=ERROR if message.kind == "failure" else INFO, name=told,
+        stamp=_header(types, time).stamp, level=ERROR if message.kind == "failure" else INFO, name=content,
         msg=message.message, file="", function=message.code, line=0,
     )  # fmt: skip
 
