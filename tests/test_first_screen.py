@@ -78,7 +78,7 @@ def swung():
     """A pendulum that swings up, and the same plan stopped early, and with an input that does not lead to its goal."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=40, running_cost=dd.QuadraticCost(R=[[1.0]]))
-    return dd.solve(problem, method="shooting"), dd.solve(problem, method="shooting", max_iterations=2)
+    return dd.solve(problem, method="shooting"), dd.solve(problem, method="ilqr", max_iterations=2)
 
 
 def checked(solution):
