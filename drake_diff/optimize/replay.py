@@ -413,6 +413,8 @@ def bounds_check(plan: Plan, motion: Motion, wider: float = 1.0) -> Check:
     """The state of the motion, but the first, that is furthest beyond a bound for its range."""
     bounds, scale, tolerance = plan.problem.bounds, plan.scale, wider * STATE_TOLERANCE * plan.scale
     excess = np.maximum(np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper), 0.0)[1:]
+    if not len(excess):  # it broke off in its first step
+        return check("bound", "no state after the first", 0.0, tolerance[0], units_of(plan.problem)[0])
     k, i = divmod(int(np.argmax(np.nan_to_num(excess / scale, nan=np.inf))), excess.shape[1])
     where = f"{plan.problem.state_names[i]} at {motion.times[k + 1]:.3g} s"
     return check("bound", where, excess[k, i], tolerance[i], units_of(plan.problem)[i])
