@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.optimize.apart import kept_apart
+from drake_diff.optimize.run import kept_apart
 
 BALL = """<link name="{name}"><inertial><mass value="1"/><inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0"
 iyz="0"/></inertial><collision><geometry><sphere radius="0.2"/></geometry></collision></link>

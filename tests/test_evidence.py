@@ -98,7 +98,7 @@ def test_an_unfinished_run_says_so(swing_up, tmp_path):
 
 
 def test_a_failed_solution_is_saved_with_a_labelled_failure(swing_up, tmp_path):
-    failed = dd.solve(swing_up.problem, method="shooting", max_iterations=2)
+    failed = dd.solve(swing_up.problem, method="ilqr", max_iterations=2)
     record = dd.save(failed, tmp_path / "run")
     assert (record.state, record.verdict) == ("complete", "fail")
     assert [(f.label, f.code) for f in record.failures] == [("planning_error", "solver_iteration_limit")]

@@ -24,9 +24,8 @@ from pydrake.math import RigidTransform
 import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.model.triangles import Triangles
-from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.live import LiveSearch
-from drake_diff.optimize.program import Iteration
+from drake_diff.optimize.program import Iterate, Iteration
 from drake_diff.pages.html import asset
 from drake_diff.pages.live import live_page
 from drake_diff.pages.meshcat import STILLS, Stills, stills_of

@@ -12,9 +12,8 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import InputError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.model.tangent import tangent_space
-from drake_diff.optimize.relaxed.band import Band
 from drake_diff.optimize.relaxed.plant import Softness, relaxed_plant
-from drake_diff.optimize.relaxed.search import RelaxedSearch, between, slopes_of
+from drake_diff.optimize.relaxed.search import Band, RelaxedSearch, between, slopes_of
 from drake_diff.optimize.relaxed.stages import describe, follow, relaxed_schedule
 
 

@@ -69,7 +69,7 @@ def runs(swing_up, thrown, collocated, tmp_path_factory):
         "swing_up": swing_up,
         "thrown": thrown,
         "collocated": collocated,
-        "limited": dd.solve(swing_up.problem, method="shooting", max_iterations=2),
+        "limited": dd.solve(swing_up.problem, method="ilqr", max_iterations=2),
         "not_finite": dataclasses.replace(swing_up, xs=xs, status=dd.Status.DIVERGED),
         "no_replay": dataclasses.replace(swing_up, xs=np.full((41, 2), np.nan), status=dd.Status.DIVERGED),
     }

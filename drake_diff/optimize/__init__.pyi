@@ -1,5 +1,8 @@
 from .phased import PhasedSolution as PhasedSolution
+from .problem.cost import TrackingCost as TrackingCost
 from .problem.coupling import Coupling as Coupling
+from .problem.coupling import InputRate as InputRate
+from .problem.coupling import Jerk as Jerk
 from .problem.coupling import Periodic as Periodic
 from .problem.dwell import Dwell as Dwell
 from .problem.dynamics import DiscreteMap as DiscreteMap
@@ -7,10 +10,7 @@ from .problem.dynamics import plant_dynamics as plant_dynamics
 from .problem.held import HeldContacts as HeldContacts
 from .problem.held import Impact as Impact
 from .problem.phases import PhasedProblem as PhasedProblem
-from .problem.rates import InputRate as InputRate
-from .problem.rates import Jerk as Jerk
 from .problem.schedule import ContactSchedule as ContactSchedule
 from .problem.terminal import TerminalSet as TerminalSet
-from .problem.timed import TrackingCost as TrackingCost
 from .program import Iteration as Iteration
 from .transcription.between import violation_between_nodes as violation_between_nodes

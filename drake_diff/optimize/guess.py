@@ -14,8 +14,8 @@ from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ShapeError
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
+from drake_diff.optimize.problem.cost import TimedCost
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.timed import TimedCost
 from drake_diff.optimize.program import Multipliers
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import Collocated

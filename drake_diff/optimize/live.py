@@ -12,10 +12,9 @@ from drake_diff.exceptions import DrakeDiffError, InputError
 from drake_diff.model.parameters import applied
 from drake_diff.motion.rollout import STEPS, Rollout
 from drake_diff.optimize.goal_markers import colours_of, drawn_goals, meaning_of
-from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Iteration, Report
+from drake_diff.optimize.program import Iterate, Iteration, Report
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.pages.live import LivePage, live_page
 from drake_diff.pages.meshcat import stills_of

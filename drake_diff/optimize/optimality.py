@@ -40,9 +40,8 @@ from drake_diff.motion.continuous import ContinuousMotion
 from drake_diff.motion.loss import Totals, accumulate
 from drake_diff.optimize.ilqr.riccati import minimize_in_box
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.cost import final_cost_hessian, running_cost_hessian
+from drake_diff.optimize.problem.cost import cost_at, final_cost_hessian, running_cost_hessian
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.timed import cost_at
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.shooting import RolloutCost, ShootingVariables, final_sensitivity
 

@@ -27,7 +27,7 @@ from drake_diff.optimize.ilqr.ilqr import solve_ilqr, takes
 from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through_jumps
 from drake_diff.optimize.optimality import HOLDS, doubt_of_the_slope, out_of_reach, why_blind
 from drake_diff.optimize.problem.goals import in_words
-from drake_diff.optimize.problem.obstacles import lacking_between, swept
+from drake_diff.optimize.problem.obstacles import SelfCollision, lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report, heard
 from drake_diff.optimize.shooting import ShootingVariables
@@ -482,3 +482,20 @@ class Run:
             self.certified.update(zip([keys[k] for k in new], taken, strict=True))
         certificates = tuple(self.certified[key] for key in keys.values())
         return xs, us, certificates, why_blind(self.problem, variables, z)
+
+
+def kept_apart(problem: Problem) -> Problem:
+    """`problem` in which links keep clear of each other too, but those that are near each other at its ends.
+
+    Raises:
+        ModelError: where the links are has no formula.
+    """
+    goal = np.array(problem.goal)
+    ends = [problem.x0] + [goal] * (not np.any(np.isnan(goal[: problem.model.nq])))
+    more = SelfCollision().apart_but_at(problem.model, np.nan_to_num(np.array(ends)))
+    return dataclasses.replace(problem, constraints=(*problem.constraints, *more))
+
+
+def is_kept_apart(problem: Problem) -> bool:
+    """Whether a goal of `problem` keeps links apart already."""
+    return any(isinstance(goal, SelfCollision) and goal.weight is None for goal in problem.goals)

@@ -10,9 +10,8 @@ from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.model.parameters import ParameterVector
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.loss import Totals, differentiate_loss
-from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost
+from drake_diff.optimize.problem.cost import cost_at, differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.timed import cost_at
 
 
 class ShootingVariables:

@@ -18,17 +18,16 @@ from drake_diff.model.soft_contact import SoftContact
 from drake_diff.model.step import set_state
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.rollout import CONTINUOUS
-from drake_diff.optimize.apart import is_kept_apart, kept_apart
 from drake_diff.optimize.continuation import check_schedule
 from drake_diff.optimize.guess import another_guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, takes
 from drake_diff.optimize.optima import distinct
 from drake_diff.optimize.phased import PhasedSolution, solve_phased
+from drake_diff.optimize.problem.cost import TimedCost
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.timed import TimedCost
 from drake_diff.optimize.program import Iteration, Limits, Report
-from drake_diff.optimize.run import PLANS, Run
+from drake_diff.optimize.run import PLANS, Run, is_kept_apart, kept_apart
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.transcription.collocation import (
     MeshRefinement,
@@ -55,49 +54,10 @@ Progress = Callable[[str], None]
 
 
 @overload
-def solve(
-    problem: Problem,
-    *,
-    method: str = "auto",
-    initial_guess: Any = None,
-    scheme: str | None = None,
-    solver: str | None = None,
-    max_iterations: int = 500,
-    time_limit: float | None = None,
-    tolerance: float = 1e-8,
-    seed: int = 0,
-    continuation: Any = None,
-    refine: bool | None = None,
-    error_tolerance: float = 1e-6,
-    max_num_steps: int = 1000,
-    restarts: int = 0,
-    progress: bool | Progress = False,
-    callback: Callable[[Iteration], None] | None = None,
-    on_start: Callable[[], None] | None = None,
-    on_plan: Callable[[Any], None] | None = None,
-    view: bool | Callable[[str], None] = False,
-) -> Solution: ...
+def solve(problem: Problem, **asked: Any) -> Solution: ...
 @overload
-def solve(
-    problem: PhasedProblem,
-    *,
-    method: str = "auto",
-    initial_guess: Any = None,
-    scheme: str | None = None,
-    max_iterations: int = 500,
-    time_limit: float | None = None,
-    tolerance: float = 1e-8,
-    seed: int = 0,
-    refine: bool | None = None,
-    error_tolerance: float = 1e-6,
-    max_num_steps: int = 1000,
-    progress: bool | Progress = False,
-    callback: Callable[[Iteration], None] | None = None,
-    on_start: Callable[[], None] | None = None,
-    on_plan: Callable[[Any], None] | None = None,
-    view: bool | Callable[[str], None] = False,
-) -> PhasedSolution: ...
-def solve(
+def solve(problem: PhasedProblem, **asked: Any) -> PhasedSolution: ...
+def solve(  # type: ignore[misc]  # its keywords are written here alone
     problem: Problem | PhasedProblem,
     *,
     method: str = "auto",

@@ -19,8 +19,8 @@ from drake_diff.model.plant import FLOATING, joints
 from drake_diff.model.quantities import description_of, made_from
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
-from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost
-from drake_diff.optimize.problem.coupling import Couples, Periodic
+from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost, SumOfCosts, TrackingCost
+from drake_diff.optimize.problem.coupling import Couples, InputRate, Jerk, Periodic
 from drake_diff.optimize.problem.dwell import Dwell
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
 from drake_diff.optimize.problem.held import (
@@ -34,10 +34,8 @@ from drake_diff.optimize.problem.held import (
 from drake_diff.optimize.problem.names import units_of
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.rates import InputRate, Jerk
 from drake_diff.optimize.problem.schedule import ContactSchedule
 from drake_diff.optimize.problem.terminal import TerminalSet
-from drake_diff.optimize.problem.timed import SumOfCosts, TrackingCost
 from drake_diff.optimize.replay import deciding
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs.fields import (

@@ -21,13 +21,14 @@ from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.ilqr.constraints import Active, AugmentedLagrangian
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 from drake_diff.optimize.problem.cost import (
+    cost_at,
     differentiate_cost,
     differentiate_final_cost,
     final_cost_hessian,
+    quadratic_along,
     running_cost_hessian,
 )
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.timed import cost_at, quadratic_along
 
 # Of a state, or of 1: Jacobians are known to 1e-12, so that this leaves 1e-6 of their derivative.
 DIFFERENCE_STEP = 1e-6

@@ -38,11 +38,11 @@ from drake_diff.optimize.ilqr.riccati import (
     slope_along,
     solve_riccati,
 )
-from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.cost import CostToGo
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,
+    Iterate,
     Iteration,
     Limits,
     Multipliers,

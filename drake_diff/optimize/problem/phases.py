@@ -12,9 +12,9 @@ from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.pickling import PicklesItsFields
 from drake_diff.exceptions import InputError
 from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.cost import TimedCost
 from drake_diff.optimize.problem.dynamics import Pointwise
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.timed import TimedCost
 
 MOST_PHASES = 100
 

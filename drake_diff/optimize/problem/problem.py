@@ -27,22 +27,24 @@ from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, sel
 from drake_diff.motion.intervals import Intervals, intervals_of
 from drake_diff.motion.rollout import MOTIONS, STEPS
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
-from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost, differentiate_final_cost
-from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, checked_couplings, excess_of
+from drake_diff.optimize.problem.cost import (
+    ConstantCost,
+    FinalCost,
+    QuadraticCost,
+    SumOfCosts,
+    TimedCost,
+    TrackingCost,
+    cost_at,
+    differentiate_final_cost,
+    quadratic_along,
+    running_cost_of,
+)
+from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, RateLimit, checked_couplings, excess_of
 from drake_diff.optimize.problem.design import Design
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, plant_dynamics
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.names import bounds_of, state_of
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
-from drake_diff.optimize.problem.rates import RateLimit
-from drake_diff.optimize.problem.timed import (
-    SumOfCosts,
-    TimedCost,
-    TrackingCost,
-    cost_at,
-    quadratic_along,
-    running_cost_of,
-)
 
 MOST_STEPS = 10**8  # each has a state and an input, at least
 OPTIMIZABLE = ("controls", "initial_state", "parameters")

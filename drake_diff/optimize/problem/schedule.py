@@ -11,10 +11,9 @@ from drake_diff._base.arrays import Array, Indices, finite_array, positive_float
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import StateFunction
-from drake_diff.optimize.problem.cost import QuadraticCost
+from drake_diff.optimize.problem.cost import QuadraticCost, TrackingCost
 from drake_diff.optimize.problem.goals import USED, Goal, GoalConstraint, name_of
 from drake_diff.optimize.problem.names import coordinates
-from drake_diff.optimize.problem.timed import TrackingCost
 from drake_diff.optimize.scheduled.legs import Legs, Soles
 from drake_diff.optimize.scheduled.motion import scheduled_motion, swings, touching
 from drake_diff.optimize.scheduled.standing import standing, with_soft_feet

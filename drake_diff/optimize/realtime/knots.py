@@ -17,12 +17,15 @@ from drake_diff.optimize.problem.cost import (
     ConstantCost,
     CostToGo,
     QuadraticCost,
+    SumOfCosts,
+    TimedCost,
+    TrackingCost,
+    cost_at,
     differentiate_cost,
     running_cost_hessian,
 )
 from drake_diff.optimize.problem.goals import GoalConstraint, WithGoals
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
-from drake_diff.optimize.problem.timed import SumOfCosts, TimedCost, TrackingCost, cost_at
 from drake_diff.optimize.transcription.expressions import trace
 
 

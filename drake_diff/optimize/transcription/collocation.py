@@ -15,10 +15,10 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff._base.clock import now
+from drake_diff.optimize.problem.coupling import RateLimit
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
-from drake_diff.optimize.problem.rates import RateLimit
 from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.lead import Lead
 from drake_diff.optimize.transcription.task import OptimalControl

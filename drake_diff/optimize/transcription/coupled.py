@@ -12,8 +12,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff.optimize.problem.coupling import BoundCoupling
-from drake_diff.optimize.problem.rates import RateLimit
+from drake_diff.optimize.problem.coupling import BoundCoupling, RateLimit
 from drake_diff.optimize.transcription.expressions import KnotFunction
 from drake_diff.optimize.transcription.task import OptimalControl
 

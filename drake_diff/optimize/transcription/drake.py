@@ -20,10 +20,9 @@ from drake_diff._base.clock import TimeIsUpError, check_time, now, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 from drake_diff.model.equations import ContinuousSystem, EquationsOfMotion
-from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.cost import QuadraticCost, differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch
+from drake_diff.optimize.program import Iterate, Iteration, Limits, NlpResult, Outcome, Report, Watch
 
 
 def solve_collocation(

@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.phases import PhasedProblem, duration_of
+from drake_diff.optimize.program import Iterate
 from drake_diff.optimize.transcription.coupled import CoupledRows
 from drake_diff.optimize.transcription.expressions import KnotFunction, KnotFunctions, constraint_function
 from drake_diff.optimize.transcription.program import SparseSum, TranscribedProgram

@@ -21,9 +21,9 @@ from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, now, until_set
 from drake_diff._base.signals import noted_interrupts
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
-from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,
+    Iterate,
     Iteration,
     Limits,
     Multipliers,

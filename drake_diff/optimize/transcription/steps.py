@@ -24,11 +24,10 @@ from drake_diff.model.parameters import ParameterVector
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.loss import differentiate_loss
 from drake_diff.optimize.ilqr.expansion import Motion, curvature_along, expand_running_cost
-from drake_diff.optimize.iterate import Iterate
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import differentiate_final_cost, final_cost_hessian
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome, Report
+from drake_diff.optimize.program import Iterate, Limits, Multipliers, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.program import solve_ipopt
 
 DIFFERENCE = 1e-5  # of max(1, |z|): of exact Jacobians, known to 1e-12

@@ -25,11 +25,10 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.model.parameters import ParameterCoordinates
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, differentiate_cost
+from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, TimedCost, differentiate_cost
 from drake_diff.optimize.problem.coupling import BoundCoupling
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Moved, Pointwise
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.timed import TimedCost
 
 
 @dataclass(frozen=True, eq=False)
