@@ -40,6 +40,7 @@ REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "
 ROWS = "iterations"  # the solver's table, of a run that is not measured yet: later trace.mcap has it
 COLUMNS = ("iteration", "objective", "primal_infeasibility", "dual_infeasibility", "step")  # of that
 START = "start_us"  # the first guess of the inputs that the problem has
+REMOVED = ("segments",)  # arguments of `solve` that records of before 3 have
 GUESS = "guess_"  # before the name of an array of the guess that `solve` was given
 GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps", "multipliers", "row_multipliers")
 
@@ -203,8 +204,9 @@ def solve_again(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Sol
         problem = rebuild_problem(record, model, plan["us"], plan.get(START))
         limit, guess = arguments.pop("time_limit"), _rebuild_guess(problem, kind, plan)
         limit = None if limit is None else positive_float("time_limit [s]", limit)
+        removed = {name: arguments.pop(name) for name in REMOVED if name in arguments}
         found = solve(problem, initial_guess=guess, **arguments)
-    asked = {**(found.search.arguments if found.search else {}), "time_limit": limit}
+    asked = {**(found.search.arguments if found.search else {}), **removed, "time_limit": limit}
     return found.told(options=found.options | {"time_limit": limit}, search=Search(asked, guess))
 
 

@@ -32,7 +32,7 @@ from drake_diff.runs.fields import ModelInput, finite
 from drake_diff.runs.measurement import measure
 from drake_diff.runs.plan_record import CertificationSection, PhasesSection, PlanRecord
 from drake_diff.runs.read import load_plan_record
-from drake_diff.runs.rebuild import PLAN, TRACE, plan_fields, read_plan, rebuilt, resolve, solve_again
+from drake_diff.runs.rebuild import PLAN, REMOVED, TRACE, plan_fields, read_plan, rebuilt, resolve, solve_again
 from drake_diff.runs.save import (
     FILES,
     RECOVERED,
@@ -395,7 +395,7 @@ def _solved_in_phases(
             problem, Status(record.solver.status if record.solver else ""), record.sentence, phases
         )
         return recorded, 0.0, ("it began from a guess that the directory does not have",)
-    left_out = ("time_limit", "solver", "segments", "continuation")  # segments: of records before 3
+    left_out = ("time_limit", "solver", "continuation", *REMOVED)
     arguments: dict[str, Any] = {name: value for name, value in section.search.items() if name not in left_out}
     solved = solve(problem, **arguments)
     apart = max(_distance(one, other) for one, other in zip(solved.phases, phases, strict=True))
