@@ -53,7 +53,7 @@ def pages(tmp_path_factory):
     cost = dd.QuadraticCost(R=[[1.0]])
     solution = dd.solve(dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost), method="shooting")
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("runs.page", "comparison.files", "trials.page"):
+        for module in ("runs.page", "comparison.files", "trials.files"):
             patch.setattr(f"drake_diff.{module}.write_page", write_poisoned)
         dd.save(solution, folder / "run")
         with recalled(folder / "run") as plan:

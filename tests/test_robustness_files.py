@@ -21,10 +21,9 @@ from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 from drake_diff.runs.sealed import own_sha256
 from drake_diff.runs.verify import recalled
-from drake_diff.trials import page as robustness_page
-from drake_diff.trials.files import record_of
-from drake_diff.trials.page import robustness_data
-from drake_diff.trials.panel_trial import evaluate
+from drake_diff.trials import files as robustness_page
+from drake_diff.trials.files import record_of, robustness_data
+from drake_diff.trials.trial import evaluate
 
 LEVELS = {"mass": [0.02, 0.4], "actuator_delay": [1, 8], "time_step": [2], "sensor_bias": [0.01]}
 WORST = ["mass_0.4", "actuator_delay_1", "time_step_2", "sensor_bias_0.01"]

@@ -1,37 +1,49 @@
-"""Robustness saved: its record, a page, a row for each trial, and the worst trials as artifacts of their own."""
+"""Robustness saved: its record, a page, a row for each trial, and the worst trials as directories of their own.
+
+A trial on disk is what it was, a trace of all that the loop saw and did, a replay beside the plan, and its latencies.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.files import write_whole
+from drake_diff._base.arrays import Array
+from drake_diff._base.files import make_folder, write_whole
+from drake_diff._base.statistics import ENOUGH
+from drake_diff.logs.channels import TYPES, Shown, input_channel, motion_channels, nanoseconds, state_channel
+from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.loop.parts import Hold
-from drake_diff.loop.run import Loop
+from drake_diff.loop.run import OK, Loop
 from drake_diff.model.model import Model
+from drake_diff.model.parameters import applied, select
+from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, EvaluationPanel, finite
+from drake_diff.runs.fields import DataBoundary, DataUse, EvaluationPanel, canonical, finite
 from drake_diff.runs.plan_record import (
     CellEvidence,
+    EventEvidence,
     LoopEvidence,
     Nominal,
     PerturbationEvidence,
     PlanRecord,
     RobustnessSection,
     RunEvidence,
+    TrialEvidence,
 )
 from drake_diff.runs.provenance import embodiment_of, model_input, provenance_of, written_now
 from drake_diff.runs.read import load_plan_record
 from drake_diff.runs.sealed import WallClock
-from drake_diff.trials.perturbation import perturbation_named
-from drake_diff.trials.run import Cell, Robustness
-from drake_diff.trials.trial import Task
-from drake_diff.trials.trial_files import REPLAY, write_trial
+from drake_diff.trials.perturbation import Setup, perturbation_named, perturbed
+from drake_diff.trials.run import Cell, Robustness, agrees, sized
+from drake_diff.trials.trial import Task, Trial, result_of
 
 LATENCY = "latency"  # the perturbation whose levels are steps of the controller
 PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
@@ -74,8 +86,6 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
 
 def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -> PlanRecord:
     """Write what `save_robustness` does into `folder`, which `written_whole` gave."""
-    from drake_diff.trials.page import write_robustness_page  # loads the page templates: not needed before
-
     task = result.task
     source = None if run is None else RunEvidence(path=str(run), record_sha256=load_plan_record(run).record_sha256)
     sentence = "the trials are still being written, or that was killed or broke off"
@@ -240,3 +250,211 @@ def _table(result: Robustness) -> str:
             told = [int(e.label is None), e.label or "", e.reason, e.goal_error]
             rows.writerow([c.perturbation, c.level, e.seed, *told, *map(float, e.last)])
     return text.getvalue()
+
+
+MOST_PLOTS = 12  # of coordinates; those that end furthest from the plan
+
+
+def write_robustness_page(path: Path, result: Robustness, record: PlanRecord, replay: Path) -> None:
+    """Write the page of `result` with its `record` and `replay`, the page of the weakest point's worst trial."""
+    trial = result.worst(result.weakest).worst
+    ((name, level),) = trial.levels.items()
+    told = trial.reason or "it succeeds, and of all trials it ends furthest from the goal"
+    write_page(
+        path,
+        "robustness.html.j2",
+        record=record.model_dump(mode="json"),
+        data=robustness_data(result),
+        view=replay.read_text(encoding="utf-8"),
+        model=result.task.model.name,
+        caption=f"The worst trial of {name} {sized(name, level)}, with the plan as a ghost: {told}.",
+        enough=ENOUGH,
+        agrees=agrees,
+    )
+
+
+def robustness_data(result: Robustness) -> dict[str, Any]:
+    """What the page draws; see `page_data`."""
+    task = result.task
+    plots = list(_trial_plots(task, result.worst(result.weakest).worst))
+    for name in result.names:
+        plots += _level_plots(result, name)
+    return page_data(task.model.time_step * len(task.us), plots)
+
+
+def _trial_plots(task: Task, trial: Trial) -> Iterator[Plot]:
+    """Of one trial: each coordinate as it was, seen, estimated and planned; the inputs; the controller's status."""
+    run, model, problem = trial.outcome.run, task.model, task.plan.problem
+    setup = perturbed(task.setup, trial.levels, trial.seed)
+    planned = planned_states(task, setup)
+    count = len(planned)
+    times = setup.model.time_step * np.arange(count)
+
+    def held(rows: Array) -> Array:
+        """Rows of the controller's steps as rows of the plant's."""
+        return _padded(np.repeat(rows, setup.loop.substeps, axis=0), count)
+
+    true, seen, taken = _padded(run.motion.xs, count), held(run.observations), held(run.estimates)
+    apart = np.nanmax(np.abs(true - planned), axis=0) / task.plan.scale
+    units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
+    for i in sorted(np.argsort(-apart, kind="stable")[:MOST_PLOTS]):
+        lines = [
+            Line("true", true[:, i]),
+            Line("observed", seen[:, i], held=True),
+            Line("estimated", taken[:, i], held=True),
+            Line("plan", planned[:, i], dashed=True),
+        ]
+        limits = (problem.bounds.x_lower[i], problem.bounds.x_upper[i])
+        yield Plot(model.state_names[i], units[i], times, lines, limits=limits, group="States")
+    planned_us = _padded(np.repeat(task.us, (count - 1) // len(task.us), axis=0), count)
+    commands, applied = held(run.commands), held(run.applied)
+    for i, c in enumerate(model.contract.inputs):
+        lines = [
+            Line("command", commands[:, i], held=True),
+            Line("applied", applied[:, i], held=True),
+            Line("plan", planned_us[:, i], dashed=True, held=True),
+        ]
+        limits = (problem.bounds.u_lower[i], problem.bounds.u_upper[i])
+        yield Plot(f"input {c.name}", c.unit, times, lines, limits=limits, percent=True, group="Inputs")
+    others = list(dict.fromkeys(status for status in run.controller_status if status != "ok"))
+    events = [f"{e.t:.4g} s: {e.message}" for e in run.events]
+    note = "; ".join([*others[:3], *events[:6]]) or "nothing happened"
+    ok = held(np.array([[float(status == "ok")] for status in run.controller_status]).reshape(-1, 1))
+    status = [Line("status", ok[:, 0], held=True)]
+    yield Plot("controller status", "1: ok", times, status, range=[-0.1, 1.1], note=note, group="Inputs")
+
+
+def _padded(rows: Array, count: int) -> Array:
+    """`rows` (n, m) as (count, m): NaN below, but a held row lasts to the end where only one is missing."""
+    rows = np.vstack([rows, rows[-1:]]) if len(rows) == count - 1 else rows[:count]
+    return np.vstack([rows, np.full((count - len(rows), rows.shape[1]), np.nan)])
+
+
+def _level_plots(result: Robustness, name: str) -> Iterator[Plot]:
+    """Of one perturbation, over its levels: success, displacement, and where every trial ends."""
+    task, cells = result.task, result.of(name)
+    levels = [c.level for c in cells]
+    place: dict[str, Any] = {"axis": "level", "levels": True, "marks": "both", "place": name}
+    rates = [
+        Line("rate", [c.rate.value for c in cells]),
+        Line("95 %, lower", [c.rate.lower for c in cells], dashed=True),
+        Line("upper", [c.rate.upper for c in cells], dashed=True),
+    ]
+    yield Plot("success", "1", levels, rates, band=True, range=[-0.03, 1.03], **place)
+    moved = [Line("measured", [c.displacement for c in cells])]
+    known = any(c.predicted is not None for c in cells)
+    moved += [Line("predicted", [c.predicted for c in cells], dashed=True)] if known else []
+    note = "" if known else "no gradient predicts it"
+    yield Plot("displacement of the last state", "q, v", levels, moved, log=True, note=note, **place)
+    # Last states in the two coordinates that spread most for what is tolerated, a colour for each level and the plan.
+    ends = [*(np.array([e.last for e in c.endings]) for c in cells), task.xs[-1:]]
+    spread = np.ptp(np.vstack(ends), axis=0) / task.plan.scale
+    i, j = sorted(np.argsort(-spread, kind="stable")[:2])
+    across = np.concatenate([end[:, i] for end in ends])
+    order = np.argsort(across, kind="stable")
+    which = np.repeat(np.arange(len(ends)), [len(end) for end in ends])[order]
+    up = np.concatenate([end[:, j] for end in ends])[order]
+    labels, names = [*(f"level {level:g}" for level in levels), "the plan's"], task.model.state_names
+    contract = task.model.contract
+    units = [c.unit for c in (*contract.positions, *contract.velocities)]
+    series = [Line(label, np.where(which == k, up, np.nan)) for k, label in enumerate(labels)]
+    title = f"last {names[j]} over {names[i]}"
+    yield Plot(title, units[j], across[order], series, axis=f"{names[i]} [{units[i]}]", marks="points", place=name)
+
+
+TRIAL, TRACE, REPLAY, LATENCIES = "trial.json", "trace.mcap", "replay.html", "latencies.json"
+FURTHEST = 1e6  # m and rad: what runs away further is drawn here; the trace has it as it was
+
+
+def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None:
+    """Write trial.json, trace.mcap, replay.html and latencies.json of `trial` into `folder`.
+
+    `run` is the run directory that its plan is from, if there is one. The same trial gives the same bytes, but for the
+    latencies.
+    """
+    from drake_diff.pages.meshcat import write_replay
+    from drake_diff.pages.scene import BLUE, scene_of
+
+    make_folder(folder)
+    evidence = trial_evidence(task, trial, run)
+    write_whole(folder / TRIAL, canonical(evidence.model_dump(mode="json")).encode())
+    latencies = {"budget_s": trial.outcome.run.latency_budget, "latencies_s": trial.outcome.run.latencies.tolist()}
+    write_whole(folder / LATENCIES, canonical(latencies).encode())
+    setup, motion = perturbed(task.setup, trial.levels, trial.seed), trial.outcome.run.motion
+    planned = planned_states(task, setup)
+    with applied(select(setup.model, setup.parameters)) as model:
+        write_trial_trace(folder / TRACE, Shown(model, model.time_step, planned, motion), trial)
+        xs, ghost = (np.clip(states, -FURTHEST, FURTHEST) for states in (motion.xs, planned))
+        xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # it broke off at once
+        times = np.asarray(model.time_step * np.arange(len(xs)), dtype=float)
+        contacts = motion.contacts if len(motion.contacts) == len(xs) - 1 else ()
+        scene = scene_of(model, times, xs, us=motion.us, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
+        far = f", drawn up to {FURTHEST:g} only" if np.any(np.abs(motion.xs) > FURTHEST) else ""
+        title = f"{evidence.perturbation} {evidence.level:g}: {trial.label or 'success'}{far}"
+        write_replay(folder / REPLAY, scene, title=title)
+
+
+def planned_states(task: Task, setup: Setup) -> Array:
+    """(n+1, nx) of the plan at each step of the plant of `setup`."""
+    finer = round(task.model.time_step / setup.model.time_step)
+    return np.asarray(task.plan.sample(task.parts * finer)[0])
+
+
+def trial_evidence(task: Task, trial: Trial, run: str | None) -> TrialEvidence:
+    """What trial.json says."""
+    (name, level), *_ = trial.levels.items()
+    setup = perturbed(task.setup, trial.levels, trial.seed)
+    return TrialEvidence(
+        run=run,
+        controller=task.controller_name,
+        perturbation=name,
+        level=level,
+        seed=trial.seed,
+        reason=trial.reason,
+        **result_of(trial),
+        plant_time_step_s=setup.model.time_step,
+        controller_period_s=setup.loop.substeps * setup.model.time_step,
+        parameters={key: np.asarray(value).tolist() for key, value in setup.parameters.items()},
+        start=setup.x0.tolist(),
+        events=[EventEvidence(t_s=e.t, kind=e.kind, message=e.message) for e in trial.outcome.run.events],
+    )
+
+
+def write_trial_trace(path: Path, shown: Shown, trial: Trial) -> None:
+    """Write the trace of `trial`; `shown` has its motion and plan. Latencies differ each time and are not in it."""
+    metadata = {
+        "model": shown.model.name,
+        "time_axis": "simulated",
+        "perturbation": json.dumps(dict(trial.levels), sort_keys=True),
+        "label": trial.label or "success",
+    }
+    run, contract = trial.outcome.run, shown.model.contract
+    states, planned = (contract.positions, contract.velocities), shown.planned_xs
+    seen = ~np.isnan(run.observations).any(axis=1)
+    kind = TYPES["Event"]
+    statuses = [
+        kind.cls(time=t, kind="controller", code=OK if status == OK else "other", message=status)
+        for t, status in zip(run.times.tolist(), run.controller_status, strict=True)
+    ]
+    events = [kind.cls(time=e.t, kind=e.kind, message=e.message) for e in run.events]
+    end = shown.time_step * (len(shown.xs) - 1)
+    if trial.label is not None:
+        last = kind.cls(time=end, kind="failure", failure_label=trial.label, code=trial.label, message=trial.reason)
+        events.append(last)
+    channels = [
+        *motion_channels(shown),
+        state_channel("/planned/state", shown.times(len(planned)), planned, *states),
+        state_channel("/observation", run.times[seen], run.observations[seen], *states),
+        state_channel("/estimate", run.times, run.estimates, *states),
+        input_channel("/command", run.times, run.commands, contract.inputs),
+        input_channel("/applied", run.times, run.applied, contract.inputs),
+        _events("/controller/status", statuses),
+        _events("/events", events),
+    ]
+    write_mcap(path, channels, metadata, {})
+
+
+def _events(topic: str, events: Sequence[Any]) -> Channel:
+    kind = TYPES["Event"]
+    ordered = sorted(((nanoseconds(e.time), e) for e in events), key=lambda row: row[0])
+    return Channel(topic, kind.cls, ordered, {"units": kind.units})

@@ -16,8 +16,12 @@ Where a part of the loop raised, that comes before all: the sensor is a percepti
 the controller a control_error.
 """
 
+import atexit
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,8 +43,8 @@ from drake_diff.optimize.replay import (
     penetration_check,
     track,
 )
-from drake_diff.runs.fields import Label
-from drake_diff.trials.perturbation import Setup, perturbed
+from drake_diff.runs.fields import Label, finite
+from drake_diff.trials.perturbation import Setup, perturbation_named, perturbed
 
 CONTROLLERS = ("tvlqr", "mpc", "open_loop")
 MPC_HORIZON = 20  # steps
@@ -167,14 +171,15 @@ class Task:
         """One run of `setup`, judged; under `policy` in the controller's place, if it is given."""
         with applied(select(setup.model, setup.parameters)) as model:
             found = closed_loop(model, policy or self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
-            depth = () if found.ended else (penetration_check(model, found.motion),)
-        near = () if found.ended else tuple(clearance_checks(self.plan, found.motion))
+            checks = [] if found.ended else [penetration_check(model, found.motion)]
         last = found.motion.xs[-1]
         goal = self.plan.problem.goal_error(last) if self.judged_by == "the goal" else last - self.xs[-1]
-        checks = (goal_check(self.plan, goal), bounds_check(self.plan, found.motion), *near, *depth)
+        if not found.ended:  # a run that broke off may have no step to measure
+            of_motion = (bounds_check(self.plan, found.motion), *clearance_checks(self.plan, found.motion))
+            checks = [goal_check(self.plan, goal), *of_motion, *checks]
         return Judgement(
             run=found,
-            failures=(found.ended,) if found.ended else tuple(str(c) for c in checks if not c.passes),
+            failures=(found.ended,) if found.ended else tuple(str(check) for check in checks if not check.passes),
             goal_error=float(np.max(np.abs(goal))),
             displacement=tangent_space(self.model).minus(last, self._end),
             judged=bool(np.all(np.isfinite(goal))),
@@ -224,3 +229,49 @@ def _label(task: Task, setup: Setup, seed: int, outcome: Judgement) -> tuple[Lab
         except ModelError as error:
             return "evaluation_error", f"it could not be run again: {error}"
     return "control_error", "neither a perfect sensor nor actuator nor plant helps alone"
+
+
+def result_of(trial: Trial) -> dict[str, Any]:
+    """What became of a trial, in JSON's types; no displacement where the run broke off or it is not finite."""
+    outcome = trial.outcome
+    return {
+        "success": outcome.success,
+        "label": trial.label,
+        "goal_error": finite(outcome.goal_error),
+        "displacement": None if outcome.run.ended else finite(float(np.linalg.norm(outcome.displacement))),
+        "failures": list(outcome.failures),
+        "ended": outcome.run.ended,
+    }
+
+
+PANEL_FIELDS = {"run": str, "controller": str, "perturbation": str, "level": (int, float), "seed": int}
+_open = ExitStack()  # keeps the models of the runs as long as the process lives
+atexit.register(_open.close)
+
+
+def evaluate(trial: Mapping[str, Any]) -> dict[str, Any]:
+    """Run the plan of the run directory `trial["run"]` once and judge it; the same fields give the same row.
+
+    `trial` has run, controller ("tvlqr", "mpc", "open_loop"), perturbation, level (0: unperturbed) and seed. Other
+    fields are ignored, so that a trial.json will do. The row is JSON: success, label (None for a success), goal_error,
+    displacement of the last state (None where it is not finite or the run broke off), failures and ended. The run is
+    read once per process. Raises InputError, UnknownNameError, and ArtifactError where the run is damaged.
+    """
+    for name, kind in PANEL_FIELDS.items():
+        value = trial.get(name)
+        if not isinstance(value, kind) or isinstance(value, bool):  # type: ignore[arg-type]
+            raise InputError(f"trial: {name}", got=repr(value), expected=f"one of the fields {', '.join(PANEL_FIELDS)}")
+    name, level, seed = trial["perturbation"], trial["level"], trial["seed"]
+    perturbation_named(name)
+    if seed < 0:
+        raise InputError("trial: seed", got=seed, expected="a whole number of at least 0")
+    task = _task(str(Path(trial["run"]).resolve()), trial["controller"])
+    return result_of(run_trial(task, {name: level}, seed))
+
+
+@cache
+def _task(run: str, controller: str) -> Task:
+    from drake_diff.runs.verify import recalled  # what runs no panel need not load it
+
+    # The panel file is the user's, and so is the run that it names.
+    return Task(_open.enter_context(recalled(run, models="/", trusted=True)).plan, controller)
