@@ -11,16 +11,13 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import drake_diff as dd
-from drake_diff.identification import dry
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.dry import smooth_or_dry
 from drake_diff.identification.fit import Fit
-from drake_diff.identification.flow import ContinuousMotion
-from drake_diff.identification.frozen import FrozenMotion
 from drake_diff.identification.measured import read_pieces
+from drake_diff.identification.motion import ContinuousMotion
 from drake_diff.identification.sensors import choose_sensors
 from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.unknowns import choose_unknowns, numbers_at, set_numbers
+from drake_diff.identification.unknowns import choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 
 MASS, FRICTION = 2.0, 0.3 * 2.0 * 9.81  # [kg], [N] of a block on a floor
@@ -143,7 +140,7 @@ def test_derivatives_go_through_a_stop_that_lets_another_joint_go(load):
     """Random steps of two joints, whose stops, turns and releases follow each other: as by differences."""
     model, random, count = load("double_pendulum.urdf"), np.random.default_rng(0), 300
     tree, names = tree_for_identification(model), ["shoulder.coulomb_friction", "elbow.coulomb_friction"]
-    law = smooth_or_dry(model, tree, Chart(coordinates_of(model)), choose_unknowns(model, tree, names), 0.02)
+    law = ContinuousMotion(model, tree, choose_unknowns(model, tree, names), 0.02)
     z, hs, us = np.full(2, 2.0), np.full((count, 1), 0.02), random.uniform(-4, 4, (count, 1, 2))
     starts = random.uniform(-1, 1, (count, 4)) * [1, 1, 0.3, 0.3]
     starts[::2, 3] = 0.0
@@ -167,22 +164,21 @@ def test_readings_of_held_joints_are_those_of_joints_that_stand(load):
     model = load("double_pendulum.urdf")
     tree, names = tree_for_identification(model), ["elbow.coulomb_friction", "lower.mass", "elbow.offset"]
     unknowns = choose_unknowns(model, tree, names)
-    law = smooth_or_dry(model, tree, Chart(coordinates_of(model)), unknowns, 0.01)
+    law = ContinuousMotion(model, tree, unknowns, 0.01)
     columns = ("elbow.force", "lower.accel_x", "lower.accel_z", "shoulder.force")
     sensors = choose_sensors(model, tree, columns, None)
     q, v, u = np.array([[0.4, -0.3], [0.4, -0.3]]), np.array([[0.7, 0.0], [0.7, -0.9]]), np.array([[0.1, 0.2]] * 2)
 
     def read(z, q, v):
-        numbers = set_numbers(model, tree, unknowns, unknowns.values(z))
-        return sensors.read(numbers, q, v, u, law.grip_at(numbers, q, v, u))
+        return sensors.read(law.dynamics(unknowns.values(z)), np.hstack([q, v]), u)
 
     z = unknowns.z_start.copy()
     z[0] = 5.0
-    numbers, by = numbers_at(model, tree, unknowns, z)
-    turn, held = law.grip_at(numbers, q, v, u)
-    assert held.tolist() == [[False, True], [False, False]]
+    dynamics = law.dynamics(unknowns.values(z))
+    turn, held = dynamics.grip(np.hstack([q, v]), u)
+    assert held.tolist() == [[0, 1], [0, 0]]
     assert turn.tolist() == [[0, 0], [0, -1]]
-    by_x, by_z = sensors.slopes(numbers, q, v, u, by, (turn, held))
+    by_x, by_z = sensors.slopes(dynamics, np.hstack([q, v]), u, law.by(z))
     free = np.array([[True, True, True, False], [True] * 4])  # held: no velocity of its own
     for j, step in enumerate(1e-6 * np.eye(4)):
         rows = free[:, j]
@@ -197,25 +193,20 @@ def test_the_force_on_a_block_is_what_friction_leaves_of_the_push(write_urdf):
     model, push = write_urdf(mass=MASS), np.array([[9.0], [3.0], [9.0]])
     tree = tree_for_identification(model)
     unknowns = choose_unknowns(model, tree, ["slide.coulomb_friction"])
-    law = smooth_or_dry(model, tree, Chart(coordinates_of(model)), unknowns, 0.01)
-    numbers = set_numbers(model, tree, unknowns, np.array([FRICTION]))
-    q, v = np.zeros((3, 1)), np.array([[0.5], [0.0], [0.0]])
+    law = ContinuousMotion(model, tree, unknowns, 0.01)
+    x = np.array([[0, 0.5], [0, 0], [0, 0]])
     sensors = choose_sensors(model, tree, ("slide.force",), None)
-    read = sensors.read(numbers, q, v, push, law.grip_at(numbers, q, v, push))
+    read = sensors.read(law.dynamics(np.array([FRICTION])), x, push)
     np.testing.assert_allclose(read[:, 0], [9 - FRICTION, 0, 9 - FRICTION], atol=1e-12)  # 3 N do not move it
 
 
-def test_a_step_with_more_stops_than_are_looked_for_has_no_end(write_urdf, monkeypatch):
-    """It does not go on as if nothing had stopped."""
+def test_a_step_in_which_a_block_stops_has_no_motion_after_it(write_urdf):
     model = write_urdf(mass=MASS)
-    chart, tree = Chart(coordinates_of(model)), tree_for_identification(model)
-    law = smooth_or_dry(model, tree, chart, choose_unknowns(model, tree, ["slide.coulomb_friction"]), 0.02)
-    given = np.array([FRICTION]), np.array([[0.0, 0.02], [0.0, 1.0]]), np.full((2, 1), 0.02), np.zeros((2, 1, 1))
-    stopped, slides = law.run(*given)[:, 1]
+    tree = tree_for_identification(model)
+    law = ContinuousMotion(model, tree, choose_unknowns(model, tree, ["slide.coulomb_friction"]), 0.02)
+    given = np.array([FRICTION]), np.array([[0.0, 0.02]]), np.full((1, 1), 0.02), np.zeros((1, 1, 1))
+    (stopped,) = law.run(*given)[:, 1]
     np.testing.assert_allclose(stopped, [0.02**2 / 2 / (FRICTION / MASS), 0.0], atol=1e-12)
-    monkeypatch.setattr(dry, "MOST_PARTS", 1)
-    assert np.all(np.isnan(law.run(*given)[0, 1]))
-    np.testing.assert_array_equal(law.run(*given)[1, 1], slides)
 
 
 @pytest.mark.slow
@@ -266,9 +257,9 @@ def test_a_fit_of_which_least_is_left_at_a_kink_ends_there(load):
     Plain steps are stuck before that in 5 of these 12. One has three kinks, and stays so.
     """
     model, count = load("double_pendulum.urdf"), 100
-    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree = tree_for_identification(model)
     unknowns = choose_unknowns(model, tree, ["shoulder.coulomb_friction"])
-    law = smooth_or_dry(model, tree, chart, unknowns, H)
+    law = ContinuousMotion(model, tree, unknowns, H)
     times, true = H * np.arange(count + 1), np.array([4.0])
     us = np.column_stack([9 * np.sin(4.4 * times[:-1]), 0.6 * np.sin(8.2 * times[:-1])])
     us[:2, 0], us[2:17, 0] = 0.0, -12.0
@@ -297,7 +288,7 @@ def test_shorter_steps_are_half_of_those_that_there_are(load):
     model, count = load("double_pendulum.urdf"), 40
     tree = tree_for_identification(model)
     unknowns = choose_unknowns(model, tree, ["shoulder.damping"])
-    law = ContinuousMotion(model, tree, Chart(coordinates_of(model)), unknowns, 0.02)
+    law = ContinuousMotion(model, tree, unknowns, 0.02)
     times, us = H * np.arange(count + 1), np.zeros((count, 2))
     xs = law.run(unknowns.start, np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), H), us[None])[0]
     fit, _ = fit_of(model, law, unknowns, us, xs, times, 0)
@@ -309,7 +300,7 @@ def test_a_least_squares_mixed_with_itself_is_the_same(load):
     model, count = load("double_pendulum.urdf"), 40
     tree = tree_for_identification(model)
     unknowns = choose_unknowns(model, tree, ["shoulder.coulomb_friction", "elbow.damping"])
-    law = smooth_or_dry(model, tree, Chart(coordinates_of(model)), unknowns, H)
+    law = ContinuousMotion(model, tree, unknowns, H)
     times, us = H * np.arange(count + 1), np.full((count, 2), 6.0)
     z = np.array([2.0, 0.1])
     xs = law.run(z, np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), H), us[None])[0]
@@ -325,34 +316,12 @@ def test_a_least_squares_mixed_with_itself_is_the_same(load):
             assert one == pytest.approx(two, rel=1e-9)
 
 
-def test_a_fit_by_steps_frozen_halfway_ends_where_one_by_their_own_derivatives_does(load):
-    """Steps of 0.1 s are differentiated so badly when frozen that no part of a step leads on."""
-    model, count, h = load("double_pendulum.urdf"), 40, 0.1
-    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
-    unknowns = choose_unknowns(model, tree, ["shoulder_motor.strength"])
-    laws = [kind(model, tree, chart, unknowns, h) for kind in (FrozenMotion, ContinuousMotion)]
-    assert type(laws[0].exact()) is ContinuousMotion
-    assert laws[1].exact() is None
-    times = h * np.arange(count + 1)
-    us = np.column_stack([6 * np.sin(4.4 * times[:-1]), 0.6 * np.sin(8.2 * times[:-1])])
-    z = unknowns.z_start
-    xs = laws[1].run(unknowns.values(z), np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), h), us[None])[0]
-    for seed in range(4):
-        ended = []
-        for law in laws:
-            fit, starts = fit_of(model, law, unknowns, us, xs, times, seed)
-            ended.append(fit.solve(z, starts, 12))
-        assert all(one.converged for one in ended), [one.why for one in ended]
-        off = (ended[0].z - ended[1].z) * np.abs(ended[1].reduced.R[0, 0])
-        assert abs(off[0]) < 0.01  # [standard deviations]: least squares end within 1e-5 of |r|^2, which is 0.003
-
-
 def test_a_held_joint_that_is_taken_for_moving_at_first_is_found_at_rest_in_a_few_steps(load):
     """Its way to the stop is as v^2, which says ever less of v: plain steps take up to 15 here."""
     model, count = load("double_pendulum.urdf"), 100
-    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree = tree_for_identification(model)
     unknowns = choose_unknowns(model, tree, ["shoulder.coulomb_friction"])
-    law = smooth_or_dry(model, tree, chart, unknowns, H)
+    law = ContinuousMotion(model, tree, unknowns, H)
     times, true = H * np.arange(count + 1), np.array([4.0])
     us = np.column_stack([6 * np.sin(4.4 * times[:-1]), 0.6 * np.sin(8.2 * times[:-1])])
     xs = law.run(true, np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), H), us[None])[0]

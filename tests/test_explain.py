@@ -12,17 +12,14 @@ from helpers.chance import chance_of_a_name
 from helpers.pendulum import GRAVITY, LEVER, MASS, swing
 from helpers.robots import example_robot
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.dry import DryMotion
-from drake_diff.identification.flow import ContinuousMotion
-from drake_diff.identification.frozen import FrozenMotion, exponential
 from drake_diff.identification.measured import given_noise, read_pieces
+from drake_diff.identification.motion import ContinuousMotion
 from drake_diff.identification.screen import Inputs
 from drake_diff.identification.setting import Setting
 from drake_diff.identification.tree import tree_for_identification
@@ -129,13 +126,13 @@ def test_a_centre_of_mass_moves_as_in_a_file(tmp_path):
 def test_a_mass_promises_what_it_does_with_its_inertia():
     """As in a file. UR5's first link turns about its own axis, so that nothing but its inertia acts."""
     model = example_robot("ur5_robot.urdf")
-    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree, _chart = tree_for_identification(model), Chart(coordinates_of(model))
     each = choose_unknowns(model, tree, ["shoulder_link.mass", "shoulder_link.inertia"]).each
     both, alone = Unknowns(each, as_in_files=True), Unknowns(each[:1], as_in_files=True)
     starts, us = 0.3 * np.random.default_rng(1).standard_normal((4, model.nx)), np.full((4, 1, model.nu), 5.0)
-    law, hs = ContinuousMotion(model, tree, chart, alone, 0.01), np.full((4, 1), 0.01)
+    law, hs = ContinuousMotion(model, tree, alone, 0.01), np.full((4, 1), 0.01)
     before, xs, after = (law.run(np.exp(alone.z_start + s), starts, hs, us) for s in (-1e-3, 0, 1e-3))
-    _, by_z = Inputs(ContinuousMotion(model, tree, chart, both, 0.01), both, []).slopes(both.z_start, xs, hs, us)
+    _, by_z = Inputs(ContinuousMotion(model, tree, both, 0.01), both, []).slopes(both.z_start, xs, hs, us)
     true = (after - before)[:, -1] / 2e-3
     np.testing.assert_allclose(by_z[:, 0, :, 0], true, atol=1e-5 * np.max(np.abs(true)))
 
@@ -162,34 +159,13 @@ def test_beside_a_mass_the_motion_is_that_of_the_mass_with_its_inertia():
     assert np.max(np.abs(ends[0] - ends[2])) > 1e-3
 
 
-def test_steps_frozen_halfway_have_the_derivatives_of_the_motion():
-    """Of matrices SciPy's exponential; of an arm, those of Dormand and Prince's steps, to the third order."""
-    X = 4 * np.random.default_rng(0).standard_normal((3, 5, 5))
-    whole, phi = exponential(X)
-    for x, e, p in zip(X, whole, phi, strict=True):
-        np.testing.assert_allclose(e, expm(x), rtol=0, atol=1e-9 * np.max(np.abs(expm(x))))
-        np.testing.assert_allclose(x @ p, e - np.eye(5), rtol=0, atol=1e-9 * np.max(np.abs(e)))
-    model = example_robot("ur5_robot.urdf")
-    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
-    unknowns = choose_unknowns(model, tree, ["forearm_link.mass", "elbow_joint.damping"])
-    starts, us = 0.3 * np.random.default_rng(1).standard_normal((4, model.nx)), np.full((4, 1, model.nu), 5.0)
-    errors = []
-    for h in (0.01, 0.005):
-        exact, hs = ContinuousMotion(model, tree, chart, unknowns, h), np.full((4, 1), h)
-        args = unknowns.z_start, exact.run(unknowns.start, starts, hs, us), hs, us
-        pairs = zip(FrozenMotion(model, tree, chart, unknowns, h).slopes(*args), exact.slopes(*args), strict=True)
-        errors.append([np.max(np.abs(quick - true)) / np.max(np.abs(true)) for quick, true in pairs])
-    np.testing.assert_array_less(errors[1], 1e-3)
-    assert errors[1][0] < errors[0][0] / 6  # the third order would be 8
-
-
 def test_dry_friction_stops_and_holds_and_lets_go(load):
     """A hinge of 0.25 kg m^2 without gravity, in closed form: steps are not cut where it stops or is let go."""
     model = load("pendulum.urdf")
-    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree, _chart = tree_for_identification(model), Chart(coordinates_of(model))
     tree = replace(tree, numbers=replace(tree.numbers, gravity=np.zeros(3), damping=np.zeros(1)))
     unknowns = choose_unknowns(model, tree, ["hinge.coulomb_friction"])
-    law = DryMotion(model, tree, chart, unknowns, 0.04, joints=(0,))
+    law = ContinuousMotion(model, tree, unknowns, 0.04)
     times, torques = 0.04 * np.arange(31), np.repeat([0.0, 0.4, -1.0], 10)
     xs = law.run(np.array([0.5]), np.array([[0.1, 0.7]]), np.full((1, 30), 0.04), torques[None, :, None])[0]
     slides = np.minimum(times, 0.35)  # by -2 rad/s^2 until 0.7 / 2 s; 0.4 N m do not move it; -1 N m do, by -2 rad/s^2
@@ -205,12 +181,12 @@ def test_dry_friction_can_give_way_where_it_holds(load):
     It slides by -2 rad/s^2 until 0.2 rad/s, and from there its speed decays by 10 a second; under 0.4 N m it creeps.
     """
     model = load("pendulum.urdf")
-    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree, _chart = tree_for_identification(model), Chart(coordinates_of(model))
     tree = replace(tree, numbers=replace(tree.numbers, gravity=np.zeros(3), damping=np.zeros(1)))
     by = {"hinge.held_inertia": 2.25, "hinge.held_damping": 25.0}
     held = [Unknown(name, "", np.array([value]), 0.0, value) for name, value in by.items()]
     unknowns = Unknowns((*choose_unknowns(model, tree, ["hinge.coulomb_friction"]).each, *held))
-    law = DryMotion(model, tree, chart, unknowns, 0.04, joints=(0,), gives=True)
+    law = ContinuousMotion(model, tree, unknowns, 0.04)
     z, starts, hs = unknowns.z_start + np.array([0.5, 0, 0]), np.array([[0.1, 0.7], [0.1, 0.0]]), np.full((2, 20), 0.04)
     us = np.repeat([0.0, 0.4], 20).reshape(2, 20, 1)
     xs, t = law.run(unknowns.values(z), starts, hs, us), 0.04 * np.arange(21)
@@ -227,11 +203,9 @@ def test_dry_friction_can_give_way_where_it_holds(load):
 @pytest.mark.parametrize("names", [["elbow.coulomb_friction"], ["shoulder.coulomb_friction", "elbow.coulomb_friction"]])
 def test_derivatives_go_through_stops_and_reversals(load, names):
     model = load("double_pendulum.urdf")
-    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree, _chart = tree_for_identification(model), Chart(coordinates_of(model))
     unknowns = choose_unknowns(model, tree, names)
-    at = [link.joint.joint for link in tree.links]
-    joints = tuple(at.index(name.split(".")[0]) for name in names)
-    law = DryMotion(model, tree, chart, unknowns, 0.01, joints=joints)
+    law = ContinuousMotion(model, tree, unknowns, 0.01)
     k = np.arange(60)[:, None]
     us = np.array([2 * np.sin(0.11 * k + [0, 1]), np.cos(0.08 * k + [2, 1])])
     starts, hs, z = (
@@ -274,9 +248,9 @@ def test_of_a_right_model_nothing_is_said(pendulum, seed):
 def test_chance_names_a_change_of_a_right_arm_in_less_than_0_3_percent():
     """The limit holds what FALSE_NAME says; the penalty of BIC alone would not, of so many changes."""
     model = example_robot("ur5_robot.urdf")
-    tree, chart, period = tree_for_identification(model), Chart(coordinates_of(model)), 0.01
+    tree, _chart, period = tree_for_identification(model), Chart(coordinates_of(model)), 0.01
     us = np.random.default_rng(0).uniform(-3, 3, (40, model.nu))
-    law = ContinuousMotion(model, tree, chart, Unknowns(()), period)
+    law = ContinuousMotion(model, tree, Unknowns(()), period)
     xs = law.run(np.zeros(0), model.default_state[None], np.full((1, 40), period), us[None])[0]
     xs[:, : model.nq] += 2e-4 * np.random.default_rng(1).standard_normal((41, model.nq))
     xs[:, model.nq :] = np.nan

@@ -1,6 +1,5 @@
 """Parameters from recordings: closed forms first, then motions integrated by SciPy, which knows nothing of Drake."""
 
-from dataclasses import replace
 from math import comb
 
 import numpy as np
@@ -13,14 +12,10 @@ from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
-from drake_diff.identification.chart import Chart
-from drake_diff.identification.dry import DryMotion
-from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.judge import FALSE_ALARM, Known, colour_of, most_scatter, unidentifiable
-from drake_diff.identification.set_tree import SetTree
-from drake_diff.identification.tree import tree_for_identification
+from drake_diff.identification.motion import ContinuousMotion
+from drake_diff.identification.tree import Dynamics, tree_for_identification
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
-from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.step import set_state
 
 
@@ -188,12 +183,10 @@ def test_a_chaotic_motion_is_fitted(load):
     truth = {"lower.mass": 0.6, "elbow.damping": 0.03}
     tree = tree_for_identification(model)
     unknowns = choose_unknowns(model, tree, list(truth))
-    numbers = set_numbers(model, tree, unknowns, np.array(list(truth.values())))
+    dynamics = Dynamics(tree, set_numbers(model, tree, unknowns, np.array(list(truth.values()))))
 
     def rates(t, x):
-        return np.concatenate(
-            [x[2:], SetTree(tree, numbers).accelerate(x[None, :2], x[None, 2:], np.zeros((1, model.nu)))[0]]
-        )
+        return np.concatenate([x[2:], dynamics.accelerate(x[None], np.zeros((1, model.nu)))[0]])
 
     times = np.linspace(0, 3, 301)
     found = solve_ivp(rates, (0, 3), [2.5, 1.5, 0.0, 0.0], rtol=1e-10, atol=1e-10, t_eval=times)
@@ -216,58 +209,21 @@ def test_accelerations_are_drakes_and_steps_have_the_slopes_of_differences(name)
     wanted = np.linalg.solve(
         model.double.mass_matrix(), model.actuation @ u - model.double.inverse_dynamics(np.zeros(model.nv))
     )
-    nq = model.nq
-    found = SetTree(tree, tree.numbers).accelerate(x[None, :nq], x[None, nq:], u[None])[0]
+    found = Dynamics(tree, tree.numbers).accelerate(x[None], u[None])[0]
     np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
     numbers = tree.numbers
     by = np.eye(len(numbers.flat))
-    slopes = SetTree(tree, numbers).slopes(x[None, :nq], x[None, nq:], u[None], by)
+    by_numbers = Dynamics(tree, numbers).acceleration_jacobians(x[None], u[None], by)[1][0, :, 2 * model.nv :]
     direction = random.uniform(-1, 1, len(by)) * np.maximum(np.abs(numbers.flat), 1e-3)
 
     def moved(size):
         flat = numbers.flat + size * direction
         parts = {name: flat[numbers.places(name)] for name in type(numbers).__dataclass_fields__}
-        return SetTree(tree, type(numbers)(**parts)).accelerate(x[None, :nq], x[None, nq:], u[None])[0]
+        return Dynamics(tree, type(numbers)(**parts)).accelerate(x[None], u[None])[0]
 
     difference = (moved(1e-5) - moved(-1e-5)) / 2e-5
     # Differences over 1e-5 of light links are good to 1e-6 of the largest.
-    np.testing.assert_allclose(slopes.by_numbers[0] @ direction, difference, atol=1e-6 * np.abs(difference).max())
-
-
-@each_row("name", ["ur5_robot.urdf", "solo12.urdf"])
-def test_what_is_compiled_is_what_numpy_says(name, monkeypatch):
-    """Steps, with joints that slide and that are held, still or as if heavier; and slopes by every number of a tree."""
-    pytest.importorskip("numba")
-    model, random = example_robot(name), np.random.default_rng(1)
-    tree, chart, count = tree_for_identification(model), Chart(coordinates_of(model)), 5
-    x = np.array([state_in_range(model, random) for _ in range(count)])
-    x[:, model.nq :] = random.uniform(-1, 1, (count, model.nv))
-    h, u = random.uniform(0, 0.01, count), random.uniform(-1, 1, (count, model.nu))
-    n = len(tree.numbers.damping)
-    part = {quantity: random.uniform(0.01, 0.1, n) for quantity in ("damping", "coulomb", "held_damping")}
-    heavier = np.where(random.random(n) < 0.5, 0.0, 0.3)
-    hinges = np.isin(np.arange(n), [link.joint.v_start for link in tree.links if not link.free])
-    numbers = replace(tree.numbers, **part, held_inertia=heavier, stiffness=np.where(hinges, 2.0, 0.0))
-    law = ContinuousMotion(model, tree, chart, Unknowns(()), 0.01)
-    turn, held = random.choice([-1.0, 0.0, 1.0], (count, n)), random.random((count, n)) < 0.3
-    still = held & (heavier == 0)
-    x[:, model.nq :][still] = 0.0
-    own, by = SetTree(tree, numbers), np.eye(len(numbers.flat))
-    q, v = x[:, : model.nq], x[:, model.nq :]
-    dry = DryMotion(model, tree, chart, Unknowns(()), 0.01, joints=tuple(range(n)), gives=True)
-    fast = [law._stepped(own, x, h, u), dry._stepped(own, x, h, u, (turn, held & ~still))]
-    frozen = DryMotion(model, tree, chart, Unknowns(()), 0.01, joints=tuple(range(n)))
-    rigid = SetTree(tree, replace(numbers, held_inertia=np.zeros(n), held_damping=np.zeros(n)))
-    fast.append(frozen._stepped(rigid, x, h, u, (turn, still)))
-    slopes = own.slopes(q, v, u, by)
-    monkeypatch.setattr(SetTree, "compiled", None)
-    own, rigid = SetTree(tree, own.numbers), SetTree(tree, rigid.numbers)
-    slow = [law._stepped(own, x, h, u), dry._stepped(own, x, h, u, (turn, held & ~still))]
-    slow.append(frozen._stepped(rigid, x, h, u, (turn, still)))
-    for one, other in zip(fast, slow, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-10 * np.max(np.abs(other)))  # of rounding in 12 stages
-    for one, other in zip(vars(slopes).values(), vars(own.slopes(q, v, u, by)).values(), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-9 * np.max(np.abs(other)))
+    np.testing.assert_allclose(by_numbers @ direction, difference, atol=1e-6 * np.abs(difference).max())
 
 
 def test_steps_have_the_slopes_of_differences_by_unknowns(load):
@@ -275,7 +231,7 @@ def test_steps_have_the_slopes_of_differences_by_unknowns(load):
     tree = tree_for_identification(model)
     names = ["upper.mass", "lower.mass", "lower.center_of_mass", "elbow.offset", "elbow.damping", "model.gravity"]
     unknowns = choose_unknowns(model, tree, [*names, "elbow.coulomb_friction", "elbow_motor.strength"][:-1])
-    law = ContinuousMotion(model, tree, Chart(coordinates_of(model)), unknowns, 0.01)
+    law = ContinuousMotion(model, tree, unknowns, 0.01)
     z = unknowns.z_start + 0.05
     start, hs = np.array([[0.4, -0.3, 1.0, -2.0]]), np.array([[0.01]])
     us = np.full((1, 1, model.nu), 0.3)

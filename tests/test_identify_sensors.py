@@ -14,9 +14,9 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.sensors import choose_sensors
-from drake_diff.identification.set_tree import SetTree
-from drake_diff.identification.tree import Numbers, tree_for_identification
+from drake_diff.identification.tree import Dynamics, Numbers, tree_for_identification
 from drake_diff.mechanics.description import coordinates_of
+from drake_diff.model.step import set_state
 
 POSE = (0.1, -0.05, 0.2, 0.3, -0.4, 0.5)
 
@@ -34,10 +34,11 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
     sensors = choose_sensors(model, tree, [*columns("imu"), f"{joint}.force"], {"imu": (body, POSE)})
     x, u = state_in_range(model, random), random.uniform(-1, 1, model.nu)
     nq, nv, numbers = model.nq, model.nv, tree.numbers
-    read = sensors.read(numbers, x[None, :nq], x[None, nq:], u[None])[0]
+    dynamics = Dynamics(tree, numbers)
+    read = sensors.read(dynamics, x[None], u[None])[0]
     context = plant.CreateDefaultContext()
     plant.SetPositionsAndVelocities(context, x)
-    a = SetTree(tree, numbers).accelerate(x[None, :nq], x[None, nq:], u[None])[0]
+    a = dynamics.accelerate(x[None], u[None])[0]
     frame, world = plant.GetBodyByName(body).body_frame(), plant.world_frame()
     on_body = RigidTransform(RollPitchYaw(*POSE[3:]), POSE[:3])
     pose = frame.CalcPoseInWorld(context) @ on_body
@@ -53,11 +54,13 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
     np.testing.assert_allclose(read[6:9], R @ (acceleration[3:] + 9.81 * np.eye(3)[2]), atol=1e-9 * size)
     # What the links need is what the drive gives: inverse dynamics without rotors, springs and friction.
     k = plant.GetJointByName(joint).velocity_start()
-    moving = SetTree(tree, numbers)._moving(x[None, :nq], x[None, nq:])
-    assert read[9] == pytest.approx(moving.forces(a[None])[0][0, k], abs=1e-9 * np.abs(a).max())
+    set_state(model.double, x)
+    rotors = numbers.reflected * a + numbers.damping * x[nq:]
+    drive = model.double.inverse_dynamics(a) - rotors
+    assert read[9] == pytest.approx(drive[k], abs=1e-9 * np.abs(a).max())
 
     by = np.eye(len(numbers.flat))
-    by_x, by_numbers = sensors.slopes(numbers, x[None, :nq], x[None, nq:], u[None], by)
+    by_x, by_numbers = sensors.slopes(dynamics, x[None], u[None], by)
     direction = random.uniform(-1, 1, 2 * nv)
     change = random.uniform(-1, 1, len(by)) * np.maximum(np.abs(numbers.flat), 1e-3)
 
@@ -65,7 +68,7 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
         moved = chart.plus(x[None], h * direction[None])
         flat = numbers.flat + h * change
         parts = {name: flat[numbers.places(name)] for name in Numbers.__dataclass_fields__}
-        return sensors.read(Numbers(**parts), moved[:, :nq], moved[:, nq:], u[None])[0]
+        return sensors.read(Dynamics(tree, Numbers(**parts)), moved, u[None])[0]
 
     difference = (at(1e-5) - at(-1e-5)) / 2e-5
     found = by_x[0] @ direction + by_numbers[0] @ change

@@ -25,6 +25,13 @@ def compiled(function: Function) -> Function:
     return cast(Function, njit(cache=True, error_model="numpy")(function))
 
 
+def inner(function: Function) -> Function:
+    """As `compiled`, of a function that compiled functions alone call: a shell for Python takes longest to compile."""
+    from numba import njit
+
+    return cast(Function, njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function))
+
+
 @cache
 def time_compilations() -> None:
     """From now on tell the clock that limits go by how long Numba compiles."""

@@ -14,8 +14,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import ModelError, UnknownNameError
-from drake_diff.identification.set_tree import SetTree
-from drake_diff.identification.tree import Tree, ten_numbers, tree_for_identification
+from drake_diff.identification.tree import Dynamics, Tree, ten_numbers, tree_for_identification
 from drake_diff.model.model import Model
 
 STATES = 60  # random ones, of at least as many rows as there are numbers
@@ -108,7 +107,7 @@ def _effects(model: Model, tree: Tree, count: int) -> list[Array]:
     N = max(STATES, 20 * count // max(model.nv, 1) + 1)
     q = random.uniform(-np.pi, np.pi, (N, model.nq))
     v, a = random.standard_normal((2, N, model.nv))
-    return SetTree(tree, numbers).regressors(q, v, a)
+    return Dynamics(tree, numbers).regressors(q, v, a)
 
 
 def _sums(effects: Array, names: Sequence[str], units: Sequence[str], values: Array) -> tuple[BaseParameter, ...]:

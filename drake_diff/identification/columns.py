@@ -16,13 +16,11 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.exceptions import DrakeDiffError
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.euler import EulerMotion
-from drake_diff.identification.fit import Fit, Law, Solved, cut_segments
-from drake_diff.identification.flow import ContinuousMotion
-from drake_diff.identification.frozen import FrozenMotion
-from drake_diff.identification.identify import LONGEST, Problem
+from drake_diff.identification.fit import Fit, Solved, cut_segments
+from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import HOPELESS, noise_of
 from drake_diff.identification.measured import Piece, guess_states, noise_by_differences
+from drake_diff.identification.motion import ContinuousMotion, EulerMotion, Law
 from drake_diff.identification.tree import Mask, Tree
 from drake_diff.identification.unknowns import Unknowns
 from drake_diff.model.model import Model
@@ -191,15 +189,15 @@ def mistaken_in_the_air(
 
     `stated` (2 nv,) is the noise, NaN where it is not known.
     """
-    own = model, tree, chart, Unknowns((), as_in_files=True)
+    own = model, tree, Unknowns((), as_in_files=True)
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
     whole = np.round(periods)
     steps = not chart.coordinates.free and np.all(whole > 0) and np.all(np.abs(periods - whole) < CLOCK_TOLERANCE)
-    law = ContinuousMotion(*own, LONGEST)
-    fits = [partial(_fitted, model, law, FrozenMotion(*own, LONGEST), chart, stated)]
+    law = ContinuousMotion(*own)
+    fits = [partial(_fitted, model, law, chart, stated)]
     if steps:
         euler = EulerMotion(*own, model.time_step)
-        fits.append(partial(_fitted, model, euler, euler, chart, stated))
+        fits.append(partial(_fitted, model, euler, chart, stated))
     return mistaken_columns(model, chart, pieces, law, fits)
 
 
@@ -245,18 +243,16 @@ def side_by_side(law: Law, starts: Sequence[Array], hs: Array, us: Sequence[Arra
     return list(xs.reshape(len(starts), len(hs), *xs.shape[1:]))
 
 
-def _fitted(
-    model: Model, law: Law, cheap: Law, chart: Chart, stated: Array, pieces: Sequence[Piece]
-) -> tuple[float, bool]:
+def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequence[Piece]) -> tuple[float, bool]:
     """(-2 log of the likelihood with the noise that is left, whether what is left is noise).
 
-    Where a few steps by the cheaper derivatives of another law leave far more than noise, no more are taken.
+    Where a few steps leave far more than noise, no more are taken.
     """
     nothing = Unknowns((), as_in_files=True)
     problem = Problem(model, chart, nothing, list(pieces), stated, noise_by_differences(chart, pieces))
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            fit, starts = problem.prepared(cheap)
+            fit, starts = problem.prepared(law)
             size = noise_of(fit, fit.solve(problem.unknowns.z_first, starts, FEW))
             if np.any(size[np.isfinite(size)] > HOPELESS * problem.first_noise[np.isfinite(size)]):
                 return np.inf, False

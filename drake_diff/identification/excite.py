@@ -20,14 +20,11 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.dry import smooth_or_dry
 from drake_diff.identification.fit import Fit, growth_cuts
-from drake_diff.identification.flow import ROUGH, ContinuousMotion
-from drake_diff.identification.identify import LONGEST
 from drake_diff.identification.judge import deviations_of, known_of, unidentifiable
 from drake_diff.identification.measured import LEAST, Piece, given_noise
-from drake_diff.identification.set_tree import SetTree
-from drake_diff.identification.tree import Tree, tree_for_identification
+from drake_diff.identification.motion import ContinuousMotion
+from drake_diff.identification.tree import ORDER_4, Dynamics, Tree, tree_for_identification
 from drake_diff.identification.unknowns import FAR, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
@@ -186,20 +183,20 @@ class _Design:
 
     @cached_property
     def law(self) -> ContinuousMotion:
-        return smooth_or_dry(self.model, self.tree, self.chart, self.unknowns, LONGEST)
+        return ContinuousMotion(self.model, self.tree, self.unknowns)
 
     @cached_property
     def rough(self) -> ContinuousMotion:
-        return replace(self.law, longest=1.01 * COARSE, method=ROUGH)
+        return replace(self.law, longest=1.01 * COARSE, method=ORDER_4)
 
     @cached_property
-    def own(self) -> SetTree:
-        return SetTree(self.tree, self.tree.numbers)
+    def own(self) -> Dynamics:
+        return Dynamics(self.tree, self.tree.numbers)
 
     @cached_property
     def follows(self) -> bool:
         """Whether any motion of the joints has inputs."""
-        reach = np.linalg.matrix_rank(self.own.efforts())
+        reach = np.linalg.matrix_rank(self.own.efforts)
         return not self.chart.coordinates.free and self.model.nu > 0 and int(reach) == self.model.nv
 
     @cached_property
@@ -279,11 +276,7 @@ class _Design:
         xs = np.concatenate([q + middle, v], axis=2)
         between = (xs[:, 1:] + xs[:, :-1]) / 2
         flat = between.reshape(-1, self.model.nx)
-        us = self.own.inputs_for(
-            flat[:, : self.model.nq],
-            flat[:, self.model.nq :],
-            ((a[:, 1:] + a[:, :-1]) / 2).reshape(len(flat), -1),
-        )
+        us = self.own.inputs_for(flat, ((a[:, 1:] + a[:, :-1]) / 2).reshape(len(flat), -1))
         return xs, us.reshape(K, n - 1, -1), a
 
     def simulated(self, c: Array) -> tuple[Array, Array]:
@@ -299,7 +292,7 @@ class _Design:
             rate = min(FASTEST, 0.2 / h)
             off = planned[0, k] - xs[k]
             wanted = (a[0, k] + a[0, k + 1]) / 2 + rate**2 * off[:nq] + 2 * rate * off[nq:]
-            us[k] = self.own.inputs_for(xs[k, None, :nq], xs[k, None, nq:], wanted[None])[0]
+            us[k] = self.own.inputs_for(xs[k, None], wanted[None])[0]
             hs = np.array([self.law.cut(float(h))])
             xs[k + 1] = self.law.run(values, xs[k, None], hs, np.tile(us[k], (1, hs.shape[1], 1)))[0, -1]
         return xs, us

@@ -27,14 +27,12 @@ from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.columns import mistaken_in_the_air
 from drake_diff.identification.contact_causes import explain_contact, may_touch
-from drake_diff.identification.dry import dry_places
 from drake_diff.identification.identify import TOUCH, what_acts
 from drake_diff.identification.measured import given_noise, read_pieces
 from drake_diff.identification.race import FALLS, LOOKED_AT, Race, Runner
 from drake_diff.identification.screen import DELAY, LIMIT, LONGEST_DELAY, NO_PROMISE, Promise, View
-from drake_diff.identification.set_tree import SetTree
 from drake_diff.identification.setting import Setting
-from drake_diff.identification.tree import tree_for_identification
+from drake_diff.identification.tree import Dynamics, tree_for_identification
 from drake_diff.identification.trial import STEPS, Trial, Tried
 from drake_diff.identification.unknowns import HELD_DAMPING, HELD_INERTIA, Unknown, Unknowns
 from drake_diff.identification.words import Explanation, Words, also_touching, explained_by
@@ -165,17 +163,16 @@ class _Search:
 
     def by_friction_that_gives(self, runners: Sequence[Runner], base: Tried) -> Explanation | None:
         """Where dry friction of a joint left least, and not noise: the same, which gives way where it holds."""
-        if not runners or self.race.is_late or self.setting.tree.dynamics.coupling is not None:
+        if not runners or self.race.is_late or self.setting.tree.coupling is not None:
             return None
-        one, nq = runners[0], self.setting.model.nq
-        dry = dry_places(self.setting.tree, one.fit.unknowns)
+        one = runners[0]
+        law = self.setting.law(one.fit.unknowns, self.setting.longest, smooth=False)
+        dry = law.dry
         if len(one.names) > 1 or not dry:
             return None
         (j,) = dry
         label = one.names[0].rsplit(".", 1)[0]
-        x = one.starts[:1]
-        tree = SetTree(self.setting.tree, self.setting.tree.numbers)
-        mass, _ = tree.pushed(x[:, :nq], x[:, nq:], np.zeros((1, self.setting.model.nu)))
+        mass = Dynamics(self.setting.tree, self.setting.tree.numbers).mass(one.starts[:1])
         inertia = HELD_BY / float(np.linalg.inv(mass)[0, j, j])
         held = [
             Unknown(f"{label}.{quantity}", unit, np.array([start]), 0.0, start)

@@ -14,19 +14,18 @@ data say nothing: it is one standard deviation where a quantity is three times i
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear, minimize_scalar
 
 from drake_diff._base.arrays import Array
-from drake_diff.exceptions import SimulationError
+from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.identification.chart import Chart
 from drake_diff.identification.measured import LEAST, Piece
+from drake_diff.identification.motion import ContinuousMotion, Law
 from drake_diff.identification.sensors import Sensors
-from drake_diff.identification.tree import Grip, Numbers
-from drake_diff.identification.unknowns import BIAS, Unknowns, numbers_at, set_numbers
+from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
 
 SEGMENT_SAMPLES = 5  # of a segment at least
@@ -43,57 +42,6 @@ SHORT = 0.1  # of a step: a kink is near
 TOO_LARGE = 1e100  # of a derivative, in units of the noise: its square is beyond what numbers hold
 STUCK = "no part of a step made the motion nearer to what was measured"
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
-
-
-class Law(Protocol):
-    """How a model moves, many segments at once."""
-
-    @property
-    def words(self) -> str:
-        """Which motion this is."""
-        ...
-
-    @property
-    def segment(self) -> float:
-        """[s] how long a segment is."""
-        ...
-
-    @property
-    def kinks(self) -> bool:
-        """Whether derivatives say little of larger changes: of a joint that stops and stays, no velocity is left."""
-        ...
-
-    def cut(self, period: float) -> tuple[float, ...]:
-        """Lengths of the steps [s] over a time between samples [s]."""
-        ...
-
-    def shorter(self, than: float) -> "Law | None":
-        """The same by steps of at most half of a length [s]; None where the steps are the model's own."""
-        ...
-
-    def exact(self) -> "Law | None":
-        """The same with the derivatives of its own steps; None where it has these."""
-        ...
-
-    def is_possible(self, values: Array) -> bool:
-        """Whether there are bodies with these values."""
-        ...
-
-    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
-        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
-        ...
-
-    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
-        ...
-
-    def rates(self, values: Array, x: Array, u: Array) -> Array:
-        """(N, nx) by time, of states (N, nx) under u (N, nu)."""
-        ...
-
-    def grip_at(self, numbers: Numbers, q: Array, v: Array, u: Array) -> Grip | None:
-        """What dry friction does in states; None where there is none."""
-        ...
 
 
 @dataclass(eq=False)
@@ -291,12 +239,11 @@ class Fit:
             found[p][s.samples[k]] = xs[k, s.at[k]]
         return found
 
-    def _samples(self, s: Segments, xs: Array) -> tuple[Array, Array, Array]:
-        """q, v and u at the samples of all segments, one after the other; an input is that of the step that begins."""
+    def _samples(self, s: Segments, xs: Array) -> tuple[Array, Array]:
+        """x and u at the samples of all segments, one after the other; an input is that of the step that begins."""
         at = [(k, i) for k, each in enumerate(s.at) for i in each]
         rows, steps = np.array(at, dtype=np.intp).T
-        x = xs[rows, steps]
-        return x[:, : self.model.nq], x[:, self.model.nq :], s.us[rows, np.minimum(steps, s.us.shape[1] - 1)]
+        return xs[rows, steps], s.us[rows, np.minimum(steps, s.us.shape[1] - 1)]
 
     def _split(self, s: Segments, every: Array) -> list[Array]:
         return np.split(every, np.cumsum([len(each) for each in s.at])[:-1])
@@ -305,16 +252,20 @@ class Fit:
         """Of each segment (samples, m), what sensors read."""
         if not self.sensors.count:
             return [np.zeros((len(each), 0)) for each in s.at]
-        numbers = set_numbers(self.model, self.sensors.known, self.unknowns, values)
         with np.errstate(over="ignore", invalid="ignore"):
-            q, v, u = self._samples(s, xs)
-            return self._split(s, self.sensors.read(numbers, q, v, u, self.law.grip_at(numbers, q, v, u)))
+            return self._split(s, self.sensors.read(self._continuous.dynamics(values), *self._samples(s, xs)))
+
+    @property
+    def _continuous(self) -> ContinuousMotion:
+        """The law, of which sensors are read."""
+        if not isinstance(self.law, ContinuousMotion):
+            raise ModelError("sensors are read from motion in continuous time")
+        return self.law
 
     def _read_slopes(self, z: Array, s: Segments, xs: Array) -> list[tuple[Array, Array]]:
         """Of each segment (samples, m, 2 nv) by the state, and (samples, m, np) by z."""
-        numbers, by = numbers_at(self.model, self.sensors.known, self.unknowns, z)
-        q, v, u = self._samples(s, xs)
-        by_x, by_z = self.sensors.slopes(numbers, q, v, u, by, self.law.grip_at(numbers, q, v, u))
+        dynamics = self._continuous.dynamics(self.unknowns.values(z))
+        by_x, by_z = self.sensors.slopes(dynamics, *self._samples(s, xs), self._continuous.by(z))
         return list(zip(self._split(s, by_x), self._split(s, by_z), strict=True))
 
     def _shift(self, values: Array) -> Array:
@@ -433,9 +384,6 @@ class Fit:
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
         """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
         solved = self._descended(z, starts, most)
-        exact = self.law.exact() if solved.stuck else None
-        if exact is not None:
-            solved = self.by(exact)._descended(solved.z, solved.starts, most)
         return self._from_rest(solved, most) if solved.stuck and self.law.kinks else solved
 
     def by(self, law: Law) -> "Fit":

@@ -14,8 +14,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.dry import smooth_or_dry
-from drake_diff.identification.fit import Fit, Law, Solved, growth_cuts
+from drake_diff.identification.fit import Fit, Solved, growth_cuts
 from drake_diff.identification.judge import (
     COLOURED,
     Known,
@@ -37,8 +36,8 @@ from drake_diff.identification.measured import (
     read_given,
     read_pieces,
 )
+from drake_diff.identification.motion import ContinuousMotion, Law, discrete_motion
 from drake_diff.identification.sensors import Sensors, choose_sensors
-from drake_diff.identification.steps import discrete_motion
 from drake_diff.identification.through_impacts import judged
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
@@ -49,7 +48,7 @@ from drake_diff.model.tangent import tangent_space
 
 MOTIONS = ("auto", "continuous", "steps", "impacts")
 TOUCH = "bodies touch"
-LONGEST, SHORTEST = 0.02, 1e-4  # [s] of the steps of Runge and Kutta
+SHORTEST = 1e-4  # [s] of the steps of Runge and Kutta
 STEP_ERROR = 1e-3  # of the noise: what a step of half the length may change over a segment
 ROUNDS = 5  # of estimating the noise
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0)  # of a time between samples: delays that are tried at first
@@ -202,7 +201,7 @@ def identify(
         law: Law = (
             discrete_motion(model, unknowns, pieces)
             if own_tree is None
-            else smooth_or_dry(model, own_tree, chart, unknowns, LONGEST)
+            else ContinuousMotion(model, own_tree, unknowns)
         )
         fit, solved = problem.solve(law, max_iterations)
         found = problem.judged(fit, solved, why if motion == "auto" else "")

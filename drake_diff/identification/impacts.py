@@ -26,7 +26,7 @@ from drake_diff.identification.chart import Chart
 from drake_diff.identification.cloud import Plane, plane_at, shrink_to
 from drake_diff.identification.flights import Start, flights_of, millisecond, start_of, steps_between
 from drake_diff.identification.measured import Piece, read_pieces
-from drake_diff.identification.steps import DiscreteMotion, discrete_motion
+from drake_diff.identification.motion import DiscreteMotion, discrete_motion
 from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model

@@ -153,7 +153,7 @@ class Race:
         promise: Promise,
     ) -> Runner:
         problem = self.setting.problem(unknowns, pieces)
-        fit = problem.fit(self.setting.law_of(unknowns), pieces, problem.first_noise)
+        fit = problem.fit(self.setting.law(unknowns, self.setting.longest, smooth=False), pieces, problem.first_noise)
         return Runner(names, fit, z, starts, promise.left, promise.freedom)
 
     def raced(self, runners: list[Runner], base: Tried) -> tuple[list[Tried], list[Runner]]:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.fit import Fit, Reduced
-from drake_diff.identification.flow import ContinuousMotion
 from drake_diff.identification.measured import Piece
-from drake_diff.identification.set_tree import SetTree
+from drake_diff.identification.motion import ContinuousMotion
+from drake_diff.identification.tree import Dynamics
 from drake_diff.identification.unknowns import INERTIA, MASS, Unknown, Unknowns
 
 DELAY, LIMIT = "input_delay", "limit"  # changes of how inputs act; a limit is found by a search over its one number
@@ -53,14 +53,13 @@ class Inputs:
                 inertia = places[f"{one.label}.{INERTIA}"]
                 by_z[..., s.start] += by_z[..., inertia] @ (0.5 * np.concatenate([np.ones(3), z[inertia][3:]]))
             elif one.quantity == DELAY and not one.shifts:
-                accelerate = SetTree(self.law.tree, self.law.tree.numbers).accelerate
+                accelerate = Dynamics(self.law.tree, self.law.tree.numbers).accelerate
                 before = np.concatenate([us[:, :1], us[:, :-1]], axis=1)
                 before[1:, 0] = us[:-1, -1]
                 before[np.all(hs == 0, axis=1)] = 0.0
                 flat = xs[:, :-1].reshape(-1, xs.shape[2])
-                q, v = flat[:, :nq], flat[:, nq:]
                 nu = us.shape[2]
-                change = accelerate(q, v, before.reshape(-1, nu)) - accelerate(q, v, us.reshape(-1, nu))
+                change = accelerate(flat, before.reshape(-1, nu)) - accelerate(flat, us.reshape(-1, nu))
                 pushed = (by_x[..., nq:] @ change.reshape(*hs.shape, -1, 1))[..., 0]
                 by_z[..., s.start] = np.where((hs > 0)[..., None], pushed, 0.0)
             elif one.quantity.startswith(LIMIT):

@@ -12,8 +12,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, skew
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.set_tree import SetTree
-from drake_diff.identification.tree import Grip, Numbers, Tree
+from drake_diff.identification.tree import Dynamics, Numbers, Tree
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
 
@@ -60,7 +59,7 @@ def choose_sensors(
     """
     mounted = dict(mounted or {})
     wanted = dict.fromkeys(sensor_of(column) for column in columns)
-    if wanted and (tree is None or tree.dynamics.coupling is not None):
+    if wanted and (tree is None or tree.coupling is not None):
         why = "joints follow others" if tree is not None else "there is none here"
         raise ModelError(f"{model.name}: sensors are read from motion in continuous time, and {why}")
     for name in mounted:
@@ -150,18 +149,16 @@ class Sensors:
         every = [column for sensor in self.each for column in sensor.columns]
         return [every.index(column) for column in self.columns]
 
-    def read(self, numbers: Numbers, q: Array, v: Array, u: Array, grip: Grip | None = None) -> Array:
-        """(N, m) at q (N, nq), v (N, nv), under u (N, nu); `grip` is of dry friction."""
-        tree = self._tree
-        own = SetTree(tree, numbers)
-        a = own.accelerate(q, v, u, grip) if self._accelerates else np.zeros_like(v)
-        forces = own.carried(q, v, a) if self._forces else None
-        return np.asarray(self._read(numbers, q, v, a, forces).real)
+    def read(self, dynamics: Dynamics, x: Array, u: Array) -> Array:
+        """(N, m) at x (N, nx) under u (N, nu)."""
+        q, v = self._split(x)
+        a = dynamics.accelerate(x, u) if self._accelerates else np.zeros_like(v)
+        forces = dynamics.inverse_dynamics(q, v, a)[0] if self._forces else None
+        return np.asarray(self._read(dynamics.numbers, q, v, a, forces).real)
 
-    @property
-    def known(self) -> Tree:
-        """The tree that carries them."""
-        return self._tree
+    def _split(self, x: Array) -> tuple[Array, Array]:
+        nv = self._tree.n
+        return x[:, : x.shape[1] - nv], x[:, x.shape[1] - nv :]
 
     @property
     def _tree(self) -> Tree:
@@ -180,14 +177,11 @@ class Sensors:
         found = [sensor for sensor in self.each if sensor.quantity == FORCE]
         return [(self.columns.index(sensor.columns[0]), int(tree.first[sensor.link])) for sensor in found]
 
-    def slopes(
-        self, numbers: Numbers, q: Array, v: Array, u: Array, by: Array, grip: Grip | None = None
-    ) -> tuple[Array, Array]:
+    def slopes(self, dynamics: Dynamics, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
         """(N, m, 2 nv) by small motions of the state, and (N, m, np) by parameters, of which `by` moves the numbers."""
-        tree, nv = self._tree, v.shape[1]
-        own = SetTree(tree, numbers)
-        moving = own.slopes(q, v, u, by, grip) if self._accelerates else None
-        a = np.zeros_like(v) if moving is None else moving.a
+        q, v = self._split(x)
+        nv, numbers = v.shape[1], dynamics.numbers
+        a, by_state = dynamics.acceleration_jacobians(x, u, by) if self._accelerates else (np.zeros_like(v), None)
         moved = np.zeros((len(q), self.count, 2 * nv))
         by_a = np.zeros((len(q), self.count, nv))
         used = np.flatnonzero(self._above())
@@ -196,7 +190,7 @@ class Sensors:
             step[j] = 1j * TINY
             moved[..., j] = self._read(numbers, q, v, a, small=step).imag / TINY
             moved[..., nv + j] = self._read(numbers, q, v + step, a).imag / TINY
-            if moving is not None:
+            if by_state is not None:
                 by_a[..., j] = self._read(numbers, q, v, a + step).imag / TINY
         found = np.zeros((len(q), self.count, by.shape[1]))
         flat = numbers.flat
@@ -206,20 +200,18 @@ class Sensors:
                 parts = {name: turned[numbers.places(name)] for name in Numbers.__dataclass_fields__}
                 found[..., column] = self._read(Numbers(**parts), q, v, a).imag / TINY
         if self._forces:
-            by_q, by_v, mass, by_numbers = own.carried_slopes(q, v, a, by)
+            _, mass, slopes = dynamics.inverse_dynamics(q, v, a, by)
             for i, k in self._forces:
-                moved[:, i], by_a[:, i] = np.concatenate([by_q[:, k], by_v[:, k]], axis=1), mass[:, k]
-                found[:, i] = by_numbers[:, k]
-        if moving is not None:
-            moved[..., :nv] += by_a @ moving.by_q
-            moved[..., nv:] += by_a @ moving.by_v
-            found += by_a @ moving.by_numbers
+                moved[:, i], by_a[:, i], found[:, i] = slopes[:, k, : 2 * nv], mass[:, k], slopes[:, k, 2 * nv :]
+        if by_state is not None:
+            moved += by_a @ by_state[..., : 2 * nv]
+            found += by_a @ by_state[..., 2 * nv :]
         return moved, found
 
     def _above(self) -> Array:
         """(nv,) which coordinates any of the sensors sees by its place or motion."""
         tree = self._tree
-        seen = np.zeros(len(tree.dynamics.mass), dtype=bool)
+        seen = np.zeros(tree.n, dtype=bool)
         for sensor in self.each:
             i = sensor.link
             while i >= 0:

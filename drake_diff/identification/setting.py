@@ -8,19 +8,15 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.chart import Chart
-from drake_diff.identification.dry import DryMotion, dry_places
-from drake_diff.identification.euler import EulerMotion
-from drake_diff.identification.fit import Fit, Law, Point
-from drake_diff.identification.flow import ROUGH, ContinuousMotion
-from drake_diff.identification.frozen import FrozenMotion
-from drake_diff.identification.identify import LONGEST, Problem
+from drake_diff.identification.fit import Fit, Point
+from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import HOPELESS, most_scatter
 from drake_diff.identification.measured import Piece, noise_by_differences
+from drake_diff.identification.motion import LONGEST, ContinuousMotion, EulerMotion, Law
 from drake_diff.identification.screen import DELAY, LIMIT, LONGEST_DELAY, Inputs, View, changes_of_inputs, view
-from drake_diff.identification.tree import Tree
+from drake_diff.identification.tree import ORDER_4, Tree
 from drake_diff.identification.unknowns import (
     BIAS,
-    HELD_INERTIA,
     INERTIA,
     MASS,
     Unknown,
@@ -32,7 +28,6 @@ from drake_diff.model.model import Model
 
 PARTS = (1, 2, 4, 5, 10, 20)  # of a sample: Euler steps that are tried
 SETTLING, SETTLES = 8, 0.8  # steps by which segments settle, and the part of what was left that each must leave at most
-CALM = 1e-2  # of a small motion over a segment: by how much derivatives frozen halfway may miss it, as of a deviation
 PLAUSIBLE = 1.5  # times the squares that can be noise: what leaves more is not fitted to its end beside another
 DELAYS = (0.25, 0.75, 1.5, 3, 5.5, 8)  # of a sample, from which other changes are looked for beside a delay
 
@@ -47,7 +42,6 @@ class Setting:
     pieces: list[Piece]
     stated: Array
     by_delay: dict[float, Array] = field(default_factory=dict)  # starts of segments that settled at a delay
-    calm: bool = False  # whether steps frozen halfway have the derivatives of the motion
     step: float | None = None  # [s] of the Euler steps that stand for the motion; None for continuous time
 
     @property
@@ -89,7 +83,7 @@ class Setting:
             late = self.of([f"model.{DELAY}"])
             law = self.law(late, self.longest)
             if self.step is None:
-                law = FrozenMotion(self.model, self.tree, self.chart, late, self.longest, method=ROUGH)
+                law = replace(law, method=ORDER_4)
             problem = self.problem(late, self.cut)
             near = min(known, key=lambda other: abs(other - delay), default=0.0)
             starts = known[near] if abs(near - delay) < delay else self.starts
@@ -122,20 +116,11 @@ class Setting:
     def problem(self, unknowns: Unknowns, pieces: Sequence[Piece]) -> Problem:
         return Problem(self.model, self.chart, unknowns, list(pieces), self.stated, self.scatter)
 
-    def law(self, unknowns: Unknowns, longest: float) -> ContinuousMotion:
-        own = self.model, self.tree, self.chart, unknowns
+    def law(self, unknowns: Unknowns, longest: float, *, smooth: bool = True) -> ContinuousMotion:
+        """By Euler steps where they stand for the motion; Coulomb friction that is not smooth holds."""
         if self.step is not None:
-            return EulerMotion(*own, self.step)
-        return FrozenMotion(*own, longest) if self.calm else ContinuousMotion(*own, longest)
-
-    def law_of(self, unknowns: Unknowns) -> ContinuousMotion:
-        """With dry friction that holds, but by Euler steps."""
-        dry = dry_places(self.tree, unknowns)
-        if not dry or self.step is not None:
-            return self.law(unknowns, self.longest)
-        own = self.model, self.tree, self.chart, unknowns, self.longest
-        gives = any(one.quantity == HELD_INERTIA for one in unknowns.each)
-        return DryMotion(*own, joints=dry, gives=gives, calm=self.calm)
+            return EulerMotion(self.model, self.tree, unknowns, self.step)
+        return ContinuousMotion(self.model, self.tree, unknowns, longest, smooth=smooth)
 
     @staticmethod
     def each_of(unknowns: Unknowns) -> list[tuple[Unknown, slice]]:
@@ -148,7 +133,6 @@ class Setting:
         longest = fit.law.longest if isinstance(fit.law, ContinuousMotion) else LONGEST
         self.longest, self.segments, self.cut = longest, fit.segments, list(fit.segments.pieces)
         self.starts = self.settled(fit, nothing.z_start, starts)
-        self.calm = self.is_calm(fit)
 
     def settled(self, fit: Fit, z: Array, starts: Array) -> Array:
         """Starts of the segments from which the motion is nearer to what each of them measured, by itself.
@@ -177,22 +161,6 @@ class Setting:
                     better = _each_left(there) < best
                     starts, best = np.where(better[:, None], moved, starts), np.where(better, _each_left(there), best)
         return starts
-
-    def is_calm(self, fit: Fit) -> bool:
-        """Whether a small motion goes through segments alike by steps frozen halfway, and by the method's own."""
-        s, z = fit.segments, fit.unknowns.z_start
-        some = slice(None, None, 2)  # of the segments
-        xs = fit.law.run(fit.unknowns.values(z), self.starts[some], s.hs[some], s.us[some])
-        frozen = FrozenMotion(self.model, self.tree, self.chart, fit.unknowns, self.longest)
-        whole = []
-        for law in (fit.law, frozen):
-            steps, _ = law.slopes(z, xs, s.hs[some], s.us[some])
-            through = self.chart.from_motion(xs[:, 0])
-            for m in range(steps.shape[1]):
-                through = steps[:, m] @ through
-            whole.append(self.chart.to_motion(xs[:, -1]) @ through * fit.gap_scale / fit.gap_scale[:, None])
-        off, size = (np.linalg.norm(each, axis=(1, 2)) for each in (whole[0] - whole[1], whole[0]))
-        return bool(np.all(off <= CALM * size))
 
     def view(self, pieces: Sequence[Piece], z: Array, starts: Array) -> View | None:
         """What everything promises there; where z has a delay, inputs act so much later."""

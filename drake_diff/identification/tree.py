@@ -1,34 +1,43 @@
-"""The accelerations of a tree at many states in one call, as functions of the numbers that parameters set.
-
-    M(q) a = B (strength * u) - C(q, v) v + gravity - springs - damping v - coulomb tanh(v / v_s)
-
-where dry friction turns over a small speed; `identification.dry` has the one that holds.
+"""The equations of motion of a tree at many states, as functions of the numbers that parameters set.
 
 The force of inverse dynamics is linear in each link's ten numbers: mass, mass times centre of mass, inertia about the
 frame's origin. So is it in damping, stiffness, friction and gravity, and
 
     da / dnumber = M^-1 (d force / dnumber - d inverse dynamics / dnumber)   at fixed q, v and a.
+
+A shift of a joint on its parent is the motion of a virtual slide without mass that is put before the joint and does not
+move: its derivative is that by the slide's coordinate. `kernel` and `coulomb_friction` have the formulas.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import DOP853
 
-from drake_diff._base.arrays import Array, Indices, skew
+from drake_diff._base.arrays import Array, Indices, own_array, skew
+from drake_diff._base.compiled import kernel
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import ModelError
-from drake_diff.identification.compiled import INERTIA
-from drake_diff.mechanics.description import Link, RigidLink, read_links, springs_of, without_welds
-from drake_diff.mechanics.numpy_tree import TreeDynamics, tree_of
+from drake_diff.mechanics.coordinates import Coordinates
+from drake_diff.mechanics.description import Link, RigidLink, coordinates_of, read_links, springs_of, without_welds
+from drake_diff.mechanics.tree import tree_of
+from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators
 
-SLIP_SPEED = 0.02  # v_s [rad/s or m/s] over which dry friction turns: Drake's joints have none, so nothing gives one
+KERNEL = "drake_diff.identification.kernel"
+FRICTION = "drake_diff.identification.coulomb_friction"
+TREE = "drake_diff.mechanics.tree_kernel"
+INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz
+SLIP_SPEED = 0.02  # [rad/s or m/s] over which friction turns where it is smooth
 Mask = NDArray[np.bool_]
-Grip = tuple[Array, Mask]  # what dry friction does: which way each coordinate slides, and which of them it holds
+Method = tuple[Array, Array]  # of Runge and Kutta: (m, m) its stages, (m,) its weights
+ORDER_8: Method = (np.array(DOP853.A[: len(DOP853.B), : len(DOP853.B)]), np.array(DOP853.B))
+ORDER_4: Method = (np.diag([0.5, 0.5, 1.0], -1), np.array([1, 2, 2, 1]) / 6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +52,7 @@ class Numbers:
     stiffness: Any  # (n,)
     rest: Any  # (n,)
     coulomb: Any  # (n,) dry friction [N or N m]
-    held_inertia: Any  # (n,) by which dry friction holds a joint, beside a damping; 0 where it holds it still
+    held_inertia: Any  # (n,) by which friction that gives way holds a joint, beside a damping
     held_damping: Any  # (n,)
     strength: Any  # (nu,) what an input is multiplied by
 
@@ -64,60 +73,220 @@ class Numbers:
 
 
 @dataclass(frozen=True, eq=False)
-class Slopes:
-    """Accelerations a (N, n) and their derivatives by small motion, by v, by u and by the numbers asked for."""
-
-    a: Array
-    by_q: Array
-    by_v: Array
-    by_u: Array
-    by_numbers: Array  # (N, n, np)
-
-
-@dataclass(frozen=True, eq=False)
 class Tree:
     """The tree of a model: what stays where parameters change."""
 
     links: tuple[RigidLink, ...]  # parents first
-    dynamics: TreeDynamics  # each link in the frame of its joint; numbers are put in
-    first: Indices  # (L,) of each link, its first degree of freedom
-    actuation: Array  # (n, nu), of all joints
+    coordinates: Coordinates  # of the independent joints
+    coupling: Coupling | None  # of joints that follow others
+    n: int  # degrees of freedom of all joints
+    actuation: Array  # (n, nu)
     limits: Array  # (nu,) what Drake cuts each input at
     placed: Mapping[str, tuple[int, Any]]  # by body: the link it belongs to, and the pose of the body in its frame
     moved_by: Mapping[str, Array]  # (10, 10) by body: its ten numbers in the frame of its link
     bodies: Mapping[str, Link]
     numbers: Numbers  # the model's own
-    slip: float = SLIP_SPEED  # v_s [rad/s or m/s]
 
     @property
-    def free(self) -> NDArray[np.bool_]:
-        """(L,) whether a link is a free body."""
-        return np.array([link.free for link in self.links], dtype=bool)
+    def first(self) -> Indices:
+        """(L,) of each link, its first degree of freedom."""
+        return np.array([link.joint.v_start for link in self.links], dtype=np.intp)
 
-    def of_all(self, turn: Array) -> Array:
-        """(N, n) which way each joint slides, of which way coordinates do (N, nv)."""
-        coupling = self.dynamics.coupling
-        return turn if coupling is None else np.asarray(turn @ np.sign(coupling.spread).T)
+    @cached_property
+    def spread(self) -> Array:
+        """(n, nv) velocities of all joints by the independent ones."""
+        return np.eye(self.n) if self.coupling is None else np.asarray(self.coupling.spread, dtype=float)
 
-    def all_of(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Positions and velocities of all joints, those that follow another included."""
-        coupling = self.dynamics.coupling
-        return (q, v) if coupling is None else (coupling.positions(q), coupling.velocities(v))
 
-    def own(self, matrix: Array) -> Array:
-        """(N, nv, nv) a matrix (N, n, n) of all joints, of the independent coordinates."""
-        coupling = self.dynamics.coupling
-        return matrix if coupling is None else np.asarray(coupling.spread.T @ matrix @ coupling.spread)
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """A tree with these numbers; Coulomb friction holds the coordinates that are `dry`, else it turns over a speed."""
 
-    def along(self, force: Array) -> Array:
-        """(N, nv) of forces (N, n)."""
-        coupling = self.dynamics.coupling
-        return force if coupling is None else np.asarray(force @ coupling.spread)
+    tree: Tree
+    numbers: Numbers
+    dry: tuple[int, ...] = ()
+    gives: bool = False  # whether it gives way, of one joint
+    method: Method = ORDER_8
 
-    def along_columns(self, columns: Array) -> Array:
-        """(N, nv, k) of (N, n, k)."""
-        coupling = self.dynamics.coupling
-        return columns if coupling is None else np.asarray(coupling.spread.T @ columns)
+    def run(self, xs: Array, hs: Array, us: Array) -> None:
+        """Fill xs (K, M+1, nx), which has the starts, by steps of hs (K, M) [s] under us (K, M, nu)."""
+        kernel(FRICTION).run(*self._system(), own_array(hs), self._effort(us), xs, np.empty((0, 0, 0, 0)))
+
+    def step_jacobians(self, xs: Array, hs: Array, us: Array, by: Array) -> Array:
+        """(K, M, nx, nx + P) of each of these steps; `by` (count, P) is how the numbers change with parameters."""
+        nx = xs.shape[2]
+        jacobians = np.empty((*hs.shape, nx, nx + by.shape[1]))
+        kernel(FRICTION).run(*self._system(by), own_array(hs), self._effort(us), own_array(xs), jacobians)
+        return jacobians
+
+    def accelerate(self, x: Array, u: Array) -> Array:
+        """(N, nv) at x (N, nx) under u (N, nu)."""
+        return self._accelerations(x, u, None)[0]
+
+    def acceleration_jacobians(self, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
+        """(N, nv), and (N, nv, 2 nv + P) by small motion, by v and by parameters."""
+        a, jacobians, _, _ = self._accelerations(x, u, by)
+        return a, jacobians
+
+    def grip(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """(N, nv) which way friction lets coordinates slide, and which of them it holds."""
+        return self._accelerations(x, u, None)[2:]
+
+    def _accelerations(self, x: Array, u: Array, by: Array | None) -> tuple[Array, Array, Array, Array]:
+        N, nv = len(x), self.tree.spread.shape[1]
+        a, turn, held = np.empty((N, nv)), np.zeros((N, nv)), np.zeros((N, nv))
+        jacobians = np.empty((0, 0, 0)) if by is None else np.empty((N, nv, 2 * nv + by.shape[1]))
+        kernel(FRICTION).accelerations(*self._system(by), own_array(x), self._effort(u), turn, held, a, jacobians)
+        return a, jacobians, turn, held
+
+    def inverse_dynamics(self, q: Array, v: Array, a: Array, by: Array | None = None) -> tuple[Array, Array, Array]:
+        """tau (N, n) of the links, mass (N, n, n), and tau by small motion, by v and by parameters (N, n, 2 n + P).
+
+        At q, v and a of all joints, those that follow others included.
+        """
+        system, changes = self._system(by)
+        N, n = v.shape
+        tau, mass, jacobians = np.empty((N, n)), np.empty((N, n, n)), np.empty((N, n, 2 * n + changes.parameters))
+        kernel(KERNEL).inverse_dynamics(system, changes, *map(own_array, (q, v, a)), tau, mass, jacobians)
+        return tau, mass, jacobians
+
+    def regressors(self, q: Array, v: Array, a: Array) -> list[Array]:
+        """Of each link (N nv, 10): the force of inverse dynamics at q, v and a (N, nv) by its ten numbers."""
+        tree, spread = self.tree, self.tree.spread
+        places = self.numbers.places("inertial")
+        by = np.eye(len(self.numbers.flat))[:, places.ravel()]
+        q = q if tree.coupling is None else tree.coupling.positions(q)
+        of_joints = self.inverse_dynamics(q, v @ spread.T, a @ spread.T, by)[2][..., 2 * tree.n :]
+        reduced = (spread.T @ of_joints).reshape(-1, len(tree.links), 10)
+        return [reduced[:, i] for i in range(len(tree.links))]
+
+    @property
+    def efforts(self) -> Array:
+        """(nv, nu) the generalized force by the inputs."""
+        return np.asarray(self.tree.spread.T @ (self.tree.actuation * self.numbers.strength))
+
+    def inputs_for(self, x: Array, a: Array) -> Array:
+        """(N, nu) the inputs that give accelerations a (N, nv), the nearest where none do; limits are not looked at."""
+        nv, none = a.shape[1], np.zeros((len(x), self.tree.actuation.shape[1]))
+        _, mass, free = self._equations(x, none)
+        needed = (mass @ (a - free)[..., None])[..., 0]
+        return np.asarray(needed.reshape(-1, nv) @ np.linalg.pinv(self.efforts).T)
+
+    def _equations(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """x, the mass matrix (N, nv, nv) with reflected inertia, and the acceleration (N, nv) under u."""
+        tree, nv = self.tree, self.tree.spread.shape[1]
+        q = x[:, : x.shape[1] - nv]
+        q = q if tree.coupling is None else tree.coupling.positions(q)
+        still = np.zeros((len(x), tree.n))
+        mass = self.inverse_dynamics(q, still, still)[1] + np.diag(self.numbers.reflected)
+        return x, tree.spread.T @ mass @ tree.spread, self.accelerate(x, u)
+
+    def mass(self, x: Array) -> Array:
+        """(N, nv, nv) with reflected inertia."""
+        return self._equations(x, np.zeros((len(x), self.tree.actuation.shape[1])))[1]
+
+    def _effort(self, u: Array) -> Array:
+        return np.ascontiguousarray(np.clip(u, -self.tree.limits, self.tree.limits))
+
+    def _system(self, by: Array | None = None) -> tuple[Any, Any]:
+        """A `kernel.System`, and `kernel.Changes` by parameters that move the numbers by `by` (count, P)."""
+        if by is None:
+            return self._fixed
+        shifted = np.flatnonzero(np.any(by[self.numbers.places("offset")] != 0, axis=(1, 2)))
+        if not len(shifted):
+            system, _ = self._fixed
+            return system, self._changes(by, system, ())
+        system = self._tables(tuple(int(i) for i in shifted))
+        return system, self._changes(by, system, tuple(int(i) for i in shifted))
+
+    @cached_property
+    def _fixed(self) -> tuple[Any, Any]:
+        system = self._tables(())
+        return system, self._changes(np.zeros((len(self.numbers.flat), 0)), system, ())
+
+    def _tables(self, shifted: tuple[int, ...]) -> Any:
+        """With three virtual slides before each joint that is shifted."""
+        tree, own, compiled, t = self.tree, self.numbers, kernel(KERNEL), kernel(TREE)
+        rows, joints = list[tuple[Any, ...]](), list[tuple[int, int, int]]()
+        table_of, joint_of = list[int](), list[int]()
+        n, nq = tree.n, sum(7 if link.free else 1 for link in tree.links)
+        kinds = {"revolute": t.HINGE, "prismatic": t.SLIDE, "quaternion_floating": t.FREE}
+        for i, link in enumerate(tree.links):
+            parent, joint = (-1, -1) if link.parent < 0 else (table_of[link.parent], joint_of[link.parent])
+            for k in range(3) if i in shifted else ():
+                at = 3 * shifted.index(i) + k
+                joints.append((joint, n + at, 1))
+                joint = len(joints) - 1
+                rows.append((parent, t.SLIDE, joint, nq + at, n + at, np.eye(3)[k], np.eye(3, 4), np.zeros(10)))
+                parent = len(rows) - 1
+            for start in (3, 0) if link.free else (0,):
+                joints.append((joint, link.joint.v_start + start, 3 if link.free else 1))
+                joint = len(joints) - 1
+            frame = np.hstack([link.on_parent.rotation().matrix(), own.offset[i][:, None]])
+            starts = link.joint.q_start, link.joint.v_start
+            rows.append((parent, kinds[link.joint.kind], joint, *starts, link.axis, frame, own.inertial[i]))
+            table_of.append(len(rows) - 1)
+            joint_of.append(joint)
+        parents, kind, joint_at, q_start, v_start, axis, frames, ten = (np.array(c) for c in zip(*rows, strict=True))
+        mass = ten[:, 0]
+        center = ten[:, 1:4] / np.where(mass != 0, mass, 1.0)[:, None]
+        inertia = np.empty((len(mass), 3, 3))
+        for k, (i, j) in enumerate(INERTIA):
+            inertia[:, i, j] = inertia[:, j, i] = ten[:, 4 + k]
+        inertia += mass[:, None, None] * (skew(center) @ skew(center))  # about the centre of mass
+        identity = np.broadcast_to(np.eye(3, 4), frames.shape)
+        chain = (np.array(column) for column in zip(*joints, strict=True))
+        tables = (
+            parents, kind, joint_at, q_start, v_start, axis, frames, identity, mass, center, inertia, *chain,
+            own.gravity,
+        )  # fmt: skip
+        positions = np.zeros(n, dtype=np.int64)
+        for link in tree.links:
+            if not link.free:
+                positions[link.joint.v_start] = link.joint.q_start
+        coupling, coordinates = tree.coupling, tree.coordinates
+        plain = np.arange(nq), np.ones(nq), np.zeros(nq)
+        follow = plain if coupling is None else (coupling.of_q, coupling.ratio_q, coupling.offset)
+        return compiled.System(
+            t.Tree(*map(_array, tables)),
+            _array(ten),
+            *map(_array, follow),
+            _array(tree.spread),
+            _array(np.array(coordinates.single, dtype=np.int64).reshape(-1, 2)),
+            _array(np.array(coordinates.free, dtype=np.int64).reshape(-1, 2)),
+            positions,
+            *(_array(getattr(own, name)) for name in OF_JOINTS),
+            SLIP_SPEED,
+            _array(tree.actuation * own.strength),
+            np.isin(np.arange(tree.spread.shape[1]), self.dry),
+            self.gives,
+            *map(_array, self.method),
+        )
+
+    def _changes(self, by: Array, system: Any, shifted: tuple[int, ...]) -> Any:
+        places = self.numbers.places
+        ten = by[places("inertial")]
+        links, parameters = np.nonzero(np.any(ten != 0, axis=1))
+        real = np.flatnonzero(system.tree.v_start < self.tree.n)
+        return kernel(KERNEL).Changes(
+            by.shape[1],
+            _array(real[links]),
+            _array(parameters),
+            _array(ten[links, :, parameters]),
+            _array(by[places("gravity")].T),
+            _array(by[places("offset")[list(shifted)].ravel()]),
+            *(_array(by[places(name)]) for name in (*OF_JOINTS, "strength")),
+            _array(self.tree.actuation),
+        )
+
+
+OF_JOINTS = ("reflected", "damping", "stiffness", "rest", "coulomb", "held_inertia", "held_damping")
+
+
+def _array(values: Any) -> Any:
+    """Contiguous, of float64 or int64: of other arrays the kernel would be compiled once more."""
+    array = np.asarray(values)
+    return np.array(array, dtype=np.int64 if array.dtype.kind == "i" else float, order="C")
 
 
 def tree_for_identification(model: Model) -> Tree | Refusal:
@@ -126,46 +295,53 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         return Refusal("joints are held by constraints")
     if any(actuator.has_controller() for actuator in actuators(model.plant)):
         return Refusal("actuators have PD controllers in the plant")
-    dynamics = tree_of(model, free=True)
+    dynamics, springs = tree_of(model, free=True), springs_of(model.plant)
     if isinstance(dynamics, Refusal):
         return dynamics
-    springs = springs_of(model.plant)
     if isinstance(springs, Refusal):
         return springs
     every = read_links(model.plant, springs)
     links, placed, _ = without_welds(every)
     if any(link.stiffness != 0 and link.kind == "quaternion_floating" for link in every):
         raise ModelError("a free body has a spring")
-    inertial, n = np.zeros((len(links), 10)), len(dynamics.mass)
-    axis = np.array(dynamics.axis)
+    n, inertial = sum(6 if link.free else 1 for link in links), np.zeros((len(links), 10))
+    of_joints = np.zeros((4, n))
     for rigid in links:
-        if not rigid.free:
-            axis[rigid.joint.v_start] = rigid.axis
+        joint = rigid.joint
+        of_joints[:, joint.v_start] = joint.damping, joint.armature, joint.stiffness, joint.rest
     for link in every:
         place, pose = placed[link.body]
         if place >= 0:
             own = ten_numbers(link.mass, link.center_of_mass, link.inertia[tuple(np.transpose(INERTIA))])
             inertial[place] += _moved_by(pose) @ own
+    damping, reflected, stiffness, rest = of_joints
     numbers = Numbers(
         inertial=inertial,
         offset=np.array([link.on_parent.translation() for link in links]).reshape(-1, 3),
-        gravity=np.array(dynamics.gravity, dtype=float),
-        damping=np.array(dynamics.damping),
-        reflected=np.array(dynamics.reflected),
-        stiffness=np.array(dynamics.stiffness),
-        rest=np.array(dynamics.rest),
+        gravity=np.array(model.plant.gravity_field().gravity_vector()),
+        damping=damping,
+        reflected=reflected,
+        stiffness=stiffness,
+        rest=rest,
         coulomb=np.zeros(n),
         held_inertia=np.zeros(n),
         held_damping=np.zeros(n),
         strength=np.ones(model.nu),
     )
     limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in actuators(model.plant)])
-    own = replace(dynamics, axis=axis, origin=np.zeros((n, 3)))
-    first = np.array([link.joint.v_start for link in links], dtype=np.intp)
-    bodies = {link.body: link for link in every}
-    moves = {body: _moved_by(pose) for body, (_, pose) in placed.items()}
     actuation = model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T).T
-    return Tree(links, own, first, np.asarray(actuation), np.asarray(limits), placed, moves, bodies, numbers)
+    return Tree(
+        links=links,
+        coordinates=coordinates_of(model),
+        coupling=model.coupling,
+        n=n,
+        actuation=np.asarray(actuation),
+        limits=np.asarray(limits),
+        placed=placed,
+        moved_by={body: _moved_by(pose) for body, (_, pose) in placed.items()},
+        bodies={link.body: link for link in every},
+        numbers=numbers,
+    )
 
 
 def ten_numbers(mass: Any, center: Any, inertia: Any) -> Any:

@@ -8,10 +8,11 @@ import numpy as np
 from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff.identification.fit import Fit, Law, Solved
+from drake_diff.identification.fit import Fit, Solved
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import HOPELESS, freedom_of, intervals_of, known_of, noise_of
 from drake_diff.identification.measured import Piece
+from drake_diff.identification.motion import Law
 from drake_diff.identification.setting import Setting
 from drake_diff.identification.unknowns import Unknowns
 

@@ -18,7 +18,7 @@ from drake_diff.identification.chart import Chart
 from drake_diff.identification.flights import steps_between
 from drake_diff.identification.judge import FALSE_ALARM, colour_of, most_scatter
 from drake_diff.identification.measured import Piece, guess_states, noise_by_differences
-from drake_diff.identification.steps import DiscreteMotion, discrete_motion
+from drake_diff.identification.motion import DiscreteMotion, discrete_motion
 from drake_diff.identification.unknowns import BIAS, CENTER, Unknown, Unknowns
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select

@@ -1,0 +1,288 @@
+"""How a model moves over many segments at once, and the derivatives of its steps.
+
+In continuous time: fixed steps of order 8 by the method of Dormand and Prince (Hairer, Norsett and Wanner, "Solving
+Ordinary Differential Equations I", 1993, II.5), over which inputs are held; the derivatives are those of the method's
+own steps. A step of length 0 changes nothing: with such steps segments of different length stand side by side. Or as
+simulators move it, by semi-implicit Euler steps with damping at the end of the step,
+
+    v' = v + h (M + h D)^-1 (forces at q, v),    q' = q + h v'
+
+or by the model's own discrete steps, contact and limits included.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff.comparison.recordings import CLOCK_TOLERANCE
+from drake_diff.derivatives.step import StepDerivatives, derivatives_along
+from drake_diff.exceptions import GradientError, InputError, ModelError
+from drake_diff.identification.measured import Piece
+from drake_diff.identification.tree import ORDER_8, Dynamics, Method, Tree
+from drake_diff.identification.unknowns import (
+    BIAS,
+    COULOMB,
+    HELD_INERTIA,
+    Unknowns,
+    numbers_at,
+    set_numbers,
+)
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector, applied, select
+from drake_diff.model.step import advance
+
+LONGEST = 0.02  # [s] of a step in continuous time
+
+
+class Law(Protocol):
+    """How a model moves, many segments at once."""
+
+    @property
+    def words(self) -> str:
+        """Which motion this is."""
+        ...
+
+    @property
+    def segment(self) -> float:
+        """[s] how long a segment is."""
+        ...
+
+    @property
+    def kinks(self) -> bool:
+        """Whether derivatives say little of larger changes: of a joint that stops and stays, no velocity is left."""
+        ...
+
+    def cut(self, period: float) -> tuple[float, ...]:
+        """Lengths of the steps [s] over a time between samples [s]."""
+        ...
+
+    def shorter(self, than: float) -> "Law | None":
+        """The same by steps of at most half of a length [s]; None where the steps are the model's own."""
+        ...
+
+    def is_possible(self, values: Array) -> bool:
+        """Whether there are bodies with these values."""
+        ...
+
+    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
+        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s], 0 for none, under us (K, M, nu)."""
+        ...
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
+        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        ...
+
+    def rates(self, values: Array, x: Array, u: Array) -> Array:
+        """(N, nx) by time, of states (N, nx) under u (N, nu)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousMotion:
+    """dq/dt = N(q) v, dv/dt = a of a tree whose numbers are set by unknowns.
+
+    Coulomb friction holds the joints of which it is an unknown, unless it is `smooth`, which turns over a small speed.
+    """
+
+    model: Model
+    tree: Tree
+    unknowns: Unknowns
+    longest: float = LONGEST  # [s] the longest step
+    segment: float = 0.15  # [s]
+    method: Method = ORDER_8
+    smooth: bool = False
+
+    @cached_property
+    def dry(self) -> tuple[int, ...]:
+        """The velocities of joints that friction holds; one that others follow has the friction of all of them."""
+        labels, coupling = {one.label for one in self.unknowns.each if one.quantity == COULOMB}, self.tree.coupling
+        places = {link.joint.v_start for link in self.tree.links if link.joint.joint in labels and not self.smooth}
+        return tuple(sorted(places if coupling is None else {int(coupling.of_v[i]) for i in places}))
+
+    @property
+    def kinks(self) -> bool:
+        """Whether friction holds a joint."""
+        return bool(self.dry)
+
+    @property
+    def words(self) -> str:
+        friction = ", with dry friction that holds" if self.dry else ""
+        return f"continuous time, by steps of order 8 of at most {1e3 * self.longest:.3g} ms{friction}"
+
+    def cut(self, period: float) -> tuple[float, ...]:
+        """Lengths of the steps [s] over a time between samples [s]."""
+        count = max(1, int(np.ceil(period / self.longest - 1e-9)))
+        return (period / count,) * count
+
+    def shorter(self, than: float) -> "ContinuousMotion | None":
+        """By steps of at most half of a length [s]."""
+        return replace(self, longest=than / 2)
+
+    def is_possible(self, values: Array) -> bool:
+        """Whether there are bodies with these values."""
+        return self.unknowns.consistent(values, self.tree)
+
+    def dynamics(self, values: Array) -> Dynamics:
+        """The tree that unknowns of these values make."""
+        numbers = set_numbers(self.model, self.tree, self.unknowns, values)
+        gives = any(one.quantity == HELD_INERTIA for one in self.unknowns.each)
+        return Dynamics(self.tree, numbers, self.dry, gives, self.method)
+
+    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
+        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
+        xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
+        xs[:, 0] = starts
+        self.dynamics(values).run(xs, hs, us)
+        return xs
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
+        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        jacobians = self.dynamics(self.unknowns.values(z)).step_jacobians(xs, hs, us, self.by(z))
+        return jacobians[..., : xs.shape[2]], jacobians[..., xs.shape[2] :]
+
+    def by(self, z: Array) -> Array:
+        """(count, np) how the numbers of the tree change with z."""
+        return numbers_at(self.model, self.tree, self.unknowns, z)[1]
+
+    def rates(self, values: Array, x: Array, u: Array) -> Array:
+        """(N, nx) by time, of states (N, nx) under u (N, nu)."""
+        q, v = x[:, : self.model.nq], x[:, self.model.nq :]
+        speed = (self.tree.coordinates.rate(q) @ v[..., None])[..., 0]
+        return np.concatenate([speed, self.dynamics(values).accelerate(x, u)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class EulerMotion(ContinuousMotion):
+    """Steps of the length `longest`, of which a whole number lies between samples; of hinges and slides."""
+
+    smooth: bool = True
+
+    @property
+    def words(self) -> str:
+        return f"semi-implicit Euler steps of {1e3 * self.longest:.4g} ms"
+
+    def cut(self, period: float) -> tuple[float, ...]:
+        """Lengths of the steps [s] over a time between samples [s]."""
+        return (self.longest,) * max(1, round(period / self.longest))
+
+    def shorter(self, than: float) -> None:
+        """There is none: the step is what is looked for."""
+        return
+
+    def dynamics(self, values: Array) -> Dynamics:
+        """With damping at the end of the step."""
+        own = super().dynamics(values)
+        numbers = own.numbers
+        return replace(own, numbers=replace(numbers, reflected=numbers.reflected + self.longest * numbers.damping))
+
+    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
+        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
+        dynamics, nq = self.dynamics(values), self.model.nq
+        xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
+        xs[:, 0] = starts
+        for m in range(hs.shape[1]):
+            h, x = hs[:, m, None], xs[:, m]
+            after = x[:, nq:] + h * dynamics.accelerate(x, us[:, m])
+            xs[:, m + 1] = np.concatenate([x[:, :nq] + h * after, after], axis=1)
+        return xs
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
+        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        dynamics, by, nx, nq = self.dynamics(self.unknowns.values(z)), self.by(z), xs.shape[2], self.model.nq
+        by[dynamics.numbers.places("reflected")] += self.longest * by[dynamics.numbers.places("damping")]
+        x, u, h = xs[:, :-1].reshape(-1, nx), us.reshape(hs.size, -1), hs.reshape(-1, 1, 1)
+        jacobians = np.zeros((hs.size, nx, nx + by.shape[1]))
+        jacobians[:, nq:] = h * dynamics.acceleration_jacobians(x, u, by)[1]
+        jacobians[:, nq:, nq:nx] += np.eye(nx - nq)
+        jacobians[:, :nq] = h * jacobians[:, nq:]
+        jacobians[:, :nq, :nq] += np.eye(nq)
+        jacobians = jacobians.reshape(*hs.shape, nx, -1)
+        return jacobians[..., :nx], jacobians[..., nx:]
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteMotion:
+    """Drake's steps of a length of which a whole number lies between samples."""
+
+    model: Model  # at that time step
+    unknowns: Unknowns
+    vector: ParameterVector  # of the unknowns that are the model's
+    own: Indices  # where the vector's entries stand among the unknowns
+    segment: float = np.inf  # [s] a whole piece: where bodies touch, a state from noisy samples is no start of a motion
+    differenced: list[str] = field(default_factory=list)  # says where Drake's own derivatives were refused
+    kinks: bool = False
+
+    @property
+    def words(self) -> str:
+        return ", ".join([f"the model's own steps of {1e3 * self.model.time_step:.4g} ms", *self.differenced[:1]])
+
+    def cut(self, period: float) -> tuple[float, ...]:
+        """Lengths of the steps [s] over a time between samples [s]."""
+        return (self.model.time_step,) * round(period / self.model.time_step)
+
+    def shorter(self, than: float) -> None:
+        """There is none: it is the model's step that is fitted."""
+        return
+
+    def is_possible(self, values: Array) -> bool:
+        """Whether there are bodies with these values."""
+        return self.unknowns.consistent(values, None)
+
+    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
+        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s], 0 for none, under us (K, M, nu)."""
+        vector = self.vector.at(values[self.own])
+        xs = np.repeat(starts[:, None], hs.shape[1] + 1, axis=1)
+        with applied(vector) as model:
+            for k, count in enumerate(np.count_nonzero(hs, axis=1)):
+                for i in range(count):
+                    xs[k, i + 1] = advance(model.double, xs[k, i], us[k, i])
+                xs[k, count + 1 :] = xs[k, count]
+        return xs
+
+    def rates(self, values: Array, x: Array, u: Array) -> Array:
+        """There are none: whoever needs them is refused."""
+        raise ModelError(f"{self.words} have no rates in between: a delay is sought in continuous time")
+
+    def derivatives(self, model: Model, vector: ParameterVector, xs: Array, us: Array) -> Sequence[StepDerivatives]:
+        """Of steps from each of xs (N, nx) under us (N, nu), by the vector's parameters; those applied act."""
+        try:
+            return derivatives_along(model, xs[0], us, vector=vector, xs=xs)
+        except GradientError:
+            self.differenced.append("some derivatives by differences")
+            return derivatives_along(model, xs[0], us, vector=vector, xs=xs, method="finite_difference")
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
+        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        vector, by_z = self.vector.at(self.unknowns.values(z)[self.own]), self.unknowns.by_z(z)[self.own]
+        K, M, nx = *hs.shape, xs.shape[2]
+        by_x, by = np.tile(np.eye(nx), (K, M, 1, 1)), np.zeros((K, M, nx, len(z)))
+        taken = hs > 0
+        with applied(vector) as model:
+            each = self.derivatives(model, vector, xs[:, :-1][taken], us[taken])
+        by_x[taken] = np.array([step.A for step in each])
+        by[taken] = np.array([step.C for step in each]) @ by_z
+        return by_x, by
+
+
+def discrete_motion(model: Model, unknowns: Unknowns, pieces: Sequence[Piece]) -> DiscreteMotion:
+    """Of steps as long as the model's, or shortened so that a whole number of them lies between samples.
+
+    InputError where samples are not the same time apart; ModelError where the model came from a diagram, which has but
+    one time step.
+    """
+    every = np.concatenate([np.diff(piece.times) for piece in pieces])
+    period = float(np.median(every))
+    if np.any(np.abs(every - period) > CLOCK_TOLERANCE * min(period, model.time_step)):
+        got = f"from {1e3 * np.min(every):.6g} to {1e3 * np.max(every):.6g} ms"
+        raise InputError("times between samples", got=got, expected="the same, as the model's own steps are fitted")
+    h = period / max(1, round(period / model.time_step))
+    if abs(h - model.time_step) > CLOCK_TOLERANCE * model.time_step:
+        model = model.at_time_step(h)
+    own = [one for one in unknowns.each if one.quantity != BIAS]
+    places = [s for one, s in zip(unknowns.each, unknowns.slices, strict=True) if one.quantity != BIAS]
+    entries = np.concatenate([np.arange(s.start, s.stop) for s in places]) if places else np.zeros(0, dtype=int)
+    return DiscreteMotion(model, unknowns, select(model, [one.name for one in own]), entries)
