@@ -9,12 +9,11 @@ import pytest
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.identification import contact_causes
-from drake_diff.identification.chart import Chart
-from drake_diff.identification.measured import read_pieces
+from drake_diff.identification import contact
+from drake_diff.identification.contact import Fitted, Point, WholeMotions
+from drake_diff.identification.messages import NO_CHANGE, Explanation, also_touching
+from drake_diff.identification.recordings import Chart, read_pieces
 from drake_diff.identification.unknowns import Unknown, choose_unknowns
-from drake_diff.identification.whole_motions import Fitted, Point, WholeMotions
-from drake_diff.identification.words import NO_CHANGE, Explanation, also_touching
 from drake_diff.mechanics.description import coordinates_of
 
 sys.path.append(str(Path(__file__).parent / "benchmarks"))
@@ -58,8 +57,8 @@ def test_a_right_model_is_not_blamed_where_its_motion_is_hard_to_find():
 @pytest.fixture
 def contact_alone(monkeypatch):
     """Masses and gravity are not tried, which takes half of the time; a busy machine says the same."""
-    monkeypatch.setattr(contact_causes, "OF_MOTION", ())
-    monkeypatch.setattr(contact_causes, "LONGEST_SEARCH", np.inf)
+    monkeypatch.setattr(contact, "OF_MOTION", ())
+    monkeypatch.setattr(contact, "LONGEST_SEARCH", np.inf)
 
 
 @pytest.mark.slow
@@ -106,7 +105,7 @@ def test_a_larger_radius_is_named_though_the_model_touches_nothing(contact_alone
 )
 def test_a_change_that_is_none_is_told_from_one(start, value, half, nothing):
     own, each = mass_of(start, value, half, 0.0)
-    assert contact_causes.is_nothing(own, each) == nothing
+    assert contact.is_nothing(own, each) == nothing
 
 
 def mass_of(start, value, half, score, name="ball.mass"):
@@ -133,9 +132,9 @@ def test_a_change_that_is_none_blames_no_model(other, names):
         motions=SimpleNamespace(widened=lambda _, one: one),
         bic=lambda one: one.score,
         limit=lambda *_: 20.0,
-        words=contact_causes._Search.words,
+        words=contact._Search.words,
     )
-    w = contact_causes._Search.said(search, base, fitted, tried)
+    w = contact._Search.said(search, base, fitted, tried)
     assert w.explained
     assert w.names == names
 
@@ -153,7 +152,7 @@ def test_what_neither_search_explains_is_said_of_both():
 
 @pytest.mark.slow
 def test_a_change_that_is_not_tried_is_not_explained_by_another(ball, contact_alone, monkeypatch):
-    monkeypatch.setattr(contact_causes, "OF_CONTACT", ("friction",))
+    monkeypatch.setattr(contact, "OF_CONTACT", ("friction",))
     w = dd.explain(ball, thrown(ball, ball__stiffness=13000.0))
     assert w.names == ()
     assert not w.explained

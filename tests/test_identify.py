@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
-from drake_diff.identification.judge import FALSE_ALARM, Known, colour_of, most_scatter, unidentifiable
+from drake_diff.identification.judge import FALSE_ALARM, colour_of, most_scatter
+from drake_diff.identification.messages import unidentifiable
 from drake_diff.identification.motion import ContinuousMotion
 from drake_diff.identification.tree import Dynamics, tree_for_identification
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
@@ -119,7 +120,7 @@ def test_what_is_seen_of_two_is_told_as_it_is(names, values, seen, words):
     by_a, by_b = np.imag(seen(a[0], b[1])) / a[0].imag, np.imag(seen(b[0], a[1])) / a[1].imag
     unknowns, direction = Unknowns(tuple(each)), np.array([by_b, -by_a])
     z = unknowns.z_start
-    (told,) = unidentifiable(unknowns, z, Known(np.eye(2), (np.linalg.inv(unknowns.by_z(z)) @ direction,)))
+    (told,) = unidentifiable(unknowns, z, [np.linalg.inv(unknowns.by_z(z)) @ direction])
     ends = "leaves the motion as it is" if words is None else f"only their {words} is seen"
     assert told.endswith(ends)
     assert all(name in told for name in names)

@@ -9,10 +9,8 @@ import pytest
 import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.identification import first_state, identify_contact
-from drake_diff.identification.chart import Chart
-from drake_diff.identification.cloud import shrink_to
-from drake_diff.identification.flights import start_of
-from drake_diff.identification.measured import read_pieces
+from drake_diff.identification.impacts import shrink_to, start_of
+from drake_diff.identification.recordings import Chart, read_pieces
 from drake_diff.mechanics.description import coordinates_of
 
 sys.path.append(str(Path(__file__).parent / "benchmarks"))

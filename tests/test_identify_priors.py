@@ -10,10 +10,9 @@ from typer.testing import CliRunner
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.identification.chart import Chart
 from drake_diff.identification.fit import Fit, cut_segments
-from drake_diff.identification.measured import Piece
 from drake_diff.identification.motion import ContinuousMotion
+from drake_diff.identification.recordings import Chart, Piece
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns
 from drake_diff.mechanics.description import coordinates_of

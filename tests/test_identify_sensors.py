@@ -12,7 +12,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.chart import Chart
+from drake_diff.identification.recordings import Chart
 from drake_diff.identification.sensors import choose_sensors
 from drake_diff.identification.tree import Dynamics, Numbers, tree_for_identification
 from drake_diff.mechanics.description import coordinates_of

@@ -3,7 +3,6 @@
 import json
 import shutil
 from html import escape
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +14,8 @@ from drake_diff.comparison.files import PAGE, hash_of_arrays
 from drake_diff.comparison.recordings import place_of, read_arrays, with_own_names, write_arrays
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.identification import recorded_causes
-from drake_diff.identification.cause import cause_of
-from drake_diff.identification.recorded_causes import ENDED, as_recorded
-from drake_diff.identification.words import Words
+from drake_diff.identification.messages import search_ended
+from drake_diff.identification.recorded_causes import ENDED, as_recorded, cause_of
 from drake_diff.runs.fields import canonical
 from drake_diff.runs.other_records import CauseEvidence
 from drake_diff.runs.read import load_record
@@ -116,7 +114,7 @@ def test_whatever_number_or_name_of_a_cause_is_planted_it_is_refused(saved, seed
 
 def test_a_search_that_its_limit_ended_is_undecided(saved):
     told = load_record(saved).engines[-1].cause
-    ended = Words(None, SimpleNamespace(ended_early=True)).end
+    ended = search_ended(45.0)
     assert ended.strip().startswith(ENDED)
     early = told.model_copy(update={"sentence": told.sentence + ended})
     again, doubts = as_recorded("lab", early, told)

@@ -120,7 +120,7 @@ def compare(
     from drake_diff.comparison.files import PAGE, write_comparison
     from drake_diff.comparison.recordings import read_recording, with_own_names
     from drake_diff.comparison.side_by_side import compare as compare_engines
-    from drake_diff.identification.cause import cause_of
+    from drake_diff.identification.recorded_causes import cause_of
     from drake_diff.runs.directory import written_whole
 
     directory = out or Path("artifacts") / f"compare_{file.stem}"

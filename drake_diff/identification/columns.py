@@ -5,7 +5,7 @@ motion say which of them come nearer to the model than the columns as they are. 
 nothing but their first states, and one is named where it leaves noise and the columns as they are do not.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -15,12 +15,12 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.exceptions import DrakeDiffError
-from drake_diff.identification.chart import Chart
-from drake_diff.identification.fit import Fit, Solved, cut_segments
+from drake_diff.identification.fit import cut_segments
 from drake_diff.identification.identify import Problem
-from drake_diff.identification.judge import HOPELESS, noise_of
-from drake_diff.identification.measured import Piece, guess_states, noise_by_differences
+from drake_diff.identification.judge import HOPELESS, likelihood_of, noise_of
+from drake_diff.identification.messages import Explanation, mistaken
 from drake_diff.identification.motion import ContinuousMotion, EulerMotion, Law
+from drake_diff.identification.recordings import Chart, Piece, guess_states, noise_by_differences
 from drake_diff.identification.tree import Mask, Tree
 from drake_diff.identification.unknowns import Unknowns
 from drake_diff.model.model import Model
@@ -54,20 +54,6 @@ class Mistake:
 
 
 Fitted = Callable[[Sequence[Piece]], tuple[float, bool]]  # (-2 log of the likelihood, whether noise is left)
-
-
-@dataclass(frozen=True)
-class Mistaken:
-    """The mistake that explains a recording, others that it cannot be told from, and the evidence for each."""
-
-    words: str
-    alternatives: tuple[str, ...]
-    evidence: Mapping[str, float]
-
-    @property
-    def sentence(self) -> str:
-        tail = ": the recording cannot tell" if self.alternatives else ": this explains the recording"
-        return f"{', or '.join((self.words, *self.alternatives))}{tail}."
 
 
 def mistakes(model: Model, chart: Chart, pieces: Sequence[Piece]) -> list[Mistake]:
@@ -155,7 +141,7 @@ def _listed(names: Sequence[str]) -> str:
 
 def mistaken_columns(
     model: Model, chart: Chart, pieces: Sequence[Piece], law: Law, fits: Sequence[Fitted]
-) -> Mistaken | None:
+) -> Explanation | None:
     """The mistake of columns that alone explains recordings; None where they are explained as they are, or by none.
 
     `law` moves short segments. Each of `fits` says how well the model, as it is, goes through whole recordings.
@@ -178,13 +164,13 @@ def mistaken_columns(
         if explains or not falls:
             return None
         first, *rest = sorted(falls, key=lambda words: found[words])
-        return Mistaken(first, tuple(words for words in rest if found[words] - found[first] < SAME), falls)
+        return mistaken(first, [words for words in rest if found[words] - found[first] < SAME], falls)
     return None
 
 
 def mistaken_in_the_air(
     model: Model, tree: Tree, chart: Chart, pieces: Sequence[Piece], stated: Array
-) -> Mistaken | None:
+) -> Explanation | None:
     """The same of motions in which nothing touches, in continuous time or by the model's own Euler steps.
 
     `stated` (2 nv,) is the noise, NaN where it is not known.
@@ -259,14 +245,5 @@ def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequenc
             fit, solved = problem.solve(law, STEPS)
     except (DrakeDiffError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
         return np.inf, False
-    return _score(problem, fit, solved), not problem.doubt(fit, solved, "")
-
-
-def _score(problem: Problem, fit: Fit, solved: Solved) -> float:
-    every = np.concatenate(solved.reduced.residuals)
-    numbers = np.isfinite(every).sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        size = fit.noise * np.sqrt(np.nansum(every**2, axis=0) / numbers)
-        noise = np.where(np.isfinite(problem.stated), problem.stated, np.fmax(size, 1e-3 * problem.scatter))
-        each = numbers * ((size / noise) ** 2 + 2 * np.log(noise))
-    return float(np.sum(each[numbers > 0]))
+    score = likelihood_of(fit, solved, stated, problem.scatter)
+    return score, not problem.doubt(fit, solved, "")

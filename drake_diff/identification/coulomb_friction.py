@@ -22,12 +22,12 @@ from drake_diff.identification.kernel import (
     Workspace,
     _accelerate,
     _differentiate,
-    _factor,
     _mass_and_force,
     _step,
     _substitute,
     workspace,
 )
+from drake_diff.mechanics.tree_kernel import _factor
 
 REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
 MOST_PHASES = 60  # of a step: one with more has no end that can be told, and its state is NaN

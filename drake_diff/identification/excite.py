@@ -19,11 +19,11 @@ from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.chart import Chart
 from drake_diff.identification.fit import Fit, growth_cuts
-from drake_diff.identification.judge import deviations_of, known_of, unidentifiable
-from drake_diff.identification.measured import LEAST, Piece, given_noise
+from drake_diff.identification.judge import deviations_of, known_of
+from drake_diff.identification.messages import excitation_sentence, unidentifiable
 from drake_diff.identification.motion import ContinuousMotion
+from drake_diff.identification.recordings import LEAST, Chart, Piece, given_noise
 from drake_diff.identification.tree import ORDER_4, Dynamics, Tree, tree_for_identification
 from drake_diff.identification.unknowns import FAR, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
@@ -347,7 +347,7 @@ class _Design:
         if point is None:
             raise ModelError(f"{self.model.name} has no motion under the inputs that were planned")
         R = cut.reduce(point).R
-        return R, unidentifiable(self.unknowns, z, known_of(self.unknowns, z, R))
+        return R, unidentifiable(self.unknowns, z, known_of(self.unknowns, z, R).open)
 
     def worth(self, R: Array, scale: Array) -> float:
         """log of the determinant of the information with the pull to the file's values."""
@@ -376,14 +376,13 @@ class _Design:
         R_rest, _ = self.told(*self.simulated(np.zeros(size)))
         gain = float(np.exp((self.worth(R, scale) - self.worth(R_random, scale)) / (2 * len(scale))))
         each = [self.deviations(one) for one in (R, R_random, R_rest)]
-        e = Excitation(
+        units = {one.name: one.unit for one in self.unknowns.each}
+        return Excitation(
             times=frozen(self.times), xs=frozen(best[0]), us=frozen(best[1]),
             deviations=each[0], random=each[1], rest=each[2],
-            units={one.name: one.unit for one in self.unknowns.each},
-            unidentifiable=open_, gain=gain, noise=noise, sentence="",
+            units=units, unidentifiable=open_, gain=gain, noise=noise,
+            sentence=excitation_sentence(self.duration, each[0], each[1], each[2], units, open_, gain),
         )  # fmt: skip
-        object.__setattr__(e, "sentence", _sentence(e))
-        return e
 
     def deviations(self, R: Array) -> dict[str, Any]:
         z = self.unknowns.z_start
@@ -451,22 +450,3 @@ class _Design:
                 break
             been.append(c)
         return been[:0:-1]
-
-
-def _sentence(e: Excitation) -> str:
-    told = []
-    for name, value in e.deviations.items():
-        now, was = np.atleast_1d(value), np.atleast_1d(e.random[name])
-        if len(now) == 1:
-            unit = f" {e.units[name]}" if e.units[name] not in ("", "1") else ""
-            told.append(
-                f"{name} to {now[0]:.3g}{unit} (random {was[0]:.3g}, at rest {np.atleast_1d(e.rest[name])[0]:.3g})"
-            )
-        else:
-            told.append(f"{name} to {', '.join(f'{d:.3g}' for d in now)} {e.units[name]}")
-    more = f" and {len(told) - 4} more" if len(told) > 4 else ""
-    open_ = f" Open: {'; '.join(e.unidentifiable[:3])}." if e.unidentifiable else ""
-    return (
-        f"{e.times[-1]:.3g} s that tell {', '.join(told[:4])}{more}, at one standard deviation: "
-        f"{e.gain:.3g} times better than a random motion.{open_}"
-    )

@@ -24,18 +24,15 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
-from drake_diff.identification.chart import Chart
+from drake_diff.identification.candidates import DELAY, LIMIT, LONGEST_DELAY, NO_PROMISE, Promise, View
 from drake_diff.identification.columns import mistaken_in_the_air
-from drake_diff.identification.contact_causes import explain_contact, may_touch
+from drake_diff.identification.contact import explain_contact, may_touch
 from drake_diff.identification.identify import TOUCH, what_acts
-from drake_diff.identification.measured import given_noise, read_pieces
-from drake_diff.identification.race import FALLS, LOOKED_AT, Race, Runner
-from drake_diff.identification.screen import DELAY, LIMIT, LONGEST_DELAY, NO_PROMISE, Promise, View
-from drake_diff.identification.setting import Setting
+from drake_diff.identification.messages import Explanation, also_touching, changed_to, search_ended
+from drake_diff.identification.ranking import FALLS, LONGEST_SEARCH, LOOKED_AT, STEPS, Race, Runner, Tried
+from drake_diff.identification.recordings import Chart, given_noise, read_pieces
 from drake_diff.identification.tree import Dynamics, tree_for_identification
-from drake_diff.identification.trial import STEPS, Trial, Tried
 from drake_diff.identification.unknowns import HELD_DAMPING, HELD_INERTIA, Unknown, Unknowns
-from drake_diff.identification.words import Explanation, Words, also_touching, explained_by
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 
@@ -43,6 +40,7 @@ BESIDE, LOOKED_AT_BESIDE = 3, 4  # changes beside which a second one is sought, 
 DELAYS_SEEN, NEAR = 4, 0.02  # passes of derivatives beside a delay, and of it how near two of them are at the end
 BEHIND = 4.0  # times the least that is promised: of what is beyond, LOOKED_AT_BESIDE enter the race
 SHORTEST_DELAY = 1e-4  # [s] beside which another change is looked for
+MOST_OF_IT = 0.999  # of the squares that the model leaves: a change that takes them away is told though more is left
 TIME_STEP = "time_step"
 HELD_BY, CAUGHT = 10.0, 100.0  # times its own inertia; [1/s]: friction that gives way, where its search begins
 MOTIONS = ("auto", "continuous")
@@ -100,13 +98,13 @@ def explain(
     if not isinstance(tree, Refusal):
         columns = mistaken_in_the_air(model, tree, chart, pieces, given_noise(model, chart, noise))
         if columns is not None:
-            return explained_by(columns)
+            return columns
     why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces) if motion == "auto" else ""
     if why == TOUCH:
         return explain_contact(model, chart, pieces, given_noise(model, chart, noise))
     if why or isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: causes are looked for in motions in continuous time only, and {why}")
-    found = _Search(Setting(model, tree, chart, pieces, given_noise(model, chart, noise))).found()
+    found = _Search(model, tree, chart, pieces, given_noise(model, chart, noise)).found()
     if found.explained or motion != "auto" or not may_touch(model, chart, pieces):
         return found
     touched = explain_contact(model, chart, pieces, given_noise(model, chart, noise))
@@ -114,166 +112,153 @@ def explain(
 
 
 @dataclass(eq=False)
-class _Search:
+class _Search(Race):
     """What is tried, one after the other."""
 
-    setting: Setting
-
-    def __post_init__(self) -> None:
-        self.trial = Trial(self.setting)
-        self.race = Race(self.setting, self.trial)
-        self.words = Words(self.setting, self.race)
+    nearest: Tried | None = None
+    alone: Tried | None = None  # the change that left least by itself
+    share: float = 0.0  # of the squares, that it takes away
 
     def found(self) -> Explanation:
-        self.setting.prepare()
+        self.prepare()
         found, base, alone, runners = self.by_one()
         if found is None and not base.explains:
             found = self.by_friction_that_gives(runners, base)
-        if found is None and not base.explains and not self.race.is_late and self.may_be_steps(runners):
+        if found is None and not base.explains and not self.is_late and self.may_be_steps(runners):
             found = self.by_steps(base)
-        if found is None and not base.explains and not self.race.is_late:
+        if found is None and not base.explains and not self.is_late:
             found = self.by_two(alone, runners, base)
-        return found or (self.words.right() if base.explains else self.words.unexplained(base))
+        return found or (self.right() if base.explains else self.unexplained(base))
 
     def by_one(self) -> tuple[Explanation | None, Tried, View, list[Runner]]:
-        nothing = self.setting.of(())
-        one = self.race.running((), nothing, self.setting.cut, self.setting.starts, nothing.z_start, NO_PROMISE)
+        nothing = self.of(())
+        one = self.running((), nothing, self.cut, self.starts, nothing.z_start, NO_PROMISE)
         before = np.inf
-        while one.step() and self.setting.is_hopeless(one.left) and one.left < FALLS * before:
+        while one.step() and self.is_hopeless(one.left) and one.left < FALLS * before:
             before = one.left
-        most = 1 if self.setting.is_hopeless(one.left) else STEPS
-        base = self.trial.solved(
-            (), nothing, one.fit.law, self.setting.cut, self.setting.starts if most == 1 else one.starts, one.z, most
-        )
-        alone = self.setting.view(
-            self.setting.cut, self.setting.unknowns.z_start, base.starts if base.explains else self.setting.starts
-        )
+        most = 1 if self.is_hopeless(one.left) else STEPS
+        base = self.solved((), nothing, one.fit.law, self.cut, self.starts if most == 1 else one.starts, one.z, most)
+        alone = self.view(self.cut, self.unknowns.z_start, base.starts if base.explains else self.starts)
         if alone is None:
-            raise SimulationError(f"{self.setting.model.name} has no motion near the states that were measured")
+            raise SimulationError(f"{self.model.name} has no motion near the states that were measured")
         count = len(alone.freedoms)
-        chosen = self.race.chosen(alone, [(i,) for i in range(count)])
-        singles, runners = self.race.tried(alone, chosen, base)
-        named = self.trial.enough(base, singles, count)
-        self.words.nearest = min([self.words.nearest or base, base, *singles], key=self.trial.bic)
-        best = min(singles, key=self.trial.bic, default=None)
-        if self.setting.step is None and best is not None:
+        chosen = self.chosen(alone, [(i,) for i in range(count)])
+        singles, runners = self.tried(alone, chosen, base)
+        named = self.enough(base, singles, count)
+        self.nearest = min([self.nearest or base, base, *singles], key=self.bic)
+        best = min(singles, key=self.bic, default=None)
+        if self.step is None and best is not None:
             left = next(one.left for one in runners if one.names == best.names)
-            self.words.alone, self.words.share = best, 1 - left / alone.most
-        return self.words.said(named) if named else None, base, alone, runners
+            self.alone, self.share = best, 1 - left / alone.most
+        return self.named(named) if named else None, base, alone, runners
 
     def by_friction_that_gives(self, runners: Sequence[Runner], base: Tried) -> Explanation | None:
         """Where dry friction of a joint left least, and not noise: the same, which gives way where it holds."""
-        if not runners or self.race.is_late or self.setting.tree.coupling is not None:
+        if not runners or self.is_late or self.tree.coupling is not None:
             return None
         one = runners[0]
-        law = self.setting.law(one.fit.unknowns, self.setting.longest, smooth=False)
+        law = self.law(one.fit.unknowns, self.longest, smooth=False)
         dry = law.dry
         if len(one.names) > 1 or not dry:
             return None
         (j,) = dry
         label = one.names[0].rsplit(".", 1)[0]
-        mass = Dynamics(self.setting.tree, self.setting.tree.numbers).mass(one.starts[:1])
+        mass = Dynamics(self.tree, self.tree.numbers).mass(one.starts[:1])
         inertia = HELD_BY / float(np.linalg.inv(mass)[0, j, j])
         held = [
             Unknown(f"{label}.{quantity}", unit, np.array([start]), 0.0, start)
             for quantity, unit, start in ((HELD_INERTIA, "", inertia), (HELD_DAMPING, "", CAUGHT * inertia))
         ]
-        unknowns = Unknowns((*self.setting.of(one.names).each, *held), as_in_files=True)
+        unknowns = Unknowns((*self.of(one.names).each, *held), as_in_files=True)
         z = np.concatenate([one.z, unknowns.z_start[1:]])
-        gives = self.race.running(one.names, unknowns, self.setting.cut, one.starts, z, NO_PROMISE)
+        gives = self.running(one.names, unknowns, self.cut, one.starts, z, NO_PROMISE)
         try:
-            self.race.improve([gives])
+            self.improve([gives])
             there = gives.fit.at(gives.z, gives.starts)
-            if there is None or self.setting.is_hopeless(there.value):
+            if there is None or self.is_hopeless(there.value):
                 return None
-            if there.value + len(held) * float(np.log(self.setting.count)) > one.left:
+            if there.value + len(held) * float(np.log(self.count)) > one.left:
                 return None
-            found = self.trial.solved(one.names, unknowns, gives.fit.law, self.setting.cut, gives.starts, gives.z)
+            found = self.solved(one.names, unknowns, gives.fit.law, self.cut, gives.starts, gives.z)
         except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
             return None
-        self.words.nearest = min([self.words.nearest or base, found], key=self.trial.bic)
-        named = self.trial.enough(base, [found], len(self.setting.unknowns.each))
+        self.nearest = min([self.nearest or base, found], key=self.bic)
+        named = self.enough(base, [found], len(self.unknowns.each))
         if not named:
             return None
         more, slower = (float(found.values[each.name]) for each in held)
         own = {name: found.values[name] for name in one.names}, {name: found.intervals[name] for name in one.names}
-        said = self.words.said([found._replace(values=own[0], intervals=own[1])])
+        said = self.named([found._replace(values=own[0], intervals=own[1])])
         way = f"as if by {more:.3g} more of inertia and {slower:.3g} of damping"
-        return self.words.ended_with(said, f"with friction that gives way where it holds, {way}")
+        return self.ended_with(said, f"with friction that gives way where it holds, {way}")
 
     def by_two(self, alone: View, runners: Sequence[Runner], base: Tried) -> Explanation | None:
         count = len(alone.freedoms)
         pairs = self.paired(alone, runners, base)
-        named = self.trial.enough(base, pairs, count * (count - 1) // 2)
+        named = self.enough(base, pairs, count * (count - 1) // 2)
         if named:
-            named = self.trial.enough(base, [*self.halves(named), *named], count * (count - 1) // 2)
+            named = self.enough(base, [*self.halves(named), *named], count * (count - 1) // 2)
             named = [one for one in named if not any(set(other.names) < set(one.names) for other in named)]
-        self.words.nearest = min([self.words.nearest or base, *pairs], key=self.trial.bic)
-        return self.words.said(named) if named else None
+        self.nearest = min([self.nearest or base, *pairs], key=self.bic)
+        return self.named(named) if named else None
 
     def halves(self, pairs: Sequence[Tried]) -> list[Tried]:
         """Each change of some pairs alone, from where the pair was: the other one may do nothing."""
         found: dict[str, Tried] = {}
         for pair in pairs:
-            unknowns = self.setting.of([name for name in pair.names if not name.endswith(f".{LIMIT}")])
-            for one, s in self.setting.each_of(unknowns) if len(unknowns.each) == 2 else []:
+            unknowns = self.of([name for name in pair.names if not name.endswith(f".{LIMIT}")])
+            for one, s in self.each_of(unknowns) if len(unknowns.each) == 2 else []:
                 if one.name not in found:
-                    alone, z, cut = self.setting.of([one.name]), pair.z[s], self.setting.cut
-                    runner = self.race.running((one.name,), alone, cut, pair.starts, z, NO_PROMISE)
-                    if not runner.step() or self.setting.is_hopeless(runner.left):
+                    alone, z, cut = self.of([one.name]), pair.z[s], self.cut
+                    runner = self.running((one.name,), alone, cut, pair.starts, z, NO_PROMISE)
+                    if not runner.step() or self.is_hopeless(runner.left):
                         continue
                     law = runner.fit.law
-                    found[one.name] = self.trial.solved((one.name,), alone, law, cut, pair.starts, z)
+                    found[one.name] = self.solved((one.name,), alone, law, cut, pair.starts, z)
         return list(found.values())
 
     def may_be_steps(self, runners: Sequence[Runner]) -> bool:
         """Whether Euler steps leave clearly less than continuous time, or less and little, with one change or none."""
         whole = [one for one in runners if not one.special and one.fit.unknowns.delay is None]
         whole = [one for one in whole if np.isfinite(one.left)][:BESIDE]
-        nothing = self.setting.of(())
-        each: list[tuple[tuple[str, ...], Unknowns, Array, Array]] = [
-            ((), nothing, nothing.z_start, self.setting.starts)
-        ]
+        nothing = self.of(())
+        each: list[tuple[tuple[str, ...], Unknowns, Array, Array]] = [((), nothing, nothing.z_start, self.starts)]
         each += [(one.names, one.fit.unknowns, one.z, one.starts) for one in whole]
         for names, unknowns, z, starts in each:
             before = self.left_by(None, names, unknowns, z, starts)
-            after = min((self.left_by(step, names, unknowns, z, starts) for step in self.setting.steps), default=np.inf)
-            if after < FALLS * before or (after < before and not self.setting.is_hopeless(after)):
+            after = min((self.left_by(step, names, unknowns, z, starts) for step in self.steps), default=np.inf)
+            if after < FALLS * before or (after < before and not self.is_hopeless(after)):
                 return True
         return False
 
     def left_by(self, step: float | None, names: tuple[str, ...], unknowns: Unknowns, z: Array, starts: Array) -> float:
         """What a step of Gauss and Newton leaves of the squares by Euler steps of this length."""
-        self.setting.step = step
-        one = self.race.running(names, unknowns, self.setting.cut, starts, z, NO_PROMISE)
+        self.step = step
+        one = self.running(names, unknowns, self.cut, starts, z, NO_PROMISE)
         left = one.left if one.step() else np.inf
-        self.setting.step = None
+        self.step = None
         return left
 
     def by_steps(self, base: Tried) -> Explanation | None:
         """By Euler steps of a length, with one other change or none."""
-        nothing, left = self.setting.of(()), dict[float, float]()
+        nothing, left = self.of(()), dict[float, float]()
         promise = Promise((), 0.0, 0.0, np.zeros(0))
-        for step in self.setting.steps:
-            self.setting.step = step
-            one = self.race.running((), nothing, self.setting.cut, self.setting.starts, nothing.z_start, promise)
-            seen = (
-                self.setting.view(self.setting.cut, self.setting.unknowns.z_start, one.starts) if one.step() else None
-            )
+        for step in self.steps:
+            self.step = step
+            one = self.running((), nothing, self.cut, self.starts, nothing.z_start, promise)
+            seen = self.view(self.cut, self.unknowns.z_start, one.starts) if one.step() else None
             if seen is not None:
-                each = seen.promises([(i,) for i in range(len(seen.freedoms))], float(np.log(self.setting.count)))
+                each = seen.promises([(i,) for i in range(len(seen.freedoms))], float(np.log(self.count)))
                 left[step] = each[0].left if each else seen.most
-        self.setting.step = min(left, key=left.__getitem__, default=None)
-        if self.setting.step is None:
+        self.step = min(left, key=left.__getitem__, default=None)
+        if self.step is None:
             return None
-        name, own = f"model.{TIME_STEP}", abs(self.setting.step / self.setting.model.time_step - 1) < 1e-6
+        name, own = f"model.{TIME_STEP}", abs(self.step / self.model.time_step - 1) < 1e-6
         try:
             found, stepped, _, _ = self.by_one()
         finally:
-            step, self.setting.step = self.setting.step, None
-        if found is None and not (
-            stepped.explains and base.score - stepped.score > self.trial.least(1.0, len(self.setting.steps))
-        ):
+            step, self.step = self.step, None
+        if found is None and not (stepped.explains and base.score - stepped.score > self.least(1.0, len(self.steps))):
             return None
         steps = f"semi-implicit Euler steps of {1e3 * step:.4g} ms"
         if own:
@@ -282,14 +267,12 @@ class _Search:
         if found is None:
             sentence = f"{'Nothing: the model' if own else name} explains it, by {steps}."
             if not own:
-                sentence = (
-                    f"{name} is {step:.4g} s, not {self.setting.model.time_step:.4g}: {steps} explain the recording."
-                )
+                sentence = f"{name} is {step:.4g} s, not {self.model.time_step:.4g}: {steps} explain the recording."
             values = {} if own else {name: step}
             within = {} if own else {name: frozen([step, step])}
-            return Explanation(more, values, within, (), True, sentence, self.race.evidence)
+            return Explanation(more, values, within, (), True, sentence, self.evidence)
         return replace(
-            self.words.ended_with(found, f"by {steps}"),
+            self.ended_with(found, f"by {steps}"),
             names=(*found.names, *more),
             values={**found.values, **({} if own else {name: step})},
             intervals={**found.intervals, **({} if own else {name: frozen([step, step])})},
@@ -300,19 +283,19 @@ class _Search:
         """Pairs beside the change that left least, where that is little; those that promise most; and beside others."""
         later: list[Searching] = []  # searches for a limit or a delay, which take longest
         beside: list[Searching] = [partial(self.beside, one, base, later) for one in runners[:BESIDE]]
-        first = 1 if runners and not self.setting.is_hopeless(runners[0].left) else 0
+        first = 1 if runners and not self.is_hopeless(runners[0].left) else 0
         both: list[Searching] = [partial(self.at_the_model, alone, base), partial(self.beside_a_delay, base)]
         found: list[Tried] = []
         for search in chain(beside[:first], both, beside[first:], later):
             found += search()
-            if any(one.explains for one in found) or self.race.is_late:
+            if any(one.explains for one in found) or self.is_late:
                 break
         return found
 
     def at_the_model(self, alone: View, base: Tried) -> list[Tried]:
-        names = [one.name for one in self.setting.unknowns.each]
-        moving = [i for i, name in enumerate(names) if not self.setting.is_of_inputs(self.setting.plain(name))]
-        return self.race.tried(alone, self.race.chosen(alone, combinations(moving, 2)), base)[0]
+        names = [one.name for one in self.unknowns.each]
+        moving = [i for i, name in enumerate(names) if not self.is_of_inputs(self.plain(name))]
+        return self.tried(alone, self.chosen(alone, combinations(moving, 2)), base)[0]
 
     def beside(self, runner: Runner, base: Tried, later: list[Searching]) -> list[Tried]:
         """Beside one change; searches for a limit or a delay are put off till later."""
@@ -321,37 +304,35 @@ class _Search:
         if runner.special:
             later.append(partial(self.beside_inputs, runner, base))
             return []
-        i = [one.name for one in self.setting.unknowns.each].index(runner.names[0])
-        seen = self.setting.view(self.setting.cut, self.setting.with_one(i, runner.z), runner.starts)
+        i = [one.name for one in self.unknowns.each].index(runner.names[0])
+        seen = self.view(self.cut, self.with_one(i, runner.z), runner.starts)
         if seen is None:
             return []
         others = [(i, k) for k in range(len(seen.freedoms)) if k != i]
-        chosen = self.race.chosen(seen, others, LOOKED_AT_BESIDE)
-        plain = {own: one for own, one in chosen.items() if not any(map(self.setting.is_of_inputs, own))}
+        chosen = self.chosen(seen, others, LOOKED_AT_BESIDE)
+        plain = {own: one for own, one in chosen.items() if not any(map(self.is_of_inputs, own))}
         rest = {own: one for own, one in chosen.items() if own not in plain}
-        later.append(lambda: self.race.tried(seen, rest, base)[0])
-        return self.race.tried(seen, plain, base)[0]
+        later.append(lambda: self.tried(seen, rest, base)[0])
+        return self.tried(seen, plain, base)[0]
 
     def beside_a_delay(self, base: Tried) -> list[Tried]:
         """A change beside a delay: what each promises together with some more delay, from several delays."""
-        each = self.setting.unknowns.each
+        each = self.unknowns.each
         last = next((i for i, one in enumerate(each) if one.quantity == DELAY), None)
         if last is None:
             return []
-        price = float(np.log(self.setting.count))
-        others = [
-            (i, last) for i, one in enumerate(each) if not self.setting.is_of_inputs(self.setting.plain(one.name))
-        ]
+        price = float(np.log(self.count))
+        others = [(i, last) for i, one in enumerate(each) if not self.is_of_inputs(self.plain(one.name))]
         best: dict[int, tuple[float, View, Promise]] = {}
         name, least = each[last].name, np.inf
-        delay = float(self.race.delayed((name,), self.setting.of([name]), NO_PROMISE).z[0])
+        delay = float(self.delayed((name,), self.of([name]), NO_PROMISE).z[0])
         for _ in range(DELAYS_SEEN):
-            if best and self.race.is_late:
+            if best and self.is_late:
                 break
-            z = self.setting.unknowns.z_start.copy()
+            z = self.unknowns.z_start.copy()
             delay = max(delay, SHORTEST_DELAY)
-            z[self.setting.unknowns.slices[last]] = delay
-            seen = self.setting.view(self.setting.cut, z, self.setting.starts_at(delay))
+            z[self.unknowns.slices[last]] = delay
+            seen = self.view(self.cut, z, self.starts_at(delay))
             promises = [] if seen is None else seen.promises(others, price)
             for promise in promises:
                 i, cost = promise.members[0], promise.left + price * promise.freedom
@@ -372,21 +353,71 @@ class _Search:
             if k < LOOKED_AT_BESIDE or best[i][0] < BEHIND * best[group[0]][0]
         ]
         names = {i: (each[i].name, each[last].name) for i in chosen}
-        return self.race.raced([self.race.runner(*best[i][1:], names[i]) for i in chosen], base)[0]
+        return self.raced([self.runner(*best[i][1:], names[i]) for i in chosen], base)[0]
 
     def beside_inputs(self, runner: Runner, base: Tried) -> list[Tried]:
         """A change beside a limit that is about what it is alone."""
         ((special, value),) = runner.special.items()
         pieces = runner.fit.segments.pieces
-        seen = self.setting.view(pieces, self.setting.unknowns.z_start, runner.starts)
+        seen = self.view(pieces, self.unknowns.z_start, runner.starts)
         if seen is None:
             return []
-        each = [one.name for one in self.setting.unknowns.each]
-        others = [(i,) for i, name in enumerate(each) if not self.setting.is_of_inputs(self.setting.plain(name))]
+        each = [one.name for one in self.unknowns.each]
+        others = [(i,) for i, name in enumerate(each) if not self.is_of_inputs(self.plain(name))]
         runners: list[Runner] = []
-        for promise in seen.promises(others, float(np.log(self.setting.count)))[:LOOKED_AT_BESIDE]:
-            if runners and self.race.is_late:
+        for promise in seen.promises(others, float(np.log(self.count)))[:LOOKED_AT_BESIDE]:
+            if runners and self.is_late:
                 break
             name = each[promise.members[0]]
-            runners.append(self.race.searched(special, (name, special), self.setting.of([name]), promise, value))
-        return self.race.raced(runners, base)[0]
+            runners.append(self.searched(special, (name, special), self.of([name]), promise, value))
+        return self.raced(runners, base)[0]
+
+    def named(self, named: Sequence[Tried]) -> Explanation:
+        texts = [" and ".join(self.changed(one, name) for name in one.names) for one in named]
+        both = "this explains" if len(named[0].names) == 1 else "these two explain"
+        tail = f": {both} the recording" if len(named) == 1 else ": the recording cannot tell"
+        return Explanation(
+            names=named[0].names,
+            values={name: value for one in reversed(named) for name, value in one.values.items()},
+            intervals={name: value for one in reversed(named) for name, value in one.intervals.items()},
+            alternatives=tuple(one.names for one in named[1:]),
+            explained=True,
+            sentence=f"{', or '.join(texts)}{tail}.{self.end}",
+            evidence=self.evidence,
+        )
+
+    def changed(self, one: Tried, name: str) -> str:
+        label, quantity = name.rsplit(".", 1)
+        value, interval = np.atleast_1d(one.values[name]), np.atleast_2d(one.intervals[name])
+        if quantity == LIMIT:
+            start, unit = self.tree.limits[[self.model.input_names.index(label)]], ""
+        else:
+            own = next(each for each in self.unknowns.each if each.name == name)
+            start, unit = own.start, own.unit
+        return changed_to(name, value, interval, start, unit)
+
+    @property
+    def end(self) -> str:
+        return search_ended(LONGEST_SEARCH) if self.ended_early else ""
+
+    def right(self) -> Explanation:
+        return Explanation((), {}, {}, (), True, "Nothing: the model explains it.", self.evidence)
+
+    def unexplained(self, base: Tried) -> Explanation:
+        nearest = self.nearest or base
+        if self.alone is not None and self.share > MOST_OF_IT:
+            one, share = self.alone, 100 * (1 - float(f"{1 - self.share:.1g}"))
+            most = " and ".join(self.changed(one, name) for name in one.names)
+            tail = f"{one.doubt}, and no second change that was tried explains that"
+            sentence = f"Not explained, but {share:.10g} % of the squares: {most}; {tail}.{self.end}"
+            return Explanation((), {}, {}, (), False, sentence, self.evidence)
+        near = f"with {' and '.join(nearest.names)}" if nearest.names else "as the model is"
+        tried = "no change that was tried" if self.ended_early else "no change of one or two quantities"
+        sentence = f"Not explained: {tried} explains the recording;"
+        sentence = f"{sentence} {near}, {nearest.doubt}.{self.end}"
+        return Explanation((), {}, {}, (), False, sentence, self.evidence)
+
+    def ended_with(self, said: Explanation, words: str) -> Explanation:
+        """With these words at the end of its sentence."""
+        before = said.sentence.removesuffix(self.end).removesuffix(".")
+        return replace(said, sentence=f"{before}, {words}.{self.end}")

@@ -21,9 +21,8 @@ from scipy.optimize import lsq_linear, minimize_scalar
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, SimulationError
-from drake_diff.identification.chart import Chart
-from drake_diff.identification.measured import LEAST, Piece
-from drake_diff.identification.motion import ContinuousMotion, Law
+from drake_diff.identification.motion import ContinuousMotion, DiscreteMotion, Law
+from drake_diff.identification.recordings import LEAST, Chart, Piece
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
@@ -205,7 +204,7 @@ class Fit:
     def at(self, z: Array, starts: Array) -> "Point | None":
         """The motion there; None where there is none."""
         values = self.unknowns.values(z)
-        if not self.law.is_possible(values):
+        if not isinstance(self.law, DiscreteMotion) and not self.law.is_possible(values):
             return None
         s = self.cut(values)
         try:
@@ -257,9 +256,9 @@ class Fit:
 
     @property
     def _continuous(self) -> ContinuousMotion:
-        """The law, of which sensors are read."""
-        if not isinstance(self.law, ContinuousMotion):
-            raise ModelError("sensors are read from motion in continuous time")
+        """The law, which has rates between its steps."""
+        if isinstance(self.law, DiscreteMotion):
+            raise ModelError("sensors and delays of inputs are of motion in continuous time")
         return self.law
 
     def _read_slopes(self, z: Array, s: Segments, xs: Array) -> list[tuple[Array, Array]]:
@@ -300,7 +299,7 @@ class Fit:
         A, C = self.law.slopes(z, xs, s.hs, s.us)
         if self.unknowns.delay is not None:
             flat = xs[:, 1:].reshape(-1, xs.shape[2]), s.us.reshape(-1, s.us.shape[2])
-            rates = self.law.rates(self.unknowns.values(z), *flat).reshape(xs[:, 1:].shape)
+            rates = self._continuous.rates(self.unknowns.values(z), *flat).reshape(xs[:, 1:].shape)
             C[..., self.unknowns.delay] = rates * s.by_delay[..., None]
         K, M, nx = A.shape[:3]
         along = np.zeros((K, M + 1, nx, nt + nz))
@@ -384,6 +383,9 @@ class Fit:
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
         """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
         solved = self._descended(z, starts, most)
+        exact = self.law.exact() if solved.stuck else None
+        if exact is not None:
+            solved = self.by(exact)._descended(solved.z, solved.starts, most)
         return self._from_rest(solved, most) if solved.stuck and self.law.kinks else solved
 
     def by(self, law: Law) -> "Fit":

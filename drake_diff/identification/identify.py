@@ -13,8 +13,8 @@ from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.chart import Chart
 from drake_diff.identification.fit import Fit, Solved, growth_cuts
+from drake_diff.identification.impacts import judged
 from drake_diff.identification.judge import (
     COLOURED,
     Known,
@@ -25,9 +25,11 @@ from drake_diff.identification.judge import (
     most_scatter,
     noise_of,
     score_of,
-    unidentifiable,
 )
-from drake_diff.identification.measured import (
+from drake_diff.identification.messages import NOISE_IS_LEFT, identification_sentence, unidentifiable
+from drake_diff.identification.motion import ContinuousMotion, Law, discrete_motion
+from drake_diff.identification.recordings import (
+    Chart,
     Piece,
     columns_of,
     given_noise,
@@ -36,9 +38,7 @@ from drake_diff.identification.measured import (
     read_given,
     read_pieces,
 )
-from drake_diff.identification.motion import ContinuousMotion, Law, discrete_motion
 from drake_diff.identification.sensors import Sensors, choose_sensors
-from drake_diff.identification.through_impacts import judged
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
@@ -364,8 +364,9 @@ class Problem:
         covariance = by_z @ np.where(np.isfinite(known.covariance), known.covariance, 0.0) @ by_z.T
         hidden = np.any(by_z[:, lost] != 0, axis=1)
         covariance[hidden, hidden] = np.inf
-        names, open_ = self.entries, unidentifiable(unknowns, z, known)
-        result = Identification(
+        names, open_ = self.entries, unidentifiable(unknowns, z, known.open)
+        why = reason or NOISE_IS_LEFT
+        return Identification(
             values=unknowns.named(values),
             start=unknowns.named(unknowns.start),
             intervals={
@@ -375,8 +376,10 @@ class Problem:
             units={one.name: one.unit for one in unknowns.each},
             unidentifiable=open_,
             explained=not reason,
-            reason=reason or "what is left is like noise, and what was held out is predicted",
-            sentence="",
+            reason=why,
+            sentence=identification_sentence(
+                unknowns, values, intervals, open_, (before, after), explained=not reason, reason=why
+            ),
             noise={n: float(s) for n, s in zip(names, fit.noise, strict=True) if np.isfinite(s)},
             error_before=before,
             error_after=after,
@@ -391,8 +394,6 @@ class Problem:
             motion=fit.law.words + (f", as {why_steps}" if why_steps else ""),
             motions=tuple(motions),
         )
-        object.__setattr__(result, "sentence", _sentence(result, intervals, unknowns, values))
-        return result
 
     def _predicted(
         self, fit: Fit, solved: Solved, known: Known, freedom: float
@@ -462,15 +463,18 @@ def _through_impacts(problem: Problem, names: Sequence[str] | str) -> Identifica
     covariance[~known, ~known] = np.inf
     every = np.concatenate(j.fitted)[:, :nv]
     motions = [Followed(p, frozen(a), frozen(b)) for p, a, b in zip(problem.pieces, j.after, j.before, strict=True)]
-    result = Identification(
+    why, open_ = j.reason or NOISE_IS_LEFT, search.open(found)
+    return Identification(
         values=unknowns.named(values),
         start=unknowns.named(unknowns.start),
         intervals=intervals,
         units={one.name: one.unit for one in unknowns.each},
-        unidentifiable=search.open(found),
+        unidentifiable=open_,
         explained=not j.reason,
-        reason=j.reason or "what is left is like noise, and what was held out is predicted",
-        sentence="",
+        reason=why,
+        sentence=identification_sentence(
+            unknowns, values, limits, open_, (j.error_before, j.error_after), explained=not j.reason, reason=why
+        ),
         noise={name: float(s) for name, s in zip(problem.entries[:nv], noise[:nv], strict=True)},
         error_before=j.error_before,
         error_after=j.error_after,
@@ -485,41 +489,3 @@ def _through_impacts(problem: Problem, names: Sequence[str] | str) -> Identifica
         motion=f"the model's own steps of {1e3 * h:.4g} ms through impacts, slopes from clouds of values" + without,
         motions=tuple(sorted(motions, key=lambda motion: motion.piece.held_out)),
     )
-    object.__setattr__(result, "sentence", _sentence(result, limits, unknowns, values))
-    return result
-
-
-def _sentence(e: Identification, intervals: Array, unknowns: Unknowns, values: Array) -> str:
-    changed, kept, vague = [], 0, 0
-    for j, name in enumerate(unknowns.columns):
-        low, high = intervals[j]
-        was, now, unit = unknowns.start[j], values[j], unknowns.units[j]
-        if not (np.isfinite(low) and np.isfinite(high)):
-            vague += 1
-        elif low <= was <= high:
-            kept += 1
-        else:
-            by = f", {100 * (now / was - 1):+.3g} %" if was else ""
-            size = abs(now - was) / max(high - low, 1e-300)
-            changed.append((size, f"{name} is {now:.4g} {unit} ({low:.4g} to {high:.4g}), not {was:.4g}{by}"))
-    changed.sort(key=lambda pair: -pair[0])
-    limits = [bound for one in unknowns.each for bound in [(one.lower, one.upper)] * len(one.start)]
-    at_bound = [
-        f"{name} is at its bound, {now:.4g} {unit}".rstrip()
-        for name, now, unit, bounds in zip(unknowns.columns, values, unknowns.units, limits, strict=True)
-        if any(np.isfinite(bound) and bound != 0 and abs(now - bound) <= 1e-9 * abs(bound) for bound in bounds)
-    ]
-    told = [text for _, text in changed[:4]] + at_bound[:3]
-    if len(changed) > 4:
-        told.append(f"{len(changed) - 4} more differ")
-    if not changed:
-        told.append("no parameter differs from the model's by more than its interval")
-    if kept and changed:
-        told.append(f"{kept} {'stays' if kept == 1 else 'stay'} within the interval")
-    if vague:
-        more = f", and {len(e.unidentifiable) - 1} more such" if len(e.unidentifiable) > 1 else ""
-        first = f" ({e.unidentifiable[0]}{more})" if e.unidentifiable else ""
-        told.append(f"{vague} cannot be known from these recordings{first}")
-    verdict = "Explained" if e.explained else "Not explained"
-    error = f"the error falls from {e.error_before:.3g} to {e.error_after:.3g} times the noise"
-    return f"{verdict}: {'; '.join(told)}; {error}; {e.reason}."

@@ -10,28 +10,217 @@ residual differs from its plane by is how far it is to be believed.
 Intervals have two parts. Slopes over a wider cloud and the scatter between recordings say how far others would lead.
 And where an impact lasts for a few steps, these matter more than noise does: the search goes on from where it ended by
 steps of half the length, and the way that this leads counts six times.
+
+What is left is measured in units of the noise and of how far apart motions are that begin at other states which the
+same measured positions allow: through impacts small errors of a first state grow.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.comparison.recordings import Recording
+from drake_diff.comparison.recordings import CLOCK_TOLERANCE, Recording
+from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError, SimulationError
-from drake_diff.identification.chart import Chart
-from drake_diff.identification.cloud import Plane, plane_at, shrink_to
-from drake_diff.identification.flights import Start, flights_of, millisecond, start_of, steps_between
-from drake_diff.identification.measured import Piece, read_pieces
+from drake_diff.identification.judge import SCATTER
 from drake_diff.identification.motion import DiscreteMotion, discrete_motion
+from drake_diff.identification.recordings import Chart, Piece, read_pieces
 from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
-from drake_diff.model.step import advance
+from drake_diff.model.step import advance, set_state
+from drake_diff.model.tangent import tangent_space
+
+LEAST = 6  # samples of a flight: fewer say little of a velocity
+CLEAR = 1  # samples between a flight and a sample at which shapes overlap
+ITERATIONS = 3  # of Gauss and Newton: through the air a motion is nearly linear in its first state
+
+
+def flights_of(model: Model, xs: Array) -> list[tuple[int, int]]:
+    """First and last sample of each stretch of xs (n, nx) that is clear of the model's contacts."""
+    if not model.contract.contact.collision_pairs:
+        return [(0, len(xs) - 1)]
+    touching = np.zeros(len(xs), dtype=bool)
+    for k, x in enumerate(xs):
+        set_state(model.double, x)
+        touching[k] = model.double.overlaps()
+    edges = np.flatnonzero(np.diff(np.concatenate([[1], touching.astype(int), [1]])))
+    found = []
+    for first, end in edges.reshape(-1, 2):
+        a, b = first + CLEAR * (first > 0), end - 1 - CLEAR * (end < len(xs))
+        if b - a + 1 >= LEAST:
+            found.append((int(a), int(b)))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A first state, and what measured positions leave open of it."""
+
+    x: Array  # (nx,)
+    spread: Array  # (2 nv, k): small motions from x, of one standard deviation each
+
+    def others(self, chart: Chart, count: int, random: np.random.Generator) -> list[Array]:
+        """First states (nx,) that the same positions could have had."""
+        return [chart.plus(self.x, self.spread @ random.standard_normal(self.spread.shape[1])) for _ in range(count)]
+
+
+def start_of(model: Model, chart: Chart, piece: Piece, scale: Array) -> Start:
+    """The state whose motion goes through the positions of a piece in which nothing touches.
+
+    By least squares, each position in units of its `scale` (nv,). Its spread is that of the scatter of what is left.
+    Parameters that are applied act.
+    """
+    each, nv = steps_between(model, piece), model.nv
+    us, x, none = np.repeat(piece.us, each, axis=0), piece.ys[0], select(model, ())
+    for _ in range(ITERATIONS):
+        steps = derivatives_along(model, x, us, vector=none)
+        xs = np.array([x] + [step.x_next for step in steps[each - 1 :: each]])
+        by_start, slopes = chart.from_motion(x), []
+        for k, step in enumerate(steps):
+            if k % each == 0:
+                slopes.append(by_start)
+            by_start = step.A @ by_start
+        slopes.append(by_start)
+        J = (chart.to_motion(xs) @ np.array(slopes))[:, :nv] / scale[:, None]
+        e = chart.minus(piece.ys, xs)[:, :nv] / scale
+        inverse = np.linalg.pinv(J.reshape(-1, 2 * nv))
+        d = np.asarray(inverse @ e.ravel(), dtype=float)
+        x = chart.plus(x, d)
+    left = np.sqrt(np.sum((e - J @ d) ** 2, axis=0) / (len(e) - 2))  # a place and a velocity of each are fitted
+    return Start(np.asarray(x), inverse * np.tile(left, len(e)))
+
+
+def steps_between(model: Model, piece: Piece) -> int:
+    """How many of the model's steps lie between two samples. InputError where it is no whole number."""
+    periods = np.diff(piece.times)
+    each = max(1, round(float(np.median(periods)) / model.time_step))
+    if np.any(np.abs(periods - each * model.time_step) > CLOCK_TOLERANCE * model.time_step * each):
+        got = f"from {1e3 * np.min(periods):.6g} to {1e3 * np.max(periods):.6g} ms"
+        expected = f"the same, and a whole number of steps of {1e3 * model.time_step:.6g} ms"
+        raise InputError(f"times between samples of {piece.name}", got=got, expected=expected)
+    return each
+
+
+def millisecond(chart: Chart, pieces: list[Piece]) -> Array:
+    """(nv,) how far each position moves in a millisecond: what an impact that much earlier or later changes."""
+    speeds = np.sqrt(np.mean(np.concatenate([p.ys[:, chart.coordinates.nq :] ** 2 for p in pieces]), axis=0))
+    for _, j in chart.coordinates.free:  # along one axis it may not have moved
+        for three in (slice(j, j + 3), slice(j + 3, j + 6)):
+            speeds[three] = np.sqrt(np.mean(speeds[three] ** 2))
+    return np.asarray(1e-3 * np.maximum(speeds, max(1e-3 * np.max(speeds), 1e-9)))
+
+
+def first_state(model: Model, recording: Recording, *, parameters: Mapping[str, Any] | None = None) -> Array:
+    """The state at the start of a recording, by its motion before anything touches.
+
+    What is measured of a motion before the first contact is all that goes into it: the state whose motion, by the
+    model's own steps, goes through the measured positions.
+
+    Args:
+        model: Its steps are taken, so that the state fits a rollout of this model and time step.
+        recording: Every position measured; its velocities are where the search begins.
+        parameters: Other values of the model's parameters, by name.
+
+    Returns:
+        (nx,); the first measured state itself where fewer than 6 samples come before the first contact.
+
+    Raises:
+        InputError: The times between samples are no whole number of steps.
+
+    Example:
+        >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.005)
+        >>> x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.5, 0, 0, 0, 1.0, 0, 0])
+        >>> xs = dd.rollout(model, x0, np.zeros((20, 0))).xs.copy()
+        >>> xs[:, 10] += 0.01  # a velocity that is wrong
+        >>> log = dd.Recording("throw", "1", 0.005 * np.arange(21), xs, np.zeros((20, 0)))
+        >>> print(round(float(dd.identification.first_state(model, log)[10]), 6))
+        1.0
+    """
+    (piece,) = read_pieces(model, recording, 0.0)
+    chart, vector = Chart(coordinates_of(model)), select(model, parameters or ())
+    found = flights_of(model, piece.ys)
+    if not found or found[0][0] > 0:
+        return np.array(piece.ys[0])
+    with applied(vector) as own:
+        return start_of(own, chart, piece.part(*found[0]), millisecond(chart, [piece])).x
+
+
+ROUNDS = 5  # of reweighting
+PULL = 1e-3  # towards where a cloud stands: what no residual knows stays there
+AGAIN = 4  # steps of one width at most: it shrinks where a step is no longer than it
+FAR = 2.0  # widths of the cloud that a step may go along each direction
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """Residuals near w: r + J d, and how far to believe each."""
+
+    r: Array  # (M,)
+    J: Array  # (M, n)
+    variance: Array  # (M,) of the scatter about the plane, and 1 of the residual's own
+
+    def weights(self, d: Array) -> Array:
+        """(M,) of the soft-L1 loss at d (n,)."""
+        e = self.r + self.J @ d
+        return np.asarray(1 / self.variance / np.sqrt(1 + e**2 / self.variance))
+
+    def step(self) -> Array:
+        """(n,) to where the loss is least."""
+        d: Array = np.zeros(self.J.shape[1])
+        for _ in range(ROUNDS):
+            weighted = self.J.T * self.weights(d)
+            d = np.asarray(-np.linalg.solve(weighted @ self.J + PULL * np.eye(len(d)), weighted @ self.r))
+        return d
+
+
+def plane_at(residual: Callable[[Array], Array], w: Array, width: float, random: np.random.Generator) -> Plane:
+    """Laid through the residuals (M,) of 4 n or more values about w (n,), in pairs."""
+    n = len(w)
+    half = max(2 * n, 4)
+    z = random.standard_normal((half, n))
+    z = np.concatenate([z, -z])
+    R = np.array([residual(w + width * each) for each in z])
+    A = np.concatenate([np.ones((2 * half, 1)), z], axis=1)
+    C = np.linalg.lstsq(A, R, rcond=None)[0]
+    scatter = np.sum((R - A @ C) ** 2, axis=0) / (2 * half - n - 1)
+    return Plane(C[0], C[1:].T / width, scatter + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Shrunk:
+    """Where steps led."""
+
+    w: Array  # (n,)
+    rounds: int  # planes that were laid
+    converged: bool  # whether the last step was within the narrowest cloud
+
+
+def shrink_to(
+    residual: Callable[[Array], Array], w: Array, widths: Sequence[float], random: np.random.Generator
+) -> Shrunk:
+    """Where steps lead, some for each width of the cloud, from w (n,).
+
+    Residuals are in units of what they are uncertain by at best.
+    """
+    rounds, within = 0, False
+    for width in widths:
+        most = FAR * width * float(np.sqrt(len(w)))
+        for _ in range(AGAIN):
+            d = plane_at(residual, w, width, random).step()
+            length = float(np.linalg.norm(d))
+            w = w + d * min(1.0, most / max(length, 1e-300))
+            rounds, within = rounds + 1, length <= most / 2
+            if within:
+                break
+    return Shrunk(w, rounds, within)
+
 
 # [s] how long segments go on after a flight, and the widths of the clouds of each stage.
 STAGES = (
@@ -374,3 +563,72 @@ def _between(plane: Plane, segments: Sequence[Segment], count: int) -> tuple[Arr
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = np.where(np.isfinite(spread), covariance / np.outer(spread, spread), np.nan)
     return np.asarray(spread * float(stats.t.ppf(0.975, count - n))), np.asarray(correlation)
+
+
+SEED = 0  # of clouds and other first states: the same recordings give the same values
+OTHERS = 8  # first states of each recording
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What a search found, and what it leaves of every recording, in units of what noise explains."""
+
+    search: Search
+    found: Found
+    after: list[Array]  # of each piece (n, nx), with the values that were found
+    before: list[Array]  # with the model's own
+    fitted: list[Array]  # (n, 2 nv) what is left of each piece that was fitted; NaN of velocities
+    error_before: float  # of what was held out; of all, where nothing was
+    error_after: float
+    reason: str  # why the recordings are not explained; empty where they are
+
+
+def judged(model: Model, pieces: Sequence[Piece], names: Sequence[str] | str, noise: Array) -> Judged:
+    """The search through impacts over the pieces; those held out are predicted from their first flight.
+
+    Positions alone are judged, by their `noise` (2 nv,). InputError or UnknownNameError for a recording or a name that
+    cannot be taken.
+    """
+    search = Search(model, pieces, names)
+    found = search.run(SEED)
+    after, left = _followed(search, found.w, noise)
+    before, was = _followed(search, np.zeros(len(found.w)), noise)
+    fitted, held = ([r for r, p in zip(left, pieces, strict=True) if p.held_out == h] for h in (False, True))
+    was_held = [r for r, piece in zip(was, pieces, strict=True) if piece.held_out]
+    entries = tangent_space(model).names
+    reason = "" if found.converged else "the search did not converge: its last step was longer than the cloud is wide"
+    reason = reason or _doubt(entries, fitted, "what is left of {} is {:.3g} times what noise explains")
+    reason = reason or _doubt(entries, held, "{} of what was held out is missed by {:.3g} times the noise")
+    return Judged(search, found, after, before, fitted, _size(was_held or was), _size(held or left), reason)
+
+
+def _followed(search: Search, w: Array, noise: Array) -> tuple[list[Array], list[Array]]:
+    """The motion (n, nx) of each recording, and what is left (n, 2 nv) in units of what noise explains; NaN of v."""
+    starts, random, nv = search.starts(w, noise), np.random.default_rng(SEED), search.model.nv
+    xs = search.whole(w, [start.x for start in starts])
+    others = [start.others(search.chart, OTHERS, random) for start in starts]
+    squares = [np.zeros((len(x), 2 * nv)) for x in xs]
+    for k in range(OTHERS):
+        for square, other, x in zip(squares, search.whole(w, [each[k] for each in others]), xs, strict=True):
+            square += search.chart.minus(other, x) ** 2 / OTHERS
+    left = []
+    for piece, x, square in zip(search.pieces, xs, squares, strict=True):
+        r = search.chart.minus(piece.ys, x) / np.sqrt(noise**2 + square)
+        r[:, nv:] = np.nan
+        left.append(r)
+    return xs, left
+
+
+def _size(residuals: Sequence[Array]) -> float:
+    return float(np.sqrt(np.nanmean(np.concatenate(residuals) ** 2)))
+
+
+def _doubt(names: Sequence[str], residuals: Sequence[Array], words: str) -> str:
+    """Where residuals are larger than noise makes them; empty where they are not."""
+    if not residuals:
+        return ""
+    every = np.concatenate(residuals)
+    seen = np.flatnonzero(np.isfinite(every).any(axis=0))
+    sizes = np.sqrt(np.nanmean(every[:, seen] ** 2, axis=0))
+    worst = int(np.argmax(sizes))
+    return words.format(names[seen[worst]], sizes[worst]) if sizes[worst] > SCATTER else ""

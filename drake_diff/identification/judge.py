@@ -10,17 +10,15 @@ from scipy import stats
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.fit import NO_PRIOR, Fit, Solved
-from drake_diff.identification.measured import ORDERS
+from drake_diff.identification.recordings import ORDERS
 from drake_diff.identification.unknowns import FAR, MASS, Unknowns
 
 HOPELESS = 3.0  # times the noise: residuals that no better weights make good
 CONFIDENCE = 0.95
 UNSEEN = 1.0  # a change by so many times its own size that the data leave open at one sigma is not determined
 NOTHING = 1e-8  # of a unit's effect: rounding
-PART = 0.03  # of the largest change in a combination: what is not told
 FALSE_ALARM = 0.004  # of all tests of the scatter together, where the model is right; of whole motions of all tests
 COLOURED = 0.001  # of all tests for whiteness together; of 12 columns of 200 samples it is 0.002: tails are heavier
-COMBINED = ("friction", "stiffness")  # of two bodies that touch, which Drake makes one of: 2 a b / (a + b), half of it
 OF_MEDIANS = 0.6  # of the degrees of freedom: drawn, for 40 to 120 samples
 LAGS = 10
 MANY = 1000  # samples, from which on Q is nearly as chi-square says
@@ -98,68 +96,6 @@ def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float
     return found
 
 
-def unidentifiable(unknowns: Unknowns, z: Array, known: Known) -> tuple[str, ...]:
-    """In words, the combinations that the data leave open."""
-    by_z, values = unknowns.by_z(z), unknowns.values(z)
-    found = []
-    for direction in known.open:
-        change = by_z @ direction
-        found.append(_words(unknowns, values, change))
-    return tuple(dict.fromkeys(found))
-
-
-def _words(unknowns: Unknowns, values: Array, change: Array) -> str:
-    sizes = np.concatenate(
-        [np.full(len(one.start), one.size or 1.0) for one in unknowns.each]
-    )  # of an inertia, a third of its trace
-    parts = np.abs(change) / sizes
-    told = [int(j) for j in np.argsort(-parts, kind="stable") if parts[j] > PART * np.max(parts)]
-    names = [unknowns.columns[j] for j in told]
-    quantities = {unknowns.each[i].name for i in _owners(unknowns, told)}
-    if len(quantities) == 1:
-        (name,) = quantities
-        if len(told) == 1:
-            return f"{names[0]}: a change of it leaves the motion as it is"
-        return f"{name}: a change of {_listed(names)} together leaves the motion as it is"
-    both = {name.rsplit(".", 1)[1] for name in quantities}
-    seen = _seen_of_two(values[told], change[told], both.pop() if len(both) == 1 else "") if len(told) == 2 else ""
-    if seen:
-        return f"{names[0]} and {names[1]}: only their {seen} is seen"
-    # Told as what a tenth of the first one's size does.
-    factor = 0.1 / parts[told[0]]
-    if change[told[0]] < 0:
-        factor = -factor
-    each = [
-        f"{name} by {factor * change[j]:+.3g} {unknowns.units[j]}" for name, j in zip(names[:6], told, strict=False)
-    ]
-    more = f" and {len(told) - 6} more" if len(told) > 6 else ""
-    return f"a change of {' with '.join(each)}{more} leaves the motion as it is"
-
-
-def _seen_of_two(values: Array, change: Array, quantity: str) -> str:
-    """What of two values stays as it is in a small change of both; "" where no word says it.
-
-    `quantity` is what both are, if it is the same. Of equal values several words would be true: the likeliest is told.
-    """
-    if np.any(values * change == 0):
-        return ""
-    absolute, relative = change[0] / change[1], change[0] / change[1] * values[1] / values[0]
-    words = {"product": relative, "quotient": -relative}
-    if quantity in COMBINED:
-        words = {"harmonic mean": relative * values[1] / values[0]}
-    elif quantity:
-        words = {"sum": absolute, "quotient": -relative, "product": relative, "difference": -absolute}
-    return next((word for word, ratio in words.items() if abs(ratio + 1) < 0.02), "")
-
-
-def _owners(unknowns: Unknowns, columns: Sequence[int]) -> set[int]:
-    return {i for i, s in enumerate(unknowns.slices) for j in columns if s.start <= j < s.stop}
-
-
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
 def freedom_of(fit: Fit, solved: Solved) -> tuple[int, float]:
     """(how many numbers were measured, how many of them the unknowns and first states take up)."""
     taken = sum(float(np.sum(np.abs(np.diag(R)) > 10 * NO_PRIOR)) for R, _, _ in solved.reduced.own)
@@ -187,6 +123,17 @@ def score_of(fit: Fit, solved: Solved) -> float:
     every = np.concatenate(solved.reduced.residuals)
     logs = np.isfinite(every).sum(axis=0) * np.log(np.where(np.isfinite(fit.noise), fit.noise, 1.0))
     return float(np.nansum(every**2)) + 2 * float(np.sum(logs))
+
+
+def likelihood_of(fit: Fit, solved: Solved, stated: Array, scatter: Array) -> float:
+    """-2 log of the likelihood with the noise that the residuals show, where none is `stated` (2 nv,)."""
+    every = np.concatenate(solved.reduced.residuals)
+    numbers = np.isfinite(every).sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = fit.noise * np.sqrt(np.nansum(every**2, axis=0) / numbers)
+        noise = np.where(np.isfinite(stated), stated, np.fmax(size, 1e-3 * scatter))
+        each = numbers * ((size / noise) ** 2 + 2 * np.log(noise))
+    return float(np.sum(each[numbers > 0]))
 
 
 def most_scatter(count: int, tests: int, *, jumps: bool = False) -> float:

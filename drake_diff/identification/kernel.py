@@ -17,6 +17,7 @@ from drake_diff.mechanics.tree_kernel import (
     _add_cross,
     _add_cross_force,
     _dot,
+    _factor,
     _rotated,
     _times,
     differentiate_tree,
@@ -128,27 +129,6 @@ def workspace(s: System, count: int) -> Workspace:
         np.empty(n),
         np.empty(n),
     )
-
-
-@inner
-def _factor(M: Array) -> bool:
-    """M = L D L', which takes its place; False if it is not positive definite."""
-    n = len(M)
-    for i in range(n):
-        for j in range(i):
-            total = M[i, j]
-            for k in range(j):
-                total -= M[i, k] * M[j, k]
-            M[i, j] = total  # L times D
-        d = M[i, i]
-        for j in range(i):
-            part = M[i, j]
-            M[i, j] = part / M[j, j]
-            d -= part * M[i, j]
-        if not d > 0:
-            return False
-        M[i, i] = d
-    return True
 
 
 @inner

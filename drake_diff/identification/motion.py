@@ -13,15 +13,14 @@ or by the model's own discrete steps, contact and limits included.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
-from drake_diff.exceptions import GradientError, InputError, ModelError
-from drake_diff.identification.measured import Piece
+from drake_diff.exceptions import GradientError, InputError
+from drake_diff.identification.recordings import Piece
 from drake_diff.identification.tree import ORDER_8, Dynamics, Method, Tree
 from drake_diff.identification.unknowns import (
     BIAS,
@@ -36,49 +35,9 @@ from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import advance
 
 LONGEST = 0.02  # [s] of a step in continuous time
-
-
-class Law(Protocol):
-    """How a model moves, many segments at once."""
-
-    @property
-    def words(self) -> str:
-        """Which motion this is."""
-        ...
-
-    @property
-    def segment(self) -> float:
-        """[s] how long a segment is."""
-        ...
-
-    @property
-    def kinks(self) -> bool:
-        """Whether derivatives say little of larger changes: of a joint that stops and stays, no velocity is left."""
-        ...
-
-    def cut(self, period: float) -> tuple[float, ...]:
-        """Lengths of the steps [s] over a time between samples [s]."""
-        ...
-
-    def shorter(self, than: float) -> "Law | None":
-        """The same by steps of at most half of a length [s]; None where the steps are the model's own."""
-        ...
-
-    def is_possible(self, values: Array) -> bool:
-        """Whether there are bodies with these values."""
-        ...
-
-    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
-        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s], 0 for none, under us (K, M, nu)."""
-        ...
-
-    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
-        ...
-
-    def rates(self, values: Array, x: Array, u: Array) -> Array:
-        """(N, nx) by time, of states (N, nx) under u (N, nu)."""
-        ...
+CHUNK = 128  # steps whose exponentials are taken in one call
+ORDER = 8  # of the series of phi
+SMALL = 0.5  # the norm of X up to which it is summed; 0.5^9 / 10! is 5e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +54,7 @@ class ContinuousMotion:
     segment: float = 0.15  # [s]
     method: Method = ORDER_8
     smooth: bool = False
+    frozen: bool = False  # whether steps are differentiated with their equations frozen halfway, where nothing is dry
 
     @cached_property
     def dry(self) -> tuple[int, ...]:
@@ -122,6 +82,10 @@ class ContinuousMotion:
         """By steps of at most half of a length [s]."""
         return replace(self, longest=than / 2)
 
+    def exact(self) -> "ContinuousMotion | None":
+        """Differentiated by the method's own derivatives; None where it is."""
+        return replace(self, frozen=False) if self.frozen else None
+
     def is_possible(self, values: Array) -> bool:
         """Whether there are bodies with these values."""
         return self.unknowns.consistent(values, self.tree)
@@ -141,8 +105,33 @@ class ContinuousMotion:
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        if self.frozen and not self.dry:
+            return self._frozen_slopes(z, xs, hs, us)
         jacobians = self.dynamics(self.unknowns.values(z)).step_jacobians(xs, hs, us, self.by(z))
         return jacobians[..., : xs.shape[2]], jacobians[..., xs.shape[2] :]
+
+    def _frozen_slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
+        """With d' = J d + C dz frozen halfway through each step (the first term of the series of Magnus, 1954).
+
+        d(h) = exp(h J) d(0) + h phi(h J) C dz, phi(X) = (exp(X) - 1) / X, wrong by h^3 / 24 of how J bends: one
+        evaluation instead of twelve, also where a motion decays within the step.
+        """
+        (K, M), nx, nq, coordinates = hs.shape, xs.shape[2], self.model.nq, self.tree.coordinates
+        h, u, x = hs.reshape(-1), us.reshape(K * M, -1), xs[:, :-1].reshape(K * M, nx)
+        values = self.unknowns.values(z)
+        halfway = self.run(values, x, h[:, None] / 2, u[:, None])[:, 1]
+        _, by = self.dynamics(values).acceleration_jacobians(halfway, u, self.by(z))
+        q, v, nv = halfway[:, :nq], halfway[:, nq:], nx - nq
+        J, C = np.zeros((K * M, nx, nx)), np.zeros((K * M, nx, len(z)))
+        J[:, :nq, :nq], J[:, :nq, nq:] = coordinates.rate_by_position(v), coordinates.rate(q)
+        J[:, nq:, :nq], J[:, nq:, nq:] = by[..., :nv] @ coordinates.motion(q), by[..., nv : 2 * nv]
+        C[:, nq:] = by[..., 2 * nv :]
+        by_x, by_z = np.empty_like(J), np.empty_like(C)
+        for k in range(0, K * M, CHUNK):
+            some = slice(k, k + CHUNK)
+            by_x[some], phi = exponential(h[some, None, None] * J[some])
+            by_z[some] = h[some, None, None] * (phi @ C[some])
+        return by_x.reshape(K, M, nx, nx), by_z.reshape(K, M, nx, -1)
 
     def by(self, z: Array) -> Array:
         """(count, np) how the numbers of the tree change with z."""
@@ -153,6 +142,22 @@ class ContinuousMotion:
         q, v = x[:, : self.model.nq], x[:, self.model.nq :]
         speed = (self.tree.coordinates.rate(q) @ v[..., None])[..., 0]
         return np.concatenate([speed, self.dynamics(values).accelerate(x, u)], axis=1)
+
+
+def exponential(X: Array) -> tuple[Array, Array]:
+    """exp(X) and phi(X) of matrices (N, n, n), by the series of X / 2^s and s times twice as much."""
+    norm = float(np.max(np.sum(np.abs(X), axis=1), initial=0.0))
+    halvings = max(0, int(np.ceil(np.log2(norm / SMALL)))) if norm > 0 else 0
+    X = X / 2.0**halvings
+    identity = np.eye(X.shape[1])
+    phi = np.broadcast_to(identity, X.shape)
+    for k in range(ORDER, 0, -1):
+        phi = identity + X @ phi / (k + 1)
+    whole = identity + X @ phi
+    for _ in range(halvings):
+        phi = (phi + whole @ phi) / 2
+        whole = whole @ whole
+    return whole, phi
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,9 +233,9 @@ class DiscreteMotion:
         """There is none: it is the model's step that is fitted."""
         return
 
-    def is_possible(self, values: Array) -> bool:
-        """Whether there are bodies with these values."""
-        return self.unknowns.consistent(values, None)
+    def exact(self) -> None:
+        """None: it has the derivatives of its own steps."""
+        return
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s], 0 for none, under us (K, M, nu)."""
@@ -242,10 +247,6 @@ class DiscreteMotion:
                     xs[k, i + 1] = advance(model.double, xs[k, i], us[k, i])
                 xs[k, count + 1 :] = xs[k, count]
         return xs
-
-    def rates(self, values: Array, x: Array, u: Array) -> Array:
-        """There are none: whoever needs them is refused."""
-        raise ModelError(f"{self.words} have no rates in between: a delay is sought in continuous time")
 
     def derivatives(self, model: Model, vector: ParameterVector, xs: Array, us: Array) -> Sequence[StepDerivatives]:
         """Of steps from each of xs (N, nx) under us (N, nu), by the vector's parameters; those applied act."""
@@ -266,6 +267,9 @@ class DiscreteMotion:
         by_x[taken] = np.array([step.A for step in each])
         by[taken] = np.array([step.C for step in each]) @ by_z
         return by_x, by
+
+
+Law = ContinuousMotion | DiscreteMotion
 
 
 def discrete_motion(model: Model, unknowns: Unknowns, pieces: Sequence[Piece]) -> DiscreteMotion:

@@ -13,12 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from drake_diff._base.arrays import Array
 from drake_diff._base.untrusted import read_plain
 from drake_diff.comparison.files import MOTION, PAGE, REPLAY, TRACE, hash_of_arrays, row_of
 from drake_diff.comparison.recordings import Recording, place_of, read_arrays
 from drake_diff.comparison.result import slug
 from drake_diff.comparison.side_by_side import compare_recordings
-from drake_diff.identification.cause import cause_of
+from drake_diff.exceptions import DrakeDiffError
+from drake_diff.identification.explain import explain
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.model import Model
 from drake_diff.runs.differences import ABSOLUTE, NUMBER, is_near
@@ -194,3 +196,38 @@ def _is_same_sentence(told: str, found: str) -> bool:
 
 def _fourth_digit(value: float) -> float:
     return float(10.0 ** (math.floor(math.log10(value)) - 3))
+
+
+def cause_of(model: Model, recording: Recording) -> CauseEvidence:
+    """The smallest change of the model that explains a recording; or why none was looked for.
+
+    Args:
+        model: The model.
+        recording: A motion of it.
+
+    Returns:
+        Names, values and 95 % intervals of what is changed, and a sentence.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> log = dd.Recording("lab", "1", [0.0, 0.01], [[1.0, 0.0], [0.99, -0.1]], [[0.0]])
+        >>> dd.identification.cause_of(model, log).sentence[:38]
+        'No cause was looked for: recording lab'
+    """
+    try:
+        found = explain(model, recording)
+    except DrakeDiffError as error:
+        sentence = f"No cause was looked for: {error}"
+        return CauseEvidence(names=[], values={}, intervals={}, alternatives=[], explained=False, sentence=sentence)
+    return CauseEvidence(
+        names=list(found.names),
+        values={name: _numbers(np.atleast_1d(value)) for name, value in found.values.items()},
+        intervals={name: [_numbers(row) for row in np.atleast_2d(each)] for name, each in found.intervals.items()},
+        alternatives=[list(names) for names in found.alternatives],
+        explained=found.explained,
+        sentence=found.sentence,
+    )
+
+
+def _numbers(values: Array) -> Numbers:
+    return [float(value) if np.isfinite(value) else None for value in values]

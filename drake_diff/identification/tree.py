@@ -23,7 +23,7 @@ from drake_diff._base.compiled import kernel
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
-from drake_diff.mechanics.description import Link, RigidLink, coordinates_of, read_links, springs_of, without_welds
+from drake_diff.mechanics.description import Link, RigidLink, coordinates_of, read_links, springs_of
 from drake_diff.mechanics.tree import tree_of
 from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
@@ -300,29 +300,23 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         return dynamics
     if isinstance(springs, Refusal):
         return springs
-    every = read_links(model.plant, springs)
-    links, placed, _ = without_welds(every)
+    every, links, placed = read_links(model.plant, springs), dynamics.links, dynamics.on
     if any(link.stiffness != 0 and link.kind == "quaternion_floating" for link in every):
         raise ModelError("a free body has a spring")
-    n, inertial = sum(6 if link.free else 1 for link in links), np.zeros((len(links), 10))
-    of_joints = np.zeros((4, n))
-    for rigid in links:
-        joint = rigid.joint
-        of_joints[:, joint.v_start] = joint.damping, joint.armature, joint.stiffness, joint.rest
+    n, inertial = len(dynamics.damping), np.zeros((len(links), 10))
     for link in every:
         place, pose = placed[link.body]
         if place >= 0:
             own = ten_numbers(link.mass, link.center_of_mass, link.inertia[tuple(np.transpose(INERTIA))])
             inertial[place] += _moved_by(pose) @ own
-    damping, reflected, stiffness, rest = of_joints
     numbers = Numbers(
         inertial=inertial,
         offset=np.array([link.on_parent.translation() for link in links]).reshape(-1, 3),
-        gravity=np.array(model.plant.gravity_field().gravity_vector()),
-        damping=damping,
-        reflected=reflected,
-        stiffness=stiffness,
-        rest=rest,
+        gravity=dynamics.gravity,
+        damping=dynamics.damping,
+        reflected=dynamics.reflected,
+        stiffness=dynamics.stiffness,
+        rest=dynamics.rest,
         coulomb=np.zeros(n),
         held_inertia=np.zeros(n),
         held_damping=np.zeros(n),

@@ -190,13 +190,11 @@ class Unknowns:
             for one, s in zip(self.each, self.slices, strict=True)
         }
 
-    def consistent(self, values: Array, tree: Tree | None) -> bool:
+    def consistent(self, values: Array, tree: Tree) -> bool:
         """Whether some distribution of mass has every body's numbers: a centre of mass alone may leave it.
 
         Points and rods have no room to begin with, and are not looked at.
         """
-        if tree is None:
-            return True
         given = self.named(values)
         for one in self.each:
             if one.quantity == CENTER and f"{one.label}.{INERTIA}" not in given:

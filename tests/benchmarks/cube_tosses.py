@@ -28,7 +28,7 @@ from cube_tosses_axes import axes_of, rotations, turned  # noqa: E402
 import drake_diff as dd  # noqa: E402
 from drake_diff._base.arrays import Array  # noqa: E402
 from drake_diff.identification import ContactIdentification, first_state, identify_contact  # noqa: E402
-from drake_diff.identification.flights import flights_of  # noqa: E402
+from drake_diff.identification.impacts import flights_of  # noqa: E402
 
 RATE, WIDTH, MASS, INERTIA = 148.0, 0.1048, 0.37, 0.00081  # [Hz, m, kg, kg m^2] as published with the tosses
 INSET = 0.0024  # [m] by hand, radius of a corner sphere: its centre is so far inside of three faces

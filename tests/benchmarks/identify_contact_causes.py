@@ -27,7 +27,7 @@ from helpers.legged import LEGGED, legged_model, rest
 from rates import success_rate
 
 import drake_diff as dd
-from drake_diff.identification.chart import Chart
+from drake_diff.identification.recordings import Chart
 from drake_diff.mechanics.description import coordinates_of
 
 MODELS = Path(__file__).parents[2] / "models"

@@ -3,11 +3,9 @@
 import numpy as np
 
 from drake_diff.comparison.recordings import Recording
-from drake_diff.identification.chart import Chart
-from drake_diff.identification.measured import given_noise, read_pieces
-from drake_diff.identification.setting import Setting
+from drake_diff.identification.ranking import Ranking
+from drake_diff.identification.recordings import Chart, given_noise, read_pieces
 from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.trial import Trial
 from drake_diff.mechanics.description import coordinates_of
 
 
@@ -18,7 +16,7 @@ def chance_of_a_name(model, recording: Recording, draws: int, seed: int = 0) -> 
     and a change alone lowers them by what b has in its own columns.
     """
     chart = Chart(coordinates_of(model))
-    setting = Setting(
+    setting = Ranking(
         model,
         tree_for_identification(model),
         chart,
@@ -35,6 +33,6 @@ def chance_of_a_name(model, recording: Recording, draws: int, seed: int = 0) -> 
         sizes, directions = np.linalg.eigh(H * np.outer(scale, scale))
         kept = sizes > 1e-12 * np.max(sizes)
         falls = np.sum(((pulled[:, s] * scale) @ directions[:, kept]) ** 2 / sizes[kept], axis=1)
-        named |= falls > Trial(setting).least(max(freedom, 1.0), len(view.freedoms))
+        named |= falls > setting.least(max(freedom, 1.0), len(view.freedoms))
         by_bic |= falls > max(freedom, 1.0) * np.log(setting.count)
     return float(np.mean(named)), float(np.mean(by_bic))

@@ -1,20 +1,148 @@
-"""The race of changes: those that promise most go on by steps of Gauss and Newton for as long as these help."""
+"""Which candidates fit best, and what evidence there is for them.
+
+Those that promise most go on by steps of Gauss and Newton for as long as these help. What comes near the noise is
+fitted, with the noise estimated anew, and ranked by BIC.
+"""
 
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.exceptions import SimulationError
-from drake_diff.identification.fit import Fit, Reduced
-from drake_diff.identification.measured import Piece
-from drake_diff.identification.screen import DELAY, LEVELS, LIMIT, Promise, View
-from drake_diff.identification.setting import Setting
-from drake_diff.identification.trial import STEPS, Trial, Tried
+from drake_diff.identification.candidates import DELAY, LEVELS, LIMIT, Candidates, Promise, View
+from drake_diff.identification.fit import Fit, Reduced, Solved
+from drake_diff.identification.identify import Problem
+from drake_diff.identification.judge import HOPELESS, freedom_of, intervals_of, known_of, likelihood_of, noise_of
+from drake_diff.identification.motion import Law
+from drake_diff.identification.recordings import Piece
 from drake_diff.identification.unknowns import Unknowns
+
+FALSE_NAME = 0.003  # of right models in which some change is named
+STEPS, ROUNDS = 8, 4  # of Gauss and Newton, and of estimating the noise
+SAME_NOISE = 0.03  # what is left of its error changes a score by less than 0.001 of how many numbers were measured
+SAME = 6.0  # of a score: evidence of 20 to 1, below which two changes are not told apart
+
+
+class Tried(NamedTuple):
+    """A change that was fitted to its end."""
+
+    names: tuple[str, ...]
+    score: float
+    pull: float  # how far it is from the file's values, as the fit weighs that
+    freedom: float
+    explains: bool
+    doubt: str
+    values: dict[str, Any]
+    intervals: dict[str, Array]
+    z: Array
+    starts: Array
+
+
+def least_evidence(freedom: float, tried: int, count: int) -> float:
+    """By how much -2 log of the likelihood must fall, where so many changes were tried and numbers measured."""
+    by_chance = float(stats.chi2.isf(FALSE_NAME / max(tried, 1), freedom))
+    return max(by_chance, freedom * float(np.log(count)))
+
+
+@dataclass(eq=False)
+class Ranking(Candidates):
+    """Fits candidates, and says which of them have the evidence."""
+
+    def solved(
+        self,
+        names: tuple[str, ...],
+        unknowns: Unknowns,
+        law: Law,
+        pieces: Sequence[Piece],
+        starts: Array,
+        z: Array,
+        most: int = STEPS,
+    ) -> Tried:
+        problem = self.problem(unknowns, pieces)
+        fit = self.followed(problem, problem.fit(law, pieces, problem.first_noise), z, starts)
+        law = fit.law
+        for _ in range(ROUNDS):
+            solved = fit.solve(z, starts, most)
+            z, starts = solved.z, solved.starts
+            shorter = fit.shorter
+            if shorter is not None and not problem.follows(fit, z, starts):
+                solved = replace(solved, converged=False, why="its steps are too long for the motion")
+                fit = problem.fit(shorter, pieces, fit.noise)
+                continue
+            size = noise_of(fit, solved)
+            seen = np.isfinite(size)
+            if np.any(size[seen] > HOPELESS * problem.first_noise[seen]):
+                solved = replace(solved, converged=True)
+                break
+            jumps = solved.stuck and unknowns.delay is not None and fit.law is law
+            if shorter is not None and jumps:  # stiff motions do, between two counts of steps that a delay cuts
+                fit = problem.fit(shorter, pieces, fit.noise)
+                continue
+            noise = np.where(np.isfinite(self.stated), self.stated, np.fmax(size, 1e-3 * self.scatter))
+            if solved.converged and np.max(np.abs(noise[seen] / fit.noise[seen] - 1)) < SAME_NOISE:
+                break
+            fit = problem.fit(fit.law, pieces, noise)
+        return self.told(names, problem, fit, solved)
+
+    def followed(self, problem: Problem, fit: Fit, z: Array, starts: Array) -> Fit:
+        """By steps short enough for the motion there: a search by longer ones takes long, and leads nowhere."""
+        for _ in range(ROUNDS):
+            shorter = fit.shorter
+            if shorter is None or problem.follows(fit, z, starts):
+                break
+            fit = fit.by(shorter)
+        return fit
+
+    def told(self, names: tuple[str, ...], problem: Problem, fit: Fit, solved: Solved) -> Tried:
+        unknowns = problem.unknowns
+        count, taken = freedom_of(fit, solved)
+        _, alone = freedom_of(problem.fit(fit.law, fit.segments.pieces, fit.noise, fixed=True), solved)
+        known = known_of(unknowns, solved.z, solved.reduced.R)
+        intervals = intervals_of(unknowns, solved.z, known.covariance, count - taken)
+        doubt = problem.doubt(fit, solved, "")
+        with np.errstate(divide="ignore"):
+            pull = float(np.sum(((solved.z - unknowns.z_start) / unknowns.widths) ** 2))
+        shaped = {
+            one.name: frozen(intervals[s][0] if len(one.start) == 1 else intervals[s])
+            for one, s in zip(unknowns.each, unknowns.slices, strict=True)
+        }
+        values = unknowns.named(unknowns.values(solved.z))
+        own = solved.z, solved.starts
+        return Tried(
+            names,
+            likelihood_of(fit, solved, self.stated, self.scatter),
+            pull,
+            taken - alone,
+            not doubt,
+            doubt,
+            values,
+            shaped,
+            *own,
+        )
+
+    def bic(self, one: Tried) -> float:
+        return one.score + one.pull + one.freedom * float(np.log(self.count))
+
+    def least(self, freedom: float, count: int) -> float:
+        """By how much a score must fall, where so many changes were tried."""
+        return max(float(stats.chi2.isf(FALSE_NAME / max(count, 1), freedom)), freedom * float(np.log(self.count)))
+
+    def enough(self, base: Tried, tried: Sequence[Tried], count: int) -> list[Tried]:
+        """The changes that explain and have the evidence, best first, and not told from the best."""
+        found = []
+        for one in tried:
+            freedom = max(one.freedom, 1.0)
+            if one.explains and base.score - one.score > self.least(freedom, count):
+                found.append(one)
+        found.sort(key=self.bic)
+        return [one for one in found if self.bic(one) - self.bic(found[0]) < SAME]
+
 
 LOOKED_AT = 8  # changes that enter the race, of those that promise most: of those of one number, and of others
 RACE = (5, 4, 3, 2, 2, 1)  # so many stay after each step of Gauss and Newton
@@ -64,11 +192,9 @@ class Runner:
 
 
 @dataclass(eq=False)
-class Race:
+class Race(Ranking):
     """Of changes of a model; it ends after LONGEST_SEARCH."""
 
-    setting: Setting
-    trial: Trial
     evidence: dict[str, float] = field(default_factory=dict)
     begun: float = field(default_factory=time.process_time)
     ended_early: bool = False
@@ -81,17 +207,17 @@ class Race:
 
     def chosen(self, seen: View, changes: Iterable[tuple[int, ...]], most: int = LOOKED_AT) -> Chosen:
         """Those that promise most, and a delay."""
-        each, changes = self.setting.unknowns.each, list(changes)
+        each, changes = self.unknowns.each, list(changes)
         chosen: Chosen = {}
         places = {True: most, False: most}  # what has more numbers bends to more, and promises more than it keeps
-        for promise in seen.promises(changes, float(np.log(self.setting.count))):
+        for promise in seen.promises(changes, float(np.log(self.count))):
             small = all(len(each[i].start) == 1 for i in promise.members)
-            own = tuple(self.setting.plain(each[i].name) for i in promise.members)
+            own = tuple(self.plain(each[i].name) for i in promise.members)
             if (
                 places[small]
                 and own not in chosen
                 and len(set(own)) == len(own)
-                and sum(map(self.setting.is_of_inputs, own)) <= 1
+                and sum(map(self.is_of_inputs, own)) <= 1
             ):
                 chosen[own] = promise
                 places[small] -= 1
@@ -102,7 +228,7 @@ class Race:
 
     def tried(self, seen: View, chosen: Chosen, base: Tried) -> tuple[list[Tried], list[Runner]]:
         """(those that are fitted, all that stayed in the race, best first)."""
-        plain = {own: promise for own, promise in chosen.items() if not any(map(self.setting.is_of_inputs, own))}
+        plain = {own: promise for own, promise in chosen.items() if not any(map(self.is_of_inputs, own))}
         found, every = self.raced([self.runner(seen, promise, own) for own, promise in plain.items()], base)
         if any(one.explains for one in found):  # a search for a delay or a limit takes longer than the others together
             first = min(promise.left for promise in chosen.values())
@@ -117,28 +243,28 @@ class Race:
 
     def runner(self, seen: View, promise: Promise, names: tuple[str, ...]) -> Runner:
         special = next((name for name in names if name.endswith(f".{LIMIT}")), None)
-        unknowns = self.setting.of([name for name in names if name != special])
+        unknowns = self.of([name for name in names if name != special])
         if special is not None:
             return self.searched(special, names, unknowns, promise)
         if unknowns.delay is not None and seen.unknowns.delay is None:
             return self.delayed(names, unknowns, promise)
         z, starts = seen.ahead(promise)
         own = [one.name for one in unknowns.each]
-        at = [i for one, s in self.setting.each_of(seen.unknowns) if one.name in own for i in range(s.start, s.stop)]
+        at = [i for one, s in self.each_of(seen.unknowns) if one.name in own for i in range(s.start, s.stop)]
         z = np.clip(z[at], *unknowns.bounds)
-        return self.running(names, unknowns, self.setting.cut, starts, z, promise)
+        return self.running(names, unknowns, self.cut, starts, z, promise)
 
     def delayed(self, names: tuple[str, ...], unknowns: Unknowns, promise: Promise) -> Runner:
         """From the delay from which steps leave least; a step sees only as far as inputs stay the same."""
-        best = self.running(names, unknowns, self.setting.cut, self.setting.starts, unknowns.z_start, promise)
+        best = self.running(names, unknowns, self.cut, self.starts, unknowns.z_start, promise)
         best.left, worse = np.inf, 0
-        for delay in self.setting.delays:
+        for delay in self.delays:
             if worse > 1:
                 break
             at = unknowns.z_start.copy()
             at[unknowns.delay] = delay
             worse += 1
-            one = self.running(names, unknowns, self.setting.cut, self.setting.starts_at(float(delay)), at, promise)
+            one = self.running(names, unknowns, self.cut, self.starts_at(float(delay)), at, promise)
             if all(one.step() for _ in names) and one.left < best.left:  # two where another change bends as well
                 best, worse = one, 0
         return best
@@ -152,8 +278,8 @@ class Race:
         z: Array,
         promise: Promise,
     ) -> Runner:
-        problem = self.setting.problem(unknowns, pieces)
-        fit = problem.fit(self.setting.law(unknowns, self.setting.longest, smooth=False), pieces, problem.first_noise)
+        problem = self.problem(unknowns, pieces)
+        fit = problem.fit(self.law(unknowns, self.longest, smooth=False), pieces, problem.first_noise)
         return Runner(names, fit, z, starts, promise.left, promise.freedom)
 
     def raced(self, runners: list[Runner], base: Tried) -> tuple[list[Tried], list[Runner]]:
@@ -163,23 +289,23 @@ class Race:
                 most = 1
             before = {one.names: one.left for one in alive}
             alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
-            there += [one for one in alive if not self.setting.is_hopeless(one.left)]
+            there += [one for one in alive if not self.is_hopeless(one.left)]
             alive = [
                 one
                 for one in alive[:most]
-                if self.setting.is_hopeless(one.left) and (most == RACE[0] or one.left < FALLS * before[one.names])
+                if self.is_hopeless(one.left) and (most == RACE[0] or one.left < FALLS * before[one.names])
             ]
         self.improve(there)
         every = sorted(runners, key=lambda one: one.left)
         alive = there + alive
-        price = float(np.log(self.setting.count))
+        price = float(np.log(self.count))
         alive.sort(key=lambda one: one.left + price * one.freedom)
         found: list[Tried] = []
         for one in alive:
             first = alive[0].left + price * alive[0].freedom
             enough = any(each.explains for each in found) and self.is_behind(one.left + price * one.freedom, first)
-            enough = enough or (bool(found) and (self.is_late or one.left > self.setting.plausible))
-            if enough or self.setting.is_hopeless(one.left) or one.fit.at(one.z, one.starts) is None:
+            enough = enough or (bool(found) and (self.is_late or one.left > self.plausible))
+            if enough or self.is_hopeless(one.left) or one.fit.at(one.z, one.starts) is None:
                 continue
             try:
                 found.append(self.ended(one))
@@ -196,18 +322,18 @@ class Race:
                 last = one.left
                 if self.is_late or not one.step() or last - one.left < CLOSE:
                     break
-                if one.left > FALLS * last and (self.is_behind(one.left, best) or self.setting.is_hopeless(one.left)):
+                if one.left > FALLS * last and (self.is_behind(one.left, best) or self.is_hopeless(one.left)):
                     break
             best = min(best, one.left)
 
     def is_behind(self, left: float, best: float) -> bool:
         """Whether a change that leaves so much is told from the one that leaves least."""
-        return left - best > TOLD_APART * max(1.0, best / self.setting.count)
+        return left - best > TOLD_APART * max(1.0, best / self.count)
 
     def ended(self, one: Runner) -> Tried:
         """The change where it fits best, with the noise estimated anew."""
         pieces = one.fit.segments.pieces
-        found = self.trial.solved(one.names, one.fit.unknowns, one.fit.law, pieces, one.starts, one.z)
+        found = self.solved(one.names, one.fit.unknowns, one.fit.law, pieces, one.starts, one.z)
         if not one.special:
             return found
         return found._replace(
@@ -224,15 +350,15 @@ class Race:
 
         def left(value: float) -> float:
             if value not in found:
-                pieces = [self.acted(piece, special, value) for piece in self.setting.cut]
-                one = self.running(names, unknowns, pieces, self.setting.starts, unknowns.z_start, promise)
+                pieces = [self.acted(piece, special, value) for piece in self.cut]
+                one = self.running(names, unknowns, pieces, self.starts, unknowns.z_start, promise)
                 if not all(one.step() for _ in range(2)):
                     one.left = np.inf
                 found[value] = one
             return found[value].left
 
-        i = self.setting.model.input_names.index(special.rsplit(".", 1)[0])
-        largest = max(float(np.max(np.abs(p.us[:, i]))) for p in self.setting.pieces)
+        i = self.model.input_names.index(special.rsplit(".", 1)[0])
+        largest = max(float(np.max(np.abs(p.us[:, i]))) for p in self.pieces)
         grid, low, high = np.array(LEVELS) * largest, 0.0, largest
         if near is not None:
             grid = np.minimum(near * np.array([0.8, 1.0, 1.25]), largest)
@@ -245,7 +371,7 @@ class Race:
         value = float(least.x)
         width = max(0.02 * value, 1e-12)
         bend = (left(value + width) + left(value - width) - 2 * left(value)) / width**2
-        noise = left(value) / self.setting.count
+        noise = left(value) / self.count
         half = 1.96 * float(np.sqrt(2 * noise / bend)) if bend > 0 else np.inf
         one = found[value]
         one.special, one.interval = {special: value}, {special: frozen([max(value - half, 0.0), value + half])}
@@ -253,7 +379,7 @@ class Race:
 
     def acted(self, piece: Piece, special: str, value: float) -> Piece:
         """The piece with an input that is cut."""
-        i = self.setting.model.input_names.index(special.rsplit(".", 1)[0])
+        i = self.model.input_names.index(special.rsplit(".", 1)[0])
         us = piece.us.copy()
         us[:, i] = np.clip(us[:, i], -value, value)
         return replace(piece, us=us)

@@ -1,0 +1,198 @@
+"""What identification says in words: of parameters, of what recordings leave open, of causes and of motions."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.identification.unknowns import Unknowns
+
+PART = 0.03  # of the largest change in a combination: what is not told
+COMBINED = ("friction", "stiffness")  # of two bodies that touch, which Drake makes one of: 2 a b / (a + b), half of it
+NOISE_IS_LEFT = "what is left is like noise, and what was held out is predicted"
+NO_CHANGE = "Not explained: no change that was tried explains the recording"
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation(ShowsItsRepr):
+    """The smallest change of a model that explains recordings; `dd.explain` makes one."""
+
+    names: tuple[str, ...]  # what is changed: one name, or two; empty where nothing is, or nothing explains
+    values: Mapping[str, Any]  # by name, of the alternatives too
+    intervals: Mapping[str, Array]  # (2,) or (k, 2): lower and upper, with 95 % of the probability
+    alternatives: tuple[tuple[str, ...], ...]  # other changes that the recordings cannot tell from this one
+    explained: bool  # whether the model explains the recordings: as it is, or with the change
+    sentence: str
+    evidence: Mapping[str, float]  # by what was fitted: by how much it lowers -2 log of the likelihood
+
+    def __repr__(self) -> str:
+        return self.sentence
+
+
+def search_ended(seconds: float) -> str:
+    """Where no further change was tried, as the search took so much processor time."""
+    return f" The search was ended after {seconds:.3g} s of processor time."
+
+
+def also_touching(found: Explanation, touched: Explanation) -> Explanation:
+    """Not explained by motion in which nothing touches, and not by motion in which bodies do."""
+    rest = touched.sentence.removeprefix(NO_CHANGE)
+    return replace(found, sentence=f"{found.sentence} Where bodies touch, none that was tried explains it either{rest}")
+
+
+def mistaken(first: str, others: Sequence[str], evidence: Mapping[str, float]) -> Explanation:
+    """By columns that are mistaken, and nothing else; by `others` as well."""
+    tail = ": the recording cannot tell" if others else ": this explains the recording"
+    sentence = f"{', or '.join((first, *others))}{tail}."
+    return Explanation((first,), {}, {}, tuple((words,) for words in others), True, sentence, evidence)
+
+
+def changed_to(name: str, values: Array, intervals: Array, start: Array, unit: str) -> str:
+    """What a quantity (k,) is, with its intervals (k, 2), and what it is in the model."""
+    columns = [name] if len(start) == 1 else [f"{name}[{k}]" for k in range(len(start))]
+    unit = f" {unit}" if unit not in ("", "1") else ""
+    return ", ".join(
+        f"{column} is {v:.4g}{unit} ({low:.4g} to {high:.4g}), not {was:.4g}"
+        if np.isfinite(low) and np.isfinite(high)
+        else f"{column} cannot be known"
+        for column, v, (low, high), was in zip(columns, values, intervals, start, strict=True)
+    )
+
+
+def unidentifiable(unknowns: Unknowns, z: Array, directions: Sequence[Array]) -> tuple[str, ...]:
+    """In words, the combinations that the data leave open, by their directions (np,) in z."""
+    by_z, values = unknowns.by_z(z), unknowns.values(z)
+    found = []
+    for direction in directions:
+        change = by_z @ direction
+        found.append(_words(unknowns, values, change))
+    return tuple(dict.fromkeys(found))
+
+
+def _words(unknowns: Unknowns, values: Array, change: Array) -> str:
+    sizes = np.concatenate(
+        [np.full(len(one.start), one.size or 1.0) for one in unknowns.each]
+    )  # of an inertia, a third of its trace
+    parts = np.abs(change) / sizes
+    told = [int(j) for j in np.argsort(-parts, kind="stable") if parts[j] > PART * np.max(parts)]
+    names = [unknowns.columns[j] for j in told]
+    quantities = {unknowns.each[i].name for i in _owners(unknowns, told)}
+    if len(quantities) == 1:
+        (name,) = quantities
+        if len(told) == 1:
+            return f"{names[0]}: a change of it leaves the motion as it is"
+        return f"{name}: a change of {_listed(names)} together leaves the motion as it is"
+    both = {name.rsplit(".", 1)[1] for name in quantities}
+    seen = _seen_of_two(values[told], change[told], both.pop() if len(both) == 1 else "") if len(told) == 2 else ""
+    if seen:
+        return f"{names[0]} and {names[1]}: only their {seen} is seen"
+    # Told as what a tenth of the first one's size does.
+    factor = 0.1 / parts[told[0]]
+    if change[told[0]] < 0:
+        factor = -factor
+    each = [
+        f"{name} by {factor * change[j]:+.3g} {unknowns.units[j]}" for name, j in zip(names[:6], told, strict=False)
+    ]
+    more = f" and {len(told) - 6} more" if len(told) > 6 else ""
+    return f"a change of {' with '.join(each)}{more} leaves the motion as it is"
+
+
+def _seen_of_two(values: Array, change: Array, quantity: str) -> str:
+    """What of two values stays as it is in a small change of both; "" where no word says it.
+
+    `quantity` is what both are, if it is the same. Of equal values several words would be true: the likeliest is told.
+    """
+    if np.any(values * change == 0):
+        return ""
+    absolute, relative = change[0] / change[1], change[0] / change[1] * values[1] / values[0]
+    words = {"product": relative, "quotient": -relative}
+    if quantity in COMBINED:
+        words = {"harmonic mean": relative * values[1] / values[0]}
+    elif quantity:
+        words = {"sum": absolute, "quotient": -relative, "product": relative, "difference": -absolute}
+    return next((word for word, ratio in words.items() if abs(ratio + 1) < 0.02), "")
+
+
+def _owners(unknowns: Unknowns, columns: Sequence[int]) -> set[int]:
+    return {i for i, s in enumerate(unknowns.slices) for j in columns if s.start <= j < s.stop}
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def identification_sentence(
+    unknowns: Unknowns,
+    values: Array,
+    intervals: Array,
+    unidentifiable: Sequence[str],
+    errors: tuple[float, float],
+    *,
+    explained: bool,
+    reason: str,
+) -> str:
+    """What recordings say of parameters (np,) with intervals (np, 2), and by how much the error falls."""
+    changed, kept, vague = [], 0, 0
+    for j, name in enumerate(unknowns.columns):
+        low, high = intervals[j]
+        was, now, unit = unknowns.start[j], values[j], unknowns.units[j]
+        if not (np.isfinite(low) and np.isfinite(high)):
+            vague += 1
+        elif low <= was <= high:
+            kept += 1
+        else:
+            by = f", {100 * (now / was - 1):+.3g} %" if was else ""
+            size = abs(now - was) / max(high - low, 1e-300)
+            changed.append((size, f"{name} is {now:.4g} {unit} ({low:.4g} to {high:.4g}), not {was:.4g}{by}"))
+    changed.sort(key=lambda pair: -pair[0])
+    limits = [bound for one in unknowns.each for bound in [(one.lower, one.upper)] * len(one.start)]
+    at_bound = [
+        f"{name} is at its bound, {now:.4g} {unit}".rstrip()
+        for name, now, unit, bounds in zip(unknowns.columns, values, unknowns.units, limits, strict=True)
+        if any(np.isfinite(bound) and bound != 0 and abs(now - bound) <= 1e-9 * abs(bound) for bound in bounds)
+    ]
+    told = [text for _, text in changed[:4]] + at_bound[:3]
+    if len(changed) > 4:
+        told.append(f"{len(changed) - 4} more differ")
+    if not changed:
+        told.append("no parameter differs from the model's by more than its interval")
+    if kept and changed:
+        told.append(f"{kept} {'stays' if kept == 1 else 'stay'} within the interval")
+    if vague:
+        more = f", and {len(unidentifiable) - 1} more such" if len(unidentifiable) > 1 else ""
+        first = f" ({unidentifiable[0]}{more})" if unidentifiable else ""
+        told.append(f"{vague} cannot be known from these recordings{first}")
+    verdict = "Explained" if explained else "Not explained"
+    error = f"the error falls from {errors[0]:.3g} to {errors[1]:.3g} times the noise"
+    return f"{verdict}: {'; '.join(told)}; {error}; {reason}."
+
+
+def excitation_sentence(
+    duration: float,
+    deviations: Mapping[str, Any],
+    random: Mapping[str, Any],
+    rest: Mapping[str, Any],
+    units: Mapping[str, str],
+    unidentifiable: Sequence[str],
+    gain: float,
+) -> str:
+    """How well a motion tells parameters, beside a random one and a recording at rest."""
+    told = []
+    for name, value in deviations.items():
+        now, was = np.atleast_1d(value), np.atleast_1d(random[name])
+        if len(now) == 1:
+            unit = f" {units[name]}" if units[name] not in ("", "1") else ""
+            told.append(
+                f"{name} to {now[0]:.3g}{unit} (random {was[0]:.3g}, at rest {np.atleast_1d(rest[name])[0]:.3g})"
+            )
+        else:
+            told.append(f"{name} to {', '.join(f'{d:.3g}' for d in now)} {units[name]}")
+    more = f" and {len(told) - 4} more" if len(told) > 4 else ""
+    open_ = f" Open: {'; '.join(unidentifiable[:3])}." if unidentifiable else ""
+    return (
+        f"{duration:.3g} s that tell {', '.join(told[:4])}{more}, at one standard deviation: "
+        f"{gain:.3g} times better than a random motion.{open_}"
+    )
