@@ -131,7 +131,6 @@ def test_a_function_is_optimized_like_the_quadratic_cost_it_is():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"optimize": ("initial_state",)}, 'fixed controls: expected none for method="ilqr"; method="shooting" takes'),
         ({"trajectory_cost": lambda xs, us: xs[3, 0] ** 2}, "trajectory_cost: expected none"),
     ],
 )

@@ -371,7 +371,8 @@ def test_the_default_guess_is_near_zero_whatever_the_limit(effort):
     assert shoot(problem).iterations[0].objective < 1.0
 
 
-def test_fixed_inputs_act_while_the_initial_state_is_free():
+@pytest.mark.parametrize("method", ["shooting", "ilqr"])
+def test_fixed_inputs_act_while_the_initial_state_is_free(method):
     """x_N = x_0 + N h v_0 + u h^2 N (N + 1) / 2 with u = 0.5 held: v_0 = 1 - 0.5 * 0.55 reaches 1 after 1 s."""
     problem = dd.Problem(
         block(),
@@ -382,7 +383,7 @@ def test_fixed_inputs_act_while_the_initial_state_is_free():
         optimize=("initial_state",),
         initial_state_mask=[False, True],
     )
-    solution = shoot(problem)
+    solution = dd.solve(problem, method=method)
     assert solution.success, solution.message
     assert solution.xs[0] == pytest.approx([0, 0.725], abs=1e-6)
     assert np.array_equal(solution.us, np.full((10, 1), 0.5))
