@@ -61,9 +61,9 @@ def save_identification(identification: Identification, directory: str | Path) -
 def write_identification(identification: Identification, folder: Path) -> FitRecord:
     """Write what `save_identification` does into `folder`, which `written_whole` gave."""
     asked, name = _asked(identification), name_of(folder)
-    kept = (folder.with_name(name) / RECORDINGS).resolve()
+    stored = (folder.with_name(name) / RECORDINGS).resolve()
     for recording, given in zip(asked.recordings, asked.files, strict=True):
-        if given is not None and given[0].resolve().is_relative_to(kept):
+        if given is not None and given[0].resolve().is_relative_to(stored):
             got = f"{given[0]}, which is in the directory to be written"
             raise InputError(f"recording {recording.name}", got=got, expected="one elsewhere")
         if given is not None and (not given[0].exists() or hash_of(given[0]) != given[1]):
@@ -118,7 +118,7 @@ def _begun(name: str, asked: Asked) -> FitRecord:
             held_out=asked.held_out,
             motion=asked.motion,
             max_iterations=asked.max_iterations,
-            priors={key: [np.ravel(part).tolist() for part in pair] for key, pair in asked.priors.items()},
+            priors={key: [np.ravel(piece).tolist() for piece in pair] for key, pair in asked.priors.items()},
             bounds={key: [finite(bound) for bound in pair] for key, pair in asked.bounds.items()},
             sensors={
                 key: records.Mounted(body=body, pose=[float(value) for value in pose])
@@ -135,7 +135,7 @@ def record_of(e: Identification, name: str) -> FitRecord:
     """The record of an identification, but for the files."""
     asked = _asked(e)
     recordings = [_recording(i, e, asked) for i in range(len(asked.recordings))]
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "verdict": "pass" if e.explained else "fail",
         "sentence": e.sentence,
         "recordings": recordings,
@@ -148,7 +148,7 @@ def record_of(e: Identification, name: str) -> FitRecord:
         **{key: getattr(e, key) for key in ("explained", "reason", "converged", "steps", "motion", "count")},
     }
     begun = _begun(name, asked)
-    return FitRecord(**{**{key: getattr(begun, key) for key in type(begun).model_fields}, **found})
+    return FitRecord(**{**{key: getattr(begun, key) for key in type(begun).model_fields}, **result})
 
 
 def _data(recordings: list[records.RecordingEvidence]) -> DataBoundary:
@@ -162,8 +162,10 @@ def _data(recordings: list[records.RecordingEvidence]) -> DataBoundary:
 
     seen = [use for r in recordings for use in uses(r, r.fitted_s, not r.held_out_s)]
     held_out = [use for r in recordings for use in uses(r, r.held_out_s, not r.fitted_s)]
-    fitted, kept = ("1 span" if len(part) == 1 else f"{len(part)} spans" for part in (seen, held_out))
-    statement = f"parameters were fitted on {fitted}, and the fit is judged on {kept} that it did not see, and its own"
+    fitted, stored = ("1 span" if len(piece) == 1 else f"{len(piece)} spans" for piece in (seen, held_out))
+    statement = (
+        f"parameters were fitted on {fitted}, and the fit is judged on {stored} that it did not see, and its own"
+    )
     return DataBoundary(
         statement=statement, seen=seen, judged_on=[*seen, *held_out], held_out=[use.name for use in held_out]
     )
@@ -199,26 +201,26 @@ def _recording(i: int, e: Identification, asked: Asked) -> records.RecordingEvid
 
 def estimates_of(e: Identification) -> list[records.Estimate]:
     """Each entry of each value with its interval."""
-    found = []
+    result = []
     for name, value in e.values.items():
         now, was = np.atleast_1d(value), np.atleast_1d(e.start[name])
         limits = np.reshape(e.intervals[name], (-1, 2))
         for i, (low, high) in enumerate(limits):
             label = name if len(now) == 1 else f"{name}[{i}]"
-            found.append(
+            result.append(
                 records.Estimate(
                     name=label, unit=e.units[name], before=float(was[i]), value=float(now[i]),
                     lower=finite(low), upper=finite(high),
                 )
             )  # fmt: skip
-    return found
+    return result
 
 
 def _correlation(covariance: Array) -> list[list[float | None]]:
     spread = np.sqrt(np.diag(covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = covariance / np.outer(spread, spread)
-    return [[finite(round(float(value), 9)) if np.isfinite(value) else None for value in row] for row in found]
+        result = covariance / np.outer(spread, spread)
+    return [[finite(round(float(value), 9)) if np.isfinite(value) else None for value in row] for row in result]
 
 
 def write_made(folder: Path, e: Identification, record: FitRecord) -> None:
@@ -240,8 +242,8 @@ def write_identification_trace(path: Path, e: Identification, attachments: Mappi
     model = _asked(e).model
     contract = model.contract
     names = {"recordings": ", ".join(r.name for r in _asked(e).recordings), "model": model.name}
-    own = {p.name for p in list_parameters(model)}
-    vector = select(model, {name: value for name, value in e.values.items() if name in own})
+    inner = {p.name for p in list_parameters(model)}
+    vector = select(model, {name: value for name, value in e.values.items() if name in inner})
     with applied(vector) if vector.parameters else nullcontext():
         channels = [c for i in range(len(_asked(e).recordings)) for c in _channels_of(e, i)]
         first = joined([m for m in e.motions if m.piece.recording == 0])
@@ -267,15 +269,15 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
     made, identification = _fitted_again(folder, record, models)
     changed = {"contract": contract_as(made.contract, record.contract), "model": model_as(made.model, record.model)}
     again = made.model_copy(update=changed)
-    with TemporaryDirectory() as place:
-        write_made(Path(place), identification, again)
-        files = {name: (Path(place) / name).read_bytes() for name in MADE}
+    with TemporaryDirectory() as location:
+        write_made(Path(location), identification, again)
+        files = {name: (Path(location) / name).read_bytes() for name in MADE}
     problems = tuple(f"{name}: every fit is written with it, and the directory has none" for name in MADE
                      if name not in record.files)  # fmt: skip
-    kept = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
+    stored = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
     carried = "" if record.model.file is None else record.model.file.path
     fields = again.model_dump(mode="json")
-    return Reproduced(fields, files, problems=problems, unchecked=(OF_RECORDINGS,), written=(carried, *kept, *MADE))
+    return Reproduced(fields, files, problems=problems, unchecked=(OF_RECORDINGS,), written=(carried, *stored, *MADE))
 
 
 def _fitted_again(folder: Path, record: FitRecord, models: Path | None) -> tuple[FitRecord, Identification]:
@@ -291,31 +293,31 @@ def _fitted_again(folder: Path, record: FitRecord, models: Path | None) -> tuple
     with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
         given: list[Recording] = []
         files: list[tuple[Path, str] | None] = []
-        for i, kept in enumerate(record.recordings):
-            name = ARRAYS if kept.file is None else kept.file
-            if kept.path != f"{RECORDINGS}/{i}/{name}" or Path(name).name != name or name in ("", "..", "."):
-                raise ArtifactError(f"{record.FILE}: recording {kept.name} is not where drake_diff keeps it")
-            path = folder / kept.path
-            if kept.file is None:
-                given.append(read_arrays(path, kept.name, kept.version, kept.facts))
+        for i, stored in enumerate(record.recordings):
+            name = ARRAYS if stored.file is None else stored.file
+            if stored.path != f"{RECORDINGS}/{i}/{name}" or Path(name).name != name or name in ("", "..", "."):
+                raise ArtifactError(f"{record.FILE}: recording {stored.name} is not where drake_diff keeps it")
+            path = folder / stored.path
+            if stored.file is None:
+                given.append(read_arrays(path, stored.name, stored.version, stored.facts))
                 files.append(None)
             else:
-                if not path.exists() or hash_of(path) != kept.sha256:
-                    raise ArtifactError(f"{kept.path}: it is not the recording that {record.FILE} describes")
+                if not path.exists() or hash_of(path) != stored.sha256:
+                    raise ArtifactError(f"{stored.path}: it is not the recording that {record.FILE} describes")
                 read = read_recording(path, model, gaps=True)
-                given.append(replace(read, name=kept.name, version=kept.version, facts=dict(kept.facts)))
-                files.append((path, str(kept.sha256)))
+                given.append(replace(read, name=stored.name, version=stored.version, facts=dict(stored.facts)))
+                files.append((path, str(stored.sha256)))
         inputs = record.inputs
-        found = identify(
+        result = identify(
             model, given, inputs.parameters, noise=inputs.noise or None, held_out=inputs.held_out, motion=inputs.motion,
             max_iterations=inputs.max_iterations,
             priors={key: (mean, deviation) for key, (mean, deviation) in inputs.priors.items()} or None,
             bounds={key: _bounds(pair) for key, pair in inputs.bounds.items()} or None,
-            sensors={key: (one.body, one.pose) for key, one in inputs.sensors.items()} or None,
+            sensors={key: (item.body, item.pose) for key, item in inputs.sensors.items()} or None,
         )  # fmt: skip
-        if found.asked is None:
+        if result.asked is None:
             raise ArtifactError("the fit does not say what was asked")
-        found = replace(found, asked=replace(found.asked, files=tuple(files)))
-        made = record_of(found, record.name)
+        result = replace(result, asked=replace(result.asked, files=tuple(files)))
+        made = record_of(result, record.name)
     kept_as = {name: getattr(record, name) for name in ("provenance", "wall_clock", "files", "record_sha256")}
-    return made.model_copy(update=kept_as), found
+    return made.model_copy(update=kept_as), result

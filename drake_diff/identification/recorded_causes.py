@@ -57,18 +57,18 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
     given = [read_arrays(folder / r.path, r.name, r.version, r.facts) for r in record.recordings]
     attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
     with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
-        found = compare_recordings(model, given)
+        result = compare_recordings(model, given)
         rows = [e for e in record.engines if not e.jacobians]
-        names = [[e.engine for e in engines] for engines in (rows, found.engines)]
+        names = [[e.engine for e in engines] for engines in (rows, result.engines)]
         if names[0] != names[1]:
             problems.append(f"{record.FILE}: its recordings are {names[0]}, compared again {names[1]}")
             return Reproduced({}, {}, problems=tuple(problems), written=written)
-        problems += _odd_files(folder, record, found.recordings)
-        known = _motion_hash(record) == hash_of_arrays(found.x0, found.us)
+        problems += _odd_files(folder, record, result.recordings)
+        known = _motion_hash(record) == hash_of_arrays(result.x0, result.us)
         if not known:
             unchecked.append("engines[...].final_gap of recordings: the motion began elsewhere")
         fields, engines = _of_the_model(record, model), list[dict[str, Any]]()
-        for row, now, recording in zip(rows, found.engines, found.recordings, strict=True):
+        for row, now, recording in zip(rows, result.engines, result.recordings, strict=True):
             cause = None if row.cause is None else cause_of(model, recording)
             if row.cause is not None and cause is not None:
                 cause, doubts = as_recorded(row.engine, row.cause, cause)
@@ -76,8 +76,8 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
             made = row_of(now, cause)
             made = made if known else made.model_copy(update={"final_gap": row.final_gap})
             engines.append({"name": row.engine, **made.model_dump(mode="json")})
-    told = [{"name": row.engine, **row.model_dump(mode="json")} for row in rows]
-    recorded = {**{key: record.model_dump(mode="json")[key] for key in fields}, "engines": told}
+    content = [{"name": row.engine, **row.model_dump(mode="json")} for row in rows]
+    recorded = {**{key: record.model_dump(mode="json")[key] for key in fields}, "engines": content}
     return Reproduced(
         {**fields, "engines": engines},
         {},
@@ -127,15 +127,15 @@ def _odd_files(folder: Path, record: ComparisonRecord, given: Sequence[Recording
     log, page = read_mcap(folder / TRACE, links=False), unescape(read_plain(folder / PAGE).decode())
     places = [i for i, e in enumerate(record.engines) if not e.jacobians]
     for i, recording in zip(places, given, strict=True):
-        kept = next(r for r in record.recordings if r.name == recording.name)
-        if len(recording.times) != kept.samples:
-            yield f"{kept.path}: {len(recording.times)} samples, and {record.FILE} says {kept.samples}"
+        stored = next(r for r in record.recordings if r.name == recording.name)
+        if len(recording.times) != stored.samples:
+            yield f"{stored.path}: {len(recording.times)} samples, and {record.FILE} says {stored.samples}"
         times = recording.times - recording.times[0]
         if (recording.name, hash_of_arrays(times, recording.xs, recording.us)) not in used:
-            yield f"{kept.path}: it is not the recording that {record.FILE} says was compared"
+            yield f"{stored.path}: it is not the recording that {record.FILE} says was compared"
         motion = log.arrays(f"/{slug(i, recording.name)}/state")
         if not np.array_equal(np.hstack([motion["q"], motion["v"]]), recording.xs):
-            yield f"{TRACE}: the motion of {recording.name} is not that in {kept.path}"
+            yield f"{TRACE}: the motion of {recording.name} is not that in {stored.path}"
         cause = record.engines[i].cause
         if cause is not None and cause.sentence not in page:
             yield f"{PAGE}: it does not say what {record.FILE} says of the cause of {recording.name}"

@@ -46,30 +46,30 @@ def _odd_panel(folder: Path, record: ComparisonRecord) -> list[str]:
     """What of the table, the summary, the records of trials and of the panel does not come out of the journal again."""
     panel, rows = read_journal(folder / JOURNAL, read_plain(folder / JOURNAL))
     trials, cells = [], _cells(folder / SUMMARY)
-    found: list[str] = []
+    result: list[str] = []
     for name in _ids(read_plain(folder / TABLE, MOST_TEXT)):
         path = folder / TRIALS / f"{name}.json"
         parsed = parse_record(path, read_fields(path))
-        one = parsed.trial if isinstance(parsed, ComparisonRecord) else None
-        if one is None:
+        item = parsed.trial if isinstance(parsed, ComparisonRecord) else None
+        if item is None:
             raise ArtifactError(f"{path}: expected the record of a trial")
-        found += _odd_trial(path, one)
-        trials.append(PanelTrial(cells.get(canonical(one.cell), one.cell), one.inputs))
+        result += _odd_trial(path, item)
+        trials.append(PanelTrial(cells.get(canonical(item.cell), item.cell), item.inputs))
     missing = sorted({trial.id for trial in trials} ^ rows.keys())
-    if found or missing:
-        return [*found, *(f"{TABLE} and {JOURNAL}: only one of them has trial {name}" for name in missing)]
-    with TemporaryDirectory() as place:
-        again = Path(place)
+    if result or missing:
+        return [*result, *(f"{TABLE} and {JOURNAL}: only one of them has trial {name}" for name in missing)]
+    with TemporaryDirectory() as location:
+        again = Path(location)
         table = write_table(again, trials, rows, panel)
         for name in (TABLE, SUMMARY, *(f"{TRIALS}/{trial.id}.json" for trial in trials)):
             if (again / name).read_bytes() != read_plain(folder / name):
-                found.append(f"{name}: it does not come out of {JOURNAL} again")
+                result.append(f"{name}: it does not come out of {JOURNAL} again")
     if record.panel is None:
         raise ArtifactError(f"{record.FILE}: expected the record of a panel")
     begun = record.panel.model_copy(update={"conditions": panel, "trials": len(trials)})
     made = ended_record(record.model_copy(update={"panel": begun}), table, 0.0)
     wrong = [name for name in SAID if getattr(made, name) != getattr(record, name)]
-    return [*found, *(f"{record.FILE}: {name} is not what the table says" for name in wrong)]
+    return [*result, *(f"{record.FILE}: {name} is not what the table says" for name in wrong)]
 
 
 def _cells(path: Path) -> dict[bytes, dict[str, Any]]:

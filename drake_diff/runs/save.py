@@ -273,8 +273,8 @@ def plan_kept(solution: Solution | PhasedSolution, name: str, folder: Path | Non
     try:
         yield
     except WriteError as error:
-        kept = folder or error.kept
-        if kept is not None and _has_plan(kept, solution):
+        retained = folder or error.kept
+        if retained is not None and _has_plan(retained, solution):
             raise
         raise WriteError(f"{error}; {_kept_elsewhere(solution, name)}") from error
 
@@ -292,9 +292,9 @@ def _has_plan(folder: Path, solution: Solution | PhasedSolution) -> bool:
 def _kept_elsewhere(solution: Solution | PhasedSolution, name: str) -> str:
     """Keep the plan in the first folder that takes it; a sentence says which."""
     places: tuple[Callable[[], Path], ...] = (lambda: Path(gettempdir()), Path.cwd, Path.home)
-    for place in places:
+    for location in places:
         try:
-            folder = partial_of(place() / name)
+            folder = partial_of(location() / name)
             keep_plan(solution, folder)
         except OSError:  # the next one, and the sentence says where it was
             continue
@@ -329,13 +329,13 @@ def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedP
     if isinstance(problem, PhasedProblem):
         phases_record(folder, problem, "incomplete", sentence).begin(folder)
         return
-    told: dict[str, Any] = {
+    content: dict[str, Any] = {
         "verdict": "incomplete",
         "sentence": sentence,
         "failures": [failure],
         "events": [Event(t_s=None, kind="failure", message=failure.message)],
     }
-    _record(folder, **told, **asked(problem)).begin(folder)
+    _record(folder, **content, **asked(problem)).begin(folder)
 
 
 def record_of(m: Measurement, folder: Path) -> PlanRecord:
@@ -392,9 +392,9 @@ def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecor
         beside = sorted(p.name for p in folder.parent.glob(f"{folder.name}.*") if p.is_dir() and is_partial(p))
         got = f"{folder}" + (f", beside which are {', '.join(beside)}" if beside else "")
         raise InputError("RUN", got=got, expected="a directory NAME.partial-... that a run left")
-    own = folder.with_name(name_of(folder))
-    target = own if out is None else Path(out).resolve()
-    with nullcontext() if target == own else writing(own):
+    inner = folder.with_name(name_of(folder))
+    target = inner if out is None else Path(out).resolve()
+    with nullcontext() if target == inner else writing(inner):
         if is_taken(target):
             expected = "a new or empty directory, as no run is replaced: --out names another"
             raise InputError("OUT", got=str(target), expected=expected)
@@ -420,8 +420,10 @@ def _measured(folder: Path, record: PlanRecord, target: Path) -> PlanRecord:
     costs, constraints = unknown_functions(record)
     if costs or constraints:
         names = ", ".join((*costs, *constraints))
-        told = f"{names}: a user's function, which no directory holds; start the script again from the plan in {PLAN}"
-        raise ArtifactError(f"{folder}: {told}")
+        content = (
+            f"{names}: a user's function, which no directory holds; start the script again from the plan in {PLAN}"
+        )
+        raise ArtifactError(f"{folder}: {content}")
     plan = read_plan(folder / PLAN, partial=True)
     source = record.contract.get("source")
     with rebuilt(record.model, source, None, ANYWHERE) as model, written_whole(target) as whole:
@@ -433,7 +435,7 @@ def _measured(folder: Path, record: PlanRecord, target: Path) -> PlanRecord:
 
 def _with_the_search(made: PlanRecord, record: PlanRecord) -> PlanRecord:
     """With what `record` says of the search, which only who ran it knew."""
-    told: dict[str, Any] = {
+    content: dict[str, Any] = {
         "sentence": f"{made.sentence}; {RECOVERED}",
         "solver": record.solver,
         "data": record.data,
@@ -442,5 +444,5 @@ def _with_the_search(made: PlanRecord, record: PlanRecord) -> PlanRecord:
     }
     if made.gradient is not None and record.gradient is not None:
         known = {name: getattr(record.gradient, name) for name in ("columns", "certificates")}
-        told["gradient"] = made.gradient.model_copy(update=known)
-    return made.model_copy(update=told)
+        content["gradient"] = made.gradient.model_copy(update=known)
+    return made.model_copy(update=content)

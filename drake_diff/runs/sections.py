@@ -174,13 +174,13 @@ def _given_data(problem: Problem) -> Iterator[DataUse]:
     """Motions that the problem's costs follow, and functions of the user, which may know any data."""
     for name in COSTS:
         cost = getattr(problem, name)
-        for i, part in enumerate(cost.costs if isinstance(cost, SumOfCosts) else (cost,)):
-            if isinstance(part, TrackingCost):
-                told = b"".join(np.asarray(v, dtype=float).tobytes() for v in part.reference if v is not None)
-                what = f"a motion of {len(part.reference[0])} times that {name.replace('_', ' ')} follows"
-                yield DataUse(name=f"{name} {i}", what=what, sha256=sha256(told).hexdigest())
-            elif isinstance(_cost(part), str):
-                yield DataUse(name=f"{name} {i}", what=f"{_cost(part)}, a function: what it knows is not recorded")
+        for i, piece in enumerate(cost.costs if isinstance(cost, SumOfCosts) else (cost,)):
+            if isinstance(piece, TrackingCost):
+                content = b"".join(np.asarray(v, dtype=float).tobytes() for v in piece.reference if v is not None)
+                what = f"a motion of {len(piece.reference[0])} times that {name.replace('_', ' ')} follows"
+                yield DataUse(name=f"{name} {i}", what=what, sha256=sha256(content).hexdigest())
+            elif isinstance(_cost(piece), str):
+                yield DataUse(name=f"{name} {i}", what=f"{_cost(piece)}, a function: what it knows is not recorded")
     for c in problem.constraints:
         if _quantity(c.function) is None:
             yield DataUse(name=f"constraint {c.label}", what="a function: what it knows is not recorded")
@@ -264,14 +264,14 @@ def _observation(problem: Problem, time_step: float) -> Observation:
 
 def _frames(model: Model) -> list[str]:
     """(nx,) the frame of each entry of the state: a floating body's is the world's, a joint's its own axes'."""
-    found = [model.contract.frame] * model.nx
+    result = [model.contract.frame] * model.nx
     for joint in joints(model.plant):
         if joint.type_name() not in FLOATING:
-            own = f"axes of {joint.name()}, {joint.parent_body().name()} to {joint.child_body().name()}"
+            inner = f"axes of {joint.name()}, {joint.parent_body().name()} to {joint.child_body().name()}"
             q, v = model.places(joint)
             for i in [*q, *(model.nq + j for j in v)]:
-                found[i] = own
-    return found
+                result[i] = inner
+    return result
 
 
 def _action(problem: Problem, time_step: float, limit: float | None) -> ActionInterface:
@@ -314,8 +314,8 @@ def _gradient(solution: Solution, measured: bool) -> GradientEvidence:
     sources = (*[methods] * (problem.nx + problem.nu), *vector.sources)
     columns = zip(names, units, sources, strict=True)
     later = Refusal("not measured yet")
-    ends, found = (solution.final_state_norms, solution.optimality) if measured else (later, later)
-    ratio = None if isinstance(found, Refusal) or not math.isfinite(found.ratio) else found.ratio
+    ends, result = (solution.final_state_norms, solution.optimality) if measured else (later, later)
+    ratio = None if isinstance(result, Refusal) or not math.isfinite(result.ratio) else result.ratio
     return GradientEvidence(
         differentiated=list(problem.optimize),
         columns=[GradientColumn(name=name, unit=unit, source=source) for name, unit, source in columns],
@@ -325,9 +325,11 @@ def _gradient(solution: Solution, measured: bool) -> GradientEvidence:
         horizon=Quantity(value=solution.horizon, unit="s"),
         final_state_norm_definition=f"none: {ends}" if isinstance(ends, Refusal) else FINAL_STATE_NORM,
         final_state_norms=[] if isinstance(ends, Refusal) else finite_list(ends),
-        lagrangian_norm_definition=f"none: {found}" if isinstance(found, Refusal) else LAGRANGIAN_NORM,
-        lagrangian_norms=[] if isinstance(found, Refusal) else finite_list(found.state_norms),
-        stationarity=Quantity(value=ratio, unit="1", reason=str(found) if isinstance(found, Refusal) else STATIONARITY),
+        lagrangian_norm_definition=f"none: {result}" if isinstance(result, Refusal) else LAGRANGIAN_NORM,
+        lagrangian_norms=[] if isinstance(result, Refusal) else finite_list(result.state_norms),
+        stationarity=Quantity(
+            value=ratio, unit="1", reason=str(result) if isinstance(result, Refusal) else STATIONARITY
+        ),
         certificates=[gradient_evidence(c) for c in solution.certificates],
     )
 
@@ -351,11 +353,11 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
                 "name": c.label,
                 "lower": finite_list(c.lower),
                 "upper": finite_list(c.upper),
-                "knots": at,
+                "knots": position,
                 "every_knot": c.knots is None,
                 "quantity": _quantity(c.function),  # null: a user's function
             }
-            for c, at in zip(problem.constraints, knots, strict=True)
+            for c, position in zip(problem.constraints, knots, strict=True)
         ],
         **({"couplings": [c.to_dict() for c in problem.couplings]} if problem.couplings else {}),
         "goals": [goal.to_dict() for goal in problem.goals],
@@ -395,9 +397,9 @@ def _cost(cost: Any) -> Any:
         parts = {**dict(named), "Q": cost.Q, "R": cost.R}
         return {"TrackingCost": {name: np.asarray(v).tolist() for name, v in parts.items() if v is not None}}
     if isinstance(cost, SumOfCosts):
-        found = [_cost(each) for each in cost.costs]
-        unknown = [each for each in found if isinstance(each, str)]
-        return f"a sum with {', '.join(unknown)}" if unknown else {"SumOfCosts": found}
+        result = [_cost(entry) for entry in cost.costs]
+        unknown = [entry for entry in result if isinstance(entry, str)]
+        return f"a sum with {', '.join(unknown)}" if unknown else {"SumOfCosts": result}
     return None if cost is None else getattr(cost, "__qualname__", type(cost).__name__)
 
 
@@ -427,10 +429,10 @@ def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array
     mask = np.array(p["initial_state_free"], dtype=bool)
     running, final = _rebuild_cost(p["running_cost"]), _rebuild_cost(p["final_cost"])
     goal = _numbers(p["x_goal"], np.nan)
-    goals = [rebuild_goal(each) for each in p["goals"]]
+    goals = [rebuild_goal(element) for element in p["goals"]]
     system = HeldContacts(model, **p["held"]) if p.get("held") else model
     constraints = [_rebuild_constraint(c, system) for c in p["constraints"] if c["quantity"] is not None]
-    couplings = [rebuild_coupling(each) for each in p.get("couplings", ()) if "Coupling" not in each]
+    couplings = [rebuild_coupling(element) for element in p.get("couplings", ()) if "Coupling" not in element]
     asked = goals or constraints or couplings or running is not None or final is not None
     if not asked and np.all(np.isnan(goal)):
         final = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem wants something to be asked
@@ -459,14 +461,14 @@ def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array
 
 
 def _rebuild_constraint(c: dict[str, Any], system: Model | HeldContacts) -> Constraint:
-    told, model = c["quantity"], system if isinstance(system, Model) else system.plant.model
-    kind = next(iter(told))
+    content, model = c["quantity"], system if isinstance(system, Model) else system.plant.model
+    kind = next(iter(content))
     if kind in IMPACT_QUANTITIES:
-        function: Any = impact_quantity(model, told)
+        function: Any = impact_quantity(model, content)
     elif kind in QUANTITIES and isinstance(system, HeldContacts):
-        function = held_quantity(system, told)
+        function = held_quantity(system, content)
     else:
-        function = made_from(model, told)
+        function = made_from(model, content)
     lower, upper = (_numbers(c[side], gap) for side, gap in GAPS.items())
     knots = None if c["every_knot"] else c["knots"]
     return Constraint(function, lower=lower, upper=upper, knots=knots, name=c["name"])
@@ -479,8 +481,8 @@ def rebuild_goal(told: Any) -> Goal:
     ((kind, values),) = told.items()
     if kind == Dwell.__name__:
         values = {**values, "goal": rebuild_goal(values.get("goal"))}
-    found: Goal = GOALS[kind](**values)
-    return found
+    result: Goal = GOALS[kind](**values)
+    return result
 
 
 def rebuild_coupling(told: Any) -> Couples:
@@ -488,8 +490,8 @@ def rebuild_coupling(told: Any) -> Couples:
     if not (isinstance(told, dict) and len(told) == 1 and next(iter(told)) in COUPLINGS):
         raise InputError("coupling", got=repr(told)[:80], expected=f"one of {', '.join(COUPLINGS)} with its values")
     ((kind, values),) = told.items()
-    found: Couples = COUPLINGS[kind](**values)
-    return found
+    result: Couples = COUPLINGS[kind](**values)
+    return result
 
 
 def _numbers(values: Any, missing: float) -> Array:
@@ -509,5 +511,5 @@ def _rebuild_cost(cost: Any) -> Any:
         reference = parts["times"], parts["xs"], parts.get("us")
         return TrackingCost(reference, Q=parts.get("Q"), R=parts.get("R"))
     if "SumOfCosts" in cost:
-        return [_rebuild_cost(each) for each in cost["SumOfCosts"]]
+        return [_rebuild_cost(entry) for entry in cost["SumOfCosts"]]
     return QuadraticCost(**cost["QuadraticCost"])

@@ -129,8 +129,8 @@ class Verification(ShowsItsRepr):
         if self.verdict == "holds":
             return f"run again, all {self.checked} values came out" + (" but for rounding" if self.rounded else "")
         if self.verdict == "intact":
-            part = f"all {self.checked} values of the recordings and their causes came out again, "
-            rest = f"{part}and the engines were not run" if self.checked else "the numbers were not taken again"
+            piece = f"all {self.checked} values of the recordings and their causes came out again, "
+            rest = f"{piece}and the engines were not run" if self.checked else "the numbers were not taken again"
             return f"the files are as they were written; {rest}"
         return "; ".join(self.complaints or self.undecided)
 
@@ -145,11 +145,11 @@ class Verification(ShowsItsRepr):
             "rounded": self.rounded,
             "note": self.notes,
         }
-        told = []
-        for word, found in groups.items():
-            told += [f"{word}: {line}" for line in found[:MOST]]
-            told += [f"{word}: and {len(found) - MOST} more"] * (len(found) > MOST)
-        return tuple(told)
+        content = []
+        for word, result in groups.items():
+            content += [f"{word}: {line}" for line in result[:MOST]]
+            content += [f"{word}: and {len(result) - MOST} more"] * (len(result) > MOST)
+        return tuple(content)
 
     def require(self) -> "Verification":
         """This verification where it holds; ArtifactError, with what does not, where it does not."""
@@ -161,10 +161,10 @@ class Verification(ShowsItsRepr):
         return f"{self.verdict}: {self.sentence}"
 
     def __repr__(self) -> str:
-        told = self.sentence if self.verdict in ("holds", "intact") else f"{len(self.complaints)} problems"
+        content = self.sentence if self.verdict in ("holds", "intact") else f"{len(self.complaints)} problems"
         if self.verdict == "undecided":
-            told = "what the verdict rests on could not be made again"
-        return "\n  ".join((f"Verification of {self.directory}: {self.verdict}, {told}", *self.lines))
+            content = "what the verdict rests on could not be made again"
+        return "\n  ".join((f"Verification of {self.directory}: {self.verdict}, {content}", *self.lines))
 
 
 def verify(
@@ -213,19 +213,19 @@ def verify(
         raise ArtifactError(f"{folder}: expected a directory that drake_diff wrote, got no directory")
     for name, value in (("time_limit", time_limit), ("memory_limit", memory_limit)):
         positive_float(name, value)
-    found = _looked_at(folder)
-    if found.complaints or found.undecided or found.record is None:
-        return found
-    if found.record.subject in NOT_RERUN and not has_recordings(found.record):
-        return _run_again(found, found.record, None)
+    result = _looked_at(folder)
+    if result.complaints or result.undecided or result.record is None:
+        return result
+    if result.record.subject in NOT_RERUN and not has_recordings(result.record):
+        return _run_again(result, result.record, None)
     answer = call_with_limits("drake_diff.runs.verify:_apart", folder, models, float(time_limit), float(memory_limit))
     if answer.exceeded:
         more = "time_limit= and memory_limit=, or --time-limit and --memory-limit, give it more"
-        return replace(found, undecided=(f"it was not made again: {answer.exceeded}: {more}",))
+        return replace(result, undecided=(f"it was not made again: {answer.exceeded}: {more}",))
     if answer.sentence:
-        return _judged(found, [f"it cannot be made again: {answer.sentence}"], [])
+        return _judged(result, [f"it cannot be made again: {answer.sentence}"], [])
     texts: dict[str, Any] = {name: tuple(str(line) for line in answer.value[name]) for name in MADE_APART}
-    return replace(found, **texts, checked=int(answer.value["checked"]))
+    return replace(result, **texts, checked=int(answer.value["checked"]))
 
 
 def call_with_limits(
@@ -247,18 +247,18 @@ def require_readable(function: str, folder: Path, models: str | Path | None) -> 
 
 def verify_own(directory: Path) -> Verification:
     """What `verify` finds in a directory that this process has just made: here, without limits, its model anywhere."""
-    found = _looked_at(directory)
-    if found.complaints or found.undecided or found.record is None:
-        return found
-    return _run_again(found, found.record, ANYWHERE)
+    result = _looked_at(directory)
+    if result.complaints or result.undecided or result.record is None:
+        return result
+    return _run_again(result, result.record, ANYWHERE)
 
 
 def _apart(directory: str, models: str | None) -> dict[str, Any]:
     """What `verify` finds, of a directory whose files are as they were written, in a process of its own."""
-    found = _looked_at(Path(directory))
-    if found.record is not None and not (found.complaints or found.undecided):
-        found = _run_again(found, found.record, None if models is None else Path(models))
-    return {name: getattr(found, name) for name in (*MADE_APART, "checked")}
+    result = _looked_at(Path(directory))
+    if result.record is not None and not (result.complaints or result.undecided):
+        result = _run_again(result, result.record, None if models is None else Path(models))
+    return {name: getattr(result, name) for name in (*MADE_APART, "checked")}
 
 
 def _looked_at(folder: Path) -> Verification:
@@ -272,13 +272,13 @@ def _looked_at(folder: Path) -> Verification:
         record, problems = _read_checked(path)
     except ArtifactError as error:
         return Verification(folder, None, complaints=(str(error),))
-    found = Verification(folder, record, problems, claimed=claims_of(record), notes=_other_versions(record))
+    result = Verification(folder, record, problems, claimed=claims_of(record), notes=_other_versions(record))
     if problems:
-        return replace(found, unchecked=("anything else: it is damaged",))
+        return replace(result, unchecked=("anything else: it is damaged",))
     unsolved = record.subject in ("plan", "phases") and isinstance(record, PlanRecord) and record.solver is None
     if record.state == "incomplete" or unsolved:
-        return replace(found, undecided=(f"there is nothing to run again: {record.sentence}",))
-    return found
+        return replace(result, undecided=(f"there is nothing to run again: {record.sentence}",))
+    return result
 
 
 def _of_a_part(folder: Path) -> Verification:
@@ -320,15 +320,15 @@ def _with_phases(found: Verification, section: PhasesSection, models: Path | Non
     )
     checked = found.checked
     for name in (phase.directory for phase in section.phases):
-        own, problems = _read_checked(found.directory / name / PlanRecord.FILE)
-        phase = _run_again(Verification(found.directory / name, own), own, models)
+        inner, problems = _read_checked(found.directory / name / PlanRecord.FILE)
+        phase = _run_again(Verification(found.directory / name, inner), inner, models)
         complaints += [f"{name}: {line}" for line in (*problems, *phase.complaints)]
         undecided += [f"{name}: {line}" for line in phase.undecided if WITHIN_PHASES not in line]
         unchecked += [f"{name}: {line}" for line in phase.unchecked if line.startswith(OF_FUNCTIONS)]
         rounded += [f"{name}: {line}" for line in phase.rounded]
         checked += phase.checked
-    told = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
-    return _judged(told, complaints, undecided)
+    content = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
+    return _judged(content, complaints, undecided)
 
 
 def has_recordings(record: SealedRecord) -> bool:
@@ -338,9 +338,9 @@ def has_recordings(record: SealedRecord) -> bool:
 
 def _without_its_functions(found: Verification, record: SealedRecord, error: Exception) -> Verification:
     """What the files of a run that cannot be made again say of each other."""
-    told = (f"not run again: {error}",)
+    content = (f"not run again: {error}",)
     if not isinstance(record, PlanRecord) or record.subject != "plan":
-        return replace(found, undecided=told, unchecked=("everything but the hashes",))
+        return replace(found, undecided=content, unchecked=("everything but the hashes",))
     plan = read_plan(found.directory / PLAN)
     try:
         trace = read_trace(found.directory / TRACE)
@@ -351,7 +351,7 @@ def _without_its_functions(found: Verification, record: SealedRecord, error: Exc
         ]
     except (ArtifactError, KeyError, LookupError, TypeError, ValueError) as wrong:
         problems = [f"its files do not go together: {type(wrong).__name__}: {wrong}"]
-    return _judged(replace(found, unchecked=(OF_FUNCTIONS,)), problems, told)
+    return _judged(replace(found, unchecked=(OF_FUNCTIONS,)), problems, content)
 
 
 @contextmanager
@@ -427,14 +427,14 @@ def _damage_of_files(path_of_record: Path, record: SealedRecord) -> Iterator[str
         elif described is None:
             yield f"{name}: {lister} does not list it"
         else:
-            size, found = path.stat(follow_symlinks=False).st_size, ""
+            size, result = path.stat(follow_symlinks=False).st_size, ""
             if size == described.bytes:  # one of another size is not read
                 read += size
                 if read > MOST_READ:
                     yield f"{name}: it and the files before it have more than {MOST_READ} bytes"
                     return
-                size, found = sha256_of(Path(path.path))
-            if described != FileEvidence(path=name, bytes=size, sha256=found):
+                size, result = sha256_of(Path(path.path))
+            if described != FileEvidence(path=name, bytes=size, sha256=result):
                 yield f"{name}: its {size} bytes are not those that {lister} describes"
 
 
@@ -500,7 +500,7 @@ def _told_of_a_solve(
         unchecked.append(f"what rests on the search: {', '.join(again.missing)}")
     if again.apart > SAME_PLAN:
         undecided.append(f"the search, run again, ends at another plan, {again.apart:.2g} of its largest number away")
-    differing = [d for one in compared for d in one.differing]
+    differing = [d for item in compared for d in item.differing]
     rounds_otherwise = again.apart > 0 or any(d.allowed for d in differing)
     rounded = []
     if 0 < again.apart <= SAME_PLAN:
@@ -514,12 +514,12 @@ def _told_of_a_solve(
             undecided.append(f"{d}, which rests on the steps that the search takes on this machine")
         else:
             problems.append(str(d))
-    checked = sum(one.count for one in compared)
+    checked = sum(item.count for item in compared)
     if OF_RECOVERED in again.unrepeated and not problems:
-        files = ", ".join(one.file for one in compared)
+        files = ", ".join(item.file for item in compared)
         undecided.append(f"what holds: measured again from the plan, all {checked} other values of {files} came out")
-    told = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
-    return _judged(told, problems, undecided)
+    content = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
+    return _judged(content, problems, undecided)
 
 
 def _is_searched(d: Difference) -> bool:
@@ -556,7 +556,7 @@ def _other_versions(record: SealedRecord) -> tuple[str, ...]:
         used.append("numba")  # by which the motions are computed, where it is there
     used = [n for n in used if n in was] if record.subject == "trial" else used  # it has those of its panel
     names = [n for n in used if was.get(n) != now.get(n)]
-    told = [f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names]
+    content = [f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names]
     if record.schema_version != SCHEMA_VERSION:
-        told.append(f"recorded by schema {record.schema_version}, and converted to {SCHEMA_VERSION}")
-    return tuple(told)
+        content.append(f"recorded by schema {record.schema_version}, and converted to {SCHEMA_VERSION}")
+    return tuple(content)
