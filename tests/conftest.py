@@ -1,7 +1,6 @@
 """Fixtures of several test modules."""
 
 import signal
-import sys
 from importlib import import_module
 
 import numpy as np
@@ -98,13 +97,6 @@ def cart(tmp_path_factory):
     path = tmp_path_factory.mktemp("models") / "cart.urdf"
     path.write_text(CART)
     return dd.load_model(path, time_step=H)
-
-
-@pytest.fixture
-def without_pinocchio(monkeypatch):
-    """As where it is not installed, for models loaded from here on."""
-    monkeypatch.setitem(sys.modules, "pinocchio", None)
-    monkeypatch.delitem(sys.modules, "drake_diff.mechanics.pinocchio_tree", raising=False)
 
 
 @pytest.fixture(scope="session")

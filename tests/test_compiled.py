@@ -1,5 +1,6 @@
 """Compiled functions against other forms of the same: NumPy's of a tree, AutoDiffXd of a step."""
 
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -8,13 +9,12 @@ from helpers.robots import example_robot, state_in_contact, state_in_range
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff._base.compiled import compiled, report_compilation
 from drake_diff.derivatives.contact import jacobian as of_contact
 from drake_diff.mechanics import compiled_tree as of_trees
 from drake_diff.mechanics import tree_kernel
 from drake_diff.mechanics.compiled_tree import compiled_tree
 from drake_diff.mechanics.description import describe_tree
-
-pytest.importorskip("pinocchio")
 
 
 def _largest(a, b):
@@ -92,3 +92,24 @@ def test_nothing_is_compiled_for_more_than_one_kind_of_arguments():
     of_steps = of_contact.kernel(of_contact.KERNEL)
     functions = of_steps.overlapping, of_steps.touch, of_steps.step_jacobians, tree_kernel.differentiate_tree
     assert [len(function.signatures) for function in functions] == [1, 1, 1, 1]
+
+
+def test_a_function_without_a_folder_for_its_cache_is_compiled_all_the_same(monkeypatch, tmp_path):
+    """As in an installation that is read-only, of a user without a home."""
+    from numba.core import caching
+
+    def refuses(self):
+        raise OSError("read-only")
+
+    monkeypatch.setattr(caching._CacheLocator, "ensure_cache_path", refuses)
+    path = tmp_path / "kernel_without_cache.py"
+    path.write_text("def double(x):\n    return 2 * x\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    double = compiled(importlib.import_module("kernel_without_cache").double)
+    assert (double(1.5), double.stats.cache_path) == (3.0, None)
+
+
+def test_a_compilation_is_logged_with_its_time(caplog):
+    report_compilation("sweep", 0.2)
+    report_compilation("sweep", 6.34)
+    assert [record.getMessage() for record in caplog.records] == ["Numba compiled sweep in 6.3 s, once on this machine"]

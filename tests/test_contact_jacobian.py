@@ -17,8 +17,6 @@ from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.parameters import select
 from drake_diff.model.step import set_state
 
-pytest.importorskip("pinocchio")
-
 MATERIAL = (
     "<drake:proximity_properties><drake:point_contact_stiffness>{k}</drake:point_contact_stiffness>"
     "<drake:relaxation_time>{tau}</drake:relaxation_time>"

@@ -9,7 +9,6 @@ from helpers.problems import pendulum
 
 import drake_diff as dd
 from drake_diff.derivatives import analytic
-from drake_diff.exceptions import ModelError
 from drake_diff.optimize.ilqr.expansion import Motion, curvature_along
 
 
@@ -18,18 +17,7 @@ def motion_of(problem, us):
     return Motion(xs, us, np.zeros((len(us), problem.model.nx)))
 
 
-@pytest.fixture(params=["analytic", "implicit"])
-def source(request, monkeypatch):
-    """The smooth Jacobians' own source, and without Pinocchio."""
-
-    def missing(model):
-        raise ModelError("left out")
-
-    if request.param == "implicit":
-        monkeypatch.setattr(analytic, "build_analytic", missing)
-
-
-def test_of_a_pendulum_by_hand(source):
+def test_of_a_pendulum_by_hand():
     """Of a damped pendulum w' = s (w + h (u / I - g / l sin q)), q' = q + h w' only d2/dq2 is not 0: s h g / l sin q.
 
     1e-6 of a step is 1e-6 of the derivative.

@@ -22,16 +22,11 @@ from drake_diff.derivatives.joint_impulses import NEAR_RIGID
 from drake_diff.derivatives.refine_step import refine_step
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
-from drake_diff.mechanics.numpy_tree import OwnDynamics
+from drake_diff.mechanics.tree import ForwardDynamics
 from drake_diff.model.parameters import applied, select
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
 SAME = 1e-9  # of the largest entry, as the gate has it: one derivative in two orders of operations
-
-
-@pytest.fixture(autouse=True)
-def _pinocchio():
-    pytest.importorskip("pinocchio", reason="pip install 'drake-diff[fast]'")
 
 
 def equal(model, xs, us, method="auto", expected=("analytic",), **known):
@@ -228,24 +223,26 @@ def test_a_doctored_inertia_is_caught(load):
     model = load("acrobot.xml")
     analytic = build_analytic(model)
     assert certified(model, analytic) is analytic
-    analytic.dynamics.model.inertias[2].mass *= 1 + 1e-6
-    assert "of the forces in Drake's equation" in certified(model, analytic).reason
+    tables = analytic.dynamics.tree.tables
+    wrong = replace(analytic.dynamics.tree, tables=tables._replace(mass=tables.mass * (1 + 1e-6)))
+    doctored = replace(analytic, dynamics=replace(analytic.dynamics, tree=wrong))
+    assert "of the forces in Drake's equation" in certified(model, doctored).reason
 
 
-@pytest.mark.parametrize("part", ["ddq_dq", "ddq_dv", "Minv"])
+@pytest.mark.parametrize("part", [0, 1, 2])
 def test_a_derivative_that_is_not_its_steps_is_caught(load, part):
+    """By q, by v and by the forces."""
     model = load("acrobot.xml")
     analytic = build_analytic(model)
 
-    def wrong(pinocchio, data, *point):
-        analytic.dynamics.derivatives(pinocchio, data, *point)
-        matrix = getattr(data, part)  # a view
-        matrix[:] *= 1 + 1e-4
+    class Doctored(ForwardDynamics):
+        def accelerate(self, q, v, force):
+            found = super().accelerate(q, v, force)
+            found[part][:, 0, 1] += 1e-6
+            return found
 
-    assert (
-        "its Jacobian differs from AutoDiffXd's"
-        in certified(model, replace(analytic, dynamics=replace(analytic.dynamics, derivatives=wrong))).reason
-    )
+    doctored = replace(analytic, dynamics=Doctored(analytic.dynamics.tree, analytic.dynamics.armature))
+    assert "its Jacobian differs from AutoDiffXd's" in certified(model, doctored).reason
 
 
 def test_other_parameters_are_never_answered_by_the_models_own(load):
@@ -314,11 +311,10 @@ def same_where_autodiff_works(model, x, u):
 
 
 @each_row("name", ["icub.urdf", "icub_reduced.urdf"])
-def test_an_inertia_that_pinocchio_does_not_take_is_had_by_our_own_dynamics(name):
+def test_an_inertia_that_no_body_has_is_taken_as_drake_takes_it(name):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(robot_file(name), time_step=0.002)
-    assert isinstance(analytic_of(model).dynamics, OwnDynamics)
     x = state_in_range(model, np.random.default_rng(0))
     assert same_where_autodiff_works(model, x, np.zeros(0))
     equal(model, x[None], np.zeros((1, 0)))
@@ -334,15 +330,8 @@ def test_auto_serves_wherever_autodiff_does_and_every_step_is_had_to_rounding():
     assert served.count(True) >= 30
 
 
-def test_without_pinocchio_our_own_dynamics_serve(load, without_pinocchio):
-    model = load("double_pendulum.urdf")
-    xs, us = np.array([[0.4, -0.9, 1.3, -0.6]] * 2), np.array([[0.25, -0.15]] * 2)
-    equal(model, xs, us)
-    assert dd.differentiate_step(model, xs[0], us[0]).method == "analytic"
-
-
 @each_row("name", ["solo12.urdf", "go2.urdf", "bolt.urdf"])
-def test_our_own_dynamics_are_pinocchios(name, without_pinocchio):
+def test_floating_robots_are_autodiffs(name):
     """In flight and on their feet, at their stops too, as AutoDiffXd has them; a wrong inertia is found out."""
     model, random = example_robot(name, 0.01, feet=True), np.random.default_rng(4)
     xs = np.array([state_in_contact(model, random), state_in_range(model, random)])
@@ -350,9 +339,9 @@ def test_our_own_dynamics_are_pinocchios(name, without_pinocchio):
     xs[1, model.nq - 1] = model.position_limits[0][-1] + 1e-3
     equal(model, xs, 0.1 * random.standard_normal((2, model.nu)))
     smooth = analytic_of(model)
-    assert smooth.dynamics.compiled is not None
-    wrong = replace(smooth.dynamics.tree, inertia=1.001 * smooth.dynamics.tree.inertia)
-    doctored = replace(smooth, dynamics=replace(smooth.dynamics, tree=wrong, compiled=None))
+    tables = smooth.dynamics.tree.tables
+    wrong = replace(smooth.dynamics.tree, tables=tables._replace(inertia=1.001 * tables.inertia))
+    doctored = replace(smooth, dynamics=replace(smooth.dynamics, tree=wrong))
     assert "of the forces in Drake's equation" in certified(model, doctored).reason
 
 

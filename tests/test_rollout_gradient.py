@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ def test_the_double_integrators_gradient_and_norms_have_their_closed_form(write_
     assert g.state_gradient_norms == pytest.approx(
         [math.hypot(1, (count - k) * h) for k in range(count + 1)], rel=1e-12
     )
-    assert g.methods == ("analytic" if find_spec("pinocchio") else "implicit",)
+    assert g.methods == ("analytic",)
 
 
 def test_a_loss_of_the_whole_motion_is_differentiated_too(write_urdf):

@@ -31,7 +31,6 @@ def test_dropped_pd_gains_are_caught_by_the_parity_gate():
     twin.set_controller_gains(PdControllerGains(p=1e-12, d=0.0))  # as good as dropped
     with pytest.raises(GradientError, match="the AutoDiffXd step is not the double step: hinge_w"):
         dd.differentiate_step(model, [0.7, -1.2], [0.3], method="autodiff")
-    pytest.importorskip("pinocchio")
     found = dd.differentiate_step(model, [0.7, -1.2], [0.3])
     assert found.method == "analytic"  # whose equation has the gains of the double plant
     np.testing.assert_allclose(found.A, dd.differentiate_step(pd_pendulum(), [0.7, -1.2], [0.3]).A, rtol=1e-12)

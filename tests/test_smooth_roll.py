@@ -13,7 +13,6 @@ from drake_diff.motion.smooth_roll import SmoothRoll, smooth_roll_of
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.program import Limits, Outcome
 
-pytest.importorskip("numba")
 pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 
 

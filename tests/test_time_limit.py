@@ -101,7 +101,7 @@ def test_replays_that_the_limit_cuts_are_named(monkeypatch, method, solver):
 @each_row(
     "method, place",
     [
-        ("collocation", "drake_diff.mechanics.casadi_tree.mass_and_residual"),
+        ("collocation", "drake_diff.mechanics.casadi_tree._regrouped"),
         ("shooting", "drake_diff.optimize.run.first_knots"),
         ("ilqr", "drake_diff.optimize.run.first_knots"),
     ],
@@ -226,7 +226,8 @@ def test_a_signal_ends_a_compilation_at_once():
 @each_row("method, solver", METHODS)
 def test_what_numba_compiles_is_told_and_no_limit_counts_it(monkeypatch, method, solver):
     """A year by the clock, of which the limit of 10 s leaves all to the search."""
-    numba = pytest.importorskip("numba")
+    import numba
+
     clock, lines, problem = stopped(monkeypatch), [], swing()
     monkeypatch.setattr("drake_diff._base.clock._uncounted", 0.0)  # which is taken back at the end
     time_compilations()

@@ -1,19 +1,22 @@
-"""Functions that Numba compiles where it is installed (the extra `fast`); who calls them has a NumPy form of the same.
+"""Functions that Numba compiles when a machine first calls them; from then on the result is read from a cache.
 
-A module of such functions is loaded through `kernel`, when it is first needed: Numba takes 0.4 s to import, and
-compiles once on a machine, after which the result is read from the cache beside the module.
+The cache is in `__pycache__` beside the module. Where that cannot be written, as in a read-only installation, it is the
+user's: the folder `NUMBA_CACHE_DIR`, or Numba's own in the home. Where there is none either, each process compiles.
+A compilation that takes long enough to be noticed is a line of the logger "drake_diff".
 """
 
+import logging
 import sys
 import time
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, TypeVar, cast
 
 from drake_diff._base.clock import uncounted
 
+NOTICED = 1.0  # [s]
+LOGGER = logging.getLogger("drake_diff")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -22,7 +25,10 @@ def compiled(function: Function) -> Function:
     from numba import njit
 
     time_compilations()
-    return cast(Function, njit(cache=True, error_model="numpy")(function))
+    try:
+        return cast(Function, njit(cache=True, error_model="numpy")(function))
+    except RuntimeError:  # Numba finds no folder for a cache
+        return cast(Function, njit(error_model="numpy")(function))
 
 
 def inner(function: Function) -> Function:
@@ -34,7 +40,7 @@ def inner(function: Function) -> Function:
 
 @cache
 def time_compilations() -> None:
-    """From now on tell the clock that limits go by how long Numba compiles."""
+    """From now on tell the clock that limits go by, and the log, how long Numba compiles."""
     from numba.core import event
 
     class Timer(event.Listener):  # type: ignore[misc]  # Numba has no types
@@ -46,20 +52,22 @@ def time_compilations() -> None:
                 self.start = time.monotonic()
             self.depth += 1
 
-        def on_end(self, _: Any) -> None:
+        def on_end(self, given: Any) -> None:
             self.depth -= 1
             if self.depth == 0:
-                uncounted(time.monotonic() - self.start)
+                seconds = time.monotonic() - self.start
+                uncounted(seconds)
+                report_compilation(getattr((given.data or {}).get("dispatcher"), "__name__", "a function"), seconds)
 
     event.register("numba:compile", Timer())
 
 
-@cache
-def has_numba() -> bool:
-    """Whether Numba is installed."""
-    return find_spec("numba") is not None
+def report_compilation(name: str, seconds: float) -> None:
+    """Log that a function was compiled, where that took long enough to be noticed."""
+    if seconds >= NOTICED:
+        LOGGER.warning("Numba compiled %s in %.1f s, once on this machine", name, seconds)
 
 
 def kernel(module: str) -> Any:
-    """The module of compiled functions; None where Numba is not installed."""
-    return (sys.modules.get(module) or import_module(module)) if has_numba() else None
+    """A module of compiled functions, loaded when it is first needed."""
+    return sys.modules.get(module) or import_module(module)

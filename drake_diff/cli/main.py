@@ -34,14 +34,10 @@ def _print_version(asked: bool) -> None:
 
 
 def _what_computes() -> str:
-    """Whether the derivatives of steps with contact are compiled."""
+    """By what the derivatives of steps are computed."""
     from importlib.metadata import version
 
-    from drake_diff._base.compiled import has_numba
-
-    if has_numba():
-        return f"Steps with contact are differentiated by compiled functions (Numba {version('numba')})"
-    return "Steps with contact are differentiated by NumPy; the extra `fast` compiles them"
+    return f"Steps are differentiated by compiled functions (Numba {version('numba')})"
 
 
 @app.callback()

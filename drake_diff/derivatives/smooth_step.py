@@ -1,4 +1,4 @@
-"""Smooth steps by the derivatives of a tree's accelerations: Pinocchio's, and without it our own.
+"""Smooth steps by the derivatives of a tree's accelerations.
 
 Where nothing touches and no limit acts, Drake's step of a tree is (see `implicit`)
 
@@ -6,27 +6,24 @@ Where nothing touches and no limit acts, Drake's step of a tree is (see `implici
 
 with M the mass matrix and reflected inertia, K the stiffness of springs and of PD control (kp), D joint damping and
 what PD control adds (kd + h kp), and c what their rest positions add. As h D stands beside the reflected inertia, the
-whole step is forward dynamics with h D as additional armature: Pinocchio's `computeABADerivatives`, or, where it is not
-installed or does not take the tree's inertias, `mechanics.tree`. Inputs are clipped at their effort limits as Drake
-does; a PD controller at its limit, as anything that this form leaves out, shows in Drake's own step, which is not this
-one then.
+whole step is forward dynamics with h D as additional armature (`mechanics.tree`). Inputs are clipped at their effort
+limits as Drake does; a PD controller at its limit, as anything that this form leaves out, shows in Drake's own step,
+which is not this one then.
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.implicit import Form, form_of
 from drake_diff.derivatives.steps import Steps
-from drake_diff.exceptions import MissingDependencyError, ModelError
+from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.compiled_tree import compiled_tree
-from drake_diff.mechanics.coordinates import Coordinates, native_positions, turn, turn_derivatives, turning
-from drake_diff.mechanics.description import Description, describe_tree
-from drake_diff.mechanics.numpy_tree import OwnDynamics, tree_of
+from drake_diff.mechanics.coordinates import Coordinates
+from drake_diff.mechanics.description import describe_tree
+from drake_diff.mechanics.tree import ForwardDynamics
 from drake_diff.model.model import Model
 
 # What a limit or a controller at its limit changes in x' is larger; x' known to rounding alone, as x + gap, is not.
@@ -34,48 +31,10 @@ STEP_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Native:
-    """N states in Drake's coordinates and in those of the dynamics, Q (N, nv, nv) turning the velocities."""
-
-    q: Array  # (N, nq)
-    v: Array  # (N, nv)
-    Q: Array
-    q_native: Array
-    v_native: Array
-
-
-class Dynamics(Protocol):
-    """The accelerations of a tree in coordinates of its own."""
-
-    @property
-    def armature(self) -> Array:
-        """(nv,) what stands beside the tree's own inertia."""
-        ...
-
-    def accelerate(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
-        """da/dq, da/dv, da/dforce (each (N, nv, nv)) and a (N, nv) under generalized forces (N, nv)."""
-        ...
-
-    def accelerate_one(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
-        """As `accelerate`, of one state (nq,) and (nv,); they may be overwritten by the next call."""
-        ...
-
-
-@runtime_checkable
-class Bends(Protocol):
-    """Dynamics that know second derivatives."""
-
-    def bend(self, q: Array, v: Array, a: Array, along: Array) -> tuple[Array, Array, Array, Array]:
-        """Those of along' tau (N, nv each) by q q, v q, a q and v v, tau (q, v, a) being inverse dynamics."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
 class SmoothStep:
     """What of a model does not change from step to step."""
 
-    dynamics: Dynamics  # of what has h D in its armature
-    turned: Coordinates  # the free bodies that the dynamics holds in other coordinates than Drake
+    dynamics: ForwardDynamics  # of what has h D in its armature
     coordinates: Coordinates
     form: Form
     time_step: float
@@ -97,17 +56,19 @@ class SmoothStep:
 
     def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
         """(N, nx, nx + nu) and x' (N, nx) of the steps from xs (N, nx) under us (N, nu), were they smooth."""
-        c = self.coordinates
+        c, h = self.coordinates, self.time_step
         if not c.free:
             return self._fixed(xs, us)
         q, v = xs[:, : c.nq], xs[:, c.nq :]
         force, clipped = self.force_of(q, v, us)
-        native = self.into_native(q, v)
-        solved = self.dynamics.accelerate(native.q_native, native.v_native, force)
-        return self.assemble(native, *self._velocities(native, solved, clipped))
+        by_q, by_v, inverse, a = self.dynamics.accelerate(q, v, force)
+        parts = by_q - inverse * self.stiffness, by_v - inverse * self.damping, self._by_input(inverse, clipped)
+        velocities = h * np.concatenate(parts, axis=2)
+        velocities[:, :, c.nv : 2 * c.nv] += np.eye(c.nv)
+        return self.assemble(q, velocities, v + h * a)
 
     def _fixed(self, xs: Array, us: Array) -> tuple[Array, Array]:
-        """Of hinges and slides, where N(q) = 1 and Pinocchio's velocities are Drake's."""
+        """Of hinges and slides, where N(q) = 1."""
         n, h = self.coordinates.nv, self.time_step
         nx, nu = 2 * n, us.shape[1]
         q, v = xs[:, :n], xs[:, n:]
@@ -156,12 +117,12 @@ class SmoothStep:
         return jacobian
 
     def curvature(self, xs: Array, us: Array, along: Array) -> Array | None:
-        """(N, nx + nu, nx + nu) the second derivative of along' x' (N, nx each); None of free bodies, or our own trees.
+        """(N, nx + nu, nx + nu) the second derivative of along' x' (N, nx each); None of free bodies.
 
         v' = v + h a, where inverse dynamics give tau(q, v, a) for the forces, which are linear in q, v and u. So with
         mu = M^-1 w, w'a has the second derivative of -mu' tau(q, v, a) at the a' that the first one has.
         """
-        if self.coordinates.free or not isinstance(self.dynamics, Bends):
+        if self.coordinates.free:
             return None
         n, h = self.coordinates.nv, self.time_step
         q, v = xs[:, :n], xs[:, n:]
@@ -201,39 +162,15 @@ class SmoothStep:
         columns = inverse.take(self.form.velocity, axis=2)
         return columns if clipped is None else columns * ~clipped[:, None]
 
-    def into_native(self, q: Array, v: Array) -> Native:
-        """The states q (N, nq), v (N, nv) in Pinocchio's coordinates."""
-        Q = turn(self.turned, q)
-        return Native(q, v, Q, native_positions(self.turned, q), (Q @ v[..., None])[..., 0])
-
-    def _velocities(
-        self, native_state: Native, solved: tuple[Array, ...], clipped: NDArray[np.bool_] | None
-    ) -> tuple[Array, Array]:
-        """(N, nv, 2 nv + nu) the derivative of v' by small motion, v and u, and v' (N, nv)."""
-        c, h, Q = self.coordinates, self.time_step, native_state.Q
-        by_q, by_v, inverse, native = solved
-        into, out, out_v = turn_derivatives(self.turned, native_state.Q, native_state.v, native)
-        Q_t = Q.swapaxes(-1, -2)
-        by_motion = Q_t @ (by_q @ Q + by_v @ into - inverse * self.stiffness) + out
-        by_velocity = Q_t @ (by_v @ Q - inverse * self.damping) + out_v
-        velocities = h * np.concatenate([by_motion, by_velocity, Q_t @ self._by_input(inverse, clipped)], axis=2)
-        velocities[:, :, c.nv : 2 * c.nv] += np.eye(c.nv)
-        return velocities, self._v_next(native_state, native)
-
-    def assemble(self, native_state: Native, velocities: Array, v_next: Array) -> tuple[Array, Array]:
+    def assemble(self, q: Array, velocities: Array, v_next: Array) -> tuple[Array, Array]:
         """(N, nx, nx + nu) and x' (N, nx), from the derivative of v' by small motion, v and u, and v'."""
         c, h = self.coordinates, self.time_step
-        lower = np.concatenate([velocities[:, :, : c.nv] @ c.motion(native_state.q), velocities[:, :, c.nv :]], axis=2)
-        N = c.rate(native_state.q)
+        lower = np.concatenate([velocities[:, :, : c.nv] @ c.motion(q), velocities[:, :, c.nv :]], axis=2)
+        N = c.rate(q)
         upper = h * N @ lower
         upper[:, :, : c.nq] += np.eye(c.nq) + h * c.rate_by_position(v_next)
-        q_next = native_state.q + h * (N @ v_next[..., None])[..., 0]
+        q_next = q + h * (N @ v_next[..., None])[..., 0]
         return np.concatenate([upper, lower], axis=1), np.concatenate([q_next, v_next], axis=1)
-
-    def _v_next(self, native_state: Native, native: Array) -> Array:
-        """(N, nv) v' by the accelerations (N, nv)."""
-        a = (native_state.Q.swapaxes(-1, -2) @ native[..., None])[..., 0] + turning(self.turned, native_state.v)
-        return np.asarray(native_state.v + self.time_step * a)
 
 
 def build_analytic(model: Model) -> SmoothStep:
@@ -252,10 +189,12 @@ def build_analytic(model: Model) -> SmoothStep:
     for i, j in description.coordinates.single:
         positions[j] = i
         limits[:, j] = model.plant.GetPositionLowerLimits()[i], model.plant.GetPositionUpperLimits()[i]
-    dynamics, turned = _dynamics(model, description, model.time_step * damping)
+    tree = compiled_tree(description)
+    if tree is None:
+        raise ModelError("a free body is not joined to the world by its own frame")
+    armature = description.by_velocity("armature") + model.time_step * damping
     return SmoothStep(
-        dynamics=dynamics,
-        turned=turned,
+        dynamics=ForwardDynamics(tree, armature),
         coordinates=description.coordinates,
         form=form,
         time_step=model.time_step,
@@ -269,18 +208,3 @@ def build_analytic(model: Model) -> SmoothStep:
         loaded=bool(stiffness.any() or damping.any() or rest.any()),
         limited=bool(np.isfinite(form.cut).any()),
     )
-
-
-def _dynamics(model: Model, description: Description, added: Array) -> tuple[Dynamics, Coordinates]:
-    """With an armature of `added` (nv,) and the joints' own; and which free bodies it holds otherwise than Drake."""
-    armature = description.by_velocity("armature") + added
-    try:
-        from drake_diff.mechanics.pinocchio_tree import PinocchioDynamics  # here, as Pinocchio is an extra
-
-        return PinocchioDynamics.of(description.links, description.gravity, armature), description.coordinates
-    except (MissingDependencyError, ModelError) as error:
-        tree = tree_of(model, free=True)
-        if isinstance(tree, Refusal):
-            raise ModelError(f"{error}; our own equations: {tree}") from error
-        dynamics = OwnDynamics(tree, model, armature, compiled_tree(description))
-        return dynamics, Coordinates((), tuple((0, j) for j in range(model.nv)))

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives.analytic import analytic_of, one_smooth_step
+from drake_diff.derivatives.analytic import one_smooth_step
 from drake_diff.derivatives.sources import ANALYTIC, CERTIFIED, IMPLICIT, OF_ONE_KIND, Chosen, check_method, choose
 from drake_diff.derivatives.steps import Steps, known_steps, take_step, take_steps
 from drake_diff.exceptions import GradientError, ShapeError
@@ -189,21 +188,6 @@ def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
             sources = (*sources[: vector.step_entry], used, *sources[vector.step_entry + 1 :])
         derivatives.append(StepDerivatives(end_state, A, B, C, names, sources, used, reason))
     return derivatives
-
-
-def smooth_jacobians(model: Model, xs: Array, us: Array, x_next: Array | None = None) -> Array | None:
-    """(N, nx, nx + nu) of steps that are all smooth, in one call; None where one is not, or there is no such call."""
-    if isinstance(analytic_of(model), Refusal):
-        return None
-    vector = select(model, ())
-    steps = take_steps(model, vector, xs[0], us, xs) if x_next is None else known_steps(model, vector, xs, us, x_next)
-    if steps.some_touch:
-        return None
-    answer = ANALYTIC.differentiate(steps)
-    if isinstance(answer, Refusal) or answer.refused:
-        return None
-    _check_derivatives(model, answer.values)
-    return answer.values
 
 
 def _check_derivatives(model: Model, jacobians: Array) -> None:

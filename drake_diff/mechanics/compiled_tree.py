@@ -34,6 +34,11 @@ class CompiledTree:
     links: dict[str, int]  # by their bodies' names
     nv: int
 
+    @property
+    def nq(self) -> int:
+        """How many positions there are: seven of a free body."""
+        return self.nv + int(np.count_nonzero(self.tables.kind == tree_kernel.FREE))
+
     def __call__(self, q: Array, v: Array, a: Array, *, derivatives: bool = True) -> Moved:
         """At q (N, nq), v and a (each (N, nv)), in Drake's coordinates; `slope`, `by_q` and `by_v` are 0 without."""
         N, n = len(q), self.nv

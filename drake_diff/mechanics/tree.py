@@ -22,6 +22,7 @@ The arithmetic is in `tree_kernel`.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -116,9 +117,20 @@ class ForwardDynamics:
         return by_q, by_v, inverse, a
 
     def accelerate_one(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
-        """As `accelerate`, of one state (nq,) and (nv,)."""
-        by_q, by_v, inverse, a = self.accelerate(q[None], v[None], force[None])
+        """As `accelerate`, of one state (nq,) and (nv,); overwritten by the next call."""
+        point, armature, (by_q, by_v, inverse, a) = self._buffers
+        for buffer, values in zip(point, (q, v, force), strict=True):
+            buffer[0] = values
+        tree_kernel.differentiate_acceleration(self.tree.tables, *point, armature, by_q, by_v, inverse, a)
         return by_q[0], by_v[0], inverse[0], a[0]
+
+    @cached_property
+    def _buffers(self) -> tuple[tuple[Array, Array, Array], Array, tuple[Array, Array, Array, Array]]:
+        """Of one state: q, v and the forces; the armature; the derivatives and the acceleration."""
+        n, nq = self.tree.nv, self.tree.nq
+        point = np.zeros((1, nq)), np.zeros((1, n)), np.zeros((1, n))
+        results = np.empty((1, n, n)), np.empty((1, n, n)), np.empty((1, n, n)), np.empty((1, n))
+        return point, own_array(self.armature), results
 
     def bend(self, q: Array, v: Array, a: Array, along: Array) -> tuple[Array, Array, Array, Array]:
         """Second derivatives of along' tau (N, n each), tau being inverse dynamics: by q q, v q, a q and v v.

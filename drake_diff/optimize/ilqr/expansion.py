@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of
-from drake_diff.derivatives.step import smooth_jacobians
 from drake_diff.derivatives.steps import known_steps
 from drake_diff.model.parameters import select
 from drake_diff.motion.rollout import STEPS
@@ -228,8 +227,7 @@ def curvature_along(problem: Problem, motion: Motion, v: Array) -> tuple[Array, 
         return None  # what is learned has the parameters in it
     analytic = analytic_of(model)
     if isinstance(analytic, Refusal):
-        differences = _differences(lambda xs, ends: smooth_jacobians(model, xs, us, ends), xs, motion.ends, v)
-        return None if differences is None else (differences, np.ones(len(us), dtype=bool))
+        return None
     steps = known_steps(model, select(model, ()), xs, us, motion.ends)
     if steps.some_touch or model.num_constraints:
         return None
@@ -237,25 +235,18 @@ def curvature_along(problem: Problem, motion: Motion, v: Array) -> tuple[Array, 
     xs, us, v = xs[known], us[known], v[known]
     curvature = analytic.curvature(xs, us, v)
     if curvature is None:  # no step is taken that might not be smooth
-        curvature = _differences(lambda xs, _: analytic.differentiate(xs, us)[0], xs, None, v)
-    return None if curvature is None else (curvature, known)
+        curvature = _differences(lambda xs: analytic.differentiate(xs, us)[0], xs, v)
+    return curvature, known
 
 
-def _differences(
-    jacobians: Callable[[Array, Array | None], Array | None], xs: Array, ends: Array | None, v: Array
-) -> Array | None:
-    """The same of `jacobians` (N, nx, nx + nu) of the states xs (N, nx) and, where they are known, the steps' ends."""
-    here, nx = jacobians(xs, ends), xs.shape[1]
-    if here is None:
-        return None
+def _differences(jacobians: Callable[[Array], Array], xs: Array, v: Array) -> Array:
+    """The same of `jacobians` (N, nx, nx + nu) of the states xs (N, nx)."""
+    here, nx = jacobians(xs), xs.shape[1]
     curvature = np.zeros((len(xs), here.shape[2], here.shape[2]))
     for j in range(nx):
         moved = np.array(xs)
         moved[:, j] += DIFFERENCE_STEP * np.maximum(1.0, np.abs(xs[:, j]))
-        near = jacobians(moved, None)
-        if near is None:
-            return None
-        slopes = (near - here) / (moved - xs)[:, j, None, None]
+        slopes = (jacobians(moved) - here) / (moved - xs)[:, j, None, None]
         curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
     curvature[:, :nx, nx:] = curvature[:, nx:, :nx].swapaxes(1, 2)
     return (curvature + curvature.swapaxes(1, 2)) / 2
