@@ -269,15 +269,6 @@ def test_a_second_replacement_changes_nothing():
     assert collision_names(plant) == before
 
 
-def test_the_name_keeps_its_model_once():
-    plant = Plant(0.005)
-    crate = plant.plant.AddModelInstance("crate")
-    body = plant.plant.AddRigidBody("box", crate, SpatialInertia.SolidBoxWithMass(MASS, *SIZE))
-    plant.shape(body, Capsule(0.1, 0.2), contact_properties(1e4))
-    replaced(plant)
-    assert collision_names(plant) == ["crate::box_shape_corner_0", "crate::box_shape_corner_1"]
-
-
 def test_masses_and_what_is_drawn_stay():
     plant = Plant(0.005)
     body = add_body(plant, Box(*SIZE))
@@ -364,15 +355,6 @@ def test_hydroelastic_in_a_plant_with_point_contact_is_an_error():
 # The other route, and errors.
 
 
-def test_differences_changes_nothing():
-    plant = Plant(0.005)
-    add_body(plant, Box(*SIZE))
-    assert replaced(plant, "differences") == (
-        "Where geometries touch that AutoDiffXd refuses, steps are differentiated by finite differences, as chosen.",
-    )
-    assert collision_names(plant) == ["box_shape"]
-
-
 def test_an_unknown_route_lists_those_that_exist():
     with pytest.raises(UnknownNameError) as error:
         replaced(Plant(0.005), "spheres")
@@ -445,8 +427,3 @@ def test_a_compliant_half_space_meets_no_compliant_body(shapes, kind):
     """Why the route hydroelastic makes half spaces rigid: not even the double step takes these."""
     for twin in TWINS:
         assert step_throws(shapes[kind], HalfSpace(), "hydroelastic", half_space="compliant", twin=twin)
-
-
-def test_an_unknown_contact_model_is_an_error(shapes):
-    with pytest.raises(UnknownNameError, match="hydroelastic_with_fallback"):
-        autodiff_supports(shapes["Box"], shapes["Box"], "soft")

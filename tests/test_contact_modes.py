@@ -5,7 +5,6 @@ import pytest
 from helpers.models import Plant, contact_properties
 from helpers.table import each_row
 from pydrake.geometry import AddCompliantHydroelasticProperties, AddRigidHydroelasticProperties, Box
-from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
@@ -57,10 +56,6 @@ def test_every_candidate_pair_is_listed():
     assert set(far.values()) == {"separated"}
 
 
-def test_a_model_without_geometry_has_no_modes(load):
-    assert dd.contact_modes(load("pendulum.urdf"), [0.1, 0.0], [0.0]) == {}
-
-
 @pytest.mark.parametrize(("push", "mode"), [(0.0, "sticking"), (3.0 * MU * G, "sliding")])
 def test_a_hydroelastic_patch_has_a_mode_too(push, mode):
     plant = Plant(H, "sap", "hydroelastic")
@@ -104,16 +99,3 @@ def test_at_the_edge_of_friction_the_push_changes_the_mode():
 def test_no_change_is_reported_where_there_is_none():
     assert dd.certify(pushed_ball("sap"), [0.0, REST, 0.5, 0.0], [0.0]).mode_changes == ()
     assert dd.certify(pushed_ball("sap"), [0.0, 0.3, 0.5, 0.0], [0.0]).mode_changes == ()
-
-
-def test_ground_by_name_where_it_was_registered_by_hand():
-    plant = Plant(H)
-    body = plant.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.0, 0.2, 0.2, 0.2))
-    plant.plant.RegisterCollisionGeometry(
-        body, RigidTransform(), Box(0.2, 0.2, 0.2), "skin", contact_properties(K, 0.0, MU, 0.0)
-    )
-    plant.ground(contact_properties(K, 0.0, MU, 0.0))
-    model = plant.model()
-    x = model.default_state
-    x[6] = 0.0999
-    assert dd.contact_modes(model, x) == {("box/skin", "world/ground"): "sticking"}

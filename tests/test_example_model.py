@@ -28,12 +28,6 @@ def test_an_unknown_example_is_refused_and_the_known_ones_are_listed():
     assert all(name in str(refusal.value) for name in example_files())
 
 
-def test_options_are_those_of_load_model():
-    model = dd.example_model("cart_pole", time_step=0.02, gravity=[0, 0, -1.62])
-    assert model.time_step == 0.02
-    assert model.contract.gravity == (0, 0, -1.62)
-
-
 def test_the_panda_moves_like_the_one_it_was_made_of():
     """Drake reads both files; the fingers of ours are fixed 2 cm out, where those of the other are set to."""
     ours = dd.example_model("panda")

@@ -34,18 +34,6 @@ def test_an_entry_has_a_short_script_and_a_small_picture(entry):
     assert 1000 < picture.stat().st_size <= LARGEST_PICTURE
 
 
-def test_a_picture_opens_its_report_where_there_is_one(tmp_path):
-    pytest.importorskip("mkdocs")
-    site = module("site")
-    entry, other = gallery.ENTRIES[:2]
-    report = tmp_path / entry.report
-    report.parent.mkdir(parents=True)
-    report.touch()
-    text = site.with_reports(gallery.page(), tmp_path)
-    assert f"[![{entry.title}]({entry.name}.jpg)]({entry.report})\n" in text
-    assert f"-   ![{other.title}]({other.name}.jpg)\n" in text
-
-
 @pytest.mark.slow
 @browsing
 def test_the_command_runs_verifies_and_draws_an_example(tmp_path, capsys):

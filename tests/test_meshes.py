@@ -12,7 +12,7 @@ from helpers.table import each_row
 from pydrake.geometry import CalcVolume, Convex, Role, Sphere
 
 import drake_diff as dd
-from drake_diff.exceptions import ModelError, ModelWarning, SimulationError, UnknownNameError
+from drake_diff.exceptions import ModelError, ModelWarning, SimulationError
 from drake_diff.model import triangles
 from drake_diff.model.sphere_fit import MOST_SPHERES, fit_spheres
 from drake_diff.model.triangles import MOST_CORNERS, hull_of, read_mesh
@@ -117,15 +117,6 @@ def test_a_mesh_is_found_by_any_of_its_names(tmp_path, uri):
     trimesh.creation.box(EDGES).export(tmp_path / "robot/meshes/my box.stl")
     text = urdf(f'<mesh filename="{uri.format(folder=tmp_path)}"/>')
     [(shape, _)] = shapes_of(load(saved(tmp_path / "robot", "r.urdf", text)))
-    assert CalcVolume(shape) == pytest.approx(np.prod(EDGES), rel=ROUNDING)
-
-
-def test_a_package_may_be_anywhere(tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    trimesh.creation.box(EDGES).export(tmp_path / "elsewhere/box.stl")
-    path = saved(tmp_path, "r.urdf", urdf('<mesh filename="package://mine/box.stl"/>'))
-    assert not shapes_of(load(path))
-    [(shape, _)] = shapes_of(load(path, packages={"mine": tmp_path / "elsewhere"}))
     assert CalcVolume(shape) == pytest.approx(np.prod(EDGES), rel=ROUNDING)
 
 
@@ -281,15 +272,6 @@ def test_the_same_file_gives_the_same_bytes_in_another_process(tmp_path):
     assert run.stdout.split() == [hull.corners.tobytes().hex(), spheres.centres.tobytes().hex(), str(spheres.radius)]
 
 
-def test_a_changed_model_has_the_same_shapes(tmp_path):
-    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
-    model = load(saved(tmp_path, "r.urdf", urdf('<mesh filename="box.stl"/>')), "spheres")
-    other = model.at_time_step(0.002)
-    assert model.options["meshes"] == other.options["meshes"] == "spheres"
-    for (a, at), (b, there) in zip(shapes_of(model), shapes_of(other), strict=True):
-        assert (a.radius(), *at.translation()) == (b.radius(), *there.translation())
-
-
 @pytest.mark.slow
 def test_a_mesh_of_a_million_faces_keeps_a_thousand_corners(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=8, radius=0.05)
@@ -343,11 +325,6 @@ def test_a_scale_that_is_none_is_refused(tmp_path, scale):
     path = saved(tmp_path, "r.urdf", urdf(f'<mesh filename="box.stl" scale="{scale}"/>'))
     with pytest.raises(ModelError, match=r"box\.stl.*scale of one or three numbers"):
         dd.load_model(path, time_step=0.01, meshes="convex")
-
-
-def test_another_treatment_is_refused():
-    with pytest.raises(UnknownNameError, match="convex"):
-        dd.load_model(robot_file("panda.urdf"), time_step=0.01, meshes="hull")
 
 
 def test_a_mesh_names_no_other_file_that_is_opened(tmp_path, monkeypatch):

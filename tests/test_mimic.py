@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.derivatives.analytic import Reduced
-from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, UnknownNameError
+from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning
 from drake_diff.mechanics.description import describe
 from drake_diff.model.plant import actuators
 from drake_diff.model.plant import joints as joints_of
@@ -250,14 +250,6 @@ def test_fixed_joints_are_where_they_start(tmp_path):
     assert model.changed(mimic="reduce").nv == 2
 
 
-def test_without_the_argument_all_joints_stay_in_the_state(tmp_path):
-    model = load(sliders(tmp_path), None)
-    assert model.state_names == ("a_x", "b_x", "a_v", "b_v")
-    assert model.plant.num_constraints() == 1
-    assert model.notes == ()
-    assert load(sliders(tmp_path)).notes == ("1 mimic joints were reduced: b = 1.7 a + 0.3.",)
-
-
 @each_row("parts, words", [
     (joint("b", "prismatic", "world", "b_link", "1 0 0", follows("a", 0.0)), "ratio other than 0"),
     (joint("b", "prismatic", "world", "b_link", "1 0 0", follows("a", 1.0, 9.0), limits=(0, 1)), "no position of a is"),
@@ -280,11 +272,6 @@ def test_joints_that_follow_each_other_are_refused(tmp_path):
     for mimic in ("reduce", "fix"):
         with pytest.raises(ModelError, match="follows itself"):
             load(path, mimic)
-
-
-def test_an_unknown_choice_is_refused(tmp_path):
-    with pytest.raises(UnknownNameError, match="one of fix, reduce"):
-        load(sliders(tmp_path), "lock")
 
 
 def test_a_policy_on_a_motor_of_a_follower_is_refused(tmp_path):

@@ -189,13 +189,6 @@ def test_what_is_included_is_read_and_other_lines_keep_their_numbers(tmp_path):
         load(path)
 
 
-def test_a_file_that_includes_itself_is_refused(tmp_path):
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "sub" / "a.xml").write_text('<mujoco><include file="m.xml"/></mujoco>')
-    with pytest.raises(ModelError, match="it includes itself"):
-        load(write(tmp_path, HINGE.format("", ""), more='<include file="sub/a.xml"/>'))
-
-
 PYRAMID = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 

@@ -59,11 +59,6 @@ def same(found, error):
         assert repr(found.got) == repr(error.got) or found.got == repr(error.got)
 
 
-def test_every_error_is_in_the_table():
-    assert set(KINDS) == {type(error) for error in ERRORS}
-    assert {InputError, ModelError, exceptions.ModelWarning} <= set(KINDS)
-
-
 @each_row("error", ERRORS)
 def test_every_error_pickles_and_copies(error):
     same(pickle.loads(pickle.dumps(error)), error)
@@ -108,11 +103,6 @@ def test_a_model_a_problem_and_a_solution_are_the_same_in_another_process(load, 
     assert np.array_equal(found.replay.xs, solution.replay.xs)
     assert [str(c) for c in found.certificates] == [str(c) for c in solution.certificates]
     assert found.problem.parameters.model is found.problem.model
-
-
-def test_a_copy_of_a_solution_is_no_new_model(load):
-    problem = swing(load("pendulum.urdf", time_step=0.05))
-    assert copy.copy(problem).model is problem.model
 
 
 @each_row("method", ["collocation", "shooting"])

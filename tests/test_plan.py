@@ -1,7 +1,5 @@
 """`drake-diff plan`: from a file to a verified plan; what is wrong is one sentence and a status."""
 
-import os
-import pty
 import subprocess
 import sys
 
@@ -12,7 +10,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.cli.main import main
-from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.exceptions import ModelError
 from drake_diff.model.example import example_files
 from drake_diff.planning import plan
 from drake_diff.planning.around import Line
@@ -58,30 +56,6 @@ def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
     assert dd.verify(tmp_path / "out").holds
     end = dd.read_trace(tmp_path / "out" / "trace.mcap").xs[-1]
     assert end[:2] == pytest.approx([0.0, 0.5], abs=0.025)  # what a replay in other steps may be off: 5 % of its way
-
-
-@pytest.mark.slow
-def test_on_a_terminal_the_stages_are_a_live_table(arm, tmp_path):
-    """A table that is written again and again, which no pipe ever sees."""
-    ours, theirs = pty.openpty()
-    words = [sys.executable, "-m", "drake_diff.cli.main", "plan", str(arm), "--goal", "elbow=0.5", "--out", "out"]
-    with subprocess.Popen(words, stdout=theirs, stderr=theirs, cwd=tmp_path, env=os.environ | {"TERM": "xterm"}) as run:
-        os.close(theirs)
-        written = b"".join(iter(lambda: _read(ours), b"")).decode()
-    os.close(ours)
-    assert run.returncode == 0, written
-    assert "Traceback" not in written
-    for stage in ("load", "audit", "guess", "solve", "save", "verify"):
-        assert stage in written
-    assert "\x1b[2K" in written  # rewritten in place
-
-
-def _read(terminal):
-    """What is written next; nothing at the end, which Linux tells by an error."""
-    try:
-        return os.read(terminal, 65536)
-    except OSError:
-        return b""
 
 
 def test_the_inputs_of_a_smooth_guess_make_that_motion(arm):
@@ -143,13 +117,6 @@ def test_bad_words_are_one_sentence_and_status_2(words, arm, tmp_path, monkeypat
     assert ended.value.code == 2
     assert told.startswith("drake-diff: ")
     assert "Traceback" not in told
-
-
-def test_unknown_names_list_the_known_ones(arm, tmp_path):
-    with pytest.raises(UnknownNameError, match="elbow, shoulder"):
-        plan(arm, goals={"knee": 1.0}, out=tmp_path / "out")
-    with pytest.raises(InputError, match="limits"):
-        plan(arm, goals={"elbow": 4.0}, out=tmp_path / "out")
 
 
 def test_what_nothing_drives_is_refused(tmp_path):

@@ -2,8 +2,6 @@
 
 import importlib
 import pickle
-import pydoc
-import re
 import subprocess
 import sys
 import tomllib
@@ -45,11 +43,6 @@ def test_every_name_of_a_room_is_there_and_documented(room):
     assert package.__all__
     for name in package.__all__:
         assert getattr(package, name).__doc__, name
-
-
-def test_every_public_name_is_documented():
-    for name in PUBLIC:
-        assert getattr(drake_diff, name).__doc__, name
 
 
 HEAVY = (
@@ -158,31 +151,11 @@ def test_public_names_are_pickled_by_name():
         assert pickle.loads(pickle.dumps(value)) is value, name
 
 
-def test_help_lists_the_public_names():
-    text = pydoc.plain(pydoc.render_doc(drake_diff))
-    assert "Trajectory optimization on Drake" in text
-    assert re.search(r"^    class Problem\(", text, re.MULTILINE)
-    assert re.search(r"^    step\(", text, re.MULTILINE)
-
-
-def test_a_star_imports_the_public_names():
-    assert fresh("from drake_diff import *; print(step.__name__, Problem.__name__)") == "step Problem\n"
-
-
 def test_a_name_that_is_none_is_refused():
     with pytest.raises(AttributeError, match=r"No drake_diff attribute stepp"):
         drake_diff.stepp  # noqa: B018
     with pytest.raises(ImportError, match="cannot import name 'stepp'"):
         exec("from drake_diff import stepp")
-
-
-def test_a_public_name_can_be_replaced_and_comes_back(monkeypatch):
-    real = drake_diff.step
-    with monkeypatch.context() as patch:
-        patch.setattr(drake_diff, "step", len)
-        importlib.import_module("drake_diff.model.step")
-        assert drake_diff.step is len
-    assert drake_diff.step is real
 
 
 def test_the_stub_goes_into_the_wheel():

@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from helpers.models import MODELS, robot_file
+from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
@@ -50,11 +50,6 @@ def load(path, **options):
         warnings.simplefilter("always")
         model = dd.load_model(path, **{"time_step": 0.01, **options})
     return model, "\n".join(str(w.message) for w in caught)
-
-
-def test_by_default_nothing_is_invented(write):
-    model, told = load(write())
-    assert (model.nq, model.nv, model.nu, told) == (9, 8, 0, "")
 
 
 def test_a_textbook_arm_becomes_one_that_can_be_driven(write):
@@ -124,7 +119,6 @@ def test_what_copies_another_joint_is_not_driven(write):
         load(path, actuators=["elbow"])
 
 
-BLOCK = '<link name="{}"><inertial><mass>1</mass></inertial></link>'
 SDF = (
     '<sdf version="1.9"><model name="outer"><link name="a"><inertial><mass>1</mass></inertial></link>'
     '<model name="inner"><link name="b"><inertial><mass>1</mass></inertial></link></model>'
@@ -236,14 +230,6 @@ def test_a_base_that_is_held_is_not_free_and_needs_no_weld(write):
 def test_what_has_no_joint_cannot_be_welded_away():
     with pytest.raises(ModelError, match="nothing could move any more"):
         load(MODELS / "projectile.sdf", base="weld")
-
-
-@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
-def test_real_robots_are_repaired():
-    solo = dd.load_model(robot_file("solo12.urdf"), time_step=0.005, actuators="all", ground=True)
-    assert solo.nu == 12
-    z1 = dd.load_model(robot_file("z1.urdf"), time_step=0.005, actuators="all")
-    assert z1.nu == z1.nv
 
 
 def test_a_joint_is_fixed_beside_those_that_mimic(write):

@@ -76,19 +76,3 @@ def test_the_pictures_of_contact_models_are_those_that_the_command_draws(tmp_pat
     assert all((DOCS / f"pictures/{name}.svg").is_file() for name in shown)
     pictures.draw("contact_shapes", tmp_path)  # the one that simulates nothing
     assert (tmp_path / "contact_shapes.svg").read_text().startswith("<?xml")
-
-
-def test_each_page_says_what_to_do_next():
-    """Not those that one looks things up in, and those that are nothing but links."""
-    pytest.importorskip("mkdocs")
-    spec = importlib.util.spec_from_file_location("site_hook", DOCS / "site.py")
-    site = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(site)
-    pages = [*DOCS.glob("*.md"), *DOCS.glob("questions/*.md"), DOCS / "notebooks/index.md"]
-    named = {
-        page for page in pages if re.search(r"(?i)what would I do next\?|what to do next|to go next", page.read_text())
-    }
-    written = {DOCS / name for name in site.NEXT}
-    assert not named & written
-    missing = {page.name for page in {*pages} - named - written} - {"glossary.md", "index.md"}
-    assert not missing

@@ -12,7 +12,7 @@ from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
-from drake_diff.model.soft_contact import distances, separations
+from drake_diff.model.soft_contact import separations
 from drake_diff.model.step import set_state
 
 SOFT = dd.model.SoftContact(0.05, 200.0)
@@ -81,19 +81,6 @@ def test_a_force_without_its_derivative_is_refused(load, monkeypatch):
         dd.model.SoftContact, "normal_force", lambda s, phi: honest(s, getattr(phi, "value", lambda: phi)())
     )
     assert dd.certify(soft, [0, 0.3, 1, 0.2], [1.0]).verdict == "disagree"
-
-
-def test_the_model_itself_stays_as_it_is(load):
-    model = load("two_spheres.sdf", time_step=0.02)
-    before = dd.step(model, [0, 0.3, 1, 0], [1.0])
-    dd.step(dd.model.softened(model, SOFT), [0, 0.3, 1, 0], [1.0])
-    assert np.array_equal(dd.step(model, [0, 0.3, 1, 0], [1.0]), before)
-
-
-def test_distances_are_those_between_the_surfaces(load):
-    twin = load("two_spheres.sdf").double
-    set_state(twin, [0.1, 0.7, 0, 0])
-    assert distances(twin) == {("pusher", "ball"): pytest.approx(0.4, abs=1e-14)}
 
 
 def test_a_floating_ball_leaves_the_ground_along_its_height(load):

@@ -26,33 +26,6 @@ def test_projectile_follows_symplectic_euler(load, h, count):
     assert end[10:] == pytest.approx(v0 - [0, 0, G * count * h], rel=1e-9)
 
 
-def test_projectile_error_is_first_order_with_coefficient_g_t_h_over_2(load):
-    for h in (0.02, 0.01, 0.005):
-        model = load("projectile.sdf", time_step=h)
-        end = dd.rollout(model, model.default_state, num_steps=round(1 / h)).xs[-1]
-        assert end[6] + G / 2 == pytest.approx(-G * h / 2, rel=1e-9)
-
-
-def test_projectile_by_gravity(load):
-    """dz_N/dg = -h^2 N (N + 1) / 2 = -0.505; linear in g, so a difference is exact."""
-    ends = []
-    for g in (9.0, 10.0):
-        model = load("projectile.sdf", gravity=(0, 0, -g))
-        ends.append(dd.rollout(model, model.default_state, num_steps=100).xs[-1][6])
-    assert ends[1] - ends[0] == pytest.approx(-0.505, rel=1e-9)
-
-
-def test_projectile_by_the_time_step(load):
-    """dz_N/dh = v_0 N - g h N (N + 1); quadratic in h, so a central difference is exact."""
-    ends = []
-    for h in (0.0099, 0.0101):
-        model = load("projectile.sdf", time_step=h)
-        x0 = model.default_state
-        x0[12] = 5.0
-        ends.append(dd.rollout(model, x0, num_steps=100).xs[-1][6])
-    assert (ends[1] - ends[0]) / 0.0002 == pytest.approx(5.0 * 100 - 9.81 * 0.01 * 100 * 101, rel=1e-9)
-
-
 def test_double_pendulum_mass_matrix(load):
     """Uniform rods, m1 = 1, m2 = 0.7, l1 = 0.8, l2 = 0.5, at q2 = -0.9:
 
@@ -85,13 +58,6 @@ def test_pendulum_step_and_jacobian(load, approximation, h, q, w, u):
     assert np.linalg.det(d.A) == pytest.approx(s, rel=1e-12)
 
 
-def test_pendulum_digits_of_the_oracle(load):
-    d = dd.differentiate_step(load("pendulum.urdf"), [0.7, -1.2], [0.3])
-    assert d.x_next == pytest.approx([0.686908411253, -1.309158874737], abs=1e-12)
-    assert d.A[1] == pytest.approx([-0.1494641804235, 0.996015936255], rel=1e-12)
-    assert d.B.ravel() == pytest.approx([3.984063745020e-4, 3.984063745020e-2], rel=1e-12)
-
-
 def test_double_pendulum_step_jacobian_and_energy(load):
     """M (v+ - v) / h = u - bias - G, q+ = q + h v+ and its derivative.
 
@@ -116,18 +82,6 @@ def test_double_pendulum_step_jacobian_and_energy(load):
     assert motion.potential_energy[0] == pytest.approx(-10.18077388024687, rel=1e-12)
 
 
-@pytest.mark.parametrize(("x", "v", "u"), [(0.35, -0.4, 1.0), (-0.2, 2.0, -7.0)])
-def test_mass_spring_damper_step_and_jacobian(load, x, v, u):
-    """Spring explicit, damper implicit."""
-    h, m, k, c, rest = 0.01, 2.0, 50.0, 1.5, 0.1
-    s = 1 / (1 + h * c / m)
-    v_next = s * (v + h * (u - k * (x - rest)) / m)
-    d = dd.differentiate_step(load("mass_spring_damper.sdf", time_step=h), [x, v], [u])
-    assert d.x_next == pytest.approx([x + h * v_next, v_next], rel=1e-12)
-    assert pytest.approx(np.array([[1 - h**2 * s * k / m, h * s], [-h * s * k / m, s]]), rel=1e-12) == d.A
-    assert d.B.ravel() == pytest.approx([h**2 * s / m, h * s / m], rel=1e-12)
-
-
 ALL = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf")
 
 
@@ -141,12 +95,6 @@ def test_upper_half_of_the_jacobian_follows_from_the_lower(load, name):
         assert d.A[:n] == pytest.approx(np.eye(n, 2 * n) + h * d.A[n:], abs=1e-14)
         assert d.B[:n] == pytest.approx(h * d.B[n:], abs=1e-14)
         assert np.linalg.det(d.A) == pytest.approx(np.linalg.det(d.A[n:, n:]), rel=1e-12)
-
-
-def test_a_conservative_one_dof_step_preserves_area(write_urdf):
-    """Semi-implicit Euler is symplectic: det A = 1 without damping."""
-    model = write_urdf(mass=2.0)
-    assert np.linalg.det(dd.differentiate_step(model, [0.3, 1.0], [0.5]).A) == pytest.approx(1, abs=1e-14)
 
 
 def ball_on_ground(h, k, approximation, relaxation_time=None, mass=1.0):

@@ -5,9 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-from helpers.table import each_row, slow_after
-
 TABLES = """
 from helpers.table import each_row, slow_after
 
@@ -33,21 +30,3 @@ def test_every_row_that_fails_is_named_and_the_others_are_checked(tmp_path):
     failed = [line.split("]")[0] for line in run.stdout.splitlines() if line.startswith("SUBFAILED")]
     assert failed == ["SUBFAILED[1: 2, 3; ex", "SUBFAILED[2: 4, 5; ex"], run.stdout + run.stderr
     assert "3 failed, 1 passed, 7 subtests passed" in run.stdout, run.stdout
-
-
-def test_a_table_that_checks_nothing_or_fits_nothing_is_refused():
-    with pytest.raises(ValueError, match="without rows"):
-        each_row("a", [])
-    with pytest.raises(ValueError, match="2 rows have 1 names"):
-        each_row("a", [1, 2], ids=["one"])
-    with pytest.raises(ValueError, match="shorter"):
-        each_row("a, b", [(1, 2), (1,)])
-    with pytest.raises(TypeError, match="test of its own"):
-        each_row("a", [pytest.param(1, marks=pytest.mark.slow)])
-    with pytest.raises(TypeError, match="takes no"):
-        each_row("a", [1])(lambda b: None)
-
-
-def test_rows_after_the_first_ones_are_slow():
-    rows = slow_after(1, [3, (4, 5)])
-    assert [(row.values, [mark.name for mark in row.marks]) for row in rows] == [((3,), []), ((4, 5), ["slow"])]

@@ -118,6 +118,9 @@ class Canaries:
         self.watch = libc.inotify_init1(os.O_NONBLOCK)
         for path in folder.iterdir():
             libc.inotify_add_watch(self.watch, os.fsencode(path), OPENED | ACCESSED)
+        (folder / "secret.obj").read_text()
+        if not self.opened():
+            raise RuntimeError("inotify does not report a file that is opened")
 
     def opened(self):
         count = 0
@@ -239,13 +242,25 @@ def model_changed(folder, rng, canaries):
         ending = str(rng.choice(["urdf", "sdf", "xml", "dmd.yaml"]))
         ((how, data),) = broken(ending, int(rng.integers(2**31)), 1)
         name = f"robot.{ending}"
-    with_attachment(folder / "trace.mcap", "pendulum.urdf", name, data)
-    fields["model"]["file"] = {"path": name, "bytes": len(data), "sha256": sha256(data).hexdigest(), "reason": None}
+    _with_model(folder, fields, name, data)
     if rng.random() < 0.3:  # one that is to be read where it stood
         fields["contract"]["source"] = str(rng.choice([str(canaries.folder / f"secret.{e}") for e in ("urdf", "xml")]))
         fields["model"]["named"] = [{"path": "x.obj", "bytes": 1, "sha256": "0" * 64, "reason": None}]
     _sealed(folder, fields)
     return f"model: {name}, {how}"
+
+
+def replace_model(folder, name, data):
+    """Another robot file, all hashes right."""
+    fields = json.loads((folder / "record.json").read_text())
+    _with_model(folder, fields, name, data)
+    seal(folder, fields)
+    return f"model: {name}"
+
+
+def _with_model(folder, fields, name, data):
+    with_attachment(folder / "trace.mcap", "pendulum.urdf", name, data)
+    fields["model"]["file"] = {"path": name, "bytes": len(data), "sha256": sha256(data).hexdigest(), "reason": None}
 
 
 def with_attachment(path, old, new, data):
@@ -346,8 +361,11 @@ def opened_as_users_do(folder, base, place, rng, wanted):
                 yield what, f"BUG: {type(error).__name__}: {error!s:.500}"
 
 
-def fuzz(count, seed, *, log=None):
-    """Counts of what went wrong, and how the ways to open a directory ended."""
+def fuzz(count, seed, *, log=None, every_model=False):
+    """Counts of what went wrong, and how the ways to open a directory ended.
+
+    With `every_model` each file of `models` is tried once instead; one with which the run holds is wrong too.
+    """
     rng, ended, wrong, slowest = np.random.default_rng(seed), Counter(), [], 0.0
     read = []
     sys.addaudithook(lambda event, given: read.append(given[0]) if event == "open" and given[0] in FORBIDDEN else None)
@@ -358,13 +376,18 @@ def fuzz(count, seed, *, log=None):
         model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
         task = dd.Problem(model, x0=[0, 0], x_goal=[0.1, 0], num_steps=4, running_cost=dd.QuadraticCost(R=[[1.0]]))
         dd.save(dd.solve(task, method="shooting"), base)
-        for i in range(count):
+        pool = models(canaries.folder)
+        for i in range(len(pool) if every_model else count):
             folder = place / "runs" / "run"
             shutil.copytree(base, folder)
             way = list(WAYS)[rng.choice(len(WAYS), p=list(WAYS.values()))]
-            told = way(folder, rng, canaries)
             wanted = ["list", "mcap info", "load_record", str(rng.choice(["mcap recover", "compare-runs"]))]
-            wanted.append("verify" if rng.random() < 0.7 else str(rng.choice(["view", "robustness"])))
+            if every_model:
+                told = replace_model(folder, pool[i][0], pool[i][1].encode())
+                wanted += ["verify", *(("view", "robustness") if i % 5 == 0 else ())]
+            else:
+                told = way(folder, rng, canaries)
+                wanted.append("verify" if rng.random() < 0.7 else str(rng.choice(["view", "robustness"])))
             if log is not None:
                 log.write_text(f"{seed} {i} {told}\n")
             canaries.opened()
@@ -373,6 +396,8 @@ def fuzz(count, seed, *, log=None):
                 ended[f"{what}: {how.split(':')[0]}"] += 1
                 if how.startswith("BUG"):
                     wrong.append(("error without a name", i, told, what, how))
+                if every_model and (what, how) == ("verify", "exit status 0"):
+                    wrong.append(("accepted", i, told, what, how))
             taken = time.monotonic() - start
             slowest = max(slowest, taken)
             if taken > HANG:
@@ -389,16 +414,17 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=1000)
+    parser.add_argument("--every-model", action="store_true", help="each strange robot file once, nothing by chance")
     parser.add_argument("--log", type=Path)
     asked = parser.parse_args()
     start = time.monotonic()
-    wrong, ended, slowest = fuzz(asked.count, asked.seed, log=asked.log)
+    wrong, ended, slowest = fuzz(asked.count, asked.seed, log=asked.log, every_model=asked.every_model)
     for line in wrong:
         print(*line, sep=" | ")
     for what, count in sorted(ended.items()):
         print(f"{count:6d} {what}")
     kinds = Counter(kind for kind, *_ in wrong)
-    names = ("error without a name", "hang", "read outside")
+    names = ("error without a name", "hang", "read outside", "accepted")
     told = ", ".join(f"{kinds[name]} {name}" for name in names)
     print(f"{asked.count} directories, seed {asked.seed}: 0 crashes, {told}; the slowest took {slowest:.1f} s")
     print(f"{time.monotonic() - start:.0f} s in all")

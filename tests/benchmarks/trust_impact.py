@@ -8,9 +8,9 @@ another.
 from dataclasses import replace
 
 import numpy as np
-from helpers.impacts import Floor
 from helpers.models import Plant, contact_properties
 from helpers.robots import example_robot, state_in_range
+from rigid_floor import Floor
 from trust import Figure
 
 import drake_diff as dd
