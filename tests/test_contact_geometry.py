@@ -145,30 +145,28 @@ def test_the_box_rests_on_four_springs():
 # What is registered in place of what.
 
 
-def test_the_corner_spheres_touch_three_faces_of_a_turned_box_from_inside():
+X_BG = RigidTransform(RollPitchYaw(0.3, -0.5, 0.9), [0.1, 0.2, -0.3])
+CORNERS = [X_BG @ (np.array(signs) * [0.145, 0.095, 0.045]) for signs in product((-1, 1), repeat=3)]
+
+
+@each_row(
+    "shape, pose, radius, centres",
+    [
+        (Box(*SIZE), X_BG, 0.005, CORNERS),  # 0.05 of the edge of 0.1 m: each touches three faces from inside
+        (Capsule(0.1, 0.4), RigidTransform([0, 0, 1.0]), 0.1, [[0, 0, 0.8], [0, 0, 1.2]]),  # its two ends
+    ],
+    ids=["box", "capsule"],
+)
+def test_a_moving_box_or_capsule_becomes_spheres(shape, pose, radius, centres):
     plant = Plant(0.005)
-    X_BG = RigidTransform(RollPitchYaw(0.3, -0.5, 0.9), [0.1, 0.2, -0.3])
-    body = add_body(plant, Box(*SIZE), pose=X_BG)
+    body = add_body(plant, shape, pose=pose)
     replaced(plant)
     inspector = plant.scene_graph.model_inspector()
-    for i, signs in enumerate(product((-1, 1), repeat=3)):
+    for i, centre in enumerate(centres):
         sphere = geometry_id(plant, body, f"box_shape_corner_{i}")
-        assert inspector.GetShape(sphere).radius() == pytest.approx(0.005, rel=1e-12)  # 0.05 of the edge of 0.1 m
-        p_BS = X_BG @ (np.array(signs) * [0.145, 0.095, 0.045])
-        np.testing.assert_allclose(inspector.GetPoseInFrame(sphere).translation(), p_BS, atol=1e-15)
-
-
-def test_a_moving_capsule_becomes_its_two_ends():
-    plant = Plant(0.005)
-    body = add_body(plant, Capsule(0.1, 0.4), pose=RigidTransform([0, 0, 1.0]))
-    (note,) = replaced(plant)
-    assert "capsule" in note
-    inspector = plant.scene_graph.model_inspector()
-    for i, z in enumerate((0.8, 1.2)):
-        sphere = geometry_id(plant, body, f"box_shape_corner_{i}")
-        assert inspector.GetShape(sphere).radius() == 0.1
-        np.testing.assert_allclose(inspector.GetPoseInFrame(sphere).translation(), [0, 0, z], atol=1e-15)
-    assert len(collision_names(plant)) == 2
+        assert inspector.GetShape(sphere).radius() == pytest.approx(radius, rel=1e-12)
+        np.testing.assert_allclose(inspector.GetPoseInFrame(sphere).translation(), centre, atol=1e-15)
+    assert len(collision_names(plant)) == len(centres)
 
 
 def test_a_moving_cylinder_becomes_spheres_along_its_rims_approximately():
@@ -361,13 +359,12 @@ def test_an_unknown_route_lists_those_that_exist():
     assert all(route in str(error.value) for route in ROUTES)
 
 
-@pytest.mark.parametrize("route", ROUTES)
-def test_a_finalized_plant_is_an_error(route):
+def test_a_finalized_plant_is_an_error():
     plant = Plant(0.005)
     add_body(plant, Box(*SIZE))
     plant.plant.Finalize()
     with pytest.raises(ModelError, match="is finalized"):
-        replaced(plant, route)
+        replaced(plant)
 
 
 def test_a_name_that_is_taken_is_an_error():

@@ -41,10 +41,6 @@ def test_a_ball_in_the_air_is_separated_and_so_is_one_that_leaves(approximation)
     assert dd.contact_modes(model, [0.0, 0.1 - 1e-5, 0.0, 1.0], [0.0]) == {PAIR: "separated"}
 
 
-def test_without_friction_every_contact_slides():
-    assert dd.contact_modes(pushed_ball("sap", 0.0), [0.0, REST, 0.0, 0.0], [0.0]) == {PAIR: "sliding"}
-
-
 def test_every_candidate_pair_is_listed():
     plant = Plant(H)
     for i, name in enumerate("abc"):
@@ -94,6 +90,14 @@ def test_at_the_edge_of_friction_the_push_changes_the_mode():
     columns = {c.column for c in dd.certify(model, x, [limit]).mode_changes}
     assert "push" in columns
     assert not dd.certify(model, x, [limit - 0.3]).mode_changes
+
+
+@each_row("z, vx, vz", [(0.3, 1.0, -1.0), (REST, 1.0, 0.0), (0.097, 0.5, -0.5), (0.0985, 0, 0.3)])
+@each_row("approximation", ["sap", "similar", "lagged"])
+def test_no_good_contact_state_is_flagged(z, vx, vz, approximation):
+    model, x = pushed_ball(approximation), [0.0, z, vx, vz]
+    dd.certify(model, x, [0.3]).require()
+    assert not [f for f in dd.audit(model, x, [0.3]) if f.severity == "error"]
 
 
 def test_no_change_is_reported_where_there_is_none():

@@ -23,13 +23,18 @@ def example(name):
     return module
 
 
+def solved(module, problem=None):
+    solution = dd.solve(module.problem() if problem is None else problem, **getattr(module, "solve_options", {}))
+    assert solution.success, solution.message
+    return solution
+
+
 def test_the_cart_pole_swings_up_near_the_continuous_optimum():
     """From u = 0 it leads to the local optimum whose cost without time steps is 58.8077 N^2 s (Hermite-Simpson at 50
     and 100 intervals agree on it); another of 57.9448 is known. Semi-implicit Euler is first order: 1% at h = 0.02 s.
     """
     module = example("cart_pole_swing_up")
-    solution = dd.solve(module.problem(), **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module)
     assert solution.cost == pytest.approx(58.8077, rel=0.01)
     assert np.abs(solution.replay.xs[-1] - [1, np.pi, 0, 0]).max() < 1e-8  # the simulator itself arrives
 
@@ -52,8 +57,7 @@ def test_the_projectiles_three_gradients_agree(vx):
 
 def test_the_projectile_lands_on_the_target():
     module = example("projectile_hits_target")
-    solution = dd.solve(module.problem())
-    assert solution.success, solution.message
+    solution = solved(module)
     assert solution.xs[0][module.VX] == pytest.approx(2.0, abs=1e-8)
     assert solution.xs[-1][module.X] == pytest.approx(6.0, abs=1e-8)
     assert solution.xs[-1][module.X + 2] == pytest.approx(0.0, abs=1e-9)  # back on the ground at the last step
@@ -70,8 +74,7 @@ def test_the_sphere_has_no_gradient_where_it_touches_and_one_elsewhere():
 @pytest.mark.slow
 def test_the_sphere_rolls_to_where_it_is_sent():
     module = example("sphere_on_ground")
-    solution = dd.solve(module.problem())
-    assert solution.success, solution.message
+    solution = solved(module)
     assert solution.xs[-1][module.X] == pytest.approx(1.0, abs=1e-5)
     assert 0 < solution.replay.penetration.max() < 0.02
 
@@ -80,8 +83,7 @@ def test_the_sphere_rolls_to_where_it_is_sent():
 def test_the_ball_is_pushed_from_a_guess_that_never_touches_it():
     """The goal is hard: 1e-8 of the solver, 1e-5 the package's measure, here on the true plant's own rollout."""
     module = example("push_without_touching")
-    solution = dd.solve(module.problem(), **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module)
     assert solution.replay.xs[-1][module.BALL] == pytest.approx(module.GOAL, abs=1e-7)
     assert not solution.replay.contacts[0]
 
@@ -145,8 +147,7 @@ def test_the_panda_arrives_although_it_is_pushed(tmp_path):
 def test_a_quadrotor_flies_through_its_gates_and_its_record_holds(tmp_path):
     """The plan passes each gate as the replays do, in finer steps too; verify builds the rotors again."""
     module = example("quadrotor_gates")
-    solution = dd.solve(module.problem(), **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module)
     for knot, gate in module.GATES.items():
         assert np.linalg.norm(solution.xs[knot, 4:7] - gate) <= module.OPENING
     finer = [
@@ -169,8 +170,7 @@ def test_a_quadrotor_flies_through_its_gates_and_its_record_holds(tmp_path):
 def test_the_acrobot_stands_and_its_elbow_keeps_its_limit():
     """The plan itself; on the plant it is followed under feedback, in the shortest steps within 5 % of a turn."""
     module = example("acrobot_swing_up")
-    solution = dd.solve(module.problem(), **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module)
     assert solution.xs[-1] == pytest.approx(module.UPRIGHT, abs=1e-6)
     assert np.all(np.abs(solution.inputs_at_knots) <= module.STRONGEST)
     followed = max((r for r in solution.replays if r.control != "open loop"), key=lambda r: len(r.motion.us))
@@ -196,8 +196,7 @@ def test_the_load_of_the_crane_sways_no_more_than_it_may():
 def test_the_hand_of_the_panda_reaches_its_target_around_the_ball():
     """By Drake's own kinematics: where the hand is in the end, and where the links' frames are on the way."""
     module = example("panda_around_a_ball")
-    solution = dd.solve(module.problem())
-    assert solution.success, solution.message
+    solution = solved(module)
     model = solution.problem.model
     context = model.plant.CreateDefaultContext()
     near = module.BALL.radius + module.BALL.margin
@@ -214,8 +213,7 @@ def test_the_hand_of_the_panda_reaches_its_target_around_the_ball():
 def test_the_pushed_cart_pole_stands_again():
     module = example("pushed_cart_pole")
     problem = module.problem()
-    solution = dd.solve(problem, **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module, problem)
     stands = solution.xs[module.UP :] - [1, np.pi, 0, 0]
     assert np.abs(stands).max() < 0.05  # [m, rad, m/s, rad/s] it falls a little and comes back, for no force at all
     controller = dd.loop.MPC(problem, horizon=30, plan=solution)
@@ -237,8 +235,7 @@ def test_the_ball_bounces_into_its_target(capsys):
 @pytest.mark.slow
 def test_the_hopper_flies_and_stands_half_a_metre_on():
     module = example("hop_from_standing")
-    solution = dd.solve(module.problem(), **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module)
     end, flies = solution.replay.xs[-1], [not contacts for contacts in solution.replay.contacts]
     assert end[0] == pytest.approx(module.WAY, abs=1e-6)
     assert np.abs(end[4:]).max() < 1e-6
@@ -250,8 +247,7 @@ def test_the_hopper_flies_and_stands_half_a_metre_on():
 def test_two_fingers_hold_the_box_up_by_its_sides():
     """At the end nothing is under it, and what carries it are two forces at its sides, within their friction cones."""
     module = example("grasp_and_lift")
-    solution = dd.solve(module.problem(), **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module)
     for found in solution.replay.contacts[-5:]:
         assert sorted(name for c in found for name in (c.body_a, c.body_b)) == ["box", "box", "left", "right"]
         for contact in found:
@@ -265,8 +261,7 @@ def test_two_fingers_hold_the_box_up_by_its_sides():
 def test_the_ball_flies_out_of_the_cup_into_its_target():
     """After the cup it touches nothing and flies a parabola, in Drake's steps z = z_0 + v t - g t (t + h) / 2."""
     module = example("throw_into_target")
-    solution = dd.solve(module.problem(), **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module)
     xs, h = solution.replay.xs, module.TIME_STEP
     assert np.linalg.norm(xs[-1][3:5] - module.TARGET) < 0.05 * np.sqrt(2)  # 5 cm in x and in z
     flies = 1 + max(k for k, contacts in enumerate(solution.replay.contacts) if contacts)
@@ -286,8 +281,7 @@ def test_the_quadruped_goes_as_its_schedule_says_and_its_record_holds(name, way,
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         problem = module.problem()
-    solution = dd.solve(problem, **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module, problem)
     model, knot = problem.model, 0
     context = model.plant.CreateDefaultContext()
     assert solution.xs[-1][4] == pytest.approx(way, abs=0.03)  # the goal's tolerance
@@ -309,8 +303,7 @@ def test_the_leg_that_is_designed_jumps_by_a_design_inside_its_bounds():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)  # the linkage is told
         problem = module.problem()
-    solution = dd.solve(problem, **module.solve_options)
-    assert solution.success, solution.message
+    solution = solved(module, problem)
     lower, upper = problem.bounds_of_parameters()
     moves = upper > lower
     inside = (solution.parameters - lower)[moves] / (upper - lower)[moves]

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, add_slide
 from helpers.table import each_row
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
-    ExternallyAppliedSpatialForceMultiplexer,
     MultibodyPlantConfig,
     Propeller,
     PropellerInfo,
@@ -93,26 +92,6 @@ def test_a_quadrotor_hovers_under_a_quarter_of_its_weight_per_rotor():
     problem = dd.Problem(model, x0=model.default_state, num_steps=2, running_cost=lambda x, u: u @ u)
     assert problem.bounds.u_lower.tolist() == [0.0] * 4
     assert problem.bounds.u_upper.tolist() == [6.0] * 4
-
-
-def test_a_rotor_turns_the_body_by_its_arm_and_its_moment_ratio():
-    """About x by arm (f1 - f3), about y by arm (f2 - f0), about z by the ratio; upwards by the mass."""
-    model = quadrotor()
-    d = dd.differentiate_step(model, model.default_state, HOVER)
-    ix, iy, iz = INERTIA
-    by_hand = np.array(
-        [
-            [0, ARM / ix, 0, -ARM / ix],
-            [-ARM / iy, 0, ARM / iy, 0],
-            RATIO / iz * TURNS,
-            np.zeros(4),
-            np.zeros(4),
-            np.full(4, 1 / MASS),
-        ]
-    )
-    assert d.B[7:] == pytest.approx(H * by_hand, abs=1e-14)
-    assert d.method == "autodiff"
-    assert "the diagram feeds applied_spatial_force" in d.reason  # neither of the fast sources knows of it
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -532,66 +511,3 @@ def test_a_rocket_lands_with_least_effort(method, steps, close):
     solution = dd.solve(dd.Problem(model, x0=x0, x_goal=goal, num_steps=steps, running_cost=cost), method=method)
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(MASS**2 * (12 * z**2 / T**3 + 12 * z * v / T**2 + 4 * v**2 / T), rel=close)
-
-
-def glider(time_step=0.04):
-    """A flat plate of 0.2 m^2 and 0.5 kg with an engine along its chord, and a Propeller for it."""
-    builder = DiagramBuilder()
-    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, use_sampled_output_ports=False), builder)
-    body = plant.AddRigidBody("plane", SpatialInertia.SolidBoxWithMass(0.5, 0.6, 0.3, 0.1))
-    plant.Finalize()
-    forward = RigidTransform(RotationMatrix.MakeYRotation(np.pi / 2), np.zeros(3))
-    wing, engine = builder.AddSystem(Wing(body.index(), 0.2)), builder.AddSystem(Propeller(body.index(), forward))
-    both = builder.AddSystem(ExternallyAppliedSpatialForceMultiplexer(2))
-    builder.Connect(plant.get_body_poses_output_port(), wing.get_body_poses_input_port())
-    builder.Connect(plant.get_body_spatial_velocities_output_port(), wing.get_body_spatial_velocities_input_port())
-    builder.Connect(plant.get_body_poses_output_port(), engine.get_body_poses_input_port())
-    builder.Connect(wing.get_spatial_force_output_port(), both.get_input_port(0))
-    builder.Connect(engine.get_spatial_forces_output_port(), both.get_input_port(1))
-    builder.Connect(both.get_output_port(), plant.get_applied_spatial_force_input_port())
-    builder.ExportInput(engine.get_command_input_port(), "engine")
-    return dd.model_from_diagram(builder.Build())
-
-
-def level_flight(pitch):
-    """The speed at which the plate carries its weight, pitched up and flying level, and the thrust that keeps it.
-
-    The plate's force rho S sin(pitch) v^2 is along its normal, the engine's along its chord.
-    """
-    normal, thrust = 0.5 * 9.81 * np.array([np.cos(pitch), np.sin(pitch)])
-    return np.sqrt(normal / (1.204 * 0.2 * np.sin(pitch))), thrust
-
-
-def flying(model, pitch, speed):
-    x = model.default_state
-    x[:4], x[10] = [np.cos(pitch / 2), 0, -np.sin(pitch / 2), 0], speed
-    return x
-
-
-def test_a_plane_flies_level_where_lift_and_thrust_carry_it():
-    model, (speed, thrust) = glider(), level_flight(0.15)
-    x = flying(model, 0.15, speed)
-    end = dd.step(model, x, [thrust])
-    assert end[10:] == pytest.approx(x[10:], abs=1e-12)
-    assert dd.certify(model, x, [thrust]).verdict == "agree"
-
-
-@pytest.mark.parametrize("method", [pytest.param("collocation", marks=pytest.mark.slow), "ilqr"])
-def test_a_plane_is_planned_to_climb(method):
-    """From level flight 1 m up in 1 s; the plan is the plant's own motion, and needs more than the level thrust."""
-    model, (speed, thrust) = glider(), level_flight(0.15)
-    x0, goal = flying(model, 0.15, speed), np.full(13, np.nan)
-    goal[6] = 1.0
-    problem = dd.Problem(
-        model,
-        x0=x0,
-        x_goal=goal,
-        num_steps=25,
-        running_cost=dd.QuadraticCost(R=[[1.0]], u_ref=[thrust]),
-        bounds=dd.Bounds(u_lower=[0.0], u_upper=[30.0]),
-    )
-    solution = dd.solve(problem, method=method)
-    assert solution.success, solution.message
-    assert solution.us.mean() > thrust
-    assert solution.xs[-1][6] == pytest.approx(1.0, abs=1e-4)
-    assert solution.xs[-1][11] == pytest.approx(0.0, abs=1e-9)  # straight on

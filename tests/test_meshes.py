@@ -168,15 +168,6 @@ def test_a_box_becomes_eight_spheres_that_touch_its_faces():
     assert spheres.ground_gap == pytest.approx((np.sqrt(3) - 1) * r, rel=2e-3)
 
 
-def test_a_rod_becomes_a_row():
-    rod = trimesh.creation.capsule(height=0.3, radius=0.02, count=[32, 32])
-    spheres = fit_spheres(hull_of(np.array(rod.vertices), "rod"), "rod")
-    assert 2 < len(spheres.centres) < MOST_SPHERES
-    np.testing.assert_allclose(spheres.centres[:, :2], 0, atol=0.002)  # the slack of spheres 5 % smaller
-    assert np.ptp(spheres.centres[:, 2]) == pytest.approx(0.3, abs=0.006)
-    assert spheres.open_gap < spheres.radius
-
-
 def test_spheres_are_inside_and_their_gaps_are_true():
     random = np.random.default_rng(17)
     for _ in range(12):

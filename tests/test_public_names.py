@@ -68,31 +68,25 @@ def test_importing_the_package_loads_nothing_heavy():
     assert fresh("import drake_diff; print(loaded())") == "[]\n"
 
 
-@pytest.mark.parametrize("words", [["--help"], ["--version"]])
-def test_the_commands_first_words_load_nothing_heavy(words):
-    code = """
+@pytest.mark.parametrize(
+    ("words", "status", "typers_own"),
+    [
+        (["--help"], 0, ["typer", "rich"]),
+        (["--version"], 0, ["typer", "rich"]),
+        (["run", "--help"], 0, ["typer", "rich", "pydantic"]),  # which typer imports where it is installed
+        (["run", "no_such_script.py"], 2, ["typer", "rich", "pydantic"]),
+    ],
+)
+def test_a_command_that_does_not_begin_loads_nothing_heavy(words, status, typers_own):
+    code = f"""
 from drake_diff.cli.main import main
-sys.argv = ["drake-diff", *WORDS]
+sys.argv = ["drake-diff", *{words}]
 try:
     main()
 except SystemExit as end:
-    print(f"exit {end.code}, loaded {loaded('typer', 'rich')}")
+    print(f"exit {{end.code}}, loaded {{loaded(*{typers_own})}}")
 """
-    assert fresh(code.replace("WORDS", repr(words))).splitlines()[-1] == "exit 0, loaded []"
-
-
-@pytest.mark.parametrize(("words", "status"), [(["run", "--help"], 0), (["run", "no_such_script.py"], 2)])
-def test_a_command_that_does_not_begin_loads_no_drake(words, status):
-    """Typer itself imports pydantic there, where it finds it."""
-    code = """
-from drake_diff.cli.main import main
-sys.argv = ["drake-diff", *WORDS]
-try:
-    main()
-except SystemExit as end:
-    print(f"exit {end.code}, loaded {loaded('typer', 'rich', 'pydantic')}")
-"""
-    assert fresh(code.replace("WORDS", repr(words))).splitlines()[-1] == f"exit {status}, loaded []"
+    assert fresh(code).splitlines()[-1] == f"exit {status}, loaded []"
 
 
 def test_a_model_is_loaded_without_records_logs_and_other_engines():

@@ -283,18 +283,6 @@ def test_packages_are_found_above_the_file_beside_it_and_where_they_are_said_to_
     assert load(path)[0].contract.geometries == model.contract.geometries
 
 
-def test_messages_name_the_lines_of_the_file_though_meshes_were_taken_out(write):
-    visual = '<visual>\n<geometry>\n<mesh filename="a.stl"/></geometry>\n</visual>'
-    ignored = '\n<safety_controller k_velocity="1"/>'
-    path = write(
-        robot(SHOULDER, joint("elbow", "upper", "lower", more=ignored)).replace("<inertial>", visual + "<inertial>")
-    )
-    line = path.read_text().split("<safety")[0].count("\n") + 1
-    _model, told = load(path)
-    assert f"{path}:{line}: warning: The tag 'safety_controller'" in told
-    assert "literal-string" not in told
-
-
 def test_a_chain_that_is_held_at_its_other_end_is_told_to_engines_and_differentiated(write):
     model, _ = load(write(), base="lower", actuators="all")
     dd.certify(model, [0.3, -0.2, 0.1, 0.4], [1.0, 2.0]).require()

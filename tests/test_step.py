@@ -26,17 +26,6 @@ def test_projectile_follows_symplectic_euler(load, h, count):
     assert end[10:] == pytest.approx(v0 - [0, 0, G * count * h], rel=1e-9)
 
 
-def test_double_pendulum_mass_matrix(load):
-    """Uniform rods, m1 = 1, m2 = 0.7, l1 = 0.8, l2 = 0.5, at q2 = -0.9:
-
-    M11 = m1 l1^2 / 3 + m2 (l1^2 + l2^2 / 3 + l1 l2 cos q2), M12 = m2 (l2^2 / 3 + l1 l2 cos(q2) / 2), M22 = m2 l2^2 / 3.
-    """
-    model = load("double_pendulum.urdf", time_step=0.005)
-    dd.step(model, [0.4, -0.9, 1.3, -0.6], [0.0, 0.0])
-    expected = [[0.89371745778245, 0.14535872889123], [0.14535872889123, 0.05833333333333]]
-    assert model.plant.CalcMassMatrix(model.double.context) == pytest.approx(np.array(expected), abs=1e-13)
-
-
 def pendulum_step(q, w, u, h, l=0.5, b=0.1, m=1.0):  # noqa: E741
     """Joint damping implicit, gravity and input explicit."""
     inertia = m * l**2

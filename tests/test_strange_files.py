@@ -7,7 +7,7 @@ import sys
 
 import pytest
 from helpers.strange import DIRECTIVES, FILES, MJCF, URDF, broken, ends, put
-from helpers.table import each_row
+from helpers.table import each_row, slow_after
 
 import drake_diff as dd
 from drake_diff._base.sandbox import crash_of
@@ -36,15 +36,10 @@ def test_the_whole_files_load(tmp_path, ending):
     assert end == "'ok'"
 
 
+@pytest.mark.parametrize(("seed", "count"), slow_after(1, [(0, 50), (1, 400)]))
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_broken_files_end_in_an_error_that_names_the_file(tmp_path, ending):
-    check(tmp_path, ending, seed=0, count=50)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_many_broken_files_end_in_an_error_that_names_the_file(tmp_path, ending):
-    check(tmp_path, ending, seed=1, count=400)
+def test_broken_files_end_in_an_error_that_names_the_file(tmp_path, ending, seed, count):
+    check(tmp_path, ending, seed, count)
 
 
 @pytest.mark.parametrize(("ending", "text"), [("urdf", URDF), ("xml", MJCF)])
