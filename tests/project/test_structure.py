@@ -5,7 +5,7 @@ from pathlib import Path
 
 from helpers.table import each_row
 
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 BENCHMARKS = TESTS / "benchmarks"
 PROGRAMS = {path.stem for path in BENCHMARKS.glob("*.py")} - {"__main__"}
 # They import a benchmark until their owner has changed them.

@@ -16,7 +16,7 @@ from drake_diff.identification.recordings import Chart, read_pieces
 from drake_diff.identification.unknowns import Unknown, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 
-sys.path.append(str(Path(__file__).parent / "benchmarks"))
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 import identify_contact_causes
 
 PERIOD = 0.01

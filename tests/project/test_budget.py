@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-BUDGET = Path(__file__).parents[1] / ".ci/budget.py"
+BUDGET = Path(__file__).parents[2] / ".ci/budget.py"
 MODULE = '''"""A module."""
 
 LIMIT = 3

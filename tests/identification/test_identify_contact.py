@@ -13,7 +13,7 @@ from drake_diff.identification.impacts import shrink_to, start_of
 from drake_diff.identification.recordings import Chart, read_pieces
 from drake_diff.mechanics.description import coordinates_of
 
-sys.path.append(str(Path(__file__).parent / "benchmarks"))
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 
 def throws(model, truth, *, steps=1, height=0.0):

@@ -27,7 +27,7 @@ from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknown
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.runs.read import load_record
 
-sys.path.append(str(Path(__file__).parent / "benchmarks"))
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 
 @pytest.fixture

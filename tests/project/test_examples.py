@@ -13,7 +13,7 @@ from helpers.table import each_row, slow_after
 import drake_diff as dd
 from drake_diff.exceptions import GradientWarning, ModelWarning
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def example(name):

@@ -215,7 +215,7 @@ def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(monkeypatch):
     So these are short: by steps of 0.25 ms 0.05 % less than its friction is found.
     """
     pytest.importorskip("mujoco")
-    sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
     import identify
 
     monkeypatch.setattr(identify.base, "STEP", 2e-5)

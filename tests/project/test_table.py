@@ -26,7 +26,7 @@ def test_every_row_that_fails_is_named_and_the_others_are_checked(tmp_path):
     (tmp_path / "test_tables.py").write_text(TABLES)
     words = ["-q", "--import-mode=prepend", "-p", "no:cacheprovider", f"--basetemp={tmp_path / 'own'}", str(tmp_path)]
     command, alone = [sys.executable, "-m", "pytest", *words], os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-    run = subprocess.run(command, cwd=Path(__file__).parent, env=alone, capture_output=True, text=True, check=False)
+    run = subprocess.run(command, cwd=Path(__file__).parents[1], env=alone, capture_output=True, text=True, check=False)
     failed = [line.split("]")[0] for line in run.stdout.splitlines() if line.startswith("SUBFAILED")]
     assert failed == ["SUBFAILED[1: 2, 3; ex", "SUBFAILED[2: 4, 5; ex"], run.stdout + run.stderr
     assert "3 failed, 1 passed, 7 subtests passed" in run.stdout, run.stdout

@@ -51,7 +51,7 @@ def leave():
 
 
 def ask(function, monkeypatch, seconds=20.0, **arguments):
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))  # the child imports what this process can
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))  # the child imports what this process can
     return call(f"test_sandbox:{function.__name__}", arguments, seconds)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-PROGRAM = Path(__file__).parent / "benchmarks" / "acceptance.py"
+PROGRAM = Path(__file__).parents[1] / "benchmarks" / "acceptance.py"
 NO_FALSE_CLAIM = "no false claim"
 
 

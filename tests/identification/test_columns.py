@@ -9,7 +9,7 @@ import pytest
 import drake_diff as dd
 from drake_diff.identification.columns import side_by_side
 
-sys.path.append(str(Path(__file__).parent / "benchmarks"))
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 PERIOD = 0.01
 
 
