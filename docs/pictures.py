@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
 import drake_diff as dd
+from drake_diff.motion import RolloutGradient
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs/pictures"
@@ -112,7 +113,7 @@ def touchdown(axes: list[Axes]) -> None:
     def height(x: np.ndarray) -> float:
         return x[Z]
 
-    def gradient(z: float, **options: str) -> dd.motion.RolloutGradient:
+    def gradient(z: float, **options: str) -> RolloutGradient:
         return dd.differentiate_rollout(ball, state(ball, z=z), None, height, num_steps=100, **options)
 
     motions = [gradient(z, method="continuous").loss for z in heights[::12]]

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 import drake_diff as dd
+from drake_diff.motion import ParametricPolicy
 
 HEIGHT, HIDDEN, DROPS, UNSEEN = 0.75, 6, (0.6, 0.75, 0.9), (0.65, 0.85)  # [m] where to, and where the body falls from
 FIRST = np.random.default_rng(0).normal(0, np.repeat([0.5, 0.1], [5 * HIDDEN, HIDDEN]))  # the weights
@@ -28,7 +29,7 @@ def network(x: np.ndarray, t: float, weights: np.ndarray) -> np.ndarray:
 
 
 def fall(function: Any, weights: np.ndarray, height: float, *loss: Any) -> Any:
-    asked = {"policy": dd.motion.ParametricPolicy(network, weights), "num_steps": 40, "method": "continuous"}
+    asked = {"policy": ParametricPolicy(network, weights), "num_steps": 40, "method": "continuous"}
     return function(model, [height, 0.45, 0, 0], None, *loss, **asked)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import drake_diff as dd
+from drake_diff.motion import ParametricPolicy
 
 MODEL = Path(__file__).parent.parent / "models" / "cart_pole.urdf"
 TIME_STEP, HIDDEN, STEP_SIZE = 0.02, 16, 0.03
@@ -47,7 +48,7 @@ def loss_and_gradient(
     model: dd.Model, parameters: np.ndarray, starts: np.ndarray, num_steps: int
 ) -> tuple[float, np.ndarray]:
     """The mean over rollouts from `starts` (m, 4) of the loss, and its gradient by the parameters (97,)."""
-    policy = dd.motion.ParametricPolicy(network, parameters)
+    policy = ParametricPolicy(network, parameters)
     found = [dd.differentiate_rollout(model, x0, None, loss, policy=policy, num_steps=num_steps) for x0 in starts]
     return float(np.mean([g.loss for g in found])), np.mean([g.by_policy for g in found], axis=0)
 
@@ -69,7 +70,7 @@ def train(model: dd.Model, parameters: np.ndarray, starts: np.ndarray) -> np.nda
 
 def survivors(model: dd.Model, parameters: np.ndarray, starts: np.ndarray, seconds: float = 5.0) -> int:
     """From how many of `starts` (m, 4) the pole stays up and the cart on its rail for that long."""
-    policy, steps = dd.motion.ParametricPolicy(network, parameters), round(seconds / TIME_STEP)
+    policy, steps = ParametricPolicy(network, parameters), round(seconds / TIME_STEP)
     motions = [dd.rollout(model, x0, policy=policy, num_steps=steps).xs for x0 in starts]
     return sum(bool(np.all(np.abs(xs - UPRIGHT)[:, :2] < LIMITS)) for xs in motions)
 

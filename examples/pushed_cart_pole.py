@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 import drake_diff as dd
+from drake_diff.trials import save_robustness
 
 MODEL = Path(__file__).parent.parent / "models" / "cart_pole.urdf"
 TIME_STEP, UP, STAY, TRIALS = 0.02, 100, 50, 10  # [s], steps to swing up and to stand, trials at each strength
@@ -37,7 +38,7 @@ def main() -> None:
     dd.save(solution, "artifacts/pushed_cart_pole")
     controller = dd.loop.MPC(solution.problem, horizon=30, plan=solution)
     trials = dd.robustness(solution, {"push": PUSHES}, trials=TRIALS, controller=controller, progress=print)
-    dd.trials.save_robustness(trials, "artifacts/pushed_cart_pole_trials", "artifacts/pushed_cart_pole")
+    save_robustness(trials, "artifacts/pushed_cart_pole_trials", "artifacts/pushed_cart_pole")
     print(trials)
 
 

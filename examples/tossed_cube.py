@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import drake_diff as dd
+from drake_diff.identification import first_state
 from drake_diff.identification.impacts import flights_of
 
 FOLDER, OUT = Path(__file__).parent / "cube_tosses", Path("artifacts/tossed_cube")
@@ -50,7 +51,7 @@ def main(fit: int = 8, unseen: int = 8) -> None:
     for told, values in (("by hand", {}), ("as identified", dict(impacts.values))):
         errors = []  # [% of the width] the distance of the centre from where it was measured, on average over a toss
         for log in logs[-unseen:]:
-            x0 = dd.identification.first_state(model, log, parameters=values)  # by what is before the first contact
+            x0 = first_state(model, log, parameters=values)  # by what is before the first contact
             motion = dd.rollout(model, x0, num_steps=STEPS * len(log.us), parameters=values).xs[::STEPS]
             errors.append(100 * metre / WIDTH * np.linalg.norm(motion[:, 4:7] - log.xs[:, 4:7], axis=1).mean())
         print(f"Tosses not used, {told}: {np.mean(errors):.1f} % of the width off on average, {np.round(errors, 1)}")

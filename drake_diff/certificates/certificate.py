@@ -299,7 +299,8 @@ class Certificate(ShowsItsRepr):
       beside it; the entry's `reason` says which.
 
     Example:
-        >>> certificate = dd.certificates.certify_jacobian(np.sin, [0.0], [[1.01]], rows=["y"], columns=["x"])
+        >>> from drake_diff.certificates import certify_jacobian
+        >>> certificate = certify_jacobian(np.sin, [0.0], [[1.01]], rows=["y"], columns=["x"])
         >>> certificate.verdict
         'disagree'
         >>> print(certificate.worst)
@@ -433,9 +434,11 @@ def certify_jacobian(
         Richardson, "The approximate arithmetical solution by finite differences", 1911.
 
     Example:
-        >>> dd.certificates.certify_jacobian(np.sin, [0.0], [[1.0]]).verdict
+        >>> from drake_diff.certificates import certify_jacobian
+        >>> certify_jacobian(np.sin, [0.0], [[1.0]]).verdict
         'agree'
-        >>> dd.certificates.certify_jacobian(np.abs, [0.0], [[0.0]]).verdict  # a kink: central differences see 0
+        >>> from drake_diff.certificates import certify_jacobian
+        >>> certify_jacobian(np.abs, [0.0], [[0.0]]).verdict  # a kink: central differences see 0
         'discontinuous'
     """
     x = finite_array("x", x, ("n",))

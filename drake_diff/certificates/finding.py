@@ -31,7 +31,8 @@ class Finding(ShowsItsRepr):
     `load_model` with which the same file has no such finding; empty where the file, x or u has to change.
 
     Example:
-        >>> dd.certificates.Finding("info", "locked_joint", "elbow", "is locked", "unlock it")
+        >>> from drake_diff.certificates import Finding
+        >>> Finding("info", "locked_joint", "elbow", "is locked", "unlock it")
         info locked_joint (elbow): is locked
           -> unlock it
     """

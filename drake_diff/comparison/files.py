@@ -51,7 +51,7 @@ def save_comparison(
     Args:
         comparison: from `dd.compare`.
         directory: where to write; an earlier run there is replaced.
-        causes: by the name of a recording, what `dd.identification.cause_of` says of it.
+        causes: by the name of a recording, what `drake_diff.identification.cause_of` says of it.
 
     Returns:
         The record in record.json, which `dd.verify` checks against the other files.
@@ -64,7 +64,8 @@ def save_comparison(
         >>> import tempfile
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
         >>> found = dd.compare(model, ["numpy"], num_steps=3)
-        >>> print(dd.comparison.save_comparison(found, tempfile.mkdtemp()).verdict)
+        >>> from drake_diff.comparison import save_comparison
+        >>> print(save_comparison(found, tempfile.mkdtemp()).verdict)
         pass
     """
     with written_whole(directory) as folder:

@@ -337,7 +337,8 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
         >>> head = ",".join(["time", *model.state_names, *model.input_names])
         >>> _ = path.write_text(head + "\\n0,0,0,0\\n0.01,0,0,")
-        >>> print(dd.comparison.read_recording(path, model))
+        >>> from drake_diff.comparison import read_recording
+        >>> print(read_recording(path, model))
         run (version unknown): 2 samples over 0.01 s
     """
     path = Path(path)

@@ -340,7 +340,8 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     Example:
         >>> import pathlib, tempfile
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
-        >>> files = dd.export.export_model(model, pathlib.Path(tempfile.mkdtemp()) / "out", target="sdf", states=2)
+        >>> from drake_diff.export import export_model
+        >>> files = export_model(model, pathlib.Path(tempfile.mkdtemp()) / "out", target="sdf", states=2)
         >>> print([file.name for file in files])
         ['model.sdf', 'contract.json', 'initial_states.csv', 'inputs.csv', 'README.md']
     """

@@ -68,7 +68,8 @@ def base_parameters(model: Model, bodies: Sequence[str] | None = None) -> tuple[
         parameters of robots" (1991).
 
     Example:
-        >>> for base in dd.identification.base_parameters(dd.load_model("models/double_pendulum.urdf", time_step=0.01)):
+        >>> from drake_diff.identification import base_parameters
+        >>> for base in base_parameters(dd.load_model("models/double_pendulum.urdf", time_step=0.01)):
         ...     print(base)
         upper.inertia_yy + 0.64 lower.mass = 0.6613 kg m^2
         upper.moment_x = 0 kg m

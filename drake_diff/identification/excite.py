@@ -48,7 +48,7 @@ FASTEST = 20.0  # [1/s] by which what inputs that are held do to the motion is t
 
 @dataclass(frozen=True, eq=False)
 class Excitation(ShowsItsRepr):
-    """Inputs that tell much of a model's parameters, and what they will tell; `dd.excite` makes one."""
+    """Inputs that tell much of a model's parameters, and what they will tell; `excite` makes one."""
 
     times: Array  # (n,) [s]
     xs: Array  # (n, nx) how the model moves, from rest
@@ -117,7 +117,8 @@ def excite(
         >>> model = dd.load_model("models/double_pendulum.urdf", time_step=0.01)
         >>> limits = {"shoulder_motor": 20.0, "elbow_motor": 5.0}
         >>> names = ["lower.mass", "elbow.damping"]
-        >>> e = dd.excite(model, names, limits=limits, duration=2.0, harmonics=3, max_iterations=5)
+        >>> from drake_diff.identification import excite
+        >>> e = excite(model, names, limits=limits, duration=2.0, harmonics=3, max_iterations=5)
         >>> e.deviations["lower.mass"] < e.random["lower.mass"] < e.rest["lower.mass"]
         True
     """

@@ -131,7 +131,7 @@ def identify(
 
     Args:
         model: The model; its own values are where the search begins.
-        recordings: One or more of `dd.Recording`, or files as `dd.comparison.read_recording` takes them. States that
+        recordings: One or more of `dd.Recording`, or files as `comparison.read_recording` takes them. States that
             were not measured are NaN, or columns that a file lacks; positions alone are enough. Inputs are held from
             each sample to the next. Samples may be any time apart.
         parameters: Names as by `dd.list_parameters`, and beside them JOINT.coulomb_friction, INPUT.strength and

@@ -140,7 +140,8 @@ def first_state(model: Model, recording: Recording, *, parameters: Mapping[str, 
         >>> xs = dd.rollout(model, x0, np.zeros((20, 0))).xs.copy()
         >>> xs[:, 10] += 0.01  # a velocity that is wrong
         >>> log = dd.Recording("throw", "1", 0.005 * np.arange(21), xs, np.zeros((20, 0)))
-        >>> print(round(float(dd.identification.first_state(model, log)[10]), 6))
+        >>> from drake_diff.identification import first_state
+        >>> print(round(float(first_state(model, log)[10]), 6))
         1.0
     """
     (piece,) = read_pieces(model, recording, 0.0)
@@ -505,7 +506,8 @@ def identify_contact(
         ...     x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.13 + 0.01 * k, 0, 0, 0, 0.5 + 0.1 * k, 0, -0.5])
         ...     xs = dd.rollout(model, x0, np.zeros((60, 0)), parameters={"ball.friction": 0.2}).xs
         ...     logs.append(dd.Recording(f"throw {k}", "1", 0.005 * np.arange(61), xs, np.zeros((60, 0))))
-        >>> found = dd.identification.identify_contact(model, logs, ["ball.friction"])
+        >>> from drake_diff.identification import identify_contact
+        >>> found = identify_contact(model, logs, ["ball.friction"])
         >>> print(round(found.values["ball.friction"], 3))
         0.2
     """

@@ -211,7 +211,8 @@ def cause_of(model: Model, recording: Recording) -> CauseEvidence:
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
         >>> log = dd.Recording("lab", "1", [0.0, 0.01], [[1.0, 0.0], [0.99, -0.1]], [[0.0]])
-        >>> dd.identification.cause_of(model, log).sentence[:38]
+        >>> from drake_diff.identification import cause_of
+        >>> cause_of(model, log).sentence[:38]
         'No cause was looked for: recording lab'
     """
     try:

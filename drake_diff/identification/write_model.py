@@ -69,7 +69,8 @@ def write_model(identification: Identification, path: str | Path) -> Path:
         >>> motion = dd.rollout(model, [1.0, 0.0], np.zeros((500, 1)), parameters={"hinge.damping": 0.2})
         >>> log = dd.Recording("lab", "1", 0.01 * np.arange(51), motion.xs[::10], np.zeros((50, 1)))
         >>> found = dd.identify(model, log, ["hinge.damping"], motion="steps")
-        >>> path = dd.identification.write_model(found, pathlib.Path(tempfile.mkdtemp()) / "right.urdf")
+        >>> from drake_diff.identification import write_model
+        >>> path = write_model(found, pathlib.Path(tempfile.mkdtemp()) / "right.urdf")
         >>> dd.list_parameters(dd.load_model(path, time_step=0.001))[0]
         hinge.damping = 0.2 N m s/rad, at least 0; derivative by autodiff
     """

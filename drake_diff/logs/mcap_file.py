@@ -158,7 +158,8 @@ def read_mcap(path: str | Path, *, links: bool = True) -> McapLog:
         The format: https://mcap.dev/spec
 
     Example:
-        >>> log = dd.logs.read_mcap("artifacts/pendulum_swing_up/trace.mcap")
+        >>> from drake_diff.logs import read_mcap
+        >>> log = read_mcap("artifacts/pendulum_swing_up/trace.mcap")
         >>> log.arrays("/state")["q"].shape[1]
         1
     """

@@ -1,4 +1,5 @@
 from . import quantities as quantities
+from .contact import contact_modes as contact_modes
 from .contract import Contract as Contract
 from .counted import StepCount as StepCount
 from .counted import count_steps as count_steps

@@ -58,7 +58,8 @@ def contact_modes(model: Model, x: ArrayLike, u: ArrayLike | None = None) -> dic
 
     Example:
         >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
-        >>> dd.contact_modes(model, model.default_state)
+        >>> from drake_diff.model import contact_modes
+        >>> contact_modes(model, model.default_state)
         {('ball/ball', 'ground/ground'): 'sticking'}
     """
     advance(model.double, *check_point(model, x, u))

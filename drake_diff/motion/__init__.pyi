@@ -1,7 +1,11 @@
 from .gradient import RolloutGradient as RolloutGradient
+from .policy import LQR as LQR
+from .policy import TVLQR as TVLQR
 from .policy import ParametricPolicy as ParametricPolicy
 from .rollout import Rollout as Rollout
 from .smoothing import Barrier as Barrier
 from .smoothing import Gaussian as Gaussian
 from .smoothing import Smoothed as Smoothed
+from .smoothing import smooth as smooth
+from .smoothing import smooth_step as smooth_step
 from .undefined import Undefined as Undefined

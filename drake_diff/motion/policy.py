@@ -137,7 +137,8 @@ class LQR:
 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
-        >>> dd.LQR(model, [0, np.pi, 0, 0], [0], np.eye(4), np.eye(1)).gain.shape
+        >>> from drake_diff.motion import LQR
+        >>> LQR(model, [0, np.pi, 0, 0], [0], np.eye(4), np.eye(1)).gain.shape
         (1, 4)
     """
 
@@ -190,7 +191,8 @@ class TVLQR:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
         >>> us = np.ones((30, 1))
         >>> xs = dd.rollout(model, [0, 0], us).xs
-        >>> dd.TVLQR(model, xs, us, np.eye(2), np.eye(1)).gains.shape
+        >>> from drake_diff.motion import TVLQR
+        >>> TVLQR(model, xs, us, np.eye(2), np.eye(1)).gains.shape
         (30, 1, 2)
     """
 

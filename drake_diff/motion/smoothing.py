@@ -137,7 +137,8 @@ class Smoothed(ShowsItsRepr):
 
     Example:
         >>> from drake_diff.motion import Gaussian
-        >>> dd.smooth(lambda x: x**2, [0.0], lambda x: np.diag(2 * x), noise=Gaussian(0.1), samples=100)
+        >>> from drake_diff.motion import smooth
+        >>> smooth(lambda x: x**2, [0.0], lambda x: np.diag(2 * x), noise=Gaussian(0.1), samples=100)
         blend of first and zeroth order, 1 x 1, 100 samples of Gaussian(sigma = 0.1), seed 0
         standard errors up to ...; first order is biased in 0 of 1 entries, its weight is ...
     """
@@ -208,7 +209,8 @@ def smooth(
 
     Example:
         >>> from drake_diff.motion import Gaussian
-        >>> jump = dd.smooth(np.sign, [0.0], lambda x: [0.0], noise=Gaussian(1.0), samples=4000)
+        >>> from drake_diff.motion import smooth
+        >>> jump = smooth(np.sign, [0.0], lambda x: [0.0], noise=Gaussian(1.0), samples=4000)
         >>> float(jump.first[0, 0]), bool(jump.biased[0, 0]), bool(abs(jump.jacobian[0, 0] - 0.8) < 0.1)
         (0.0, True, True)
     """
@@ -288,7 +290,8 @@ def smooth_step(
     Example:
         >>> from drake_diff.motion import Gaussian
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
-        >>> dd.smooth_step(model, [0.1, 0.0], [0.0], noise=Gaussian([0.01, 0.01, 0]), samples=20).jacobian.shape
+        >>> from drake_diff.motion import smooth_step
+        >>> smooth_step(model, [0.1, 0.0], [0.0], noise=Gaussian([0.01, 0.01, 0]), samples=20).jacobian.shape
         (2, 3)
     """
     x, u = check_point(model, x, u)

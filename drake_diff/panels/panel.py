@@ -310,7 +310,8 @@ def run_panel(
         >>> folder = Path(mkdtemp())
         >>> _ = (folder / "trials.py").write_text("def square(trial): return {'cost': trial['x'] ** 2}")
         >>> _ = (folder / "panel.toml").write_text('evaluate = "trials.py:square"\n[axes]\nx = [1, 2, 3]')
-        >>> [row["cost"] for row in dd.panels.run_panel(folder / "panel.toml", out=folder / "out", workers=1).rows]
+        >>> from drake_diff.panels import run_panel
+        >>> [row["cost"] for row in run_panel(folder / "panel.toml", out=folder / "out", workers=1).rows]
         [1, 4, 9]
     """
     path = Path(path)

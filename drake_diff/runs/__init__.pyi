@@ -13,4 +13,5 @@ from .plan_record import PlanRecord as PlanRecord
 from .save import recover as recover
 from .sealed import SealedRecord as SealedRecord
 from .trace import Trace as Trace
+from .trace import read_trace as read_trace
 from .verify import Verification as Verification

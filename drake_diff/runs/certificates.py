@@ -65,7 +65,8 @@ def certify_model(
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
-        >>> print(dd.runs.certify_model(model, states=2))
+        >>> from drake_diff.runs import certify_model
+        >>> print(certify_model(model, states=2))
         pendulum: pass, 2 of 2 sampled states have a certified derivative
     """
     start = time.monotonic()
@@ -148,10 +149,11 @@ def save_rollout(
 
     Example:
         >>> import tempfile
+        >>> from drake_diff.runs import save_rollout
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
         >>> certificate = dd.certify_rollout(model, [0.5, 0], np.zeros((20, 1)), lambda x: x[0], refine=True)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     record = dd.runs.save_rollout(certificate, model, folder)
+        ...     record = save_rollout(certificate, model, folder)
         >>> record.verdict, [slope.sign_agrees for slope in record.rollout.truth.slopes]
         ('pass', [True, True, True])
     """

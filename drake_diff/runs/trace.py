@@ -184,7 +184,8 @@ class Trace(ShowsItsRepr):
     be taken; `planned_xs` (N+1, nx), `planned_us` (N or N+1, nu) and `planned_us_mid` (N, nu) are the solver's.
 
     Example:
-        >>> trace = dd.read_trace("artifacts/pendulum_swing_up/trace.mcap")
+        >>> from drake_diff.runs import read_trace
+        >>> trace = read_trace("artifacts/pendulum_swing_up/trace.mcap")
         >>> sorted(trace.attachments), float(trace.diagnostics["max_penetration"].max())
         (['configuration.json', 'pendulum.urdf', 'record.json'], 0.0)
     """
@@ -238,7 +239,8 @@ def read_trace(path: str | Path) -> Trace:
         ArtifactError: The file is damaged or lacks a channel.
 
     Example:
-        >>> trace = dd.read_trace("artifacts/pendulum_swing_up/trace.mcap")
+        >>> from drake_diff.runs import read_trace
+        >>> trace = read_trace("artifacts/pendulum_swing_up/trace.mcap")
         >>> trace.xs.shape, trace.us.shape, float(trace.times[-1])
         ((41, 2), (40, 1), 0.8)
     """

@@ -77,7 +77,8 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
         >>> cost = dd.QuadraticCost(R=[[1.0]])
         >>> problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost)
         >>> result = dd.robustness(dd.solve(problem, method="shooting"), {"mass": [0.05]}, trials=2)
-        >>> dd.trials.save_robustness(result, mkdtemp()).verdict
+        >>> from drake_diff.trials import save_robustness
+        >>> save_robustness(result, mkdtemp()).verdict
         'pass'
     """
     with written_whole(directory) as folder:

@@ -25,7 +25,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
 from drake_diff.exceptions import DrakeDiffError
-from drake_diff.motion import Gaussian
+from drake_diff.motion import Gaussian, smooth
 
 Array = NDArray[np.float64]
 GRAVITY, MASS, RADIUS, ROD = 9.81, 1.0, 0.1, 0.5
@@ -68,14 +68,14 @@ def truth_of(case: Case, x: Array, sigma: float, samples: int = TRUTH_SAMPLES) -
     if case.closed_form:
         value, gradient = case.closed_form(x, sigma)
         return value, gradient, np.zeros(len(x))
-    found = dd.smooth(case.f, x, noise=Gaussian(sigma), samples=samples, seed=TRUTH_SEED, method="zeroth")
+    found = smooth(case.f, x, noise=Gaussian(sigma), samples=samples, seed=TRUTH_SEED, method="zeroth")
     return float(found.value[0]), found.jacobian[0], np.sqrt(found.variance[0])
 
 
 def estimate(case: Case, order: str, x: Array, sigma: float, samples: int, seed: int) -> tuple[Array, Array, int]:
     """The gradient (n,), its variance (n,), and the calls that it took."""
     derivative = None if order == "zeroth" else case.derivative
-    found = dd.smooth(case.f, x, derivative, noise=Gaussian(sigma), samples=samples, seed=seed, method=order)
+    found = smooth(case.f, x, derivative, noise=Gaussian(sigma), samples=samples, seed=seed, method=order)
     calls = {"first": samples, "zeroth": samples + 1, "blend": 2 * samples + 2}[order]
     return found.jacobian[0], (found.variance - found.bias_square)[0], calls
 

@@ -12,6 +12,7 @@ from pydrake.multibody.tree import PdControllerGains
 import drake_diff as dd
 from drake_diff._base.differences import sweep_of
 from drake_diff._base.refusal import Refusal
+from drake_diff.certificates import certify_jacobian
 from drake_diff.certificates.certificate import judge
 from drake_diff.certificates.differences import look_around
 from drake_diff.derivatives.refine_step import RefinedSteps
@@ -31,11 +32,11 @@ def test_a_right_jacobian_agrees_and_one_entry_1_percent_off_is_caught(n):
     f, jacobian = smooth(n)
     x = np.random.default_rng(1).standard_normal(n)
     right = jacobian(x)
-    dd.certificates.certify_jacobian(f, x, right).require()
+    certify_jacobian(f, x, right).require()
     for i, j in [(0, 0), (n - 1, n // 2), (n // 3, n - 1)]:
         wrong = right.copy()
         wrong[i, j] *= 1.01
-        certificate = dd.certificates.certify_jacobian(f, x, wrong)
+        certificate = certify_jacobian(f, x, wrong)
         assert certificate.verdict == "disagree"
         assert (certificate.worst.row, certificate.worst.column) == (f"f[{i}]", f"x[{j}]")
         assert certificate.count("agree") == n * n - 1
@@ -52,8 +53,8 @@ def test_all_points_in_one_call_give_the_same_certificate():
     wrong = jacobian(x)
     wrong[2, 3] *= 1.01
     for claimed, verdict in ((jacobian, "agree"), (wrong, "disagree")):
-        one = dd.certificates.certify_jacobian(f, x, claimed)
-        together = dd.certificates.certify_jacobian(many, x, claimed, batched=True)
+        one = certify_jacobian(f, x, claimed)
+        together = certify_jacobian(many, x, claimed, batched=True)
         assert one.verdict == together.verdict == verdict
         assert np.array_equal(one.codes, together.codes)
         assert np.array_equal(one.difference, together.difference)
@@ -99,9 +100,7 @@ def test_one_entry_of_a_step_1_percent_off_is_caught(tmp_path, nx):
 
 
 def verdict(f, derivative, x=0.0, **options):
-    return dd.certificates.certify_jacobian(
-        f, [x], [[derivative]] if np.isscalar(derivative) else derivative, **options
-    ).verdict
+    return certify_jacobian(f, [x], [[derivative]] if np.isscalar(derivative) else derivative, **options).verdict
 
 
 @pytest.mark.parametrize("claimed", [0.0, 1.0, -1.0])
@@ -137,19 +136,19 @@ def test_what_a_value_at_rest_does_not_depend_on_is_known_and_one_wrong_entry_is
         return np.array([np.cos(x[0]), x[1]])
 
     right = np.array([[0.0, 0.0], [0.0, 1.0]])
-    certificate = dd.certificates.certify_jacobian(f, np.zeros(2), right)
+    certificate = certify_jacobian(f, np.zeros(2), right)
     assert certificate.verdict == "agree"
     for entry in ((0, 0), (0, 1), (1, 0)):
         wrong = right.copy()
         wrong[entry] = 1e-3
-        assert dd.certificates.certify_jacobian(f, np.zeros(2), wrong).verdict != "agree"
-    hidden = dd.certificates.certify_jacobian(lambda x: np.array([1e20 + x[0], x[1]]), np.zeros(2), right)
+        assert certify_jacobian(f, np.zeros(2), wrong).verdict != "agree"
+    hidden = certify_jacobian(lambda x: np.array([1e20 + x[0], x[1]]), np.zeros(2), right)
     assert hidden.verdict == "undecided"  # the slope is 1
 
 
 def test_a_large_offset_that_hides_the_derivative_is_undecided():
     """Next to 1e15 the rounding of the value is 0.1: no step resolves a slope of 1."""
-    certificate = dd.certificates.certify_jacobian(lambda x: 1e15 + x, [0.0], [[1.0]])
+    certificate = certify_jacobian(lambda x: 1e15 + x, [0.0], [[1.0]])
     assert certificate.verdict == "undecided"
     with pytest.raises(CertificateError, match="undecided"):
         certificate.require()
@@ -164,12 +163,12 @@ def test_what_a_solver_leaves_unsolved_is_no_jump():
 
 def test_a_derivative_that_is_not_finite_is_refused():
     with pytest.raises(GradientError, match="not finite"):
-        dd.certificates.certify_jacobian(np.sin, [0.0], [[np.nan]])
+        certify_jacobian(np.sin, [0.0], [[np.nan]])
 
 
 def test_a_derivative_of_the_wrong_shape_is_refused():
     with pytest.raises(ShapeError, match="derivative"):
-        dd.certificates.certify_jacobian(lambda x: np.ones(2), [0.0], [[1.0]], rows=("a", "b"))
+        certify_jacobian(lambda x: np.ones(2), [0.0], [[1.0]], rows=("a", "b"))
 
 
 def test_an_unknown_method_is_refused_with_the_list_of_methods(load):
@@ -186,7 +185,7 @@ def test_an_unknown_method_is_refused_with_the_list_of_methods(load):
 def test_nothing_but_agree_passes_require():
     for claimed, f in ((0.0, np.abs), (2.0, np.sin)):
         with pytest.raises(CertificateError, match="derivative"):
-            dd.certificates.certify_jacobian(f, [0.0], [[claimed]]).require()
+            certify_jacobian(f, [0.0], [[claimed]]).require()
 
 
 SMOOTH = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf")
@@ -253,7 +252,7 @@ def test_a_rollout_that_starts_at_touchdown_is_refused(load):
 
 
 def test_the_printed_certificate_names_the_worst_entry_and_both_numbers():
-    text = str(dd.certificates.certify_jacobian(np.sin, [0.0], [[1.01]], rows=("y",), columns=("x",)))
+    text = str(certify_jacobian(np.sin, [0.0], [[1.01]], rows=("y",), columns=("x",)))
     assert "disagree" in text
     assert "d y / d x: derivative 1.01, differences 1" in text
 
@@ -262,7 +261,7 @@ def test_a_certificates_repr_is_short_and_its_html_is_escaped(load):
     """The names come from models, which are untrusted text: 400 entries print in a few lines."""
     f, jacobian = smooth(20)
     names = [f"<i>{i}</i>" for i in range(20)]
-    certificate = dd.certificates.certify_jacobian(f, np.zeros(20), jacobian(np.zeros(20)), rows=names)
+    certificate = certify_jacobian(f, np.zeros(20), jacobian(np.zeros(20)), rows=names)
     assert repr(certificate).startswith(
         "Certificate of the derivative: agree (400 agree of 400 entries, given, would have noticed 0.0006 %)\n"
     )
@@ -297,7 +296,7 @@ STAIRS = {
 @each_row("name", list(STAIRS))
 def test_stairs_are_discontinuous_whatever_is_claimed_and_the_jumps_are_told(name):
     for claimed in (0.0, 1.0):
-        certificate = dd.certificates.certify_jacobian(STAIRS[name], [0.3123412], [[claimed]])
+        certificate = certify_jacobian(STAIRS[name], [0.3123412], [[claimed]])
         assert certificate.verdict == "discontinuous"
         assert "it jumps by" in str(certificate)
 
@@ -310,9 +309,9 @@ def test_a_difference_of_nearly_equal_numbers_is_no_staircase():
         random = np.random.default_rng(seed)
         x = random.standard_normal(8)
         x[6:] = 5.54382 + random.standard_normal(2) * 10 ** random.uniform(-8, -6)
-        certificate = dd.certificates.certify_jacobian(lambda z: [z[0], 50 * (z[6] - z[7])], x, slope)
+        certificate = certify_jacobian(lambda z: [z[0], 50 * (z[6] - z[7])], x, slope)
         assert certificate.verdict == "agree", (seed, str(certificate))
-        wrong = dd.certificates.certify_jacobian(lambda z: [z[0], 50 * (z[6] - z[7])], x, 1.001 * slope)
+        wrong = certify_jacobian(lambda z: [z[0], 50 * (z[6] - z[7])], x, 1.001 * slope)
         assert wrong.verdict == "disagree"
 
 
@@ -325,7 +324,7 @@ def test_a_difference_of_nearly_equal_numbers_is_no_staircase():
     ],
 )
 def test_the_reason_of_a_discontinuity_is_told_with_numbers(f, reason):
-    certificate = dd.certificates.certify_jacobian(f, [0.0], [[0.0]])
+    certificate = certify_jacobian(f, [0.0], [[0.0]])
     assert certificate.verdict == "discontinuous"
     assert reason in certificate.worst.reason
     assert reason in str(certificate)
@@ -352,7 +351,7 @@ def test_the_scatter_of_the_values_says_how_small_an_error_would_be_noticed():
     powers = []
     for scatter in (1e-12, 1e-9, 1e-7, 1e-4):
         f = lambda x, e=scatter: np.sin(x) + e * np.sin(1e12 * x)  # noqa: E731
-        certificate = dd.certificates.certify_jacobian(f, [0.3], [[np.cos(0.3)]])
+        certificate = certify_jacobian(f, [0.3], [[np.cos(0.3)]])
         entry = certificate.worst
         powers.append(certificate.power)
         assert abs(entry.difference - np.cos(0.3)) <= entry.noticeable
@@ -397,8 +396,8 @@ def test_the_same_differences_judge_another_derivative():
     x = np.random.default_rng(1).standard_normal(5)
     wrong = jacobian(x)
     wrong[2, 3] *= 1.01
-    first = dd.certificates.certify_jacobian(f, x, jacobian(x))
-    again, anew = first.of(wrong), dd.certificates.certify_jacobian(f, x, wrong)
+    first = certify_jacobian(f, x, jacobian(x))
+    again, anew = first.of(wrong), certify_jacobian(f, x, wrong)
     assert np.array_equal(again.codes, anew.codes)
     assert again.worst == anew.worst
     with pytest.raises(ShapeError, match="derivative"):
@@ -456,10 +455,10 @@ def test_motors_in_the_air_are_not_called_discontinuous():
 def test_a_product_that_is_zero_in_both_factors_is_smooth():
     """As the rate of a quaternion at rest: beside the point its derivative is another number, of mixed derivatives."""
     jacobian = lambda z: np.array([[z[1], z[0], 0.0], [0.0, 0.0, 3.0]])  # noqa: E731
-    certificate = dd.certificates.certify_jacobian(lambda z: np.array([z[0] * z[1], 3 * z[2]]), np.zeros(3), jacobian)
+    certificate = certify_jacobian(lambda z: np.array([z[0] * z[1], 3 * z[2]]), np.zeros(3), jacobian)
     certificate.require()
     wrong = lambda z: jacobian(z) + np.array([[0.0, 1e-6, 0.0], [0.0, 0.0, 0.0]])  # noqa: E731
-    false = dd.certificates.certify_jacobian(lambda z: np.array([z[0] * z[1], 3 * z[2]]), np.zeros(3), wrong)
+    false = certify_jacobian(lambda z: np.array([z[0] * z[1], 3 * z[2]]), np.zeros(3), wrong)
     assert false.verdict != "agree"
 
 
@@ -468,7 +467,7 @@ def test_a_row_of_rounding_alone_is_zero():
     for size, verdict_of_zero in ((1e-50, "agree"), (1e-12, "disagree")):
         f = lambda x, size=size: np.array([10 * x[0], size * np.sin(x[1])])  # noqa: E731
         zero = np.array([[10.0, 0.0], [0.0, 0.0]])
-        assert dd.certificates.certify_jacobian(f, np.zeros(2), zero).verdict == verdict_of_zero
+        assert certify_jacobian(f, np.zeros(2), zero).verdict == verdict_of_zero
 
 
 def test_what_does_not_agree_at_a_joint_limit_says_so(tmp_path):
@@ -493,9 +492,7 @@ def test_terms_that_cancel_do_not_jump():
     for _ in range(200):
         a, z = random.uniform(-100, 100), random.uniform(-10, 10)
         x = np.array([z, z + random.choice([0, 1e-9, 1e-7, 1e-5])])
-        certificate = dd.certificates.certify_jacobian(
-            lambda z, a=a: np.array([a * (z[0] - z[1])]), x, lambda z, a=a: [[a, -a]]
-        )
+        certificate = certify_jacobian(lambda z, a=a: np.array([a * (z[0] - z[1])]), x, lambda z, a=a: [[a, -a]])
         assert certificate.verdict == "agree", certificate
 
 
@@ -506,4 +503,4 @@ def test_a_derivative_that_jumps_where_terms_cancel_is_caught():
     def steps(z):
         return np.array([np.round(65 * (z[0] - z[1]), 5)])
 
-    assert dd.certificates.certify_jacobian(steps, x, [[65.0, -65.0]]).verdict == "discontinuous"
+    assert certify_jacobian(steps, x, [[65.0, -65.0]]).verdict == "discontinuous"

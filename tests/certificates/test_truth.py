@@ -13,6 +13,7 @@ import drake_diff as dd
 from drake_diff.certificates.truth import TrueSlope, judged, softest_contact
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.motion.continuous import ContinuousMotion, ImplicitSteps
+from drake_diff.runs import save_rollout
 from drake_diff.runs.plan_record import SlopeEvidence
 
 
@@ -206,7 +207,7 @@ def test_the_truth_goes_into_a_record_and_back(dropped, tmp_path):
     """One slope is not ours; one is not measured; the steps' gradient is refused, and the record says so."""
     _, model = dropped("sap", relaxation_time=0.005, dissipation=0.2)
     certificate = dd.certify_rollout(model, (0.2, -2.0), None, height, num_steps=15, refine=True, seconds=60)
-    saved = dd.runs.save_rollout(certificate, model, tmp_path / "run")
+    saved = save_rollout(certificate, model, tmp_path / "run")
     read = dd.load_record(tmp_path / "run")
     assert read == saved
     assert read.verdict == "fail"
@@ -224,15 +225,13 @@ def test_the_truth_goes_into_a_record_and_back(dropped, tmp_path):
     with pytest.raises(ArtifactError, match="expected value and error where the slope exists"):
         dd.load_record(tmp_path / "run")
     slow = dd.certify_rollout(model, (0.2, -2.0), None, height, num_steps=15, method="continuous", seconds=1e-6)
-    kept = dd.runs.save_rollout(slow, model, tmp_path / "cut").rollout.truth
+    kept = save_rollout(slow, model, tmp_path / "cut").rollout.truth
     assert kept.loss is None
     assert {slope.exists for slope in kept.slopes} == {None}
     with pytest.raises(ValueError, match="expected a reason where there is no slope"):
         SlopeEvidence(**kept.slopes[0].model_dump() | {"reason": ""})
     with pytest.raises(InputError, match="not sampled"):
-        dd.runs.save_rollout(
-            dd.certify_rollout(model, (0.2, -2.0), None, height, num_steps=15, sampled=True), model, tmp_path
-        )
+        save_rollout(dd.certify_rollout(model, (0.2, -2.0), None, height, num_steps=15, sampled=True), model, tmp_path)
 
 
 @pytest.mark.parametrize("stiffness", [1e4, 1e7])

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import InputError
+from drake_diff.logs import read_mcap
 from drake_diff.logs.channels import TYPES
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.optimize.solution import Solution
@@ -63,7 +64,7 @@ def test_recover_says_how_much_and_what_stopped_it(file):
     file.write_bytes(whole[: len(whole) // 2])
     done = drake_diff("mcap", "recover", file, file.with_name("b.mcap"))
     assert done.exit_code == 0
-    log = dd.logs.read_mcap(file.with_name("b.mcap"))
+    log = read_mcap(file.with_name("b.mcap"))
     count = len(log.messages["/state"])
     assert 0 < count < 3000
     assert f"{count} messages and 2 attachments to" in done.stdout

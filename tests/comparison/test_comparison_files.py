@@ -13,7 +13,10 @@ from typer.testing import CliRunner
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.comparison import files as comparison_trace
+from drake_diff.comparison import save_comparison
 from drake_diff.comparison.files import comparison_data, record_of
+from drake_diff.logs import read_mcap
+from drake_diff.runs import ComparisonRecord
 from drake_diff.runs.sealed import own_sha256
 
 
@@ -30,13 +33,13 @@ def ball():
 @pytest.fixture(scope="module")
 def saved(ball, tmp_path_factory):
     folder = tmp_path_factory.mktemp("comparison")
-    return folder, dd.comparison.save_comparison(ball, folder)
+    return folder, save_comparison(ball, folder)
 
 
 def test_the_record_has_every_number_and_its_own_hash(ball, saved):
     folder, record = saved
     fields = json.loads((folder / "record.json").read_text())
-    assert dd.runs.ComparisonRecord.model_validate(fields) == record
+    assert ComparisonRecord.model_validate(fields) == record
     assert own_sha256(fields) == fields["record_sha256"]
     for file in record.files.values():
         assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
@@ -51,14 +54,14 @@ def test_the_record_has_every_number_and_its_own_hash(ball, saved):
 
 
 def test_the_record_is_the_same_but_for_the_times(ball, saved, tmp_path):
-    again = dd.comparison.save_comparison(ball, tmp_path / saved[0].name)
+    again = save_comparison(ball, tmp_path / saved[0].name)
     apart = {"wall_clock": None, "record_sha256": "", "files": {}}
     assert again.model_copy(update=apart) == saved[1].model_copy(update=apart)
     assert (tmp_path / saved[0].name / "trace.mcap").read_bytes() == (saved[0] / "trace.mcap").read_bytes()
 
 
 def test_the_trace_has_every_engines_motion(ball, saved):
-    log = dd.logs.read_mcap(saved[0] / "trace.mcap")
+    log = read_mcap(saved[0] / "trace.mcap")
     topics = [t for t in log.messages if t.endswith("/state")]
     assert topics == ["/0_drake_sap_autodiff/state", "/1_drake_lagged_autodiff/state", "/2_pinocchio/state"]
     for topic, e in zip(topics, ball.engines, strict=True):
@@ -122,21 +125,21 @@ def test_names_of_engines_are_escaped(load, tmp_path):
     found = dd.compare(model, (engine,), num_steps=5)
     assert "&lt;script&gt;" in found._repr_html_()
     assert "<script>" not in found._repr_html_()
-    dd.comparison.save_comparison(found, tmp_path)
+    save_comparison(found, tmp_path)
     page = (tmp_path / "comparison.html").read_text()
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
 
 
 def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(ball, tmp_path, monkeypatch):
-    before = dd.comparison.save_comparison(ball, tmp_path / "out")
+    before = save_comparison(ball, tmp_path / "out")
 
     def fails(*_):
         raise OSError("no space left")
 
     monkeypatch.setattr(comparison_trace, "write_comparison_trace", fails)
     with pytest.raises(OSError, match="no space"):
-        dd.comparison.save_comparison(ball, tmp_path / "out")
+        save_comparison(ball, tmp_path / "out")
     (left,) = tmp_path.glob("out.partial-*")
     assert json.loads((left / "record.json").read_text())["verdict"] == "incomplete"
     assert not (left / "comparison.html").exists()

@@ -15,9 +15,11 @@ from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff.cli.main import app
+from drake_diff.comparison import read_recording
 from drake_diff.comparison.attribution import move
 from drake_diff.engines.formats import mjcf
 from drake_diff.exceptions import ArtifactError, InputError, ShapeError
+from drake_diff.logs import read_mcap
 
 H = 0.01
 INPUTS = 2 * np.sin(np.arange(40))[:, None]
@@ -90,7 +92,7 @@ def test_the_command_compares_recordings_and_saves_them(load, tmp_path):
         done = CliRunner().invoke(app, command)
         assert done.exit_code == status, done.output
     assert "as if the time step were half" in done.output
-    log = dd.logs.read_mcap(next((tmp_path / "out").glob("*.mcap")))
+    log = read_mcap(next((tmp_path / "out").glob("*.mcap")))
     np.testing.assert_allclose(log.arrays("/3_other/state")["time"], 5 * H * np.arange(9))
     frames = {t.child_frame_id.split("/")[0] for _, m in log.messages["/tf"] for t in m.transforms}
     assert "2_same" in frames
@@ -227,12 +229,10 @@ ROWS = [[0, 0.1, 0.2, 0.3, 0.4, 1.5], [0.01, 1.1, 1.2, 1.3, 1.4, 2.5], [0.02, 2.
 
 def test_csv_columns_are_found_by_name(load, tmp_path):
     model = load("cart_pole.urdf")
-    plain = dd.comparison.read_recording(write_csv(tmp_path / "run.csv", HEADER, ROWS), model)
+    plain = read_recording(write_csv(tmp_path / "run.csv", HEADER, ROWS), model)
     order = [5, 4, 0, 2, 1, 3]
     turned = [[row[i] for i in order] for row in [HEADER, *ROWS]]
-    other = dd.comparison.read_recording(
-        write_csv(tmp_path / "turned.csv", turned[0], turned[1:]), model, name="turned"
-    )
+    other = read_recording(write_csv(tmp_path / "turned.csv", turned[0], turned[1:]), model, name="turned")
     for recording in (plain, other):
         np.testing.assert_array_equal(recording.times, [0, 0.01, 0.02])
         np.testing.assert_array_equal(recording.xs, [row[1:5] for row in ROWS])
@@ -240,7 +240,7 @@ def test_csv_columns_are_found_by_name(load, tmp_path):
     assert (plain.name, plain.version, other.name) == ("run", "(version unknown)", "turned")
     told = {"engine": "isaaclab", "version": "3.0.0", "time step": 0.01, "gravity": [0, 0, -9.81], "seeds": [1, 2]}
     (tmp_path / "run.contract.json").write_text(json.dumps(told))
-    plain = dd.comparison.read_recording(tmp_path / "run.csv", model)
+    plain = read_recording(tmp_path / "run.csv", model)
     assert (plain.name, plain.version, plain.facts["time step"]) == ("isaaclab", "3.0.0", "0.01")
 
 
@@ -266,7 +266,7 @@ def changed(row, column, value):
 )
 def test_a_bad_csv_is_named_by_line_and_column(load, tmp_path, header, rows, match):
     with pytest.raises(InputError, match=match):
-        dd.comparison.read_recording(write_csv(tmp_path / "bad.csv", header, rows), load("cart_pole.urdf"))
+        read_recording(write_csv(tmp_path / "bad.csv", header, rows), load("cart_pole.urdf"))
 
 
 def test_what_is_no_recording_is_refused(load, tmp_path):
@@ -280,14 +280,14 @@ def test_what_is_no_recording_is_refused(load, tmp_path):
         ("none.csv", InputError),
     ):
         with pytest.raises(error, match=name):
-            dd.comparison.read_recording(tmp_path / name, model)
+            read_recording(tmp_path / name, model)
     with pytest.raises(ArtifactError, match=r"junk\.mcap"):
-        dd.comparison.read_recording(tmp_path / "junk.mcap", model)
+        read_recording(tmp_path / "junk.mcap", model)
     write_csv(tmp_path / "run.csv", HEADER, ROWS)
     for text, match in (("{", "JSON object"), ("[]", "JSON object"), ('{"color": "red"}', "color")):
         (tmp_path / "run.contract.json").write_text(text)
         with pytest.raises(InputError, match=match):
-            dd.comparison.read_recording(tmp_path / "run.csv", model)
+            read_recording(tmp_path / "run.csv", model)
 
 
 # ---- MCAP of this project, and ROS 2 -----------------------------------------------------------------------------
@@ -300,12 +300,12 @@ def run(pushed):
 
 def test_our_own_trace_is_a_recording_to_the_bit(run, load):
     model, motion, folder = run
-    found = dd.comparison.read_recording(folder / "trace.mcap", model)
+    found = read_recording(folder / "trace.mcap", model)
     assert found.xs.tobytes() == motion.xs.tobytes()
     assert found.us.tobytes() == motion.us.tobytes()
     assert compared(model, found).step_gaps.max() == 0
     with pytest.raises(InputError, match="names of q in /state"):
-        dd.comparison.read_recording(folder / "trace.mcap", load("pendulum.urdf"))
+        read_recording(folder / "trace.mcap", load("pendulum.urdf"))
 
 
 def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
@@ -315,7 +315,7 @@ def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
     model, motion, folder = run
     export_ros2(folder, tmp_path / "bag")
     for path in (tmp_path / "bag", tmp_path / "bag" / "bag.mcap"):
-        found = dd.comparison.read_recording(path, model)
+        found = read_recording(path, model)
         assert found.xs.tobytes() == motion.xs.tobytes()
         assert found.us.tobytes() == motion.us.tobytes()
         assert compared(model, found).verdict == "same"
@@ -332,7 +332,7 @@ def test_a_damaged_bag_is_no_recording(run, tmp_path):
     file.write_bytes(whole[: len(whole) // 2])
     for path in (file, tmp_path / "bag"):
         with pytest.raises(ArtifactError):
-            dd.comparison.read_recording(path, model)
+            read_recording(path, model)
 
 
 def bag_of(path, messages):
@@ -406,7 +406,7 @@ def test_odometry_s_frames_and_quaternion_are_mapped(tmp_path):
     """The twist is turned from the child frame, w goes to the front: a mistake in either leaves no step the same."""
     part = lambda t, x: ("/odom", "nav_msgs/msg/Odometry", "world", t, lambda y: odometry(y, x, rotation_of(x)))  # noqa: E731
     model, xs, path = ball_bag(tmp_path / "bag", [part])
-    found = dd.comparison.read_recording(path, model)
+    found = read_recording(path, model)
     np.testing.assert_allclose(found.xs[0], BALL, atol=1e-14)  # by hand, the rotation by Drake's own
     np.testing.assert_allclose(found.xs, xs, atol=1e-14)
     np.testing.assert_allclose(found.times, H * np.arange(6), atol=1e-9)  # from 0, to the nanosecond
@@ -433,11 +433,11 @@ def test_pose_and_twist_say_their_frame(tmp_path, frame):
         return "/twist", "geometry_msgs/msg/TwistStamped", frame, t, lambda types: velocity(types, x)
 
     model, xs, path = ball_bag(tmp_path / "bag", [poses, twists])
-    np.testing.assert_allclose(dd.comparison.read_recording(path, model).xs, xs, atol=1e-14)
+    np.testing.assert_allclose(read_recording(path, model).xs, xs, atol=1e-14)
     unknown = lambda t, x: (*twists(t, x)[:2], "camera", *twists(t, x)[3:])  # noqa: E731
     _, _, path = ball_bag(tmp_path / "camera", [poses, unknown])
     with pytest.raises(InputError, match=r"frame_id of TwistStamped: expected 'world'.*got 'camera'"):
-        dd.comparison.read_recording(path, model)
+        read_recording(path, model)
 
 
 # ---- several free bodies -----------------------------------------------------------------------------------------
@@ -465,10 +465,10 @@ def test_a_recording_of_two_free_bodies_is_compared_and_the_wrong_mass_is_seen(t
     needs("mujoco")
     model = two_bases(tmp_path)
     right = csv_of(tmp_path / "right.csv", model, two_in_mujoco(model))
-    e = compared(model, dd.comparison.read_recording(right, model))
+    e = compared(model, read_recording(right, model))
     assert (e.verdict, e.first.as_if) == ("other law", "as if rotations were by the exponential")
     wrong = csv_of(tmp_path / "wrong.csv", model, two_in_mujoco(two_bases(tmp_path, 0.65)))
-    e = compared(model, dd.comparison.read_recording(wrong, model))
+    e = compared(model, read_recording(wrong, model))
     assert e.verdict == "unexplained"
     assert e.step_gaps.max() > 1e-4  # 30 % of an arm's mass, where the turn's law makes 1e-7
 
@@ -521,9 +521,9 @@ def test_the_odometry_of_two_bodies_is_told_apart(tmp_path, names, match):
     path = two_bag(tmp_path / "bag", model, xs, names)
     if match:
         with pytest.raises(InputError, match=match):
-            dd.comparison.read_recording(path, model)
+            read_recording(path, model)
         return
-    found = dd.comparison.read_recording(path, model)
+    found = read_recording(path, model)
     np.testing.assert_allclose(found.xs, xs, atol=1e-14)
     np.testing.assert_array_equal(found.us, np.tile([0.1, 0.2], (10, 1)))
 
@@ -547,7 +547,7 @@ def test_a_body_that_is_missing_at_one_time_is_named(tmp_path):
                  lambda types, body=body, frame=frame: {**odometry(types, body, rotation_of(body)),
                                                         "child_frame_id": frame})  # fmt: skip
     with pytest.raises(InputError, match=r"t = 1700000000030000000 ns: .*got the joints, right_body alone"):
-        dd.comparison.read_recording(bag_of(tmp_path / "bag", rows), model)
+        read_recording(bag_of(tmp_path / "bag", rows), model)
 
 
 def test_the_exported_bag_of_two_free_bodies_is_a_recording(tmp_path):
@@ -565,7 +565,7 @@ def test_the_exported_bag_of_two_free_bodies_is_a_recording(tmp_path):
     write_trace(tmp_path / "trace.mcap", measure(solution), {})
     counts = export_ros2(tmp_path, tmp_path / "bag")
     assert counts["/odometry/left_body"] == counts["/odometry/right_body"] == 6
-    found = dd.comparison.read_recording(tmp_path / "bag", model)
+    found = read_recording(tmp_path / "bag", model)
     np.testing.assert_allclose(found.xs, motion.xs, atol=1e-15)  # the twist is turned there and back
     np.testing.assert_array_equal(found.us, motion.us)
 
@@ -581,7 +581,7 @@ def test_a_follower_is_left_out_of_a_bag_s_state(tmp_path):
          joints(["b", "a"], [1.7 * q + 0.3, q], [1.7 * v, v], [0.0, 2.0]))
         for k, (q, v) in enumerate(xs)
     ]  # fmt: skip
-    found = dd.comparison.read_recording(bag_of(tmp_path / "bag", rows), model)
+    found = read_recording(bag_of(tmp_path / "bag", rows), model)
     np.testing.assert_array_equal(found.xs, xs)
     np.testing.assert_array_equal(found.us, np.full((4, 1), 2.0))
 
@@ -603,7 +603,7 @@ def joints(names, position, velocity, effort):
 def test_what_joint_states_lack_is_named(load, tmp_path, fields, match):
     rows = [("/joint_states", "sensor_msgs/msg/JointState", "", STAMP + k, fields) for k in (0, 10_000_000)]
     with pytest.raises(InputError, match=match):
-        dd.comparison.read_recording(bag_of(tmp_path / "bag", rows), load("cart_pole.urdf"))
+        read_recording(bag_of(tmp_path / "bag", rows), load("cart_pole.urdf"))
 
 
 def test_a_bag_without_what_the_model_has_is_refused(load, tmp_path):
@@ -612,10 +612,10 @@ def test_a_bag_without_what_the_model_has_is_refused(load, tmp_path):
     ]
     path = bag_of(tmp_path / "bag", rows)
     with pytest.raises(InputError, match="topics of geometry_msgs/msg/PoseStamped"):
-        dd.comparison.read_recording(path, load("projectile.sdf"))
+        read_recording(path, load("projectile.sdf"))
     (tmp_path / "empty").mkdir()
     with pytest.raises(ArtifactError, match="not a ROS 2 bag"):
-        dd.comparison.read_recording(Path(tmp_path / "empty"), load("projectile.sdf"))
+        read_recording(Path(tmp_path / "empty"), load("projectile.sdf"))
 
 
 def test_a_recording_shows_in_jupyter_with_its_name_escaped():

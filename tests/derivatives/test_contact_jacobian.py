@@ -14,6 +14,7 @@ from drake_diff.derivatives.contact.active_contacts import read_pairs
 from drake_diff.derivatives.contact.laws import ContactLaw
 from drake_diff.derivatives.steps import take_step
 from drake_diff.exceptions import GradientError, SimulationError
+from drake_diff.model import contact_modes
 from drake_diff.model.parameters import select
 from drake_diff.model.step import set_state
 
@@ -129,7 +130,7 @@ def test_a_tumbling_robots_steps_are_autodiffs(tmp_path, approximation):
     states, modes = _touching_states(model, 25, seed=3), set()
     for x, u in states:
         _agree(model, x, u)
-        modes |= set(dd.contact_modes(model, x, u).values())
+        modes |= set(contact_modes(model, x, u).values())
     assert modes == {"sticking", "sliding", "separated"}
 
 

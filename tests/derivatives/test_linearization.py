@@ -24,6 +24,7 @@ from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.mechanics.tree import ForwardDynamics
 from drake_diff.model.parameters import applied, select
+from drake_diff.motion import TVLQR
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
 SAME = 1e-9  # of the largest entry, as the gate has it: one derivative in two orders of operations
@@ -388,7 +389,7 @@ def test_ilqr_is_the_same_with_and_without(load):
 def test_tvlqr_is_the_same_with_and_without(load):
     def gains(model):
         us = 0.2 * np.random.default_rng(0).standard_normal((20, 2))
-        return dd.TVLQR(model, dd.rollout(model, [0.4, -0.9, 1.3, -0.6], us).xs, us, np.eye(4), np.eye(2)).gains
+        return TVLQR(model, dd.rollout(model, [0.4, -0.9, 1.3, -0.6], us).xs, us, np.eye(4), np.eye(2)).gains
 
     ours, theirs = with_and_without(load, gains)
     np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)

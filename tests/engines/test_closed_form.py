@@ -11,6 +11,7 @@ from helpers.robots import example_robot
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff.comparison import save_comparison
 from drake_diff.engines import ClosedForm
 from drake_diff.engines.contract import UNKNOWN, is_another_model
 from drake_diff.exceptions import InputError, NonFiniteError, ShapeError, UnknownNameError
@@ -197,7 +198,7 @@ def test_a_function_that_fails_on_the_way_is_not_compared(model):
 
 def test_the_record_has_the_functions_name_hash_and_parameters_and_verify_says_what_it_cannot(model, tmp_path):
     both = dd.compare(model, [mine(model)], num_steps=3)
-    record = dd.comparison.save_comparison(both, tmp_path / "out")
+    record = save_comparison(both, tmp_path / "out")
     kept = dd.load_record(tmp_path / "out").engines[1].function
     assert kept.name == "cart_pole"
     assert kept.sha256 == sha256(inspect.getsource(cart_pole).encode()).hexdigest()

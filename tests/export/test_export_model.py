@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff.cli.main import app
+from drake_diff.comparison import read_recording
 from drake_diff.comparison.attribution import move
 from drake_diff.engines.closed_form import BY_MODEL
 from drake_diff.engines.formats import urdf
@@ -89,7 +90,7 @@ def test_the_other_side_s_motion_comes_back_and_is_the_same(load, tmp_path):
     samples = [[repr(float(n)) for n in (0.01 * k, *x, *u)] for k, x in enumerate(motion.xs)]
     (out / "run.csv").write_text("\n".join([header, *map(",".join, samples)]))
     (out / "run.contract.json").write_text('{"engine": "theirs", "time step": 0.01, "gravity": [0, 0, -9.81]}')
-    e = dd.compare(model, (), recordings=(dd.comparison.read_recording(out / "run.csv", model),)).engines[-1]
+    e = dd.compare(model, (), recordings=(read_recording(out / "run.csv", model),)).engines[-1]
     assert (e.engine, e.verdict, len(e.step_gaps)) == ("theirs", "same", 30)
 
 

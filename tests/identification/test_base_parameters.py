@@ -6,15 +6,15 @@ from helpers.robots import example_robot, state_in_range
 from helpers.table import slow_after
 from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
 
-import drake_diff as dd
 from drake_diff.exceptions import ModelError, UnknownNameError
+from drake_diff.identification import base_parameters
 from drake_diff.identification.base import NAMES
 from drake_diff.identification.tree import ten_numbers, tree_for_identification
 
 
 def test_two_rods_have_the_textbooks_sums(load):
     """Rods of 1 kg and 0.8 m, 0.7 kg and 0.5 m: I1 + l1^2 m2, m1 c1 + l1 m2, I2, m2 c2; none weighs sideways."""
-    found = {next(iter(b.parts)): b for b in dd.identification.base_parameters(load("double_pendulum.urdf"))}
+    found = {next(iter(b.parts)): b for b in base_parameters(load("double_pendulum.urdf"))}
     assert {name: dict(b.parts) for name, b in found.items()} == {
         "upper.inertia_yy": {"upper.inertia_yy": 1.0, "lower.mass": pytest.approx(0.64)},
         "upper.moment_x": {"upper.moment_x": 1.0},
@@ -26,7 +26,7 @@ def test_two_rods_have_the_textbooks_sums(load):
     assert found["upper.inertia_yy"].value == pytest.approx(0.8**2 / 3 + 0.64 * 0.7)
     assert found["upper.moment_z"].value == pytest.approx(-0.4 - 0.8 * 0.7)
     assert str(found["upper.moment_z"]) == "upper.moment_z - 0.8 lower.mass = -0.96 kg m"
-    (yy, *_) = dd.identification.base_parameters(load("double_pendulum.urdf"), ["lower"])
+    (yy, *_) = base_parameters(load("double_pendulum.urdf"), ["lower"])
     assert dict(yy.parts) == {
         "lower.inertia_yy": 1.0
     }  # with the upper one known, the lower one's mass is seen by itself
@@ -38,7 +38,7 @@ def test_two_rods_have_the_textbooks_sums(load):
 def test_numbers_that_leave_the_sums_leave_the_motion(name, count):
     """A UR5 has 36 of them, as is published of its kind. Drake's inverse dynamics cannot tell the changed robot."""
     model, random = example_robot(name), np.random.default_rng(0)
-    found = dd.identification.base_parameters(model)
+    found = base_parameters(model)
     if count is not None:
         assert len(found) == count
     tree = tree_for_identification(model)
@@ -73,9 +73,9 @@ def test_numbers_that_leave_the_sums_leave_the_motion(name, count):
 
 def test_what_makes_no_sense_is_refused(load):
     with pytest.raises(UnknownNameError, match="lowest"):
-        dd.identification.base_parameters(load("double_pendulum.urdf"), ["lowest"])
+        base_parameters(load("double_pendulum.urdf"), ["lowest"])
     with pytest.raises(ModelError, match="controllers"):
-        dd.identification.base_parameters(example_robot("finger_edu.urdf", gains=(1.0, 0.1)))
+        base_parameters(example_robot("finger_edu.urdf", gains=(1.0, 0.1)))
 
 
 def ten(link):

@@ -9,7 +9,9 @@ from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff.cli.main import app
+from drake_diff.comparison import read_recording
 from drake_diff.exceptions import DrakeDiffError, InputError, UnknownNameError
+from drake_diff.identification import excite
 
 
 def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motion_gives(write_urdf):
@@ -19,7 +21,7 @@ def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motio
     limits = {x_name: 0.5, v_name: 2.0, u_name: 3.0}
     found = {}
     for name, most in ((f"{u_name}.strength", 4), (f"{u_name}.strength", 0), ("block.mass", 0)):
-        e = dd.excite(
+        e = excite(
             model,
             [name],
             duration=1.0,
@@ -51,7 +53,7 @@ def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motio
 
 def test_what_no_motion_tells_stays_open(load):
     model, names = load("pendulum.urdf"), ["hinge.damping", "pole.center_of_mass"]
-    e = dd.excite(model, names, duration=1.0, limits={"hinge_q": 1.0}, max_iterations=0)
+    e = excite(model, names, duration=1.0, limits={"hinge_q": 1.0}, max_iterations=0)
     assert e.unidentifiable == ("pole.center_of_mass[1]: a change of it leaves the motion as it is",)
     assert np.isinf(e.deviations["pole.center_of_mass"][1])
     assert np.isfinite(e.deviations["hinge.damping"])
@@ -64,7 +66,7 @@ def test_a_default_state_at_a_limit_of_a_joint_is_moved_to_the_middle():
     lower, upper = model.position_limits
     i = model.position_names.index("shoulder_lift_q")
     assert model.default_state[i] == lower[i] == 0
-    e = dd.excite(model, ["elbow_flex.damping"], duration=1.0, max_iterations=0)
+    e = excite(model, ["elbow_flex.damping"], duration=1.0, max_iterations=0)
     assert e.xs[0, i] == pytest.approx(upper[i] / 2)
 
 
@@ -73,7 +75,7 @@ def test_what_is_promised_of_friction_is_what_its_sign_does(write_urdf):
     model, sigma = write_urdf(mass=2.0), 0.002
     limits = {"slide_x": 0.5, "slide_v": 2.0, "push": 3.0}
     given = {"duration": 1.0, "period": 0.02, "noise": {"slide_x": sigma}, "limits": limits, "harmonics": 2}
-    e = dd.excite(model, ["slide.coulomb_friction"], **given, max_iterations=0)
+    e = excite(model, ["slide.coulomb_friction"], **given, max_iterations=0)
     fine = np.linspace(0, 1, 50 * 400 + 1)
     slows = np.sign(np.interp(fine, e.times, e.xs[:, 1]))  # the speed is linear between samples
     speed = np.concatenate([[0.0], np.cumsum((slows[1:] + slows[:-1]) / 2)]) * (fine[1] - fine[0]) / 2.0
@@ -97,9 +99,9 @@ def test_the_command_prints_the_sentence_and_writes_a_recording(load, tmp_path):
     assert result.exit_code == 0, result.output
     model = load("pendulum.urdf")
     limits = {"hinge_q": (-1, 1.5), "motor": 4.0}
-    e = dd.excite(model, ["hinge.damping"], duration=1.0, max_iterations=0, limits=limits)
+    e = excite(model, ["hinge.damping"], duration=1.0, max_iterations=0, limits=limits)
     assert e.sentence in result.output
-    read = dd.comparison.read_recording(out, model)
+    read = read_recording(out, model)
     for one, other in ((read.times, e.times), (read.xs, e.xs), (read.us, e.us)):
         np.testing.assert_array_equal(one, other)  # printed to the last bit
     assert np.max(np.abs(read.us)) <= 4
@@ -126,13 +128,13 @@ def test_the_command_refuses_what_makes_no_sense(words, expected):
 def test_what_makes_no_sense_is_refused(load, write_urdf):
     model = load("cart_pole.urdf")
     with pytest.raises(InputError, match="limits of"):
-        dd.excite(write_urdf(), ["block.mass"])
+        excite(write_urdf(), ["block.mass"])
     with pytest.raises(UnknownNameError, match="limit of"):
-        dd.excite(model, ["pole.mass"], limits={"nothing": 1.0})
+        excite(model, ["pole.mass"], limits={"nothing": 1.0})
     with pytest.raises(InputError, match="one at rest"):
-        dd.excite(model, ["pole.mass"], x0=[0, 0, 1, 0])
+        excite(model, ["pole.mass"], x0=[0, 0, 1, 0])
     with pytest.raises(InputError, match="periods"):
-        dd.excite(model, ["pole.mass"], duration=0.1)
+        excite(model, ["pole.mass"], duration=0.1)
 
 
 @pytest.mark.slow
@@ -143,7 +145,7 @@ def test_estimates_from_motions_of_another_simulator_scatter_as_promised():
     names = ["lower.mass", "upper.mass", "elbow.damping"]
     sigma = {"shoulder_q": 1e-3, "elbow_q": 1e-3}
     limits = {"shoulder_q": 2.0, "elbow_q": 2.0, "shoulder_motor": 20.0, "elbow_motor": 5.0}
-    e = dd.excite(model, names, duration=2.0, noise=sigma, limits=limits, harmonics=3, max_iterations=8)
+    e = excite(model, names, duration=2.0, noise=sigma, limits=limits, harmonics=3, max_iterations=8)
     assert e.gain > 2
     text = (
         (MODELS / "double_pendulum.urdf")

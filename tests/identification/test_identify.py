@@ -11,6 +11,7 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
+from drake_diff.comparison import read_recording
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.identification.judge import FALSE_ALARM, colour_of, most_scatter
 from drake_diff.identification.messages import unidentifiable
@@ -286,7 +287,7 @@ def test_a_file_may_lack_columns_and_cells(pendulum, tmp_path):
     e = dd.identify(pendulum, path, ["hinge.damping"])
     assert e.explained, e.reason
     with pytest.raises(InputError, match="column hinge_w"):
-        dd.comparison.read_recording(path, pendulum)
+        read_recording(path, pendulum)
 
 
 def refused(model, log, *arguments, **more):

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import JacobianWrtVariable
 
 import drake_diff as dd
+from drake_diff.comparison import read_recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.recordings import Chart
 from drake_diff.identification.sensors import choose_sensors
@@ -120,7 +121,7 @@ def test_a_sensor_file_is_kept_and_comes_out_again(tmp_path):
     record = dd.save(e, tmp_path / "run")
     assert record.inputs.sensors["tip"].body == "pole"
     assert dd.verify(tmp_path / "run").holds
-    read = dd.comparison.read_recording(path, model, gaps=True)
+    read = read_recording(path, model, gaps=True)
     again = dd.save(
         dd.identify(model, read, ["hinge.damping"], sensors={"tip": ("pole", [0, 0, -0.5])}), tmp_path / "b"
     )

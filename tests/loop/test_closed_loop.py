@@ -14,6 +14,7 @@ from drake_diff.exceptions import InputError
 from drake_diff.loop.parts import Actuator, Fallback, Predictor, Sensor
 from drake_diff.loop.run import Loop, Push, closed_loop
 from drake_diff.model.tangent import tangent_space
+from drake_diff.motion import LQR
 
 
 def gain(kp, kd):
@@ -336,7 +337,7 @@ def test_bad_runs_are_named(cart):
 def test_a_cart_pole_is_kept_upright_by_lqr_and_falls_without():
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=H)
     up = np.array([0.0, np.pi, 0.0, 0.0])
-    policy = dd.LQR(model, up, np.zeros(1), np.eye(4), np.eye(1))
+    policy = LQR(model, up, np.zeros(1), np.eye(4), np.eye(1))
     start = up + np.array([0.0, 0.1, 0.0, 0.0])
     kept = closed_loop(model, policy, start, 800, Loop(sensor=Sensor(noise=0.003)))
     assert np.abs(kept.motion.xs[-1, 1] - np.pi) < 0.1

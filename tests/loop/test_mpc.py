@@ -12,6 +12,7 @@ from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.step import advance
+from drake_diff.motion import TVLQR
 from drake_diff.optimize.replay import goal_check, regulator_weights
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -197,7 +198,7 @@ def test_an_open_loop_holds_its_last_input():
 def test_tracking_is_the_regulator_of_the_replays_within_bounds(swung):
     controller = tracking(swung)
     xs, us = swung.plan.sample(1)
-    gains = dd.TVLQR(swung.problem.model, xs, us, *regulator_weights(swung.plan, us)).gains
+    gains = TVLQR(swung.problem.model, xs, us, *regulator_weights(swung.plan, us)).gains
     d = np.array([0.01, -0.02, 0.0, 0.01])
     assert controller(xs[40] + d, 0.8) == pytest.approx(us[40] - gains[40] @ d, abs=1e-12)
     assert controller(xs[40] + 1e6, 0.8)[0] in (-20, 20)

@@ -8,6 +8,7 @@ from pydrake.geometry import AddCompliantHydroelasticProperties, AddRigidHydroel
 from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
+from drake_diff.model import contact_modes
 
 G, K, MU, H = 9.81, 1e4, 0.5, 0.01
 REST = 0.1 - G / K  # [m] of a ball of 1 kg on a ground, both of stiffness 2 K
@@ -28,17 +29,17 @@ def pushed_ball(approximation, mu=MU):
 def test_a_push_below_the_friction_limit_sticks_and_one_above_slides(approximation, mu):
     """The limit is mu m g."""
     model, x = pushed_ball(approximation, mu), [0.0, REST, 0.0, 0.0]
-    assert dd.contact_modes(model, x, [0.5 * mu * G]) == {PAIR: "sticking"}
-    assert dd.contact_modes(model, x, [-0.5 * mu * G]) == {PAIR: "sticking"}
-    assert dd.contact_modes(model, x, [1.3 * mu * G]) == {PAIR: "sliding"}
+    assert contact_modes(model, x, [0.5 * mu * G]) == {PAIR: "sticking"}
+    assert contact_modes(model, x, [-0.5 * mu * G]) == {PAIR: "sticking"}
+    assert contact_modes(model, x, [1.3 * mu * G]) == {PAIR: "sliding"}
 
 
 @pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
 def test_a_ball_in_the_air_is_separated_and_so_is_one_that_leaves(approximation):
     model = pushed_ball(approximation)
-    assert dd.contact_modes(model, [0.0, 0.2, 0.0, 0.0], [0.0]) == {PAIR: "separated"}
+    assert contact_modes(model, [0.0, 0.2, 0.0, 0.0], [0.0]) == {PAIR: "separated"}
     # Overlapping by 1e-5 m and leaving at 1 m/s, it is out within the step.
-    assert dd.contact_modes(model, [0.0, 0.1 - 1e-5, 0.0, 1.0], [0.0]) == {PAIR: "separated"}
+    assert contact_modes(model, [0.0, 0.1 - 1e-5, 0.0, 1.0], [0.0]) == {PAIR: "separated"}
 
 
 def test_every_candidate_pair_is_listed():
@@ -46,9 +47,9 @@ def test_every_candidate_pair_is_listed():
     for i, name in enumerate("abc"):
         plant.ball(name, 1.0, 0.1, contact_properties(2 * K, 0.0, MU, 0.0), "xyz"[i])
     model = plant.model()
-    modes = dd.contact_modes(model, [0.0] * 3 + [0.0] * 3)  # all three at the origin
+    modes = contact_modes(model, [0.0] * 3 + [0.0] * 3)  # all three at the origin
     assert list(modes) == [("a/a", "b/b"), ("a/a", "c/c"), ("b/b", "c/c")]
-    far = dd.contact_modes(model, [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+    far = contact_modes(model, [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
     assert set(far.values()) == {"separated"}
 
 
@@ -67,7 +68,7 @@ def test_a_hydroelastic_patch_has_a_mode_too(push, mode):
     x[6] = 0.1 - 1e-5
     for _ in range(40):
         x = dd.step(model, x)
-    assert dd.contact_modes(model, x) == {("box/box_shape", "world/ground"): mode}
+    assert contact_modes(model, x) == {("box/box_shape", "world/ground"): mode}
 
 
 def test_a_change_of_mode_beside_the_step_is_named_with_the_entries_it_touches():
@@ -85,7 +86,7 @@ def test_a_change_of_mode_beside_the_step_is_named_with_the_entries_it_touches()
 def test_at_the_edge_of_friction_the_push_changes_the_mode():
     """sap: at 0.3 N short of mu m g no change within 1e-4 N, at the limit one."""
     model, x = pushed_ball("sap"), [0.0, REST, 0.0, 0.0]
-    limit = next(u for u in np.arange(4.0, 6.0, 1e-4) if dd.contact_modes(model, x, [u])[PAIR] == "sliding")
+    limit = next(u for u in np.arange(4.0, 6.0, 1e-4) if contact_modes(model, x, [u])[PAIR] == "sliding")
     assert limit == pytest.approx(MU * G, rel=0.02)  # sap's regularization
     columns = {c.column for c in dd.certify(model, x, [limit]).mode_changes}
     assert "push" in columns

@@ -6,6 +6,7 @@ from helpers.engines import engine_of
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff.motion import TVLQR
 
 control = pytest.importorskip("control", reason="python-control is not installed")
 ENGINES = ["numpy", "drake", "mujoco", "pinocchio"]
@@ -69,5 +70,5 @@ def test_ilqrs_gain_at_rest_is_python_controls(load):
     Q, R = np.diag([1.0, 10.0, 0.1, 0.1]), np.array([[0.1]])
     found = dd.differentiate_step(model, x, np.zeros(1))
     K, *_ = control.dlqr(found.A, found.B, Q, R)
-    policy = dd.TVLQR(model, np.tile(x, (1501, 1)), np.zeros((1500, 1)), Q=Q, R=R, Qf=Q)
+    policy = TVLQR(model, np.tile(x, (1501, 1)), np.zeros((1500, 1)), Q=Q, R=R, Qf=Q)
     np.testing.assert_allclose(policy.gains[0], K, rtol=1e-6)

@@ -21,6 +21,7 @@ from pydrake.systems.controllers import (
 from pydrake.trajectories import PiecewisePolynomial
 
 import drake_diff as dd
+from drake_diff.motion import TVLQR
 from drake_diff.optimize.replay import goal_check, regulator_weights
 
 NAMES = ("cart_pole", "acrobot")
@@ -104,11 +105,11 @@ def survivors(solution, controller, level, trials):
 def test_our_gains_are_drakes_on_the_discrete_plant(name):
     """1e-9 of the largest; what is asked is 1e-6. 80 to 100 steps of rounding in two Riccati recursions."""
     solution = swing_up(name)
-    ours = dd.TVLQR(solution.problem.model, solution.xs, solution.us, *regulator_weights(solution.plan, solution.us))
+    ours = TVLQR(solution.problem.model, solution.xs, solution.us, *regulator_weights(solution.plan, solution.us))
     drakes = discrete_gains(solution)
     assert drakes.shape == ours.gains.shape
     assert np.abs(drakes - ours.gains).max() < 1e-9 * np.abs(ours.gains).max()
-    other = dd.TVLQR(solution.problem.model, solution.xs, solution.us, 1.01 * np.eye(4), np.eye(1))
+    other = TVLQR(solution.problem.model, solution.xs, solution.us, 1.01 * np.eye(4), np.eye(1))
     assert np.abs(drakes - other.gains).max() > 1e-3 * np.abs(ours.gains).max()
 
 
@@ -116,7 +117,7 @@ def test_our_gains_are_drakes_on_the_discrete_plant(name):
 def test_in_continuous_time_drakes_gains_are_others(name):
     """So that the survival below compares two regulators: a tenth of the typical gain apart, at most steps."""
     solution = swing_up(name)
-    ours = dd.TVLQR(solution.problem.model, solution.xs, solution.us, *regulator_weights(solution.plan, solution.us))
+    ours = TVLQR(solution.problem.model, solution.xs, solution.us, *regulator_weights(solution.plan, solution.us))
     apart = np.abs(continuous_gains(solution) - ours.gains).max(axis=(1, 2))
     assert np.median(apart) > 0.1 * np.median(np.abs(ours.gains).max(axis=(1, 2)))
 

@@ -10,6 +10,7 @@ from pydrake.geometry import Sphere
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, GradientWarning, InputError
+from drake_diff.motion import ParametricPolicy
 from drake_diff.motion import undefined as verdict
 from drake_diff.motion.flow.steps import FlowSteps
 from drake_diff.motion.undefined import Undefined
@@ -98,7 +99,7 @@ def test_columns_of_parameters_inputs_and_policies_are_judged():
     names = [one.column for one in g.undefined]
     assert "lift at all times" in names
     assert "ball.stiffness" not in names  # it does not touch
-    policy = dd.motion.ParametricPolicy(lambda x, t, p: [p[0] + 50 * p[1] * x[1]], [9.81 / 2, 0.0])
+    policy = ParametricPolicy(lambda x, t, p: [p[0] + 50 * p[1] * x[1]], [9.81 / 2, 0.0])
     _, undefined = gradient(model, x0, lambda x: x[3], 20, policy=policy)
     assert {"policy[0]", "policy[1]"} <= set(undefined)
     touching = [0, 0.1 - 1e-5, 0, 1e-4]  # a touch that is hardly one: of stiffness nothing depends smoothly

@@ -11,6 +11,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.model.parameters import select
+from drake_diff.motion import LQR
 from drake_diff.optimize.checks import check
 from drake_diff.optimize.messages import controls
 from drake_diff.optimize.replay import (
@@ -59,7 +60,7 @@ def test_half_the_step_leads_a_block_elsewhere_by_the_closed_form(write_urdf):
 def test_feedback_holds_what_open_loop_loses(load):
     """Balancing upright: what half the step changes grows by exp(4.4 t) open loop, and decays under TVLQR."""
     model = load("pendulum.urdf", time_step=0.02)
-    balance = dd.LQR(model, [np.pi, 0], [0], Q=np.eye(2), R=[[1.0]])
+    balance = LQR(model, [np.pi, 0], [0], Q=np.eye(2), R=[[1.0]])
     us = dd.rollout(model, [np.pi - 0.5, 0], policy=balance, num_steps=150).us
     problem = dd.Problem(model, x0=[np.pi - 0.5, 0], num_steps=150, x_goal=[np.pi, 0])
     plan = plan_of(problem, us)

@@ -10,6 +10,7 @@ from scipy.linalg import solve_discrete_are
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
+from drake_diff.motion import LQR
 from drake_diff.optimize import Dwell, TerminalSet
 from drake_diff.runs.messages import asked_for
 
@@ -111,7 +112,7 @@ def test_a_pendulum_swings_up_to_where_a_regulator_takes_over(method):
     assert all(c.passes for c in solution.checks if c.what == "regulator" and c.plant == "in steps of 0.01 s")
     # Drake's own plant, under the regulator of its own LQR, comes to rest upright
     model, x = solution.problem.model, np.array(solution.xs[-1])
-    regulator = dd.LQR(model, [np.pi, 0], [0], np.eye(2), np.eye(1))
+    regulator = LQR(model, [np.pi, 0], [0], np.eye(2), np.eye(1))
     for _ in range(200):
         u = regulator(x, 0.0)
         assert np.abs(u) <= 3.0
@@ -129,7 +130,7 @@ def test_where_a_formula_is_too_hopeful_sampling_lowers_the_level():
     hopeful, random = replace(region, level=region.linear_level), np.random.default_rng(7)
 
     def arrives(x):
-        regulator = dd.LQR(model, [np.pi, 0, 0, 0], [0], np.eye(4), np.eye(1))
+        regulator = LQR(model, [np.pi, 0, 0, 0], [0], np.eye(4), np.eye(1))
         for _ in range(400):
             if np.max(np.abs(x)) > 1e6:  # it spins ever faster, beyond what this step can follow
                 return False
@@ -187,7 +188,7 @@ def test_a_heavier_bob_has_a_set_of_its_own():
     assert np.max(np.abs(found.cost_to_go - light.cost_to_go)) > 1.0
     model = heavy.model
     with dd.model.parameters.applied(dd.model.parameters.select(model, {"pole.mass": 2.0})) as set_model:
-        regulator = dd.LQR(set_model, [np.pi, 0], [0], np.eye(2), np.eye(1))
+        regulator = LQR(set_model, [np.pi, 0], [0], np.eye(2), np.eye(1))
     np.testing.assert_allclose(found.cost_to_go, regulator.cost_to_go, rtol=1e-9)
 
 

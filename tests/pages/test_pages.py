@@ -12,11 +12,13 @@ from helpers.models import MODELS
 from helpers.table import each_row, slow_after
 
 import drake_diff as dd
+from drake_diff.comparison import save_comparison
 from drake_diff.pages import html
 from drake_diff.pages.html import write_page
 from drake_diff.runs.page import Check
 from drake_diff.runs.verify import recalled
 from drake_diff.runs.view import scene_of_run
+from drake_diff.trials import save_robustness
 
 PACKAGE = Path(dd.__file__).parent
 EVIL = "</script><script>document.title = 'evil'</script><img src=x onerror=\"document.title = 'evil'\">'"
@@ -58,8 +60,8 @@ def pages(tmp_path_factory):
         dd.save(solution, folder / "run")
         with recalled(folder / "run") as plan:
             trials = dd.robustness(plan, {"mass": [0.02, 0.4]}, trials=2, controller="open_loop")
-            dd.trials.save_robustness(trials, folder / "trials", folder / "run")
-        dd.comparison.save_comparison(dd.compare(model, ("drake:lagged", "newton"), num_steps=5), folder / "engines")
+            save_robustness(trials, folder / "trials", folder / "run")
+        save_comparison(dd.compare(model, ("drake:lagged", "newton"), num_steps=5), folder / "engines")
     found = {
         "report": folder / "run/report.html",
         "robustness": folder / "trials/robustness.html",

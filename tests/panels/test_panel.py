@@ -22,6 +22,7 @@ import drake_diff as dd
 from drake_diff._base.statistics import success_rate
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
+from drake_diff.panels import run_panel
 from drake_diff.panels.panel import row_of
 from drake_diff.panels.panel_file import expand, load_panel
 from drake_diff.panels.results import ranked
@@ -150,7 +151,7 @@ def thousand(tmp_path_factory):
     (folder / "trials.py").write_text(FUNCTIONS)
     path = folder / "panel.toml"
     path.write_text(PANEL.format(function="cheap", seeds=100, seconds=0.002, methods='["ilqr", "b,c"]'))
-    dd.panels.run_panel(path, out=folder / "one", workers=1)
+    run_panel(path, out=folder / "one", workers=1)
     assert len(logged(path)) == 1000
     return path
 
@@ -159,7 +160,7 @@ def thousand(tmp_path_factory):
 @pytest.mark.parametrize("workers", [2, 4])
 def test_a_thousand_trials_give_the_same_bytes_whatever_the_number_of_workers(thousand, workers):
     out = thousand.parent / f"with_{workers}"
-    dd.panels.run_panel(thousand, out=out, workers=workers)
+    run_panel(thousand, out=out, workers=workers)
     assert files(out) == files(thousand.parent / "one")
 
 
@@ -192,15 +193,15 @@ def test_a_thousand_trials_killed_three_times_at_random_give_the_same_bytes(thou
 def test_one_and_two_workers_give_the_same_bytes(write, tmp_path):
     path = write("cheap", seeds=3)
     for workers in (1, 2):
-        dd.panels.run_panel(path, out=tmp_path / str(workers), workers=workers)
+        run_panel(path, out=tmp_path / str(workers), workers=workers)
     assert files(tmp_path / "1") == files(tmp_path / "2")
 
 
 def test_a_finished_panel_is_read_and_written_again_to_the_same_bytes_without_any_evaluation(write, tmp_path):
     path = write("cheap")
-    dd.panels.run_panel(path, out=tmp_path / "out", workers=1)
+    run_panel(path, out=tmp_path / "out", workers=1)
     before, begun = files(tmp_path / "out"), logged(path)
-    table = dd.panels.run_panel(path, out=tmp_path / "out", workers=1)
+    table = run_panel(path, out=tmp_path / "out", workers=1)
     assert files(tmp_path / "out") == before
     assert logged(path) == begun
     assert list(table.rows[0]) == ["id", "method", "level", "repeat", "seed", "success", "cost", "also"]
@@ -219,12 +220,12 @@ def test_global_generators_start_from_the_trials_own_seed():
 
 
 def test_a_trial_whose_worker_dies_is_evaluated_once_more(write, tmp_path):
-    table = dd.panels.run_panel(write("dies_once"), out=tmp_path / "out", workers=2)
+    table = run_panel(write("dies_once"), out=tmp_path / "out", workers=2)
     assert [row["cost"] for row in table.rows] == [0.5, 1, 2, 4, 8]
 
 
 def test_a_trial_whose_worker_dies_twice_is_a_row_that_says_so(write, tmp_path):
-    table = dd.panels.run_panel(write("dies"), out=tmp_path / "out", workers=1)
+    table = run_panel(write("dies"), out=tmp_path / "out", workers=1)
     assert table.errors == 1
     assert repr(table).splitlines()[:2] == [
         f"5 trials in 5 cells, 1 errors, in {tmp_path / 'out'}",
@@ -235,7 +236,7 @@ def test_a_trial_whose_worker_dies_twice_is_a_row_that_says_so(write, tmp_path):
 
 
 def test_a_trial_that_calls_exit_ends_itself_alone(write, tmp_path):
-    table = dd.panels.run_panel(write("exits"), out=tmp_path / "out", workers=1)
+    table = run_panel(write("exits"), out=tmp_path / "out", workers=1)
     assert [row.get("error") for row in table.rows] == [None, None, "SystemExit: enough", None, None]
 
 
@@ -266,7 +267,7 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
 def test_a_script_needs_no_guard_around_its_panel(write, tmp_path):
     """Workers do not import the script that started them: without `if __name__ == "__main__"` it would start again."""
     script = tmp_path / "script.py"
-    script.write_text(f"import drake_diff as dd\nprint(dd.panels.run_panel({str(write())!r}, out='out', workers=1))\n")
+    script.write_text(f"import drake_diff as dd\nprint(run_panel({str(write())!r}, out='out', workers=1))\n")
     done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.splitlines()[0] == "5 trials in 5 cells, 1 errors, in out", done.stderr
 
@@ -276,23 +277,23 @@ def test_a_script_needs_no_guard_around_its_panel(write, tmp_path):
 
 def test_a_torn_last_line_is_dropped_and_its_trial_evaluated_again(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
-    dd.panels.run_panel(path, out=out, workers=1)
+    run_panel(path, out=out, workers=1)
     before, whole = files(out), (out / "trials.jsonl").read_bytes()
     for cut in (1, 30, len(whole.split(b"\n")[-2])):  # also one that lacks nothing but its end
         (out / "trials.jsonl").write_bytes(whole[:-cut])
         begun = len(logged(path))
-        dd.panels.run_panel(path, out=out, workers=1)
+        run_panel(path, out=out, workers=1)
         assert len(logged(path)) == begun + 1
         assert (out / "trials.jsonl").read_bytes() == whole
         assert files(out) == before
     (out / "trials.jsonl").write_bytes(whole[:20])  # of the first line, which says what the panel is
-    dd.panels.run_panel(path, out=out, workers=1)
+    run_panel(path, out=out, workers=1)
     assert files(out) == before
 
 
 def test_a_changed_byte_in_any_line_is_refused(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
-    dd.panels.run_panel(path, out=out, workers=1)
+    run_panel(path, out=out, workers=1)
     whole = (out / "trials.jsonl").read_bytes()
     drawn = random.Random(0)
     for place in drawn.sample(range(len(whole) - 1), 40):
@@ -301,31 +302,31 @@ def test_a_changed_byte_in_any_line_is_refused(write, tmp_path):
             continue
         (out / "trials.jsonl").write_bytes(changed)
         with pytest.raises(ArtifactError, match=r"trials\.jsonl"):
-            dd.panels.run_panel(path, out=out, workers=1)
+            run_panel(path, out=out, workers=1)
         assert (out / "trials.jsonl").read_bytes() == changed
 
 
 def test_another_panels_journal_is_refused_and_so_is_one_of_its_lines(write, tmp_path):
-    dd.panels.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
-    dd.panels.run_panel(write("cheap", methods='["other"]'), out=tmp_path / "other", workers=1)
+    run_panel(write("cheap"), out=tmp_path / "out", workers=1)
+    run_panel(write("cheap", methods='["other"]'), out=tmp_path / "other", workers=1)
     with pytest.raises(ArtifactError, match="another panel: sha256: expected "):
-        dd.panels.run_panel(write("cheap"), out=tmp_path / "other", workers=1)
+        run_panel(write("cheap"), out=tmp_path / "other", workers=1)
     foreign = (tmp_path / "other" / "trials.jsonl").read_bytes().splitlines(keepends=True)[1]
     with open(tmp_path / "out" / "trials.jsonl", "ab") as file:
         file.write(foreign)
     with pytest.raises(ArtifactError, match="line 7 is damaged or another panel's"):
-        dd.panels.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
+        run_panel(write("cheap"), out=tmp_path / "out", workers=1)
 
 
 def test_a_comment_changes_no_panel_but_another_function_does(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
-    dd.panels.run_panel(path, out=out, workers=1)
+    run_panel(path, out=out, workers=1)
     path.write_text("# said in passing\n" + path.read_text())
-    dd.panels.run_panel(path, out=out, workers=1)
+    run_panel(path, out=out, workers=1)
     with open(tmp_path / "trials.py", "a") as file:
         file.write("# changed\n")
     with pytest.raises(ArtifactError, match="another panel: function_sha256"):
-        dd.panels.run_panel(path, out=out, workers=1)
+        run_panel(path, out=out, workers=1)
 
 
 def test_two_at_once_on_one_directory_are_refused(write, tmp_path):
@@ -333,7 +334,7 @@ def test_two_at_once_on_one_directory_are_refused(write, tmp_path):
     process = start(path, out, "--workers", 1)
     wait_for(lambda: len(logged(path)) == 1)
     with pytest.raises(ArtifactError, match="another process is at work"):
-        dd.panels.run_panel(path, out=out, workers=1)
+        run_panel(path, out=out, workers=1)
     process.kill()
     process.communicate()
 
@@ -372,7 +373,7 @@ def test_the_summary_of_a_cell_by_hand(tmp_path):
         "def f(trial):\n    k = trial['repeat']\n    return {'cost': [1, 2, 6][k], 'success': k > 0}\n"
     )
     (tmp_path / "p.toml").write_text('evaluate = "trials.py:f"\nseeds = 3\n[[cells]]\nmethod = "a"\n')
-    cell = dd.panels.run_panel(tmp_path / "p.toml", out=tmp_path / "out", workers=1).summary["cells"][0]
+    cell = run_panel(tmp_path / "p.toml", out=tmp_path / "out", workers=1).summary["cells"][0]
     # (4 + 1 + 9) / 2 = 7 is the variance of 1, 2, 6
     assert cell["numbers"] == {"cost": {"count": 3, "mean": 3.0, "std": math.sqrt(7), "min": 1.0, "max": 6.0}}
     assert (cell["success"]["count"], cell["success"]["rate"]) == (2, 2 / 3)
@@ -442,7 +443,7 @@ def test_a_file_that_cannot_be_right_is_refused_before_anything_is_written(tmp_p
     path = tmp_path / "p.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
-        dd.panels.run_panel(path, out=tmp_path / "out", workers=1)
+        run_panel(path, out=tmp_path / "out", workers=1)
     assert not (tmp_path / "out").exists()
 
 
@@ -453,18 +454,18 @@ def test_bad_options_are_refused(write, tmp_path):
         ({"address": "host:1"}, 'address: expected none for engine="local"'),
     ]:
         with pytest.raises(InputError, match=message):
-            dd.panels.run_panel(write(), out=tmp_path / "out", **options)
+            run_panel(write(), out=tmp_path / "out", **options)
 
 
 def test_without_ray_its_extra_is_named(write, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'drake-diff\[cluster\]'"):
-        dd.panels.run_panel(write(), out=tmp_path / "out", engine="ray")
+        run_panel(write(), out=tmp_path / "out", engine="ray")
 
 
 def test_every_trial_has_a_record_that_is_the_same_for_any_number_of_workers(write, tmp_path):
     path = write("fails")
-    found = [dd.panels.run_panel(path, out=tmp_path / f"out_{n}", workers=n) for n in (1, 2)]
+    found = [run_panel(path, out=tmp_path / f"out_{n}", workers=n) for n in (1, 2)]
     one, two = ({p.name: p.read_bytes() for p in (f.directory / "trials").iterdir()} for f in found)
     assert one == two
     assert set(one) == {f"{row['id']}.json" for row in found[0].rows}
@@ -480,7 +481,7 @@ def test_every_trial_has_a_record_that_is_the_same_for_any_number_of_workers(wri
 
 
 def test_a_panel_and_its_trials_are_records(write, tmp_path):
-    done = dd.panels.run_panel(write("fails"), out=tmp_path / "runs" / "mine", workers=1)
+    done = run_panel(write("fails"), out=tmp_path / "runs" / "mine", workers=1)
     record = dd.load_record(done.directory)
     assert (record.subject, record.verdict) == ("panel", "fail")
     assert (record.panel.trials, record.panel.errors) == (len(done.rows), done.errors)
@@ -520,7 +521,7 @@ def files_again(directory):
 
 
 def test_a_panel_whose_files_do_not_follow_from_its_journal_is_broken(write, tmp_path):
-    made = dd.panels.run_panel(write("fails"), out=tmp_path / "panel", workers=1).directory
+    made = run_panel(write("fails"), out=tmp_path / "panel", workers=1).directory
     trial = min((made / "trials").iterdir())
     one = json.loads(trial.read_bytes())
 
@@ -597,7 +598,7 @@ def test_the_ranking_is_by_what_is_sure_and_says_what_cannot_be_told_apart():
 
 def test_names_on_the_page_of_a_panel_are_text(write, tmp_path):
     path = write("fails", methods='["<script>alert(1)</script>"]')
-    dd.panels.run_panel(path, out=tmp_path / "out", workers=1)
+    run_panel(path, out=tmp_path / "out", workers=1)
     page = (tmp_path / "out" / "panel.html").read_text()
     assert "<script>alert(1)" not in page
     assert "method=&lt;script&gt;alert(1)" in page

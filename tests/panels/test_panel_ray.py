@@ -55,7 +55,7 @@ def kill(finished, count, errors):
         print("of", len(pids), "workers one is killed after", finished, "trials")
 
 if __name__ == "__main__":
-    dd.panels.run_panel("panel.toml", out="ray", workers=2, engine="ray", progress=kill)
+    run_panel("panel.toml", out="ray", workers=2, engine="ray", progress=kill)
 """
 
 

@@ -14,6 +14,7 @@ from drake_diff.exceptions import InputError, MissingDependencyError
 from drake_diff.planning import around, plan
 from drake_diff.planning.around import Line, Space, lines
 from drake_diff.planning.robot import load_robot
+from drake_diff.runs import read_trace
 
 LONG, THICK = 0.5, 0.03  # [m] of each link, and its radius
 ROD = """<link name="{name}"><inertial><origin xyz="0 0 -0.25"/><mass value="1"/>
@@ -165,7 +166,7 @@ def test_the_command_leads_around(arm, tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert dd.verify(tmp_path / "out").verdict == "holds"
-    qs = dd.read_trace(tmp_path / "out" / "trace.mcap").xs[:, :2]
+    qs = read_trace(tmp_path / "out" / "trace.mcap").xs[:, :2]
     assert np.min(distance(qs, np.array([-0.45, 0, -0.83]))) >= 0.08  # at the knots
 
 

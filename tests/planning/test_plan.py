@@ -16,6 +16,7 @@ from drake_diff.planning import plan
 from drake_diff.planning.around import Line
 from drake_diff.planning.motion import along
 from drake_diff.planning.robot import load_robot
+from drake_diff.runs import read_trace
 
 
 def command(*words, cwd):
@@ -54,7 +55,7 @@ def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
     assert "base='weld'" in done.stdout
     assert (tmp_path / "out" / "report.html").is_file()
     assert dd.verify(tmp_path / "out").holds
-    end = dd.read_trace(tmp_path / "out" / "trace.mcap").xs[-1]
+    end = read_trace(tmp_path / "out" / "trace.mcap").xs[-1]
     assert end[:2] == pytest.approx([0.0, 0.5], abs=0.025)  # what a replay in other steps may be off: 5 % of its way
 
 

@@ -13,6 +13,7 @@ from drake_diff.exceptions import InputError
 from drake_diff.model.contact import contacts_of_the_step, deepest_overlap, thinnest_geometry
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
+from drake_diff.motion import TVLQR
 from drake_diff.planning import plan, shifting
 from drake_diff.planning.feet import find_feet
 from drake_diff.planning.robot import GROUND, ON_FEET, load_robot, ranges
@@ -223,7 +224,7 @@ def test_solo12_lowers_its_trunk_with_its_feet_on_the_ground(tmp_path):
     half = model.at_time_step(model.time_step / 2)
     xs, us = solution.plan.sample(2)
     weights = np.eye(half.nu), np.eye(tangent_space(half).size)
-    policy = dd.TVLQR(half, xs, us, 100 * weights[1], weights[0])
+    policy = TVLQR(half, xs, us, 100 * weights[1], weights[0])
     motion = dd.rollout(half, xs[0], policy=policy, num_steps=len(us))
     plant = MultibodyPlant(0.0)
     Parser(plant).AddModels(str(file))

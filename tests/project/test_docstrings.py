@@ -57,7 +57,7 @@ def test_a_function_names_each_argument_and_what_it_returns(name):
     assert "Returns:" in text or inspect.signature(function).return_annotation is None
 
 
-LONG = ("drake_diff.identification.identify_contact", "dd.excite", "drake_diff.identification.write_model")
+LONG = ("drake_diff.identification.identify_contact", "excite", "drake_diff.identification.write_model")
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from drake_diff.exceptions import InputError, ModelWarning
 from drake_diff.model.contact import penetration
 from drake_diff.model.sampling import sample_states
 from drake_diff.model.step import set_state
+from drake_diff.runs import PlanRecord, certify_model
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
 
@@ -24,7 +25,7 @@ NAMES = sorted(path.name for path in MODELS.iterdir())
 @each_row("name", NAMES)
 def test_every_model_here_is_certified_at_every_sampled_state(load, name):
     """Eight models of 20 states, contact among them: the good states of the zoo."""
-    record = dd.runs.certify_model(load(name, time_step=0.005), states=20, seed=3)
+    record = certify_model(load(name, time_step=0.005), states=20, seed=3)
     assert record.verdict == "pass", [s for s in record.certification.states if s.verdict != "agree"]
     assert len(record.certification.states) == 20
 
@@ -41,7 +42,7 @@ def test_real_robots_are_certified(name, base):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(robot_file(name), time_step=0.005, weld_base=base)
-    assert dd.runs.certify_model(model, states=20).verdict == "pass"
+    assert certify_model(model, states=20).verdict == "pass"
 
 
 @pytest.mark.parametrize("name", ["sphere_on_ground.sdf", "sliding_block.sdf"])
@@ -78,7 +79,7 @@ def test_a_model_that_cannot_touch_is_sampled_in_free_motion(load):
 def test_a_wrong_derivative_fails_the_model(load, monkeypatch):
     monkeypatch.setattr("drake_diff.model.parameter_kinds.IDENTITY_OFFSET", 0.0)
 
-    record = dd.runs.certify_model(offset_pendulum(), states=4, parameters=("second.offset",))
+    record = certify_model(offset_pendulum(), states=4, parameters=("second.offset",))
     assert record.verdict == "fail"
     assert {state.verdict for state in record.certification.states} == {"disagree"}
     assert "second.offset" in record.certification.states[0].gradient.worst
@@ -86,7 +87,7 @@ def test_a_wrong_derivative_fails_the_model(load, monkeypatch):
 
 def test_a_refused_derivative_is_told_and_fails(load, monkeypatch):
     monkeypatch.setattr("drake_diff.derivatives.step.MAGNITUDE_BOUND", 1e-3)
-    record = dd.runs.certify_model(load("pendulum.urdf"), states=2)
+    record = certify_model(load("pendulum.urdf"), states=2)
     assert record.verdict == "fail"
     assert record.certification.states[0].verdict == "refused"
     assert "expected a finite number of at most" in record.certification.states[0].refusal
@@ -103,7 +104,7 @@ def test_a_refused_derivative_is_told_and_fails(load, monkeypatch):
 )
 def test_bad_options_are_named_and_leave_no_file(load, tmp_path, options, words):
     with pytest.raises(InputError, match=words):
-        dd.runs.certify_model(load("pendulum.urdf"), directory=tmp_path / "out", **options)
+        certify_model(load("pendulum.urdf"), directory=tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
 
 
@@ -113,19 +114,19 @@ def test_the_record_is_written_and_says_incomplete_until_it_is_not(load, tmp_pat
 
     monkeypatch.setattr("drake_diff.runs.certificates.sample_states", killed)
     with pytest.raises(KeyboardInterrupt):
-        dd.runs.certify_model(load("pendulum.urdf"), directory=tmp_path / "out")
+        certify_model(load("pendulum.urdf"), directory=tmp_path / "out")
     (left,) = tmp_path.iterdir()
     assert left.name.startswith("out.partial-")
     assert json.loads((left / "record.json").read_text())["verdict"] == "incomplete"
     monkeypatch.undo()
-    record = dd.runs.certify_model(load("pendulum.urdf"), states=3, directory=tmp_path / "out")
-    written = dd.runs.PlanRecord.model_validate_json((tmp_path / "out" / "record.json").read_text())
+    record = certify_model(load("pendulum.urdf"), states=3, directory=tmp_path / "out")
+    written = PlanRecord.model_validate_json((tmp_path / "out" / "record.json").read_text())
     assert written == record
     assert written.verdict == "pass"
 
 
 def test_the_same_seed_gives_the_same_record_wall_clock_apart(load):
-    records = [dd.runs.certify_model(load("sphere_on_ground.sdf"), states=4, seed=2) for _ in range(2)]
+    records = [certify_model(load("sphere_on_ground.sdf"), states=4, seed=2) for _ in range(2)]
     plain = [json.loads(record.to_json()) for record in records]
     for fields in plain:
         del fields["wall_clock"], fields["record_sha256"]

@@ -10,9 +10,12 @@ import pytest
 from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
+from drake_diff.comparison import save_comparison
+from drake_diff.runs import certify_model, save_rollout
 from drake_diff.runs.fields import canonical
 from drake_diff.runs.provenance import embodiment_of
 from drake_diff.runs.sealed import SCHEMA_VERSION, own_sha256
+from drake_diff.trials import save_robustness
 
 H = 0.02
 OLD = ROOT / "tests" / "data" / "pendulum_2_4"
@@ -23,15 +26,15 @@ def written(tmp_path_factory):
     """A directory of each kind, of the pendulum."""
     folder = tmp_path_factory.mktemp("kinds")
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=H)
-    dd.runs.certify_model(model, states=1, directory=folder / "certification")
+    certify_model(model, states=1, directory=folder / "certification")
     still = dd.Recording("lab", "1", H * np.arange(3), np.zeros((3, 2)), np.zeros((2, 1)))
-    dd.comparison.save_comparison(dd.compare(model, ["numpy"], recordings=(still,)), folder / "comparison")
+    save_comparison(dd.compare(model, ["numpy"], recordings=(still,)), folder / "comparison")
     certificate = dd.certify_rollout(model, [0.5, 0], np.zeros((5, 1)), lambda x: x[0])
-    dd.runs.save_rollout(certificate, model, folder / "rollout")
+    save_rollout(certificate, model, folder / "rollout")
     cost = dd.QuadraticCost(R=[[1.0]])
     problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost)
     result = dd.robustness(dd.solve(problem, method="shooting"), {"mass": [0.05], "latency": [1, 2]}, trials=2)
-    dd.trials.save_robustness(result, folder / "robustness")
+    save_robustness(result, folder / "robustness")
     motion = dd.rollout(model, [1.0, 0.0], np.zeros((150, 1)), parameters={"hinge.damping": 0.2})
     noisy = motion.xs + 1e-3 * np.random.default_rng(0).standard_normal(motion.xs.shape)
     log = dd.Recording("swing", "1", H * np.arange(151), noisy, np.zeros((150, 1)))

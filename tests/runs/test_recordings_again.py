@@ -10,6 +10,7 @@ from helpers.models import MODELS
 from helpers.pendulum import swing
 
 import drake_diff as dd
+from drake_diff.comparison import save_comparison
 from drake_diff.comparison.files import PAGE, hash_of_arrays
 from drake_diff.comparison.recordings import place_of, read_arrays, with_own_names, write_arrays
 from drake_diff.exceptions import ArtifactError, InputError
@@ -35,7 +36,7 @@ def saved(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compared") / "run"
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
     found = dd.compare(model, ["numpy"], recordings=[recorded()])
-    dd.comparison.save_comparison(found, folder, causes={"lab": cause_of(model, recorded())})
+    save_comparison(found, folder, causes={"lab": cause_of(model, recorded())})
     return folder
 
 
@@ -202,7 +203,7 @@ def test_a_record_of_before_says_that_its_cause_was_not_looked_for_again(copy):
 def test_a_model_from_a_diagram_is_undecided(tmp_path):
     model = dd.model_from_diagram(dd.load_model(MODELS / "pendulum.urdf", time_step=0.01).diagram)
     found = dd.compare(model, [], recordings=[recorded()])
-    dd.comparison.save_comparison(found, tmp_path / "run")
+    save_comparison(found, tmp_path / "run")
     told = verify_own(tmp_path / "run")
     assert told.verdict == "undecided"
     assert "a user's own diagram" in str(told)
@@ -224,4 +225,4 @@ def test_arrays_come_back_to_the_last_bit_and_names_are_kept_apart(saved, tmp_pa
     twice = dd.compare(model, [], recordings=[recorded(), recorded()])
     cause = load_record(saved).engines[-1].cause
     with pytest.raises(InputError, match="two called lab"):
-        dd.comparison.save_comparison(twice, tmp_path / "run", causes={"lab": cause})
+        save_comparison(twice, tmp_path / "run", causes={"lab": cause})

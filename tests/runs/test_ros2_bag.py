@@ -7,6 +7,8 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
+from drake_diff.logs import read_mcap
+from drake_diff.runs import read_trace
 from drake_diff.runs.ros2 import export_ros2
 
 pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
@@ -35,7 +37,7 @@ def messages(bag, topic):
 
 
 def test_joint_states_are_the_trace_s_bit_for_bit(run, bag):
-    trace, found = dd.read_trace(run / "trace.mcap"), messages(bag, "/joint_states")
+    trace, found = read_trace(run / "trace.mcap"), messages(bag, "/joint_states")
     assert [t for t, _ in found] == [20_000_000 * k for k in range(11)]
     assert [list(m.name) for _, m in found] == [["slide", "hinge"]] * 11
     xs = np.array([[*m.position, *m.velocity] for _, m in found])
@@ -48,7 +50,7 @@ def test_joint_states_are_the_trace_s_bit_for_bit(run, bag):
 
 
 def test_frames_inputs_and_diagnostics_are_the_trace_s(run, bag):
-    log = dd.logs.read_mcap(run / "trace.mcap")
+    log = read_mcap(run / "trace.mcap")
     for (_, ours), (_, theirs) in zip(log.messages["/tf"], messages(bag, "/tf"), strict=True):
         for a, b in zip(ours.transforms, theirs.transforms, strict=True):
             assert (b.header.frame_id, b.child_frame_id) == ("world", a.child_frame_id)
@@ -75,7 +77,7 @@ def test_contacts_and_events_are_the_trace_s(load, tmp_path):
     solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
     write_trace(tmp_path / "trace.mcap", measure(solution), {})
     export_ros2(tmp_path, tmp_path / "bag")
-    log = dd.logs.read_mcap(tmp_path / "trace.mcap").messages
+    log = read_mcap(tmp_path / "trace.mcap").messages
     found = messages(tmp_path / "bag", "/contacts")
     assert len(found) == len(log["/contacts"]) == 3
     for (time, ours), (at, theirs) in zip(log["/contacts"], found, strict=True):

@@ -41,6 +41,7 @@ from drake_diff.optimize import phased
 from drake_diff.optimize import run as optimize_run
 from drake_diff.optimize.solve import _best_of
 from drake_diff.optimize.transcription.collocation import Transcription
+from drake_diff.panels import run_panel
 from drake_diff.runs import recover
 from drake_diff.runs.compare import list_runs
 from drake_diff.runs.directory import writing, written_whole
@@ -176,7 +177,7 @@ def test_a_panel_leaves_others_files_alone(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "table.csv").write_text("mine")
     with pytest.raises(InputError, match=r"which holds 'table\.csv'"):
-        dd.panels.run_panel(tmp_path / "panel.toml", out=tmp_path / "out", workers=1)
+        run_panel(tmp_path / "panel.toml", out=tmp_path / "out", workers=1)
     assert names(tmp_path / "out") == ["table.csv"]
     assert (tmp_path / "out" / "table.csv").read_text() == "mine"
 

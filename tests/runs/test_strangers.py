@@ -223,7 +223,7 @@ def test_a_log_is_not_unpacked_before_its_size_is_known(tmp_path, made):
     tracemalloc.start()
     try:
         with pytest.raises(ArtifactError, match=r"unpacks to|has|left|decompress"):
-            dd.logs.read_mcap(path)
+            read_mcap(path)
         done = recover_mcap(path, tmp_path / "out.mcap")
         assert tracemalloc.get_traced_memory()[1] < 32 * MIB
     finally:

@@ -17,10 +17,12 @@ from mcap.reader import make_reader
 
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
+from drake_diff.certificates import certify_jacobian
 from drake_diff.exceptions import ArtifactError
+from drake_diff.logs import read_mcap
 from drake_diff.optimize.program import Iteration
 from drake_diff.optimize.solution import Solution
-from drake_diff.runs import measure
+from drake_diff.runs import measure, read_trace
 from drake_diff.runs.trace import write_trace
 
 
@@ -68,11 +70,11 @@ def thrown(tmp_path_factory):
     solution = solution_of(problem, xs=motion.xs)
     path = tmp_path_factory.mktemp("thrown") / "trace.mcap"
     write_trace(path, measure(solution), {})
-    return solution, dd.logs.read_mcap(path)
+    return solution, read_mcap(path)
 
 
 def test_a_collocated_plan_comes_back_as_the_same_solution(collocated, trace_of_collocated):
-    plan = dd.read_trace(trace_of_collocated).plan
+    plan = read_trace(trace_of_collocated).plan
     for name in ("xs", "us", "us_mid", "u_final", "free_horizon"):
         assert bits(plan[name]) == bits(getattr(collocated, name)), name
     again = solution_of(collocated.problem, **plan)
@@ -95,8 +97,8 @@ def test_parameters_that_were_found_come_back_and_move_the_frames(tmp_path, load
     )
     solution = solution_of(problem, parameters=np.array([0.1, 0.0, -0.9]))
     write_trace(tmp_path / "a.mcap", measure(solution), {})
-    assert bits(dd.read_trace(tmp_path / "a.mcap").plan["parameters"]) == bits(solution.parameters)
-    log = dd.logs.read_mcap(tmp_path / "a.mcap")
+    assert bits(read_trace(tmp_path / "a.mcap").plan["parameters"]) == bits(solution.parameters)
+    log = read_mcap(tmp_path / "a.mcap")
     assert log.channel_metadata["/planned/plan"]["names"]["parameters"] == [f"elbow.offset[{i}]" for i in range(3)]
     lower = log.messages["/tf"][0][1].transforms[1].translation
     assert [lower.x, lower.y, lower.z] == pytest.approx([0.1, 0.0, -0.9], abs=1e-12)
@@ -121,7 +123,7 @@ def test_any_plan_round_trips_whatever_its_numbers(tmp_path_factory, data):
     }
     solution = solution_of(problem, **fields)
     write_trace(path, measure(solution), {})
-    trace, log = dd.read_trace(path), dd.logs.read_mcap(path)
+    trace, log = read_trace(path), read_mcap(path)
     assert bits(trace.plan["xs"]) == bits(solution.xs)
     assert bits(trace.plan["us"]) == bits(solution.us)
     assert trace.plan["u_final"] is None
@@ -143,7 +145,7 @@ def test_any_plan_round_trips_whatever_its_numbers(tmp_path_factory, data):
 def test_a_plan_whose_motion_differs_has_a_ghost_and_one_that_does_not_has_none(
     collocated, trace_of_collocated, tmp_path
 ):
-    log = dd.logs.read_mcap(trace_of_collocated)
+    log = read_mcap(trace_of_collocated)
     frames = [t.child_frame_id for t in log.messages["/tf"][3][1].transforms]
     assert [name.startswith("planned/") for name in frames] == [False, True]
     assert frames[1] == "planned/" + frames[0]
@@ -153,12 +155,12 @@ def test_a_plan_whose_motion_differs_has_a_ghost_and_one_that_does_not_has_none(
     assert abs(rotation.w * np.cos(half_angle) + rotation.y * np.sin(half_angle)) == pytest.approx(1, abs=1e-12)
     still = solution_of(pendulum())
     write_trace(tmp_path / "a.mcap", measure(dataclasses.replace(still, xs=still.replay.xs)), {})
-    log = dd.logs.read_mcap(tmp_path / "a.mcap")
+    log = read_mcap(tmp_path / "a.mcap")
     assert {len(message.transforms) for _, message in log.messages["/tf"]} == {1}
 
 
 def test_every_replay_has_its_row(collocated, trace_of_collocated):
-    found = dd.logs.read_mcap(trace_of_collocated).arrays("/replays")
+    found = read_mcap(trace_of_collocated).arrays("/replays")
     replays = collocated.replays
     assert found["variant"] == [r.variant for r in replays]
     assert found["control"] == [r.control for r in replays]
@@ -169,7 +171,7 @@ def test_every_replay_has_its_row(collocated, trace_of_collocated):
 
 
 def test_every_certificate_has_its_row(collocated, trace_of_collocated):
-    found = dd.logs.read_mcap(trace_of_collocated).arrays("/gradient/check")
+    found = read_mcap(trace_of_collocated).arrays("/gradient/check")
     certificates = collocated.certificates
     assert len(certificates) > 0
     assert found["verdict"] == [c.verdict for c in certificates]
@@ -179,10 +181,10 @@ def test_every_certificate_has_its_row(collocated, trace_of_collocated):
 
 
 def test_a_certificate_without_entries_and_one_that_is_zero_have_a_row_too(tmp_path):
-    nothing = dd.certificates.certify_jacobian(lambda x: np.zeros(0), np.zeros(2), np.zeros((0, 2)))
-    zero = dd.certificates.certify_jacobian(lambda x: np.zeros(2), np.zeros(2), np.zeros((2, 2)))
+    nothing = certify_jacobian(lambda x: np.zeros(0), np.zeros(2), np.zeros((0, 2)))
+    zero = certify_jacobian(lambda x: np.zeros(2), np.zeros(2), np.zeros((2, 2)))
     write_trace(tmp_path / "a.mcap", measure(solution_of(pendulum(), certificates=(nothing, zero))), {})
-    found = dd.logs.read_mcap(tmp_path / "a.mcap").arrays("/gradient/check")
+    found = read_mcap(tmp_path / "a.mcap").arrays("/gradient/check")
     assert found["verdict"] == ["agree", "agree"]
     assert np.isnan(found["cosine"]).all()
     assert found["worst_row"][0] == ""
@@ -221,7 +223,7 @@ def test_failures_are_the_record_s_and_the_configuration_is_attached(tmp_path):
     solution = solution_of(pendulum(), options={"tolerance": float("inf"), "seed": 3})
     m = measure(solution)
     write_trace(tmp_path / "a.mcap", m, {"record.json": ("application/json", b"{}")})
-    log = dd.logs.read_mcap(tmp_path / "a.mcap")
+    log = read_mcap(tmp_path / "a.mcap")
     events = log.arrays("/events")
     assert events["kind"] == [e.kind for e in m.events] == ["solver_started", "solver_ended", "failure"]
     assert (events["failure_label"][2], events["code"][2]) == ("planning_error", "solver_iteration_limit")
@@ -238,10 +240,10 @@ def test_a_state_without_a_pose_has_no_frames_and_the_rest_is_there(tmp_path, lo
     xs = np.tile(problem.model.default_state, (4, 1))
     xs[1, :4], xs[2, 5] = 0.0, np.nan
     write_trace(tmp_path / "a.mcap", measure(solution_of(problem, xs=xs)), {})
-    log = dd.logs.read_mcap(tmp_path / "a.mcap")
+    log = read_mcap(tmp_path / "a.mcap")
     planned = [[t for t in m.transforms if t.child_frame_id.startswith("planned/")] for _, m in log.messages["/tf"]]
     assert [len(p) for p in planned] == [2, 0, 0, 2]  # ball and ground
-    assert bits(dd.read_trace(tmp_path / "a.mcap").planned_xs) == bits(xs)
+    assert bits(read_trace(tmp_path / "a.mcap").planned_xs) == bits(xs)
 
 
 def test_no_flipped_byte_of_a_trace_is_read(trace_of_collocated, tmp_path):
@@ -252,7 +254,7 @@ def test_no_flipped_byte_of_a_trace_is_read(trace_of_collocated, tmp_path):
         damaged[place] = (damaged[place] + seeded.randrange(1, 256)) % 256
         (tmp_path / "a.mcap").write_bytes(damaged)
         with pytest.raises(ArtifactError, match=r"a\.mcap"):
-            dd.read_trace(tmp_path / "a.mcap")
+            read_trace(tmp_path / "a.mcap")
 
 
 def test_a_whole_log_that_is_no_trace_is_refused(tmp_path):
@@ -260,7 +262,7 @@ def test_a_whole_log_that_is_no_trace_is_refused(tmp_path):
 
     write_mcap(tmp_path / "a.mcap", [], {}, {})
     with pytest.raises(ArtifactError, match="no channel /diagnostics, /input"):
-        dd.read_trace(tmp_path / "a.mcap")
+        read_trace(tmp_path / "a.mcap")
 
 
 def test_hostile_names_of_model_bodies_and_joints_are_only_names(tmp_path):
@@ -270,7 +272,7 @@ def test_hostile_names_of_model_bodies_and_joints_are_only_names(tmp_path):
         urdf = urdf.replace(f'"{name}"', f'"{evil}../[red]{name}ü"')
     (tmp_path / "evil.urdf").write_text(urdf)
     write_trace(tmp_path / "a.mcap", measure(solution_of(pendulum(tmp_path, "evil.urdf"))), {})
-    log = dd.logs.read_mcap(tmp_path / "a.mcap")
+    log = read_mcap(tmp_path / "a.mcap")
     assert log.messages["/joint_states"][0][1].joints[0].name == "<script>alert(1)</script>../[red]hingeü"
     assert log.metadata["run"]["model"].startswith("<script>")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "evil.urdf"]

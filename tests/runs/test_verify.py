@@ -24,14 +24,16 @@ from mcap.writer import Writer
 
 import drake_diff as dd
 import drake_diff.runs.save as evidence
+from drake_diff.comparison import save_comparison
 from drake_diff.exceptions import ArtifactError
-from drake_diff.runs import measure
+from drake_diff.runs import ComparisonRecord, certify_model, measure
 from drake_diff.runs.compare import list_runs
 from drake_diff.runs.differences import is_near, is_near_text
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.save import begin
 from drake_diff.runs.sealed import reproducible
 from drake_diff.runs.trace import write_trace
+from drake_diff.trials import save_robustness
 
 FILES = ("plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap")
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -449,10 +451,10 @@ def kinds(run, solution, tmp_path_factory):
     folder = tmp_path_factory.mktemp("kinds")
     model = solution.problem.model
     shutil.copytree(run, folder / "plan")
-    dd.comparison.save_comparison(dd.compare(model, ("numpy",), num_steps=5), folder / "comparison")
+    save_comparison(dd.compare(model, ("numpy",), num_steps=5), folder / "comparison")
     tried = dd.robustness(solution, {"mass": [0.1]}, trials=2, controller="open_loop")
-    dd.trials.save_robustness(tried, folder / "robustness")
-    dd.runs.certify_model(model, states=2, directory=folder / "certification")
+    save_robustness(tried, folder / "robustness")
+    certify_model(model, states=2, directory=folder / "certification")
     return folder
 
 
@@ -504,13 +506,13 @@ def test_a_certification_that_lies_is_found_by_certifying_again(kinds, tmp_path)
 @pytest.mark.slow
 def test_a_certification_carries_its_model_and_one_whose_mesh_changed_is_undecided(tmp_path):
     path = Path(shutil.copy(MODELS / "pendulum.urdf", tmp_path))
-    dd.runs.certify_model(dd.load_model(path, time_step=0.02), states=1, directory=tmp_path / "certified")
+    certify_model(dd.load_model(path, time_step=0.02), states=1, directory=tmp_path / "certified")
     path.unlink()
     assert dd.verify(tmp_path / "certified").require().holds
     (tmp_path / "tetra.obj").write_text(TETRAHEDRON)
     (tmp_path / "m.urdf").write_text(EVIL.format(mesh="tetra.obj"))
     model = dd.load_model(tmp_path / "m.urdf", time_step=0.02)
-    dd.runs.certify_model(model, states=1, directory=tmp_path / "meshed")
+    certify_model(model, states=1, directory=tmp_path / "meshed")
     assert "does not hold: models=FOLDER" in str(dd.verify(tmp_path / "meshed"))
     assert dd.verify(tmp_path / "meshed", models=tmp_path).require().holds
     (tmp_path / "tetra.obj").write_text(TETRAHEDRON + "\n")
@@ -523,19 +525,19 @@ def test_a_pass_with_an_engine_or_a_perturbation_that_does_not_hold_is_refused(k
     fields = dd.load_record(kinds / "comparison").model_dump()
     fields["engines"][1]["verdict"] = "unexplained"
     with pytest.raises(ValueError, match=r'"pass" with numpy'):
-        dd.runs.ComparisonRecord.model_validate({**fields, "verdict": "pass"})
+        ComparisonRecord.model_validate({**fields, "verdict": "pass"})
     fields = dd.load_record(kinds / "robustness").model_dump()
     trials = fields["robustness"]
     for change in ({"nominal": None}, {"perturbations": [{**trials["perturbations"][0], "margin": 0.0}]}):
         with pytest.raises(ValueError, match=r'"pass" with (an unperturbed run|mass)'):
-            dd.runs.PlanRecord.model_validate({**fields, "verdict": "pass", "robustness": {**trials, **change}})
+            PlanRecord.model_validate({**fields, "verdict": "pass", "robustness": {**trials, **change}})
 
 
 def test_a_pass_of_a_state_that_does_not_agree_is_no_certification(kinds):
     fields = dd.load_record(kinds / "certification").model_dump()
     fields["certification"]["states"][0]["gradient"] = None
     with pytest.raises(ValueError, match="state 0 refused"):
-        dd.runs.PlanRecord.model_validate(fields)
+        PlanRecord.model_validate(fields)
 
 
 def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):

@@ -19,9 +19,12 @@ import drake_diff as dd
 from drake_diff._base.statistics import success_rate
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
+from drake_diff.logs import read_mcap
+from drake_diff.runs import PlanRecord
 from drake_diff.runs.sealed import own_sha256
 from drake_diff.runs.verify import recalled
 from drake_diff.trials import files as robustness_page
+from drake_diff.trials import save_robustness
 from drake_diff.trials.files import record_of, robustness_data
 from drake_diff.trials.trial import evaluate
 
@@ -49,13 +52,13 @@ def result(run):
 @pytest.fixture(scope="module")
 def saved(result, run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("robustness") / "tried"
-    return folder, dd.trials.save_robustness(result, folder, run)
+    return folder, save_robustness(result, folder, run)
 
 
 def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
     folder, record = saved
     fields = json.loads((folder / "record.json").read_text())
-    assert dd.runs.PlanRecord.model_validate(fields) == record
+    assert PlanRecord.model_validate(fields) == record
     assert own_sha256(fields) == fields["record_sha256"]
     for file in record.files.values():
         assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
@@ -91,7 +94,7 @@ def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
 def test_everything_but_wall_clock_is_the_same_byte_for_byte(saved, run, tmp_path):
     folder, record = saved
     with recalled(run) as solution:
-        again = dd.trials.save_robustness(
+        again = save_robustness(
             dd.robustness(solution, LEVELS, trials=6, controller="open_loop"), tmp_path / "tried", run
         )
     apart = {"wall_clock": None, "record_sha256": "", "files": {}}
@@ -130,7 +133,7 @@ def test_it_is_the_worst_at_the_lowest_level_that_fails(result):
 
 def test_the_trace_has_all_that_the_loop_saw_and_did(result, saved):
     trial = result.worst("actuator_delay").worst
-    log, found = dd.logs.read_mcap(saved[0] / "worst/actuator_delay_1/trace.mcap"), trial.outcome.run
+    log, found = read_mcap(saved[0] / "worst/actuator_delay_1/trace.mcap"), trial.outcome.run
     for topic, rows in (
         ("/state", found.motion.xs),
         ("/observation", found.observations),
@@ -161,7 +164,7 @@ def test_the_table_has_a_row_for_each_trial(result, saved):
 def test_what_a_controller_raises_stands_in_record_and_table(run, tmp_path):
     with recalled(run) as solution:
         found = dd.robustness(solution, {"mass": [0.02]}, trials=2, controller=lambda *_: lambda x, t: 1 / 0)
-        record = dd.trials.save_robustness(found, tmp_path / "out", run)
+        record = save_robustness(found, tmp_path / "out", run)
     assert record.verdict == "fail"
     assert record.robustness.perturbations[0].cells[0].controller_errors == {"ZeroDivisionError: division by zero": 2}
     rows = list(csv.DictReader((tmp_path / "out" / "trials.csv").open()))
@@ -256,14 +259,14 @@ def test_the_words_say_whether_gradients_knew(result):
 
 
 def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(result, tmp_path, monkeypatch):
-    before = dd.trials.save_robustness(result, tmp_path / "out")
+    before = save_robustness(result, tmp_path / "out")
 
     def fails(*_):
         raise OSError("no space left")
 
     monkeypatch.setattr(robustness_page, "write_robustness_page", fails)
     with pytest.raises(OSError, match="no space"):
-        dd.trials.save_robustness(result, tmp_path / "out")
+        save_robustness(result, tmp_path / "out")
     (left,) = tmp_path.glob("out.partial-*")
     assert json.loads((left / "record.json").read_text())["verdict"] == "incomplete"
     assert not (left / "robustness.html").exists()
@@ -274,7 +277,7 @@ def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(result, tmp_p
     other.mkdir()
     (other / "notes.txt").write_text("keep")
     with pytest.raises(InputError, match="which holds 'mine'"):
-        dd.trials.save_robustness(result, tmp_path / "out")
+        save_robustness(result, tmp_path / "out")
     assert (other / "notes.txt").read_text() == "keep"
 
 
@@ -285,7 +288,7 @@ def test_a_loop_of_ones_own_is_not_said_to_run_again(cart, run, tmp_path):
         trials=2,
         loop=dd.loop.Loop(sensor=dd.loop.Sensor(noise=0.01), latency_budget=1),
     )
-    record = dd.trials.save_robustness(result, tmp_path, run)
+    record = save_robustness(result, tmp_path, run)
     trial = json.loads((tmp_path / record.robustness.perturbations[0].worst / "trial.json").read_text())
     assert trial["run"] is None
     assert record.robustness.loop.sensor["noise"] == 0.01
@@ -304,15 +307,15 @@ def test_a_run_that_breaks_off_at_once_and_one_with_a_fallback_are_kept(cart, tm
 
     solution = pushed_and_stopped(cart)
     result = dd.robustness(solution, {"mass": [0.1]}, trials=1, controller=made)
-    record = dd.trials.save_robustness(result, tmp_path / "broken")
+    record = save_robustness(result, tmp_path / "broken")
     assert record.robustness.nominal.ended.endswith("no answer")
     assert record.robustness.perturbations[0].cells[0].labels == {"control_error": 1}
     assert record.robustness.loop.controller == "a user's function"
     assert record.robustness.run is None
     loop = dd.loop.Loop(fallback=dd.loop.Fallback("stop"))
     found = dd.robustness(solution, {"mass": [0.1]}, trials=1, controller=made, loop=loop)
-    dd.trials.save_robustness(found, tmp_path / "kept")
-    log = dd.logs.read_mcap(tmp_path / "kept/worst/mass_0.1/trace.mcap")
+    save_robustness(found, tmp_path / "kept")
+    log = read_mcap(tmp_path / "kept/worst/mass_0.1/trace.mcap")
     assert [m.kind for _, m in log.messages["/events"]] == ["fallback", "failure"]
     assert {m.code for _, m in log.messages["/controller/status"]} == {"other"}
     status = next(p for p in robustness_data(found)["plots"] if p["title"] == "controller status")
@@ -328,12 +331,12 @@ def test_what_runs_away_is_kept(cart, tmp_path, levels):
     result = dd.robustness(
         plan(cart, np.zeros((300, 1)), start, start), levels, trials=8, controller="open_loop", seed=1
     )
-    record = dd.trials.save_robustness(result, tmp_path)
+    record = save_robustness(result, tmp_path)
     worst = result.cells[0].worst
     fields = json.loads((tmp_path / record.robustness.perturbations[0].worst / "trial.json").read_text())
     assert fields["label"] == worst.label
     assert (fields["goal_error"] is None) == (worst.label == "evaluation_error")
-    log = dd.logs.read_mcap(tmp_path / record.robustness.perturbations[0].worst / "trace.mcap")
+    log = read_mcap(tmp_path / record.robustness.perturbations[0].worst / "trace.mcap")
     assert np.array_equal(log.arrays("/state")["q"], worst.outcome.run.motion.xs[:, :1])
     replay = (tmp_path / record.robustness.perturbations[0].worst / "replay.html").read_text()
     assert "drawn up to 1e+06 only" in replay
@@ -343,10 +346,10 @@ def test_what_runs_away_is_kept(cart, tmp_path, levels):
 def test_plants_with_contact_finer_steps_and_no_inputs_are_kept(thrown, tmp_path):
     levels = {"contact_approximation": [1], "time_step": [2], "friction": [0.4]}
     result = dd.robustness(thrown, levels, trials=2)
-    record = dd.trials.save_robustness(result, tmp_path)
+    record = save_robustness(result, tmp_path)
     fields = json.loads((tmp_path / "worst/time_step_2/trial.json").read_text())
     assert (fields["plant_time_step_s"], fields["controller_period_s"]) == (0.0025, 0.005)
-    log = dd.logs.read_mcap(tmp_path / "worst/time_step_2/trace.mcap")
+    log = read_mcap(tmp_path / "worst/time_step_2/trace.mcap")
     assert len(log.arrays("/state")["q"]) == len(log.arrays("/planned/state")["q"]) == 121
     assert len(log.arrays("/estimate")["q"]) == 60
     assert log.messages["/contacts"]
