@@ -293,10 +293,11 @@ def test_a_check_has_how_far_the_plan_ends_from_its_goal_and_what_is_allowed(wri
     off = abs(np.sum(vs) * H / 2 - 1)  # symplectic Euler by hand; the speed ends at 0 exactly
     controlled = [r for r in solution.replays if r.variant == "in steps of 0.025 s"]
     assert min(r.goal_error for r in controlled) <= off + 1e-9
-    assert controlled[0].goal_error == pytest.approx(off, rel=1e-6)
+    assert controlled[0].goal_error == pytest.approx(off, abs=1e-9)
     (ends,) = [c for c in controlled[0].checks if c.what == "goal"]
-    assert (ends.where, ends.value) == ("slide_x", pytest.approx(off, rel=1e-6))
-    assert ends.tolerance == pytest.approx(0.05 * np.ptp(solution.xs[:, 0]))
+    i = solution.problem.state_names.index(ends.where)  # both are off by rounding: the speeds sum to the same
+    assert ends.value == pytest.approx(off, abs=1e-9)
+    assert ends.tolerance == pytest.approx(0.05 * np.ptp(solution.xs[:, i]))
     from_diagram = dd.solve(dd.Problem(rail_block(), x0=[0, 0], x_goal=[1, 0], num_steps=10), method="shooting")
     assert {r.variant for r in from_diagram.replays} == {"in steps of 0.1 s"}  # it allows no other step
 
