@@ -10,8 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import drake_diff as dd
-from drake_diff.identification import first_state
-from drake_diff.identification.impacts import flights_of
+from drake_diff.identification.impacts import first_state, flights_of
 
 FOLDER, OUT = Path(__file__).parent / "cube_tosses", Path("artifacts/tossed_cube")
 RATE, STEPS = 148, 2  # [Hz], and steps between samples

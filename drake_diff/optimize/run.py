@@ -49,7 +49,7 @@ FINER_ROUNDS = 6  # of a mesh whose plan does not hold
 GRACE = 0.05  # of the time limit, beyond it: for measures of what a search found that the limit ended
 # What a solve is made of, in this order; a time limit names what it cut.
 STAGES = ("certificates of the guess", "the search", "certificates of the result", "replays and other measures")
-FEW_STEPS = 50  # of iLQR, for the guess of a search by shooting
+FEW_STEPS = 100  # of iLQR, for the first guess of shooting: most that converge do so in fewer
 PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 
 Searcher = Callable[[Problem, Array, Array, Array], tuple[NlpResult, Array, Array]]
@@ -287,27 +287,44 @@ class Run:
         return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages), around=around)
 
     def shoot(self, guess: Guess, *, given: bool) -> Solution:
-        """From the states of the guess.
+        """The sparse program through the steps, from the states of the guess.
 
-        Where none is `given`, the rollout of inputs that the problem has, and a motion in continuous time, comes first,
-        and a few steps of iLQR, which keeps to the motions there are.
+        Where no guess is `given`, a few steps of iLQR come first, from the rollout of the inputs and without couplings,
+        which iLQR does not take. If they converge, the program starts from their motion, else from the default guess.
+        Where the problem has inputs, or the motion is in continuous time, the program starts from what iLQR reached in
+        any case.
         """
         problem = self.problem
         multipliers = guess.multipliers if given else None
         rolled = not given and (not problem.optimizes_controls or bool(np.any(problem.us)) or problem.motion != STEPS)
 
         def search(problem: Problem, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
-            if rolled and takes(problem):
-                few = dataclasses.replace(self._left(), max_iterations=min(FEW_STEPS, self.limits.max_iterations))
-                result, xs, us = solve_ilqr(problem, xs, us, limits=few, report=self.report, values=values)
+            swept = None if given else self._few_sweeps(problem, xs[0], us, values)
+            if swept is not None and swept[0].outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
+                return swept
+            if swept is not None and (rolled or swept[0].outcome is Outcome.SOLVED):
+                result, xs, us = swept
                 self.options["initial_guess"] = f"default, then {result.message}"
                 values = values if result.parameters is None else result.parameters
-                if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
-                    return result, xs, us
             options: dict[str, Any] = {"values": values, "begun": multipliers}
             return solve_shooting(problem, xs, us, limits=self._left(), report=self.report, **options)
 
         return self._through_steps(guess.xs, guess.us, search, guess, around=not rolled)
+
+    def _few_sweeps(
+        self, problem: Problem, x0: Array, us: Array, values: Array
+    ) -> tuple[NlpResult, Array, Array] | None:
+        """A few iterations of iLQR from the rollout of `us` (N, nu); None if iLQR does not apply or cannot step."""
+        problem = dataclasses.replace(problem, couplings=())
+        if not takes(problem):
+            return None
+        few = dataclasses.replace(self._left(), max_iterations=min(FEW_STEPS, self.limits.max_iterations))
+        try:
+            with problem.intervals(problem.design.vector.at(values)) as intervals:
+                rolled = roll(intervals, x0, us)
+            return solve_ilqr(problem, rolled, us, limits=few, report=self.report, values=values)
+        except (GradientError, SimulationError):
+            return None
 
     def _through_steps(
         self,

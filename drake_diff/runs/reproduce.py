@@ -172,8 +172,10 @@ def _run_again(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Repr
         return _written(solution, record, 0.0)
     ways = [(s.method, s.scheme, s.solver) for s in (solution, recorded)]
     if apart == np.inf or ways[0] != ways[1]:
-        ended = f"run again, it ends by {solution.method} ({solution.scheme}) in {len(solution.us)} intervals"
-        return _without_the_search(recorded, record, (f"{ended} at another plan",))
+        recorded_by, solved_by = (
+            f"{s.method} ({s.scheme}, {s.solver}) in {len(s.us)} intervals" for s in (recorded, solution)
+        )
+        return _without_the_search(recorded, record, (f"recorded by {recorded_by}, this version takes {solved_by}",))
     return _written(replace(solution, **plan_fields(plan)), record, apart)
 
 

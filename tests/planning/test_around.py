@@ -117,9 +117,9 @@ def test_a_hand_goes_around_a_ball_and_the_plan_is_clear_by_the_closed_form(arm,
 @each_row(
     "avoid, message",
     [
-        ([dd.SphereObstacle([0, 0, -0.8], 0.1)], r"start: .*got lower enters obstacle sphere at 0, 0, -0.8"),
-        ([dd.SphereObstacle([-1, 0, 0], 0.2)], r"goal tip: .*got at the goal lower enters obstacle"),
-        ([dd.BoxObstacle([-0.9, 0, 0.1], [0.3, 0.3, 0.3])], r"goal tip: .*got at the goal lower enters obstacle"),
+        ([dd.SphereObstacle([0, 0, -0.8], 0.1)], r"start: .*got lower and obstacle sphere at 0, 0, -0.8 come"),
+        ([dd.SphereObstacle([-1, 0, 0], 0.2)], r"goal tip: .*got at the goal lower and obstacle"),
+        ([dd.BoxObstacle([-0.9, 0, 0.1], [0.3, 0.3, 0.3])], r"goal tip: .*got at the goal lower and obstacle"),
         ([1.0], r"avoid: .*SphereObstacles"),
     ],
     ids=str,
