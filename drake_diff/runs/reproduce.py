@@ -323,9 +323,6 @@ def _in_phases(folder: Path, record: PlanRecord, section: PhasesSection, models:
             return replace(made, undecided=(why,))
         problem = _phased_problem(section, list(phases))
         solution, apart, unrepeated = _solved_in_phases(problem, record, section, phases)
-        if apart > SAME_PLAN:
-            ends = f"the search, run again, ends at another plan, {apart:.2g} of its largest number away"
-            return replace(made, undecided=(ends,))
         again = _as_given(record_of_phases(folder, solution), record).model_dump(mode="json")
     for made_link, link in zip(again["phases"]["links"], section.links, strict=True):
         if link.reset == {"impact": {}}:  # as records of 2.x tell of one
@@ -391,18 +388,22 @@ def _rebuilt_phases(
 def _solved_in_phases(
     problem: PhasedProblem, record: PlanRecord, section: PhasesSection, phases: tuple[Solution, ...]
 ) -> tuple[PhasedSolution, float, tuple[str, ...]]:
-    """The recorded plan as the search, run again, ends at it; how far away that ends, and why it was not run again."""
+    """The recorded plan as the search, run again, ends at it; how far away that ends, and why it was not run again.
+
+    Where the search ends elsewhere, the plan is as the record says.
+    """
+    status = Status(record.solver.status if record.solver else "")
+    recorded = PhasedSolution(problem, status, record.sentence, phases)
     if section.search is None or section.initial_guess is not None:
-        recorded = PhasedSolution(
-            problem, Status(record.solver.status if record.solver else ""), record.sentence, phases
-        )
         return recorded, 0.0, ("it began from a guess that the directory does not have",)
     left_out = ("time_limit", "solver", "continuation", *REMOVED)
     arguments: dict[str, Any] = {name: value for name, value in section.search.items() if name not in left_out}
     solved = solve(problem, **arguments)
     apart = max(_distance(one, other) for one, other in zip(solved.phases, phases, strict=True))
+    if apart > SAME_PLAN:
+        return recorded, 0.0, (f"run again, it ends at another plan, {apart:.2g} of its largest number away",)
     ended = replace(solved, search=Search(dict(section.search)))
-    if 0 < apart <= SAME_PLAN:
+    if apart > 0:
         pairs = zip(phases, solved.phases, strict=True)
         ended = replace(ended, phases=tuple(one.told(status=other.status) for one, other in pairs))
     return ended, apart, ()
