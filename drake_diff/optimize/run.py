@@ -292,14 +292,16 @@ class Run:
         Where no guess is `given`, a few steps of iLQR come first, from the rollout of the inputs and without couplings,
         which iLQR does not take. If they converge, the program starts from their motion, else from the default guess.
         Where the problem has inputs, or the motion is in continuous time, the program starts from what iLQR reached in
-        any case.
+        any case. A design that is optimized with the inputs goes without iLQR, which far from its goal leads a jumping
+        leg to a short one, of half the height.
         """
         problem = self.problem
+        co_design = problem.optimizes_controls and problem.optimizes_parameters
         multipliers = guess.multipliers if given else None
         rolled = not given and (not problem.optimizes_controls or bool(np.any(problem.us)) or problem.motion != STEPS)
 
         def search(problem: Problem, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
-            swept = None if given else self._few_sweeps(problem, xs[0], us, values)
+            swept = None if given or co_design else self._few_sweeps(problem, xs[0], us, values)
             if swept is not None and swept[0].outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
                 return swept
             if swept is not None and (rolled or swept[0].outcome is Outcome.SOLVED):
