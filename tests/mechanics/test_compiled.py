@@ -84,14 +84,17 @@ def test_nothing_is_compiled_for_more_than_one_kind_of_arguments():
     model, random = example_robot("solo12.urdf", feet=True), np.random.default_rng(6)
     xs = np.array([state_in_contact(model, random) for _ in range(3)])
     us = np.zeros((3, model.nu))
+    of_steps = of_contact.kernel(of_contact.KERNEL)
+    functions = of_steps.overlapping, of_steps.touch, of_steps.step_jacobians, tree_kernel.differentiate_tree
+    dd.linearize(model, xs, us)
+    compiled = [len(function.signatures) for function in functions]  # other kernels call the last one as well
+    assert min(compiled) > 0
     xs.setflags(write=False)
     dd.linearize(model, xs, us)
     dd.linearize(model, xs[:1], us[:1])
     dd.linearize(model, np.asfortranarray(xs), us)
     dd.differentiate_step(model, xs[0], us[0])
-    of_steps = of_contact.kernel(of_contact.KERNEL)
-    functions = of_steps.overlapping, of_steps.touch, of_steps.step_jacobians, tree_kernel.differentiate_tree
-    assert [len(function.signatures) for function in functions] == [1, 1, 1, 1]
+    assert [len(function.signatures) for function in functions] == compiled
 
 
 def test_a_function_without_a_folder_for_its_cache_is_compiled_all_the_same(monkeypatch, tmp_path):

@@ -228,7 +228,7 @@ def test_a_goal_that_nothing_moves_is_no_gradient(write_urdf):
 
 def test_a_solver_that_lies_is_not_believed(load, monkeypatch):
     def liar(problem, xs, us, **options):
-        return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, us
+        return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, np.zeros_like(us)
 
     monkeypatch.setattr("drake_diff.optimize.run.solve_shooting", liar)
     solution = dd.solve(swing_up(load, 20), method="shooting")
