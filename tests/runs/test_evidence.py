@@ -147,7 +147,7 @@ def test_the_trace_has_well_known_channels_with_units_in_simulated_time(run):
     assert states[5][1].joints[0].position == pytest.approx(read_trace(run / "trace.mcap").xs[5, 0], abs=0)
     assert log.channel_metadata["/state"]["units"]["q"] == {"hinge_q": "rad"}
     assert log.channel_metadata["/diagnostics"]["units"]["energy_total"] == "J"
-    assert len(log.messages["/solver/iterations"]) > 3
+    assert len(log.messages["/solver/iterations"]) == dd.load_record(run).solver.iterations
     assert {m.verdict for _, m in log.messages["/gradient/check"]} == {"agree"}
 
 

@@ -69,7 +69,7 @@ def test_two_runs_differ_in_what_was_changed_and_what_that_changed(runs):
     found = compare_runs(runs / "a", runs / "b")
     configuration = {d.key: (d.a, d.b) for d in found.configuration}
     assert configuration.pop("problem.x_goal[0]") == (1.0, 0.5)
-    assert set(configuration) == {"inputs.initial_guess_sha256"}  # a straight line to the goal
+    assert set(configuration) == {"inputs.initial_guess", "inputs.initial_guess_sha256"}  # how many steps iLQR took
     assert found.versions == ()
     assert "cost [1]" in {d.key for d in found.metrics}
     assert found.comparable
