@@ -126,24 +126,24 @@ def compare(
     directory = out or Path("artifacts") / f"compare_{file.stem}"
     recordings = with_own_names([read_recording(path, model) for path in recording or ()])
     with written_whole(directory) as folder:
-        found = compare_engines(model, names_in(engines), recordings=recordings, num_steps=num_steps, seed=seed)
-        apart = {e.engine for e in found.engines if e.verdict != "same"}
-        causes = {one.name: cause_of(model, one) for one in recordings if one.name in apart}
-        record = write_comparison(found, folder, causes=causes)
+        comparison = compare_engines(model, names_in(engines), recordings=recordings, num_steps=num_steps, seed=seed)
+        apart = {e.engine for e in comparison.engines if e.verdict != "same"}
+        causes = {motion.name: cause_of(model, motion) for motion in recordings if motion.name in apart}
+        record = write_comparison(comparison, folder, causes=causes)
     rows = table(
         "engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian", wrap=False
     )
     clock = record.wall_clock
     for i, e in enumerate(record.engines):
         times = (clock.seconds_per_step[e.engine], clock.seconds_per_jacobian[e.engine])
-        own = {"its own step's": "yes", "not its own step's": "no"}.get(e.gradient, e.gradient)
+        answer = {"its own step's": "yes", "not its own step's": "no"}.get(e.gradient, e.gradient)
         rows.add_row(
             plain(e.engine),
             plain(e.verdict, GAPS[e.verdict]) if i else plain("reference", "dim"),
             f"{e.largest_step_gap:.1e}",
             "" if e.first_apart_s is None else f"{e.first_apart_s:.4g} s",
             f"{max((j.gap for j in e.jacobians), default=0.0):.1e}",
-            plain(own, "red" if own == "no" else ""),
+            plain(answer, "red" if answer == "no" else ""),
             *("-" if t is None else f"{1e6 * t:.0f} µs" for t in times),
         )
     show(rows)
@@ -206,22 +206,22 @@ def identify(
     limits = numbers_in("--bounds", bounds or (), "PARAMETER=LOWER,UPPER", counts=(2,))
     mounted = dict(_sensor_pose(word) for word in sensor or ())
     try:
-        part: float | str = float(held_out)
+        holdout: float | str = float(held_out)
     except ValueError:
-        part = held_out
-    asked: dict[str, Any] = {"noise": given, "held_out": part, "motion": motion, "sensors": mounted}
+        holdout = held_out
+    asked: dict[str, Any] = {"noise": given, "held_out": holdout, "motion": motion, "sensors": mounted}
     with written_whole(directory) as folder:
         with progress_line("fitting"):
-            found = estimate(model, list(recording), names, **asked, priors=priors, bounds=limits)
-        record: Any = write_identification(found, folder)
+            identification = estimate(model, list(recording), names, **asked, priors=priors, bounds=limits)
+        record: Any = write_identification(identification, folder)
     show(judged(record.verdict), record.sentence)
     rows = table("parameter", "before", "found", "95 % from", "to", "unit", "", left=1)
     for e in record.estimates:
         known = e.lower is not None and e.upper is not None
         differs = known and not e.lower <= e.before <= e.upper
-        told = plain("not known", "dim") if not known else plain("differs", "yellow") if differs else plain("")
+        remark = plain("not known", "dim") if not known else plain("differs", "yellow") if differs else plain("")
         rows.add_row(
-            plain(e.name), plain(e.before), plain(e.value), plain(e.lower), plain(e.upper), plain(e.unit), told
+            plain(e.name), plain(e.before), plain(e.value), plain(e.lower), plain(e.upper), plain(e.unit), remark
         )
     show(rows)
     for line in record.unidentifiable:
@@ -278,20 +278,20 @@ def excite(
         "seed": seed,
     }
     with progress_line("searching"):
-        found = design(model, names, duration=duration, period=period, **asked)
-    show(found.sentence)
+        excitation = design(model, names, duration=duration, period=period, **asked)
+    show(excitation.sentence)
     rows = table("parameter", "known to", "random", "at rest", "unit", left=1)
-    for name, value in found.deviations.items():
-        each = [np.atleast_1d(one) for one in (value, found.random[name], found.rest[name])]
-        for k, numbers in enumerate(zip(*each, strict=True)):
-            label = name if len(each[0]) == 1 else f"{name}[{k}]"
-            told = (plain(float(number) if np.isfinite(number) else "not known") for number in numbers)
-            rows.add_row(plain(label), *told, plain(found.units[name]))
+    for name, value in excitation.deviations.items():
+        columns = [np.atleast_1d(deviations) for deviations in (value, excitation.random[name], excitation.rest[name])]
+        for k, numbers in enumerate(zip(*columns, strict=True)):
+            label = name if len(columns[0]) == 1 else f"{name}[{k}]"
+            cells = (plain(float(number) if np.isfinite(number) else "not known") for number in numbers)
+            rows.add_row(plain(label), *cells, plain(excitation.units[name]))
     show(rows)
-    for line in found.unidentifiable:
+    for line in excitation.unidentifiable:
         show(plain("left open", "bold dim"), line)
     if out is not None:
-        write_csv(found.recording(), model, out)
+        write_csv(excitation.recording(), model, out)
         show(f"wrote {out}")
 
 

@@ -194,11 +194,11 @@ def panel(
     directory = out or Path("artifacts") / file.stem
     try:
         with _counted() as progress:
-            found = run_panel(file, out=directory, workers=workers, engine=engine, address=address, progress=progress)
+            results = run_panel(file, out=directory, workers=workers, engine=engine, address=address, progress=progress)
     except KeyboardInterrupt:
         show(f"interrupted: finished trials are in {directory}; the same command goes on from there")
         raise typer.Exit(INTERRUPTED) from None
-    cells = found.summary["cells"]
+    cells = results.summary["cells"]
     with_success = any("success" in cell for cell in cells)
     axes, names = (list(dict.fromkeys(name for cell in cells for name in cell[key])) for key in ("cell", "numbers"))
     judgement = ["success", "95 %"] if with_success else []
@@ -214,11 +214,11 @@ def panel(
             words.append(None if n is None else f"{n['mean']:.4g}{spread}")
         rows.add_row(*(plain(word) for word in words))
     show(rows)
-    show(f"{found.summary['trials']} trials, {found.errors} errors")
+    show(f"{results.summary['trials']} trials, {results.errors} errors")
     show(
         f"wrote {directory}: record.json, table.csv, summary.json, trials.jsonl, panel.html, a record of each in trials"
     )
-    raise typer.Exit(1 if found.errors else 0)
+    raise typer.Exit(1 if results.errors else 0)
 
 
 @contextmanager

@@ -79,8 +79,8 @@ def run(
                     record_without_problem(directory.name, sentence).begin(folder)
                 show(f"{sentence}; a record that says so is in {folder}")
                 raise typer.Exit(INTERRUPTED) from None
-            told: dict[str, Any] = {"view": show_address} if view else {}
-            record = _solved_into(directory, folder, problem, options | told, cross_check)
+            view_options: dict[str, Any] = {"view": show_address} if view else {}
+            record = _solved_into(directory, folder, problem, options | view_options, cross_check)
     except KeyboardInterrupt:
         if claimed:
             raise
@@ -111,15 +111,15 @@ def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
     for name in options.keys() - set(known):
         raise UnknownNameError("solve_options", got=name, known=known)
     parts = problem.phases if isinstance(problem, PhasedProblem) else (problem,)
-    show(plain(script.name, "bold"), "; ".join(f"{part.system}, {part.num_steps} steps" for part in parts))
+    show(plain(script.name, "bold"), "; ".join(f"{phase.system}, {phase.num_steps} steps" for phase in parts))
     return problem, options
 
 
-def _wait_at(place: str) -> None:
+def _wait_at(location: str) -> None:
     """Say that until Ctrl-C something is at a place."""
     try:
         # Not by a console: interrupted after it has written, it would write the line once more.
-        typer.echo(f"{place} (Ctrl-C ends it)")
+        typer.echo(f"{location} (Ctrl-C ends it)")
         threading.Event().wait()
     except KeyboardInterrupt:
         typer.echo("ended")
@@ -202,9 +202,9 @@ def _show_record(record: Any) -> None:
         rows.add_row(metric.name, plain(metric.value), metric.unit, tolerance, shown)
     show(rows)
     for replay in record.replays:
-        told = plain("holds") if replay.holds else plain(f"does not hold: {replay.failures[0]}", "red")
+        verdict = plain("holds") if replay.holds else plain(f"does not hold: {replay.failures[0]}", "red")
         goal = "-" if replay.goal_error is None else f"{replay.goal_error:.3g}"
-        show(f"replayed {replay.variant}, {replay.control}: goal error {goal},", told)
+        show(f"replayed {replay.variant}, {replay.control}: goal error {goal},", verdict)
     for p in record.parameters:
         moved = f", from {p.start:.6g}" if p.optimized else ""
         show(f"{p.name} = {p.value:.9g} {p.unit}{moved}, derivative from {p.derivative_source}")
@@ -231,13 +231,13 @@ def verify(
     """
     from drake_diff.runs.verify import verify as verify_run
 
-    found = verify_run(run, models=models, time_limit=time_limit, memory_limit=memory_limit)
-    verdict = "unknown" if found.record is None else found.record.verdict
-    told = found.sentence if found.verdict in ("holds", "intact") else "see below"
-    show(judged(found.verdict), f"{run}: {told}; the run's verdict: {verdict}")
-    for line in found.lines:
+    verification = verify_run(run, models=models, time_limit=time_limit, memory_limit=memory_limit)
+    verdict = "unknown" if verification.record is None else verification.record.verdict
+    sentence = verification.sentence if verification.verdict in ("holds", "intact") else "see below"
+    show(judged(verification.verdict), f"{run}: {sentence}; the run's verdict: {verdict}")
+    for line in verification.lines:
         show(plain(f"  {line}", "red" if line.startswith("broken") else "dim"))
-    raise typer.Exit(0 if found.holds else 1)
+    raise typer.Exit(0 if verification.holds else 1)
 
 
 @memory_at_most(MOST_MEMORY)
@@ -266,8 +266,8 @@ def recover_run(
 
     record: Any = complete(run, out)
     show(judged(record.verdict), f" {record.sentence}")
-    place = out or run.resolve().with_name(record.name)
-    show(f"wrote {place}: {record.FILE}, {', '.join(sorted(record.files))}")
+    directory = out or run.resolve().with_name(record.name)
+    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 
@@ -285,23 +285,23 @@ def compare_runs(
     """
     from drake_diff.runs.compare import compare_runs as compare
 
-    found = compare(a, b)
+    comparison = compare(a, b)
     for title in ("configuration", "versions", "metrics"):
-        differing = getattr(found, title)
+        differing = getattr(comparison, title)
         show(plain(title if differing else f"{title}: no difference", "bold"))
         rows = table("", "A", "B")
         for row in differing:
             rows.add_row(plain(row.key), plain(row.a), plain(row.b))
         if differing:
             show(rows)
-    for line in found.refused:
+    for line in comparison.refused:
         show(plain(f"not compared: {line}", "red"))
     if out is not None:
         from drake_diff.runs.compare import write_runs_page
 
         write_runs_page(out, a, b, models=models)
         show(f"wrote {out}")
-    raise typer.Exit(0 if found.comparable else 1)
+    raise typer.Exit(0 if comparison.comparable else 1)
 
 
 def schema(
@@ -385,8 +385,8 @@ def check(file: LogFile) -> None:
         show(judged("damaged"), f" {error}")
         raise typer.Exit(1) from error
     count = sum(len(messages) for messages in log.messages.values())
-    told = f"{count} messages in {len(log.messages)} channels, {len(log.attachments)} attachments"
-    show(plain("whole", "bold green"), f" {file}: {told}, every checksum holds")
+    contents = f"{count} messages in {len(log.messages)} channels, {len(log.attachments)} attachments"
+    show(plain("whole", "bold green"), f" {file}: {contents}, every checksum holds")
 
 
 @memory_at_most(MOST_MEMORY)

@@ -72,7 +72,7 @@ def takes_model(command: Callable[..., None]) -> Callable[..., None]:
     Typer reads options from a function's signature, so this one writes them there, once for all commands.
     """
     loading = inspect.signature(_load).parameters
-    own = [p for p in inspect.signature(command).parameters.values() if p.name not in ("model", "file")]
+    arguments = [p for p in inspect.signature(command).parameters.values() if p.name not in ("model", "file")]
 
     @functools.wraps(command)
     def run(**given: Any) -> None:
@@ -80,7 +80,7 @@ def takes_model(command: Callable[..., None]) -> Callable[..., None]:
         command(_load(**{name: given.pop(name) for name in loading}), file, **given)
 
     model, *options = loading.values()
-    parameters = [model, *own, *options]
+    parameters = [model, *arguments, *options]
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run
@@ -141,8 +141,8 @@ def survived(file: Path, options: Mapping[str, Any]) -> None:
 
     crash = crash_of(read)
     if crash:
-        told = f"ModelError: {file}: the model cannot be read: the process that tried to ended by {crash}"
-        console(stderr=True).print(plain(f"drake-diff: {told}"), soft_wrap=True)
+        message = f"ModelError: {file}: the model cannot be read: the process that tried to ended by {crash}"
+        console(stderr=True).print(plain(f"drake-diff: {message}"), soft_wrap=True)
         raise typer.Exit(1)
 
 
@@ -212,15 +212,15 @@ def as_options(arguments: Mapping[str, Any]) -> str:
 
 def console(*, stderr: bool = False) -> Console:
     """A console without markup; tables in a file or pipe are not folded to a terminal's width."""
-    found = Console(soft_wrap=True, highlight=False, markup=False, stderr=stderr)
-    if not found.is_terminal:
-        found.width = NOT_FOLDED
-    return found
+    terminal = Console(soft_wrap=True, highlight=False, markup=False, stderr=stderr)
+    if not terminal.is_terminal:
+        terminal.width = NOT_FOLDED
+    return terminal
 
 
 def show(*parts: str | Text | Table) -> None:
     """Print a line or a table; only `Text` keeps a style."""
-    console().print(*(plain(part) if isinstance(part, str) else part for part in parts))
+    console().print(*(plain(renderable) if isinstance(renderable, str) else renderable for renderable in parts))
 
 
 def plain(value: Any, style: str = "") -> Text:

@@ -210,7 +210,7 @@ class MPC:
 
         That is looked at where the last ones cost far more than was planned.
         """
-        steps, found = np.arange(k, k + len(us)), list[tuple[float, Motion]]()
+        steps, candidates = np.arange(k, k + len(us)), list[tuple[float, Motion]]()
         last, first = self._step, self._first_step
         for step, begin in ((last, self._solved_at), (first, 0)):
             if step is None:
@@ -222,35 +222,35 @@ class MPC:
             except SimulationError:
                 continue
             if np.isfinite(paid):
-                found.append((paid, motion))
+                candidates.append((paid, motion))
                 if paid <= FAR_MORE * step.merit:
                     break
-        if not found:
+        if not candidates:
             raise SimulationError("the last plan cannot be followed on the plant from where it is")
-        return min(found, key=lambda each: each[0])[1]
+        return min(candidates, key=lambda candidate: candidate[0])[1]
 
     def _same_sign(self, x: Array, planned: Array) -> Array:
         """`x` with its quaternions as near to those of `planned` as they can be: either sign is the same rotation."""
         x = np.array(x)
         for start in tangent_space(self._problem.model).quaternions:
-            part = slice(start, start + 4)
-            if x[part] @ planned[part] < 0:
-                x[part] *= -1
+            entries = slice(start, start + 4)
+            if x[entries] @ planned[entries] < 0:
+                x[entries] *= -1
         return x
 
     def _told(self, step: Step, k: int) -> str:
         """What is to be said of a step at the problem's step `k`."""
-        said = []
+        remarks = []
         if not step.size and not step.is_reached:
-            said.append(f"{FOLLOWED}: no step lowers what is paid, though the derivatives promise it")
+            remarks.append(f"{FOLLOWED}: no step lowers what is paid, though the derivatives promise it")
         elif step.size and step.is_doubtful:
-            said.append("the derivatives are not those of the plant's steps")
+            remarks.append("the derivatives are not those of the plant's steps")
         elif 0 < step.size < 1:
-            said.append(f"a step of {step.size:g}: the plant does not follow its derivatives further")
+            remarks.append(f"a step of {step.size:g}: the plant does not follow its derivatives further")
         if step.given_way is not None:
             label, far, knot = step.given_way
-            said.append(f"{label} gives way by {far:.3g} at {(k + knot) * self._problem.model.time_step:.4g} s")
-        return "; ".join(said) or OK
+            remarks.append(f"{label} gives way by {far:.3g} at {(k + knot) * self._problem.model.time_step:.4g} s")
+        return "; ".join(remarks) or OK
 
     def _get_ready(self) -> None:
         """Do once what each length of a plan needs once, so that no call has to."""
@@ -285,10 +285,10 @@ class MPC:
         damping = 0.0
         for i in range(PLAN_STEPS):
             stretch = stretch if stretch.rolls else stretch.along(motion.xs)
-            found = take_step(stretch, motion, damping * unit if damping else None)
-            if isinstance(found, Refusal):
-                raise InputError("plan", got=found.reason, expected="a plan near which a minimum is found")
-            step, motion = found, found.motion
+            outcome = take_step(stretch, motion, damping * unit if damping else None)
+            if isinstance(outcome, Refusal):
+                raise InputError("plan", got=outcome.reason, expected="a plan near which a minimum is found")
+            step, motion = outcome, outcome.motion
             is_near = i >= PLENTY and not step.whole and step.promised <= NEAR * (1 + abs(step.merit))
             if damping <= DAMPED and (step.is_reached or not step.size or is_near):
                 break
@@ -298,8 +298,8 @@ class MPC:
             less = damping / 8 if damping > DAMPED else 0.0
             damping = max(8 * damping, DAMPED) if step.size < 1.0 else less
         if damping:  # gains and costs-to-go are those of the problem itself
-            found = take_step(stretch, motion)
-            step = step if isinstance(found, Refusal) else found
+            outcome = take_step(stretch, motion)
+            step = step if isinstance(outcome, Refusal) else outcome
         apart = float(np.max(np.abs(motion.gaps) / ranges))
         if apart > GAP or step.given_way is not None:
             got = f"steps that are {apart:.2g} of a range off" if apart > GAP else self._told(step, 0)
@@ -369,8 +369,8 @@ def _fixed_point(problem: Problem, x: Array, u: Array) -> tuple[Array, Array]:
     free[model.nq :] = False
     quaternions = [slice(start, start + 4) for start in tangent_space(model).quaternions]
     for i in range(FIXED_POINT_STEPS):
-        for part in quaternions:
-            x[part] /= np.linalg.norm(x[part])
+        for quaternion in quaternions:
+            x[quaternion] /= np.linalg.norm(x[quaternion])
         d = differentiate_step(model, x, u)
         if np.max(np.abs(d.x_next - x)) <= AT_REST:
             break

@@ -64,8 +64,8 @@ class Sensor:
 
         def read(k: int, x: Array) -> Array | None:
             # Drawn in every step, so that another rate or dropout leaves the noise of the other steps as it is.
-            shift, kept = noise * random.standard_normal(space.size), random.uniform() >= self.dropout
-            due = k % self.every == 0 and (kept or k == 0)
+            shift, received = noise * random.standard_normal(space.size), random.uniform() >= self.dropout
+            due = k % self.every == 0 and (received or k == 0)
             samples.append(space.plus(x, bias + shift) if due else None)
             return samples[max(0, k - self.delay)]
 

@@ -217,10 +217,10 @@ class _LoopRun:
         self.ended = self.failed_part = self.controller_error = ""
 
     def result(self, x0: Array, num_steps: int) -> ClosedLoop:
-        for name, part in (("estimator", self.loop.estimator), ("controller", self.controller)):
+        for name, component in (("estimator", self.loop.estimator), ("controller", self.controller)):
             try:
-                if hasattr(part, "start"):
-                    part.start(x0)
+                if hasattr(component, "start"):
+                    component.start(x0)
             except Exception as error:  # as one of its first call
                 self.start_errors[name] = error
         meter, xs = Meter(self.model), [x0]
@@ -267,18 +267,18 @@ class _LoopRun:
     def _decide(self, k: int, x: Array) -> Array | None:
         """What the actuator applies in step k; None where the run ends."""
         fallback, t = self.loop.fallback, k * self.period
-        last, part = self.rows[-1][2] if self.rows else None, "sensor"
+        last, component = self.rows[-1][2] if self.rows else None, "sensor"
         try:  # they may be a user's code, as the controller
             seen = self.read(k, x)
             if seen is not None:
                 seen = array_with_gaps("the measurement", seen, x.shape)
-            part = "estimator"
-            if part in self.start_errors:
-                raise self.start_errors[part]
+            component = "estimator"
+            if component in self.start_errors:
+                raise self.start_errors[component]
             estimate = array_with_gaps("the estimate", self.loop.estimator.estimate(seen, last), x.shape)
         except Exception as error:
-            self.failed_part = part
-            self._end(k, f"the {part} failed: {type(error).__name__}: {error}")
+            self.failed_part = component
+            self._end(k, f"the {component} failed: {type(error).__name__}: {error}")
             return None
         self.unseen = 0 if seen is not None else self.unseen + 1
         if fallback is not None and self.unseen > fallback.patience:
@@ -287,8 +287,10 @@ class _LoopRun:
             command, status, taken = self._command(estimate, t)
             budget = self.loop.latency_budget
             if command is not None and budget is not None and taken > budget:
-                told = f"the controller took {taken:.3g} s, expected at most {budget:.3g} s: the last command is held"
-                self.events.append(LoopEvent(t, "late", told))
+                message = (
+                    f"the controller took {taken:.3g} s, expected at most {budget:.3g} s: the last command is held"
+                )
+                self.events.append(LoopEvent(t, "late", message))
                 command, status = np.zeros(self.model.nu) if last is None else last, LATE
         if command is not None and not self.in_charge:
             self.events.append(LoopEvent(t, "recovery", "the controller is followed again"))
@@ -317,8 +319,8 @@ class _LoopRun:
             status = str(getattr(self.controller, "status", OK))
         except Exception as error:  # it is a user's code: whatever it raises is a failure of the controller, not ours
             self.controller_error = f"{type(error).__name__}: {error}"
-            told = "it is not finite" if isinstance(error, NonFiniteError) else self.controller_error
-            return None, f"the controller failed: {told}", perf_counter() - begin
+            reason = "it is not finite" if isinstance(error, NonFiniteError) else self.controller_error
+            return None, f"the controller failed: {reason}", perf_counter() - begin
         return command, status, perf_counter() - begin
 
     def _end(self, k: int, why: str) -> None:
@@ -328,8 +330,8 @@ class _LoopRun:
     def _pushed(self, k: int, x: Array) -> Array:
         """The state with the velocity that pushes at plant step k give it: M dv = J' p."""
         plant, context = self.model.plant, self.model.double.context
-        for at, body, impulse in self.pushes:
-            if at == k:
+        for push_step, body, impulse in self.pushes:
+            if push_step == k:
                 set_state(self.model.double, x)
                 J = plant.CalcJacobianTranslationalVelocity(
                     context, JacobianWrtVariable.kV, body.body_frame(), body.CalcCenterOfMassInBodyFrame(context),
@@ -337,6 +339,6 @@ class _LoopRun:
                 )  # fmt: skip
                 dv = np.linalg.solve(self.model.double.mass_matrix(), self.model.double.own_force(J.T @ impulse))
                 x = np.concatenate([x[: self.model.nq], x[self.model.nq :] + dv])
-                told = f"{body.name()} is pushed by {np.linalg.norm(impulse):.3g} N s"
-                self.events.append(LoopEvent(k * self.model.time_step, "push", told))
+                message = f"{body.name()} is pushed by {np.linalg.norm(impulse):.3g} N s"
+                self.events.append(LoopEvent(k * self.model.time_step, "push", message))
         return x

@@ -106,22 +106,22 @@ def cell_name(cell: dict[str, Any]) -> str:
 def load_panel(path: Path) -> Panel:
     """The panel in the TOML file at `path`; InputError names every wrong entry."""
     try:
-        said = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(str(path), got=f"{type(error).__name__}: {error}", expected="a panel in TOML") from error
     try:
-        return Panel.model_validate(said)
+        return Panel.model_validate(document)
     except ValidationError as error:
         wrong = []
-        for found in error.errors():
-            place = ".".join(str(part) for part in found["loc"])
-            if found["type"] == "extra_forbidden":
-                wrong.append(f"{place}, which is not one of them")
-            elif found["type"] == "missing":
-                wrong.append(f"no {place}")
+        for issue in error.errors():
+            location = ".".join(str(key) for key in issue["loc"])
+            if issue["type"] == "extra_forbidden":
+                wrong.append(f"{location}, which is not one of them")
+            elif issue["type"] == "missing":
+                wrong.append(f"no {location}")
             else:
-                got = "" if found["type"] == "value_error" else f", got {found['input']!r:.80}"
-                wrong.append(f"{place or 'panel'}: {found['msg'].removeprefix('Value error, ')}{got}")
+                got = "" if issue["type"] == "value_error" else f", got {issue['input']!r:.80}"
+                wrong.append(f"{location or 'panel'}: {issue['msg'].removeprefix('Value error, ')}{got}")
         expected = f"the fields {', '.join(Panel.model_fields)}"
         raise InputError(str(path), got="; ".join(wrong), expected=expected) from error
 

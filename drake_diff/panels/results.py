@@ -151,16 +151,16 @@ class PanelTable(ShowsItsRepr):
         cells = self.summary["cells"]
         lines = [f"{len(self.rows)} trials in {len(cells)} cells, {self.errors} errors, in {self.directory}"]
         for cell in cells[:SHOWN_CELLS]:
-            told = [f"success {cell['success']['rate']:.3g}"] if "success" in cell else []
-            told += [f"{name} {numbers['mean']:.4g}" for name, numbers in cell["numbers"].items()]
-            lines.append(f"  {cell_name(cell['cell'])}: {', '.join(told) or 'no numbers'}")
+            figures = [f"success {cell['success']['rate']:.3g}"] if "success" in cell else []
+            figures += [f"{name} {numbers['mean']:.4g}" for name, numbers in cell["numbers"].items()]
+            lines.append(f"  {cell_name(cell['cell'])}: {', '.join(figures) or 'no numbers'}")
         if len(cells) > SHOWN_CELLS:
             lines.append(f"  and {len(cells) - SHOWN_CELLS} more cells")
         return "\n".join(lines)
 
 
 def write_table(
-    directory: Path, trials: Sequence[PanelTrial], found: Mapping[str, Row], made: Mapping[str, Any]
+    directory: Path, trials: Sequence[PanelTrial], results: Mapping[str, Row], made: Mapping[str, Any]
 ) -> PanelTable:
     """Write `table.csv`, `summary.json`, a record of each trial and the ranking of all `trials` into `directory`.
 
@@ -169,22 +169,22 @@ def write_table(
     cells: dict[bytes, list[PanelTrial]] = {}
     for trial in trials:
         cells.setdefault(canonical(trial.cell), []).append(trial)
-    judged = any(isinstance(row.get("success"), bool) for row in found.values())
+    judged = any(isinstance(row.get("success"), bool) for row in results.values())
     rows = tuple(
-        {"id": t.id, **t.cell, "repeat": t.fields["repeat"], "seed": t.fields["seed"], **found[t.id]} for t in trials
+        {"id": t.id, **t.cell, "repeat": t.fields["repeat"], "seed": t.fields["seed"], **results[t.id]} for t in trials
     )
     summary = {
         "panel": dict(made),
         "trials": len(trials),
-        "errors": sum("error" in row for row in found.values()),
-        "cells": [_cell(group[0].cell, [found[t.id] for t in group], judged) for group in cells.values()],
+        "errors": sum("error" in row for row in results.values()),
+        "cells": [_cell(group[0].cell, [results[t.id] for t in group], judged) for group in cells.values()],
     }
-    write_whole(directory / TABLE, _csv(rows, {name for row in found.values() for name in row}))
+    write_whole(directory / TABLE, _csv(rows, {name for row in results.values() for name in row}))
     text = json.dumps(summary, indent=1, allow_nan=False, ensure_ascii=False)
     write_whole(directory / SUMMARY, text.encode() + b"\n")
     (directory / TRIALS).mkdir(exist_ok=True)
     for trial in trials:
-        record = trial_record(trial.id, trial.name, trial.cell, trial.fields, found[trial.id], made)
+        record = trial_record(trial.id, trial.name, trial.cell, trial.fields, results[trial.id], made)
         write_whole(directory / TRIALS / f"{trial.id}.json", record.to_json().encode())
     write_ranking(directory / PAGE, summary)
     return PanelTable(directory, rows, summary)
@@ -207,14 +207,14 @@ def ended_record(begun: ComparisonRecord, table: PanelTable, seconds: float) -> 
     """The record at the end; `seconds` is how long this call of the panel took."""
     by, rows = ranked(table.summary)
     ranking = [{key: row[key] for key in RANKED if key in row} for row in rows]
-    found = {"errors": table.errors, "ranked_by": by, "ranking": ranking}
+    results = {"errors": table.errors, "ranked_by": by, "ranking": ranking}
     if begun.panel is None:
         raise ArtifactError(f"{begun.name}: expected the record of a panel")
     return begun.model_copy(
         update={
             "verdict": "fail" if table.errors else "pass",
             "sentence": f"{rows[0]['name']} is the best of {len(rows)} cells, by {by}; {table.errors} errors",
-            "panel": begun.panel.model_copy(update=found),
+            "panel": begun.panel.model_copy(update=results),
             "wall_clock": WallClock(written_utc=written_now(), duration_s=seconds),
         }
     )
@@ -238,9 +238,9 @@ def ranked(summary: Mapping[str, Any]) -> tuple[str, list[dict[str, Any]]]:
     ordered = sorted(cells, key=key)  # equals stay in the panel's order
     rows: list[dict[str, Any]] = []
     for i, cell in enumerate(ordered):
-        place = i + 1 if not rows or key(ordered[i - 1]) != key(cell) else rows[-1]["place"]
+        rank = i + 1 if not rows or key(ordered[i - 1]) != key(cell) else rows[-1]["place"]
         apart = cell["success"]["high"] < ordered[0]["success"]["low"] if judged else None
-        rows.append({"place": place, "name": cell_name(cell["cell"]), "apart": apart, **cell})
+        rows.append({"place": rank, "name": cell_name(cell["cell"]), "apart": apart, **cell})
     if judged:
         return "the lower end of the 95 % interval of the success rate, then the mean cost", rows
     if any(COST in cell["numbers"] for cell in cells):

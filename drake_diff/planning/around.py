@@ -107,19 +107,19 @@ def lines(space: Space, target: Array, seed: int) -> list[Line]:
     if space.is_free(straight.postures):
         return [straight]
     random = np.random.default_rng([seed, 3])
-    can_search, found = find_spec("ompl") is not None, []
+    can_search, candidates = find_spec("ompl") is not None, []
     bent = "a bent line" if can_search else "a bent line (no search: ompl is not installed)"
     for i in range(BENDS):
         pull = WIDTH * (i + 1) / BENDS * random.uniform(-1, 1, len(target)) * (robot.upper - robot.lower)
         middle = np.clip((robot.q + target) / 2 + pull, robot.lower, robot.upper)
         line = Line(bent, np.array([robot.q, middle, target]))
         if space.is_free(line.postures):
-            found.append(line)
-    if not (can_search or found):
+            candidates.append(line)
+    if not (can_search or candidates):
         raise MissingDependencyError("a way around what is in the way needs a search: pip install ompl")
     searched = [_searched(space, target, seed + i) for i in range(SEARCHES if can_search else 0)]
-    found += [line for line in searched if line is not None]
-    return sorted(found, key=lambda line: line.length)[:KEPT] or [straight]
+    candidates += [line for line in searched if line is not None]
+    return sorted(candidates, key=lambda line: line.length)[:KEPT] or [straight]
 
 
 def _searched(space: Space, target: Array, seed: int) -> Line | None:

@@ -62,11 +62,13 @@ def find_feet(model: Model, q: Array) -> tuple[Foot, ...] | Refusal:
     """The feet of a robot whose base floats, as it stands upright in the file's posture q (nq,); or why it has none."""
     if len(model.plant.GetFloatingBaseBodies()) != 1:
         return Refusal(f"{len(model.plant.GetFloatingBaseBodies())} bodies float")
-    found = limbs(model)
-    if len(found) < FEWEST:
-        return Refusal(f"{len(found) or 'none'} of its limbs {'ends' if len(found) == 1 else 'end'} in a shape")
+    candidates = limbs(model)
+    if len(candidates) < FEWEST:
+        return Refusal(
+            f"{len(candidates) or 'none'} of its limbs {'ends' if len(candidates) == 1 else 'end'} in a shape"
+        )
     upright(model, q)
-    heights = np.array([_lowest(model, limb) for limb in found])
+    heights = np.array([_lowest(model, limb) for limb in candidates])
     ground = float(np.min(heights))
     if _lowest_of_all(model) < ground - FLAT:
         return Refusal("what is lowest of it is not the end of a limb")
@@ -74,7 +76,7 @@ def find_feet(model: Model, q: Array) -> tuple[Foot, ...] | Refusal:
     lower = [body.name() for body in bodies(model.plant) if _pose(model, body).translation()[2] < ground - LEVEL * tall]
     if lower:
         return Refusal(f"{lower[0]} is below all that could touch the ground, and has no shape")
-    low = [limb for limb, height in zip(found, heights, strict=True) if height - ground <= LEVEL * tall]
+    low = [limb for limb, height in zip(candidates, heights, strict=True) if height - ground <= LEVEL * tall]
     legs = [_with_sole(model, limb) for limb in low]
     drawn = sum(_travel(model, q, limb) >= TRAVEL * tall for limb in low)
     if drawn < max(FEWEST, len(low)):
@@ -98,7 +100,7 @@ def limbs(model: Model) -> list[Foot]:
     moving = [joint for joint in joints(plant) if joint.num_velocities() and joint.type_name() not in FLOATING]
     before = {i: joint for joint in moving for i in group[int(joint.child_body().index())]}
     parents = {i for joint in moving for i in group.get(int(joint.parent_body().index()), ())}
-    found, seen = [], set[frozenset[int]]()
+    feet, seen = [], set[frozenset[int]]()
     for last in moving:
         if group[int(last.child_body().index())] & parents:
             continue
@@ -110,12 +112,12 @@ def limbs(model: Model) -> list[Foot]:
         if end is None or end in seen:
             continue
         seen.add(end)
-        at = tuple(i for j in chain for i in model.places(j)[1])
-        found.append(_end(model, end, spheres, at))
-    return found
+        velocities = tuple(i for j in chain for i in model.places(j)[1])
+        feet.append(_end(model, end, spheres, velocities))
+    return feet
 
 
-def _end(model: Model, rigid: frozenset[int], spheres: dict[int, list[Any]], at: tuple[int, ...]) -> Foot:
+def _end(model: Model, rigid: frozenset[int], spheres: dict[int, list[Any]], velocities: tuple[int, ...]) -> Foot:
     """The spheres on bodies that are welded together, all in the frame of the first with some."""
     plant, inspector = model.plant, model.double.inspector
     those = [plant.get_body(BodyIndex(i)) for i in sorted(rigid) if i in spheres]
@@ -129,7 +131,7 @@ def _end(model: Model, rigid: frozenset[int], spheres: dict[int, list[Any]], at:
             frictions.append(proximity_property(inspector, geometry, "friction") or 0.0)
     everything = np.arange(len(radii))
     names = tuple(str(plant.get_body(BodyIndex(i)).name()) for i in sorted(rigid))
-    return Foot(names, first.body_frame(), np.array(centres), np.array(radii), min(frictions), at, everything)
+    return Foot(names, first.body_frame(), np.array(centres), np.array(radii), min(frictions), velocities, everything)
 
 
 def _with_sole(model: Model, end: Foot) -> Foot:
@@ -145,12 +147,12 @@ def _lowest(model: Model, foot: Foot) -> float:
 def _lowest_of_all(model: Model) -> float:
     """[m] the lowest point of all spheres that move."""
     fixed = {int(body.index()) for body in model.plant.GetBodiesWeldedTo(model.plant.world_body())}
-    inspector, found = model.double.inspector, [np.inf]
+    inspector, heights = model.double.inspector, [np.inf]
     for body, geometry in collision_geometries(model.plant, model.double.scene_graph):
         if int(body.index()) not in fixed and isinstance(inspector.GetShape(geometry), Sphere):
-            place = _pose(model, body).multiply(inspector.GetPoseInFrame(geometry).translation())
-            found.append(float(place[2]) - inspector.GetShape(geometry).radius())
-    return min(found)
+            centre = _pose(model, body).multiply(inspector.GetPoseInFrame(geometry).translation())
+            heights.append(float(centre[2]) - inspector.GetShape(geometry).radius())
+    return min(heights)
 
 
 def _pose(model: Model, body: Any) -> Any:
@@ -174,9 +176,9 @@ def center_of_mass(model: Model) -> tuple[Array, Array]:
     """(3,) [m] the centre of mass in the twin's state, and (3, nv) how it moves."""
     twin = model.double
     plant, context, world = twin.plant, twin.context, twin.plant.world_frame()
-    place = plant.CalcCenterOfMassPositionInWorld(context)
+    centre = plant.CalcCenterOfMassPositionInWorld(context)
     jacobian = plant.CalcJacobianCenterOfMassTranslationalVelocity(context, JacobianWrtVariable.kV, world, world)
-    return np.asarray(place), own_velocities(model, jacobian)
+    return np.asarray(centre), own_velocities(model, jacobian)
 
 
 def own_velocities(model: Model, jacobian: Array) -> Array:

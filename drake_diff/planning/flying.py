@@ -34,13 +34,13 @@ def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> Guess:
         if not places:
             shifts = np.array(FAR) * random.uniform(-1, 1, shifts.shape) + np.array([0.0, 0.0, UP])
             turns = TURNED * random.uniform(-1, 1, turns.shape)
-        for name, place in places.items():
+        for name, position in places.items():
             i = _carrier(robot, name)
-            missing = place - np.asarray(frame_position(model, name)(np.concatenate([robot.q, np.zeros(model.nv)])))
+            missing = position - np.asarray(frame_position(model, name)(np.concatenate([robot.q, np.zeros(model.nv)])))
             shifts[i] = missing
-        found = _flown(robot, shifts, turns)
-        if best is None or found.depth < best.depth:
-            best = found
+        candidate = _flown(robot, shifts, turns)
+        if best is None or candidate.depth < best.depth:
+            best = candidate
         if best.depth <= TOUCHING:
             break
     assert best is not None  # noqa: S101  there is one draw at least
@@ -80,11 +80,11 @@ def _inputs(model: Model, x: Array, wanted: Array) -> Array:
 
 def _carrier(robot: Robot, name: str) -> int:
     """Which of the floating bodies carries a frame or body: the one that takes it along."""
-    place, still = frame_position(robot.model, name), np.zeros(robot.model.nv)
+    locate, still = frame_position(robot.model, name), np.zeros(robot.model.nv)
     free = floating(robot.model)
-    for i, (_, at, _) in enumerate(free):
+    for i, (_, q_start, _) in enumerate(free):
         moved = robot.q.copy()
-        moved[at + 4] += 1.0
-        if np.any(place(np.concatenate([moved, still])) != place(np.concatenate([robot.q, still]))):
+        moved[q_start + 4] += 1.0
+        if np.any(locate(np.concatenate([moved, still])) != locate(np.concatenate([robot.q, still]))):
             return i
-    raise InputError("goals", got=name, expected=f"a frame on what flies: {', '.join(each for each, _, _ in free)}")
+    raise InputError("goals", got=name, expected=f"a frame on what flies: {', '.join(label for label, _, _ in free)}")

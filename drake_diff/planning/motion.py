@@ -54,8 +54,8 @@ class Guess:
 
 def speed_limits(model: Model) -> Array:
     """(nv,) what a first guess may use of the velocity limits; FASTEST where there is none, or one of 0."""
-    found = np.array([min(abs(v.lower), abs(v.upper)) for v in model.contract.velocities])
-    return np.where((found > 0) & np.isfinite(found), np.minimum(OF_SPEED * found, 5 * FASTEST), FASTEST)
+    limits = np.array([min(abs(v.lower), abs(v.upper)) for v in model.contract.velocities])
+    return np.where((limits > 0) & np.isfinite(limits), np.minimum(OF_SPEED * limits, 5 * FASTEST), FASTEST)
 
 
 def _inputs(model: Model, x: Array, wanted: Array) -> Array:
@@ -94,11 +94,11 @@ def along(robot: Robot, line: Line, *, slower: float = 1.0) -> Guess:
     duration = slower * float(np.max(speeds / speed_limits(robot.model), initial=0.0))
     duration = float(np.clip(duration, SHORTEST, LONGEST))
     name = line.name if slower == 1 else f"{line.name} in {slower:g} times the time"
-    found = _timed(robot, name, line, duration)
-    while found.effort > OF_EFFORT and duration < LONGEST:
+    guess = _timed(robot, name, line, duration)
+    while guess.effort > OF_EFFORT and duration < LONGEST:
         duration = min(1.5 * duration, LONGEST)
-        found = _timed(robot, name, line, duration)
-    return found
+        guess = _timed(robot, name, line, duration)
+    return guess
 
 
 def _timed(robot: Robot, name: str, line: Line, duration: float) -> Guess:
@@ -123,12 +123,12 @@ def smooth(t: Array) -> Array:
 
 def _positions(model: Model) -> Indices:
     """(nv,) where in q the coordinate of each velocity of a joint is."""
-    found = np.arange(model.nv)
+    indices = np.arange(model.nv)
     for joint in joints(model.plant):
         q, v = model.places(joint)
         if len(q) == len(v) == 1:
-            found[v[0]] = q[0]
-    return found
+            indices[v[0]] = q[0]
+    return indices
 
 
 def by_controller(robot: Robot, model: Model, target: Array, *, steps: int, reach: float, name: str) -> Guess | None:
@@ -141,13 +141,13 @@ def by_controller(robot: Robot, model: Model, target: Array, *, steps: int, reac
     xs, us = [x], []
     try:
         effect = drive(model, robot.q)
-        own = np.argmax(np.abs(effect), axis=0)  # the velocity that an input acts on most
-        gain = model.time_step / effect[own, np.arange(model.nu)]
-        at = _positions(model)[own]
+        joint_v = np.argmax(np.abs(effect), axis=0)  # the velocity that an input acts on most
+        gain = model.time_step / effect[joint_v, np.arange(model.nu)]
+        joint_q = _positions(model)[joint_v]
         for k in range(steps):
             s = np.array(min(1.0, 1.25 * (k + 1) / steps))
-            aim = robot.q[at] + reach * smooth(s) * (target[at] - robot.q[at])
-            u = gain * (PULL * (aim - x[at]) - DAMP * x[model.nq + own])
+            aim = robot.q[joint_q] + reach * smooth(s) * (target[joint_q] - robot.q[joint_q])
+            u = gain * (PULL * (aim - x[joint_q]) - DAMP * x[model.nq + joint_v])
             u = np.clip(u, -OF_PULL * limits, OF_PULL * limits)
             x = np.array(advance(model.double, x, u))
             xs.append(x)

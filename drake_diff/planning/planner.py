@@ -125,11 +125,11 @@ class Plan(ShowsItsRepr):
         return f"; optima at cost {', '.join(f'{cost:.4g}' for cost in costs)}" if len(costs) > 1 else ""
 
     def _goal(self, far: float) -> str:
-        told = [f"a state {far:.2g} away (rad or m), at the end of {self.solution.horizon:.3g} s"]
+        sentences = [f"a state {far:.2g} away (rad or m), at the end of {self.solution.horizon:.3g} s"]
         goals = getattr(self.solution.problem, "goals", ())
-        told += [str(goal) for goal in goals]
-        told += doubts_of(goals, self.model)
-        return ", ".join(told)
+        sentences += [str(goal) for goal in goals]
+        sentences += doubts_of(goals, self.model)
+        return ", ".join(sentences)
 
     def __repr__(self) -> str:
         return "\n".join(self.lines)
@@ -198,17 +198,17 @@ def plan(
             task = asked(ready.model, goals or {}, avoid)
             try:
                 attempts = (attempt.restarted(restarts) for attempt in _attempts(ready, task, time, seed))
-                tried, found, apart = _first_that_holds(attempts, clock, partial(_keep, folder=folders[0]))
+                tried, solutions, apart = _first_that_holds(attempts, clock, partial(_keep, folder=folders[0]))
             except ModelError as error:
                 if ready.standing is None:
                     raise
-                tried, found, apart = [str(error)], [], False
-            if apart or ready.standing is None or (found and found[-1].status is Status.INTERRUPTED):
+                tried, solutions, apart = [str(error)], [], False
+            if apart or ready.standing is None or (solutions and solutions[-1].status is Status.INTERRUPTED):
                 break
             held = f"no plan with its feet on the ground was verified: {'; '.join(tried)}"
-        if not found:
+        if not solutions:
             raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or NOTHING}")
-        best = found[-1] if apart else min(found, key=lambda s: s.defect + s.goal_error)
+        best = solutions[-1] if apart else min(solutions, key=lambda s: s.defect + s.goal_error)
         clock.begin("save", best.status.value)
         with plan_kept(best, directory.name, folders[0]):
             record = write_run(best, folders[0])
@@ -268,7 +268,7 @@ def _first_that_holds(
     An interrupt ends the attempts.
     """
     tried: list[str] = []
-    found: list[Solution] = []
+    solutions: list[Solution] = []
     for first in attempts:
         attempt: _Attempt | None = first
         while attempt is not None:
@@ -281,18 +281,18 @@ def _first_that_holds(
                 tried.append(f"{attempt.name}: not possible ({error})")
                 break
             depth = attempt.depth(solution) if solution.success else 0.0
-            found.append(solution)
+            solutions.append(solution)
             tried.append(f"{attempt.name}: {solution.status.value}")
             if solution.status is Status.INTERRUPTED:
-                return tried, found, False
+                return tried, solutions, False
             failures = measure(solution).failures if solution.success else ()
             if solution.success and depth <= TOUCHING and not failures:
-                return tried, found, True
+                return tried, solutions, True
             tried[-1] += "".join(f", but {failure.message}" for failure in failures)
             if depth > TOUCHING:
                 tried[-1] += f", but shapes overlap by {1000 * depth:.2g} mm"
             attempt = attempt.instead if depth > TOUCHING else None
-    return tried, found, False
+    return tried, solutions, False
 
 
 def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:
@@ -316,14 +316,14 @@ def _of_standing(robot: Robot, standing: tuple[Legged, Rest], task: Task, seed: 
     legged, rest = standing
     for again in range(1 + (task.is_free and robot.model.nv <= TRIED_TWICE)):
         if task.is_free:
-            found = random_shift(legged, rest, [seed, again], robot.overlap)
+            shift = random_shift(legged, rest, [seed, again], robot.overlap)
         else:
-            found = shift_to(legged, rest, task.frames, task.joints)
-        if isinstance(found, Refusal):
-            raise ModelError(f"from where it stands no other posture was found: {found}")
-        moved = np.max(np.abs(legged.apart(found.xs[-1][: robot.model.nq], robot.q)))
+            shift = shift_to(legged, rest, task.frames, task.joints)
+        if isinstance(shift, Refusal):
+            raise ModelError(f"from where it stands no other posture was found: {shift}")
+        moved = np.max(np.abs(legged.apart(shift.xs[-1][: robot.model.nq], robot.q)))
         name = f"its feet where they are, up to {moved:.2g} rad or m to a posture that it holds"
-        yield _feasible(robot, task, Guess(name, robot.model, found.xs, found.us, 0.0))
+        yield _feasible(robot, task, Guess(name, robot.model, shift.xs, shift.us, 0.0))
 
 
 def _of_driven(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:
@@ -351,10 +351,10 @@ def _check_that_limits_bound_time(model: Model) -> None:
 
 def _guesses(space: Space, target: Array, seed: int) -> list[Guess]:
     """First guesses to `target` (nq,): those that touch nothing before others, then those within the effort limits."""
-    robot, found = space.robot, lines(space, target, seed)
-    guesses = [along(robot, line) for line in found]
-    if len(found) == 1:
-        guesses.append(along(robot, found[0], slower=2.0))
+    robot, paths = space.robot, lines(space, target, seed)
+    guesses = [along(robot, line) for line in paths]
+    if len(paths) == 1:
+        guesses.append(along(robot, paths[0], slower=2.0))
     return sorted(guesses, key=lambda guess: (_touched(space, guess), max(guess.effort, OF_EFFORT)))
 
 
@@ -389,7 +389,7 @@ def _feasible(robot: Robot, task: Task, guess: Guess) -> _Attempt:
 
 
 def _problem(task: Task, guess: Guess, x_goal: Array, **asked: Any) -> Problem:
-    goals = [FrameGoal(name, position=place) for name, place in task.frames.items()]
+    goals = [FrameGoal(name, position=position) for name, position in task.frames.items()]
     return Problem(
         guess.model,
         x0=guess.xs[0],
@@ -407,8 +407,8 @@ def _of_reachable(robot: Robot, task: Task, seed: int) -> Iterator[_Attempt]:
     As the file says; then on ways on which nothing touches; then from where it comes to rest.
     """
     random = np.random.default_rng([seed, 2])
-    part = random.uniform(-1, 1, robot.model.nq)
-    target = robot.q + part * (robot.upper - robot.lower) / 2
+    fractions = random.uniform(-1, 1, robot.model.nq)
+    target = robot.q + fractions * (robot.upper - robot.lower) / 2
     guesses = [_reachable(robot, robot.model, target, *REACHES[0])]
     if robot.apart is not None:
         space, elsewhere = Space.of(robot, task.avoid), _elsewhere(robot, random)
@@ -420,8 +420,8 @@ def _of_reachable(robot: Robot, task: Task, seed: int) -> Iterator[_Attempt]:
         gentle = robot.model.changed(**GENTLE)
         rest = by_controller(robot, gentle, robot.q, steps=COMES_TO_REST, reach=0.0, name="")
         settled = robot if rest is None else replace(robot, q=rest.xs[-1][: gentle.nq])
-        told = f"from where it comes to rest, by spheres in its shapes and steps of {GENTLE['time_step']:g} s"
-        guesses = [_reachable(settled, gentle, target, reach, steps, told) for reach, steps in GENTLY]
+        label = f"from where it comes to rest, by spheres in its shapes and steps of {GENTLE['time_step']:g} s"
+        guesses = [_reachable(settled, gentle, target, reach, steps, label) for reach, steps in GENTLY]
     else:
         guesses = []
     guesses += [_reachable(robot, robot.model, target, *reach) for reach in REACHES[1:]]
@@ -435,11 +435,11 @@ def _reachable(robot: Robot, model: Model, target: Array, reach: float, steps: i
 
 def _elsewhere(robot: Robot, random: np.random.Generator) -> Robot:
     """The robot in another posture to begin in: that of its file may be one in which it just touches something."""
-    one = of_joints(robot.model)
+    is_joint = of_joints(robot.model)
     for i in range(DRAWS):
         width = WIDTH * (i + 1) / DRAWS * (robot.upper - robot.lower)
         drawn = np.clip(robot.q + width * random.uniform(-1, 1, len(robot.q)), robot.lower, robot.upper)
-        q = np.where(one, drawn, robot.q)
+        q = np.where(is_joint, drawn, robot.q)
         if robot.overlap(q) == 0:
             return replace(robot, q=q)
     return robot
@@ -505,10 +505,10 @@ class _Clock:
         self.report, self.seconds, self.stage = report, dict[str, float](), ""
         self.start = time.process_time()
 
-    def begin(self, stage: str, told: str) -> None:
+    def begin(self, stage: str, sentence: str) -> None:
         self._close()
         self.stage = stage
-        self.report(stage, told)
+        self.report(stage, sentence)
 
     def end(self) -> dict[str, float]:
         self._close()
@@ -522,5 +522,5 @@ class _Clock:
         self.start = now
 
 
-def _quiet(stage: str, told: str) -> None:
+def _quiet(stage: str, sentence: str) -> None:
     """Nothing."""

@@ -47,23 +47,23 @@ def start(
     model = shapes or driven
     if model is None:
         return Start(first, 0.0, 0.0, frozenset())
-    one, margin = of_joints(model), INSIDE * (upper - lower)
+    is_joint, margin = of_joints(model), INSIDE * (upper - lower)
 
     def drawn(middle: Array, width: Array, moved: NDArray[np.bool_]) -> Array:
         q = np.clip(middle + width * random.uniform(-1, 1, len(first)), lower + margin, upper - margin)
-        return np.where(one & moved, q, middle)
+        return np.where(is_joint & moved, q, middle)
 
     every, whole = np.ones(len(first), dtype=bool), upper - lower
     always = pairs_always([first, *(drawn(first, whole, every) for _ in range(SEEN - 1))], shapes)
 
     def measured(q: Array) -> Start:
         load = 0.0 if driven is None else share_to_hold(driven, q)
-        found = {} if shapes is None else _overlaps(shapes, q)
-        overlap = sum(depth for pair, depth in found.items() if pair not in always and depth > TOUCHING)
+        depths = {} if shapes is None else _overlaps(shapes, q)
+        overlap = sum(depth for pair, depth in depths.items() if pair not in always and depth > TOUCHING)
         return Start(q, overlap, load, always)
 
     def has_room(q: Array) -> bool:
-        beside = [q + np.where(one, random.choice([-ROOM, ROOM], len(q)), 0.0) for _ in range(BESIDE)]
+        beside = [q + np.where(is_joint, random.choice([-ROOM, ROOM], len(q)), 0.0) for _ in range(BESIDE)]
         return shapes is None or all(deepest(shapes, other, always) <= TOUCHING for other in beside)
 
     best, tight = measured(first), None
@@ -75,26 +75,26 @@ def start(
                 break
             tight, best = tight or best, replace(best, overlap=np.inf)  # unless all others are worse
         if i < ATTEMPTS:
-            part = (i + 1) / ATTEMPTS
-            q = np.where(one, first + part * (random.uniform(lower + margin, upper - margin) - first), first)
+            fraction = (i + 1) / ATTEMPTS
+            q = np.where(is_joint, first + fraction * (random.uniform(lower + margin, upper - margin) - first), first)
         else:
             few = random.random(len(first)) < max(0.1, 3 / len(first))
             q = drawn(best.q, whole * 0.5 ** random.uniform(0, 6), few)
-        found = measured(q)
-        best = found if _badness(found) < _badness(best) else best
+        candidate = measured(q)
+        best = candidate if _badness(candidate) < _badness(best) else best
     return best
 
 
-def _badness(found: Start) -> float:
-    return found.overlap / DEPTH + max(0.0, found.load - HELD)
+def _badness(candidate: Start) -> float:
+    return candidate.overlap / DEPTH + max(0.0, candidate.load - HELD)
 
 
 def pairs_always(tried: list[Array], shapes: Model | None) -> frozenset[Pair]:
     """The pairs of shapes that overlap in each of the postures (nq,)."""
     if shapes is None:
         return frozenset()
-    found = [{pair for pair, depth in _overlaps(shapes, q).items() if depth > TOUCHING} for q in tried]
-    return frozenset(set.intersection(*found))
+    overlaps = [{pair for pair, depth in _overlaps(shapes, q).items() if depth > TOUCHING} for q in tried]
+    return frozenset(set.intersection(*overlaps))
 
 
 def deepest(shapes: Model, q: Array, besides: frozenset[Pair]) -> float:
@@ -148,11 +148,11 @@ def of_joints(model: Model) -> NDArray[np.bool_]:
     """(nq,) whether a coordinate is that of a joint, and no part of a free body's pose."""
     if model.nq == model.nv:
         return np.ones(model.nq, dtype=bool)
-    found = np.zeros(model.nq, dtype=bool)
+    mask = np.zeros(model.nq, dtype=bool)
     for joint in joints(model.plant):
         if joint.num_positions() == 1:
-            found[list(model.places(joint)[0])] = True
-    return found
+            mask[list(model.places(joint)[0])] = True
+    return mask
 
 
 def inside(model: Model, lower: Array, upper: Array) -> Array:

@@ -69,12 +69,12 @@ def load_robot(path: Path, seed: int, held: str = "") -> Robot:
     What floats and can stand on feet does so, unless `held` says why it is to be held.
     """
     options: dict[str, Any] = {"time_step": TIME_STEP}
-    told: list[str] = []
+    repairs: list[str] = []
     model = _loaded(path, options)
-    reduced = _reduced(path, options, model, told)
+    reduced = _reduced(path, options, model, repairs)
     if reduced.nv < model.nv:
         options["mimic"], gone = "reduce", model.nv - reduced.nv
-        told.append(f"{gone} joint{'s' * (gone > 1)} that follow others left the state (mimic='reduce')")
+        repairs.append(f"{gone} joint{'s' * (gone > 1)} that follow others left the state (mimic='reduce')")
         model = reduced
     count = sum(joint.num_velocities() == 1 for joint in joints(model.plant))
     if model.nu < (count if count > TEXTBOOK else FEW * count):
@@ -82,26 +82,26 @@ def load_robot(path: Path, seed: int, held: str = "") -> Robot:
         if model.nu > had:
             options["actuators"] = "all"
             begin = f"only {had} joints had a motor" if had else "no joint had a motor"
-            told.append(f"{begin}: all {model.nu} that can be driven have one (actuators='all')")
+            repairs.append(f"{begin}: all {model.nu} that can be driven have one (actuators='all')")
     if model.plant.GetFloatingBaseBodies() and joints(model.plant):
-        standing = Refusal(held) if held else _standing(path, model, options, told, seed)
+        standing = Refusal(held) if held else _standing(path, model, options, repairs, seed)
         if isinstance(standing, Robot):
             return standing
         welded = _held(path, options)
         if welded is not None and welded.nv < model.nv:
             names = _few(model.plant.get_body(b).name() for b in sorted(model.plant.GetFloatingBaseBodies()))
             options["base"], model = "weld", welded
-            told.append(f"{names} floated: it is fixed to the world (base='weld'), as {standing}")
+            repairs.append(f"{names} floated: it is fixed to the world (base='weld'), as {standing}")
     stuck = _stuck(model)
     if stuck and len(stuck) == count:
         raise ModelError(f"{path}: no joint of it can move: each has the same lower and upper limit, which Drake keeps")
     if stuck:
         options["fix_joints"] = stuck
         model = _loaded(path, options)
-        told.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
-    model = _with_mass(path, options, model, told)
-    model = _with_thrusters(path, options, model, told)
-    return _placed(path, options, model, told, np.random.default_rng(seed))
+        repairs.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
+    model = _with_mass(path, options, model, repairs)
+    model = _with_thrusters(path, options, model, repairs)
+    return _placed(path, options, model, repairs, np.random.default_rng(seed))
 
 
 # Of a robot that stands: every shape is spheres, which a ground meets with derivatives, and only the ground is met.
@@ -112,65 +112,71 @@ STEPS_ON_FEET, MANY = (0.005, 0.01), 24  # [s], the second of robots of more vel
 DRAWN = 16  # postures, to see which shapes always overlap
 
 
-def _standing(path: Path, read: Model, options: dict[str, Any], told: list[str], seed: int) -> Robot | Refusal:
+def _standing(path: Path, read: Model, options: dict[str, Any], repairs: list[str], seed: int) -> Robot | Refusal:
     """The robot that was `read` on its feet on a ground; or why it does not stand."""
     on_feet = options | ON_FEET | GROUND | {"time_step": STEPS_ON_FEET[read.nv > MANY]}
     random = np.random.default_rng(seed)
-    told = list(told)
+    repairs = list(repairs)
     try:
         model = _loaded(path, on_feet)
         stuck = _stuck(model)
         if stuck:
             on_feet["fix_joints"] = stuck
             model = _loaded(path, on_feet)
-            told.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
-        model = _with_mass(path, on_feet, model, told)
+            repairs.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
+        model = _with_mass(path, on_feet, model, repairs)
         if model.nv > MANY and isinstance(analytic_of(model), Refusal) and options.get("mimic") == "reduce":
             on_feet["mimic"] = "fix"
             model = _loaded(path, on_feet)
-            told.append("what follows and what leads is fixed where it stands (mimic='fix'), for analytic derivatives")
+            repairs.append(
+                "what follows and what leads is fixed where it stands (mimic='fix'), for analytic derivatives"
+            )
         derivatives = analytic_of(model)
         if model.nv > MANY and isinstance(derivatives, Refusal):
             return Refusal(f"the derivatives of {model.nv} velocities in contact would take minutes: {derivatives}")
         lower, upper = ranges(model)
-        found = stand(model, lower, upper)
-        if isinstance(found, Refusal):
-            return Refusal(f"it cannot stand: {found}")
+        stance = stand(model, lower, upper)
+        if isinstance(stance, Refusal):
+            return Refusal(f"it cannot stand: {stance}")
         shapes = _loaded(path, on_feet | {"ground": None, "contact": True})
-        q, one = found[1].x[: model.nq], of_joints(model)
-        overlapping = pairs_always([np.where(one, random.uniform(lower, upper), q) for _ in range(DRAWN)], shapes)
+        q, is_joint = stance[1].x[: model.nq], of_joints(model)
+        overlapping = pairs_always([np.where(is_joint, random.uniform(lower, upper), q) for _ in range(DRAWN)], shapes)
         besides = overlapping | pairs_always([q], shapes)
     except DrakeDiffError as error:
         return Refusal(f"a model that could stand cannot be made: {error}")
-    feet = _few(foot.name for foot in found[0].feet)
-    told.append(f"it stands on {feet}, on a ground that was added (base='free', ground=True), by spheres in its shapes")
+    feet = _few(foot.name for foot in stance[0].feet)
+    repairs.append(
+        f"it stands on {feet}, on a ground that was added (base='free', ground=True), by spheres in its shapes"
+    )
     if besides:
-        told.append(f"{_few(map(' and '.join, sorted(besides)))} overlap where it stands, which is not looked at")
-    return Robot(model, shapes, q, lower, upper, tuple(told), False, besides, found)
+        repairs.append(f"{_few(map(' and '.join, sorted(besides)))} overlap where it stands, which is not looked at")
+    return Robot(model, shapes, q, lower, upper, tuple(repairs), False, besides, stance)
 
 
-def _with_thrusters(path: Path, options: dict[str, Any], model: Model, told: list[str]) -> Model:
+def _with_thrusters(path: Path, options: dict[str, Any], model: Model, repairs: list[str]) -> Model:
     """The model, with thrusters where it floats and nothing drives it; ModelError where nothing can."""
     if not model.nu and model.plant.GetFloatingBaseBodies():
         options["body_forces"] = thrusters(model)
         model = _loaded(path, options)
         names = _few(dict.fromkeys(force.body for force in options["body_forces"]))
-        told.append(f"nothing drives {names}: six thrusters push and turn it, two along each axis (body_forces)")
+        repairs.append(f"nothing drives {names}: six thrusters push and turn it, two along each axis (body_forces)")
     if not model.nu:
         raise ModelError(f"{path}: nothing in it can be driven: it has no revolute or prismatic joint, and none floats")
     return model
 
 
-def _reduced(path: Path, options: dict[str, Any], model: Model, told: list[str]) -> Model:
+def _reduced(path: Path, options: dict[str, Any], model: Model, repairs: list[str]) -> Model:
     """The model without the joints that follow others; as it is where that cannot be done, which is told."""
     try:
         return _loaded(path, options | {"mimic": "reduce"})
     except ModelError as error:
-        told.append(f"joints that follow others stay in the state, as {error}")
+        repairs.append(f"joints that follow others stay in the state, as {error}")
         return model
 
 
-def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], random: np.random.Generator) -> Robot:
+def _placed(
+    path: Path, options: dict[str, Any], model: Model, repairs: list[str], random: np.random.Generator
+) -> Robot:
     """The robot in the posture it starts in, and with the contact that its plan needs."""
     lower, upper = ranges(model)
     first = inside(model, lower, upper)
@@ -182,32 +188,34 @@ def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], 
     if flies and shapes is not None:
         first = lifted(shapes, first)
     try:
-        found = start(shapes, apart if driven else None, first, lower, upper, random)
+        posture = start(shapes, apart if driven else None, first, lower, upper, random)
     except SimulationError as error:
-        told.append(f"its overlap is not looked for: {error}")
-        shapes, found = None, start(None, apart if driven else None, first, lower, upper, random)
-    weak = _too_weak(apart, found) if driven and found.load > 1 else ()
+        repairs.append(f"its overlap is not looked for: {error}")
+        shapes, posture = None, start(None, apart if driven else None, first, lower, upper, random)
+    weak = _too_weak(apart, posture) if driven and posture.load > 1 else ()
     if weak and len(weak) < model.nv:
-        told.append(f"the motors of {_few(weak)} cannot hold the weight in any posture tried: fixed (fix_joints)")
+        repairs.append(f"the motors of {_few(weak)} cannot hold the weight in any posture tried: fixed (fix_joints)")
         fixed = options | {"fix_joints": (*options.get("fix_joints", ()), *weak)}
-        return _placed(path, fixed, _loaded(path, fixed), told, random)
-    if found.always:
-        told.append(f"{_few(map(' and '.join, sorted(found.always)))} overlap in every posture, which is not looked at")
+        return _placed(path, fixed, _loaded(path, fixed), repairs, random)
+    if posture.always:
+        repairs.append(
+            f"{_few(map(' and '.join, sorted(posture.always)))} overlap in every posture, which is not looked at"
+        )
     if (driven or flies) and touches:
         model = apart
         seen = "" if shapes is None else ": overlap is looked for along the plan"
-        told.append(f"contact is left out of its steps (contact=False){seen}")
-    if np.any(np.abs(found.q - model.default_state[: model.nq]) > 1e-9):
-        told.append(
+        repairs.append(f"contact is left out of its steps (contact=False){seen}")
+    if np.any(np.abs(posture.q - model.default_state[: model.nq]) > 1e-9):
+        repairs.append(
             "its start is moved to where joints are inside their limits, nothing overlaps and its motors hold it"
         )
     other = apart if model is not apart else None
-    return Robot(model, shapes, found.q, lower, upper, tuple(told), driven, found.always, apart=other)
+    return Robot(model, shapes, posture.q, lower, upper, tuple(repairs), driven, posture.always, apart=other)
 
 
-def _too_weak(model: Model, found: Start) -> tuple[str, ...]:
+def _too_weak(model: Model, posture: Start) -> tuple[str, ...]:
     """The joints whose motors are too weak for the posture, and those that follow them."""
-    over = np.flatnonzero(shares_to_hold(model, found.q) > 1)
+    over = np.flatnonzero(shares_to_hold(model, posture.q) > 1)
     moved = [actuator.joint().name() for actuator in actuators(model.plant)]
     return _with_followers(model, [moved[i] for i in model.inputs.actuator[over]])
 
@@ -229,23 +237,23 @@ def _held(path: Path, options: dict[str, Any]) -> Model | None:
 def _stuck(model: Model) -> tuple[str, ...]:
     """The joints that have no way to go between their limits, and those that follow them."""
     lower, upper = model.position_limits
-    found: list[str] = []
+    names: list[str] = []
     for joint in joints(model.plant):
-        (at, _) = model.places(joint)
-        if joint.num_positions() == 1 and len(at) and lower[at[0]] >= upper[at[0]]:
-            found.append(joint.name())
-    return _with_followers(model, found)
+        (positions, _) = model.places(joint)
+        if joint.num_positions() == 1 and len(positions) and lower[positions[0]] >= upper[positions[0]]:
+            names.append(joint.name())
+    return _with_followers(model, names)
 
 
 def _with_followers(model: Model, names: list[str]) -> tuple[str, ...]:
     """The joints, and those that follow them."""
-    found, mimics = list(names), () if model.coupling is None else model.coupling.mimics
-    while more := [m.follower for m in mimics if m.leader in found and m.follower not in found]:
-        found += more
-    return tuple(found)
+    joint_names, mimics = list(names), () if model.coupling is None else model.coupling.mimics
+    while more := [m.follower for m in mimics if m.leader in joint_names and m.follower not in joint_names]:
+        joint_names += more
+    return tuple(joint_names)
 
 
-def _with_mass(path: Path, options: dict[str, Any], model: Model, told: list[str]) -> Model:
+def _with_mass(path: Path, options: dict[str, Any], model: Model, repairs: list[str]) -> Model:
     """The model, less joints that nothing hangs on which has a mass: Drake could take no step of them."""
     if _can_step(model):
         return model
@@ -253,7 +261,7 @@ def _with_mass(path: Path, options: dict[str, Any], model: Model, told: list[str
         held = _loaded(path, options | {"mimic": "fix"})
         if _can_step(held):
             options["mimic"] = "fix"
-            told.append(
+            repairs.append(
                 "joints that follow others, and those that they follow, are fixed (mimic='fix'), as Drake cannot "
                 f"take a step with them: {_why_not(model)}"
             )
@@ -262,12 +270,14 @@ def _with_mass(path: Path, options: dict[str, Any], model: Model, told: list[str
     light = tuple(
         joint.name()
         for joint in joints(model.plant)
-        if joint.num_velocities() == 1 and len(at := model.places(joint)[1]) and moved[at[0], at[0]] <= 0
+        if joint.num_velocities() == 1
+        and len(velocities := model.places(joint)[1])
+        and moved[velocities[0], velocities[0]] <= 0
     )
     if not light:
         return model
     options["fix_joints"] = (*options.get("fix_joints", ()), *light)
-    told.append(f"{_few(light)} move nothing that has a mass or inertia: fixed (fix_joints)")
+    repairs.append(f"{_few(light)} move nothing that has a mass or inertia: fixed (fix_joints)")
     return _loaded(path, options)
 
 

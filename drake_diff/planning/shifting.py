@@ -69,13 +69,13 @@ def random_shift(robot: Legged, start: Rest, seed: Sequence[int], depth: Callabl
         way[base + 5] = -size * LOWERED * tall * random.uniform(0.5, 1)
         way[robot.joint_v[arms]] = of_arms * MOVED * random.uniform(-1, 1, len(arms)) * (high - low)[arms]
         wish = Wish(robot.moved(q0, way), near, feet, inside=INSIDE / 2)
-        found = reached(robot, start, find_posture(robot, q0, wish), feet)
-        if isinstance(found, Refusal):
-            why = found
-        elif max(depth(x[: model.nq]) for x in found.xs[:: max(1, len(found.us) // 20)]) > deepest:
+        shift = reached(robot, start, find_posture(robot, q0, wish), feet)
+        if isinstance(shift, Refusal):
+            why = shift
+        elif max(depth(x[: model.nq]) for x in shift.xs[:: max(1, len(shift.us) // 20)]) > deepest:
             why = Refusal("its own shapes would overlap")
         else:
-            return found
+            return shift
     return why
 
 
@@ -85,26 +85,26 @@ def shift_to(robot: Legged, start: Rest, frames: Mapping[str, Array], joints: Ma
     feet, base = robot.soles(q0)[0], robot.base_v
     near = np.full(model.nv, FREE_JOINT)
     near[base : base + 6] = FREE_BASE
-    at = list(joints)
-    near[[i - 1 if i > robot.base_q else i for i in at]] = KEPT
+    indices = list(joints)
+    near[[i - 1 if i > robot.base_q else i for i in indices]] = KEPT
     asked, aimed = np.array(list(joints.values())), np.array(list(joints.values()))
-    places = {name: np.array(place) for name, place in frames.items()}
-    found: Shift | Refusal = Refusal("")
+    places = {name: np.array(position) for name, position in frames.items()}
+    shift: Shift | Refusal = Refusal("")
     for _ in range(CORRECTIONS + 1):
         q = q0.copy()
-        q[at] = aimed
+        q[indices] = aimed
         wish = Wish(q, near, feet, balanced=OVER_FEET, frames=places)
-        found = reached(robot, start, find_posture(robot, q0, wish), feet)
-        if isinstance(found, Refusal):
-            return found
-        end = found.xs[-1]
+        shift = reached(robot, start, find_posture(robot, q0, wish), feet)
+        if isinstance(shift, Refusal):
+            return shift
+        end = shift.xs[-1]
         misses = {name: frames[name] - np.asarray(frame_position(model, name)(end)) for name in frames}
-        off = asked - end[at]
+        off = asked - end[indices]
         far = max((float(np.max(np.abs(miss))) for miss in misses.values()), default=0.0)
         if far < FRAME_MISS and np.max(np.abs(off), initial=0.0) < JOINT_MISS:
-            return found
+            return shift
         aimed = aimed + off
-        places = {name: place + misses[name] for name, place in places.items()}
+        places = {name: position + misses[name] for name, position in places.items()}
     return Refusal(
         f"its frames end {far:.2g} m and its joints {np.max(np.abs(off), initial=0.0):.2g} off what is asked"
     )
@@ -121,14 +121,14 @@ def reached(robot: Legged, start: Rest, q: Array, feet: Array) -> Shift | Refusa
         return end
     why = Refusal("")
     for duration in DURATIONS:
-        found = between(robot, start, end, duration)
-        if isinstance(found, Refusal):
-            why = found
+        shift = between(robot, start, end, duration)
+        if isinstance(shift, Refusal):
+            why = shift
             continue
-        x, nq = found.xs[-1], robot.model.nq
+        x, nq = shift.xs[-1], robot.model.nq
         away, speed = float(np.max(np.abs(robot.apart(x[:nq], end.x[:nq])))), float(np.max(np.abs(x[nq:])))
         if away <= ARRIVED and speed <= AT_REST:
-            return found
+            return shift
         why = Refusal(f"it ends {away:.2g} rad or m from where it would rest, at {speed:.2g} rad/s or m/s")
     return why
 
@@ -145,9 +145,9 @@ def between(robot: Legged, start: Rest, end: Rest, duration: float) -> Shift | R
     s = _smooth(moving + 1)
     feet = [robot.soles(q)[0] for q in (q0, q1)]
     way, qs = robot.apart(q1, q0), [q0]
-    for part in s[1:-1]:
-        near = robot.moved(q0, part * way)
-        wish = Wish(near, np.full(model.nv, ALONG), feet[0] + part * (feet[1] - feet[0]))
+    for fraction in s[1:-1]:
+        near = robot.moved(q0, fraction * way)
+        wish = Wish(near, np.full(model.nv, ALONG), feet[0] + fraction * (feet[1] - feet[0]))
         qs.append(find_posture(robot, qs[-1], wish))
     qs += [q1] * (holding + 1)
     v = [np.zeros(model.nv)] + [robot.apart(b, a) / h for a, b in pairwise(qs)]
@@ -177,17 +177,17 @@ def _regulated(robot: Legged, xs: Array, us: Array, end: Rest) -> Shift | Refusa
     lower, upper = input_limits(model)
     try:
         policy = TVLQR(model, xs, us, *weights(robot, us[0]))
-        x, found, inputs = xs[0], [xs[0]], []
+        x, states, inputs = xs[0], [xs[0]], []
         for k in range(len(us)):
             u = np.clip(policy(x, k * model.time_step), lower, upper)
             x = np.array(advance(model.double, x, u))
-            found.append(x)
+            states.append(x)
             inputs.append(u)
     except (SimulationError, GradientError) as error:
         return Refusal(f"the motion cannot be stepped: {error}")
     terms = [*model.contract.positions, *model.contract.velocities]
     low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
-    beyond = (low < high) & np.any((np.array(found) < low) | (np.array(found) > high), axis=0)
+    beyond = (low < high) & np.any((np.array(states) < low) | (np.array(states) > high), axis=0)
     if np.any(beyond):
         return Refusal(f"{model.state_names[int(np.argmax(beyond))]} would leave its limits")
-    return Shift(np.array(found), np.array(inputs), end)
+    return Shift(np.array(states), np.array(inputs), end)

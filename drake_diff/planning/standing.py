@@ -106,9 +106,9 @@ class Legged:
     def moved(self, q: Array, d: Array, inside: float = 0.0) -> Array:
         """Posture q (nq,) moved by d (nv,), joints that part of their range inside their limits."""
         still = np.zeros(self.model.nv)
-        found = self.space.plus(np.concatenate([q, still]), np.concatenate([d, still]))[: self.model.nq]
-        found[self.joint_q] = np.clip(found[self.joint_q], *self.limits(inside))
-        return found
+        posture = self.space.plus(np.concatenate([q, still]), np.concatenate([d, still]))[: self.model.nq]
+        posture[self.joint_q] = np.clip(posture[self.joint_q], *self.limits(inside))
+        return posture
 
     def limits(self, inside: float) -> tuple[Array, Array]:
         """(lower, upper) of the coordinates of joints, that part of their range inside."""
@@ -128,10 +128,10 @@ class Legged:
         """
         upright(self.model, q)
         chosen = self.touching or tuple(self._standing(foot) for foot in self.feet)
-        found = [bottoms(self.model, foot, which) for foot, which in zip(self.feet, chosen, strict=True)]
+        pairs = [bottoms(self.model, foot, which) for foot, which in zip(self.feet, chosen, strict=True)]
         owners = np.concatenate([np.full(len(which), i) for i, which in enumerate(chosen)])
-        jacobians = [jacobian.reshape(-1, 3, self.model.nv) for _, jacobian in found]
-        return np.vstack([points for points, _ in found]), np.vstack(jacobians), owners
+        jacobians = [jacobian.reshape(-1, 3, self.model.nv) for _, jacobian in pairs]
+        return np.vstack([points for points, _ in pairs]), np.vstack(jacobians), owners
 
     def keep_soles(self, q: Array) -> None:
         """Let the points that stand in posture q (nq,) be those that stand in all others."""
@@ -147,8 +147,8 @@ class Legged:
         inspector, plant = self.model.double.inspector, self.model.plant
         grounds = plant.GetCollisionGeometriesForBody(plant.world_body())
         ground = max(proximity_property(inspector, g, "friction") or 0.0 for g in grounds)
-        own = np.array([foot.friction for foot in self.feet])
-        return np.asarray(2 * own * ground / np.maximum(own + ground, 1e-12))
+        coefficients = np.array([foot.friction for foot in self.feet])
+        return np.asarray(2 * coefficients * ground / np.maximum(coefficients + ground, 1e-12))
 
 
 def stand(model: Model, lower: Array, upper: Array) -> tuple[Legged, Rest] | Refusal:
@@ -164,10 +164,10 @@ def stand(model: Model, lower: Array, upper: Array) -> tuple[Legged, Rest] | Ref
     stance = standing_posture(robot, file)
     if isinstance(stance, Refusal):
         return stance
-    found = settled(robot, stance)
-    if not isinstance(found, Refusal):
-        robot.keep_soles(found.x[: model.nq])
-    return found if isinstance(found, Refusal) else (robot, found)
+    rest = settled(robot, stance)
+    if not isinstance(rest, Refusal):
+        robot.keep_soles(rest.x[: model.nq])
+    return rest if isinstance(rest, Refusal) else (robot, rest)
 
 
 def standing_posture(robot: Legged, file: Array) -> Stance | Refusal:
@@ -187,9 +187,9 @@ def standing_posture(robot: Legged, file: Array) -> Stance | Refusal:
     for _ in range(STARTS):
         drawn = np.zeros(model.nv)
         drawn[robot.joint_v] = random.uniform(-SPREAD, SPREAD, len(robot.joint_v))
-        found = find_posture(robot, robot.moved(wanted, drawn, INSIDE), wish)
-        off = float(np.sum(_residuals(robot, found, wish)[0] ** 2))
-        stance = hold(robot, found) if off < least else why
+        posture = find_posture(robot, robot.moved(wanted, drawn, INSIDE), wish)
+        off = float(np.sum(_residuals(robot, posture, wish)[0] ** 2))
+        stance = hold(robot, posture) if off < least else why
         if isinstance(stance, Refusal):
             why = stance if stance.reason else why
         else:
@@ -199,14 +199,14 @@ def standing_posture(robot: Legged, file: Array) -> Stance | Refusal:
 
 def find_posture(robot: Legged, first: Array, wish: Wish) -> Array:
     """(nq,) the posture nearest to what is wished for, by damped least squares from posture `first` (nq,)."""
-    q, at = first, robot.joint_v
+    q, joint_v = first, robot.joint_v
     lower, upper = robot.limits(wish.inside)
     for _ in range(ITERATIONS):
         error, jacobian = _residuals(robot, q, wish)
         down = jacobian.T @ error
         stuck = np.zeros(robot.model.nv, dtype=bool)
         values = q[robot.joint_q]
-        stuck[at] = ((values <= lower) & (down[at] > 0)) | ((values >= upper) & (down[at] < 0))
+        stuck[joint_v] = ((values <= lower) & (down[joint_v] > 0)) | ((values >= upper) & (down[joint_v] < 0))
         jacobian = np.where(stuck, 0.0, jacobian)
         normal = jacobian.T @ jacobian + DAMPING * np.eye(jacobian.shape[1])
         change = np.asarray(-np.linalg.solve(normal, np.where(stuck, 0.0, down)), dtype=float)
@@ -229,9 +229,9 @@ def _residuals(robot: Legged, q: Array, wish: Wish) -> tuple[Array, Array]:
         mass, by_mass = center_of_mass(model)
         rows.append((mass[:2] - np.mean(points[:, :2], axis=0)) / wish.balanced)
         slopes.append((by_mass[:2] - np.mean(by_v[:, :2], axis=0)) / wish.balanced)
-    for name, place in wish.frames.items():
+    for name, position in wish.frames.items():
         here, by_frame = _origin(model, name)
-        rows.append((here - place) / AT_PLACE)
+        rows.append((here - position) / AT_PLACE)
         slopes.append(by_frame / AT_PLACE)
     rows.append(robot.apart(q, wish.q) / wish.near)
     slopes.append(np.diag(1 / wish.near))
@@ -317,8 +317,8 @@ def settled(robot: Legged, stance: Stance) -> Rest | Refusal:
     lifted = [foot.name for foot in robot.feet if not touching & set(foot.bodies)]
     others = touching.difference(*[foot.bodies for foot in robot.feet])
     if lifted or others:
-        told = f"{lifted[0]} is off the ground" if lifted else f"{min(others)} is on the ground"
-        return Refusal(f"at rest {told}")
+        fault = f"{lifted[0]} is off the ground" if lifted else f"{min(others)} is on the ground"
+        return Refusal(f"at rest {fault}")
     return Rest(x, u)
 
 

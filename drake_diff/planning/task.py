@@ -64,12 +64,12 @@ def asked(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle] = ()
         elif len(numbers) == 1:
             if name not in of_joints or (model.nq != model.nv and of_joints[name] < model.nq - model.nv + 6):
                 raise UnknownNameError("goal: joint", got=name, known=of_joints)
-            at = of_joints[name]
-            low, high = model.contract.positions[at].lower, model.contract.positions[at].upper
+            index = of_joints[name]
+            low, high = model.contract.positions[index].lower, model.contract.positions[index].upper
             if not low <= numbers[0] <= high:
                 expected = f"a position within its limits [{low:g}, {high:g}]"
                 raise InputError(f"goal {name}", got=numbers[0], expected=expected)
-            angles[at] = float(numbers[0])
+            angles[index] = float(numbers[0])
         else:
             expected = "three numbers (the position of a frame) or one (that of a joint)"
             raise InputError(f"goal {name}", got=f"{len(numbers)} numbers", expected=expected)
@@ -88,31 +88,31 @@ def postures(robot: Robot, task: Task, seed: int) -> list[Array]:
     if task.is_free:
         return _random_goals(space, random)
     start, fixed = robot.q.copy(), np.zeros(robot.model.nq, dtype=bool)
-    for at, value in task.joints.items():
-        start[at], fixed[at] = value, True
+    for index, value in task.joints.items():
+        start[index], fixed[index] = value, True
     if not task.frames:
         space.check("goal", start)
         return [start]
-    found: list[Array] = []
+    candidates: list[Array] = []
     nearest, blocked = np.inf, ""
     for i in range(MORE_SEEDS if task.avoid else SEEDS):
-        if len(found) >= CANDIDATES and i >= SEEDS:
+        if len(candidates) >= CANDIDATES and i >= SEEDS:
             break
         first = start if i == 0 else np.where(fixed, start, random.uniform(robot.lower, robot.upper))
         q, off = _reached(robot, task, first, fixed)
         nearest = min(nearest, off)
         if off <= REACHED and robot.overlap(q) <= TOUCHING and share_to_hold(robot.model, q) <= 1.0:
             blocked = space.told(q)
-            found += [] if blocked else [q]
-    if not found and blocked:
+            candidates += [] if blocked else [q]
+    if not candidates and blocked:
         expected = f"a goal that some posture reaches clear of all obstacles; {MORE_SEEDS} were tried"
         raise InputError(f"goal {', '.join(task.frames)}", got=f"at the goal {blocked}", expected=expected)
-    if not found:
-        told = "inside all limits, without overlap and held by the motors"
+    if not candidates:
+        criteria = "inside all limits, without overlap and held by the motors"
         if nearest > REACHED:
-            told = f"inside all limits: the nearest of {SEEDS} tries is {nearest:.3g} m away"
-        raise ModelError(f"no posture was found with {', '.join(task.frames)} at its goal, {told}")
-    return sorted(found, key=lambda q: float(np.max(np.abs(q - robot.q))))[:CANDIDATES]
+            criteria = f"inside all limits: the nearest of {SEEDS} tries is {nearest:.3g} m away"
+        raise ModelError(f"no posture was found with {', '.join(task.frames)} at its goal, {criteria}")
+    return sorted(candidates, key=lambda q: float(np.max(np.abs(q - robot.q))))[:CANDIDATES]
 
 
 def _reached(robot: Robot, task: Task, q: Array, fixed: Array) -> tuple[Array, float]:
@@ -130,7 +130,7 @@ def _reached(robot: Robot, task: Task, q: Array, fixed: Array) -> tuple[Array, f
 
     def places(q: Array) -> Array:
         x = np.concatenate([q, np.zeros(model.nv)])
-        return np.concatenate([np.asarray(place(x), dtype=float) for place in functions])
+        return np.concatenate([np.asarray(function(x), dtype=float) for function in functions])
 
     q, off = np.clip(q, low, high), np.inf
     for _ in range(ITERATIONS):
@@ -152,11 +152,11 @@ def _reached(robot: Robot, task: Task, q: Array, fixed: Array) -> tuple[Array, f
 def _random_goals(space: Space, random: np.random.Generator) -> list[Array]:
     """Some of those; ModelError where none is found."""
     drawn = [_random_posture(space, random) for _ in range(RANDOM)]
-    found = [q for q in drawn if q is not None]
-    if not found:
-        told = "no posture to go to was found: none that was drawn is clear of all shapes and held by the motors"
-        raise ModelError(f"{told}: give a goal")
-    return found
+    goals = [q for q in drawn if q is not None]
+    if not goals:
+        message = "no posture to go to was found: none that was drawn is clear of all shapes and held by the motors"
+        raise ModelError(f"{message}: give a goal")
+    return goals
 
 
 def _random_posture(space: Space, random: np.random.Generator) -> Array | None:
@@ -168,8 +168,8 @@ def _random_posture(space: Space, random: np.random.Generator) -> Array | None:
     margin = 0.2 * MOVE * (robot.upper - robot.lower)
     best, least = None, 1.0
     for i in range(DRAWS):
-        part = NEARER ** (i // (DRAWS // 5))  # some robots can only hold what is near
-        q = robot.q + part * random.uniform(-1, 1, len(reach)) * reach
+        fraction = NEARER ** (i // (DRAWS // 5))  # some robots can only hold what is near
+        q = robot.q + fraction * random.uniform(-1, 1, len(reach)) * reach
         q = np.clip(q, robot.lower + margin, robot.upper - margin)
         if any(robot.overlap(robot.q + s * (q - robot.q)) > TOUCHING for s in (0.25, 0.5, 0.75, 1.0)):
             continue

@@ -22,12 +22,12 @@ def thrusters(model: Model) -> tuple[BodyForce, ...]:
     Together they can push and turn it in any direction. Each is beside the centre of mass by the body's radius of
     gyration.
     """
-    plant, found = model.plant, list[BodyForce]()
+    plant, forces = model.plant, list[BodyForce]()
     set_state(model.double, model.default_state)
     for label, body in labelled(bodies(plant)).items():
         if body.index() not in plant.GetFloatingBaseBodies():
             continue
-        whole = [each.index() for each in plant.GetBodiesWeldedTo(body)]
+        whole = [welded.index() for welded in plant.GetBodiesWeldedTo(body)]
         inertia = plant.CalcSpatialInertia(model.double.context, body.body_frame(), whole)
         mass, centre = float(inertia.get_mass()), np.asarray(inertia.get_com())
         if not mass > 0:
@@ -39,16 +39,16 @@ def thrusters(model: Model) -> tuple[BodyForce, ...]:
             for side in (1.0, -1.0):
                 point = centre + side * float(f"{arm:.3g}") * np.eye(3)[beside]
                 name = f"{label}_{'xyz'[axis]}{'+' if side > 0 else '-'}"
-                found.append(BodyForce(name, label, point, np.eye(3)[axis], lower=-limit, upper=limit))
-    return tuple(found)
+                forces.append(BodyForce(name, label, point, np.eye(3)[axis], lower=-limit, upper=limit))
+    return tuple(forces)
 
 
 def lifted(shapes: Model, q: Array) -> Array:
     """Posture q (nq,) with what floats as much higher as it takes to overlap with nothing; as it is if none helps."""
     for up in (0.0, *LIFTS):
         higher = q.copy()
-        for i, (_, at, _) in enumerate(floating(shapes)):
-            higher[at + 6] += up * (1 + i)
+        for i, (_, q_start, _) in enumerate(floating(shapes)):
+            higher[q_start + 6] += up * (1 + i)
         if deepest(shapes, higher, frozenset()) <= TOUCHING:
             return higher
     return q

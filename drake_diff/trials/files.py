@@ -134,8 +134,8 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
             for name in result.names
         ],
     )
-    found = {"panel": _panel(result), "data": _data(result, run), "wall_clock": _times(result)}
-    return record.model_copy(update=found)
+    sections = {"panel": _panel(result), "data": _data(result, run), "wall_clock": _times(result)}
+    return record.model_copy(update=sections)
 
 
 def _panel(result: Robustness) -> EvaluationPanel:
@@ -248,8 +248,8 @@ def _table(result: Robustness) -> str:
     rows.writerow(["perturbation", "level", "seed", "success", "label", "reason", "goal_error", *ends])
     for c in result.cells:
         for e in c.endings:
-            told = [int(e.label is None), e.label or "", e.reason, e.goal_error]
-            rows.writerow([c.perturbation, c.level, e.seed, *told, *map(float, e.last)])
+            judgement = [int(e.label is None), e.label or "", e.reason, e.goal_error]
+            rows.writerow([c.perturbation, c.level, e.seed, *judgement, *map(float, e.last)])
     return text.getvalue()
 
 
@@ -260,7 +260,7 @@ def write_robustness_page(path: Path, result: Robustness, record: PlanRecord, re
     """Write the page of `result` with its `record` and `replay`, the page of the weakest point's worst trial."""
     trial = result.worst(result.weakest).worst
     ((name, level),) = trial.levels.items()
-    told = trial.reason or "it succeeds, and of all trials it ends furthest from the goal"
+    reason = trial.reason or "it succeeds, and of all trials it ends furthest from the goal"
     write_page(
         path,
         "robustness.html.j2",
@@ -268,7 +268,7 @@ def write_robustness_page(path: Path, result: Robustness, record: PlanRecord, re
         data=robustness_data(result),
         view=replay.read_text(encoding="utf-8"),
         model=result.task.model.name,
-        caption=f"The worst trial of {name} {sized(name, level)}, with the plan as a ghost: {told}.",
+        caption=f"The worst trial of {name} {sized(name, level)}, with the plan as a ghost: {reason}.",
         enough=ENOUGH,
         agrees=agrees,
     )
@@ -335,18 +335,18 @@ def _level_plots(result: Robustness, name: str) -> Iterator[Plot]:
     """Of one perturbation, over its levels: success, displacement, and where every trial ends."""
     task, cells = result.task, result.of(name)
     levels = [c.level for c in cells]
-    place: dict[str, Any] = {"axis": "level", "levels": True, "marks": "both", "place": name}
+    axis_options: dict[str, Any] = {"axis": "level", "levels": True, "marks": "both", "place": name}
     rates = [
         Line("rate", [c.rate.value for c in cells]),
         Line("95 %, lower", [c.rate.lower for c in cells], dashed=True),
         Line("upper", [c.rate.upper for c in cells], dashed=True),
     ]
-    yield Plot("success", "1", levels, rates, band=True, range=[-0.03, 1.03], **place)
+    yield Plot("success", "1", levels, rates, band=True, range=[-0.03, 1.03], **axis_options)
     moved = [Line("measured", [c.displacement for c in cells])]
     known = any(c.predicted is not None for c in cells)
     moved += [Line("predicted", [c.predicted for c in cells], dashed=True)] if known else []
     note = "" if known else "no gradient predicts it"
-    yield Plot("displacement of the last state", "q, v", levels, moved, log=True, note=note, **place)
+    yield Plot("displacement of the last state", "q, v", levels, moved, log=True, note=note, **axis_options)
     # Last states in the two coordinates that spread most for what is tolerated, a colour for each level and the plan.
     ends = [*(np.array([e.last for e in c.endings]) for c in cells), task.xs[-1:]]
     spread = np.ptp(np.vstack(ends), axis=0) / task.plan.scale

@@ -82,12 +82,12 @@ def perturbation_named(name: str) -> Perturbation:
 
 def parameters_of(model: Model, quantity: str) -> dict[str, Array]:
     """The parameters of a quantity that are not 0: those of bodies and joints, not of single geometries."""
-    found = {p.name: p.value for p in list_parameters(model) if p.kind.quantity == quantity and "/" not in p.name}
+    parameters = {p.name: p.value for p in list_parameters(model) if p.kind.quantity == quantity and "/" not in p.name}
     fixed = {"inertia", "mass"} & {quantity}
     moving = {body.name() for body in moving_bodies(model.plant)}
     return {
         name: value
-        for name, value in found.items()
+        for name, value in parameters.items()
         if np.any(value) and (not fixed or name.rsplit(".", 1)[0].rsplit("::", 1)[-1] in moving)
     }
 
@@ -123,8 +123,8 @@ def _time_step(setup: Setup, level: float, random: Random) -> Setup:
 
 
 def _contact(setup: Setup, level: float, random: Random) -> Setup:
-    own = setup.model.contract.contact.approximation
-    other = random.choice([name for name in ("sap", "similar", "lagged") if name != own])
+    approximation = setup.model.contract.contact.approximation
+    other = random.choice([name for name in ("sap", "similar", "lagged") if name != approximation])
     return replace(setup, model=setup.model.with_contact(str(other)))
 
 

@@ -89,8 +89,8 @@ def robustness(
     cells = []
     for name, values in levels.items():
         for level in values:
-            found = [run_trial(task, {name: level}, trial_seed(seed, k)) for k in range(trials)]
-            cells.append(cell_of(name, level, found, sensitivity.predicted(name, level)))
+            outcomes = [run_trial(task, {name: level}, trial_seed(seed, k)) for k in range(trials)]
+            cells.append(cell_of(name, level, outcomes, sensitivity.predicted(name, level)))
             if progress is not None:
                 progress(f"{name} {level:g}: {cells[-1].rate.successes} of {trials}")
     return Robustness(task, tuple(cells), trials, seed)
@@ -135,8 +135,8 @@ class Cell:
     def __repr__(self) -> str:
         level = sized(self.perturbation, self.level)
         labels = ", ".join(f"{count} {label}" for label, count in self.labels.items())
-        told = f"{self.perturbation} {level}: {self.rate.successes} of {self.rate.trials} succeed"
-        return f"{told}; {labels}" if labels else told
+        sentence = f"{self.perturbation} {level}: {self.rate.successes} of {self.rate.trials} succeed"
+        return f"{sentence}; {labels}" if labels else sentence
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,8 +239,8 @@ def cell_of(name: str, level: float, trials: Sequence[Trial], predicted: float |
     """What `trials` of one perturbation and level amount to."""
 
     def distance(trial: Trial) -> float:
-        found = trial.outcome.goal_error
-        return found if np.isfinite(found) else float("inf")
+        error = trial.outcome.goal_error
+        return error if np.isfinite(error) else float("inf")
 
     endings = tuple(Ending(t.seed, t.label, t.reason, distance(t), t.outcome.run.motion.xs[-1]) for t in trials)
     errors = [ending.goal_error for ending in endings]
@@ -279,35 +279,35 @@ def _weakest_point(result: Robustness) -> str:
     name = result.weakest
     held, cell = result.margins[name], result.worst(name)
     much = f"with a margin of {sized(name, held)}" if held else "with no margin"
-    told = f"at {sized(name, cell.level)} {cell.rate.successes} of {cell.rate.trials} succeed"
-    return f"Weakest point: {name}, {much}: {told}. What fails first: {cell.worst.reason}."
+    rate = f"at {sized(name, cell.level)} {cell.rate.successes} of {cell.rate.trials} succeed"
+    return f"Weakest point: {name}, {much}: {rate}. What fails first: {cell.worst.reason}."
 
 
 def _blame(result: Robustness) -> str:
     labels = sum((Counter(c.labels) for c in result.cells), Counter())
     if not labels:
         return ""
-    of = ", ".join(f"{count} {label.replace('_', ' ')}{'s' * (count > 1)}" for label, count in labels.most_common())
+    causes = ", ".join(f"{count} {label.replace('_', ' ')}{'s' * (count > 1)}" for label, count in labels.most_common())
     count = sum(labels.values())
-    told = f"Of {count} failed trial{'s' * (count > 1)}: {of}."
+    sentences = f"Of {count} failed trial{'s' * (count > 1)}: {causes}."
     raised = sum((Counter(c.controller_errors) for c in result.cells), Counter())
     if raised:
         (error, most), count = raised.most_common(1)[0], sum(raised.values())
-        told += f" In {count} of them the controller itself failed, in {most} with {error}."
-    return told
+        sentences += f" In {count} of them the controller itself failed, in {most} with {error}."
+    return sentences
 
 
 def _gradients(result: Robustness) -> str:
-    told = [c for c in result.cells if c.ratio is not None]
-    if not told:
+    cells = [c for c in result.cells if c.ratio is not None]
+    if not cells:
         return "Gradients predict none of it."
-    right = sum(agrees(c.ratio) for c in told)
+    right = sum(agrees(c.ratio) for c in cells)
     name = result.weakest
     known = [agrees(c.ratio) for c in result.of(name) if c.ratio is not None]
     about = f"of {name} in {sum(known)} of {len(known)}" if known else f"they say nothing about {name}"
     return (
         f"Gradients predict the displacement of the last state within a factor of {AGREE:g} in {right} of the "
-        f"{len(told)} cells that they cover; {about}."
+        f"{len(cells)} cells that they cover; {about}."
     )
 
 
@@ -357,18 +357,18 @@ class Sensitivity:
             effect = UNIFORM * noise.reshape(self.space.size, -1, self.space.size).sum(axis=1)
         else:
             effect = UNIFORM * (factor if name == "actuator_strength" else self._by_factor(name))
-        found = float(level * np.linalg.norm(effect))
-        return found if np.isfinite(found) else None
+        displacement = float(level * np.linalg.norm(effect))
+        return displacement if np.isfinite(displacement) else None
 
     def _by_factor(self, quantity: str) -> Array:
         """(nt, n) the derivative by a factor of each parameter of a quantity."""
-        columns, at = [], 0
+        columns, offset = [], 0
         for name in FACTORS:
             for value in self.parameters[name].values():
                 width = len(np.atleast_1d(value))
                 if name == quantity:
-                    columns.append(self._effects[1][:, at : at + width] @ np.atleast_1d(value))
-                at += width
+                    columns.append(self._effects[1][:, offset : offset + width] @ np.atleast_1d(value))
+                offset += width
         return np.array(columns).T
 
     @cached_property
@@ -388,9 +388,9 @@ class Sensitivity:
                 with applied(vector) as same:
                     along.append(derivatives_along(same, xs[0], us, vector=vector, xs=xs[:-1]))
         for k, (u, K) in enumerate(zip(us, self._gains or (), strict=True)):
-            steps = [found[k] for found in along]
-            found = self.space.jacobian(xs[k], xs[k + 1], steps[0].A, steps[0].B, *(step.C for step in steps))
-            A, B, C = np.split(found, [size, size + task.model.nu], axis=1)
+            steps = [derivatives[k] for derivatives in along]
+            jacobian = self.space.jacobian(xs[k], xs[k + 1], steps[0].A, steps[0].B, *(step.C for step in steps))
+            A, B, C = np.split(jacobian, [size, size + task.model.nu], axis=1)
             loop = A + B @ K
             start, noise = loop @ start, np.hstack([loop @ noise, B @ K])
             factor = loop @ factor + B * u

@@ -134,16 +134,16 @@ class Task:
             return given
         if callable(given):
             try:
-                found: Any = given(self.plan, model, self.xs, self.us)
+                controller: Any = given(self.plan, model, self.xs, self.us)
             except DrakeDiffError:
                 raise
             except Exception as error:
                 got = f"{type(error).__name__}: {error}"
                 raise InputError("controller", got=got, expected="a function that makes a controller") from error
-            if not callable(found):
-                got = f"one that makes {type(found).__name__}"
+            if not callable(controller):
+                got = f"one that makes {type(controller).__name__}"
                 raise InputError("controller", got=got, expected="u = controller(x, t)")
-            return found
+            return controller
         if given == "tvlqr" and model.nu:
             return track(self.plan, model, self.xs, self.us)
         if given == "mpc" and model.nu:
@@ -170,16 +170,16 @@ class Task:
     def run(self, setup: Setup, seed: int, policy: Controller | None = None) -> Judgement:
         """One run of `setup`, judged; under `policy` in the controller's place, if it is given."""
         with applied(select(setup.model, setup.parameters)) as model:
-            found = closed_loop(model, policy or self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
-            checks = [] if found.ended else [penetration_check(model, found.motion)]
-        last = found.motion.xs[-1]
+            loop_run = closed_loop(model, policy or self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
+            checks = [] if loop_run.ended else [penetration_check(model, loop_run.motion)]
+        last = loop_run.motion.xs[-1]
         goal = self.plan.problem.goal_error(last) if self.judged_by == "the goal" else last - self.xs[-1]
-        if not found.ended:  # a run that broke off may have no step to measure
-            of_motion = (bounds_check(self.plan, found.motion), *clearance_checks(self.plan, found.motion))
+        if not loop_run.ended:  # a run that broke off may have no step to measure
+            of_motion = (bounds_check(self.plan, loop_run.motion), *clearance_checks(self.plan, loop_run.motion))
             checks = [goal_check(self.plan, goal), *of_motion, *checks]
         return Judgement(
-            run=found,
-            failures=(found.ended,) if found.ended else tuple(str(check) for check in checks if not check.passes),
+            run=loop_run,
+            failures=(loop_run.ended,) if loop_run.ended else tuple(str(check) for check in checks if not check.passes),
             goal_error=float(np.max(np.abs(goal))),
             displacement=tangent_space(self.model).minus(last, self._end),
             judged=bool(np.all(np.isfinite(goal))),
@@ -199,8 +199,8 @@ def run_trial(task: Task, levels: Mapping[str, float], seed: int) -> Trial:
 
 
 def _label(task: Task, setup: Setup, seed: int, outcome: Judgement) -> tuple[Label, str]:
-    if part := outcome.run.failed_part:
-        return RAISED[part], f"the {part} itself failed"
+    if component := outcome.run.failed_part:
+        return RAISED[component], f"the {component} itself failed"
     if not task.nominal.success:
         why = f"unperturbed it fails too: {task.nominal.failures[0]}"
         if task.run(replace(task.setup, loop=replace(task.loop, sensor=Sensor(), estimator=Hold())), 0).success:
@@ -221,8 +221,8 @@ def _label(task: Task, setup: Setup, seed: int, outcome: Judgement) -> tuple[Lab
     )
     for label, why, fixed in fixes:
         try:
-            own = label == "state_error" and not isinstance(task.controller, str)
-            if own and (other := task.followed_by(setup, seed)):
+            is_own = label == "state_error" and not isinstance(task.controller, str)
+            if is_own and (other := task.followed_by(setup, seed)):
                 return "control_error", f"{other} in the controller's place succeeds"
             if task.run(fixed, seed).success:
                 return label, why

@@ -59,8 +59,8 @@ class StateFunction:
         """(m,) at one state, floats or AutoDiffXd."""
         if x.dtype == float:
             return self.values(x[None])[0]
-        at = ExtractValue(x.reshape(-1, 1)).T
-        return chain_rows(self.values(at)[0], self.slopes(at)[0], x)
+        states = ExtractValue(x.reshape(-1, 1)).T
+        return chain_rows(self.values(states)[0], self.slopes(states)[0], x)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -221,22 +221,22 @@ def short(values: Any) -> str:
 
 
 def resolve_bounds(
-    given: Bounds | None, own: Mapping[str, Array], state_names: Sequence[str], input_names: Sequence[str]
+    given: Bounds | None, defaults: Mapping[str, Array], state_names: Sequence[str], input_names: Sequence[str]
 ) -> Bounds:
-    """`given` with the limits of `own` (by the fields' names) where it has none; InputError where two cross."""
+    """`given` with the limits of `defaults` (by the fields' names) where it has none; InputError where two cross."""
     if not (given is None or isinstance(given, Bounds)):
         raise InputError("bounds", got=type(given).__name__, expected="Bounds")
-    found = {}
-    for name, limits in own.items():
+    resolved = {}
+    for name, limits in defaults.items():
         value = getattr(given, name, None)
         checked = limits if value is None else array_with_gaps(name, value, limits.shape)
-        found[name] = frozen(np.where(np.isnan(checked), limits, checked))
+        resolved[name] = frozen(np.where(np.isnan(checked), limits, checked))
     for kind, names in (("x", state_names), ("u", input_names)):
-        lower, upper = found[f"{kind}_lower"], found[f"{kind}_upper"]
+        lower, upper = resolved[f"{kind}_lower"], resolved[f"{kind}_upper"]
         for i in np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf))[:1]:
             got = f"[{lower[i]:g}, {upper[i]:g}]"
             raise InputError(f"bounds of {names[i]}", got=got, expected="lower at most upper")
-    return Bounds(**found)
+    return Bounds(**resolved)
 
 
 def plant_limits(model: Model) -> dict[str, Array]:

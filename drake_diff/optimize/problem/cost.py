@@ -77,10 +77,10 @@ class QuadraticCost:
 
     def check_sizes(self, name: str, nx: int, nu: int) -> None:
         """Raise ShapeError where a part has not the size of the states (nx,) or inputs (nu,); `name` is the cost's."""
-        for part, size in (("Q", nx), ("R", nu), ("x_ref", nx), ("u_ref", nu)):
-            value = getattr(self, part)
+        for field, size in (("Q", nx), ("R", nu), ("x_ref", nx), ("u_ref", nu)):
+            value = getattr(self, field)
             if value is not None and len(value) != size:
-                raise ShapeError(f"{name}.{part}", got=value.shape, expected=(size,) * value.ndim)
+                raise ShapeError(f"{name}.{field}", got=value.shape, expected=(size,) * value.ndim)
 
     def __call__(self, x: Any, u: Any = None) -> Any:
         """The cost of x (nx,) and u (nu,): floats or AutoDiffXd."""
@@ -323,11 +323,11 @@ class TrackingCost(TimedCost):
 
     def _with(self, known: Array) -> QuadraticCost:
         nx = self.reference[1].shape[1]
-        found = copy.copy(self._form)  # type: ignore[attr-defined]  # whose weights were checked
-        object.__setattr__(found, "x_ref", known[..., :nx] if self.Q is not None else None)
+        cost = copy.copy(self._form)  # type: ignore[attr-defined]  # whose weights were checked
+        object.__setattr__(cost, "x_ref", known[..., :nx] if self.Q is not None else None)
         held = self.reference[2] is not None and self.R is not None
-        object.__setattr__(found, "u_ref", known[..., nx:] if held else None)
-        return found
+        object.__setattr__(cost, "u_ref", known[..., nx:] if held else None)
+        return cost
 
 
 def quadratic_along(cost: Any, times: Array) -> QuadraticCost | None:
@@ -356,8 +356,8 @@ class SumOfCosts(TimedCost):
         return np.hstack([none, *(cost.known_at(times) for cost in self.costs if isinstance(cost, TimedCost))])
 
     def followed(self, times: Array) -> tuple[Array, Array | None] | None:
-        found = (cost.followed(times) for cost in self.costs if isinstance(cost, TimedCost))
-        return next((each for each in found if each is not None), None)
+        references = (cost.followed(times) for cost in self.costs if isinstance(cost, TimedCost))
+        return next((reference for reference in references if reference is not None), None)
 
     def of(self, x: Any, u: Any, known: Any) -> Any:
         total: Any = 0.0
@@ -419,13 +419,20 @@ def _table(reference: Any) -> tuple[Any, Any, Any]:
         return reference.times, reference.xs, rows
     if isinstance(reference, Trajectory):
         reference = (reference,)
-    if isinstance(reference, Sequence) and reference and all(isinstance(part, Trajectory) for part in reference):
+    if (
+        isinstance(reference, Sequence)
+        and reference
+        and all(isinstance(trajectory, Trajectory) for trajectory in reference)
+    ):
         start, end = reference[0].start_time(), reference[0].end_time()
         if not (np.isfinite(end - start) and end > start):
             raise InputError("TrackingCost", got=f"from {start:g} to {end:g} s", expected="a beginning and an end")
         times = np.linspace(start, end, SAMPLES)
-        found = [part.vector_values(np.clip(times, part.start_time(), part.end_time())).T for part in reference[:2]]
-        return times, found[0], found[1] if len(found) > 1 else None
+        samples = [
+            trajectory.vector_values(np.clip(times, trajectory.start_time(), trajectory.end_time())).T
+            for trajectory in reference[:2]
+        ]
+        return times, samples[0], samples[1] if len(samples) > 1 else None
     if isinstance(reference, Sequence) and len(reference) in (2, 3):
         return reference[0], reference[1], reference[2] if len(reference) == 3 else None
     expected = "a Solution, Drake's trajectories, or (times, xs) or (times, xs, us)"

@@ -69,9 +69,9 @@ class BoundCoupling:
         """Whether it joins the inputs too."""
         return self.rows.takes_input
 
-    def packed(self, xs: Array, us: Array, at: Indices) -> tuple[Array, Array]:
-        """(x, u) that `rows` takes at the rows `at` (n,) of a motion xs (M+1, nx), us (M, nu) or (M+1, nu)."""
-        return xs[at].ravel(), us[np.minimum(at, len(us) - 1)].ravel()
+    def packed(self, xs: Array, us: Array, knots: Indices) -> tuple[Array, Array]:
+        """(x, u) that `rows` takes at the rows `knots` (n,) of a motion xs (M+1, nx), us (M, nu) or (M+1, nu)."""
+        return xs[knots].ravel(), us[np.minimum(knots, len(us) - 1)].ravel()
 
     def excess(self, xs: Array, us: Array, where: Indices) -> tuple[float, int]:
         """The largest excess over a bound, and the row of the last knot of its place; inf where a value is no number.
@@ -81,18 +81,20 @@ class BoundCoupling:
         if not len(self.knots):
             return 0.0, 0
         with np.errstate(all="ignore"):
-            return max((self.rows.excess(*self.packed(xs, us, where[at])), int(where[at[-1]])) for at in self.knots)
+            return max(
+                (self.rows.excess(*self.packed(xs, us, where[knots])), int(where[knots[-1]])) for knots in self.knots
+            )
 
     def reach(self, xs: Array, us: Array) -> float:
         """The largest range of a value as the last knot of a place moves along a motion: a tolerance's scale."""
         values = []
         with np.errstate(all="ignore"):
             if len(self.knots) > 1:
-                values = [self.rows(*self.packed(xs, us, at)) for at in self.knots]
+                values = [self.rows(*self.packed(xs, us, knots)) for knots in self.knots]
             else:
                 values = [self.rows(*self.packed(xs, us, np.append(self.knots[0, :-1], k))) for k in range(len(xs))]
-        found = np.array(values)
-        return float(np.max(np.ptp(found[np.isfinite(found).all(axis=1)], axis=0), initial=0.0))
+        table = np.array(values)
+        return float(np.max(np.ptp(table[np.isfinite(table).all(axis=1)], axis=0), initial=0.0))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -143,8 +145,8 @@ class Coupling(Joins):
         object.__setattr__(self, "lower", limits.lower)
         object.__setattr__(self, "upper", limits.upper)
         if self._arguments() not in (len(self.knots), 2 * len(self.knots)):
-            told = f"{self._arguments()} arguments for {len(self.knots)} knots"
-            raise InputError(f"coupling {self.label}", got=told, expected=FORM)
+            got = f"{self._arguments()} arguments for {len(self.knots)} knots"
+            raise InputError(f"coupling {self.label}", got=got, expected=FORM)
 
     def __repr__(self) -> str:
         lower, upper = (short(side[0] if len(side) == 1 else side) for side in (self.lower, self.upper))
@@ -241,8 +243,8 @@ class Periodic(Joins):
 
     def __repr__(self) -> str:
         given = {"M": self.M, "offset": self.offset, "entries": self.entries}
-        told = ", ".join(f"{name}={short(value)}" for name, value in given.items() if value is not None)
-        return f"Periodic({told})"
+        arguments = ", ".join(f"{name}={short(value)}" for name, value in given.items() if value is not None)
+        return f"Periodic({arguments})"
 
     def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> BoundCoupling:
         entries = np.arange(nx) if self.entries is None else np.array(self.entries)
@@ -256,8 +258,8 @@ class Periodic(Joins):
             moved = [sum(M[i, j] * first[j] for j in np.flatnonzero(M[i])) for i in range(len(entries))]
             return np.array([last[e] - m - offset[i] for i, (e, m) in enumerate(zip(entries, moved, strict=True))])
 
-        found = Coupling(apart, lower=0.0, upper=0.0, name=self.label)
-        return found.bound(num_steps, nx, nu, input_at_end=input_at_end)
+        coupling = Coupling(apart, lower=0.0, upper=0.0, name=self.label)
+        return coupling.bound(num_steps, nx, nu, input_at_end=input_at_end)
 
     def to_dict(self) -> dict[str, Any]:
         name = None if self.name == "periodic" else self.name
@@ -268,21 +270,21 @@ class Periodic(Joins):
 def checked_couplings(given: Any) -> tuple[Couples, ...]:
     """One or several as a tuple; InputError of anything else."""
     several = tuple(given) if isinstance(given, (tuple, list)) else (given,)
-    for each in several:
-        if not isinstance(each, Couples):
+    for coupling in several:
+        if not isinstance(coupling, Couples):
             raise InputError(
-                "couplings", got=type(each).__name__, expected="Periodic, Coupling, InputRate, Jerk, or several"
+                "couplings", got=type(coupling).__name__, expected="Periodic, Coupling, InputRate, Jerk, or several"
             )
     return several
 
 
 def excess_of(couplings: Sequence[BoundCoupling], xs: Array, us: Array, where: Indices) -> dict[str, tuple[float, int]]:
     """The largest excess of each by its label, and the row of its last knot; see `BoundCoupling.excess`."""
-    found: dict[str, tuple[float, int]] = {}
+    excesses: dict[str, tuple[float, int]] = {}
     for c in couplings:
         worst = c.excess(xs, us, where)
-        found[c.label] = max(worst, found.get(c.label, worst))
-    return found
+        excesses[c.label] = max(worst, excesses.get(c.label, worst))
+    return excesses
 
 
 System = Model | Dynamics
@@ -295,8 +297,8 @@ class RateLimit(Couples):
     of_inputs: bool
 
     def __repr__(self) -> str:
-        told = self.limit if isinstance(self.limit, dict) else f"{self.limit:g}"
-        return f"{type(self).__name__}({told})"
+        limit = self.limit if isinstance(self.limit, dict) else f"{self.limit:g}"
+        return f"{type(self).__name__}({limit})"
 
     def entries(self, system: System) -> tuple[Indices, Array]:
         """The inputs, or the entries of the state whose x' changes, that have a limit, and the limits."""
@@ -309,26 +311,26 @@ class RateLimit(Couples):
                 raise InputError(kind, got="one limit", expected="limits by name: plain dynamics have no velocities")
             places = sorted(set(known.values()))
             return np.array(places), np.full(len(places), self.limit)
-        found = {}
+        limits = {}
         for name, limit in self.limit.items():
             if name not in known:
                 raise UnknownNameError(kind, got=name, known=known)
-            if known[name] in found:
+            if known[name] in limits:
                 raise InputError(kind, got=name, expected="each once: two names are the same")
-            found[known[name]] = limit
-        return np.array(list(found)), np.array(list(found.values()))
+            limits[known[name]] = limit
+        return np.array(list(limits)), np.array(list(limits.values()))
 
     def of_steps(self, system: System, num_steps: int, time_step: float) -> BoundCoupling:
         """What has to hold of a motion in `num_steps` steps of `time_step` [s]."""
         places, limits = self.entries(system)
 
         def change_of_input(x: Any, u: Any) -> Any:
-            one, other = np.split(u, 2)
-            return (other[places] - one[places]) / time_step
+            first, other = np.split(u, 2)
+            return (other[places] - first[places]) / time_step
 
         def change_of_acceleration(x: Any) -> Any:
-            one, other, last = np.split(x, 3)
-            return (last[places] - 2 * other[places] + one[places]) / time_step**2
+            first, other, last = np.split(x, 3)
+            return (last[places] - 2 * other[places] + first[places]) / time_step**2
 
         function, knots = (change_of_input, 2) if self.of_inputs else (change_of_acceleration, 3)
         count = num_steps if self.of_inputs else num_steps + 1
@@ -423,9 +425,9 @@ class Jerk(RateLimit):
     def _known(self, system: System) -> dict[str, int]:
         if not isinstance(system, Model):
             return {name: i for i, name in enumerate(system.state_names)} if isinstance(self.limit, dict) else {}
-        found = {name: system.nq + i for i, name in enumerate(system.velocity_names)}
+        indices = {name: system.nq + i for i, name in enumerate(system.velocity_names)}
         for name, joint in labelled(joints(system.plant)).items():
             _, velocities = system.places(joint)
             if joint.num_velocities() == 1 and len(velocities) == 1:  # none of a joint that follows another
-                found.setdefault(name, system.nq + velocities[0])
-        return found
+                indices.setdefault(name, system.nq + velocities[0])
+        return indices

@@ -27,7 +27,7 @@ class Design:
     def __init__(
         self,
         model: Model,
-        own: ParameterVector,
+        vector: ParameterVector,
         bounds: tuple[Array, Array],
         *,
         free: bool,
@@ -35,14 +35,16 @@ class Design:
         start: float,
         num_steps: int,
     ):
-        self.model, self.own_count = model, len(own.values)
+        self.model, self.own_count = model, len(vector.values)
         self.has_step = horizon is not None and model.can_rebuild
         self.lower, self.upper = bounds
-        moving, values = own.parameters if free else (), own.values if free else np.zeros(0)
-        self.vector, self.moved = own, np.arange(self.own_count if free else 0)
+        moving, values = vector.parameters if free else (), vector.values if free else np.zeros(0)
+        self.vector, self.moved = vector, np.arange(self.own_count if free else 0)
         if self.has_step and horizon is not None:
             step, ends = select(model, (TIME_STEP,)).parameters, np.array(horizon) / num_steps
-            self.vector = ParameterVector(model, (*own.parameters, *step), frozen([*own.values, start / num_steps]))
+            self.vector = ParameterVector(
+                model, (*vector.parameters, *step), frozen([*vector.values, start / num_steps])
+            )
             self.lower, self.upper = np.append(self.lower, ends[0]), np.append(self.upper, ends[1])
             if ends[0] < ends[1]:
                 self.moved = np.append(self.moved, self.own_count)
@@ -91,9 +93,9 @@ class Design:
         """The parameters at coordinates c (nc,)."""
         return self.vector.at(self.values(c))
 
-    def whole(self, own: Array, time_step: float) -> Array:
-        """(np,) the values with the problem's `own` parameters and the length of a step [s]."""
-        return np.append(own, time_step) if self.has_step else np.asarray(own, dtype=float)
+    def whole(self, values: Array, time_step: float) -> Array:
+        """(np,) the `values` of the problem's own parameters and the length of a step [s]."""
+        return np.append(values, time_step) if self.has_step else np.asarray(values, dtype=float)
 
     def own(self, values: Array) -> Array:
         """Those of the problem's own parameters among all values (np,)."""
@@ -111,7 +113,7 @@ class Design:
 
     def of_model(self, model: Model) -> "Design":
         """The same of another model with the same parameters."""
-        found: Any = object.__new__(Design)
-        found.__dict__.update(self.__dict__)
-        found.model, found.vector = model, replace(self.vector, model=model)
-        return found
+        design: Any = object.__new__(Design)
+        design.__dict__.update(self.__dict__)
+        design.model, design.vector = model, replace(self.vector, model=model)
+        return design

@@ -63,9 +63,9 @@ class Dwell(Goal):
         self._set(seconds=positive_float("Dwell.seconds [s]", self.seconds), end=int(self.end))
 
     def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
-        at = self.knots_in(problem)
+        knots = self.knots_in(problem)
         goal: Any = self.goal
-        return tuple(_held(c) for c in replace(goal, knots=at).bind_to(problem))
+        return tuple(_held(c) for c in replace(goal, knots=knots).bind_to(problem))
 
     def knots_in(self, problem: Any) -> tuple[int, ...]:
         """The knots of a Problem at which it holds."""
@@ -95,7 +95,9 @@ class Dwell(Goal):
 
 def _held(c: GoalConstraint) -> GoalConstraint:
     """`c` all along between its knots, with the part of its tolerance that a stay may use."""
-    part = STAYED / AIMED if c.measured is None else 1.0
+    fraction = STAYED / AIMED if c.measured is None else 1.0
     middle = np.nan_to_num(c.wanted)
-    lower, upper = (np.where(np.isnan(c.wanted), side, middle + part * (side - middle)) for side in (c.lower, c.upper))
+    lower, upper = (
+        np.where(np.isnan(c.wanted), side, middle + fraction * (side - middle)) for side in (c.lower, c.upper)
+    )
     return replace(c, lower=lower, upper=upper, name=f"{c.label}, stayed at", dwells=True)

@@ -75,8 +75,8 @@ class Pointwise:
         """
         count, width = knots.shape
         if not self.takes_columns:
-            found = [self._carried(InitializeAutoDiff(k).ravel(), width) for k in knots]
-            return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
+            pairs = [self._carried(InitializeAutoDiff(k).ravel(), width) for k in knots]
+            return np.array([value for value, _ in pairs]), np.array([rows for _, rows in pairs])
         seeds = np.repeat(np.eye(width), count, axis=0)
         columns = InitializeAutoDiff(value=knots.T.reshape(-1, 1), gradient=seeds).reshape(width, count)
         value, rows = self._carried(columns, width, count)
@@ -178,34 +178,34 @@ class Dynamics:
 
     def with_parameters(self, given: Any) -> "Dynamics":
         """These dynamics of the parameters that `given` names alone, or also sets; the others stay as they are."""
-        own = self.parameters
+        parameters = self.parameters
         if isinstance(given, ParameterVector):
             given = given.to_dict()
         names = (given,) if isinstance(given, str) else tuple(given)
         if not names:
-            return self.of_no_parameters if own.names else self
-        if not own.names:
+            return self.of_no_parameters if parameters.names else self
+        if not parameters.names:
             expected = "none: these dynamics have no parameters, as Dynamics(f, ..., parameters={name: value}) has"
             raise InputError("parameters", got=", ".join(map(str, names)), expected=expected)
         for name in names:
-            if name not in own.names:
-                raise UnknownNameError("parameter", got=name, known=own.names)
+            if name not in parameters.names:
+                raise UnknownNameError("parameter", got=name, known=parameters.names)
         if len(set(names)) < len(names):
             raise InputError("parameters", got=", ".join(names), expected="each name once")
-        values = given if isinstance(given, Mapping) else {name: own.to_dict()[name] for name in names}
-        found, place = copy.copy(self), {name: i for i, name in enumerate(names)}
-        found.parameters = plain_parameters({name: np.ravel(values[name])[0] for name in names})
-        if names != own.names:
-            found.form = self._chosen(lambda p: [p[place[n]] if n in place else v for n, v in self._named])
-        return found
+        values = given if isinstance(given, Mapping) else {name: parameters.to_dict()[name] for name in names}
+        dynamics, indices = copy.copy(self), {name: i for i, name in enumerate(names)}
+        dynamics.parameters = plain_parameters({name: np.ravel(values[name])[0] for name in names})
+        if names != parameters.names:
+            dynamics.form = self._chosen(lambda p: [p[indices[n]] if n in indices else v for n, v in self._named])
+        return dynamics
 
     @property
     def of_no_parameters(self) -> "Dynamics":
         """These dynamics with all parameters at their values."""
-        found = copy.copy(self)
-        found.parameters, values = plain_parameters({}), self.parameters.values
-        found.form = self._chosen(lambda p: values)
-        return found
+        dynamics = copy.copy(self)
+        dynamics.parameters, values = plain_parameters({}), self.parameters.values
+        dynamics.form = self._chosen(lambda p: values)
+        return dynamics
 
     @property
     def _named(self) -> list[tuple[str, float]]:
@@ -214,10 +214,10 @@ class Dynamics:
     def _chosen(self, whole: Callable[[Any], Any]) -> Any:
         """The form of other parameters p, where `whole` makes all of these dynamics' of p."""
         f, nu = self.form.f, self.nu
-        found = copy.copy(self.form)
-        found.takes_columns = False
-        found.f = lambda x, z: f(x, np.concatenate([z[:nu], np.array(whole(z[nu:]))]))
-        return found
+        form = copy.copy(self.form)
+        form.takes_columns = False
+        form.f = lambda x, z: f(x, np.concatenate([z[:nu], np.array(whole(z[nu:]))]))
+        return form
 
     def values(self, knots: Array) -> Array:
         """(K, nx) the rates at `knots` (K, nx + nu), rows [x, u]."""
@@ -289,18 +289,18 @@ class DiscreteMap(Dynamics):
     def values(self, knots: Array, steps: Any = None) -> Array:
         """(K, nx) the next states at `knots` (K, nx + nu), rows [x, u], of the `steps` (K,); of step 0 where None."""
         knots = np.asarray(knots, dtype=float)
-        found = np.empty((len(knots), self.nx))
+        states = np.empty((len(knots), self.nx))
         for k, rows in self._by_step(len(knots), steps):
-            found[rows] = self.at_step(k).values(knots[rows])
-        return found
+            states[rows] = self.at_step(k).values(knots[rows])
+        return states
 
     def linearize(self, knots: Array, steps: Any = None) -> tuple[Array, Array]:
         """(K, nx) the next states and (K, nx, nx + nu) their Jacobians [A, B], as `values`."""
         knots = np.asarray(knots, dtype=float)
-        found, slopes = np.empty((len(knots), self.nx)), np.empty((len(knots), self.nx, self.nx + self.nu))
+        states, slopes = np.empty((len(knots), self.nx)), np.empty((len(knots), self.nx, self.nx + self.nu))
         for k, rows in self._by_step(len(knots), steps):
-            found[rows], slopes[rows] = self.at_step(k).linearize(knots[rows])
-        return found, slopes
+            states[rows], slopes[rows] = self.at_step(k).linearize(knots[rows])
+        return states, slopes
 
     def _by_step(self, count: int, steps: Any) -> Iterator[tuple[int, Any]]:
         """Each step and its rows."""
@@ -342,11 +342,11 @@ class Moved:
 
         A parameter that Drake takes no negative value of is moved by parts of its own value, which is above 0.
         """
-        at, sizes = np.array(c), np.maximum(1.0, np.abs(c))
+        coordinates, sizes = np.array(c), np.maximum(1.0, np.abs(c))
         for parameter, s in self.coordinates.start.pairs:
             if parameter.kind.positive:
-                at[s] = sizes[s] = np.maximum(c[s], SMALLEST_TRIED)
-        return at, sizes
+                coordinates[s] = sizes[s] = np.maximum(c[s], SMALLEST_TRIED)
+        return coordinates, sizes
 
     def _by_values(self, knots: Array) -> Array:
         values = [self.coordinates.to_values(c) for c in knots[:, self.width :]]
@@ -403,11 +403,11 @@ class PlantKnots:
     def values(self, knots: Array) -> Array:
         if not self.vector.parameters:
             return self.equations.values(knots)
-        found = np.full((len(knots), self.model.nx), np.nan)
+        values = np.full((len(knots), self.model.nx), np.nan)
         for rows, vector in self._alike(knots):
             with applied(vector):
-                found[rows] = self.equations.values(knots[rows, : self.width])
-        return found
+                values[rows] = self.equations.values(knots[rows, : self.width])
+        return values
 
     def _alike(self, knots: Array) -> Iterator[tuple[Any, ParameterVector]]:
         """The knots that have the same parameters; those with none that Drake takes are left out."""
@@ -427,8 +427,8 @@ class PlantKnots:
                         values[k], rows[k] = self._linearize(knots[k, : self.model.nx], knots[k, self.model.nx :])
             return values, rows
         if self.tree is None:
-            found = [self._linearize(k[: self.model.nx], k[self.model.nx :]) for k in knots]
-            return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
+            pairs = [self._linearize(k[: self.model.nx], k[self.model.nx :]) for k in knots]
+            return np.array([value for value, _ in pairs]), np.array([rows for _, rows in pairs])
         n, actuation = self.model.nv, self.equations.actuation
         q, values = knots[:, :n], self.values(knots)
         d = self.tree(q, values[:, :n], values[:, n:])

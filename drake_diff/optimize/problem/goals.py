@@ -89,8 +89,8 @@ class GoalConstraint(Constraint):
             off = float(np.linalg.norm(self.measured(x)))
             return off if np.isfinite(off) else float("inf")
         values, wanted = np.asarray(self.function(x), dtype=float), self.wanted
-        one = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
-        apart = np.where(np.isnan(wanted), one, values - wanted)
+        excess = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
+        apart = np.where(np.isnan(wanted), excess, values - wanted)
         off = float(np.linalg.norm(apart, ord=self.norm))
         return off if np.isfinite(off) else float("inf")
 
@@ -131,12 +131,12 @@ class Goal:
         return {type(self).__name__: {name: _plain(value) for name, value in self._given()}}
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name}={_plain(value)!r}" for name, value in self._given())
-        return f"{type(self).__name__}({told})"
+        arguments = ", ".join(f"{name}={_plain(value)!r}" for name, value in self._given())
+        return f"{type(self).__name__}({arguments})"
 
     def _given(self) -> list[tuple[str, Any]]:
-        found = [(f, getattr(self, f.name)) for f in fields(self)]  # type: ignore[arg-type]  # all are dataclasses
-        return [(f.name, value) for f, value in found if f.default is MISSING or value != f.default]
+        pairs = [(f, getattr(self, f.name)) for f in fields(self)]  # type: ignore[arg-type]  # all are dataclasses
+        return [(f.name, value) for f, value in pairs if f.default is MISSING or value != f.default]
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
@@ -202,24 +202,24 @@ class FrameGoal(Goal):
         )
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        found = []
+        constraints = []
         if self.position is not None:
             where, name = frame_position(model, self.frame, self.point), f"{self.frame} position"
-            found.append(within(where, _gaps(self.position), self.tolerance, "m", name, self.knots))
+            constraints.append(within(where, _gaps(self.position), self.tolerance, "m", name, self.knots))
         if self.rotation is not None:
             turned = frame_rotation_error(model, self.frame, np.array(self.rotation))
             name = f"{self.frame} rotation"
-            found.append(within(turned, np.zeros(3), self.rotation_tolerance, "rad", name, self.knots))
-        return tuple(found)
+            constraints.append(within(turned, np.zeros(3), self.rotation_tolerance, "rad", name, self.knots))
+        return tuple(constraints)
 
     def marks(self) -> tuple[Mark, ...]:
-        label, found = f"target of {self.frame}", tuple[Mark, ...]()
+        label, marks = f"target of {self.frame}", tuple[Mark, ...]()
         if self.position is not None:
-            found = _place(label, self.position, self.tolerance)
+            marks = _place(label, self.position, self.tolerance)
         if self.rotation is not None:
-            place = tuple(p or 0.0 for p in self.position or (0.0,) * 3)
-            found = (*found, Mark(label, "axes", (0.1,), place, self.rotation))
-        return found
+            position = tuple(p or 0.0 for p in self.position or (0.0,) * 3)
+            marks = (*marks, Mark(label, "axes", (0.1,), position, self.rotation))
+        return marks
 
 
 @dataclass(frozen=True, repr=False)
@@ -272,15 +272,15 @@ class FrameVelocityGoal(Goal):
             raise InputError("FrameVelocityGoal", got="nothing but free entries", expected="a velocity")
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        found = []
+        constraints = []
         if any(v is not None for v in self.velocity):
             moving, name = frame_velocity(model, self.frame, self.point), f"{self.frame} velocity"
-            found.append(within(moving, _gaps(self.velocity), self.tolerance, "m/s", name, self.knots))
+            constraints.append(within(moving, _gaps(self.velocity), self.tolerance, "m/s", name, self.knots))
         if any(v is not None for v in self.angular_velocity):
             turning, name = frame_angular_velocity(model, self.frame), f"{self.frame} angular velocity"
             wanted = _gaps(self.angular_velocity)
-            found.append(within(turning, wanted, self.angular_tolerance, "rad/s", name, self.knots))
-        return tuple(found)
+            constraints.append(within(turning, wanted, self.angular_tolerance, "rad/s", name, self.knots))
+        return tuple(constraints)
 
     def marks(self) -> tuple[Mark, ...]:
         if not any(self.velocity):
@@ -333,14 +333,16 @@ class JointGoal(Goal):
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         wanted, contract = coordinates(model, "JointGoal", self.values), model.contract
         units = [coordinate.unit for coordinate in contract.positions + contract.velocities]
-        found = []
+        constraints = []
         for unit in dict.fromkeys(units[i] for i in wanted):
             here = [i for i in wanted if units[i] == unit]
             names = [model.state_names[i] for i in here]
             label = ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} more"
             target = np.array([wanted[i] for i in here])
-            found.append(within(_Entries(tuple(here)), target, self.tolerance, unit, label, self.knots, norm=np.inf))
-        return tuple(found)
+            constraints.append(
+                within(_Entries(tuple(here)), target, self.tolerance, unit, label, self.knots, norm=np.inf)
+            )
+        return tuple(constraints)
 
 
 @dataclass(frozen=True, repr=False)
@@ -462,8 +464,8 @@ class _Squared:
     unit: float
 
     def __call__(self, x: Any) -> Any:
-        found = self.vector(x)
-        return found @ found / self.unit
+        residuals = self.vector(x)
+        return residuals @ residuals / self.unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -492,25 +494,25 @@ def within(
     name: str,
     knots: Any,
     *,
-    part: float = AIMED,
+    fraction: float = AIMED,
     norm: float = 2.0,
 ) -> GoalConstraint:
-    """`function` (m,) of the state within `tolerance` of `wanted` (m,), NaN where free; a plan uses `part` of it.
+    """`function` (m,) of the state within `tolerance` of `wanted` (m,), NaN where free; a plan uses a `fraction` of it.
 
     Its rows then have bounds of their own, the largest cube within that distance.
     """
     sides = np.count_nonzero(np.isfinite(wanted)) ** (1 / norm)
-    half = part * tolerance / sides
+    half = fraction * tolerance / sides
     lower, upper = (np.where(np.isnan(wanted), np.sign(side) * np.inf, wanted + side) for side in (-half, half))
     return GoalConstraint(function, lower, upper, knots, name, tolerance=tolerance, unit=unit, norm=norm)
 
 
 def _place(label: str, position: Any, tolerance: float) -> tuple[Mark, ...]:
     """A ball at a position, or a slab where some of its entries are free."""
-    at, free = tuple(p or 0.0 for p in position), [p is None for p in position]
+    centre, free = tuple(p or 0.0 for p in position), [p is None for p in position]
     if any(free):
-        return (Mark(label, "box", tuple(1.0 if f else 2 * tolerance for f in free), at),)
-    return (Mark(label, "sphere", (max(tolerance, SMALLEST_BALL),), at),)
+        return (Mark(label, "box", tuple(1.0 if f else 2 * tolerance for f in free), centre),)
+    return (Mark(label, "sphere", (max(tolerance, SMALLEST_BALL),), centre),)
 
 
 def _gaps(numbers: Any) -> Array:
@@ -525,10 +527,10 @@ def checked_weight(subject: str, weight: Any, knots: Any) -> float | None:
     """`weight` where it is None or above 0, and the goal is one of the last knot or of all."""
     if weight is None:
         return None
-    at = checked_knots(f"{subject}.knots", knots)
-    if at not in (None, LAST):
+    goal_knots = checked_knots(f"{subject}.knots", knots)
+    if goal_knots not in (None, LAST):
         raise InputError(
-            f"{subject}.knots with a weight", got=list(at or ()), expected="the last one, -1, or None: all"
+            f"{subject}.knots with a weight", got=list(goal_knots or ()), expected="the last one, -1, or None: all"
         )
     return positive_float(f"{subject}.weight", weight)
 

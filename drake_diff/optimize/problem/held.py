@@ -62,15 +62,15 @@ class HeldContacts(Dynamics):
         self.points = {name: finite_array(f"point of {name}", point, (3,)) for name, point in given.items()}
         places = _Stacked([frame_position(model, name, point) for name, point in self.points.items()], self._columns)
         speeds = _Stacked([frame_velocity(model, name, point) for name, point in self.points.items()], self._columns)
-        found = held_plant(model, places, speeds)
-        if isinstance(found, Refusal):
-            raise ModelError(f"held contacts: {found}")
-        self.plant = found
+        plant = held_plant(model, places, speeds)
+        if isinstance(plant, Refusal):
+            raise ModelError(f"held contacts: {plant}")
+        self.plant = plant
         every = [f"{name} {axis}" for name in self.points for axis in self.axes]
-        self.rows = tuple(every[i] for i in found.rows)
-        own: dict[str, Any] = dict(plant_limits(model))
-        own |= {"state_names": model.state_names, "input_names": model.input_names}
-        super().__init__(found, model.nx, model.nu, **own)
+        self.rows = tuple(every[i] for i in plant.rows)
+        options: dict[str, Any] = dict(plant_limits(model))
+        options |= {"state_names": model.state_names, "input_names": model.input_names}
+        super().__init__(plant, model.nx, model.nu, **options)
         self.model, self.default_state = model, frozen(model.default_state)
 
     def __repr__(self) -> str:
@@ -125,24 +125,24 @@ class HeldContacts(Dynamics):
         """
         reach = positive_float("tolerance [m]", tolerance)
         zero = np.zeros(len(self.rows))
-        found = [Constraint(HeldSpeeds(self), zero, zero, knots=0, name="held points at rest")]
+        constraints = [Constraint(HeldSpeeds(self), zero, zero, knots=0, name="held points at rest")]
         where = self._where(at)
         if not np.all(np.isnan(where)):
             given = np.flatnonzero(~np.isnan(where))
             lower, upper = where[given] - reach, where[given] + reach
-            found.append(Constraint(HeldPlaces(self, given.tolist()), lower, upper, name="held points in place"))
+            constraints.append(Constraint(HeldPlaces(self, given.tolist()), lower, upper, name="held points in place"))
         if friction is not None:
-            found += self._pushing(positive_float("friction", friction))
-        return found
+            constraints += self._pushing(positive_float("friction", friction))
+        return constraints
 
-    def _where(self, at: Any) -> Array:
-        if at is None:
+    def _where(self, positions: Any) -> Array:
+        if positions is None:
             return np.full(len(self.rows), np.nan)
-        if np.ndim(at) == 0:
-            return np.array([float(at) if row.endswith(" z") else np.nan for row in self.rows])
-        where = np.asarray(at, dtype=float)
+        if np.ndim(positions) == 0:
+            return np.array([float(positions) if row.endswith(" z") else np.nan for row in self.rows])
+        where = np.asarray(positions, dtype=float)
         if where.shape != (len(self.rows),) or np.any(np.isinf(where)):
-            raise InputError("at", got=repr(at), expected=f"a height, or {len(self.rows)} places: {self.rows}")
+            raise InputError("at", got=repr(positions), expected=f"a height, or {len(self.rows)} places: {self.rows}")
         return where
 
     def _pushing(self, friction: float) -> Iterator[Constraint]:
@@ -228,8 +228,8 @@ class Impact:
 
     def impulses(self, x: Any) -> Any:
         """(m,) [N s] on the points, one for each of `held.rows`, in any arithmetic."""
-        found = self.held.plant.impulses(np.concatenate([np.asarray(x), np.zeros(self.held.nu)]))
-        return (1 + self.restitution) * found
+        impulses = self.held.plant.impulses(np.concatenate([np.asarray(x), np.zeros(self.held.nu)]))
+        return (1 + self.restitution) * impulses
 
     def gaps(self, x: Any) -> Any:
         """[m] how far the points are from where they meet the world, in any arithmetic."""
@@ -248,18 +248,21 @@ class Impact:
 
     def broken_rules(self, x: Array) -> list[str]:
         """What of the impact at `x` (nx,) the world does not do: a gap that is open, a pull, a slide."""
-        found = [f"{self.held.rows[i]} is {gap:.3g} m apart" for i, gap in zip(self.gap_rows, self.gaps(x), strict=True)
-                 if not abs(gap) <= STAYS_CLOSED]  # fmt: skip
+        faults = [
+            f"{self.held.rows[i]} is {gap:.3g} m apart"
+            for i, gap in zip(self.gap_rows, self.gaps(x), strict=True)
+            if not abs(gap) <= STAYS_CLOSED
+        ]
         if self.friction is None:
-            return found
+            return faults
         values = (1 + self.restitution) * self.held.plant.jump_at(np.asarray(x, dtype=float))[1]
         for name, z, along in self.held.normals():
             most, slide = self.friction * values[z], float(np.linalg.norm(values[along]))
             if values[z] < -STAYS_CLOSED:
-                found.append(f"the ground pulls at {name} by {-values[z]:.3g} N s")
+                faults.append(f"the ground pulls at {name} by {-values[z]:.3g} N s")
             elif slide > most + STAYS_CLOSED:
-                found.append(f"{name} slides: {slide:.3g} N s along the ground, friction holds {most:.3g}")
-        return found
+                faults.append(f"{name} slides: {slide:.3g} N s along the ground, friction holds {most:.3g}")
+        return faults
 
     def saltation(self, x: Array, rates: Array, rates_after: Array) -> Array:
         """(nx, nx) of the rates (nx,) before and after; the reset's own derivative where no single gap closes."""
@@ -287,31 +290,31 @@ class Impact:
             >>> [constraint.label for constraint in dd.optimize.Impact(foot, at=0.0, friction=0.8).kept()]
             ['foot z touches', 'foot is pushed', 'foot does not slide in the impact']
         """
-        found, zero = [], np.zeros(len(self.gap_rows))
+        constraints, zero = [], np.zeros(len(self.gap_rows))
         if self.has_gap:
             names = " and ".join(self.held.rows[i] for i in self.gap_rows)
-            found.append(Constraint(ImpactGaps(self), zero, zero, knots=-1, name=f"{names} touches"))
+            constraints.append(Constraint(ImpactGaps(self), zero, zero, knots=-1, name=f"{names} touches"))
         if self.friction is not None:
             for name, z, along in self.held.normals():
-                found.append(Constraint(ImpactPush(self, z), lower=0.0, knots=-1, name=f"{name} is pushed"))
+                constraints.append(Constraint(ImpactPush(self, z), lower=0.0, knots=-1, name=f"{name} is pushed"))
                 if along:
                     cone = ImpactCone(self, z, along, self.friction)
                     label = f"{name} does not slide in the impact"
-                    found.append(Constraint(cone, lower=cone_limits(along), knots=-1, name=label))
-        return found
+                    constraints.append(Constraint(cone, lower=cone_limits(along), knots=-1, name=label))
+        return constraints
 
     def to_dict(self) -> dict[str, Any]:
         """What a record tells of it."""
-        at = [None if np.isnan(place) else float(place) for place in self.where]
-        return self.held.to_dict() | {"restitution": self.restitution, "at": at, "friction": self.friction}
+        positions = [None if np.isnan(position) else float(position) for position in self.where]
+        return self.held.to_dict() | {"restitution": self.restitution, "at": positions, "friction": self.friction}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any], model: Model) -> "Impact":
         """The same again; InputError where `values` are none."""
         try:
             held = HeldContacts(model, values["points"], axes=values["axes"])
-            at = [np.nan if place is None else place for place in values["at"]]
-            return cls(held, restitution=values["restitution"], at=at, friction=values["friction"])
+            positions = [np.nan if position is None else position for position in values["at"]]
+            return cls(held, restitution=values["restitution"], at=positions, friction=values["friction"])
         except (KeyError, TypeError) as error:
             raise InputError("impact", got=repr(values)[:80], expected="what Impact.to_dict tells") from error
 
@@ -431,20 +434,20 @@ QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (HeldSpeeds, HeldP
 IMPACT_QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (ImpactGaps, ImpactPush, ImpactCone)}
 
 
-def impact_quantity(model: Model, told: dict[str, Any]) -> ImpactQuantity:
+def impact_quantity(model: Model, record: dict[str, Any]) -> ImpactQuantity:
     """The function that `ImpactQuantity.to_dict` told of, on `model`; InputError where that is none."""
-    ((kind, values),) = told.items()
+    ((kind, values),) = record.items()
     impact = Impact.from_dict(values["impact"], model)
-    found: ImpactQuantity = IMPACT_QUANTITIES[kind](
+    quantity: ImpactQuantity = IMPACT_QUANTITIES[kind](
         impact, **{name: value for name, value in values.items() if name != "impact"}
     )
-    return found
+    return quantity
 
 
-def held_quantity(held: HeldContacts, told: dict[str, Any]) -> HeldQuantity:
+def held_quantity(held: HeldContacts, record: dict[str, Any]) -> HeldQuantity:
     """The function that `HeldQuantity.to_dict` told of, of `held`; InputError where that is none."""
-    if not (len(told) == 1 and next(iter(told)) in QUANTITIES):
-        raise InputError("quantity", got=repr(told)[:80], expected=f"one of {', '.join(QUANTITIES)} with its values")
-    ((kind, values),) = told.items()
-    found: HeldQuantity = QUANTITIES[kind](held, **values)
-    return found
+    if not (len(record) == 1 and next(iter(record)) in QUANTITIES):
+        raise InputError("quantity", got=repr(record)[:80], expected=f"one of {', '.join(QUANTITIES)} with its values")
+    ((kind, values),) = record.items()
+    quantity: HeldQuantity = QUANTITIES[kind](held, **values)
+    return quantity

@@ -18,27 +18,27 @@ def coordinates(system: Model | Dynamics, subject: str, given: Mapping[str, Any]
 
     Raises UnknownNameError of a name that is none, InputError where two are the same coordinate.
     """
-    known, found = places_of(system), dict[int, Any]()
+    known, values = places_of(system), dict[int, Any]()
     for name, value in given.items():
         if name not in known:
             raise UnknownNameError(subject, got=name, known=known)
-        if known[name] in found:
+        if known[name] in values:
             other = next(n for n in given if known[n] == known[name])
             raise InputError(subject, got=f"{other} and {name}", expected="each coordinate once: they are the same")
-        found[known[name]] = value
-    return found
+        values[known[name]] = value
+    return values
 
 
 def places_of(system: Model | Dynamics) -> dict[str, int]:
     """The place in the state of each of its names, and of joints with one position by the joint's own name."""
-    found = {name: i for i, name in enumerate(system.state_names)}
+    places = {name: i for i, name in enumerate(system.state_names)}
     model = system if isinstance(system, Model) else system.model
     if model is not None:
         for name, joint in labelled(joints(model.plant)).items():
             positions, _ = model.places(joint)
             if joint.num_positions() == 1 and len(positions) == 1:  # none of a joint that follows another
-                found.setdefault(name, positions[0])
-    return found
+                places.setdefault(name, positions[0])
+    return places
 
 
 def state_of(system: Model | Dynamics, subject: str, given: Any, elsewhere: Array) -> Any:
@@ -67,13 +67,13 @@ def bounds_of(system: Model | Dynamics, given: Any) -> Any:
             raise InputError(
                 f"bounds of {name}", got=repr(pair)[:80], expected="(lower, upper), None where there is none"
             )
-        kind, place = ("x", places[name]) if name in places else ("u", inputs[name])
+        kind, index = ("x", places[name]) if name in places else ("u", inputs[name])
         for side, value in zip(SIDES, pair, strict=True):
             if value is not None:
                 bound = array_with_gaps(f"bounds of {name}", value, ())
                 if np.isnan(bound):
                     raise InputError(f"bounds of {name}", got=repr(pair)[:80], expected="numbers, None for no bound")
-                sides[f"{kind}_{side}"][place] = bound
+                sides[f"{kind}_{side}"][index] = bound
     return Bounds(**sides)
 
 

@@ -48,8 +48,8 @@ class ClearanceConstraint(GoalConstraint):
     @property
     def clearance(self) -> Clearance:
         """The distances, row by row."""
-        found: Clearance = self.function  # type: ignore[assignment]
-        return found
+        clearance: Clearance = self.function  # type: ignore[assignment]
+        return clearance
 
     @property
     def margin(self) -> float:
@@ -69,16 +69,16 @@ class ClearanceConstraint(GoalConstraint):
         values, rows = self.clearance.linearize(x[None])
         return values[0], np.hstack([rows[0], np.zeros((len(values[0]), len(u)))])
 
-    def seen(self, times: Array, at: Motion, allowed: float) -> tuple[Array, Array]:
+    def seen(self, times: Array, motion: Motion, allowed: float) -> tuple[Array, Array]:
         """`times` (K,) [s], and as many between them that nothing of a motion that lacks more than `allowed` is missed.
 
         Between two states that are clear by a and b while a piece moves by s, it is clear by (a + b - s) / 2 at least.
         Where that is too little, the middle is looked at, until it is not, or the piece moves by less than `allowed`.
 
         Returns:
-            Times (S,), and the states (S, nx) that `at` gives there.
+            Times (S,), and the states (S, nx) that `motion` gives there.
         """
-        xs, least = at(times), self.margin - allowed
+        xs, least = motion(times), self.margin - allowed
         while True:
             values, ways = self.clearance.values(xs), ARC * self.clearance.moved(xs)
             clear = np.min((values[:-1] + values[1:] - ways) / 2, axis=1) >= least
@@ -89,13 +89,13 @@ class ClearanceConstraint(GoalConstraint):
             if not len(unseen) or len(times) + len(unseen) > MOST_SEEN:
                 break
             middle = (times[unseen] + times[unseen + 1]) / 2
-            times, xs = np.insert(times, unseen + 1, middle), np.insert(xs, unseen + 1, at(middle), axis=0)
+            times, xs = np.insert(times, unseen + 1, middle), np.insert(xs, unseen + 1, motion(middle), axis=0)
         xs[unseen] = np.nan  # a motion too wild to be looked at: nobody knows what it enters
         return times, xs
 
-    def nearest(self, times: Array, at: Motion, allowed: float) -> Check:
+    def nearest(self, times: Array, motion: Motion, allowed: float) -> Check:
         """What a motion lacks most of the margin, of `allowed` [m], at `times` (K,) [s] or in between."""
-        times, xs = self.seen(times, at, allowed)
+        times, xs = self.seen(times, motion, allowed)
         worst = int(np.argmax(self.lacking(xs)))
         return self.check_at(xs[worst], f"{times[worst]:.4g} s", allowed)
 
@@ -149,7 +149,7 @@ class Obstacle(Goal):
             lacking = margin - clearance(x)
             return (lacking + np.abs(lacking)) / 2
 
-        found = ClearanceConstraint(
+        constraint = ClearanceConstraint(
             clearance,
             np.full(len(clearance.labels), margin),
             name=name,
@@ -158,7 +158,7 @@ class Obstacle(Goal):
             measured=used,
             thing=thing,
         )
-        return (found,)
+        return (constraint,)
 
 
 @dataclass(frozen=True, repr=False)
@@ -319,8 +319,8 @@ class SelfCollision(Obstacle):
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
         pairs, touching = self._pairs(model)
-        kept = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
-        return self.constraints(OfPairs(model, _placing(model), kept), self.margin, "clear of itself", "")
+        free_pairs = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
+        return self.constraints(OfPairs(model, _placing(model), free_pairs), self.margin, "clear of itself", "")
 
     def apart_but_at(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
         """What keeps all pairs of `model` apart but those that are nearer than the margin at one of xs (K, nx).
@@ -332,8 +332,8 @@ class SelfCollision(Obstacle):
             return ()
         near = np.any(OfPairs(model, placing, pairs).values(xs) < self.margin, axis=0)
         touching = {frozenset((a.body, b.body)) for (a, b), close in zip(pairs, near, strict=True) if close}
-        kept = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
-        return self.constraints(OfPairs(model, placing, kept), self.margin, "clear of itself", "")
+        free_pairs = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
+        return self.constraints(OfPairs(model, placing, free_pairs), self.margin, "clear of itself", "")
 
     def left_out(self, model: Model) -> tuple[str, ...]:
         """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b"."""
@@ -343,7 +343,7 @@ class SelfCollision(Obstacle):
         """The pairs of pieces that may touch, and the pairs of bodies among them that always do."""
         placing = _placing(model)
         known = labelled(bodies(model.plant))
-        for name in (each for pair in self.ignore for each in pair):
+        for name in (body for pair in self.ignore for body in pair):
             if name not in known:
                 raise UnknownNameError("SelfCollision.ignore", got=name, known=known)
         pieces, left = _pieces(model, placing, self.links, fixed=True), {frozenset(pair) for pair in self.ignore}
@@ -383,10 +383,10 @@ def _are_neighbours(placing: Placing, a: Piece, b: Piece) -> bool:
 
 
 def _placing(model: Model) -> Placing:
-    found = placing_of(model)
-    if isinstance(found, Refusal):
-        raise ModelError(f"obstacles: {found}")
-    return found
+    placing = placing_of(model)
+    if isinstance(placing, Refusal):
+        raise ModelError(f"obstacles: {placing}")
+    return placing
 
 
 def _pieces(model: Model, placing: Placing, links: Sequence[str] | None, *, fixed: bool = False) -> list[Piece]:
@@ -454,8 +454,8 @@ def along_steps(times: Array, xs: Array) -> tuple[Array, Motion]:
 
     That is how a step moves positions: at a constant speed.
     """
-    at = np.interp(np.arange(PARTS * (len(xs) - 1) + 1) / PARTS, np.arange(len(xs)), times)
-    return at, lambda every: np.array([np.interp(every, times, column) for column in xs.T]).T
+    instants = np.interp(np.arange(PARTS * (len(xs) - 1) + 1) / PARTS, np.arange(len(xs)), times)
+    return instants, lambda every: np.array([np.interp(every, times, column) for column in xs.T]).T
 
 
 def lacking_between(constraints: Sequence[Constraint], xs: Array) -> tuple[float, bool]:
@@ -474,12 +474,12 @@ def lacking_between(constraints: Sequence[Constraint], xs: Array) -> tuple[float
 
 def swept(constraints: Sequence[Constraint], time_step: float, parts: int) -> tuple[ClearanceConstraint, ...]:
     """What keeps clear of the same in the middle of the step before each knot, in `parts` - 1 places on its way."""
-    found = []
+    swept_constraints = []
     for c in clearances(constraints):
         clearance = Swept(c.clearance, time_step * np.arange(1, parts) / parts)
         lower = np.full(len(clearance.labels), c.margin)
-        found.append(replace(c, function=clearance, lower=lower, upper=None, name=f"{c.label}, on the way"))
-    return tuple(found)
+        swept_constraints.append(replace(c, function=clearance, lower=lower, upper=None, name=f"{c.label}, on the way"))
+    return tuple(swept_constraints)
 
 
 def doubts_of(goals: Sequence[Goal], model: Model) -> Iterator[str]:

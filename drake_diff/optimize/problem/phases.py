@@ -99,8 +99,8 @@ class PhasedProblem(PicklesItsFields, ShowsItsRepr):
     def __repr__(self) -> str:
         lines = [f"PhasedProblem of {len(self.phases)} phase{'s' * (len(self.phases) != 1)}"]
         for i, (name, phase) in enumerate(zip(self.names, self.phases, strict=True)):
-            told = repr(phase).splitlines()[0].removeprefix("Problem of ").replace(":", ",", 1)
-            lines.append(f"{name}: {told}")
+            description = repr(phase).splitlines()[0].removeprefix("Problem of ").replace(":", ",", 1)
+            lines.append(f"{name}: {description}")
             lines += [f"reset to {self.names[s.after]}: {s.told}" for s in self.switches if s.before == i]
         if self.horizon is not None:
             lines.append(f"horizon {self.horizon[0]:g} to {self.horizon[1]:g} s in all")
@@ -143,24 +143,24 @@ class Switch:
 
     def __init__(self, problem: PhasedProblem, before: int, after: int, reset: Any):
         self.before, self.after = before, after
-        one, other = problem.phases[before], problem.phases[after]
+        earlier, other = problem.phases[before], problem.phases[after]
         self.reset = reset
         self.label = f"the reset from {problem.names[before]} to {problem.names[after]}"
-        self.rows, self.columns = other.state_names, one.state_names
+        self.rows, self.columns = other.state_names, earlier.state_names
         self.matrix: Array | None = None  # of a linear reset
         function = reset
         if reset is None:
-            if one.nx != other.nx:
-                expected = f"a matrix or function, as one has {one.nx} states and the other {other.nx}"
+            if earlier.nx != other.nx:
+                expected = f"a matrix or function, as one has {earlier.nx} states and the other {other.nx}"
                 raise InputError(self.label, got="None", expected=expected)
-            self.matrix = frozen(np.eye(one.nx))
+            self.matrix = frozen(np.eye(earlier.nx))
         elif not callable(reset):
-            self.matrix = finite_array(self.label, reset, (other.nx, one.nx))
+            self.matrix = finite_array(self.label, reset, (other.nx, earlier.nx))
         self.told = "the state goes on" if reset is None else "a matrix" if self.matrix is not None else _name_of(reset)
         if self.matrix is not None:
             function = _Linear(self.matrix)
-        probe = one.dynamics.probe()[:, : one.nx]
-        self.form = Pointwise(self.label, _of_state(function), one.nx, (other.nx,), probe)
+        probe = earlier.dynamics.probe()[:, : earlier.nx]
+        self.form = Pointwise(self.label, _of_state(function), earlier.nx, (other.nx,), probe)
         self.probe = np.hstack([probe, other.dynamics.probe()[:, : other.nx]])  # both states, side by side
         self.link = Constraint(_Apart(function), lower=np.zeros(other.nx), upper=np.zeros(other.nx), name=self.label)
 

@@ -149,16 +149,16 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             if isinstance(given, ParameterVector) and given.model is not system:
                 given = given.to_dict()
             self._set("parameters", select(system, given))
-            own = plant_limits(system)
+            limits = plant_limits(system)
         else:
             all_of_them = (
                 self.optimizes_parameters and isinstance(self.parameters, (tuple, list)) and not self.parameters
             )
             asked = system.parameters if all_of_them else self.parameters
             self._set("parameters", system.with_parameters(asked).parameters)
-            own = vars(system.bounds)
+            limits = vars(system.bounds)
         self._check_parameters()
-        bounds = resolve_bounds(bounds_of(system, self.bounds), own, self.state_names, self.input_names)
+        bounds = resolve_bounds(bounds_of(system, self.bounds), limits, self.state_names, self.input_names)
         self._set("bounds", bounds)
         self._set("initial_state_mask", self._check_mask())
         shape = (self.num_steps, self.nu)
@@ -198,9 +198,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         for name in ("running_cost", "final_cost", "trajectory_cost", "parameter_cost"):
             cost = getattr(self, name)
             if cost is not None:
-                own = isinstance(cost, (QuadraticCost, ConstantCost, TrackingCost, SumOfCosts))
-                told = repr(cost) if own else getattr(cost, "__qualname__", type(cost).__name__)
-                lines.append(f"{name.replace('_', ' ')}: {told}")
+                has_repr = isinstance(cost, (QuadraticCost, ConstantCost, TrackingCost, SumOfCosts))
+                description = repr(cost) if has_repr else getattr(cost, "__qualname__", type(cost).__name__)
+                lines.append(f"{name.replace('_', ' ')}: {description}")
         if self.waypoints:
             lines.append(f"waypoints at knots {', '.join(map(str, self.waypoints))}")
         lines += [f"constraint: {constraint!r}" for constraint in self.constraints]
@@ -302,12 +302,12 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """The final cost, with that of goals that have a weight at the end; None where there is none."""
         return self._with_goals(self.final_cost, LAST)
 
-    def _with_goals(self, own: Any, knots: Any) -> Any:
+    def _with_goals(self, cost: Any, knots: Any) -> Any:
         soft = [goal for goal in self.goals if goal.weight is not None and goal.knots == knots]
         terms = tuple((cast(float, goal.weight), constraint) for goal in soft for constraint in self._bound(goal))
-        if terms and isinstance(own, TimedCost):
-            return SumOfCosts((own, WithGoals(None, terms)))
-        return WithGoals(own, terms) if terms else own
+        if terms and isinstance(cost, TimedCost):
+            return SumOfCosts((cost, WithGoals(None, terms)))
+        return WithGoals(cost, terms) if terms else cost
 
     @cached_property
     def design(self) -> Design:
@@ -392,20 +392,20 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         was refined, and a constraint of all knots is one of all rows. Waypoints are constraints here too, and so are
         couplings: those of steps, where they are not given.
         """
-        found: dict[str, tuple[float, int]] = {}
+        excesses: dict[str, tuple[float, int]] = {}
         where = np.arange(len(xs)) if knots is None else knots
         for c in self.kept:
-            at = self.knots_of(c, input_at_end=len(us) == len(xs))
-            every = range(at[0], len(us) if c.takes_input else len(xs))  # from 1 where the first state is given
-            rows: Any = every if c.knots is None else where[list(at)]
+            own_knots = self.knots_of(c, input_at_end=len(us) == len(xs))
+            every = range(own_knots[0], len(us) if c.takes_input else len(xs))  # from 1 where the first state is given
+            rows: Any = every if c.knots is None else where[list(own_knots)]
             if c.whole and c.knots is not None:
-                rows = range(where[at[0]], where[at[-1]] + 1)
+                rows = range(where[own_knots[0]], where[own_knots[-1]] + 1)
             worst = max((c.excess(xs[k], us[min(k, len(us) - 1)]), int(k)) for k in rows)
-            found[c.label] = max(worst, found.get(c.label, worst))
+            excesses[c.label] = max(worst, excesses.get(c.label, worst))
         for knot, wanted in self.waypoints.items():
             distance = np.abs(xs[where[knot]] - wanted)[~np.isnan(wanted)]
-            found[f"waypoint at knot {knot}"] = (float(np.max(distance, initial=0.0)), int(where[knot]))
-        return found | excess_of(self.coupled_steps() if coupled is None else coupled, xs, us, where)
+            excesses[f"waypoint at knot {knot}"] = (float(np.max(distance, initial=0.0)), int(where[knot]))
+        return excesses | excess_of(self.coupled_steps() if coupled is None else coupled, xs, us, where)
 
     def ranges(self, xs: Array) -> Array:
         """(nx,) the range of each state along xs (M, nx), a tolerance's scale; see SMALLEST_RANGE, SMALLEST_SHARE."""
@@ -486,7 +486,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return state
 
     def _check_waypoints(self) -> dict[int, Array]:
-        found = {}
+        waypoints = {}
         if not (self.waypoints is None or isinstance(self.waypoints, Mapping)):
             got = f"{self.waypoints!r:.80}"
             raise InputError("waypoints", got=got, expected="a mapping from knots to states")
@@ -495,8 +495,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             if not whole or not 0 < knot < self.num_steps:
                 expected = f"whole numbers from 1 to {self.num_steps - 1} (the last state's is x_goal)"
                 raise InputError("knots of waypoints", got=f"{knot!r:.80}", expected=expected)
-            found[int(knot)] = self._check_state(f"waypoint at knot {knot}", state)
-        return dict(sorted(found.items()))
+            waypoints[int(knot)] = self._check_state(f"waypoint at knot {knot}", state)
+        return dict(sorted(waypoints.items()))
 
     def _check_constraints(self) -> tuple[Constraint, ...]:
         given = self.constraints if isinstance(self.constraints, (tuple, list)) else (self.constraints,)
@@ -525,8 +525,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
     def _check_given(self, bound: BoundCoupling) -> None:
         """Refuse a coupling of states that are all given and do not keep it."""
         lower, upper = self.state_limits()
-        at = np.unique(bound.knots)
-        if bound.takes_input or np.any(lower[at] != upper[at]):
+        knots = np.unique(bound.knots)
+        if bound.takes_input or np.any(lower[knots] != upper[knots]):
             return
         excess, _ = bound.excess(lower, np.zeros((len(lower), self.nu)), np.arange(len(lower)))
         if not excess <= SAME_STATE:
@@ -563,15 +563,15 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             fixed = self._fixed_values(constraint)
             apart = np.maximum(constraint.lower - fixed, fixed - constraint.upper)
             for i in np.flatnonzero(apart > NO_SLOPE)[:1]:
-                told = f"{constraint.wanted[i]:.6g}, but its entry {i} is {fixed[i]:.6g} wherever {self.name} goes"
-                raise InputError(f"goal {constraint.label}", got=told, expected="what some joint can change")
+                got = f"{constraint.wanted[i]:.6g}, but its entry {i} is {fixed[i]:.6g} wherever {self.name} goes"
+                raise InputError(f"goal {constraint.label}", got=got, expected="what some joint can change")
 
     def _fixed_values(self, constraint: GoalConstraint) -> Array:
         """(m,) the values of a goal's rows that no coordinate changes at any of some states, NaN of all others."""
         random, none = np.random.default_rng(0), np.zeros(self.nu)
         states = self.x0 + random.standard_normal((TRIED, self.nx))
-        found = [constraint.differentiate(x, none) for x in states]
-        values, slopes = np.array([v for v, _ in found]), np.array([np.max(np.abs(j), axis=1) for _, j in found])
+        pairs = [constraint.differentiate(x, none) for x in states]
+        values, slopes = np.array([v for v, _ in pairs]), np.array([np.max(np.abs(j), axis=1) for _, j in pairs])
         still = (np.max(slopes, axis=0) <= NO_SLOPE) & (np.ptp(values, axis=0) <= NO_SLOPE)
         return np.where(still, values[0], np.nan)
 

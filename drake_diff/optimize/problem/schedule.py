@@ -104,7 +104,7 @@ class ContactSchedule(Goal):
         alike = dict[bytes, list[int]]()
         for foot in range(len(self.feet)):
             alike.setdefault(stands[:, foot].tobytes(), []).append(foot)
-        found, most = list[GoalConstraint](), USED * self.slip
+        constraints, most = list[GoalConstraint](), USED * self.slip
         for those in alike.values():
             name, down = ", ".join(self.feet[i] for i in those), on[:, those[0]]
             heights, slides = soles.of("heights", those), soles.of("slides", those)
@@ -112,11 +112,11 @@ class ContactSchedule(Goal):
             standing = np.flatnonzero(carries) + 1  # not where it lands: longer steps fly a little longer
             still = np.flatnonzero(carries & np.concatenate([carries[:1], carries[:-1]])) + 1
             swung = np.array([k for a, b in swings(down) for k in _middle(a, b, self.num_steps)], dtype=int)
-            found += _rows(heights, standing, name, "over the ground where it stands", self.touch, upper=0.0)
+            constraints += _rows(heights, standing, name, "over the ground where it stands", self.touch, upper=0.0)
             clear = self.clearance
-            found += _rows(heights, swung, name, "short of its clearance where it swings", clear, lower=clear)
-            found += _rows(slides, still, name, "of slip where it stands", self.slip, lower=-most, upper=most)
-        return tuple(found)
+            constraints += _rows(heights, swung, name, "short of its clearance where it swings", clear, lower=clear)
+            constraints += _rows(slides, still, name, "of slip where it stands", self.slip, lower=-most, upper=most)
+        return tuple(constraints)
 
     def with_soft_feet(self, model: Model) -> Model:
         """The model with contact that is as soft for its time step as plans need, where its file gives none.
@@ -169,11 +169,11 @@ class ContactSchedule(Goal):
         posture = np.array(model.default_state[: model.nq])
         if not isinstance(joints, Mapping):
             raise InputError("ContactSchedule.standing: joints", got=repr(joints)[:80], expected="positions by name")
-        for at, value in coordinates(model, "ContactSchedule.standing", joints).items():
-            if at >= model.nq:
-                got = model.state_names[at]
+        for index, value in coordinates(model, "ContactSchedule.standing", joints).items():
+            if index >= model.nq:
+                got = model.state_names[index]
                 raise InputError("ContactSchedule.standing: joints", got=got, expected="positions, not velocities")
-            posture[at] = float(finite_array(f"ContactSchedule.standing {model.state_names[at]}", value, ()))
+            posture[index] = float(finite_array(f"ContactSchedule.standing {model.state_names[index]}", value, ()))
         return standing(Legs(model, self.feet, posture), posture)[0]
 
     def guess(self, model: Model, x0: Any, end: Any = None, *, swing: float = 0.04) -> tuple[Array, Array]:
@@ -264,8 +264,8 @@ class _Soles:
                 if key not in self.read:
                     self.read[key] = self.legs.read(x)
             soles = self.legs.soles([self.read[key] for key in new])
-            found = self._slopes(states, soles) if what.endswith("by x") else self._values(states, soles)
-            for name, values in found.items():
+            readings = self._slopes(states, soles) if what.endswith("by x") else self._values(states, soles)
+            for name, values in readings.items():
                 for key, value in zip(new, values, strict=True):
                     self.known.setdefault(key, {})[name] = value
         return np.array([self.known[key][what] for key in keys])
@@ -308,9 +308,9 @@ def _rows(
     if not len(knots):
         return
     unit = "m/s" if off.startswith("of slip") else "m"
-    at = tuple(int(k) for k in knots)
+    indices = tuple(int(k) for k in knots)
     label = f"{name}: {off}"
-    yield GoalConstraint(function, knots=at, name=label, tolerance=tolerance, unit=unit, norm=np.inf, **sides)
+    yield GoalConstraint(function, knots=indices, name=label, tolerance=tolerance, unit=unit, norm=np.inf, **sides)
 
 
 def _phase(given: Any) -> tuple[int, tuple[str, ...]]:
@@ -325,5 +325,5 @@ def _phase(given: Any) -> tuple[int, tuple[str, ...]]:
 
 def _middle(a: int, b: int, last: int) -> range:
     """The knots of a swing from a to b without its first and last part; up to where it begins or ends the motion."""
-    part = MIDDLE * (b - a)
-    return range(math.ceil(a + part) if a > 0 else 1, (math.floor(b - part) if b < last else last) + 1)
+    margin = MIDDLE * (b - a)
+    return range(math.ceil(a + margin) if a > 0 else 1, (math.floor(b - margin) if b < last else last) + 1)

@@ -75,9 +75,9 @@ class Region:
     def random_state(self, random: np.random.Generator) -> Array:
         """(nx,) one uniform in the set."""
         direction = random.standard_normal(len(self.x_goal))
-        part = random.random() ** (1 / len(direction)) / np.linalg.norm(direction)
+        radius = random.random() ** (1 / len(direction)) / np.linalg.norm(direction)
         square_root = np.linalg.cholesky(self.cost_to_go / self.level)
-        return self.x_goal + np.linalg.solve(square_root.T, part * direction)
+        return self.x_goal + np.linalg.solve(square_root.T, radius * direction)
 
 
 _KNOWN: "WeakKeyDictionary[Model, dict[Any, Region]]" = WeakKeyDictionary()
@@ -195,8 +195,8 @@ def _found(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
     d = differentiate_step(model, x_goal, np.zeros(model.nu))
     u_goal = np.asarray(np.linalg.lstsq(d.B, x_goal - d.x_next, rcond=None)[0])
     if np.any((u_goal <= bounds.u_lower) | (u_goal >= bounds.u_upper)):
-        told = f"a state that takes u = {u_goal.round(4).tolist()}"
-        raise InputError("TerminalSet.x_goal", got=told, expected="one that inputs within their limits hold")
+        got = f"a state that takes u = {u_goal.round(4).tolist()}"
+        raise InputError("TerminalSet.x_goal", got=got, expected="one that inputs within their limits hold")
     Q = np.eye(model.nx) if asked.Q is None else finite_array("TerminalSet.Q", asked.Q, (model.nx, model.nx))
     R = np.eye(model.nu) if asked.R is None else finite_array("TerminalSet.R", asked.R, (model.nu, model.nu))
     regulator = LQR(model, x_goal, u_goal, Q, R)
@@ -220,24 +220,24 @@ def _found(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
 
 
 def _sampled(
-    model: Model, at: Callable[[float, int], Region], level: float, samples: int, seed: int, *, fixed: bool
+    model: Model, region_at: Callable[[float, int], Region], level: float, samples: int, seed: int, *, fixed: bool
 ) -> float:
     """The level, lowered until `samples` random states in a row converge; a `fixed` one that fails is refused."""
     random, least, most = np.random.default_rng(seed), 1e-12 * level, level
     in_a_row = 0
     while in_a_row < samples:
-        region = at(level, 0)
+        region = region_at(level, 0)
         x = region.random_state(random)
         if region.converges(model, x):
             in_a_row += 1
             continue
-        told = f"a state at {float(region.value(x)):.2g} of it that does not converge, {x.round(4).tolist()}"
+        got = f"a state at {float(region.value(x)):.2g} of it that does not converge, {x.round(4).tolist()}"
         if fixed:
-            raise InputError("TerminalSet.level", got=told, expected="a level from which all random states converge")
+            raise InputError("TerminalSet.level", got=got, expected="a level from which all random states converge")
         level = min(LOWERED * level, WITHIN * float(region.value(x)) * level) if in_a_row < TRIED else WITHIN * level
         in_a_row = 0
         if level < least:
-            raise InputError("TerminalSet", got=told, expected=f"a level below {most:.3g} that converges")
+            raise InputError("TerminalSet", got=got, expected=f"a level below {most:.3g} that converges")
     return level if fixed or level == most else WITHIN * level
 
 
@@ -247,11 +247,11 @@ def linear_level(K: Array, S: Array, x_goal: Array, u_goal: Array, bounds: Bound
     Over it the largest a' d is sqrt(level a' S^-1 a). A position without a bound stays within FLAT of its goal.
     """
     rows = np.vstack([-K, np.eye(len(S))])
-    at = np.concatenate([u_goal, x_goal])
+    goal = np.concatenate([u_goal, x_goal])
     lower, upper = (
         np.concatenate(sides) for sides in ((bounds.u_lower, bounds.x_lower), (bounds.u_upper, bounds.x_upper))
     )
-    room = np.minimum(at - lower, upper - at)
+    room = np.minimum(goal - lower, upper - goal)
     positions = slice(len(u_goal), len(u_goal) + nq)
     room[positions] = np.minimum(room[positions], FLAT)
     widths = np.einsum("ri,ij,rj->r", rows, np.linalg.inv(S), rows)

@@ -78,23 +78,23 @@ def violation_between_nodes(motion: Collocated) -> Excess:
         return Excess(0.0, 0.0, 0.0, 0.0, "nowhere", (), ())
     states, inputs = task.dynamics.state_names, task.dynamics.input_names
     ranges, (times, xs) = task.problem.ranges(motion.xs), motion.between_knots
-    found = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
+    groups = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
     for c in task.problem.kept:
         if isinstance(c, ClearanceConstraint):
-            found.append([_too_near(motion, c)])
+            groups.append([_too_near(motion, c)])
         elif isinstance(c, GoalConstraint) and c.dwells:
-            found.append([_of_stay(motion, c)])
+            groups.append([_of_stay(motion, c)])
         elif c.knots is None:
-            found.append(_of_constraint(motion, c, ranges))
+            groups.append(_of_constraint(motion, c, ranges))
     for limit in task.problem.rate_limits:
         _, most = limit.entries(task.problem.system)
         rates, when = motion.rates_of(limit)
         extent = _extent(rates) if limit.of_inputs else JERK_TOLERANCE / EXCESS_TOLERANCE * most
-        found.append(_beyond("constraint", (limit.label,) * len(most), rates, -most, most, extent, when))
+        groups.append(_beyond("constraint", (limit.label,) * len(most), rates, -most, most, extent, when))
     k, tau = np.repeat(np.arange(count), len(DENSE)), np.tile(DENSE, count)
     us = motion.between(k, tau)[1]
-    found.append(_beyond("input", inputs, us, b.u_lower, b.u_upper, _extent(us), motion.times(k, tau)))
-    every = [each for kind in found for each in kind]
+    groups.append(_beyond("input", inputs, us, b.u_lower, b.u_upper, _extent(us), motion.times(k, tau)))
+    every = [excess for kind in groups for excess in kind]
     largest = {kind: max((e.excess for e in every if e.kind == kind), default=0.0) for kind in KINDS}
     worst = max(every, key=lambda e: e.part)
     where = worst.check.where if worst.excess > 0 else "nowhere"
@@ -144,12 +144,12 @@ def _beyond(
 ) -> list[_Beyond]:
     """One for each column of `values` (S, n)."""
     excess, tolerance = _excess(values, lower, upper), _tolerance(ranges)
-    found = []
+    excesses = []
     for i, k in enumerate(np.argmax(excess, axis=0).tolist()):
         far, limit = float(excess[k, i]), float(tolerance[i])
         row = _between("bound", f"{names[i]} at {times[k]:.4g} s", far, limit)
-        found.append(_Beyond(kind, far, far / limit, times[~(excess[:, i] <= limit)], row))
-    return found
+        excesses.append(_Beyond(kind, far, far / limit, times[~(excess[:, i] <= limit)], row))
+    return excesses
 
 
 def _between(what: str, where: str, value: float, tolerance: float, unit: str = "1") -> Check:
@@ -203,8 +203,8 @@ def _of_constraint(motion: Collocated, c: Constraint, ranges: Array) -> list[_Be
     order = np.argsort(times)
     times, xs = times[order], xs[order]
     first = motion.horizon * (motion.mesh[0] + motion.mesh[1]) / 2
-    kept = times > (first if motion.task.problem.initial_state_is_given else 0.0)  # what is given nothing can keep
-    times, xs = times[kept], xs[kept]
+    mask = times > (first if motion.task.problem.initial_state_is_given else 0.0)  # what is given nothing can keep
+    times, xs = times[mask], xs[mask]
 
     def at(more: Array) -> tuple[Array, Array]:
         return motion.at(more)[0], motion.applied_at(more)
@@ -215,18 +215,18 @@ def _of_constraint(motion: Collocated, c: Constraint, ranges: Array) -> list[_Be
     scale = np.concatenate([ranges, np.maximum(np.ptp(motion.us, axis=0), SMALLEST_RANGE)])
     depth, through = _depth(c, xs, us, excess, scale)
     depth = np.where(through, 1.0, depth)
-    part = np.maximum(excess / tolerance, depth / DEPTH_TOLERANCE)
-    found = []
+    fraction = np.maximum(excess / tolerance, depth / DEPTH_TOLERANCE)
+    excesses = []
     for i in range(values.shape[1]):
-        k = int(np.lexsort((excess[:, i], part[:, i]))[-1])
+        k = int(np.lexsort((excess[:, i], fraction[:, i]))[-1])
         far, where = float(excess[k, i]), f"{c.label} at {times[k]:.4g} s"
         row = _between("bound", where, far, float(tolerance[i]))
         if through[k, i]:
             row = replace(row, what="passage", verdict="fail")
         elif depth[k, i] / DEPTH_TOLERANCE > far / tolerance[i]:
             row = _between("depth", where, float(depth[k, i]), DEPTH_TOLERANCE)
-        found.append(_Beyond("constraint", far, float(part[k, i]), times[~(part[:, i] <= 1)], row))
-    return found
+        excesses.append(_Beyond("constraint", far, float(fraction[k, i]), times[~(fraction[:, i] <= 1)], row))
+    return excesses
 
 
 def _values(c: Constraint, xs: Array, us: Array) -> Array:
@@ -236,9 +236,9 @@ def _values(c: Constraint, xs: Array, us: Array) -> Array:
 
 
 def _looked_at(
-    c: Constraint, times: Array, xs: Array, us: Array, at: Callable[[Array], tuple[Array, Array]]
+    c: Constraint, times: Array, xs: Array, us: Array, motion_at: Callable[[Array], tuple[Array, Array]]
 ) -> tuple[Array, Array, Array]:
-    """`times` (S,) [s] in order, states and inputs (S, ...) at them, and more by `at` where a constraint may not hold.
+    """`times` (S,) [s] in order, states and inputs (S, ...) at them, and more by `motion_at` where `c` may not hold.
 
     These are about each place where it comes nearer to a bound than before and after.
     """
@@ -257,7 +257,7 @@ def _looked_at(
         more = np.setdiff1d((ends[0] + inside[:, None] * (ends[1] - ends[0])).ravel(), times)
         every = np.concatenate([times, more])
         order = np.argsort(every)
-        found_xs, found_us = at(more)
+        found_xs, found_us = motion_at(more)
         times, xs, us = every[order], np.vstack([xs, found_xs])[order], np.vstack([us, found_us])[order]
     return times, xs, us
 

@@ -102,15 +102,15 @@ class Collocated:
 
         Those are of the scheme's own polynomials: of the input, and of x'.
         """
-        found: dict[str, tuple[float, int]] = {}
+        excesses: dict[str, tuple[float, int]] = {}
         for limit in self.task.problem.rate_limits:
-            of = self.nodes[:, self.task.dynamics.nx :] if limit.of_inputs else self._rates
+            quantity = self.nodes[:, self.task.dynamics.nx :] if limit.of_inputs else self._rates
             entries, limits = limit.entries(self.task.problem.system)
-            values = self.task.scheme.at(SLOPED) @ self.task.scheme.per_interval(of[:, entries])
+            values = self.task.scheme.at(SLOPED) @ self.task.scheme.per_interval(quantity[:, entries])
             excess = np.maximum(np.abs(self._slopes(values)) - limits, 0.0)
             worst = np.nan_to_num(np.max(excess, axis=(1, 2)), nan=np.inf)
-            found[limit.label] = float(np.max(worst)), int(np.argmax(worst))
-        return found
+            excesses[limit.label] = float(np.max(worst)), int(np.argmax(worst))
+        return excesses
 
     def rates_of(self, limit: RateLimit) -> tuple[Array, Array]:
         """(S, n) slopes by time, at places from end to end of all intervals, of what `limit` is of; and the times (S,).
@@ -121,10 +121,10 @@ class Collocated:
         k, tau = np.repeat(np.arange(count), len(SLOPED)), np.tile(SLOPED, count)
         xs, us = self.between(k, tau)
         with np.errstate(all="ignore"):
-            of = us if limit.of_inputs else self.task.dynamics.values(np.hstack([xs, us]))
+            quantity = us if limit.of_inputs else self.task.dynamics.values(np.hstack([xs, us]))
         entries, _ = limit.entries(self.task.problem.system)
-        found = self._slopes(of[:, entries].reshape(count, len(SLOPED), -1))
-        return found.reshape(len(k), -1), self.times(k, tau)
+        slopes = self._slopes(quantity[:, entries].reshape(count, len(SLOPED), -1))
+        return slopes.reshape(len(k), -1), self.times(k, tau)
 
     def _slopes(self, values: Array) -> Array:
         """Of `values` (N, S, n) by time, exact for parabolas."""
@@ -228,15 +228,15 @@ class Collocated:
         """(10 N + 1, nx) where the dynamics lead from `x` (nx,), with feedback by `gains` (N, nu, nx) if there are."""
         if not self.task.is_map:
             return self._lead.from_state(x, gains)
-        found, (lower, upper) = [x[None]], self.input_limits
+        states, (lower, upper) = [x[None]], self.input_limits
         with np.errstate(all="ignore"):
             for k, planned in enumerate(self._held[:, 0]):
-                x, u = found[-1][-1], planned[self.task.dynamics.nx :]
+                x, u = states[-1][-1], planned[self.task.dynamics.nx :]
                 if gains is not None:
                     u = np.minimum(np.maximum(u + gains[k] @ (planned[: len(x)] - x), lower), upper)
                 after = self.task.moved(np.concatenate((x, u))[None], np.array([k]))
-                found.append(np.vstack([np.tile(x, (SUBSTEPS - 1, 1)), after]))  # the state is held until then
-        return np.concatenate(found)
+                states.append(np.vstack([np.tile(x, (SUBSTEPS - 1, 1)), after]))  # the state is held until then
+        return np.concatenate(states)
 
     @cached_property
     def _lead(self) -> Lead:
@@ -268,7 +268,7 @@ class Collocated:
         nx, task, held = self.task.dynamics.nx, self.task, self._held
         k = np.arange(len(self.mesh) - 1)
         z = np.column_stack([self.xs[:-1], np.zeros(len(k))])
-        dt, found = self.lengths[:, None] / SUBSTEPS, [z]
+        dt, states = self.lengths[:, None] / SUBSTEPS, [z]
 
         def rate(z: Array, half: int) -> Array:
             knots = np.concatenate((z[:, :nx], held[:, half, nx:]), axis=1)
@@ -285,8 +285,8 @@ class Collocated:
                 k2 = rate(z + dt / 2 * k1, i + 1)
                 k3 = rate(z + dt / 2 * k2, i + 1)
                 z = z + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + dt * k3, i + 2))
-                found.append(z)
-        return np.array(found)
+                states.append(z)
+        return np.array(states)
 
     def measured_as(self, other: "Collocated") -> None:
         """Take over where the knots of `other` lead, which has the same dynamics and cost; nothing of another motion.
@@ -325,7 +325,9 @@ class Collocated:
         """
         times, xs = self.between_knots
         knots = self.horizon * self.mesh
-        when, where = c.seen(np.unique(np.concatenate([knots, times])), lambda at: self.at(at)[0], c.between)
+        when, where = c.seen(
+            np.unique(np.concatenate([knots, times])), lambda instants: self.at(instants)[0], c.between
+        )
         between = ~np.isin(when, knots)
         return np.concatenate([times, when[between]]), np.vstack([xs, where[between]])
 
@@ -356,9 +358,9 @@ class Transcribed(Collocated):
 
     def told(self, **fields: Any) -> "Transcribed":
         """With other words about the same motion, and what was measured of it."""
-        found = replace(self, **fields)
-        vars(found).update({name: value for name, value in vars(self).items() if name in MEASURED})
-        return found
+        transcribed = replace(self, **fields)
+        vars(transcribed).update({name: value for name, value in vars(self).items() if name in MEASURED})
+        return transcribed
 
 
 def _finite(values: Array) -> Array:
@@ -464,16 +466,16 @@ class Transcription:
             entered = bool(np.max(lacking) > _largest_margin(self.problem))
             mesh = _split(motion, tolerance, np.ones_like(lacking) if entered else lacking)
             missing = f"{in_words(float(np.max(lacking)), 'm')} too near to an obstacle"
-            told = f"error {error:.2g}" if error > tolerance else missing
+            reason = f"error {error:.2g}" if error > tolerance else missing
             if len(mesh) - 1 > most:
-                told = f"{told} still, with {count} intervals: raise max_num_steps"
-                motion = motion.told(result=replace(motion.result, note=told))
+                reason = f"{reason} still, with {count} intervals: raise max_num_steps"
+                motion = motion.told(result=replace(motion.result, note=reason))
                 break
             if report is not None:
-                report.say(f"{told} with {count} intervals: refined to {len(mesh) - 1}")
+                report.say(f"{reason} with {count} intervals: refined to {len(mesh) - 1}")
             left, last = _left(limits, start), motion
             if entered:  # what goes through an obstacle is no place to go on from
-                these, then = (self.task.scheme.node_fractions(each) for each in (mesh, coarse))
+                these, then = (self.task.scheme.node_fractions(grid) for grid in (mesh, coarse))
                 nodes = np.array([np.interp(these, then, column) for column in begun.T]).T
                 motion = self.solve_on(mesh, nodes, first, left, report, parameters, far=far)
             else:
@@ -484,7 +486,7 @@ class Transcription:
                 break
             rounds.append((len(mesh) - 1, motion.largest_error))
             near.append(_nearer(motion))
-        cleared = tuple((count, float(np.max(each))) for (count, _), each in zip(rounds, near, strict=True))
+        cleared = tuple((count, float(np.max(shortfalls))) for (count, _), shortfalls in zip(rounds, near, strict=True))
         return motion.told(refinements=tuple(rounds), cleared=cleared if np.any(near[0] > 0) else ())
 
     def finer(
@@ -524,7 +526,7 @@ class Transcription:
         program, why = TranscribedProgram(self.task, mesh, self.functions), self.functions.why_not
         moved = None if parameters is None else self.task.at(self._inside(parameters)).coordinates
         guess = program.pack(nodes, horizon, moved)
-        told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+        derivatives = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
         start = now()
         sizes = len(program.lower), len(program.sides[0])
         begun = multipliers if multipliers and multipliers.sizes == sizes else None
@@ -537,10 +539,13 @@ class Transcription:
         if not why and result.message == NOT_FINITE:
             again = solve_ipopt(program, guess, limits, report, exact=False, **options)
             if again.message != NOT_FINITE:  # then it was the Hessian
-                told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
-        found, horizon = program.unpack(result.z)
+                derivatives, result = (
+                    "symbolic, limited-memory Hessian: the exact one is not finite at an iterate",
+                    again,
+                )
+        solution_nodes, horizon = program.unpack(result.z)
         task = self.task.at(program.parameter_values(result.z)) if self.task.varied else self.task
-        return Transcribed(task, frozen(mesh), frozen(found), horizon, result, told)
+        return Transcribed(task, frozen(mesh), frozen(solution_nodes), horizon, result, derivatives)
 
     def _inside(self, values: Array) -> Array:
         return np.clip(values, *self.problem.bounds_of_parameters())
@@ -588,8 +593,8 @@ def _nearer(motion: Transcribed) -> Array:
     lacking = np.zeros(len(motion.mesh) - 1)
     for c in clearances(motion.task.problem.kept):
         times, xs = motion.seen(c)
-        each = np.nan_to_num(c.lacking(xs), posinf=0.0)
-        np.maximum.at(lacking, motion.interval_at(times), np.where(each > c.between, each, 0.0))
+        shortfalls = np.nan_to_num(c.lacking(xs), posinf=0.0)
+        np.maximum.at(lacking, motion.interval_at(times), np.where(shortfalls > c.between, shortfalls, 0.0))
     return lacking
 
 

@@ -46,8 +46,8 @@ class CoupledRows:
     def jacobian(self, z: Any) -> tuple[Entries, Any]:
         """((rows, columns, index), source): the entry at rows, columns is source[index]."""
         rows, entries = self.function.jacobian_at
-        place, index = self._numbered(len(rows))
-        return (self.function.rows * place + rows, self.columns[:, entries], index), self.function.jacobian(
+        positions, index = self._numbered(len(rows))
+        return (self.function.rows * positions + rows, self.columns[:, entries], index), self.function.jacobian(
             self._taken(z)
         )
 
@@ -56,9 +56,9 @@ class CoupledRows:
         function: Any = self.function
         rows, entries = function.hessian_at
         weights = ca.reshape(multipliers, self.function.rows, len(self.columns))
-        one, other = self.columns[:, rows], self.columns[:, entries]
+        first, other = self.columns[:, rows], self.columns[:, entries]
         _, index = self._numbered(len(rows))
-        places = np.minimum(one, other), np.maximum(one, other), index
+        places = np.minimum(first, other), np.maximum(first, other), index
         return places, function.hessian(self._taken(z), weights)
 
     def _taken(self, z: Any) -> Any:

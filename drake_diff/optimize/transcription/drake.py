@@ -57,7 +57,7 @@ def solve_collocation(
         return (Iterate(problem, frozen(h * np.arange(count + 1)), xs, us, problem.parameters, by_steps=False),)
 
     result = _solve_snopt(program, guess, limits, report, motions)
-    xs, us = (result.z[at] for at in places)
+    xs, us = (result.z[indices] for indices in places)
     return result, xs, us[:-1], us[-1]
 
 

@@ -37,10 +37,10 @@ def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) ->
     try:
         with np.errstate(all="ignore"):
             result = np.asarray(f(entries[:nx], entries[nx:])).ravel()
-            found = [entry.sx if isinstance(entry, Symbol) else float(entry) for entry in result]
+            expressions = [entry.sx if isinstance(entry, Symbol) else float(entry) for entry in result]
     except Exception as error:  # whatever it is that f cannot do with symbols: it need not
         return Refusal(f"{type(error).__name__}: {str(error).splitlines()[0][:100] if str(error) else ''}")
-    function = ca.Function("traced", [knot], [ca.vertcat(*found)])
+    function = ca.Function("traced", [knot], [ca.vertcat(*expressions)])
     if not agrees(function, probe, wanted, SAME_VALUES):
         return Refusal("its symbolic form gives other values")
     return function
@@ -133,14 +133,14 @@ class SymbolicPlant(Symbolic):
         return self._plant.hessian
 
     def _compute(self, count: int) -> Values:
-        found = np.empty((count, self._jacobian.nnz_out(0)))
+        entries = np.empty((count, self._jacobian.nnz_out(0)))
         buffer, evaluate = _mapped(self._jacobian, count).buffer()
-        buffer.set_res(0, found.data)
+        buffer.set_res(0, entries.data)
 
         def nonzeros(knots: Array) -> Array:
             buffer.set_arg(0, knots.data)
             evaluate()
-            return found
+            return entries
 
         return nonzeros
 
@@ -169,8 +169,8 @@ class Called:
         return self._kept[-1](knots)
 
     def jacobian(self, knots: Any) -> Any:
-        def rows(at: Array) -> Array:
-            return self.linearize(at)[1].transpose(0, 2, 1)
+        def rows(points: Array) -> Array:
+            return self.linearize(points)[1].transpose(0, 2, 1)
 
         self._kept.append(_KnotCallback(self, knots.shape[1], self.rows * self.width, rows))
         return ca.vec(self._kept[-1](knots))
@@ -291,9 +291,9 @@ class Stepwise:
 
     def jacobian_of(self, knot: Array, step: int = 0) -> Array:
         """(m, nx + nu) at one `knot` (nx + nu,) of a step."""
-        found = np.zeros((self.rows, self.width))
-        found[self.jacobian_at] = np.asarray(self._jacobians[step](knot)).ravel()
-        return found
+        jacobian = np.zeros((self.rows, self.width))
+        jacobian[self.jacobian_at] = np.asarray(self._jacobians[step](knot)).ravel()
+        return jacobian
 
     def hessian(self, knots: Any, weights: Any) -> Any:
         return ca.vertcat(*[f(knots[:, k], weights[:, k]) for k, f in enumerate(self._hessians)])
@@ -360,10 +360,10 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
         function: Any, values: Values, linearize: Linearize, rows: int, nx: int = nx, probe: Array = probe
     ) -> KnotFunction:
         with np.errstate(all="ignore"):
-            found = trace(function, nx, probe, values(probe))
-        if isinstance(found, Refusal):
-            return Called(found.reason, values, linearize, rows, probe.shape[1])
-        return Symbolic(found)
+            expression = trace(function, nx, probe, values(probe))
+        if isinstance(expression, Refusal):
+            return Called(expression.reason, values, linearize, rows, probe.shape[1])
+        return Symbolic(expression)
 
     def joined(c: BoundCoupling) -> KnotFunction:
         count = c.knots.shape[1]
@@ -391,10 +391,10 @@ def _map(task: OptimalControl) -> KnotFunction:
     if not (isinstance(f, DiscreteMap) and f.counts):
         return _dynamics(task)
     probe, steps = f.probe(), np.minimum(np.arange(count + 1), count - 1)
-    found = [trace(f.at_step(k).f, f.nx, probe, f.at_step(k).values(probe)) for k in range(count)]
-    why = next((each.reason for each in found if isinstance(each, Refusal)), None)
+    functions = [trace(f.at_step(k).f, f.nx, probe, f.at_step(k).values(probe)) for k in range(count)]
+    why = next((refusal.reason for refusal in functions if isinstance(refusal, Refusal)), None)
     if why is None:
-        return Stepwise([*found, found[-1]])
+        return Stepwise([*functions, functions[-1]])
 
     def of(function: Any) -> Any:
         return lambda knots: function(knots, steps)
@@ -409,25 +409,25 @@ def constraint_function(c: Constraint, nx: int, probe: Array) -> KnotFunction:
         return np.array([c(knot[:nx], knot[nx:]) for knot in knots])
 
     def linearize(knots: Array) -> tuple[Array, Array]:
-        found = [c.differentiate(knot[:nx], knot[nx:]) for knot in knots]
-        return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
+        pairs = [c.differentiate(knot[:nx], knot[nx:]) for knot in knots]
+        return np.array([value for value, _ in pairs]), np.array([rows for _, rows in pairs])
 
     with np.errstate(all="ignore"):
-        found = trace(c.function if c.takes_input else lambda x, u: c.function(x), nx, probe, values(probe))
-    if isinstance(found, Refusal):
-        return Called(found.reason, values, linearize, len(c.lower), probe.shape[1])
-    return Symbolic(found)
+        function = trace(c.function if c.takes_input else lambda x, u: c.function(x), nx, probe, values(probe))
+    if isinstance(function, Refusal):
+        return Called(function.reason, values, linearize, len(c.lower), probe.shape[1])
+    return Symbolic(function)
 
 
 def _dynamics(task: OptimalControl) -> KnotFunction:
     dynamics, moved = task.dynamics, task.varied
     form, source = dynamics.form, moved or dynamics
     probe, nu = source.probe(), dynamics.nu
-    found: Any = Refusal("an object with derivatives of its own")
+    function: Any = Refusal("an object with derivatives of its own")
     if isinstance(form, PlantKnots):
-        found = symbolic_plant(form.model, dynamics.parameters, None if moved is None else moved.coordinates)
+        function = symbolic_plant(form.model, dynamics.parameters, None if moved is None else moved.coordinates)
     elif isinstance(form, HeldPlant):
-        found = form.rates.function
+        function = form.rates.function
     elif isinstance(form, Pointwise):
         start = dynamics.parameters.values
 
@@ -435,7 +435,7 @@ def _dynamics(task: OptimalControl) -> KnotFunction:
             tail = start if moved is None else moved.coordinates.to_values(z[nu:])
             return form.f(x, np.concatenate([z[:nu], tail]) if len(start) else z)
 
-        found = trace(by_knot, dynamics.nx, probe, source.values(probe))
-    if isinstance(found, Refusal):
-        return Called(found.reason, source.values, source.linearize, dynamics.nx, probe.shape[1])
-    return SymbolicPlant(found) if isinstance(found, PlantFunctions) else Symbolic(found)
+        function = trace(by_knot, dynamics.nx, probe, source.values(probe))
+    if isinstance(function, Refusal):
+        return Called(function.reason, source.values, source.linearize, dynamics.nx, probe.shape[1])
+    return SymbolicPlant(function) if isinstance(function, PlantFunctions) else Symbolic(function)

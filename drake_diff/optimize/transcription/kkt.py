@@ -147,11 +147,11 @@ class HeldPlan:
         rows = self.rows[np.flatnonzero(on_row).tolist(), :]
         first = -(np.asarray(ca.mtimes(hessian, ca.DM(dz))) + right[: len(self.z)])[free]
         second = -(np.asarray(ca.mtimes(rows, ca.DM(dz))) + right[len(self.z) :][on_row])
-        kept = free.tolist()
-        found = _kkt(hessian[kept, kept], rows[:, kept], first, second)
-        dz[free] = found[: len(free)]
+        indices = free.tolist()
+        solution = _kkt(hessian[indices, indices], rows[:, indices], first, second)
+        dz[free] = solution[: len(free)]
         of_rows = np.zeros((len(self.values), len(change.values)))
-        of_rows[on_row] = found[len(free) :]
+        of_rows[on_row] = solution[len(free) :]
         moved = np.asarray(ca.mtimes(self.rows, ca.DM(dz))) + right[len(self.z) :]
         left = np.asarray(ca.mtimes(hessian, ca.DM(dz)) + ca.mtimes(self.rows.T, ca.DM(of_rows))) + right[: len(self.z)]
         weak = self._weak(np.maximum(1.0, np.abs(change.values)), dz, left, moved, of_rows)
@@ -223,9 +223,9 @@ class HeldPlan:
         """(m,) those of the rows that leave the least of the Lagrangian's gradient, and what they leave (n,)."""
         free, rows = np.flatnonzero(~(self.fixed | on_bound)), np.flatnonzero(on_row)
         jacobian = self.rows[rows.tolist(), free.tolist()]
-        found = _kkt(ca.DM.eye(len(free)), jacobian, -self.slope[free][:, None], np.zeros((len(rows), 1)))
+        solution = _kkt(ca.DM.eye(len(free)), jacobian, -self.slope[free][:, None], np.zeros((len(rows), 1)))
         multipliers = np.zeros(len(self.values))
-        multipliers[rows] = found[len(free) :, 0]
+        multipliers[rows] = solution[len(free) :, 0]
         left = self.slope + np.asarray(ca.mtimes(self.rows.T, ca.DM(multipliers))).ravel()
         return multipliers, left
 
@@ -241,8 +241,8 @@ class HeldPlan:
             return np.concatenate([cost, gradient, values])
 
         steps = DIFFERENCE * np.maximum(1.0, np.abs(change.values))
-        found = np.array([(at(i, step) - at(i, -step)) / (2 * step) for i, step in enumerate(steps.tolist())]).T
-        return found[0], found[1:]
+        differences = np.array([(at(i, step) - at(i, -step)) / (2 * step) for i, step in enumerate(steps.tolist())]).T
+        return differences[0], differences[1:]
 
 
 def _near(values: Array, bound: Array) -> Mask:
@@ -275,11 +275,11 @@ def _kkt(hessian: Any, rows: Any, first: Array, second: Array) -> Array:
     matrix = ca.blockcat([[hessian, rows.T], [rows, -SINGULAR * ca.DM.eye(m)]])
     solver, right = ca.Linsol("kkt", "qr", matrix.sparsity()), ca.DM(np.vstack([first, second]))
     try:
-        found = solver.solve(matrix, right)
+        solution = solver.solve(matrix, right)
         for _ in range(REFINEMENTS):
-            found += solver.solve(matrix, right - ca.mtimes(exact, found))
+            solution += solver.solve(matrix, right - ca.mtimes(exact, solution))
     except RuntimeError as error:  # CasADi's, of a matrix without an inverse
         raise GradientError(FLAT) from error
-    if not np.all(np.isfinite(np.asarray(found))):
+    if not np.all(np.isfinite(np.asarray(solution))):
         raise GradientError(FLAT)
-    return np.asarray(found)
+    return np.asarray(solution)

@@ -46,14 +46,14 @@ class Lead:
 
     def from_state(self, x: Array, gains: Array | None) -> Array:
         """(substeps N + 1, nx) from `x` (nx,), with feedback by `gains` (N, nu, nx) if there are."""
-        found, steps, slope = [x[None]], 1, None
+        states, steps, slope = [x[None]], 1, None
         with np.errstate(all="ignore"):
             for k in range(len(self.motion.lengths)):
                 gain = None if gains is None else gains[k]
                 slope = slope if gains is None else None  # another gain acts from here on
-                within, steps, slope = self._through(k, found[-1][-1], gain, steps, slope)
-                found.append(within)
-        return np.concatenate(found)
+                within, steps, slope = self._through(k, states[-1][-1], gain, steps, slope)
+                states.append(within)
+        return np.concatenate(states)
 
     def _through(
         self, k: int, x: Array, gain: Array | None, steps: int, slope: Array | None
@@ -65,12 +65,12 @@ class Lead:
             if error <= 1 or steps >= MOST_STEPS:
                 break
             slope, steps = slopes[0][0], 2 * steps
-        found = np.empty((self.substeps, self.nx))
+        samples = np.empty((self.substeps, self.nx))
         dt = self.motion.lengths[k] / steps
-        for (rows, weights), start, own in zip(_shown(self.substeps, steps), states, slopes, strict=False):
-            found[rows] = start + dt * (weights @ own)
-        found[-1] = states[-1]
-        return found, max(steps // 2, 1) if error <= EASY else steps, slopes[-1][-1]
+        for (rows, weights), start, step_slopes in zip(_shown(self.substeps, steps), states, slopes, strict=False):
+            samples[rows] = start + dt * (weights @ step_slopes)
+        samples[-1] = states[-1]
+        return samples, max(steps // 2, 1) if error <= EASY else steps, slopes[-1][-1]
 
     def _in_steps(
         self, k: int, x: Array, gain: Array | None, steps: int, slope: Array | None
@@ -85,9 +85,9 @@ class Lead:
             slopes = np.empty((len(STAGES) + 1, self.nx))
             slopes[0] = self._rate(k, x, planned[i, 0], gain) if slope is None else slope
             for stage, weights in enumerate(STAGE_WEIGHTS, 1):
-                at = x + dt * (weights @ slopes[:stage])
-                slopes[stage] = self._rate(k, at, planned[i, stage], gain)
-            x, slope = at, slopes[-1]
+                state = x + dt * (weights @ slopes[:stage])
+                slopes[stage] = self._rate(k, state, planned[i, stage], gain)
+            x, slope = state, slopes[-1]
             states.append(x)
             every.append(slopes)
             error = np.abs(dt * (ERROR @ slopes)) / self.allowed
@@ -114,9 +114,9 @@ class Lead:
 @cache
 def _shown(substeps: int, steps: int) -> list[tuple[slice, Array]]:
     """Of each of an interval's `steps`, which of `substeps` ends lie in it, and the weights of its slopes there."""
-    found, ends = [], np.arange(1, substeps + 1) / substeps * steps
+    pairs, ends = [], np.arange(1, substeps + 1) / substeps * steps
     for i in range(steps):
         first, last = np.searchsorted(ends, [i, i + 1], side="right").tolist()
         powers = (ends[first:last, None] - i) ** np.arange(1, DENSE.shape[1] + 1)
-        found.append((slice(first, last), powers @ DENSE.T))
-    return found
+        pairs.append((slice(first, last), powers @ DENSE.T))
+    return pairs

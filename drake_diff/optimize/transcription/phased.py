@@ -76,7 +76,9 @@ class PhasedProgram:
     def iterates(self, z: Array) -> tuple[Iterate, ...]:
         """The motion of each phase at z, for callbacks."""
         return tuple(
-            one for program, part in zip(self.programs, self.split(z), strict=True) for one in program.iterates(part)
+            iterate
+            for program, variables in zip(self.programs, self.split(z), strict=True)
+            for iterate in program.iterates(variables)
         )
 
     @cached_property
@@ -93,40 +95,42 @@ class PhasedProgram:
     def nlp(self) -> dict[str, Any]:
         """x, f and g as CasADi's nlpsol takes them."""
         functions = [ca.Function("phase", [p.z], [p.nlp["f"], p.nlp["g"]]) for p in self.programs]
-        found = [function(z) for function, z in zip(functions, self._parts, strict=True)]
-        g = [*(rows for _, rows in found), *(link.values(self.z) for link in self.links)]
+        pairs = [function(z) for function, z in zip(functions, self._parts, strict=True)]
+        g = [*(rows for _, rows in pairs), *(link.values(self.z) for link in self.links)]
         g += [ca.mtimes(self._durations, self.z)] * bool(self._whole)
-        return {"x": self.z, "f": sum(f for f, _ in found), "g": ca.vertcat(*g)}
+        return {"x": self.z, "f": sum(f for f, _ in pairs), "g": ca.vertcat(*g)}
 
     def derivatives(self, exact: bool) -> dict[str, Any]:
         """CasADi Functions by the names of nlpsol's options, "hess_lag" only where `exact`."""
         p, sigma = ca.MX.sym("p", 0), ca.MX.sym("sigma")
         multipliers = ca.MX.sym("multipliers", self.nlp["g"].numel())
-        own = list(zip([program.derivatives(exact) for program in self.programs], self._parts, strict=True))
-        slope = ca.vertcat(*[each["grad_f"](z, p)[1] for each, z in own])
-        rows = [each["jac_g"](z, p)[1] for each, z in own]
-        ends = np.cumsum([0, *(part.size1() for part in rows)]).tolist()
+        pairs = list(zip([program.derivatives(exact) for program in self.programs], self._parts, strict=True))
+        slope = ca.vertcat(*[phase_functions["grad_f"](z, p)[1] for phase_functions, z in pairs])
+        rows = [phase_functions["jac_g"](z, p)[1] for phase_functions, z in pairs]
+        ends = np.cumsum([0, *(block.size1() for block in rows)]).tolist()
         linked = SparseSum((sum(link.count for link in self.links), self.z.numel()))
         first = 0
         for link in self.links:
-            (at, columns, index), source = link.jacobian(self.z)
-            linked.add(first + at, columns, 1.0, source, index)
+            (positions, columns, index), source = link.jacobian(self.z)
+            linked.add(first + positions, columns, 1.0, source, index)
             first += link.count
         jacobian = [ca.diagcat(*rows), linked.matrix(), *[ca.MX(self._durations)] * bool(self._whole)]
-        found = {
+        functions = {
             "grad_f": ca.Function("grad_f", [self.z, p], [self.nlp["f"], slope]),
             "jac_g": ca.Function("jac_g", [self.z, p], [self.nlp["g"], ca.vertcat(*jacobian)]),
         }
         if exact:
-            within = zip(own, ends[:-1], ends[1:], strict=True)
-            hessian = ca.diagcat(*[each["hess_lag"](z, p, sigma, multipliers[a:b]) for (each, z), a, b in within])
+            within = zip(pairs, ends[:-1], ends[1:], strict=True)
+            hessian = ca.diagcat(
+                *[phase_functions["hess_lag"](z, p, sigma, multipliers[a:b]) for (phase_functions, z), a, b in within]
+            )
             bent, first = SparseSum((self.z.numel(), self.z.numel())), ends[-1]
             for link in self.links:
-                (at, columns, index), source = link.hessian(self.z, multipliers[first : first + link.count])
-                bent.add(at, columns, 1.0, source, index)
+                (positions, columns, index), source = link.hessian(self.z, multipliers[first : first + link.count])
+                bent.add(positions, columns, 1.0, source, index)
                 first += link.count
-            found["hess_lag"] = ca.Function("hess_lag", [self.z, p, sigma, multipliers], [hessian + bent.matrix()])
-        return found
+            functions["hess_lag"] = ca.Function("hess_lag", [self.z, p, sigma, multipliers], [hessian + bent.matrix()])
+        return functions
 
     @cached_property
     def _parts(self) -> list[Any]:

@@ -117,9 +117,9 @@ class TranscribedProgram:
     @property
     def names(self) -> tuple[str, ...]:
         """(n,) of the variables."""
-        own = (*self.task.dynamics.state_names, *self.task.dynamics.input_names)
+        names = (*self.task.dynamics.state_names, *self.task.dynamics.input_names)
         others = self.task.problem.parameters.names if self.task.varied else ()
-        return (*[f"{name} at node {k}" for k in self.every for name in own], *others, *["horizon"] * self.free)
+        return (*[f"{name} at node {k}" for k in self.every for name in names], *others, *["horizon"] * self.free)
 
     def iterates(self, z: Array) -> tuple[Iterate, ...]:
         """The motion at z, for callbacks."""
@@ -131,8 +131,8 @@ class TranscribedProgram:
 
     def pack(self, nodes: Array, horizon: float, coordinates: Array | None = None) -> Array:
         """The decision variables of `nodes` (K, nx + nu), `horizon` [s] and `coordinates` (np,), the task's if None."""
-        found = self.task.coordinates if coordinates is None else coordinates
-        return np.concatenate([nodes.ravel(), found, [horizon] * self.free])
+        values = self.task.coordinates if coordinates is None else coordinates
+        return np.concatenate([nodes.ravel(), values, [horizon] * self.free])
 
     def parameter_values(self, z: Array) -> Array:
         """The values (np,) of the problem's parameters at the decision variables."""
@@ -155,7 +155,7 @@ class TranscribedProgram:
     def sides(self) -> tuple[Array, Array]:
         """(lower, upper) of g: 0 for the defects, each path constraint's own, node by node, and each coupling's."""
         parts = [(b.lower, b.upper) for b in self._links]
-        parts += [(np.tile(c.lower, len(at)), np.tile(c.upper, len(at))) for _, at, c in self.paths]
+        parts += [(np.tile(c.lower, len(nodes)), np.tile(c.upper, len(nodes))) for _, nodes, c in self.paths]
         parts += [*(c.sides for c in self.coupled), *(c.sides for c in self.slopes), self._linear_sides]
         lower, upper = zip(*parts, strict=True)
         return np.concatenate(lower), np.concatenate(upper)
@@ -175,7 +175,7 @@ class TranscribedProgram:
         if self.functions.parameters is not None:
             f += self.functions.parameters.values(self.parameters)
         g = [ca.mtimes(self._S, self.z) - self.time * ca.mtimes(self._D, ca.vec(self.rates))]
-        g += [ca.vec(f.values(self.knots[:, at.tolist()])) for f, at, _ in self.paths]
+        g += [ca.vec(f.values(self.knots[:, nodes.tolist()])) for f, nodes, _ in self.paths]
         g += [c.values(self.z) for c in self.coupled]
         for c, weights in zip(self.slopes, self._slope_weights, strict=True):
             g.append(ca.mtimes(weights, ca.vec(self.rates) if c.of_rates else self.z))
@@ -189,15 +189,15 @@ class TranscribedProgram:
         pace, p, sigma = Pace(), ca.MX.sym("p", 0), ca.MX.sym("sigma")
         multipliers = ca.MX.sym("multipliers", self.nlp["g"].numel())
         pace.go_on()
-        found = {"grad_f": ca.Function("grad_f", [self.z, p], [self.nlp["f"], self._gradient()])}
+        functions = {"grad_f": ca.Function("grad_f", [self.z, p], [self.nlp["f"], self._gradient()])}
         pace.go_on()
-        found["jac_g"] = ca.Function("jac_g", [self.z, p], [self.nlp["g"], self._jacobian()])
+        functions["jac_g"] = ca.Function("jac_g", [self.z, p], [self.nlp["g"], self._jacobian()])
         if exact:
             pace.go_on()
             hessian = self._hessian(sigma, multipliers)
             pace.go_on()
-            found["hess_lag"] = ca.Function("hess_lag", [self.z, p, sigma, multipliers], [hessian])
-        return found
+            functions["hess_lag"] = ca.Function("hess_lag", [self.z, p, sigma, multipliers], [hessian])
+        return functions
 
     def _set_links(self) -> None:
         """The defects and the Bernstein coefficients of bounded states, and those of bounded inputs."""
@@ -209,7 +209,7 @@ class TranscribedProgram:
         self._relax_what_is_given(hull)
         self._links, self.num_links = (defects, hull), defects.count + hull.count
         rows, columns, states, slopes, rates = (
-            np.concatenate([np.broadcast_to(getattr(each, name), each.rows.shape).ravel() for each in self._links])
+            np.concatenate([np.broadcast_to(getattr(link, name), link.rows.shape).ravel() for link in self._links])
             for name in ("rows", "columns", "state", "slope", "rates")
         )
         self._S = _sparse(rows, columns, states, (self.num_links, self.z.numel()))
@@ -242,10 +242,10 @@ class TranscribedProgram:
         moved = slice(count, count + len(self.task.coordinates))
         for node in (0, self.every[-1]):
             given = np.append(lower[node] == upper[node], self.lower[moved] == self.upper[moved])
-            for place, state in enumerate(hull.each):
+            for position, state in enumerate(hull.each):
                 if given[state] and np.all(given[columns[rows == state]]):
-                    at = hull.rows[(hull.node == node) & (hull.state[:, 0] != 0), place] - hull.first
-                    hull.lower[at], hull.upper[at] = -np.inf, np.inf
+                    indices = hull.rows[(hull.node == node) & (hull.state[:, 0] != 0), position] - hull.first
+                    hull.lower[indices], hull.upper[indices] = -np.inf, np.inf
 
     def _gradient(self) -> Any:
         total, last = SparseSum((self.z.numel(), 1)), self.every[-1:]
@@ -257,9 +257,9 @@ class TranscribedProgram:
             b = _Blocks(self.functions.final.jacobian_at, last, self.width)
             total.add(b.column, 0, 1.0, self.functions.final.jacobian(self.knots[:, -1]), b.index)
         if self.functions.parameters is not None:
-            of = self.functions.parameters
-            places = self.first_parameter + of.jacobian_at[1]
-            total.add(places, 0, 1.0, of.jacobian(self.parameters), np.arange(len(places)))
+            parameter_cost = self.functions.parameters
+            places = self.first_parameter + parameter_cost.jacobian_at[1]
+            total.add(places, 0, 1.0, parameter_cost.jacobian(self.parameters), np.arange(len(places)))
         return ca.densify(total.matrix())
 
     def _jacobian(self) -> Any:
@@ -267,12 +267,15 @@ class TranscribedProgram:
         rows, columns = f.jacobian_at
         for links in self._links:
             total.add(links.rows, links.columns, links.state, ca.DM(1), 0)
-            place = np.full(self.nx, -1)
-            place[links.each] = np.arange(len(links.each))
-            kept = np.flatnonzero(place[rows] >= 0)
-            index = links.node[:, None] * len(rows) + kept
-            at = links.starts[:, None] + place[rows[kept]], self.column(links.node[:, None], columns[kept])
-            total.add(*at, -links.slope, self.time * self.rate_rows, index)
+            positions = np.full(self.nx, -1)
+            positions[links.each] = np.arange(len(links.each))
+            entries = np.flatnonzero(positions[rows] >= 0)
+            index = links.node[:, None] * len(rows) + entries
+            targets = (
+                links.starts[:, None] + positions[rows[entries]],
+                self.column(links.node[:, None], columns[entries]),
+            )
+            total.add(*targets, -links.slope, self.time * self.rate_rows, index)
             if self.free:
                 total.add(links.rows, self.z.numel() - 1, -links.slope, ca.vec(self.rates), links.rates)
         first = self.num_links
@@ -301,32 +304,34 @@ class TranscribedProgram:
         if not c.of_rates:
             total.add(first + rows, places, weights, ca.DM(1), 0)
             return
-        of, columns = self.functions.dynamics.jacobian_at
+        derivative_rows, columns = self.functions.dynamics.jacobian_at
         nodes, entries = np.divmod(places, self.nx)
         for entry in np.unique(entries):
-            here, kept = entries == entry, np.flatnonzero(of == entry)
+            here, nonzeros = entries == entry, np.flatnonzero(derivative_rows == entry)
             node = nodes[here][:, None]
-            at = first + rows[here][:, None], self.column(node, columns[kept])
-            total.add(*at, weights[here][:, None], self.rate_rows, node * len(of) + kept)
+            targets = first + rows[here][:, None], self.column(node, columns[nonzeros])
+            total.add(*targets, weights[here][:, None], self.rate_rows, node * len(derivative_rows) + nonzeros)
 
     def pulled(self, multipliers: Any, horizon: Any) -> Any:
         """(K nx,) what the rows' multipliers (m,) weigh the rates of all nodes by; MX or DM."""
-        found = -horizon * ca.mtimes(self._D.T, multipliers[: self.num_links])
+        rate_weights = -horizon * ca.mtimes(self._D.T, multipliers[: self.num_links])
         for first, weights in self._of_rates():
-            found += ca.mtimes(weights.T, multipliers[first : first + weights.shape[0]])
-        return found
+            rate_weights += ca.mtimes(weights.T, multipliers[first : first + weights.shape[0]])
+        return rate_weights
 
     def pushed(self, rates: Array, horizon: float) -> Array:
         """(m,) the part of all rows that is linear in the `rates` (K nx,) of all nodes; 0 of the others."""
-        found = np.zeros(self.nlp["g"].numel())
-        found[: self.num_links] = -horizon * np.asarray(ca.mtimes(self._D, ca.DM(rates))).ravel()
+        values = np.zeros(self.nlp["g"].numel())
+        values[: self.num_links] = -horizon * np.asarray(ca.mtimes(self._D, ca.DM(rates))).ravel()
         for first, weights in self._of_rates():
-            found[first : first + weights.shape[0]] = np.asarray(ca.mtimes(weights, ca.DM(rates))).ravel()
-        return found
+            values[first : first + weights.shape[0]] = np.asarray(ca.mtimes(weights, ca.DM(rates))).ravel()
+        return values
 
     def _of_rates(self) -> Iterator[tuple[int, Any]]:
         """Where the rows of limits of accelerations begin, and the weights of the rates in them."""
-        first = self.num_links + sum(f.rows * len(at) for f, at, _ in self.paths) + sum(c.count for c in self.coupled)
+        first = (
+            self.num_links + sum(f.rows * len(nodes) for f, nodes, _ in self.paths) + sum(c.count for c in self.coupled)
+        )
         for c, weights in zip(self.slopes, self._slope_weights, strict=True):
             if c.of_rates:
                 yield first, weights
@@ -359,9 +364,9 @@ class TranscribedProgram:
             columns = function.hessian_at[1]
             total.add(self.column(b.node, b.rows), self.column(b.node, columns), 1.0, source, b.index)
         if self.functions.parameters is not None:
-            of: Any = self.functions.parameters
-            rows, columns = (self.first_parameter + places for places in of.hessian_at)
-            total.add(rows, columns, 1.0, of.hessian(self.parameters, sigma), np.arange(len(rows)))
+            parameter_cost: Any = self.functions.parameters
+            rows, columns = (self.first_parameter + places for places in parameter_cost.hessian_at)
+            total.add(rows, columns, 1.0, parameter_cost.hessian(self.parameters, sigma), np.arange(len(rows)))
         if self.free:
             b = _Blocks(f.jacobian_at, self.every, self.width)
             source = self.rate_rows * nu[(b.node * self.nx + b.rows).ravel().tolist()]
@@ -428,7 +433,7 @@ def solve_ipopt(
         lower, upper = program.sides
         known = {} if begun is None else {"lam_x0": begun.variables, "lam_g0": begun.rows}
         with until_set(interrupted):
-            found = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper, **known)
+            solution = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper, **known)
         stats = solver.stats()
     columns = [stats.get("iterations", {}).get(name, ()) for name in ("obj", "inf_pr", "inf_du", "alpha_pr")]
     table = tuple(Iteration(i, *map(float, row)) for i, row in enumerate(zip(*columns, strict=True)))
@@ -445,27 +450,27 @@ def solve_ipopt(
     if watch.stopped_by is not None:
         return NlpResult(watch.best_of(guess), watch.stopped_by, f"stopped: {watch.stopped_by.value}", table)
     words = str(stats["return_status"])
-    outcome, left = OUTCOMES.get(words, Outcome.FAILED), _stationarity(program, options, found)
-    z = np.asarray(found["x"]).ravel()
-    multipliers = Multipliers(*(np.asarray(found[name]).ravel() for name in ("lam_x", "lam_g")))
-    told = f"IPOPT: {words.replace('_', ' ')}"
-    return NlpResult(z, outcome, told, table, stationarity=left, multipliers=multipliers)
+    outcome, left = OUTCOMES.get(words, Outcome.FAILED), _stationarity(program, options, solution)
+    z = np.asarray(solution["x"]).ravel()
+    multipliers = Multipliers(*(np.asarray(solution[name]).ravel() for name in ("lam_x", "lam_g")))
+    message = f"IPOPT: {words.replace('_', ' ')}"
+    return NlpResult(z, outcome, message, table, stationarity=left, multipliers=multipliers)
 
 
-def _stationarity(program: Program, derivatives: Any, found: Any) -> float:
+def _stationarity(program: Program, derivatives: Any, solution: Any) -> float:
     """What IPOPT's multipliers leave of the Lagrangian's gradient, those of what does not hold the plan left out."""
-    z, slope = found["x"], ca.DM(derivatives["grad_f"](found["x"], [])[1])
+    z, slope = solution["x"], ca.DM(derivatives["grad_f"](solution["x"], [])[1])
     rows, jacobian = derivatives["jac_g"](z, [])
     of_rows, of_variables = (
         _holding(np.asarray(multiplier).ravel(), np.asarray(value).ravel(), *sides)
         for multiplier, value, sides in (
-            (found["lam_g"], rows, program.sides),
-            (found["lam_x"], z, (program.lower, program.upper)),
+            (solution["lam_g"], rows, program.sides),
+            (solution["lam_x"], z, (program.lower, program.upper)),
         )
     )
     left = slope + ca.mtimes(jacobian.T, ca.DM(of_rows)) + ca.DM(of_variables)
     terms = ca.fabs(slope) + ca.mtimes(ca.fabs(jacobian.T), ca.DM(abs(of_rows))) + ca.DM(abs(of_variables))
-    gradient, largest = (float(np.max(np.abs(np.asarray(each)), initial=0.0)) for each in (left, terms))
+    gradient, largest = (float(np.max(np.abs(np.asarray(vector)), initial=0.0)) for vector in (left, terms))
     return gradient / largest if largest > 0 else 0.0
 
 
@@ -534,15 +539,15 @@ class _Links:
     One entry of node, state and slope for each interval, row and node of it; `starts` are where their rows begin.
     """
 
-    def __init__(self, program: TranscribedProgram, first: int, states: Array, slopes: Array, each: Indices):
+    def __init__(self, program: TranscribedProgram, first: int, states: Array, slopes: Array, coordinates: Indices):
         lengths, (groups, nodes) = np.diff(program.mesh), states.shape
         k, i, j = (a.ravel() for a in np.indices((len(lengths), groups, nodes)))
-        self.first, self.each, self.count = first, each, len(lengths) * groups * len(each)
+        self.first, self.each, self.count = first, coordinates, len(lengths) * groups * len(coordinates)
         self.node = k * program.task.scheme.nodes + j
         self.state, self.slope = states[i, j][:, None], (lengths[k] * slopes[i, j])[:, None]
-        self.starts = first + (k * groups + i) * len(each)
-        self.rows = self.starts[:, None] + np.arange(len(each))
-        self.columns, self.rates = (self.node[:, None] * size + each for size in (program.width, program.nx))
+        self.starts = first + (k * groups + i) * len(coordinates)
+        self.rows = self.starts[:, None] + np.arange(len(coordinates))
+        self.columns, self.rates = (self.node[:, None] * size + coordinates for size in (program.width, program.nx))
         self.lower, self.upper = np.zeros(self.count), np.zeros(self.count)
 
     def set_limits(self, lower: Array, upper: Array) -> None:
@@ -552,12 +557,12 @@ class _Links:
 
 
 class _Blocks:
-    """The nonzeros at `at` (rows, columns) of one block a node, as arrays (nodes, nonzeros); `column` is of all z."""
+    """The nonzeros at `pattern` (rows, columns) of one block a node, as (nodes, nonzeros); `column` is of all z."""
 
-    def __init__(self, at: tuple[Indices, Indices], nodes: Indices, width: int):
-        self.rows, columns = (np.tile(a, (len(nodes), 1)) for a in at)
-        self.place = np.repeat(np.arange(len(nodes))[:, None], len(at[0]), axis=1)
-        self.node = np.repeat(nodes[:, None], len(at[0]), axis=1)
+    def __init__(self, pattern: tuple[Indices, Indices], nodes: Indices, width: int):
+        self.rows, columns = (np.tile(a, (len(nodes), 1)) for a in pattern)
+        self.place = np.repeat(np.arange(len(nodes))[:, None], len(pattern[0]), axis=1)
+        self.node = np.repeat(nodes[:, None], len(pattern[0]), axis=1)
         self.column = self.node * width + columns
         self.index = np.arange(self.rows.size).reshape(self.rows.shape)
 
@@ -594,5 +599,5 @@ class SparseSum:
 def _sparse(rows: Any, columns: Any, values: Any, shape: tuple[int, int]) -> Any:
     """A DM of `shape` with `values` other than 0 at (rows, columns)."""
     rows, columns, values = (a.ravel() for a in np.broadcast_arrays(rows, columns, values))
-    kept = values != 0
-    return ca.DM.triplet(rows[kept].tolist(), columns[kept].tolist(), ca.DM(values[kept]), *shape)
+    nonzero = values != 0
+    return ca.DM.triplet(rows[nonzero].tolist(), columns[nonzero].tolist(), ca.DM(values[nonzero]), *shape)

@@ -71,14 +71,14 @@ def solve_shooting(
     )
     if program.refusals:
         count = f"{program.refusals} point{'s' * (program.refusals > 1)}"
-        told = f"; backed off from {count} that could not be stepped or differentiated, the last: {program.refusal}"
+        remark = f"; backed off from {count} that could not be stepped or differentiated, the last: {program.refusal}"
         refused = result.outcome is Outcome.FAILED
         outcome = Outcome.NO_GRADIENT if refused else result.outcome
-        result = replace(result, message=result.message + told, outcome=outcome)
-    xs, us, found = program.motion(np.clip(result.z, program.lower, program.upper))
-    result = replace(result, parameters=found)
+        result = replace(result, message=result.message + remark, outcome=outcome)
+    xs, us, parameters = program.motion(np.clip(result.z, program.lower, program.upper))
+    result = replace(result, parameters=parameters)
     try:
-        with problem.intervals(problem.design.vector.at(found)) as intervals:
+        with problem.intervals(problem.design.vector.at(parameters)) as intervals:
             rolled = roll(intervals, xs[0], us)
     except SimulationError:
         return result, xs, us
@@ -114,8 +114,8 @@ class StepProgram:
         self.horizon_at: int | None = self.size - 1 if self.design.moves_step else None
         self.horizon_unit = count * float(self._by_step(self.design.start)[-1]) if self.design.moves_step else 1.0
         single = [(c, np.array([k])) for c in problem.kept for k in problem.knots_of(c, input_at_end=False)]
-        several = [(c.rows, at) for c in problem.coupled_steps() for at in c.knots]
-        self.paths = [_Path(self, rows, at) for rows, at in (*single, *several)]
+        several = [(c.rows, knots) for c in problem.coupled_steps() for knots in c.knots]
+        self.paths = [_Path(self, rows, knots) for rows, knots in (*single, *several)]
         joins_all = problem.trajectory_cost is not None
         self.functions: Any = Called("trajectory_cost joins all states" if joins_all else "")
         self.z = ca.MX.sym("z", self.size)
@@ -131,9 +131,12 @@ class StepProgram:
     def names(self) -> tuple[str, ...]:
         """(n,) of the variables."""
         names = np.full(self.size, "", dtype=object)
-        for at, own in ((self.states_at, self.problem.state_names), (self.inputs_at, self.problem.input_names)):
-            for k, row in enumerate(at):
-                names[row] = [f"{name} at knot {k}" for name in own]
+        for positions, labels in (
+            (self.states_at, self.problem.state_names),
+            (self.inputs_at, self.problem.input_names),
+        ):
+            for k, row in enumerate(positions):
+                names[row] = [f"{name} at knot {k}" for name in labels]
         names[self.parameters_at] = self.design.coordinates.start.names
         return tuple(names)
 
@@ -182,9 +185,9 @@ class StepProgram:
     def derivatives(self, exact: bool = True) -> dict[str, Any]:
         """CasADi Functions by the names of nlpsol's options; the Hessian is there in any case."""
         n, m = self.size, len(self.sides[0])
-        one, vector, rows = ca.Sparsity.dense(1, 1), ca.Sparsity.dense(n, 1), ca.Sparsity.dense(m, 1)
+        scalar, vector, rows = ca.Sparsity.dense(1, 1), ca.Sparsity.dense(n, 1), ca.Sparsity.dense(m, 1)
         return {
-            "grad_f": self._callback("grad_f", [n, 0], [one, vector], self._gradient),
+            "grad_f": self._callback("grad_f", [n, 0], [scalar, vector], self._gradient),
             "jac_g": self._callback("jac_g", [n, 0], [rows, self._rows_at.sparsity], self._jacobian),
             "hess_lag": self._callback("hess_lag", [n, 0, 1, m], [self._hessian_at.sparsity], self._hessian),
         }
@@ -206,14 +209,14 @@ class StepProgram:
             rows += [here, np.repeat(here, len(block))]
             columns += [self.states_at[k + 1], np.tile(block, nx)]
         first = self.problem.num_steps * nx
-        for each in self.paths:
-            here = first + np.arange(each.count)
-            rows.append(np.repeat(here, len(each.columns)))
-            columns.append(np.tile(each.columns, each.count))
-            first += each.count
+        for path in self.paths:
+            here = first + np.arange(path.count)
+            rows.append(np.repeat(here, len(path.columns)))
+            columns.append(np.tile(path.columns, path.count))
+            first += path.count
         self._rows_at = _Places(rows, columns, (first, self.size))
-        pairs = [each[np.array(np.triu_indices(len(each)))] for each in self._hessian_blocks]
-        ends = [np.min(each, axis=0) for each in pairs], [np.max(each, axis=0) for each in pairs]
+        pairs = [entries[np.array(np.triu_indices(len(entries)))] for entries in self._hessian_blocks]
+        ends = [np.min(pair, axis=0) for pair in pairs], [np.max(pair, axis=0) for pair in pairs]
         self._hessian_at = _Places(*ends, (self.size, self.size))
 
     @property
@@ -237,20 +240,20 @@ class StepProgram:
         us = np.where(us <= b.u_lower, np.nextafter(b.u_lower, b.u_upper), us)
         return z[self.states_at], us, self.design.time_step(self.design.values(z[self.parameters_at]))
 
-    def _by_step(self, at: Array) -> Array:
+    def _by_step(self, coordinates: Array) -> Array:
         """(nc,) the derivative of the length of a step by the coordinates."""
         by_values = np.zeros(len(self.design.vector.values))
         if self.design.moves_step:
             by_values[self.design.own_count] = 1.0
-        return self.design.pull_back(at, by_values)
+        return self.design.pull_back(coordinates, by_values)
 
     def _steps(self, z: Array) -> list[StepDerivatives]:
         if self._kept[0] != z.tobytes():
             (xs, us, _), vector = self._read(z), self.vector(z)
             with self.problem.intervals(vector) as intervals:
-                found = intervals.derivatives(xs[0], us, xs[:-1])
-            self.methods |= {d.method for d in found}
-            self._kept = z.tobytes(), found
+                derivatives = intervals.derivatives(xs[0], us, xs[:-1])
+            self.methods |= {d.method for d in derivatives}
+            self._kept = z.tobytes(), derivatives
         return self._kept[1]
 
     def _values(self, z: Array) -> list[Any]:
@@ -261,12 +264,17 @@ class StepProgram:
             return [self._cost(z), np.concatenate([(xs[1:] - ends).ravel(), *paths])]
 
     def _cost(self, z: Array) -> float:
-        own = self.design.own(self.design.values(z[self.parameters_at]))
-        return self.problem.objective(*self._read(z)) + self.problem.cost_of_parameters(own)
+        parameters = self.design.own(self.design.values(z[self.parameters_at]))
+        return self.problem.objective(*self._read(z)) + self.problem.cost_of_parameters(parameters)
 
     def _gradient(self, z: Array, _: Array) -> list[Any]:
         xs, us, h = self._read(z)
-        gradient, at, final, paid = np.zeros(self.size), z[self.parameters_at], self.problem.total_final_cost, 0.0
+        gradient, coordinates, final, paid = (
+            np.zeros(self.size),
+            z[self.parameters_at],
+            self.problem.total_final_cost,
+            0.0,
+        )
         by_nodes = expand_running_cost(self.problem, xs, us, h)[0]
         gradient[np.hstack([self.states_at[:-1], self.inputs_at])] = by_nodes
         if final is not None:
@@ -278,21 +286,21 @@ class StepProgram:
             gradient[self.inputs_at] += by_us
             paid += value
         rates = (self.problem.objective(xs, us, h) - paid) / h  # of a running cost, whose steps are all of one length
-        gradient[self.parameters_at] = self._by_coordinates(at) + rates * self._by_step(at)
+        gradient[self.parameters_at] = self._by_coordinates(coordinates) + rates * self._by_step(coordinates)
         return [self._cost(z), gradient]
 
-    def _by_coordinates(self, at: Array) -> Array:
+    def _by_coordinates(self, coordinates: Array) -> Array:
         """(nc,) the gradient of `parameter_cost` by the coordinates."""
-        cost, values = self.problem.parameter_cost, self.design.values(at)
+        cost, values = self.problem.parameter_cost, self.design.values(coordinates)
         by_values = np.zeros(len(values))
         if cost is not None:
             by_values[: self.design.own_count] = differentiate_final_cost(cost, np.array(self.design.own(values)))[1]
-        return self.design.pull_back(at, by_values)
+        return self.design.pull_back(coordinates, by_values)
 
     def _jacobians(self, z: Array) -> Array:
         """(N, nx, nx + nu + np) of the steps."""
-        at = z[self.parameters_at]
-        return np.array([np.hstack([d.A, d.B, self.design.pull_back(at, d.C)]) for d in self._steps(z)])
+        coordinates = z[self.parameters_at]
+        return np.array([np.hstack([d.A, d.B, self.design.pull_back(coordinates, d.C)]) for d in self._steps(z)])
 
     def _jacobian(self, z: Array, _: Array) -> list[Any]:
         xs, us = self._read(z)[:2]
@@ -307,15 +315,15 @@ class StepProgram:
         count, nx, nu = self.problem.num_steps, self.problem.nx, self.problem.nu
         blocks = list(-self._curvature(z, multipliers[: count * nx].reshape(count, nx)))
         blocks.append(np.zeros((nx, nx)))
-        at, width = z[self.parameters_at], nx + nu
-        by_step = self._by_step(at)
+        coordinates, width = z[self.parameters_at], nx + nu
+        by_step = self._by_step(coordinates)
         for block, slope, cost in zip(blocks, *expand_running_cost(self.problem, xs, us, h), strict=False):
             block[:width, :width] += sigma[0] * cost
             block[:width, width:] += sigma[0] * np.outer(slope / h, by_step)
         if self.problem.total_final_cost is not None:
             blocks[-1] += sigma[0] * final_cost_hessian(self.problem.total_final_cost, xs[-1])
-        for j, step in enumerate(np.diag(DIFFERENCE * np.maximum(1.0, np.abs(at)))):
-            apart = self._by_coordinates(at + step) - self._by_coordinates(at - step)
+        for j, step in enumerate(np.diag(DIFFERENCE * np.maximum(1.0, np.abs(coordinates)))):
+            apart = self._by_coordinates(coordinates + step) - self._by_coordinates(coordinates - step)
             blocks[0][width:, width + j] += sigma[0] * apart / (2 * step[j])
         first = count * nx
         for path in self.paths:
@@ -339,30 +347,30 @@ class StepProgram:
 
         Griewank and Toint, "Partitioned variable metric updates for large structured optimization problems", 1982.
         """
-        at, jacobians = z[np.array(self._blocks[:-1])], self._jacobians(z)
+        points, jacobians = z[np.array(self._blocks[:-1])], self._jacobians(z)
         if self._last is None:
-            self._last = at, jacobians, np.zeros((*at.shape, at.shape[1]))
+            self._last = points, jacobians, np.zeros((*points.shape, points.shape[1]))
         before, old, learned = self._last
-        step = at - before
+        step = points - before
         off = np.einsum("kij,ki->kj", jacobians - old, weights) - np.einsum("kij,kj->ki", learned, step)
         divisor, length = np.einsum("ki,ki->k", off, step), np.linalg.norm(step, axis=1)
         safe = (length > SMALLEST_MOVE) & (np.abs(divisor) > SAFE_DIVISOR * length * np.linalg.norm(off, axis=1))
         learned[safe] += off[safe, :, None] * off[safe, None, :] / divisor[safe, None, None]
-        self._last = at, jacobians, learned
+        self._last = points, jacobians, learned
         return np.array(learned)
 
     def _differences(self, z: Array, weights: Array) -> Array:
         """The same by central differences of the Jacobians."""
-        at, b = np.array(self._blocks[:-1]), self.problem.bounds
+        points, b = np.array(self._blocks[:-1]), self.problem.bounds
         lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         lower[self.inputs_at], upper[self.inputs_at] = b.u_lower, b.u_upper  # beyond them the plant may cut off
-        part = ROUGH_DIFFERENCE if ROUGH in self.methods else DIFFERENCE
-        found = np.zeros((*at.shape, at.shape[1]))
-        for j, column in enumerate(at.T):
+        fraction = ROUGH_DIFFERENCE if ROUGH in self.methods else DIFFERENCE
+        curvature = np.zeros((*points.shape, points.shape[1]))
+        for j, column in enumerate(points.T):
             where, ends = np.unique(column), []
             for side in (-1, 1):
                 moved = np.array(z)
-                moved[where] += side * part * np.maximum(1.0, np.abs(z[where]))
+                moved[where] += side * fraction * np.maximum(1.0, np.abs(z[where]))
                 moved = np.clip(moved, lower, upper)
                 try:
                     slopes = self._jacobians(moved)
@@ -370,23 +378,23 @@ class StepProgram:
                     if not self.lenient:
                         raise
                     self.refusals, self.refusal, self._kept = self.refusals + 1, str(error), (b"", [])
-                    return np.zeros_like(found)
+                    return np.zeros_like(curvature)
                 ends.append((moved[column], np.einsum("kij,ki->kj", slopes, weights)))
             (low, before), (high, after) = ends
             apart = np.where(high > low, high - low, np.inf)
-            found[:, :, j] = (after - before) / apart[:, None]
+            curvature[:, :, j] = (after - before) / apart[:, None]
         self._kept = b"", []
-        return (found + found.swapaxes(1, 2)) / 2
+        return (curvature + curvature.swapaxes(1, 2)) / 2
 
 
 class _Path:
     """A constraint on the states at the knots `at` (n,) side by side, and on the inputs there."""
 
-    def __init__(self, program: StepProgram, rows: Constraint, at: Indices):
-        self.rows, self.at, self.count = rows, at, len(rows.lower)
-        self.columns = program.states_at[at].ravel()
+    def __init__(self, program: StepProgram, rows: Constraint, knots: Indices):
+        self.rows, self.at, self.count = rows, knots, len(rows.lower)
+        self.columns = program.states_at[knots].ravel()
         if rows.takes_input:
-            self.columns = np.concatenate([self.columns, program.inputs_at[at].ravel()])
+            self.columns = np.concatenate([self.columns, program.inputs_at[knots].ravel()])
 
     def packed(self, xs: Array, us: Array) -> tuple[Array, Array]:
         """What `rows` takes; a function of states alone takes any input."""
@@ -398,23 +406,23 @@ class _Path:
 
     def curvature(self, x: Array, u: Array, weights: Array) -> Array:
         """(w, w) the second derivative of weights (m,) times the values, by differences of their Jacobian."""
-        z, found = np.concatenate([x, u]), np.zeros((len(self.columns), len(self.columns)))
+        z, curvature = np.concatenate([x, u]), np.zeros((len(self.columns), len(self.columns)))
         if not np.any(weights):
-            return found
-        for j in range(len(found)):
+            return curvature
+        for j in range(len(curvature)):
             step = np.zeros(len(z))
             step[j] = DIFFERENCE * max(1.0, abs(z[j]))
             low, high = (self.jacobian(*np.split(z + side * step, [len(x)])) for side in (-1, 1))
-            found[j] = weights @ (high - low) / (2 * step[j])
-        return (found + found.T) / 2
+            curvature[j] = weights @ (high - low) / (2 * step[j])
+        return (curvature + curvature.T) / 2
 
 
 class _Places:
     """A sparse matrix whose entries are sums of values in one order."""
 
     def __init__(self, rows: list[Any], columns: list[Any], shape: tuple[int, int]):
-        at = np.concatenate(columns) * shape[0] + np.concatenate(rows)
-        places, self.targets = np.unique(at, return_inverse=True)
+        positions = np.concatenate(columns) * shape[0] + np.concatenate(rows)
+        places, self.targets = np.unique(positions, return_inverse=True)
         down, across = places % shape[0], places // shape[0]
         starts = np.searchsorted(across, np.arange(shape[1] + 1))
         self.sparsity = ca.Sparsity(*shape, starts.tolist(), down.tolist())
@@ -449,11 +457,11 @@ class _Callback(ca.Callback):  # type: ignore[misc]
     def eval(self, arguments: Any) -> Any:
         """The outputs; an error that is none of a step is kept for the solve to raise, as C++ must not see it."""
         try:
-            found = self.evaluate(*[np.asarray(a).ravel() for a in arguments])
+            values = self.evaluate(*[np.asarray(a).ravel() for a in arguments])
         except (GradientError, SimulationError) as error:
             self.owner.refusals, self.owner.refusal = self.owner.refusals + 1, str(error)
             return [ca.DM(sparsity, np.nan) for sparsity in self.outputs]
         except Exception as error:
             self.owner.functions.error = self.owner.functions.error or error
             return [ca.DM(sparsity, np.nan) for sparsity in self.outputs]
-        return [ca.DM(value) for value in found]
+        return [ca.DM(value) for value in values]

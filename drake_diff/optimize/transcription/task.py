@@ -137,8 +137,8 @@ class KnownRate:
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
         """(K, 1) and the gradients (K, 1, nx + nu)."""
-        found = [differentiate_cost(self.f, k[: self.nx], k[self.nx :]) for k in knots]
-        return np.array([[v] for v, _, _ in found]), np.array([[np.concatenate(g)] for _, *g in found])
+        derivatives = [differentiate_cost(self.f, k[: self.nx], k[self.nx :]) for k in knots]
+        return np.array([[v] for v, _, _ in derivatives]), np.array([[np.concatenate(g)] for _, *g in derivatives])
 
 
 class TimedRate:
@@ -223,9 +223,9 @@ class OptimalControl:
 
     def at(self, values: Array) -> "OptimalControl":
         """The same with the parameters at `values` (np,)."""
-        found = copy.copy(self)
-        found.dynamics = self.dynamics.at(values)
-        return found
+        task = copy.copy(self)
+        task.dynamics = self.dynamics.at(values)
+        return task
 
     @property
     def coordinates(self) -> Array:
@@ -259,8 +259,8 @@ class OptimalControl:
             return np.array(knots)
         if constraint.knots is None:
             return np.arange(knots[0], self.scheme.nodes * (len(mesh) - 1) + 1)
-        at = self.nodes_at(knots, mesh)
-        return np.arange(at[0], at[-1] + 1) if constraint.whole else at
+        nodes = self.nodes_at(knots, mesh)
+        return np.arange(nodes[0], nodes[-1] + 1) if constraint.whole else nodes
 
     def node_limits(self, mesh: Array) -> tuple[Array, Array]:
         """(lower, upper), each (K, nx + nu): the bounds of the nodes, equal where an end or a waypoint is given."""
