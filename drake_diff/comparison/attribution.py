@@ -133,24 +133,24 @@ def jacobian_at(
         return central_differences(step, size, DIFFERENCE_STEP[precision], minus=space.minus)
 
     try:
-        found = engine.differentiate_step(x, u)
+        derivatives = engine.differentiate_step(x, u)
     except NO_DERIVATIVE as error:
         why = "" if isinstance(error, NotOfferedError) else f" ({error})"
         method = f"central differences of its steps, {DIFFERENCE_STEP[precision]:g} wide{why}"
         return JacobianAt(state, frozen(quotients()), method, None, None)
-    jacobian = space.jacobian(x, engine.step(x, u), found.A, found.B)
+    jacobian = space.jacobian(x, engine.step(x, u), derivatives.A, derivatives.B)
     if precision == "float32":
         gap = np.abs(jacobian - quotients()).max() / np.abs(jacobian).max()
-        return JacobianAt(state, frozen(jacobian), found.method, AGREES if gap <= SINGLE else "undecided", None)
+        return JacobianAt(state, frozen(jacobian), derivatives.method, AGREES if gap <= SINGLE else "undecided", None)
     # What the engine's solver leaves unsolved of a step in contact, relative.
     unsolved = (engine.contract.solver_tolerance or 0.0) if engine.contact_depth(x) else 0.0
     certificate = certify_displacement(
         one_by_one(step), jacobian, rows=space.names, columns=(*space.names, *names), scale=np.ones(size),
         minus=space.minus,
-        unsolved=unsolved, stopped=max(unsolved, DIFFERENCES_LEAVE if "differences" in found.method else 0.0),
-        method=found.method, subject=f"the Jacobian of {engine.name} at the {state} state",
+        unsolved=unsolved, stopped=max(unsolved, DIFFERENCES_LEAVE if "differences" in derivatives.method else 0.0),
+        method=derivatives.method, subject=f"the Jacobian of {engine.name} at the {state} state",
     )  # fmt: skip
-    return JacobianAt(state, frozen(jacobian), found.method, certificate.verdict, certificate)
+    return JacobianAt(state, frozen(jacobian), derivatives.method, certificate.verdict, certificate)
 
 
 def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) -> Array | Refusal:
@@ -158,12 +158,12 @@ def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) 
     product = np.eye(space.size)
     for x, u, x_next in zip(motion.xs, motion.us, motion.xs[1:], strict=False):
         try:
-            found = engine.differentiate_step(x, u)
+            derivatives = engine.differentiate_step(x, u)
         except NotOfferedError:
             return Refusal("the engine has no derivative of a step in contact")
         except NO_DERIVATIVE as error:
             return Refusal(str(error))
-        product = space.jacobian(x, x_next, found.A) @ product
+        product = space.jacobian(x, x_next, derivatives.A) @ product
     return frozen(product)
 
 
@@ -221,19 +221,19 @@ class Attribution:
 
 
 def attribute(
-    coordinates: Coordinates, one: Engine, two: Engine, x: Array, u: Array, steps: tuple[Array, Array]
+    coordinates: Coordinates, first: Engine, second: Engine, x: Array, u: Array, steps: tuple[Array, Array]
 ) -> Attribution:
-    """What makes the `steps` (nx,) that `one` and `two` took from `x` (nx,) under `u` (nu,) differ."""
+    """What makes the `steps` (nx,) that `first` and `second` took from `x` (nx,) under `u` (nu,) differ."""
     q, v = x[: coordinates.nq], x[coordinates.nq :]
-    masses, no_mass = _offered((one, two), "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
-    biases, no_bias = _offered((one, two), "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
+    masses, no_mass = _offered((first, second), "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
+    biases, no_bias = _offered((first, second), "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
     a, b = (
         Terms(M, *_forces_of(engine, M, bias, x, u), engine.contract.time_step)
-        for M, bias, engine in zip(masses, biases, (one, two), strict=True)
+        for M, bias, engine in zip(masses, biases, (first, second), strict=True)
     )
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
     schemes = []
-    for engine, terms, after in ((one, a, after_a), (two, b, after_b)):
+    for engine, terms, after in ((first, a, after_a), (second, b, after_b)):
         misfits = {scheme: _size(after - euler(coordinates, x, terms, scheme)) for scheme in SCHEMES}
         best = min(misfits, key=lambda scheme: misfits[scheme])
         fits = misfits[best] <= FITS[engine.contract.precision] * max(1.0, _size(after))
@@ -246,7 +246,7 @@ def attribute(
     }
     effects[INTEGRATOR] = _size(euler(coordinates, x, a, scheme_b) - base)
     left = (after_b - euler(coordinates, x, b, scheme_b)) - (after_a - base)
-    what = what_is_left(coordinates, one, two, x, steps, left)
+    what = what_is_left(coordinates, first, second, x, steps, left)
     effects[what] = max(_size(left), effects.get(what, 0.0))
     ranked = dict(sorted(effects.items(), key=lambda item: -item[1]))
     gap = _size(after_b - after_a)
@@ -280,15 +280,15 @@ def _offered(
     engines: tuple[Engine, Engine], name: str, ask: Callable[[Engine], Array], otherwise: Array
 ) -> tuple[list[Array], list[str]]:
     """What both say, and who says nothing: an engine that does not offer it gets the other's."""
-    found: list[Array | None] = []
+    answers: list[Array | None] = []
     for engine in engines:
         try:
-            found.append(ask(engine))
+            answers.append(ask(engine))
         except NotOfferedError:
-            found.append(None)
-    known = next((value for value in found if value is not None), otherwise)
-    missing = [f"{name} of {e.name}" for e, value in zip(engines, found, strict=True) if value is None]
-    return [known if value is None else value for value in found], missing
+            answers.append(None)
+    known = next((value for value in answers if value is not None), otherwise)
+    missing = [f"{name} of {e.name}" for e, value in zip(engines, answers, strict=True) if value is None]
+    return [known if value is None else value for value in answers], missing
 
 
 def _forces_of(engine: Engine, M: Array, bias: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -305,7 +305,12 @@ def forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
 
 
 def what_is_left(
-    coordinates: Coordinates, one: Engine, two: Engine, x: Array, steps: tuple[Array, Array], left: Array | None = None
+    coordinates: Coordinates,
+    first: Engine,
+    second: Engine,
+    x: Array,
+    steps: tuple[Array, Array],
+    left: Array | None = None,
 ) -> str:
     """What makes `steps` differ that no Euler step explains: a law that is at work, if any.
 
@@ -313,24 +318,24 @@ def what_is_left(
     and Drake's acts up to WINDOW steps ahead of it; what touches pushes all joints that it moves.
     """
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
-    push = _push(coordinates, one, x, after_b - after_a if left is None else left, after_a)
-    joints = _joints_near_limits(coordinates, (one, two), x, (after_a, after_b))
+    push = _push(coordinates, first, x, after_b - after_a if left is None else left, after_a)
+    joints = _joints_near_limits(coordinates, (first, second), x, (after_a, after_b))
     if push and not push <= joints:  # something pushes joints that are at no limit
         joints = set()
-    if _touching((one, two), (x, *steps)) and not (push and joints and len(push) < coordinates.nv):
+    if _touching((first, second), (x, *steps)) and not (push and joints and len(push) < coordinates.nv):
         return CONTACT_LAW
     if joints and (push or left is None):
         return LIMIT_LAW
-    return UNEXPLAINED if one.contract.integrator == two.contract.integrator else INTEGRATOR
+    return UNEXPLAINED if first.contract.integrator == second.contract.integrator else INTEGRATOR
 
 
-def _push(coordinates: Coordinates, one: Engine, x: Array, left: Array, after: Array) -> set[int]:
+def _push(coordinates: Coordinates, engine: Engine, x: Array, left: Array, after: Array) -> set[int]:
     """The velocities on which the force acts that changes the velocity by `left`; none where that is rounding."""
     change = left[coordinates.nq :]
-    if _size(change) <= FITS[one.contract.precision] * max(1.0, _size(after)):
+    if _size(change) <= FITS[engine.contract.precision] * max(1.0, _size(after)):
         return set()
-    _, damping = forces(one.contract, np.zeros(len(one.contract.inputs)))  # implicit in Drake's step
-    force = np.abs((one.mass_matrix(x[: coordinates.nq]) + one.contract.time_step * np.diag(damping)) @ change)
+    _, damping = forces(engine.contract, np.zeros(len(engine.contract.inputs)))  # implicit in Drake's step
+    force = np.abs((engine.mass_matrix(x[: coordinates.nq]) + engine.contract.time_step * np.diag(damping)) @ change)
     return {int(j) for j in np.flatnonzero(force > PUSHED * np.max(force))}
 
 
@@ -348,15 +353,15 @@ def _joints_near_limits(
     coordinates: Coordinates, engines: tuple[Engine, Engine], x: Array, after: tuple[Array, Array]
 ) -> set[int]:
     """The velocities of the joints that pass a limit, or would within WINDOW steps at the largest of their speeds."""
-    found = set()
+    velocities = set()
     for engine in engines:
         joints = [joint for joint in engine.contract.joints if joint.kind != "quaternion_floating"]
         for joint, (i, j) in zip(joints, coordinates.single, strict=True):
             speed = max(abs(float(state[coordinates.nq + j])) for state in (x, *after))
             reach = WINDOW * engine.contract.time_step * speed
             if not all(joint.lower <= state[i] - reach and state[i] + reach <= joint.upper for state in (x, *after)):
-                found.add(j)
-    return found
+                velocities.add(j)
+    return velocities
 
 
 def _size(difference: Array) -> float:
@@ -392,46 +397,46 @@ CHANGES: Mapping[str, Change] = {
 
 def precision_of(recording: Recording) -> Precision:
     """As the facts tell, else float64."""
-    told = recording.facts.get("precision", "float64")
-    if told not in PRECISIONS:
-        raise InputError(f"recording {recording.name}: precision", got=told, expected="float64 or float32")
-    return PRECISIONS[told]
+    precision = recording.facts.get("precision", "float64")
+    if precision not in PRECISIONS:
+        raise InputError(f"recording {recording.name}: precision", got=precision, expected="float64 or float32")
+    return PRECISIONS[precision]
 
 
 def told_lines(recording: Recording, reference: DrakeEngine) -> tuple[ContractLine, ...]:
     """A line per quantity of a match: what no fact tells of is different, for that reason."""
-    ours, found = reference.contract, []
+    ours, lines = reference.contract, []
     texts = {"integrator": ours.integrator, "contact law": ours.contact_law, "limit law": ours.limit_law}
     numbers = {"time step": (ours.time_step,), "gravity": ours.gravity}
     quantities = [line.quantity for line in match_contracts(reference, reference)]
     for quantity in (*quantities, "seeds", "reset distribution"):
-        told = recording.facts.get(quantity)
-        if told is None:
-            found.append(ContractLine(quantity, "different", NOT_TOLD, NOT_TOLD))
+        fact = recording.facts.get(quantity)
+        if fact is None:
+            lines.append(ContractLine(quantity, "different", NOT_TOLD, NOT_TOLD))
             continue
         if quantity in texts:
-            own: object = texts[quantity]
-            same = told == own
+            value: object = texts[quantity]
+            same = fact == value
         elif quantity in numbers:
-            own = numbers[quantity]
-            theirs = _numbers(recording, quantity, told, len(numbers[quantity]))
-            same = np.allclose(theirs, np.array(own), rtol=SAME_NUMBER[precision_of(recording)], atol=0.0)
+            value = numbers[quantity]
+            theirs = _numbers(recording, quantity, fact, len(numbers[quantity]))
+            same = np.allclose(theirs, np.array(value), rtol=SAME_NUMBER[precision_of(recording)], atol=0.0)
         else:
-            found.append(ContractLine(quantity, "mapped", f"{told}; here each step starts from the recorded state"))
+            lines.append(ContractLine(quantity, "mapped", f"{fact}; here each step starts from the recorded state"))
             continue
-        detail = told if same else f"{ours.engine}: {own}; {recording.name}: {told}"
-        found.append(ContractLine(quantity, "equal" if same else "different", detail))
-    return tuple(found)
+        detail = fact if same else f"{ours.engine}: {value}; {recording.name}: {fact}"
+        lines.append(ContractLine(quantity, "equal" if same else "different", detail))
+    return tuple(lines)
 
 
-def _numbers(recording: Recording, quantity: str, told: str, count: int) -> Array:
+def _numbers(recording: Recording, quantity: str, text: str, count: int) -> Array:
     try:
-        values = np.atleast_1d(np.array(json.loads(told), dtype=float))
+        values = np.atleast_1d(np.array(json.loads(text), dtype=float))
     except (ValueError, TypeError):
         values = np.zeros(0)
     if values.shape != (count,) or not np.isfinite(values).all():
         expected = "a number" if count == 1 else f"a list of {count} numbers"
-        raise InputError(f"recording {recording.name}: {quantity}", got=told, expected=expected)
+        raise InputError(f"recording {recording.name}: {quantity}", got=text, expected=expected)
     return values
 
 

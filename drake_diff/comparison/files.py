@@ -97,11 +97,11 @@ def _kept(comparison: Comparison) -> tuple[Recording, ...]:
 
 
 def _keep(folder: Path, comparison: Comparison) -> None:
-    kept = _kept(comparison)
-    for i, recording in enumerate(kept):
+    recordings = _kept(comparison)
+    for i, recording in enumerate(recordings):
         write_arrays(folder / place_of(i), recording)
     source = comparison.model.source
-    if kept and source is not None:
+    if recordings and source is not None:
         write_whole(folder / source.name, source.read_bytes())
 
 
@@ -109,7 +109,7 @@ def record_of(
     comparison: Comparison, name: str, causes: Mapping[str, records.CauseEvidence] = NONE
 ) -> ComparisonRecord:
     """The record of `comparison`, but for the files."""
-    found = {
+    fields = {
         "verdict": "pass" if comparison.holds else "fail",
         "sentence": str(comparison),
         "states": [records.StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
@@ -128,7 +128,7 @@ def record_of(
             seconds_per_jacobian={e.engine: e.seconds_per_jacobian for e in comparison.engines},
         ),
     }
-    return _begun(name, comparison.model).model_copy(update=found)
+    return _begun(name, comparison.model).model_copy(update=fields)
 
 
 def _begun(name: str, model: Model) -> ComparisonRecord:
@@ -299,17 +299,17 @@ def _coordinate_plots(comparison: Comparison) -> Iterator[Plot]:
     """Those coordinates whose motions are furthest apart, in the order of the state."""
     model, times = comparison.model, comparison.reference.motion.times
     units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
-    found = [[_on(times, e.motion, e.motion.xs[:, i]) for e in comparison.engines] for i in range(model.nx)]
-    spread = [float(np.nanmax(np.nanmax(xs, axis=0) - np.nanmin(xs, axis=0))) for xs in found]
+    motions = [[_on(times, e.motion, e.motion.xs[:, i]) for e in comparison.engines] for i in range(model.nx)]
+    spread = [float(np.nanmax(np.nanmax(xs, axis=0) - np.nanmin(xs, axis=0))) for xs in motions]
     for i in sorted(np.argsort(spread)[::-1][:MOST_PLOTS]):
-        lines = [Line(e.engine, x) for e, x in zip(comparison.engines, found[i], strict=True)]
+        lines = [Line(e.engine, x) for e, x in zip(comparison.engines, motions[i], strict=True)]
         yield Plot(model.state_names[i], units[i], times, lines, group="Coordinates")
 
 
 def _on(times: Array, motion: EngineMotion, values: Array) -> Array:
     """`values` (n,) of a motion at `times`, NaN where it has none."""
-    found = np.full(len(times), np.nan)
-    at = np.searchsorted(times, motion.times - SAME_TIME)
-    known = (at < len(times)) & (np.abs(times[np.minimum(at, len(times) - 1)] - motion.times) < SAME_TIME)
-    found[at[known]] = np.asarray(values)[known]
-    return found
+    sampled = np.full(len(times), np.nan)
+    indices = np.searchsorted(times, motion.times - SAME_TIME)
+    known = (indices < len(times)) & (np.abs(times[np.minimum(indices, len(times) - 1)] - motion.times) < SAME_TIME)
+    sampled[indices[known]] = np.asarray(values)[known]
+    return sampled

@@ -59,14 +59,14 @@ def read_ros2(path: Path, model: Model) -> tuple[tuple[Array, Array, Array], Map
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise MissingDependencyError("a ROS 2 bag needs rosbags: pip install 'drake-diff[ros2]'") from error
-    store, found = get_typestore(Stores.ROS2_HUMBLE), _Found(str(path), model)
+    store, log = get_typestore(Stores.ROS2_HUMBLE), _Found(str(path), model)
     messages, facts = _messages(path)
     for topic, kind, data in messages:
         message = store.deserialize_cdr(data, kind)
         stamp = message.header.stamp
         source = topic, _frame_of_body(kind, message)
-        found.sources[kind].setdefault(source, {})[stamp.sec * 1_000_000_000 + stamp.nanosec] = message
-    return found.motion(), facts
+        log.sources[kind].setdefault(source, {})[stamp.sec * 1_000_000_000 + stamp.nanosec] = message
+    return log.motion(), facts
 
 
 def _frame_of_body(kind: str, message: Any) -> str:
@@ -100,7 +100,7 @@ class _Found:
     def __init__(self, path: str, model: Model):
         self.path, self.model, self.description = path, model, describe_whole(model)
         self.sources: dict[str, dict[Source, Stamped]] = {kind: {} for kind in USED}
-        followers = {each.joint for each in self.description.followers}
+        followers = {follower.joint for follower in self.description.followers}
         moving = [link for link in self.description.moving if link.joint not in followers]
         self.singles = [x for x in moving if x.kind != "quaternion_floating"]
         self.free = [x for x in moving if x.kind == "quaternion_floating"]
@@ -137,9 +137,9 @@ class _Found:
 
     def _common(self, parts: Mapping[str, Mapping[int, Any]]) -> list[int]:
         """The times that all parts have; InputError for one that some lack."""
-        every = sorted({time for part in parts.values() for time in part})
+        every = sorted({time for messages in parts.values() for time in messages})
         for time in every:
-            there = [name for name, part in parts.items() if time in part]
+            there = [name for name, messages in parts.items() if time in messages]
             if len(there) < len(parts):
                 raise InputError(
                     f"{self.path}: t = {time} ns", got=f"{', '.join(there)} alone",
@@ -171,9 +171,9 @@ class _Found:
         names, sources = _names(link.body), self.sources[kind]
         by_frame = [source for source in sources if source[1].strip("/") in names]
         by_topic = [source for source in sources if any(f"/{name}/" in f"/{source[0].strip('/')}/" for name in names)]
-        for found in (by_frame, by_topic):
-            if len(found) == 1:
-                return sources[found[0]]
+        for matches in (by_frame, by_topic):
+            if len(matches) == 1:
+                return sources[matches[0]]
         if len(self.free) == 1:
             return self._only(kind)
         raise InputError(
@@ -189,14 +189,14 @@ class _Found:
             return {t: _base(m.pose.pose, m.twist.twist, in_body=True) for t, m in odometry.items()}
         poses, twists = self._of_body(POSE, link), self._of_body(TWIST, link)
         self._common({f"the pose of {link.body}": poses, f"the twist of {link.body}": twists})
-        found = {}
+        bases = {}
         for t, pose in poses.items():
             frame, world = twists[t].header.frame_id, pose.header.frame_id
             if (frame != world and frame not in _names(link.body)) or world in _names(link.body):
                 expected = f"{world!r}, the pose's, or {link.body!r}, the body"
                 raise InputError(f"{self.path}: frame_id of TwistStamped", got=repr(frame), expected=expected)
-            found[t] = _base(pose.pose, twists[t].twist, in_body=frame != world)
-        return found
+            bases[t] = _base(pose.pose, twists[t].twist, in_body=frame != world)
+        return bases
 
 
 def _names(body: str) -> set[str]:
@@ -205,8 +205,8 @@ def _names(body: str) -> set[str]:
 
 
 def _listed(sources: Mapping[Source, Stamped]) -> str:
-    told = sorted(topic if not frame else f"{topic} (of {frame})" for topic, frame in sources)
-    return ", ".join(told) or "none"
+    topics = sorted(topic if not frame else f"{topic} (of {frame})" for topic, frame in sources)
+    return ", ".join(topics) or "none"
 
 
 def _base(pose: Any, twist: Any, in_body: bool) -> Array:
@@ -356,7 +356,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
         raise InputError("recording", got=str(path), expected=SUFFIXES)
     facts = {**facts, **_told(path)}
     name, version = name or facts.get("engine", path.stem), facts.get("version", "(version unknown)")
-    times, xs, us = (frozen(part) for part in motion)
+    times, xs, us = (frozen(array) for array in motion)
     recording = Recording(name, version, times, xs, us, facts, outputs)
     if not gaps:
         check_recording(recording, model)
@@ -365,15 +365,15 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
 
 def with_own_names(recordings: Sequence[Recording]) -> list[Recording]:
     """The same, those whose name was there before with a number behind it: they come from files called alike."""
-    found: list[Recording] = []
+    renamed: list[Recording] = []
     for recording in recordings:
-        names, count = [one.name for one in found], 1
+        names, count = [previous.name for previous in renamed], 1
         name = recording.name
         while name in names:
             count += 1
             name = f"{recording.name} {count}"
-        found.append(replace(recording, name=name))
-    return found
+        renamed.append(replace(recording, name=name))
+    return renamed
 
 
 def write_csv(recording: Recording, model: Model, path: Path) -> None:
@@ -396,12 +396,12 @@ def _told(path: Path) -> dict[str, str]:
     if not beside.exists():
         return {}
     try:
-        told = json.loads(beside.read_text())
+        facts = json.loads(beside.read_text())
     except ValueError as error:
         raise InputError(str(beside), got=str(error), expected="a JSON object") from error
-    if not isinstance(told, dict):
-        raise InputError(str(beside), got=type(told).__name__, expected="a JSON object")
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in told.items()}
+    if not isinstance(facts, dict):
+        raise InputError(str(beside), got=type(facts).__name__, expected="a JSON object")
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in facts.items()}
 
 
 def is_output(column: str) -> bool:
@@ -422,13 +422,13 @@ def _read_csv(path: Path, model: Model, gaps: bool) -> tuple[Motion, dict[str, A
     for k, (line, row) in enumerate(rows[1:]):
         if len(row) != len(rows[0][1]):
             raise InputError(f"{path} line {line}", got=f"{len(row)} cells", expected=f"{len(rows[0][1])}")
-        for j, (column, place) in enumerate(zip(wanted, places, strict=True)):
-            if k == len(table) - 1 and model.nx < j < last and not row[place].strip():
+        for j, (column, index) in enumerate(zip(wanted, places, strict=True)):
+            if k == len(table) - 1 and model.nx < j < last and not row[index].strip():
                 continue  # no step begins at the last sample
-            if place < 0 or (gaps and (0 < j <= model.nx or j >= last) and not row[place].strip()):
+            if index < 0 or (gaps and (0 < j <= model.nx or j >= last) and not row[index].strip()):
                 table[k, j] = np.nan
                 continue
-            table[k, j] = _number(f"{path} line {line}, column {column}", row[place])
+            table[k, j] = _number(f"{path} line {line}, column {column}", row[index])
     if np.any(np.diff(table[:, 0]) <= 0):
         k = int(np.flatnonzero(np.diff(table[:, 0]) <= 0)[0]) + 1
         got, before = table[k, 0], table[k - 1, 0]
@@ -475,9 +475,9 @@ def _read_mcap(path: Path, model: Model) -> tuple[Motion, Mapping[str, str]]:
         ("/state", "v", model.velocity_names),
         ("/input", "u", model.input_names),
     ):
-        found: Any = log.channel_metadata[topic].get("names", {}).get(key, [])
-        if tuple(found) != names:
-            raise InputError(f"{path}: names of {key} in {topic}", got=found, expected=str(list(names)))
+        labels: Any = log.channel_metadata[topic].get("names", {}).get(key, [])
+        if tuple(labels) != names:
+            raise InputError(f"{path}: names of {key} in {topic}", got=labels, expected=str(list(names)))
     motion = state["time"], np.hstack([state["q"], state["v"]]), given["u"]
     return motion, log.metadata.get("contract", {})
 
@@ -506,18 +506,18 @@ def write_arrays(path: Path, recording: Recording) -> None:
 
 
 def _arrays(recording: Recording) -> dict[str, Any]:
-    own = {"times": recording.times, "xs": recording.xs, "us": recording.us}
+    arrays = {"times": recording.times, "xs": recording.xs, "us": recording.us}
     outputs = {f"{OUTPUT}{name}": values for name, values in recording.outputs.items()}
-    return {name: np.asarray(values, dtype=float) for name, values in {**own, **outputs}.items()}
+    return {name: np.asarray(values, dtype=float) for name, values in {**arrays, **outputs}.items()}
 
 
 def read_arrays(path: Path, name: str, version: str, facts: Mapping[str, str]) -> Recording:
     """The recording whose arrays are at `path`; ArtifactError where they are none of a recording."""
-    found = arrays_of(path)
-    missing = {"times", "xs", "us"} - found.keys()
+    arrays = arrays_of(path)
+    missing = {"times", "xs", "us"} - arrays.keys()
     if missing:
-        place = "/".join(path.parts[-3:])
-        raise ArtifactError(f"{place} is not a recording: it has no {', '.join(sorted(missing))}")
-    times, xs, us = (found.pop(key) for key in ("times", "xs", "us"))
-    outputs = {key.removeprefix(OUTPUT): values for key, values in found.items() if key.startswith(OUTPUT)}
+        tail = "/".join(path.parts[-3:])
+        raise ArtifactError(f"{tail} is not a recording: it has no {', '.join(sorted(missing))}")
+    times, xs, us = (arrays.pop(key) for key in ("times", "xs", "us"))
+    outputs = {key.removeprefix(OUTPUT): values for key, values in arrays.items() if key.startswith(OUTPUT)}
     return Recording(name, version, times, xs, us, dict(facts), outputs)

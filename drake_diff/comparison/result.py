@@ -117,7 +117,7 @@ class Compared:
     def told(self) -> tuple[ContractLine, ...]:
         """The lines that explain the terms responsible; none where one of the terms is explained by no line."""
         lines = [self.tells(term) for term in sorted({self.first.responsible, self.largest.responsible})]
-        return tuple(dict.fromkeys(x for found in lines for x in found)) if all(lines) else ()
+        return tuple(dict.fromkeys(x for group in lines for x in group)) if all(lines) else ()
 
     def tells(self, term: str) -> tuple[ContractLine, ...]:
         """The lines that are different and explain a term."""
@@ -168,12 +168,12 @@ class Compared:
             return f"the same simulation: each of {within}{jacobians if self.jacobians else ''}{but}"
         if self.verdict == "other model":
             lines = [f"{line.quantity}: {line.detail}" for line in self.broken] or [self.first.as_if]
-            told = f"another model ({'; '.join(lines)})"
+            words = f"another model ({'; '.join(lines)})"
             if self.first_apart is None:
-                return f"{told}, though each of {within}"
+                return f"{words}, though each of {within}"
             since = f"the same for {self.motion.times[self.first_apart]:.4g} s, then " if self.first_apart else ""
             by = f"most by its {self.largest.responsible}"
-            return f"{told}; {since}a step differs by up to {_largest(self.step_gaps)}, {by}"
+            return f"{words}; {since}a step differs by up to {_largest(self.step_gaps)}, {by}"
         if self.verdict == "unexplained":
             return self._unexplained()
         if self.first_apart is None:
@@ -188,7 +188,7 @@ class Compared:
         terms = list(dict.fromkeys((self.first.responsible, self.largest.responsible)))
         lines_of = {line.quantity: line.reason or line.detail for line in self.told}
         why = "; ".join(lines_of[term] for term in terms if term in lines_of) or "; ".join(lines_of.values())
-        why = "; ".join(part for part in (why, self.first.as_if) if part)
+        why = "; ".join(text for text in (why, self.first.as_if) if text)
         return f"{before} by the {_list(terms)}, at most {_largest(self.step_gaps)} of the state in one step ({why})"
 
     def _unexplained(self) -> str:
@@ -262,28 +262,30 @@ class Comparison:
     def __str__(self) -> str:
         """Which engines are the same, which are not, and whose gradients are those of their own steps."""
         others, parts = self.engines[1:], []
-        for verdict, said in (
+        for verdict, phrase in (
             ("same", "the same simulation as Drake"),
             ("other law", "the same model under another law"),
             ("other model", "another model: its contract is broken"),
             ("unexplained", "different, and nothing explains why"),
         ):
             names = [e.engine for e in others if e.verdict == verdict]
-            parts += [f"{_list(names)}: {said}"] if names else []
+            parts += [f"{_list(names)}: {phrase}"] if names else []
         after_contact = any(
             "contact law" in (e.first.responsible, e.largest.responsible) for e in others if e.verdict != "same"
         )
         note = " From the first touch on a state is only as good as the contact law: examples/studies/contact_table.py."
-        own, wrong, open_, blind = (
+        trusted, wrong, open_, blind = (
             [e.engine for e in self.engines if e.gradient == kind]
             for kind in ("its own step's", "not its own step's", "undecided", "none")
         )
-        trust = [f"Gradients to trust at the states looked at: {_list(own)}"] if own else ["No gradient to trust"]
+        trust = (
+            [f"Gradients to trust at the states looked at: {_list(trusted)}"] if trusted else ["No gradient to trust"]
+        )
         trust += [f"not those of {_list(wrong)}, which are not the derivatives of their own steps"] if wrong else []
         trust += [f"those of {_list(open_)} could not be decided"] if open_ else []
         trust += [f"{_list(blind)} {'offer' if len(blind) > 1 else 'offers'} none"] if blind else []
-        found = f"{'; '.join(parts or ['no engine was compared'])}. {'; '.join(trust)}."
-        return f"{found}{note if after_contact else ''}"
+        summary = f"{'; '.join(parts or ['no engine was compared'])}. {'; '.join(trust)}."
+        return f"{summary}{note if after_contact else ''}"
 
 
 def _breaks(line: ContractLine, touched: bool) -> bool:

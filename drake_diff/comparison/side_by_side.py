@@ -85,8 +85,8 @@ def compare(
     for recording in recordings:
         check_recording(recording, model)
     if recordings and x0 is None:
-        x0, own = _motion_of(recordings[0], model)
-        us = own if us is None else us
+        x0, recorded_us = _motion_of(recordings[0], model)
+        us = recorded_us if us is None else us
     sample = sample_states(model, 1, seed)[0]
     if us is None:
         count = num_steps or min(MOST_STEPS, max(1, round(DURATION / model.time_step)))
@@ -107,12 +107,12 @@ def compare(
     panel = _Panel(model, reference, start, inputs)
     panel.look(seed)
     compared = []
-    each: tuple[Engine | Recording, ...] = (reference, *loaded, *recordings)
-    for one in each:
+    sources: tuple[Engine | Recording, ...] = (reference, *loaded, *recordings)
+    for source in sources:
         try:
-            compared.append(panel.recorded(one) if isinstance(one, Recording) else panel.compared(one))
+            compared.append(panel.recorded(source) if isinstance(source, Recording) else panel.compared(source))
         except SimulationError as error:
-            refused.append(_stuck(one, error))
+            refused.append(_stuck(source, error))
     return Comparison(model, start, inputs, tuple(panel.probes), tuple(compared), tuple(refused), tuple(recordings))
 
 
@@ -126,14 +126,14 @@ def compare_recordings(model: Model, recordings: Sequence[Recording]) -> Compari
     start, us = _motion_of(recordings[0], model)
     inputs = check_inputs(model, us, None)
     panel = _Panel(model, DrakeEngine(model), start, inputs)
-    compared, refused, kept = [], [], []
-    for one in recordings:
+    compared, refused, accepted = [], [], []
+    for recording in recordings:
         try:
-            compared.append(panel.recorded(one))
-            kept.append(one)
+            compared.append(panel.recorded(recording))
+            accepted.append(recording)
         except SimulationError as error:
-            refused.append(_stuck(one, error))
-    return Comparison(model, start, inputs, (), tuple(compared), tuple(refused), tuple(kept))
+            refused.append(_stuck(recording, error))
+    return Comparison(model, start, inputs, (), tuple(compared), tuple(refused), tuple(accepted))
 
 
 def _motion_of(recording: Recording, model: Model) -> tuple[Array, Array]:
@@ -141,14 +141,14 @@ def _motion_of(recording: Recording, model: Model) -> tuple[Array, Array]:
     return recording.xs[0], np.repeat(recording.us, steps_between(recording, model.time_step), axis=0)
 
 
-def _stuck(one: Engine | Recording, error: SimulationError) -> Refused:
-    return Refused(one.name, f"it cannot take a step from one of the states: {error}", True)
+def _stuck(source: Engine | Recording, error: SimulationError) -> Refused:
+    return Refused(source.name, f"it cannot take a step from one of the states: {error}", True)
 
 
 def default_engines(model: Model) -> tuple[str, ...]:
     """Drake's other contact approximations, where something can touch, every other engine, and what is none."""
-    own = model.contract.contact
-    others = [a for a in ("sap", "similar", "lagged") if own.collision_pairs and a != own.approximation]
+    contact = model.contract.contact
+    others = [a for a in ("sap", "similar", "lagged") if contact.collision_pairs and a != contact.approximation]
     return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
 
 
@@ -252,8 +252,10 @@ class _Panel:
         return frozen(gaps)
 
     def _attribution(self, engine: Engine, motion: EngineMotion, k: int) -> attribution.Attribution:
-        x, u, one = motion.xs[k], self.us[k], self.reference
-        return attribution.attribute(self.coordinates, one, engine, x, u, (one.step(x, u), engine.step(x, u)))
+        x, u, reference = motion.xs[k], self.us[k], self.reference
+        return attribution.attribute(
+            self.coordinates, reference, engine, x, u, (reference.step(x, u), engine.step(x, u))
+        )
 
 
 def _gap(reference: Array, other: Array) -> float:

@@ -90,11 +90,11 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
 
     Drake reads no springs in MJCF: of a model with springs only MuJoCo reads it, or nobody does, which is a complaint.
     """
-    own, gravity = describe_whole(model), model.plant.gravity_field().gravity_vector()
-    springs = any(link.stiffness for link in own.links)
+    description, gravity = describe_whole(model), model.plant.gravity_field().gravity_vector()
+    springs = any(link.stiffness for link in description.links)
     readers = ["drake"] if form != "mjcf" or not springs else []
     readers += ["mujoco"] if form == "mjcf" and find_spec("mujoco") else []
-    found = [] if readers else ["MuJoCo is not installed, and Drake reads no springs in MJCF"]
+    problems = [] if readers else ["MuJoCo is not installed, and Drake reads no springs in MJCF"]
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"model{SUFFIX[form]}"
         path.write_text(text)
@@ -110,25 +110,27 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
                         found_there = load_model(
                             path, time_step=model.time_step, gravity=gravity,
                             contact_approximation=model.contract.contact.approximation,
-                            mimic="reduce" if own.followers else None,
+                            mimic="reduce" if description.followers else None,
                         )  # fmt: skip
                         followers, engine = describe_whole(found_there).followers, _Unlimited(found_there.whole)
-                        found += _other_materials(form, own, engine.description)
+                        problems += _other_materials(form, description, engine.description)
                         if form == "sdf":
-                            of_sdf = _other_followers(own.followers, _followers_by_sdf(text))
-                            found += [f"SDF's own <mimic>, {told}" for told in of_sdf]
-                found += [f"read by {reader}, {told}" for told in _other_followers(own.followers, followers)]
+                            of_sdf = _other_followers(description.followers, _followers_by_sdf(text))
+                            problems += [f"SDF's own <mimic>, {clause}" for clause in of_sdf]
+                problems += [
+                    f"read by {reader}, {clause}" for clause in _other_followers(description.followers, followers)
+                ]
                 lines = match_contracts(_Named(model.whole, form), engine)
             except DrakeDiffError as error:
-                found.append(f"{reader} cannot read it: {error}")
+                problems.append(f"{reader} cannot read it: {error}")
             else:
                 wrong = [line for line in lines if line.verdict == "different" and line.quantity not in LAWS]
                 if reader == "drake":
                     wrong = [line for line in wrong if line.quantity not in IN_THE_CONTRACT[form]]
                 else:  # shapes that MJCF is not written for are left out, with their pairs
                     wrong = [line for line in wrong if not line.reason]
-                found += [f"read by {reader}, {line.quantity}: {line.detail}" for line in wrong]
-    return found
+                problems += [f"read by {reader}, {line.quantity}: {line.detail}" for line in wrong]
+    return problems
 
 
 def _followers_in_mujoco(path: Path) -> tuple[tuple[Follower, ...], Path]:
@@ -145,43 +147,45 @@ def _followers_in_mujoco(path: Path) -> tuple[tuple[Follower, ...], Path]:
 
 def _followers_by_sdf(text: str) -> list[Follower]:
     """The joints that follow others by SDF's own element, which Drake does not read."""
-    found = []
+    followers = []
     for joint in ElementTree.fromstring(text).iter("joint"):
         mimic = joint.find("axis/mimic")
         if mimic is not None:
-            ratio, offset, at = (float(mimic.findtext(name, "nan")) for name in ("multiplier", "offset", "reference"))
+            ratio, offset, reference = (
+                float(mimic.findtext(name, "nan")) for name in ("multiplier", "offset", "reference")
+            )
             leader = mimic.get("joint", "")
-            found.append(Follower(joint.get("name", ""), leader, ratio, offset - ratio * at))
-    return found
+            followers.append(Follower(joint.get("name", ""), leader, ratio, offset - ratio * reference))
+    return followers
 
 
-def _other_followers(own: Sequence[Follower], read: Sequence[Follower]) -> list[str]:
+def _other_followers(wanted: Sequence[Follower], read: Sequence[Follower]) -> list[str]:
     """Joints that follow others otherwise than they should, or not at all."""
-    meant, there = ({f.joint: f for f in side} for side in (own, read))
-    found = []
+    meant, there = ({f.joint: f for f in side} for side in (wanted, read))
+    problems = []
     for joint in sorted(meant.keys() | there.keys()):
         a, b = meant.get(joint), there.get(joint)
         if a is None or b is None or a.leader != b.leader or not _same([a.ratio, a.offset], [b.ratio, b.offset]):
-            found.append(f"joints that follow others: {b or f'{joint} follows none'} where {a or 'none'} was meant")
-    return found
+            problems.append(f"joints that follow others: {b or f'{joint} follows none'} where {a or 'none'} was meant")
+    return problems
 
 
 def _same(a: Sequence[float], b: Sequence[float]) -> bool:
     return bool(np.allclose(a, b, rtol=STEP_TOLERANCE, atol=STEP_TOLERANCE))
 
 
-def _other_materials(form: str, own: Description, read: Description) -> list[str]:
+def _other_materials(form: str, wanted: Description, read: Description) -> list[str]:
     """Friction and softness of shapes that came back otherwise, whether or not they can touch something there."""
-    found = []
-    for g in own.geometries if form != "mjcf" else ():
+    problems = []
+    for g in wanted.geometries if form != "mjcf" else ():
         name = collision_name(g.name) if form == "sdf" else g.name
         theirs = [x.material for x in read.geometries if x.name.rsplit("#", 1)[0].endswith(name)]
         if theirs:  # else it is left out, and told
             for quantity, value in g.material.items():
                 other = theirs[0].get(quantity)
                 if other is None or abs(other - value) > STEP_TOLERANCE * abs(value):
-                    found.append(f"read by drake, {quantity}: {g.name}: {other} where {value:g} was meant")
-    return found
+                    problems.append(f"read by drake, {quantity}: {g.name}: {other} where {value:g} was meant")
+    return problems
 
 
 class _Named(DrakeEngine):
@@ -193,8 +197,8 @@ class _Named(DrakeEngine):
 
     @property
     def contract(self) -> EngineContract:
-        own = super().contract
-        return replace(own, inputs=self.description.actuated) if self.form == "sdf" else own
+        contract = super().contract
+        return replace(contract, inputs=self.description.actuated) if self.form == "sdf" else contract
 
 
 class _Unlimited(DrakeEngine):
@@ -202,9 +206,9 @@ class _Unlimited(DrakeEngine):
 
     @property
     def contract(self) -> EngineContract:
-        own = super().contract
-        joints = [replace(j, lower=limit(j.lower), upper=limit(j.upper)) for j in own.joints]
-        return replace(own, joints=tuple(joints), effort_limits=tuple(limit(x) for x in own.effort_limits))
+        contract = super().contract
+        joints = [replace(j, lower=limit(j.lower), upper=limit(j.upper)) for j in contract.joints]
+        return replace(contract, joints=tuple(joints), effort_limits=tuple(limit(x) for x in contract.effort_limits))
 
 
 class Check(NamedTuple):
@@ -228,18 +232,18 @@ def check_small_models() -> tuple[Check, ...]:
             model = load_model(path, time_step=H)
         x, u, space = np.array(state), np.array(effort), tangent_space(model)
         drake, hand = DrakeEngine(model), NumpyEngine(model)
-        found = {}
+        answers = {}
         for engine in (drake, hand):
             x_next, (A, B, _) = engine.step(x, u), engine.differentiate_step(x, u)
-            found[engine] = {
+            answers[engine] = {
                 "step": (x_next, STEP_TOLERANCE),
                 "Jacobian": (space.jacobian(x, x_next, A, B), JACOBIAN_TOLERANCE),
                 "energy": (np.array([engine.energy(x)]), STEP_TOLERANCE),
             }
-        for what, (right, tolerance) in found[hand].items():
-            gap = float(np.abs(found[drake][what][0] - right).max() / max(1.0, np.abs(right).max()))
-            told = f"Drake is {gap:.1e} from the hand calculation, {tolerance:g} is allowed"
-            checks.append(Check(f"{name}: {what}", gap <= tolerance, told))
+        for what, (right, tolerance) in answers[hand].items():
+            gap = float(np.abs(answers[drake][what][0] - right).max() / max(1.0, np.abs(right).max()))
+            detail = f"Drake is {gap:.1e} from the hand calculation, {tolerance:g} is allowed"
+            checks.append(Check(f"{name}: {what}", gap <= tolerance, detail))
         for form in SUFFIX:
             wrong = complaints(form, model, written(form, drake.description, H))
             checks.append(Check(f"{name}: {form} read back", not wrong, "; ".join(wrong) or "the same model"))
@@ -376,7 +380,7 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
         except (MissingDependencyError, ModelError) as error:
             about_usd = f"No USD is written: {error}. UrdfConverter makes one."
     names = {g.name: collision_name(g.name) if form == "sdf" else g.name for g in description.geometries}
-    left_out = [own for own, name in names.items() if f'"{name}"' not in text]
+    left_out = [original for original, name in names.items() if f'"{name}"' not in text]
     contract = DrakeEngine(model.whole).contract
     made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
     facts: dict[str, Any] = {**vars(contract), "h": repr(contract.time_step), "gravity": list(contract.gravity)}
@@ -393,7 +397,7 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
             _plain(
                 {
                     **asdict(contract),
-                    "followers": [asdict(each) for each in description.followers],
+                    "followers": [asdict(follower) for follower in description.followers],
                     "not_in_the_file": left_out,
                     "initial_states": made,
                 }

@@ -68,10 +68,10 @@ def usd(description: Description) -> str:
 def _refuse(moving: Sequence[Link], followers: Sequence[Follower]) -> None:
     """ModelError for what USD cannot hold."""
     kinds = {link.joint: link.kind for link in moving}
-    for each in followers:
-        if kinds[each.joint] != kinds[each.leader]:
+    for follower in followers:
+        if kinds[follower.joint] != kinds[follower.leader]:
             raise ModelError(
-                f"{each.joint} follows {each.leader}: in USD a hinge cannot follow a slide, nor a slide a hinge"
+                f"{follower.joint} follows {follower.leader}: in USD a hinge cannot follow a slide, nor a slide a hinge"
             )
     for link in moving:
         if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
@@ -84,30 +84,30 @@ def _refuse(moving: Sequence[Link], followers: Sequence[Follower]) -> None:
 def lost(description: Description) -> tuple[str, ...]:
     """What of contact and actuators the file cannot say, by name."""
     kinds = {g.name: shape_of(g)[0] or type(g.shape).__name__ for g in description.geometries}
-    found = [f"the shape of {name} ({kind})" for name, kind in kinds.items() if kind not in SHAPES]
+    losses = [f"the shape of {name} ({kind})" for name, kind in kinds.items() if kind not in SHAPES]
     sides = {g.name: g.material for g in description.geometries}
     for pair in description.pairs:
         a, b = (sides[name].get("friction") for name in pair.names)
         if a != b:
-            found.append(
+            losses.append(
                 f"friction of {' with '.join(pair.names)}: {pair.friction} here, PhysX takes the average of {a} and {b}"
             )
     if any(pair.dissipation or pair.relaxation_time for pair in description.pairs):
-        found.append("dissipation of contacts")
+        losses.append("dissipation of contacts")
     limited = [x for x, e in zip(description.inputs, description.effort_limits, strict=True) if np.isfinite(e)]
-    return (*found, *(["effort limits of " + ", ".join(limited)] if limited else []))
+    return (*losses, *(["effort limits of " + ", ".join(limited)] if limited else []))
 
 
 def complaints(description: Description, text: str) -> list[str]:
     """What of bodies, joints and contact the .usda file `text`, read again, does not say."""
-    stage, found, anchored = Usd.Stage.CreateInMemory(), [], _anchored(description)
+    stage, problems, anchored = Usd.Stage.CreateInMemory(), [], _anchored(description)
     stage.GetRootLayer().ImportFromString(text)
 
     def check(subject: str, path: str, wanted: Mapping[str, float]) -> None:
         for name, value in wanted.items():
             read = stage.GetPrimAtPath(path).GetAttribute(name).Get() if stage.GetPrimAtPath(path) else None
             if read is None or not np.isclose(float(read), value, rtol=SINGLE, atol=SINGLE):
-                found.append(f"{name} of {subject}: {read} where {value} was meant")
+                problems.append(f"{name} of {subject}: {read} where {value} was meant")
 
     scene, size = "/physicsScene", float(np.linalg.norm(description.gravity))
     check("the world", scene, {"physics:gravityMagnitude": size})
@@ -129,20 +129,20 @@ def complaints(description: Description, text: str) -> list[str]:
         path = f"{ROOT}/joints/{follower.joint}"
         offset = follower.offset * _unit_of(description.moving, follower.joint)
         check(str(follower), path, {"newton:mimicCoef0": offset, "newton:mimicCoef1": follower.ratio})
-        found += _other_leaders(stage.GetPrimAtPath(path), follower)
+        problems += _other_leaders(stage.GetPrimAtPath(path), follower)
     for i, geometry in enumerate(description.geometries):
         if shape_of(geometry)[0] not in SHAPES:
             continue
         parent = GROUND if geometry.body == "world" else f"{ROOT}/{geometry.body}"
         prim = stage.GetPrimAtPath(f"{parent}/collision_{i}")
         if not prim or not prim.HasAPI(UsdPhysics.CollisionAPI):
-            found.append(f"the shape of {geometry.name}: it collides with nothing")
+            problems.append(f"the shape of {geometry.name}: it collides with nothing")
             continue
         bound = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0]
         names = {"friction": "physics:dynamicFriction", "stiffness": "physxMaterial:compliantContactStiffness"}
         wanted = {names[name]: value for name, value in geometry.material.items() if name in names}
         check(f"geometry {geometry.name}", str(bound.GetPath()) if bound else "/none", wanted)
-    return found
+    return problems
 
 
 def _other_leaders(prim: Any, follower: Follower) -> list[str]:
@@ -169,11 +169,11 @@ def _place(shape: Any, X: RigidTransform) -> None:
 
 def _anchored(description: Description) -> set[str]:
     """The world and the bodies that are welded to it: in USD, shapes that do not move, without mass or joint."""
-    found = {"world"}
+    bodies = {"world"}
     for link in description.links:
-        if link.kind == "weld" and link.parent in found:
-            found.add(link.body)
-    return found
+        if link.kind == "weld" and link.parent in bodies:
+            bodies.add(link.body)
+    return bodies
 
 
 def _add_inertia(prim: Any, link: Link, zero: AtZero) -> None:
@@ -193,8 +193,8 @@ def _add_joint(stage: Any, link: Link, zero: AtZero, anchored: set[str]) -> None
     if link.parent not in anchored:
         joint.CreateBody0Rel().SetTargets([f"{ROOT}/{link.parent}"])
     joint.CreateBody1Rel().SetTargets([f"{ROOT}/{link.body}"])
-    place = zero.frames[link.body] if link.parent in anchored else zero.in_parent(link)
-    joint.CreateLocalPos0Attr(_vector(place.translation()))
+    pose = zero.frames[link.body] if link.parent in anchored else zero.in_parent(link)
+    joint.CreateLocalPos0Attr(_vector(pose.translation()))
     joint.CreateLocalPos1Attr(_vector([0, 0, 0]))
     if link.kind == "weld":
         return
@@ -260,10 +260,10 @@ def _add_material(stage: Any, number: int, geometry: Geometry, prim: Any) -> Non
         physics.CreateStaticFrictionAttr(geometry.material["friction"])
         physics.CreateDynamicFrictionAttr(geometry.material["friction"])
     material.GetPrim().AddAppliedSchema("PhysxMaterialAPI")
-    own: dict[str, tuple[Any, Any]] = {"frictionCombineMode": (Sdf.ValueTypeNames.Token, "average")}
+    attributes: dict[str, tuple[Any, Any]] = {"frictionCombineMode": (Sdf.ValueTypeNames.Token, "average")}
     if "stiffness" in geometry.material:
-        own["compliantContactStiffness"] = (Sdf.ValueTypeNames.Float, geometry.material["stiffness"])
-    for name, (kind, value) in own.items():
+        attributes["compliantContactStiffness"] = (Sdf.ValueTypeNames.Float, geometry.material["stiffness"])
+    for name, (kind, value) in attributes.items():
         material.GetPrim().CreateAttribute(f"physxMaterial:{name}", kind).Set(value)
     binding = UsdShade.MaterialBindingAPI.Apply(prim)
     binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
@@ -273,10 +273,12 @@ def _filter_pairs(description: Description, prims: Mapping[str, Any]) -> None:
     """Pairs that Drake does not let touch do not touch."""
     touching = {frozenset(pair.names) for pair in description.pairs}
     body = {g.name: g.body for g in description.geometries}
-    for i, one in enumerate(prims):
+    for i, name in enumerate(prims):
         apart = [
-            two for two in list(prims)[i + 1 :] if body[one] != body[two] and frozenset((one, two)) not in touching
+            other
+            for other in list(prims)[i + 1 :]
+            if body[name] != body[other] and frozenset((name, other)) not in touching
         ]
         if apart:
-            filtered = UsdPhysics.FilteredPairsAPI.Apply(prims[one])
-            filtered.CreateFilteredPairsRel().SetTargets([prims[two].GetPath() for two in apart])
+            filtered = UsdPhysics.FilteredPairsAPI.Apply(prims[name])
+            filtered.CreateFilteredPairsRel().SetTargets([prims[other].GetPath() for other in apart])

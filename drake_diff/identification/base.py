@@ -41,8 +41,8 @@ class BaseParameter(ShowsItsRepr):
     def words(self) -> str:
         """The sum, without its value."""
         first, *rest = self.parts.items()
-        each = ((f"{abs(f):.4g} {name}" if abs(abs(f) - 1) > ONE else name, f) for name, f in rest)
-        return first[0] + "".join(f" {'+' if f > 0 else '-'} {words}" for words, f in each)
+        terms = ((f"{abs(f):.4g} {name}" if abs(abs(f) - 1) > ONE else name, f) for name, f in rest)
+        return first[0] + "".join(f" {'+' if f > 0 else '-'} {words}" for words, f in terms)
 
 
 def base_parameters(model: Model, bodies: Sequence[str] | None = None) -> tuple[BaseParameter, ...]:
@@ -92,13 +92,13 @@ def base_parameters(model: Model, bodies: Sequence[str] | None = None) -> tuple[
     of_links = _effects(model, tree, len(wanted))
     for body in wanted:
         link = tree.bodies[body]
-        own = ten_numbers(link.mass, link.center_of_mass, link.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+        numbers = ten_numbers(link.mass, link.center_of_mass, link.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
         effect = of_links[tree.placed[body][0]] @ tree.moved_by[body]
         for j in ORDER:
             effects.append(effect[:, j])
             names.append(f"{body}.{NAMES[j]}")
             units.append(UNITS[j])
-            values.append(float(own[j]))
+            values.append(float(numbers[j]))
     return _sums(np.array(effects).T, names, units, np.array(values))
 
 
@@ -113,7 +113,7 @@ def _effects(model: Model, tree: Tree, count: int) -> list[Array]:
 
 def _sums(effects: Array, names: Sequence[str], units: Sequence[str], values: Array) -> tuple[BaseParameter, ...]:
     size = max(float(np.max(np.linalg.norm(effects, axis=0), initial=0.0)), 1e-300)
-    kept: list[int] = []
+    columns: list[int] = []
     parts: list[dict[str, float]] = []
     total: list[float] = []
     basis = np.zeros((len(effects), 0))
@@ -122,15 +122,17 @@ def _sums(effects: Array, names: Sequence[str], units: Sequence[str], values: Ar
         left -= basis @ (basis.T @ left)  # once more: what is left of a difference is rounded
         if np.linalg.norm(left) > SAME * size:
             basis = np.column_stack([basis, left / np.linalg.norm(left)])
-            kept.append(j)
+            columns.append(j)
             parts.append({names[j]: 1.0})
             total.append(float(values[j]))
             continue
-        if not kept or np.linalg.norm(effect) <= SAME * size:
+        if not columns or np.linalg.norm(effect) <= SAME * size:
             continue
-        factors = np.linalg.lstsq(effects[:, kept], effect, rcond=None)[0]
+        factors = np.linalg.lstsq(effects[:, columns], effect, rcond=None)[0]
         for k, factor in enumerate(factors):
             if abs(factor) > 1e-6 * np.max(np.abs(factors)):
                 parts[k][names[j]] = float(factor)
                 total[k] += float(factor * values[j])
-    return tuple(BaseParameter(each, value, units[j]) for j, each, value in zip(kept, parts, total, strict=True))
+    return tuple(
+        BaseParameter(summands, value, units[j]) for j, summands, value in zip(columns, parts, total, strict=True)
+    )

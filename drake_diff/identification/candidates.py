@@ -39,10 +39,12 @@ LEVELS = (0.85, 0.6, 0.35)  # of an input's largest value: limits that are tried
 def changes_of_inputs(names: Sequence[str], pieces: Sequence[Piece]) -> list[Unknown]:
     """A column for each limit, and one for the delay of all; of inputs that move."""
     moving = [i for i in range(len(names)) if any(np.ptp(p.us[:, i]) > 0 for p in pieces)]
-    each = [
-        Unknown(f"{names[i]}.{LIMIT}{round(100 * part)}", "", np.zeros(1), 0.0, 0.0) for i in moving for part in LEVELS
+    unknowns = [
+        Unknown(f"{names[i]}.{LIMIT}{round(100 * level)}", "", np.zeros(1), 0.0, 0.0)
+        for i in moving
+        for level in LEVELS
     ]
-    return [*each, Unknown(f"model.{DELAY}", "s", np.zeros(1), 0.0, 0.0, LONGEST_DELAY)] if moving else each
+    return [*unknowns, Unknown(f"model.{DELAY}", "s", np.zeros(1), 0.0, 0.0, LONGEST_DELAY)] if moving else unknowns
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +60,13 @@ class Inputs:
         by_x, by_z = self.law.slopes(z, xs, hs, us)
         columns = self.unknowns.columns
         names, nq = self.law.model.input_names, self.law.model.nq
-        places = {one.name: s for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)}
-        for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
-            if one.quantity == MASS and f"{one.label}.{INERTIA}" in places:
+        places = {unknown.name: s for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)}
+        for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
+            if unknown.quantity == MASS and f"{unknown.label}.{INERTIA}" in places:
                 # Alone it takes the inertia along, of which half the logarithm of the second moment's root is z.
-                inertia = places[f"{one.label}.{INERTIA}"]
+                inertia = places[f"{unknown.label}.{INERTIA}"]
                 by_z[..., s.start] += by_z[..., inertia] @ (0.5 * np.concatenate([np.ones(3), z[inertia][3:]]))
-            elif one.quantity == DELAY and not one.shifts:
+            elif unknown.quantity == DELAY and not unknown.shifts:
                 accelerate = Dynamics(self.law.tree, self.law.tree.numbers).accelerate
                 before = np.concatenate([us[:, :1], us[:, :-1]], axis=1)
                 before[1:, 0] = us[:-1, -1]
@@ -74,13 +76,13 @@ class Inputs:
                 change = accelerate(flat, before.reshape(-1, nu)) - accelerate(flat, us.reshape(-1, nu))
                 pushed = (by_x[..., nq:] @ change.reshape(*hs.shape, -1, 1))[..., 0]
                 by_z[..., s.start] = np.where((hs > 0)[..., None], pushed, 0.0)
-            elif one.quantity.startswith(LIMIT):
-                i = names.index(one.label)
-                part = float(one.quantity.removeprefix(LIMIT)) / 100
-                level = part * max(float(np.max(np.abs(p.us[:, i]))) for p in self.pieces)
+            elif unknown.quantity.startswith(LIMIT):
+                i = names.index(unknown.label)
+                fraction = float(unknown.quantity.removeprefix(LIMIT)) / 100
+                level = fraction * max(float(np.max(np.abs(p.us[:, i]))) for p in self.pieces)
                 u = us[..., i]
                 cut = np.where(np.abs(u) > level, 1 - level / np.maximum(np.abs(u), 1e-300), 0.0)
-                by_z[..., s.start] = -cut[..., None] * by_z[..., columns.index(f"{one.label}.strength")]
+                by_z[..., s.start] = -cut[..., None] * by_z[..., columns.index(f"{unknown.label}.strength")]
         return by_x, by_z
 
     def __getattr__(self, name: str) -> Any:
@@ -124,13 +126,13 @@ class View:
 
     def promise(self, members: tuple[int, ...]) -> Promise | None:
         """The best step of some members; None where it leads out of bounds."""
-        at = np.concatenate([self._places[i] for i in members])
-        H, g = self.matrix[np.ix_(at, at)], self.right[at]
+        columns = np.concatenate([self._places[i] for i in members])
+        H, g = self.matrix[np.ix_(columns, columns)], self.right[columns]
         scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
         step = scale * np.linalg.lstsq(H * np.outer(scale, scale), g * scale, rcond=1e-12)[0]
-        lower = self._lower[at]
+        lower = self._lower[columns]
         if np.any(step < lower):
-            if len(at) > 1:
+            if len(columns) > 1:
                 return None
             step = np.maximum(step, lower)
         gain = float(2 * g @ step - step @ H @ step)
@@ -138,9 +140,13 @@ class View:
 
     def promises(self, changes: Iterable[tuple[int, ...]], price: float) -> list[Promise]:
         """Those that lower what is left by more than the price of their numbers, best first."""
-        found = [self.promise(members) for members in changes]
-        good = [one for one in found if one is not None and self.most - one.left > price * one.freedom]
-        return sorted(good, key=lambda one: one.left + price * one.freedom)
+        promises = [self.promise(members) for members in changes]
+        good = [
+            promise
+            for promise in promises
+            if promise is not None and self.most - promise.left > price * promise.freedom
+        ]
+        return sorted(good, key=lambda promise: promise.left + price * promise.freedom)
 
     def ahead(self, promise: Promise) -> tuple[Array, Array]:
         """(z of all changes, starts of the segments) after the step."""
@@ -220,8 +226,8 @@ class Candidates:
                 if not measured[i] or i not in singles:
                     continue
             names.append(name)
-        each = choose_unknowns(self.model, self.tree, names).each
-        return Unknowns((*each, *changes_of_inputs(self.model.input_names, self.pieces)), as_in_files=True)
+        unknowns = choose_unknowns(self.model, self.tree, names).each
+        return Unknowns((*unknowns, *changes_of_inputs(self.model.input_names, self.pieces)), as_in_files=True)
 
     @property
     def delays(self) -> Array:
@@ -254,16 +260,18 @@ class Candidates:
 
     def of(self, names: Sequence[str]) -> Unknowns:
         """Those called so; where inputs act later, the motion has its steps cut where they change."""
-        each = (one for one in self.unknowns.each if one.name in names)
-        return Unknowns(tuple(replace(one, shifts=one.quantity == DELAY) for one in each), as_in_files=True)
+        chosen = (unknown for unknown in self.unknowns.each if unknown.name in names)
+        return Unknowns(
+            tuple(replace(unknown, shifts=unknown.quantity == DELAY) for unknown in chosen), as_in_files=True
+        )
 
-    def with_one(self, i: int, own: Array) -> Array:
-        """z of everything where change i is `own`; a mass takes the inertia along, as it does alone."""
-        z, each, slices = self.unknowns.z_start.copy(), self.unknowns.each, self.unknowns.slices
-        z[slices[i]] = own
-        for one, s in self.each_of(self.unknowns):
-            if each[i].quantity == MASS and one.name == f"{each[i].label}.{INERTIA}":
-                along = 0.5 * float(own[0] - self.unknowns.z_start[slices[i]][0])
+    def with_one(self, i: int, values: Array) -> Array:
+        """z of everything where change i is `values`; a mass takes the inertia along, as it does alone."""
+        z, unknowns, slices = self.unknowns.z_start.copy(), self.unknowns.each, self.unknowns.slices
+        z[slices[i]] = values
+        for unknown, s in self.each_of(self.unknowns):
+            if unknowns[i].quantity == MASS and unknown.name == f"{unknowns[i].label}.{INERTIA}":
+                along = 0.5 * float(values[0] - self.unknowns.z_start[slices[i]][0])
                 z[s] = np.concatenate([z[s][:3] + along, z[s][3:] * np.exp(along)])
         return z
 
@@ -301,17 +309,17 @@ class Candidates:
             for b, p, q, n in zip(s.first[1:], s.of_piece[:-1], s.of_piece[1:], last[:-1], strict=True)
         ]
         parts = [s.pieces[p].part(int(a), b) for a, b, p in zip(s.first, [*ends, last[-1]], s.of_piece, strict=True)]
-        own = Fit(self.model, fit.law, self.chart, fit.unknowns, parts, fit.noise, fixed=True)
+        segment_fit = Fit(self.model, fit.law, self.chart, fit.unknowns, parts, fit.noise, fixed=True)
         left = np.inf
         for _ in range(SETTLING):
-            here = own.at(z, starts)
+            here = segment_fit.at(z, starts)
             if here is None or here.value > SETTLES * left:
                 break
-            found, left = own.reduce(here), here.value
+            reduced, left = segment_fit.reduce(here), here.value
             best = _each_left(here)
-            for part in (1.0, 0.3):
-                moved = own.moved(here.starts, found, np.zeros_like(z), part)
-                there = own.at(z, moved)
+            for fraction in (1.0, 0.3):
+                moved = segment_fit.moved(here.starts, reduced, np.zeros_like(z), fraction)
+                there = segment_fit.at(z, moved)
                 if there is not None:
                     better = _each_left(there) < best
                     starts, best = np.where(better[:, None], moved, starts), np.where(better, _each_left(there), best)
@@ -336,8 +344,8 @@ class Candidates:
     def view(self, pieces: Sequence[Piece], z: Array, starts: Array) -> View | None:
         """What everything promises there; where z has a delay, inputs act so much later."""
         unknowns = self.unknowns
-        if any(one.quantity == DELAY and z[s][0] > 0 for one, s in self.each_of(unknowns)):
-            unknowns = self.of([one.name for one in unknowns.each])
+        if any(unknown.quantity == DELAY and z[s][0] > 0 for unknown, s in self.each_of(unknowns)):
+            unknowns = self.of([unknown.name for unknown in unknowns.each])
         problem = self.problem(unknowns, pieces)
         law = cast(ContinuousMotion, Inputs(self.law(self.unknowns, self.longest), unknowns, pieces))
         return view(problem.fit(law, pieces, problem.first_noise), unknowns, z, starts)

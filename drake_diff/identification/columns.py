@@ -80,17 +80,17 @@ class _Columns:
 
     def exchanges(self) -> Iterator[Mistake]:
         for alike in (self.along, self.turning):
-            for one, other in combinations(alike, 2):
-                pairs = [pair for pair in zip(one, other, strict=True) if self.seen[list(pair)].all()]
+            for first, second in combinations(alike, 2):
+                pairs = [pair for pair in zip(first, second, strict=True) if self.seen[list(pair)].all()]
                 yield from (self.exchanged(pair) for pair in pairs)
                 if len(pairs) > 1:
                     yield self.exchanged(*pairs)
         yield from map(self.exchanged, combinations(self.inputs, 2))
 
     def mirrors(self) -> Iterator[Mistake]:
-        for own in (*self.along, *self.turning):
-            both = tuple(column for column in own if self.seen[column])
-            yield from (self.scaled(one, "the other sign", -1.0) for one in _parts(both, *((i,) for i in both)))
+        for pair in (*self.along, *self.turning):
+            both = tuple(column for column in pair if self.seen[column])
+            yield from (self.scaled(columns, "the other sign", -1.0) for columns in _parts(both, *((i,) for i in both)))
         yield from (self.scaled((i,), "the other sign", -1.0) for i in self.inputs)
 
     def degrees(self) -> Iterator[Mistake]:
@@ -113,15 +113,15 @@ class _Columns:
         return self.made(f"{_listed([self.names[i] for i in columns])} {what}", columns, columns, factor)
 
 
-def _parts(*each: tuple[int, ...]) -> list[tuple[int, ...]]:
+def _parts(*groups: tuple[int, ...]) -> list[tuple[int, ...]]:
     """Each set of columns once, without those that have none."""
-    return [columns for columns in dict.fromkeys(each) if columns]
+    return [columns for columns in dict.fromkeys(groups) if columns]
 
 
 def _columns(model: Model, chart: Chart, seen: Mask) -> _Columns:
     """Those of quaternions are in no group."""
     nq, nx = model.nq, model.nx
-    sliding = {model.places(one)[0].start for one in joints(model.plant) if one.type_name() == "prismatic"}
+    sliding = {model.places(joint)[0].start for joint in joints(model.plant) if joint.type_name() == "prismatic"}
     along = [(i, nq + j) for i, j in chart.coordinates.single if i in sliding]
     along += [(i + 4 + k, nq + j + 3 + k) for i, j in chart.coordinates.free for k in range(3)]
     turning = [(i, nq + j) for i, j in chart.coordinates.single if i not in sliding]
@@ -152,19 +152,19 @@ def mistaken_columns(
     nearer = [(every[i], others[i]) for i in np.argsort(others, kind="stable")[:FITTED] if others[i] < NEARER * left]
     measured = np.isfinite(np.concatenate([piece.ys for piece in pieces])).sum(axis=0)
     for fitted in fits:
-        found: dict[str, float] = {}
-        for one, _ in nearer:
-            score, explains = fitted([one.mended(piece) for piece in pieces])
+        scores: dict[str, float] = {}
+        for mistake, _ in nearer:
+            score, explains = fitted([mistake.mended(piece) for piece in pieces])
             if explains:  # in the columns' own units
-                found[one.words] = score - 2 * float(measured @ np.log(np.abs(one.factors[: model.nx])))
-        if not found:
+                scores[mistake.words] = score - 2 * float(measured @ np.log(np.abs(mistake.factors[: model.nx])))
+        if not scores:
             continue
         before, explains = (np.inf, False) if left - nearer[0][1] > FAR else fitted(pieces)
-        falls = {words: before - score for words, score in found.items() if before - score > EVIDENCE}
+        falls = {words: before - score for words, score in scores.items() if before - score > EVIDENCE}
         if explains or not falls:
             return None
-        first, *rest = sorted(falls, key=lambda words: found[words])
-        return mistaken(first, [words for words in rest if found[words] - found[first] < SAME], falls)
+        first, *rest = sorted(falls, key=lambda words: scores[words])
+        return mistaken(first, [words for words in rest if scores[words] - scores[first] < SAME], falls)
     return None
 
 
@@ -175,46 +175,46 @@ def mistaken_in_the_air(
 
     `stated` (2 nv,) is the noise, NaN where it is not known.
     """
-    own = model, tree, Unknowns((), as_in_files=True)
+    arguments = model, tree, Unknowns((), as_in_files=True)
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
     whole = np.round(periods)
     steps = not chart.coordinates.free and np.all(whole > 0) and np.all(np.abs(periods - whole) < CLOCK_TOLERANCE)
-    law = ContinuousMotion(*own)
+    law = ContinuousMotion(*arguments)
     fits = [partial(_fitted, model, law, chart, stated)]
     if steps:
-        euler = EulerMotion(*own, model.time_step)
+        euler = EulerMotion(*arguments, model.time_step)
         fits.append(partial(_fitted, model, euler, chart, stated))
     return mistaken_columns(model, chart, pieces, law, fits)
 
 
-def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], each: Sequence[Mistake]) -> list[float]:
+def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], candidates: Sequence[Mistake]) -> list[float]:
     """What some short segments leave without each mistake, from states that are guessed: mean log of 1 + squares."""
     s, nx = cut_segments(law, pieces, model.nu), model.nx
     some = np.unique(np.linspace(0, len(s.first) - 1, SEGMENTS).round().astype(int))
-    found: list[float] = []
-    for first in range(0, len(each), AT_ONCE):
-        part = each[first : first + AT_ONCE]
-        mended = [[one.mended(piece) for piece in pieces] for one in part]
+    losses: list[float] = []
+    for first in range(0, len(candidates), AT_ONCE):
+        batch = candidates[first : first + AT_ONCE]
+        mended = [[candidate.mended(piece) for piece in pieces] for candidate in batch]
         starts = [
-            guess_states(model, chart, own[s.of_piece[k]], np.array([s.first[k]], dtype=np.intp))
-            for own in mended
+            guess_states(model, chart, mended_pieces[s.of_piece[k]], np.array([s.first[k]], dtype=np.intp))
+            for mended_pieces in mended
             for k in some
         ]
-        us = [s.us[some][:, :, one.order[nx:] - nx] * one.factors[nx:] for one in part]
+        us = [s.us[some][:, :, candidate.order[nx:] - nx] * candidate.factors[nx:] for candidate in batch]
         with np.errstate(all="ignore"):
             count = len(some)
-            firsts = [np.concatenate(starts[count * i : count * (i + 1)]) for i in range(len(part))]
+            firsts = [np.concatenate(starts[count * i : count * (i + 1)]) for i in range(len(batch))]
             xs = side_by_side(law, firsts, s.hs[some], us)
-            for own, moved in zip(mended, xs, strict=True):
-                noise = noise_by_differences(chart, own)
+            for mended_pieces, moved in zip(mended, xs, strict=True):
+                noise = noise_by_differences(chart, mended_pieces)
                 misses = [
-                    chart.minus(own[s.of_piece[k]].ys[s.samples[k]], moved[i, s.at[k]]) / noise
+                    chart.minus(mended_pieces[s.of_piece[k]].ys[s.samples[k]], moved[i, s.at[k]]) / noise
                     for i, k in enumerate(some)
                 ]
                 squares = np.concatenate(misses) ** 2
                 known = np.log1p(squares[np.isfinite(squares)])
-                found.append(float(np.mean(known)) if len(known) else np.inf)
-    return found
+                losses.append(float(np.mean(known)) if len(known) else np.inf)
+    return losses
 
 
 def side_by_side(law: Law, starts: Sequence[Array], hs: Array, us: Sequence[Array]) -> list[Array]:

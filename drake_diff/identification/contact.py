@@ -114,32 +114,34 @@ class WholeMotions:
                 return Fitted("", np.inf, 0, False, "", np.zeros(0), np.zeros((0, 2)), point, np.zeros(0)), *quiet
             if self.size(point) < QUIET * max(least, 1.0):
                 quiet = stage, point
-        told = self.told(None, point)
-        return told, *((1.0, point) if told.explains else quiet)
+        fitted = self.told(None, point)
+        return fitted, *((1.0, point) if fitted.explains else quiet)
 
     def size(self, point: Point) -> float:
         """What is left, in units of the noise."""
         free = max(len(point.r) - sum(map(len, point.starts)), 1)
         return float(np.sqrt(point.cost / free))
 
-    def costs(self, one: Unknown, point: Point, more: float) -> dict[float, float]:
+    def costs(self, unknown: Unknown, point: Point, more: float) -> dict[float, float]:
         """What a change leaves up to each stage, and so much more in units of it."""
         left = point.cost / len(point.r)
-        return {stage: self.at(one, point.w, point.starts, stage).cost + more * left for stage in self.stages}
+        return {stage: self.at(unknown, point.w, point.starts, stage).cost + more * left for stage in self.stages}
 
-    def near(self, one: Unknown, stage: float, base: Point, J: Array) -> list[Point]:
+    def near(self, unknown: Unknown, stage: float, base: Point, J: Array) -> list[Point]:
         """Where a change may begin, best first: some values, and a step by slopes, those by first states being J."""
-        zero = self.at(one, np.zeros(len(one.start)), base.starts, stage)
-        points = [zero] if len(one.start) > 1 else [self.at(one, np.array([w]), base.starts, stage) for w in BEGIN]
-        J = np.hstack([J, self.by_change(one, zero, stage)])
+        zero = self.at(unknown, np.zeros(len(unknown.start)), base.starts, stage)
+        points = (
+            [zero] if len(unknown.start) > 1 else [self.at(unknown, np.array([w]), base.starts, stage) for w in BEGIN]
+        )
+        J = np.hstack([J, self.by_change(unknown, zero, stage)])
         norms = np.where((size := np.linalg.norm(J, axis=0)) > 0, size, 1.0)
         p = -np.linalg.lstsq(J / norms, zero.r, rcond=1e-6)[0] / norms
-        points += [self.moved(one, zero, part * p, stage) for part in (1.0, *PARTS)]
+        points += [self.moved(unknown, zero, fraction * p, stage) for fraction in (1.0, *PARTS)]
         return sorted(points, key=lambda point: point.cost)
 
     def fitted(
         self,
-        one: Unknown,
+        unknown: Unknown,
         stage: float,
         points: Sequence[Point],
         bars: Mapping[float, float],
@@ -149,25 +151,28 @@ class WholeMotions:
 
         None where it does not get far, or leaves more than `bars` say of a stage.
         """
-        points = [self.followed(one, self.at(one, each.w, each.starts, stage), stage) for each in points]
+        points = [
+            self.followed(unknown, self.at(unknown, start_point.w, start_point.starts, stage), stage)
+            for start_point in points
+        ]
         points = self.kept(points, bars.get(stage, np.inf))
         for before, further in pairwise(self.stages[self.stages.index(stage) :]):
             points = self.kept(
-                [self.further(one, point, before, further, widths) for point in points],
+                [self.further(unknown, point, before, further, widths) for point in points],
                 bars.get(further, np.inf),
             )
-        return self.told(one, points[0]) if points else None
+        return self.told(unknown, points[0]) if points else None
 
     def kept(self, points: Sequence[Point], most: float) -> list[Point]:
         """Those that are not given up, leave no more than `most` and are not where another one is, best first."""
-        found: list[Point] = []
+        survivors: list[Point] = []
         for point in sorted(points, key=lambda point: point.cost):
-            near = any(np.all(np.abs(point.w - other.w) < 1e-3) for other in found)
+            near = any(np.all(np.abs(point.w - other.w) < 1e-3) for other in survivors)
             if self.size(point) < HOPELESS and point.cost < most and not near:
-                found.append(point)
-        return found
+                survivors.append(point)
+        return survivors
 
-    def followed(self, one: Unknown | None, point: Point, stage: float, held: int | None = None) -> Point:
+    def followed(self, unknown: Unknown | None, point: Point, stage: float, held: int | None = None) -> Point:
         """Where Gauss-Newton steps lead, shortened by Levenberg's damping where they do not help.
 
         A step that does less than its slopes promise, as where a foot comes to touch a step of time earlier, is as
@@ -175,7 +180,7 @@ class WholeMotions:
         """
         damping = 0.0
         for _ in range(STEPS):
-            J = self.slopes(one, point, stage)
+            J = self.slopes(unknown, point, stage)
             if held is not None:
                 J[:, J.shape[1] - len(point.w) + held] = 0.0
             norms = np.where((size := np.linalg.norm(J, axis=0)) > 0, size, 1.0)
@@ -184,9 +189,9 @@ class WholeMotions:
             for _ in range(TRIES):
                 inverse = s / (s**2 + damping + 1e-12)
                 p = -(V.T @ (inverse * (U.T @ point.r))) / norms
-                there = self.moved(one, point, p, stage)
+                there = self.moved(unknown, point, p, stage)
                 if before - there.cost < AS_PROMISED * (before - float(np.sum((point.r + J @ p) ** 2))):
-                    shorter = [self.moved(one, point, part * p, stage) for part in PARTS]
+                    shorter = [self.moved(unknown, point, fraction * p, stage) for fraction in PARTS]
                     there = min([there, *shorter], key=lambda point: point.cost)
                 if there.cost < before:
                     point, damping = there, damping / 10 if damping > 1e-4 else 0.0
@@ -197,47 +202,47 @@ class WholeMotions:
         return point
 
     def further(
-        self, one: Unknown | None, point: Point, before: float, stage: float, widths: Sequence[float] | None
+        self, unknown: Unknown | None, point: Point, before: float, stage: float, widths: Sequence[float] | None
     ) -> Point:
         """On to the next stage; where more is left there, by smaller stages, unless there are no `widths`.
 
         Where more is left one sample further, or still, from the best of motions that the stage before allows too:
         through impacts what is left is ragged ground, on which steps by slopes stop early.
         """
-        there = self.by_halves(one, point, before, stage, widths)
-        return there if widths is None else self.others(one, point, before, there, stage, widths)
+        there = self.by_halves(unknown, point, before, stage, widths)
+        return there if widths is None else self.others(unknown, point, before, there, stage, widths)
 
     def by_halves(
-        self, one: Unknown | None, point: Point, before: float, stage: float, widths: Sequence[float] | None
+        self, unknown: Unknown | None, point: Point, before: float, stage: float, widths: Sequence[float] | None
     ) -> Point:
         """On to the next stage, and where more is left there, by smaller stages."""
-        there = self.followed(one, self.at(one, point.w, point.starts, stage), stage)
+        there = self.followed(unknown, self.at(unknown, point.w, point.starts, stage), stage)
         if widths is None or self.is_quiet(there, point):
             return there
         middle = self.between(before, stage)
         if middle is None:
-            return self.others(one, point, before, there, stage, widths)
-        half = self.by_halves(one, point, before, middle, widths)
+            return self.others(unknown, point, before, there, stage, widths)
+        half = self.by_halves(unknown, point, before, middle, widths)
         if not self.is_quiet(half, point):
             return there
-        return min(there, self.by_halves(one, half, middle, stage, widths), key=lambda point: point.cost)
+        return min(there, self.by_halves(unknown, half, middle, stage, widths), key=lambda point: point.cost)
 
     def others(
-        self, one: Unknown | None, point: Point, before: float, there: Point, stage: float, widths: Sequence[float]
+        self, unknown: Unknown | None, point: Point, before: float, there: Point, stage: float, widths: Sequence[float]
     ) -> Point:
         """The best of motions as far from a point as the stage before allows, where more is left `there`."""
         if self.is_quiet(there, point) or self.size(there) > STUCK:
             return there
-        J = self.slopes(one, self.at(one, point.w, point.starts, before), before)
+        J = self.slopes(unknown, self.at(unknown, point.w, point.starts, before), before)
         norms = np.where((size := np.linalg.norm(J, axis=0)) > 0, size, np.inf)
         _, s, V = np.linalg.svd(J / norms, full_matrices=False)
         random = np.random.default_rng(0)
         for width in widths:
             allowed = random.standard_normal((DRAWS, len(s))) / np.maximum(s, LEAST_SEEN) @ V / norms
-            each = [self.moved(one, point, width * max(1.0, self.size(point)) * p, stage) for p in allowed]
-            each.sort(key=lambda point: point.cost)
-            found = [self.followed(one, other, stage) for other in each[:BEST]]
-            there = min([there, *found], key=lambda point: point.cost)
+            candidates = [self.moved(unknown, point, width * max(1.0, self.size(point)) * p, stage) for p in allowed]
+            candidates.sort(key=lambda point: point.cost)
+            ends = [self.followed(unknown, other, stage) for other in candidates[:BEST]]
+            there = min([there, *ends], key=lambda point: point.cost)
             if self.is_quiet(there, point):
                 break
         return there
@@ -249,113 +254,115 @@ class WholeMotions:
     def between(self, before: float, stage: float) -> float | None:
         """A stage between two; None where no sample lies between."""
         longest = max(len(piece.times) for piece in self.pieces)
-        first, last = (max(FIRST, round(part * longest)) for part in (before, stage))
+        first, last = (max(FIRST, round(fraction * longest)) for fraction in (before, stage))
         return (first + last) // 2 / longest if last - first > 1 else None
 
-    def moved(self, one: Unknown | None, point: Point, p: Array, stage: float) -> Point:
+    def moved(self, unknown: Unknown | None, point: Point, p: Array, stage: float) -> Point:
         size, k = self.chart.size, len(point.w)
         starts = tuple(self.chart.plus(x, p[i * size : (i + 1) * size]) for i, x in enumerate(point.starts))
-        return self.at(one, point.w + p[len(p) - k :], starts, stage)
+        return self.at(unknown, point.w + p[len(p) - k :], starts, stage)
 
-    def slopes(self, one: Unknown | None, point: Point, stage: float) -> Array:
+    def slopes(self, unknown: Unknown | None, point: Point, stage: float) -> Array:
         """(M, 2 nv pieces + k): by first states through the derivatives of steps, by the change from differences."""
         size, blocks = self.chart.size, []
-        for i, (piece, each, x) in enumerate(zip(self.pieces, self.each, point.starts, strict=True)):
-            by_start = self.by_start(one, point.w, piece, each, x, stage)
+        for i, (piece, stride, x) in enumerate(zip(self.pieces, self.each, point.starts, strict=True)):
+            by_start = self.by_start(unknown, point.w, piece, stride, x, stage)
             block = np.zeros((len(by_start), size * len(self.pieces)))
             block[:, i * size : (i + 1) * size] = by_start
             blocks.append(block)
-        return np.hstack([np.vstack(blocks), self.by_change(one, point, stage)])
+        return np.hstack([np.vstack(blocks), self.by_change(unknown, point, stage)])
 
-    def by_start(self, one: Unknown | None, w: Array, piece: Piece, each: int, x: Array, stage: float) -> Array:
+    def by_start(self, unknown: Unknown | None, w: Array, piece: Piece, stride: int, x: Array, stage: float) -> Array:
         """(m, 2 nv) how residuals of a piece change with its first state."""
-        law, values, shift = self.changed(one, w)
-        n, us = self.part(piece, each, stage)
+        law, values, shift = self.changed(unknown, w)
+        n, us = self.part(piece, stride, stage)
         known = np.isfinite(self.chart.minus(piece.ys[:n], piece.ys[:n]))
-        found = np.zeros((n, self.chart.size, self.chart.size))
+        slopes = np.zeros((n, self.chart.size, self.chart.size))
         try:
             xs = law.run(values, (x - shift)[None], np.full((1, len(us)), self.model.time_step), us[None])[0]
         except SimulationError:
-            return found[known]
+            return slopes[known]
         with applied(law.vector.at(values[law.own])) as model:
             steps = law.derivatives(model, select(model, ()), xs[:-1], us)
         by_start = self.chart.from_motion(x)
         for k in range(n):
-            found[k] = -self.chart.to_motion((xs[k * each] + shift)[None])[0] @ by_start / self.noise[:, None]
-            for step in steps[k * each : (k + 1) * each]:
+            slopes[k] = -self.chart.to_motion((xs[k * stride] + shift)[None])[0] @ by_start / self.noise[:, None]
+            for step in steps[k * stride : (k + 1) * stride]:
                 by_start = step.A @ by_start
-        return found[known]
+        return slopes[known]
 
-    def by_change(self, one: Unknown | None, point: Point, stage: float) -> Array:
+    def by_change(self, unknown: Unknown | None, point: Point, stage: float) -> Array:
         """(M, k) how residuals change with w."""
         columns = [np.zeros((len(point.r), 0))]
         for step in SLOPE * np.eye(len(point.w)):
-            columns.append((self.at(one, point.w + step, point.starts, stage).r - point.r)[:, None] / SLOPE)
+            columns.append((self.at(unknown, point.w + step, point.starts, stage).r - point.r)[:, None] / SLOPE)
         return np.hstack(columns)
 
-    def at(self, one: Unknown | None, w: Array, starts: tuple[Array, ...], stage: float) -> Point:
+    def at(self, unknown: Unknown | None, w: Array, starts: tuple[Array, ...], stage: float) -> Point:
         """The point with its residuals; of a motion that Drake cannot step, ones that are very large."""
-        (law, values, shift), found = self.changed(one, w), []
-        for piece, each, x in zip(self.pieces, self.each, starts, strict=True):
-            n, us = self.part(piece, each, stage)
+        (law, values, shift), residuals = self.changed(unknown, w), []
+        for piece, stride, x in zip(self.pieces, self.each, starts, strict=True):
+            n, us = self.part(piece, stride, stage)
             measured = piece.ys[:n]
             try:
                 xs = law.run(values, (x - shift)[None], np.full((1, len(us)), self.model.time_step), us[None])
-                r = self.chart.minus(measured, xs[0, ::each] + shift) / self.noise
+                r = self.chart.minus(measured, xs[0, ::stride] + shift) / self.noise
             except SimulationError:
                 r = np.full((n, self.chart.size), LOST)
             r = r[np.isfinite(self.chart.minus(measured, measured))]
-            found.append(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
-        return Point(w, starts, np.concatenate(found))
+            residuals.append(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
+        return Point(w, starts, np.concatenate(residuals))
 
     @staticmethod
-    def part(piece: Piece, each: int, stage: float) -> tuple[int, Array]:
+    def part(piece: Piece, stride: int, stage: float) -> tuple[int, Array]:
         """(how many samples of a piece are in a stage, the inputs of the steps between them)."""
         n = min(max(FIRST, round(stage * len(piece.times))), len(piece.times))
-        return n, np.repeat(piece.us[: n - 1], each, axis=0)
+        return n, np.repeat(piece.us[: n - 1], stride, axis=0)
 
-    def changed(self, one: Unknown | None, w: Array) -> tuple[DiscreteMotion, Array, Array]:
+    def changed(self, unknown: Unknown | None, w: Array) -> tuple[DiscreteMotion, Array, Array]:
         """(the motion with the change, its values, by how much columns are shifted (nx,))."""
         shift = np.zeros(self.model.nx)
-        if one is None:
+        if unknown is None:
             return self.law, np.zeros(0), shift
-        values = self.value(one, w)
-        if one.quantity == BIAS:
-            shift[self.model.state_names.index(one.label)] = values[0]
-        return self.law_of(one), values, shift
+        values = self.value(unknown, w)
+        if unknown.quantity == BIAS:
+            shift[self.model.state_names.index(unknown.label)] = values[0]
+        return self.law_of(unknown), values, shift
 
-    def law_of(self, one: Unknown) -> DiscreteMotion:
-        if one.name not in self.laws:
-            self.laws[one.name] = discrete_motion(self.model, Unknowns((one,)), self.pieces)
-        return self.laws[one.name]
+    def law_of(self, unknown: Unknown) -> DiscreteMotion:
+        if unknown.name not in self.laws:
+            self.laws[unknown.name] = discrete_motion(self.model, Unknowns((unknown,)), self.pieces)
+        return self.laws[unknown.name]
 
-    def scale(self, one: Unknown) -> tuple[float, bool]:
+    def scale(self, unknown: Unknown) -> tuple[float, bool]:
         """What w counts in, and whether it is the value's logarithm."""
-        if one.quantity == BIAS:
+        if unknown.quantity == BIAS:
             return HEIGHT, False
-        if one.quantity == CENTER:
-            return CENTER_SCALE * one.size, False
-        if one.quantity == "gravity":
+        if unknown.quantity == CENTER:
+            return CENTER_SCALE * unknown.size, False
+        if unknown.quantity == "gravity":
             return PULL, False
-        if one.size == 0.0:  # a damping of a joint that has none
+        if unknown.size == 0.0:  # a damping of a joint that has none
             return 1.0, False
         return 1.0, True
 
-    def value(self, one: Unknown, w: Array) -> Array:
+    def value(self, unknown: Unknown, w: Array) -> Array:
         """(k,) of w (k,); what cannot be below a bound stays there."""
-        scale, by_log = self.scale(one)
+        scale, by_log = self.scale(unknown)
         return np.asarray(
-            one.start * np.exp(np.clip(w, -7, 7)) if by_log else np.maximum(one.start + scale * w, one.lower)
+            unknown.start * np.exp(np.clip(w, -7, 7))
+            if by_log
+            else np.maximum(unknown.start + scale * w, unknown.lower)
         )
 
-    def told(self, one: Unknown | None, point: Point) -> Fitted:
+    def told(self, unknown: Unknown | None, point: Point) -> Fitted:
         """With the noise that is left, and whether it is noise."""
         residuals, begin = [], 0
         for piece in self.pieces:
             known = np.isfinite(self.chart.minus(piece.ys, piece.ys))
-            each = np.full(known.shape, np.nan)
-            each[known] = point.r[begin : begin + int(known.sum())]
-            residuals.append(each)
+            rows = np.full(known.shape, np.nan)
+            rows[known] = point.r[begin : begin + int(known.sum())]
+            residuals.append(rows)
             begin += int(known.sum())
         every, k = np.concatenate(residuals), len(point.w)
         numbers = np.isfinite(every).sum(axis=0)
@@ -370,21 +377,21 @@ class WholeMotions:
         if size[worst] > most:
             doubt = f"what is left of {names[worst]} is {size[worst]:.3g} times the noise"
         else:
-            entry, chance = colour_of([each[:, seen] for each in residuals], names)
+            entry, chance = colour_of([rows[:, seen] for rows in residuals], names)
             if chance < FALSE_ALARM:
                 doubt = f"what is left of {entry} is not like noise"
-        if one is None:
+        if unknown is None:
             return Fitted("", score, 0, not doubt, doubt, np.zeros(0), np.zeros((0, 2)), point, np.zeros(0))
-        J = self.slopes(one, point, 1.0)
+        J = self.slopes(unknown, point, 1.0)
         left = point.cost / free
         R = np.linalg.qr(J)[1]
-        own = np.linalg.pinv(R[-k:, -k:])
-        half = float(stats.t.ppf(0.975, free)) * np.sqrt(left * np.sum(own**2, axis=1))
+        inverse = np.linalg.pinv(R[-k:, -k:])
+        half = float(stats.t.ppf(0.975, free)) * np.sqrt(left * np.sum(inverse**2, axis=1))
         half[np.abs(np.diag(R[-k:, -k:])) <= 1e-6 * np.linalg.norm(J[:, -k:], axis=0)] = np.inf
-        interval = self.interval(one, point.w - half, point.w + half)
-        return Fitted(one.name, score, k, not doubt, doubt, self.value(one, point.w), interval, point, half)
+        interval = self.interval(unknown, point.w - half, point.w + half)
+        return Fitted(unknown.name, score, k, not doubt, doubt, self.value(unknown, point.w), interval, point, half)
 
-    def widened(self, one: Unknown, fitted: Fitted, rounds: int = 2) -> Fitted:
+    def widened(self, unknown: Unknown, fitted: Fitted, rounds: int = 2) -> Fitted:
         """With an interval that ends where what is left has grown by what it allows, and not within that by slopes.
 
         A value beside it that leaves less is where it is fitted anew.
@@ -399,24 +406,24 @@ class WholeMotions:
                 w[j] += (-1, 1)[i] * reach[i, j]
                 if not np.isfinite(reach[i, j]):
                     break
-                beside = self.followed(one, self.at(one, w, point.starts, 1.0), 1.0, held=j)
+                beside = self.followed(unknown, self.at(unknown, w, point.starts, 1.0), 1.0, held=j)
                 more = beside.cost - point.cost
                 if more < -GAIN and rounds:
-                    found = self.told(one, self.followed(one, beside, 1.0))
-                    return self.widened(one, found if found.explains else fitted, rounds - 1)
+                    refitted = self.told(unknown, self.followed(unknown, beside, 1.0))
+                    return self.widened(unknown, refitted if refitted.explains else fitted, rounds - 1)
                 if more >= rise:
                     break
                 reach[i, j] *= min(2.0, max(1.1, float(np.sqrt(rise / max(more, 1e-9)))))
             else:
                 reach[i, j] = np.inf
-        return fitted._replace(interval=self.interval(one, point.w - reach[0], point.w + reach[1]))
+        return fitted._replace(interval=self.interval(unknown, point.w - reach[0], point.w + reach[1]))
 
-    def interval(self, one: Unknown, low: Array, high: Array) -> Array:
+    def interval(self, unknown: Unknown, low: Array, high: Array) -> Array:
         """(k, 2) values of w."""
-        scale, by_log = self.scale(one)
+        scale, by_log = self.scale(unknown)
         with np.errstate(over="ignore"):
-            ends = [one.start * np.exp(w) if by_log else one.start + scale * w for w in (low, high)]
-        return np.clip(np.column_stack(ends), one.lower, one.upper)
+            ends = [unknown.start * np.exp(w) if by_log else unknown.start + scale * w for w in (low, high)]
+        return np.clip(np.column_stack(ends), unknown.lower, unknown.upper)
 
 
 OF_CONTACT = ("friction", "stiffness", "dissipation", "radius")
@@ -439,8 +446,8 @@ def explain_contact(model: Model, chart: Chart, pieces: Sequence[Piece], stated:
 def may_touch(model: Model, chart: Chart, pieces: Sequence[Piece]) -> bool:
     """Whether bodies would touch with a higher ground and larger spheres, where samples are whole steps apart."""
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
-    each = np.round(np.median(periods))
-    if not model.contract.contact.collision_pairs or each < 1 or np.any(np.abs(periods - each) > CLOCK_TOLERANCE):
+    stride = np.round(np.median(periods))
+    if not model.contract.contact.collision_pairs or stride < 1 or np.any(np.abs(periods - stride) > CLOCK_TOLERANCE):
         return False
     lower = [model.position_names.index(name) for name in _heights(model, chart)]
     radii = {p.name: p.value for p in list_parameters(model) if p.name.endswith(".radius") and "/" not in p.name}
@@ -465,22 +472,26 @@ class _Search:
 
     def found(self) -> Explanation:
         base, stage, point = self.motions.base()
-        each = self.changes()
+        unknowns = self.changes()
         if base.explains:
-            falls = self.falls(each, 1.0, point)
-            tried = [one for one in each if falls[one.name] > 0.5 * self.limit(len(one.start), len(each))]
+            falls = self.falls(unknowns, 1.0, point)
+            tried = [
+                candidate
+                for candidate in unknowns
+                if falls[candidate.name] > 0.5 * self.limit(len(candidate.start), len(unknowns))
+            ]
         else:
             law = replace(self.motions.law, segment=SEGMENT)
             columns = mistaken_columns(self.model, self.chart, self.pieces, law, [self.unchanged])
             if columns is not None:
                 return columns
-            tried = each
+            tried = unknowns
         near = self.near(self.without_twins(tried), stage, point)
         fitted = self.all_fitted(near, stage, FOLLOWED)
-        if not base.explains and not any(one.explains for one in fitted):
+        if not base.explains and not any(candidate.explains for candidate in fitted):
             fitted = self.all_fitted(near, stage, AGAIN_FOLLOWED) or fitted
         fitted = self.again(fitted, tried)
-        return self.said(self.again_unchanged(base, fitted), fitted, each)
+        return self.said(self.again_unchanged(base, fitted), fitted, unknowns)
 
     def near(self, tried: Sequence[Unknown], stage: float, base: Point) -> list[tuple[Unknown, list[Point]]]:
         """Changes with where they begin, first those that come nearest in the stage that the model does not explain."""
@@ -488,72 +499,74 @@ class _Search:
         ahead = stages[min(stages.index(stage) + 1, len(stages) - 1)]
         start = self.motions.at(None, base.w, base.starts, ahead)
         J = self.motions.slopes(None, start, ahead)
-        found = [(one, self.motions.near(one, ahead, base, J)) for one in tried]
-        return sorted(found, key=lambda pair: pair[1][0].cost)
+        pairs = [(unknown, self.motions.near(unknown, ahead, base, J)) for unknown in tried]
+        return sorted(pairs, key=lambda pair: pair[1][0].cost)
 
     def all_fitted(self, near: Sequence[tuple[Unknown, list[Point]]], stage: float, most: int) -> list[Fitted]:
         """Each change from a stage on, from the `most` values at which it is nearest there."""
         fitted: list[Fitted] = []
         bars, best = dict[float, float](), np.inf
-        for i, (one, points) in enumerate(near):
+        for i, (unknown, points) in enumerate(near):
             if self.is_late:
                 break
             widths = None if i >= LOOKED_AT else WIDTHS[: int(most > FOLLOWED)]
-            found = self.motions.fitted(one, stage, points[:most], bars, widths)
-            if found is not None:
-                fitted.append(found)
-            if found is not None and found.explains and self.bic(found) < best:
-                best, bars = self.bic(found), self.motions.costs(one, found.point, TOLD_APART)
+            candidate = self.motions.fitted(unknown, stage, points[:most], bars, widths)
+            if candidate is not None:
+                fitted.append(candidate)
+            if candidate is not None and candidate.explains and self.bic(candidate) < best:
+                best, bars = self.bic(candidate), self.motions.costs(unknown, candidate.point, TOLD_APART)
         return fitted
 
     @staticmethod
     def without_twins(tried: Sequence[Unknown]) -> list[Unknown]:
         """Of friction one body's, where only two touch, as Drake makes one number of both: `again` adds the other's."""
-        frictions = [one for one in tried if one.quantity == "friction"]
-        return [one for one in tried if len(frictions) != 2 or one is not frictions[1]]
+        frictions = [unknown for unknown in tried if unknown.quantity == "friction"]
+        return [unknown for unknown in tried if len(frictions) != 2 or unknown is not frictions[1]]
 
     def again(self, fitted: Sequence[Fitted], tried: Sequence[Unknown]) -> list[Fitted]:
         """With those that are like the best one, of the other body that touches, from its motion: it is theirs too."""
-        best = min((one for one in fitted if one.explains), key=self.bic, default=None)
+        best = min((candidate for candidate in fitted if candidate.explains), key=self.bic, default=None)
         if best is None:
             return list(fitted)
-        found = {one.name: one for one in fitted}
-        for one in tried:
-            before = found.get(one.name)
-            alike = one.quantity in OF_CONTACT and best.name.endswith(f".{one.quantity}")
+        by_name = {candidate.name: candidate for candidate in fitted}
+        for candidate in tried:
+            before = by_name.get(candidate.name)
+            alike = candidate.quantity in OF_CONTACT and best.name.endswith(f".{candidate.quantity}")
             if self.is_late or not alike or (before is not None and before.explains):
                 continue
-            points = [self.motions.at(one, np.array([w]), best.point.starts, 1.0) for w in (best.point.w[0], *AGAIN)]
-            point = self.motions.followed(one, min(points, key=lambda point: point.cost), 1.0)
+            points = [
+                self.motions.at(candidate, np.array([w]), best.point.starts, 1.0) for w in (best.point.w[0], *AGAIN)
+            ]
+            point = self.motions.followed(candidate, min(points, key=lambda point: point.cost), 1.0)
             if self.motions.size(point) < HOPELESS:
-                found[one.name] = self.motions.told(one, point)
-        return list(found.values())
+                by_name[candidate.name] = self.motions.told(candidate, point)
+        return list(by_name.values())
 
     def again_unchanged(self, base: Fitted, fitted: Sequence[Fitted]) -> Fitted:
         """The model as it is, from the motion of the change that explains best: its own search may have ended short."""
-        best = min((one for one in fitted if one.explains), key=self.bic, default=None)
+        best = min((candidate for candidate in fitted if candidate.explains), key=self.bic, default=None)
         if best is None:
             return base
         point = self.motions.followed(None, self.motions.at(None, np.zeros(0), best.point.starts, 1.0), 1.0)
-        return min(base, self.motions.told(None, point), key=lambda one: one.score)
+        return min(base, self.motions.told(None, point), key=lambda candidate: candidate.score)
 
     def unchanged(self, pieces: Sequence[Piece]) -> tuple[float, bool]:
         """How well the model as it is goes through other pieces."""
         base, _, _ = WholeMotions(self.model, self.chart, pieces, self.motions.stated).base()
         return base.score, base.explains
 
-    def falls(self, each: Sequence[Unknown], stage: float, base: Point) -> dict[str, float]:
+    def falls(self, unknowns: Sequence[Unknown], stage: float, base: Point) -> dict[str, float]:
         """By how much changes may lower the squares up to a stage, in units of what is left, by their slopes."""
         start = self.motions.at(None, base.w, base.starts, stage)
         Q = np.linalg.qr(self.motions.slopes(None, start, stage))[0]
         left = start.r - Q @ (Q.T @ start.r)
-        noise, found = left @ left / len(left), {}
-        for one in each:
-            point = self.motions.at(one, np.zeros(len(one.start)), base.starts, stage)
-            J = self.motions.by_change(one, point, stage)
-            own = J - Q @ (Q.T @ J)
-            found[one.name] = float(np.linalg.lstsq(own, left, rcond=1e-6)[0] @ (own.T @ left) / noise)
-        return found
+        noise, falls = left @ left / len(left), {}
+        for unknown in unknowns:
+            point = self.motions.at(unknown, np.zeros(len(unknown.start)), base.starts, stage)
+            J = self.motions.by_change(unknown, point, stage)
+            remainder = J - Q @ (Q.T @ J)
+            falls[unknown.name] = float(np.linalg.lstsq(remainder, left, rcond=1e-6)[0] @ (remainder.T @ left) / noise)
+        return falls
 
     def limit(self, freedom: int, tried: int) -> float:
         """By how much a score must fall, where so many changes are tried."""
@@ -570,14 +583,14 @@ class _Search:
         names = [n for q in OF_CONTACT for n in known if n.endswith(f".{q}") and "/" not in n and np.all(known[n] > 0)]
         names += [f"{height}.{BIAS}" for height in _heights(self.model, self.chart)]
         names += [n for q in OF_MOTION for n in known if n.endswith(f".{q}")]
-        found: list[Unknown] = []
+        unknowns: list[Unknown] = []
         for name in names:
             try:
-                found += choose_unknowns(self.model, None, [name]).each
+                unknowns += choose_unknowns(self.model, None, [name]).each
             except DrakeDiffError:  # a body without mass
                 continue
         moved = self.moved_by_weight()
-        return [one for one in found if one.quantity not in (MASS, CENTER) or one.label in moved]
+        return [unknown for unknown in unknowns if unknown.quantity not in (MASS, CENTER) or unknown.label in moved]
 
     def moved_by_weight(self) -> set[str]:
         """Bodies that are not fixed to the world."""
@@ -589,59 +602,71 @@ class _Search:
     def count(self) -> int:
         return int(sum(np.isfinite(piece.ys).sum() for piece in self.pieces))
 
-    def bic(self, one: Fitted) -> float:
-        return one.score + one.freedom * float(np.log(self.count))
+    def bic(self, candidate: Fitted) -> float:
+        return candidate.score + candidate.freedom * float(np.log(self.count))
 
     def said(self, base: Fitted, fitted: Sequence[Fitted], tried: Sequence[Unknown]) -> Explanation:
-        own = {one.name: one for one in tried}
+        unknowns = {candidate.name: candidate for candidate in tried}
         # Through impacts the model's own search may end short of a motion that one with next to no change finds.
-        none = {one.name: one for one in fitted if one.explains and is_nothing(own[one.name], one)}
-        unchanged = min([base, *none.values()], key=lambda one: (not one.explains, one.score))
-        evidence = {one.name: unchanged.score - one.score for one in fitted}
+        none = {
+            candidate.name: candidate
+            for candidate in fitted
+            if candidate.explains and is_nothing(unknowns[candidate.name], candidate)
+        }
+        unchanged = min([base, *none.values()], key=lambda candidate: (not candidate.explains, candidate.score))
+        evidence = {candidate.name: unchanged.score - candidate.score for candidate in fitted}
         end = search_ended(LONGEST_SEARCH) if self.ended_early else ""
         named = [
-            one
-            for one in sorted(fitted, key=self.bic)
-            if one.explains and one.name not in none and evidence[one.name] > self.limit(one.freedom, len(tried))
+            candidate
+            for candidate in sorted(fitted, key=self.bic)
+            if candidate.explains
+            and candidate.name not in none
+            and evidence[candidate.name] > self.limit(candidate.freedom, len(tried))
         ]
-        named = [one for one in named if self.bic(one) - self.bic(named[0]) < SAME]
+        named = [candidate for candidate in named if self.bic(candidate) - self.bic(named[0]) < SAME]
         if not named and unchanged.explains:
             return Explanation((), {}, {}, (), True, f"Nothing: the model explains it.{end}", evidence)
         if not named:
             near = min(fitted, key=self.bic, default=base)
             what = f"with {near.name}, {near.doubt}" if near.name and near.doubt else "none comes near it"
             return Explanation((), {}, {}, (), False, f"{NO_CHANGE}; {what}.{end}", evidence)
-        named = [self.motions.widened(own[one.name], one) for one in named]
-        texts = [self.words(own[one.name], one) for one in named]
+        named = [self.motions.widened(unknowns[candidate.name], candidate) for candidate in named]
+        texts = [self.words(unknowns[candidate.name], candidate) for candidate in named]
         tail = ": this explains the recording" if len(named) == 1 else ": the recording cannot tell"
         steps = f"by the model's own steps of {1e3 * self.model.time_step:.4g} ms"
         return Explanation(
             names=(named[0].name,),
-            values={one.name: float(one.value[0]) if len(one.value) == 1 else frozen(one.value) for one in named},
-            intervals={one.name: frozen(one.interval[0] if len(one.value) == 1 else one.interval) for one in named},
-            alternatives=tuple((one.name,) for one in named[1:]),
+            values={
+                candidate.name: float(candidate.value[0]) if len(candidate.value) == 1 else frozen(candidate.value)
+                for candidate in named
+            },
+            intervals={
+                candidate.name: frozen(candidate.interval[0] if len(candidate.value) == 1 else candidate.interval)
+                for candidate in named
+            },
+            alternatives=tuple((candidate.name,) for candidate in named[1:]),
             explained=True,
             sentence=f"{', or '.join(texts)}{tail}, {steps}.{end}",
             evidence=evidence,
         )
 
     @staticmethod
-    def words(own: Unknown, one: Fitted) -> str:
-        unit = "m" if own.quantity == BIAS else own.unit
-        return changed_to(own.name, one.value, one.interval, own.start, unit)
+    def words(unknown: Unknown, candidate: Fitted) -> str:
+        unit = "m" if unknown.quantity == BIAS else unknown.unit
+        return changed_to(unknown.name, candidate.value, candidate.interval, unknown.start, unit)
 
 
-def is_nothing(own: Unknown, one: Fitted) -> bool:
+def is_nothing(unknown: Unknown, candidate: Fitted) -> bool:
     """Whether a change is too small to tell from none: within its interval, or next to nothing of its own scale."""
-    within = bool(np.all((one.interval[:, 0] <= own.start) & (own.start <= one.interval[:, 1])))
-    known = bool(np.all(np.isfinite(one.half)))
-    return (known and within) or (own.size > 0 and bool(np.all(np.abs(one.point.w) < NEXT_TO_NOTHING)))
+    within = bool(np.all((candidate.interval[:, 0] <= unknown.start) & (unknown.start <= candidate.interval[:, 1])))
+    known = bool(np.all(np.isfinite(candidate.half)))
+    return (known and within) or (unknown.size > 0 and bool(np.all(np.abs(candidate.point.w) < NEXT_TO_NOTHING)))
 
 
 def _heights(model: Model, chart: Chart) -> list[str]:
     """Positions along which nearly all weight acts: where the ground is moves their zero."""
     set_state(model.double, model.default_state)
     pulls = np.abs(model.plant.CalcGravityGeneralizedForces(model.double.context))
-    each = [*chart.coordinates.single, *((i + 6, j + 5) for i, j in chart.coordinates.free)]
+    pairs = [*chart.coordinates.single, *((i + 6, j + 5) for i, j in chart.coordinates.free)]
     most = float(np.max(pulls, initial=0.0))
-    return [model.position_names[i] for i, j in each if most > 0 and pulls[j] > 0.9 * most]
+    return [model.position_names[i] for i, j in pairs if most > 0 and pulls[j] > 0.9 * most]

@@ -198,8 +198,8 @@ def _end(
             at_high = min(at_high, room[i])
     at_low = max(at_low, 0.0)
     for k in range(SEARCHED):
-        part = at_low / max(at_low - at_high, 1e-300) if at_low > 0 and k % 3 < 2 else 0.5
-        t = low + (high - low) * part
+        fraction = at_low / max(at_low - at_high, 1e-300) if at_low > 0 and k % 3 < 2 else 0.5
+        t = low + (high - low) * fraction
         _step(s, c, w, x, t, effort, g, nothing, out)
         _room(s, w, out, effort, g, now)
         least = np.inf

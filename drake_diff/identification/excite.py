@@ -268,12 +268,12 @@ class _Design:
         if not self.follows:
             us = np.swapaxes(series @ phi.T, 1, 2)[:, :-1] + middle
             hs = np.tile(np.concatenate([law.cut(h) for h in np.diff(times)]), (K, 1))
-            each = hs.shape[1] // (n - 1)
+            stride = hs.shape[1] // (n - 1)
             values = self.unknowns.values(self.unknowns.z_start)
             with np.errstate(over="ignore", invalid="ignore"):
-                xs = law.run(values, np.tile(self.x0, (K, 1)), hs, np.repeat(us, each, axis=1))
-            return xs[:, ::each], us, None
-        q, v, a = (np.swapaxes(series @ part.T, 1, 2) for part in (phi, slope, bend))
+                xs = law.run(values, np.tile(self.x0, (K, 1)), hs, np.repeat(us, stride, axis=1))
+            return xs[:, ::stride], us, None
+        q, v, a = (np.swapaxes(series @ waves.T, 1, 2) for waves in (phi, slope, bend))
         xs = np.concatenate([q + middle, v], axis=2)
         between = (xs[:, 1:] + xs[:, :-1]) / 2
         flat = between.reshape(-1, self.model.nx)
@@ -302,8 +302,8 @@ class _Design:
         """(..., n - 1, 2 (nx + nu)) how far each sample is below and above limits, in ranges; -1 without one."""
         low, high = self.limits
         size = np.where(np.isfinite(high - low), (high - low) / 2, 1.0)
-        each = np.concatenate([xs[..., 1:, :], us], axis=-1)
-        both = np.concatenate([(low - each) / size, (each - high) / size], axis=-1)
+        values = np.concatenate([xs[..., 1:, :], us], axis=-1)
+        both = np.concatenate([(low - values) / size, (values - high) / size], axis=-1)
         return np.where(np.isfinite(both), both, np.where(np.isnan(both) | (both > 0), 1e3, -1.0))
 
     def over(self, c: Array) -> Array:
@@ -336,8 +336,8 @@ class _Design:
         if point is None:
             return [np.zeros((len(z), len(z)))] * len(xs)
         with np.errstate(over="ignore", invalid="ignore"):
-            each = fit.reduce(point).each
-        return [R if np.all(np.isfinite(R)) else np.zeros_like(R) for R in each]
+            Rs = fit.reduce(point).each
+        return [R if np.all(np.isfinite(R)) else np.zeros_like(R) for R in Rs]
 
     def told(self, xs: Array, us: Array) -> tuple[Array, tuple[str, ...]]:
         """(R of one motion as `identify` would cut it, what stays open)."""
@@ -368,21 +368,25 @@ class _Design:
         scale = np.where(np.isfinite(widths), widths / FAR, 1 / np.where(norms > 0, norms, 1.0))
         order = np.argsort([-self.worth(R, scale) for R in Rs], kind="stable")
         tried = self.searched(starts[order[0]], scale, most) if most else []
-        best = next((one for one in map(self.kept, [*tried, *(starts[i] for i in order)]) if one), None)
-        middle = next((one for one in map(self.kept, (starts[i] for i in order[len(order) // 2 :])) if one), None)
+        best = next((motion for motion in map(self.kept, [*tried, *(starts[i] for i in order)]) if motion), None)
+        middle = next(
+            (motion for motion in map(self.kept, (starts[i] for i in order[len(order) // 2 :])) if motion), None
+        )
         if best is None or middle is None:
             raise ModelError(f"{self.model.name}: no motion from x0 was found that keeps the limits at every sample")
         R, open_ = self.told(*best)
         R_random, _ = self.told(*middle)
         R_rest, _ = self.told(*self.simulated(np.zeros(size)))
         gain = float(np.exp((self.worth(R, scale) - self.worth(R_random, scale)) / (2 * len(scale))))
-        each = [self.deviations(one) for one in (R, R_random, R_rest)]
-        units = {one.name: one.unit for one in self.unknowns.each}
+        deviations = [self.deviations(root) for root in (R, R_random, R_rest)]
+        units = {unknown.name: unknown.unit for unknown in self.unknowns.each}
         return Excitation(
             times=frozen(self.times), xs=frozen(best[0]), us=frozen(best[1]),
-            deviations=each[0], random=each[1], rest=each[2],
+            deviations=deviations[0], random=deviations[1], rest=deviations[2],
             units=units, unidentifiable=open_, gain=gain, noise=noise,
-            sentence=excitation_sentence(self.duration, each[0], each[1], each[2], units, open_, gain),
+            sentence=excitation_sentence(
+                self.duration, deviations[0], deviations[1], deviations[2], units, open_, gain
+            ),
         )  # fmt: skip
 
     def deviations(self, R: Array) -> dict[str, Any]:
@@ -393,9 +397,9 @@ class _Design:
         """c, made smaller until limits are kept and bodies do not touch; None where no part of it does."""
         parts = 0.85 ** np.arange(SHRINKINGS)
         inside = np.max(self.over(parts[:, None] * c), axis=(1, 2)) <= 0
-        for part in parts[inside]:
-            if not self.touches(self.planned(self.rough, part * c[None], self.few)[0][0]):
-                return np.asarray(part * c)
+        for fraction in parts[inside]:
+            if not self.touches(self.planned(self.rough, fraction * c[None], self.few)[0][0]):
+                return np.asarray(fraction * c)
         return None
 
     def touches(self, xs: Array) -> bool:
@@ -409,8 +413,8 @@ class _Design:
 
     def kept(self, c: Array) -> tuple[Array, Array] | None:
         """The motion, where it, or one that is a little smaller, keeps all limits at every sample."""
-        for part in SMALLER:
-            xs, us = self.simulated(part * c)
+        for fraction in SMALLER:
+            xs, us = self.simulated(fraction * c)
             if np.all(np.isfinite(xs)) and np.max(self.beyond(xs, us)) <= 0 and not self.touches(xs):
                 return xs, us
         return None
@@ -427,7 +431,7 @@ class _Design:
 
         bounded = np.flatnonzero(np.isfinite(np.concatenate(self.limits)))
         been, box = [c], BOX
-        worth, over = (each[0] for each in of(c[None]))
+        worth, over = (values[0] for values in of(c[None]))
         for _ in range(most):
             moved, moved_over = of(c + DIFFERENCE * np.eye(len(c)))
             gradient, J = (moved - worth) / DIFFERENCE, (moved_over - over).T / DIFFERENCE

@@ -104,11 +104,11 @@ def explain(
         return explain_contact(model, chart, pieces, given_noise(model, chart, noise))
     if why or isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: causes are looked for in motions in continuous time only, and {why}")
-    found = _Search(model, tree, chart, pieces, given_noise(model, chart, noise)).found()
-    if found.explained or motion != "auto" or not may_touch(model, chart, pieces):
-        return found
+    explanation = _Search(model, tree, chart, pieces, given_noise(model, chart, noise)).found()
+    if explanation.explained or motion != "auto" or not may_touch(model, chart, pieces):
+        return explanation
     touched = explain_contact(model, chart, pieces, given_noise(model, chart, noise))
-    return touched if touched.explained else also_touching(found, touched)
+    return touched if touched.explained else also_touching(explanation, touched)
 
 
 @dataclass(eq=False)
@@ -121,23 +121,25 @@ class _Search(Race):
 
     def found(self) -> Explanation:
         self.prepare()
-        found, base, alone, runners = self.by_one()
-        if found is None and not base.explains:
-            found = self.by_friction_that_gives(runners, base)
-        if found is None and not base.explains and not self.is_late and self.may_be_steps(runners):
-            found = self.by_steps(base)
-        if found is None and not base.explains and not self.is_late:
-            found = self.by_two(alone, runners, base)
-        return found or (self.right() if base.explains else self.unexplained(base))
+        explanation, base, alone, runners = self.by_one()
+        if explanation is None and not base.explains:
+            explanation = self.by_friction_that_gives(runners, base)
+        if explanation is None and not base.explains and not self.is_late and self.may_be_steps(runners):
+            explanation = self.by_steps(base)
+        if explanation is None and not base.explains and not self.is_late:
+            explanation = self.by_two(alone, runners, base)
+        return explanation or (self.right() if base.explains else self.unexplained(base))
 
     def by_one(self) -> tuple[Explanation | None, Tried, View, list[Runner]]:
         nothing = self.of(())
-        one = self.running((), nothing, self.cut, self.starts, nothing.z_start, NO_PROMISE)
+        runner = self.running((), nothing, self.cut, self.starts, nothing.z_start, NO_PROMISE)
         before = np.inf
-        while one.step() and self.is_hopeless(one.left) and one.left < FALLS * before:
-            before = one.left
-        most = 1 if self.is_hopeless(one.left) else STEPS
-        base = self.solved((), nothing, one.fit.law, self.cut, self.starts if most == 1 else one.starts, one.z, most)
+        while runner.step() and self.is_hopeless(runner.left) and runner.left < FALLS * before:
+            before = runner.left
+        most = 1 if self.is_hopeless(runner.left) else STEPS
+        base = self.solved(
+            (), nothing, runner.fit.law, self.cut, self.starts if most == 1 else runner.starts, runner.z, most
+        )
         alone = self.view(self.cut, self.unknowns.z_start, base.starts if base.explains else self.starts)
         if alone is None:
             raise SimulationError(f"{self.model.name} has no motion near the states that were measured")
@@ -148,7 +150,7 @@ class _Search(Race):
         self.nearest = min([self.nearest or base, base, *singles], key=self.bic)
         best = min(singles, key=self.bic, default=None)
         if self.step is None and best is not None:
-            left = next(one.left for one in runners if one.names == best.names)
+            left = next(runner.left for runner in runners if runner.names == best.names)
             self.alone, self.share = best, 1 - left / alone.most
         return self.named(named) if named else None, base, alone, runners
 
@@ -156,41 +158,44 @@ class _Search(Race):
         """Where dry friction of a joint left least, and not noise: the same, which gives way where it holds."""
         if not runners or self.is_late or self.tree.coupling is not None:
             return None
-        one = runners[0]
-        law = self.law(one.fit.unknowns, self.longest, smooth=False)
+        runner = runners[0]
+        law = self.law(runner.fit.unknowns, self.longest, smooth=False)
         dry = law.dry
-        if len(one.names) > 1 or not dry:
+        if len(runner.names) > 1 or not dry:
             return None
         (j,) = dry
-        label = one.names[0].rsplit(".", 1)[0]
-        mass = Dynamics(self.tree, self.tree.numbers).mass(one.starts[:1])
+        label = runner.names[0].rsplit(".", 1)[0]
+        mass = Dynamics(self.tree, self.tree.numbers).mass(runner.starts[:1])
         inertia = HELD_BY / float(np.linalg.inv(mass)[0, j, j])
         held = [
             Unknown(f"{label}.{quantity}", unit, np.array([start]), 0.0, start)
             for quantity, unit, start in ((HELD_INERTIA, "", inertia), (HELD_DAMPING, "", CAUGHT * inertia))
         ]
-        unknowns = Unknowns((*self.of(one.names).each, *held), as_in_files=True)
-        z = np.concatenate([one.z, unknowns.z_start[1:]])
-        gives = self.running(one.names, unknowns, self.cut, one.starts, z, NO_PROMISE)
+        unknowns = Unknowns((*self.of(runner.names).each, *held), as_in_files=True)
+        z = np.concatenate([runner.z, unknowns.z_start[1:]])
+        gives = self.running(runner.names, unknowns, self.cut, runner.starts, z, NO_PROMISE)
         try:
             self.improve([gives])
             there = gives.fit.at(gives.z, gives.starts)
             if there is None or self.is_hopeless(there.value):
                 return None
-            if there.value + len(held) * float(np.log(self.count)) > one.left:
+            if there.value + len(held) * float(np.log(self.count)) > runner.left:
                 return None
-            found = self.solved(one.names, unknowns, gives.fit.law, self.cut, gives.starts, gives.z)
+            candidate = self.solved(runner.names, unknowns, gives.fit.law, self.cut, gives.starts, gives.z)
         except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
             return None
-        self.nearest = min([self.nearest or base, found], key=self.bic)
-        named = self.enough(base, [found], len(self.unknowns.each))
+        self.nearest = min([self.nearest or base, candidate], key=self.bic)
+        named = self.enough(base, [candidate], len(self.unknowns.each))
         if not named:
             return None
-        more, slower = (float(found.values[each.name]) for each in held)
-        own = {name: found.values[name] for name in one.names}, {name: found.intervals[name] for name in one.names}
-        said = self.named([found._replace(values=own[0], intervals=own[1])])
+        more, slower = (float(candidate.values[unknown.name]) for unknown in held)
+        mappings = (
+            {name: candidate.values[name] for name in runner.names},
+            {name: candidate.intervals[name] for name in runner.names},
+        )
+        explanation = self.named([candidate._replace(values=mappings[0], intervals=mappings[1])])
         way = f"as if by {more:.3g} more of inertia and {slower:.3g} of damping"
-        return self.ended_with(said, f"with friction that gives way where it holds, {way}")
+        return self.ended_with(explanation, f"with friction that gives way where it holds, {way}")
 
     def by_two(self, alone: View, runners: Sequence[Runner], base: Tried) -> Explanation | None:
         count = len(alone.freedoms)
@@ -198,33 +203,35 @@ class _Search(Race):
         named = self.enough(base, pairs, count * (count - 1) // 2)
         if named:
             named = self.enough(base, [*self.halves(named), *named], count * (count - 1) // 2)
-            named = [one for one in named if not any(set(other.names) < set(one.names) for other in named)]
+            named = [
+                candidate for candidate in named if not any(set(other.names) < set(candidate.names) for other in named)
+            ]
         self.nearest = min([self.nearest or base, *pairs], key=self.bic)
         return self.named(named) if named else None
 
     def halves(self, pairs: Sequence[Tried]) -> list[Tried]:
         """Each change of some pairs alone, from where the pair was: the other one may do nothing."""
-        found: dict[str, Tried] = {}
+        halves: dict[str, Tried] = {}
         for pair in pairs:
             unknowns = self.of([name for name in pair.names if not name.endswith(f".{LIMIT}")])
-            for one, s in self.each_of(unknowns) if len(unknowns.each) == 2 else []:
-                if one.name not in found:
-                    alone, z, cut = self.of([one.name]), pair.z[s], self.cut
-                    runner = self.running((one.name,), alone, cut, pair.starts, z, NO_PROMISE)
+            for unknown, s in self.each_of(unknowns) if len(unknowns.each) == 2 else []:
+                if unknown.name not in halves:
+                    alone, z, cut = self.of([unknown.name]), pair.z[s], self.cut
+                    runner = self.running((unknown.name,), alone, cut, pair.starts, z, NO_PROMISE)
                     if not runner.step() or self.is_hopeless(runner.left):
                         continue
                     law = runner.fit.law
-                    found[one.name] = self.solved((one.name,), alone, law, cut, pair.starts, z)
-        return list(found.values())
+                    halves[unknown.name] = self.solved((unknown.name,), alone, law, cut, pair.starts, z)
+        return list(halves.values())
 
     def may_be_steps(self, runners: Sequence[Runner]) -> bool:
         """Whether Euler steps leave clearly less than continuous time, or less and little, with one change or none."""
-        whole = [one for one in runners if not one.special and one.fit.unknowns.delay is None]
-        whole = [one for one in whole if np.isfinite(one.left)][:BESIDE]
+        whole = [runner for runner in runners if not runner.special and runner.fit.unknowns.delay is None]
+        whole = [runner for runner in whole if np.isfinite(runner.left)][:BESIDE]
         nothing = self.of(())
-        each: list[tuple[tuple[str, ...], Unknowns, Array, Array]] = [((), nothing, nothing.z_start, self.starts)]
-        each += [(one.names, one.fit.unknowns, one.z, one.starts) for one in whole]
-        for names, unknowns, z, starts in each:
+        cases: list[tuple[tuple[str, ...], Unknowns, Array, Array]] = [((), nothing, nothing.z_start, self.starts)]
+        cases += [(runner.names, runner.fit.unknowns, runner.z, runner.starts) for runner in whole]
+        for names, unknowns, z, starts in cases:
             before = self.left_by(None, names, unknowns, z, starts)
             after = min((self.left_by(step, names, unknowns, z, starts) for step in self.steps), default=np.inf)
             if after < FALLS * before or (after < before and not self.is_hopeless(after)):
@@ -234,8 +241,8 @@ class _Search(Race):
     def left_by(self, step: float | None, names: tuple[str, ...], unknowns: Unknowns, z: Array, starts: Array) -> float:
         """What a step of Gauss and Newton leaves of the squares by Euler steps of this length."""
         self.step = step
-        one = self.running(names, unknowns, self.cut, starts, z, NO_PROMISE)
-        left = one.left if one.step() else np.inf
+        runner = self.running(names, unknowns, self.cut, starts, z, NO_PROMISE)
+        left = runner.left if runner.step() else np.inf
         self.step = None
         return left
 
@@ -245,55 +252,57 @@ class _Search(Race):
         promise = Promise((), 0.0, 0.0, np.zeros(0))
         for step in self.steps:
             self.step = step
-            one = self.running((), nothing, self.cut, self.starts, nothing.z_start, promise)
-            seen = self.view(self.cut, self.unknowns.z_start, one.starts) if one.step() else None
+            runner = self.running((), nothing, self.cut, self.starts, nothing.z_start, promise)
+            seen = self.view(self.cut, self.unknowns.z_start, runner.starts) if runner.step() else None
             if seen is not None:
-                each = seen.promises([(i,) for i in range(len(seen.freedoms))], float(np.log(self.count)))
-                left[step] = each[0].left if each else seen.most
+                promises = seen.promises([(i,) for i in range(len(seen.freedoms))], float(np.log(self.count)))
+                left[step] = promises[0].left if promises else seen.most
         self.step = min(left, key=left.__getitem__, default=None)
         if self.step is None:
             return None
-        name, own = f"model.{TIME_STEP}", abs(self.step / self.model.time_step - 1) < 1e-6
+        name, is_model_step = f"model.{TIME_STEP}", abs(self.step / self.model.time_step - 1) < 1e-6
         try:
-            found, stepped, _, _ = self.by_one()
+            explanation, stepped, _, _ = self.by_one()
         finally:
             step, self.step = self.step, None
-        if found is None and not (stepped.explains and base.score - stepped.score > self.least(1.0, len(self.steps))):
+        if explanation is None and not (
+            stepped.explains and base.score - stepped.score > self.least(1.0, len(self.steps))
+        ):
             return None
         steps = f"semi-implicit Euler steps of {1e3 * step:.4g} ms"
-        if own:
+        if is_model_step:
             steps += ", as the model makes them"
-        more = () if own else (name,)
-        if found is None:
-            sentence = f"{'Nothing: the model' if own else name} explains it, by {steps}."
-            if not own:
+        more = () if is_model_step else (name,)
+        if explanation is None:
+            sentence = f"{'Nothing: the model' if is_model_step else name} explains it, by {steps}."
+            if not is_model_step:
                 sentence = f"{name} is {step:.4g} s, not {self.model.time_step:.4g}: {steps} explain the recording."
-            values = {} if own else {name: step}
-            within = {} if own else {name: frozen([step, step])}
+            values = {} if is_model_step else {name: step}
+            within = {} if is_model_step else {name: frozen([step, step])}
             return Explanation(more, values, within, (), True, sentence, self.evidence)
         return replace(
-            self.ended_with(found, f"by {steps}"),
-            names=(*found.names, *more),
-            values={**found.values, **({} if own else {name: step})},
-            intervals={**found.intervals, **({} if own else {name: frozen([step, step])})},
-            alternatives=tuple((*names, *more) for names in found.alternatives),
+            self.ended_with(explanation, f"by {steps}"),
+            names=(*explanation.names, *more),
+            values={**explanation.values, **({} if is_model_step else {name: step})},
+            intervals={**explanation.intervals, **({} if is_model_step else {name: frozen([step, step])})},
+            alternatives=tuple((*names, *more) for names in explanation.alternatives),
         )
 
     def paired(self, alone: View, runners: Sequence[Runner], base: Tried) -> list[Tried]:
         """Pairs beside the change that left least, where that is little; those that promise most; and beside others."""
         later: list[Searching] = []  # searches for a limit or a delay, which take longest
-        beside: list[Searching] = [partial(self.beside, one, base, later) for one in runners[:BESIDE]]
+        beside: list[Searching] = [partial(self.beside, runner, base, later) for runner in runners[:BESIDE]]
         first = 1 if runners and not self.is_hopeless(runners[0].left) else 0
         both: list[Searching] = [partial(self.at_the_model, alone, base), partial(self.beside_a_delay, base)]
-        found: list[Tried] = []
+        candidates: list[Tried] = []
         for search in chain(beside[:first], both, beside[first:], later):
-            found += search()
-            if any(one.explains for one in found) or self.is_late:
+            candidates += search()
+            if any(candidate.explains for candidate in candidates) or self.is_late:
                 break
-        return found
+        return candidates
 
     def at_the_model(self, alone: View, base: Tried) -> list[Tried]:
-        names = [one.name for one in self.unknowns.each]
+        names = [unknown.name for unknown in self.unknowns.each]
         moving = [i for i, name in enumerate(names) if not self.is_of_inputs(self.plain(name))]
         return self.tried(alone, self.chosen(alone, combinations(moving, 2)), base)[0]
 
@@ -304,27 +313,27 @@ class _Search(Race):
         if runner.special:
             later.append(partial(self.beside_inputs, runner, base))
             return []
-        i = [one.name for one in self.unknowns.each].index(runner.names[0])
+        i = [unknown.name for unknown in self.unknowns.each].index(runner.names[0])
         seen = self.view(self.cut, self.with_one(i, runner.z), runner.starts)
         if seen is None:
             return []
         others = [(i, k) for k in range(len(seen.freedoms)) if k != i]
         chosen = self.chosen(seen, others, LOOKED_AT_BESIDE)
-        plain = {own: one for own, one in chosen.items() if not any(map(self.is_of_inputs, own))}
-        rest = {own: one for own, one in chosen.items() if own not in plain}
+        plain = {names: promise for names, promise in chosen.items() if not any(map(self.is_of_inputs, names))}
+        rest = {names: promise for names, promise in chosen.items() if names not in plain}
         later.append(lambda: self.tried(seen, rest, base)[0])
         return self.tried(seen, plain, base)[0]
 
     def beside_a_delay(self, base: Tried) -> list[Tried]:
         """A change beside a delay: what each promises together with some more delay, from several delays."""
-        each = self.unknowns.each
-        last = next((i for i, one in enumerate(each) if one.quantity == DELAY), None)
+        unknowns = self.unknowns.each
+        last = next((i for i, unknown in enumerate(unknowns) if unknown.quantity == DELAY), None)
         if last is None:
             return []
         price = float(np.log(self.count))
-        others = [(i, last) for i, one in enumerate(each) if not self.is_of_inputs(self.plain(one.name))]
+        others = [(i, last) for i, unknown in enumerate(unknowns) if not self.is_of_inputs(self.plain(unknown.name))]
         best: dict[int, tuple[float, View, Promise]] = {}
-        name, least = each[last].name, np.inf
+        name, least = unknowns[last].name, np.inf
         delay = float(self.delayed((name,), self.of([name]), NO_PROMISE).z[0])
         for _ in range(DELAYS_SEEN):
             if best and self.is_late:
@@ -345,14 +354,14 @@ class _Search(Race):
             if abs(delay - before) < NEAR * delay:
                 break
         order = sorted(best, key=lambda i: best[i][0])
-        groups = [[i for i in order if (len(each[i].start) == 1) == small][:LOOKED_AT] for small in (True, False)]
+        groups = [[i for i in order if (len(unknowns[i].start) == 1) == small][:LOOKED_AT] for small in (True, False)]
         chosen = [
             i
             for group in groups
             for k, i in enumerate(group)
             if k < LOOKED_AT_BESIDE or best[i][0] < BEHIND * best[group[0]][0]
         ]
-        names = {i: (each[i].name, each[last].name) for i in chosen}
+        names = {i: (unknowns[i].name, unknowns[last].name) for i in chosen}
         return self.raced([self.runner(*best[i][1:], names[i]) for i in chosen], base)[0]
 
     def beside_inputs(self, runner: Runner, base: Tried) -> list[Tried]:
@@ -362,38 +371,38 @@ class _Search(Race):
         seen = self.view(pieces, self.unknowns.z_start, runner.starts)
         if seen is None:
             return []
-        each = [one.name for one in self.unknowns.each]
-        others = [(i,) for i, name in enumerate(each) if not self.is_of_inputs(self.plain(name))]
+        names = [unknown.name for unknown in self.unknowns.each]
+        others = [(i,) for i, name in enumerate(names) if not self.is_of_inputs(self.plain(name))]
         runners: list[Runner] = []
         for promise in seen.promises(others, float(np.log(self.count)))[:LOOKED_AT_BESIDE]:
             if runners and self.is_late:
                 break
-            name = each[promise.members[0]]
+            name = names[promise.members[0]]
             runners.append(self.searched(special, (name, special), self.of([name]), promise, value))
         return self.raced(runners, base)[0]
 
     def named(self, named: Sequence[Tried]) -> Explanation:
-        texts = [" and ".join(self.changed(one, name) for name in one.names) for one in named]
+        texts = [" and ".join(self.changed(candidate, name) for name in candidate.names) for candidate in named]
         both = "this explains" if len(named[0].names) == 1 else "these two explain"
         tail = f": {both} the recording" if len(named) == 1 else ": the recording cannot tell"
         return Explanation(
             names=named[0].names,
-            values={name: value for one in reversed(named) for name, value in one.values.items()},
-            intervals={name: value for one in reversed(named) for name, value in one.intervals.items()},
-            alternatives=tuple(one.names for one in named[1:]),
+            values={name: value for candidate in reversed(named) for name, value in candidate.values.items()},
+            intervals={name: value for candidate in reversed(named) for name, value in candidate.intervals.items()},
+            alternatives=tuple(candidate.names for candidate in named[1:]),
             explained=True,
             sentence=f"{', or '.join(texts)}{tail}.{self.end}",
             evidence=self.evidence,
         )
 
-    def changed(self, one: Tried, name: str) -> str:
+    def changed(self, candidate: Tried, name: str) -> str:
         label, quantity = name.rsplit(".", 1)
-        value, interval = np.atleast_1d(one.values[name]), np.atleast_2d(one.intervals[name])
+        value, interval = np.atleast_1d(candidate.values[name]), np.atleast_2d(candidate.intervals[name])
         if quantity == LIMIT:
             start, unit = self.tree.limits[[self.model.input_names.index(label)]], ""
         else:
-            own = next(each for each in self.unknowns.each if each.name == name)
-            start, unit = own.start, own.unit
+            unknown = next(unknown for unknown in self.unknowns.each if unknown.name == name)
+            start, unit = unknown.start, unknown.unit
         return changed_to(name, value, interval, start, unit)
 
     @property
@@ -406,9 +415,9 @@ class _Search(Race):
     def unexplained(self, base: Tried) -> Explanation:
         nearest = self.nearest or base
         if self.alone is not None and self.share > MOST_OF_IT:
-            one, share = self.alone, 100 * (1 - float(f"{1 - self.share:.1g}"))
-            most = " and ".join(self.changed(one, name) for name in one.names)
-            tail = f"{one.doubt}, and no second change that was tried explains that"
+            candidate, share = self.alone, 100 * (1 - float(f"{1 - self.share:.1g}"))
+            most = " and ".join(self.changed(candidate, name) for name in candidate.names)
+            tail = f"{candidate.doubt}, and no second change that was tried explains that"
             sentence = f"Not explained, but {share:.10g} % of the squares: {most}; {tail}.{self.end}"
             return Explanation((), {}, {}, (), False, sentence, self.evidence)
         near = f"with {' and '.join(nearest.names)}" if nearest.names else "as the model is"
@@ -417,7 +426,7 @@ class _Search(Race):
         sentence = f"{sentence} {near}, {nearest.doubt}.{self.end}"
         return Explanation((), {}, {}, (), False, sentence, self.evidence)
 
-    def ended_with(self, said: Explanation, words: str) -> Explanation:
+    def ended_with(self, explanation: Explanation, words: str) -> Explanation:
         """With these words at the end of its sentence."""
-        before = said.sentence.removesuffix(self.end).removesuffix(".")
-        return replace(said, sentence=f"{before}, {words}.{self.end}")
+        before = explanation.sentence.removesuffix(self.end).removesuffix(".")
+        return replace(explanation, sentence=f"{before}, {words}.{self.end}")

@@ -90,17 +90,17 @@ def _size(path: Path) -> int:
     return sum(p.stat().st_size for p in ([path] if path.is_file() else path.rglob("*")) if p.is_file())
 
 
-def _keep(place: Path, recording: Recording, given: tuple[Path, str] | None) -> None:
-    make_folder(place.parent)
+def _keep(target: Path, recording: Recording, given: tuple[Path, str] | None) -> None:
+    make_folder(target.parent)
     if given is None:
-        write_arrays(place, recording)
+        write_arrays(target, recording)
     elif given[0].is_dir():
         for path in sorted(given[0].rglob("*")):
             if path.is_file():
-                make_folder((place / path.relative_to(given[0])).parent)
-                write_whole(place / path.relative_to(given[0]), path.read_bytes())
+                make_folder((target / path.relative_to(given[0])).parent)
+                write_whole(target / path.relative_to(given[0]), path.read_bytes())
     else:
-        write_whole(place, given[0].read_bytes())
+        write_whole(target, given[0].read_bytes())
 
 
 def _begun(name: str, asked: Asked) -> FitRecord:

@@ -88,7 +88,7 @@ def steps_between(law: Law, piece: Piece, k: int, delay: float | None) -> tuple[
 
 def cut_segments(law: Law, pieces: Sequence[Piece], nu: int, delay: float | None = None) -> Segments:
     """The last sample of a piece belongs to its last segment, any other to the segment that it starts or is within."""
-    of_piece, first, hs, us, samples, at, by_delay = [], [], [], [], [], [], []
+    of_piece, first, hs, us, samples, offsets, by_delay = [], [], [], [], [], [], []
     for p, piece in enumerate(pieces):
         n = len(piece.times)
         bounds = [0]
@@ -107,15 +107,15 @@ def cut_segments(law: Law, pieces: Sequence[Piece], nu: int, delay: float | None
             by_delay.append(np.concatenate(changes))
             last = b + 1 if b == n - 1 else b
             samples.append(np.arange(a, last))
-            at.append(np.concatenate([[0], np.cumsum([len(each) for each in lengths])])[: last - a])
-    counts = np.array([len(each) for each in hs], dtype=np.intp)
-    longest = max(len(each) for each in hs)
+            offsets.append(np.concatenate([[0], np.cumsum([len(steps) for steps in lengths])])[: last - a])
+    counts = np.array([len(steps) for steps in hs], dtype=np.intp)
+    longest = max(len(steps) for steps in hs)
     all_h, all_u, all_d = np.zeros((len(hs), longest)), np.zeros((len(hs), longest, nu)), np.zeros((len(hs), longest))
     for k, (h, u) in enumerate(zip(hs, us, strict=True)):
         all_h[k, : len(h)], all_u[k, : len(u)], all_d[k, : len(h)] = h, u, by_delay[k]
         all_u[k, len(u) :] = u[-1]
     ids = np.array(of_piece, dtype=np.intp), np.array(first, dtype=np.intp)
-    after = [np.asarray(a, dtype=np.intp) for a in at]
+    after = [np.asarray(a, dtype=np.intp) for a in offsets]
     return Segments(list(pieces), *ids, all_h, all_u, counts, samples, after, all_d)
 
 
@@ -140,19 +140,19 @@ class Reduced:
 
     def mixed(self, other: "Reduced", share: float) -> "Reduced":
         """The sum of this least squares and the other one, which has this share of it; starts follow as here."""
-        mine, nz, own = 1 - share, len(self.b), []
+        mine, nz, blocks = 1 - share, len(self.b), []
         rows = [_weighed(mine, self.R, self.b), _weighed(share, other.R, other.b)]
         rest = mine * self.rest + share * other.rest
         for a, b in zip(self.own, other.own, strict=True):
             nt = len(a[2])
             R = _triangle(np.vstack([_weighed(mine, *a), _weighed(share, *b)]))
-            own.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
+            blocks.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
             rows.append(R[nt : nt + nz, nt:])
             rest += float(R[nt + nz, -1] ** 2)
         R = _triangle(np.vstack(rows))
         rest += float(R[nz, -1] ** 2)
         now = mine * self.now + share * other.now
-        return replace(self, now=now, R=R[:nz, :nz], b=R[:nz, -1], rest=rest, own=own)
+        return replace(self, now=now, R=R[:nz, :nz], b=R[:nz, -1], rest=rest, own=blocks)
 
 
 class Fit:
@@ -233,24 +233,24 @@ class Fit:
         s = self.cut(values)
         with np.errstate(over="ignore", invalid="ignore"):
             xs = self.law.run(values, solved.starts, s.hs, s.us)
-        found = [np.empty((len(piece.times), self.model.nx)) for piece in s.pieces]
+        states = [np.empty((len(piece.times), self.model.nx)) for piece in s.pieces]
         for k, p in enumerate(s.of_piece):
-            found[p][s.samples[k]] = xs[k, s.at[k]]
-        return found
+            states[p][s.samples[k]] = xs[k, s.at[k]]
+        return states
 
     def _samples(self, s: Segments, xs: Array) -> tuple[Array, Array]:
         """x and u at the samples of all segments, one after the other; an input is that of the step that begins."""
-        at = [(k, i) for k, each in enumerate(s.at) for i in each]
-        rows, steps = np.array(at, dtype=np.intp).T
+        pairs = [(k, i) for k, offsets in enumerate(s.at) for i in offsets]
+        rows, steps = np.array(pairs, dtype=np.intp).T
         return xs[rows, steps], s.us[rows, np.minimum(steps, s.us.shape[1] - 1)]
 
     def _split(self, s: Segments, every: Array) -> list[Array]:
-        return np.split(every, np.cumsum([len(each) for each in s.at])[:-1])
+        return np.split(every, np.cumsum([len(offsets) for offsets in s.at])[:-1])
 
     def _read(self, values: Array, s: Segments, xs: Array) -> list[Array]:
         """Of each segment (samples, m), what sensors read."""
         if not self.sensors.count:
-            return [np.zeros((len(each), 0)) for each in s.at]
+            return [np.zeros((len(offsets), 0)) for offsets in s.at]
         with np.errstate(over="ignore", invalid="ignore"):
             return self._split(s, self.sensors.read(self._continuous.dynamics(values), *self._samples(s, xs)))
 
@@ -275,17 +275,17 @@ class Fit:
 
     def _bias_columns(self) -> list[tuple[int, int]]:
         """(column of z, entry of a small motion) of each bias."""
-        found = []
+        pairs = []
         singles = dict(self.chart.coordinates.single)
         names = (*self.model.position_names, *self.model.velocity_names)
-        for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
-            if one.quantity == BIAS and one.label in self.sensors.columns:
-                found.append((s.start, self.chart.size + self.sensors.columns.index(one.label)))
-            elif one.quantity == BIAS:
-                i = names.index(one.label)
+        for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
+            if unknown.quantity == BIAS and unknown.label in self.sensors.columns:
+                pairs.append((s.start, self.chart.size + self.sensors.columns.index(unknown.label)))
+            elif unknown.quantity == BIAS:
+                i = names.index(unknown.label)
                 entry = singles[i] if i < self.model.nq else self.model.nv + i - self.model.nq
-                found.append((s.start, entry))
-        return found
+                pairs.append((s.start, entry))
+        return pairs
 
     def _pull(self, z: Array) -> float:
         weak = np.sum(((z - self.unknowns.z_start) / self.unknowns.pulls) ** 2)
@@ -307,15 +307,15 @@ class Fit:
         for m in range(M):
             along[:, m + 1] = A[:, m] @ along[:, m]
             along[:, m + 1, :, nt:] += C[:, m]
-        own, rows_z, nodes, by_piece, rest = [], [np.zeros((0, nz + 1))], [], [], 0.0
+        blocks, rows_z, nodes, by_piece, rest = [], [np.zeros((0, nz + 1))], [], [], 0.0
         read = self._read_slopes(z, s, xs) if self.sensors.count else []
         for p, piece in enumerate(s.pieces):
             D, e = np.eye(nt, nt + nz), np.zeros(nt)
-            rows, found = [], np.full((len(piece.times), len(self.noise)), np.nan)
+            rows, linearized = [], np.full((len(piece.times), len(self.noise)), np.nan)
             for k in np.flatnonzero(s.of_piece == p):
                 nodes.append((D, e))
-                at = xs[k, s.at[k]]
-                moved = self.chart.to_motion(at) @ along[k, s.at[k]]
+                states = xs[k, s.at[k]]
+                moved = self.chart.to_motion(states) @ along[k, s.at[k]]
                 if read:
                     by_x, by_z = read[k]
                     of_outputs = by_x @ moved
@@ -329,37 +329,37 @@ class Fit:
                 J /= self.noise[:, None]
                 seen = np.isfinite(r)
                 rows.append(np.column_stack([J[seen], r[seen]]))
-                found[s.samples[k]] = r
+                linearized[s.samples[k]] = r
                 end = self.chart.to_motion(xs[k, s.counts[k]]) @ along[k, s.counts[k]]
                 e = end[:, :nt] @ e + gaps[k]
                 D = end[:, :nt] @ D
                 D[:, nt:] += end[:, nt:]
-            by_piece.append(found)
+            by_piece.append(linearized)
             ridge = np.zeros((nt, nt + nz + 1))
             ridge[:, :nt] = NO_PRIOR * np.eye(nt)
             if self.law.kinks:
                 ridge[nt // 2 :, nt // 2 : nt] = np.diag(1 / (reach * NEAR * self.gap_scale[nt // 2 :]))
             R = _triangle(np.vstack([*rows, ridge]))
-            own.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
+            blocks.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
             rows_z.append(R[nt : nt + nz, nt:])
             rest += float(R[nt + nz, -1] ** 2)
         R = _triangle(np.vstack(rows_z))
         rest += float(R[nz, -1] ** 2)
         now = sum(float(np.nansum(r**2)) for r in by_piece)
-        each = [rows[:, :nz] for rows in rows_z[1:]]
-        return Reduced(now, R[:nz, :nz], R[:nz, -1], rest, own, nodes, by_piece, each)
+        Rs = [rows[:, :nz] for rows in rows_z[1:]]
+        return Reduced(now, R[:nz, :nz], R[:nz, -1], rest, blocks, nodes, by_piece, Rs)
 
-    def step_of(self, z: Array, found: Reduced) -> Array:
+    def step_of(self, z: Array, reduced: Reduced) -> Array:
         """dz (np,) of the linearized problem, within bounds and not far."""
         if self.fixed:
             return np.zeros_like(z)
         widths = self.unknowns.widths
-        norms = np.linalg.norm(found.R, axis=0)
+        norms = np.linalg.norm(reduced.R, axis=0)
         scale = np.where(np.isfinite(widths), widths, 1 / np.where(norms > 0, norms, 1.0))
         pulls = self.unknowns.pulls
         off, by_z = self.unknowns.prior_rows(z)
-        matrix = np.vstack([found.R * scale, np.diag(scale / pulls), by_z * scale])
-        right = np.concatenate([found.b, (self.unknowns.z_start - z) / pulls, -off])
+        matrix = np.vstack([reduced.R * scale, np.diag(scale / pulls), by_z * scale])
+        right = np.concatenate([reduced.b, (self.unknowns.z_start - z) / pulls, -off])
         lower, upper = self.unknowns.bounds
         far = np.where(np.isfinite(widths), LARGEST / 3 * widths, np.inf)
         low, high = np.maximum(lower - z, -far) / scale, np.minimum(upper - z, far) / scale
@@ -370,14 +370,14 @@ class Fit:
             step = np.clip(lsq_linear(matrix, right, bounds=(low, high), method="bvls").x, low, high)
         return np.asarray(step * scale)
 
-    def moved(self, starts: Array, found: Reduced, dz: Array, part: float) -> Array:
+    def moved(self, starts: Array, reduced: Reduced, dz: Array, fraction: float) -> Array:
         """The starts of the segments a part of the way along the step dz."""
         after, first = starts.copy(), {}
-        for p, (R, R_z, b) in enumerate(found.own):
+        for p, (R, R_z, b) in enumerate(reduced.own):
             first[p] = np.linalg.lstsq(R, b - R_z @ dz, rcond=1e-14)[0]
-        for k, (D, e) in enumerate(found.nodes):
+        for k, (D, e) in enumerate(reduced.nodes):
             d = D @ np.concatenate([first[int(self.segments.of_piece[k])], dz]) + e
-            after[k] = self.chart.plus(starts[k], part * d)
+            after[k] = self.chart.plus(starts[k], fraction * d)
         return after
 
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
@@ -390,8 +390,8 @@ class Fit:
 
     def by(self, law: Law) -> "Fit":
         """The same with another law, of segments as long."""
-        own = self.model, law, self.chart, self.unknowns, self.segments.pieces, self.noise
-        return Fit(*own, sensors=self.sensors, fixed=self.fixed)
+        arguments = self.model, law, self.chart, self.unknowns, self.segments.pieces, self.noise
+        return Fit(*arguments, sensors=self.sensors, fixed=self.fixed)
 
     def _descended(self, z: Array, starts: Array, most: int) -> "Solved":
         merit, reach, here = 0.0, 1.0, self.at(z, starts)
@@ -400,39 +400,39 @@ class Fit:
                 "the model has no motion from the states that were measured: its steps are not finite"
             )
         for steps in range(most + 1):
-            found = self.reduce(here, reach)
-            dz, promised = self._promised(here, found)
-            now = found.now + self._pull(here.z)
+            reduced = self.reduce(here, reach)
+            dz, promised = self._promised(here, reduced)
+            now = reduced.now + self._pull(here.z)
             settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * now)
             if promised <= settled and here.gap <= CLOSED:
-                return Solved(here.z, here.starts, found, True, steps, "")
+                return Solved(here.z, here.starts, reduced, True, steps, "")
             if steps == most:
                 break
             less = here.value - now + promised
             if here.gap > 0:
                 merit = max(merit, 2 * max(-less, 0.0) / here.gap + 1.0)
-            part, ahead = self._ahead(here, found, dz, merit, less + merit * here.gap)
+            fraction, ahead = self._ahead(here, reduced, dz, merit, less + merit * here.gap)
             if ahead is None and reach > 1.0:
                 reach = 1.0
                 continue
-            if self.law.kinks and part <= SHORT:
-                found = self._both_sides(here, found, dz, max(2 * part, 0.5**HALVINGS))
-                promised, part, ahead = self._along_a_kink(here, found, merit, part, ahead)
+            if self.law.kinks and fraction <= SHORT:
+                reduced = self._both_sides(here, reduced, dz, max(2 * fraction, 0.5**HALVINGS))
+                promised, fraction, ahead = self._along_a_kink(here, reduced, merit, fraction, ahead)
             if ahead is None:
                 ended = promised <= PROMISED and here.gap <= CLOSED
-                return Solved(here.z, here.starts, found, ended, steps, "" if ended else STUCK)
-            reach = reach * FARTHER if part == 1.0 else max(reach / FARTHER, 1.0)
+                return Solved(here.z, here.starts, reduced, ended, steps, "" if ended else STUCK)
+            reach = reach * FARTHER if fraction == 1.0 else max(reach / FARTHER, 1.0)
             here = ahead
-        return Solved(here.z, here.starts, found, False, most, "it took too many steps")
+        return Solved(here.z, here.starts, reduced, False, most, "it took too many steps")
 
-    def _promised(self, here: "Point", found: Reduced) -> tuple[Array, float]:
+    def _promised(self, here: "Point", reduced: Reduced) -> tuple[Array, float]:
         """The step dz (np,), and how much less of |r|^2 it leaves by the linearized motion."""
-        dz = self.step_of(here.z, found)
-        then = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + self._pull(here.z + dz)
-        return dz, found.now + self._pull(here.z) - then
+        dz = self.step_of(here.z, reduced)
+        then = reduced.rest + float(np.sum((reduced.b - reduced.R @ dz) ** 2)) + self._pull(here.z + dz)
+        return dz, reduced.now + self._pull(here.z) - then
 
     def _along_a_kink(
-        self, here: "Point", both: Reduced, merit: float, part: float, ahead: "Point | None"
+        self, here: "Point", both: Reduced, merit: float, fraction: float, ahead: "Point | None"
     ) -> "tuple[float, float, Point | None]":
         """(What both sides promise, part of their step or of the one ahead, whichever does better, where it leads)."""
         dz, promised = self._promised(here, both)
@@ -440,38 +440,40 @@ class Fit:
             return promised, 0.0, None
         along, there = self._ahead(here, both, dz, merit, promised + merit * here.gap)
         if there is None or (ahead is not None and ahead.above(merit) <= there.above(merit)):
-            return promised, part, ahead
+            return promised, fraction, ahead
         return promised, along, there
 
-    def _both_sides(self, here: "Point", found: Reduced, dz: Array, part: float) -> Reduced:
+    def _both_sides(self, here: "Point", reduced: Reduced, dz: Array, fraction: float) -> Reduced:
         """The linearized motion at a kink: with that a part of dz farther on, weighed so that it promises least.
 
         What is left is the larger of the two there. Where even so little is promised, least is left at the kink itself,
         as where a joint stops just when an input changes.
         """
-        beyond = self.at(np.clip(here.z + part * dz, *self.unknowns.bounds), self.moved(here.starts, found, dz, part))
+        beyond = self.at(
+            np.clip(here.z + fraction * dz, *self.unknowns.bounds), self.moved(here.starts, reduced, dz, fraction)
+        )
         if beyond is None:
-            return found
+            return reduced
         other = self.reduce(beyond)
         least = minimize_scalar(
-            lambda share: self._promised(here, found.mixed(other, share))[1],
+            lambda share: self._promised(here, reduced.mixed(other, share))[1],
             bounds=(0.0, 1.0),
             method="bounded",
             options={"xatol": 1e-6},
         )
-        return found.mixed(other, float(least.x))
+        return reduced.mixed(other, float(least.x))
 
     def _ahead(
-        self, here: "Point", found: Reduced, dz: Array, merit: float, gain: float
+        self, here: "Point", reduced: Reduced, dz: Array, merit: float, gain: float
     ) -> tuple[float, "Point | None"]:
         """The largest part of a step that does well, halved as often as needed, and where it leads."""
-        for part in (0.5**k for k in range(HALVINGS + 1)):
+        for fraction in (0.5**k for k in range(HALVINGS + 1)):
             ahead = self.at(
-                np.clip(here.z + part * dz, *self.unknowns.bounds), self.moved(here.starts, found, dz, part)
+                np.clip(here.z + fraction * dz, *self.unknowns.bounds), self.moved(here.starts, reduced, dz, fraction)
             )
-            allowed = here.value + merit * here.gap - 1e-4 * part * gain + 1e-9 * (1 + abs(here.value))
+            allowed = here.value + merit * here.gap - 1e-4 * fraction * gain + 1e-9 * (1 + abs(here.value))
             if ahead is not None and ahead.value + merit * ahead.gap <= allowed:
-                return part, ahead
+                return fraction, ahead
         return 0.0, None
 
     def _from_rest(self, stuck: "Solved", most: int) -> "Solved":
@@ -521,8 +523,8 @@ def _weighed(share: float, *columns: Array) -> Array:
 def _triangle(matrix: Array) -> Array:
     """(n, n) R with R' R = matrix' matrix, of a matrix (m, n)."""
     n = matrix.shape[1]
-    found: Array = np.asarray(np.linalg.qr(matrix, mode="r"))
-    return np.vstack([found, np.zeros((max(0, n - len(found)), n))])
+    triangle: Array = np.asarray(np.linalg.qr(matrix, mode="r"))
+    return np.vstack([triangle, np.zeros((max(0, n - len(triangle)), n))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -548,13 +550,13 @@ def growth_cuts(fit: Fit, z: Array, starts: Array) -> list[Piece]:
     point = fit.at(z, starts)
     if point is None:
         return list(s.pieces)
-    found = fit.reduce(point)
+    reduced = fit.reduce(point)
     pieces: list[Piece] = []
     scale = fit.gap_scale
     for p, piece in enumerate(s.pieces):
         begin, base = 0, np.eye(nt)
         for k in np.flatnonzero(s.of_piece == p):
-            D = found.nodes[k][0][:, :nt]
+            D = reduced.nodes[k][0][:, :nt]
             grown = np.linalg.norm((D @ np.linalg.pinv(base)) * scale / scale[:, None], 2)
             if grown > GROWTH and s.first[k] - begin >= LEAST and len(piece.times) - s.first[k] > LEAST:
                 pieces.append(piece.part(begin, int(s.first[k])))

@@ -196,7 +196,7 @@ def identify(
     if motion == "impacts":
         if priors or bounds:
             raise InputError("priors and bounds", got="some", expected='none with motion="impacts"')
-        found = _through_impacts(problem, parameters)
+        identification = _through_impacts(problem, parameters)
     else:
         law: Law = (
             discrete_motion(model, unknowns, pieces)
@@ -204,7 +204,7 @@ def identify(
             else ContinuousMotion(model, own_tree, unknowns)
         )
         fit, solved = problem.solve(law, max_iterations)
-        found = problem.judged(fit, solved, why if motion == "auto" else "")
+        identification = problem.judged(fit, solved, why if motion == "auto" else "")
     names = parameters if isinstance(parameters, str) else tuple(parameters)
     asked = Asked(
         model,
@@ -219,7 +219,7 @@ def identify(
         dict(bounds or {}),
         dict(sensors or {}),
     )
-    return replace(found, asked=asked)
+    return replace(identification, asked=asked)
 
 
 def what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
@@ -261,8 +261,8 @@ class Problem:
 
     def guess(self, fit: Fit) -> Array:
         s = fit.segments
-        found = [guess_states(self.model, self.chart, p, s.first[s.of_piece == i]) for i, p in enumerate(s.pieces)]
-        return np.concatenate(found)
+        guesses = [guess_states(self.model, self.chart, p, s.first[s.of_piece == i]) for i, p in enumerate(s.pieces)]
+        return np.concatenate(guesses)
 
     @property
     def first_noise(self) -> Array:
@@ -305,13 +305,13 @@ class Problem:
         period = float(np.median(np.diff(self.pieces[0].times)))
         tried = []
         for delay in np.clip(period * np.array(DELAYS), low, high):
-            at = z.copy()
-            at[column] = delay
-            if (point := fit.at(at, starts)) is not None:
-                found = fit.reduce(point)
-                dz = fit.step_of(at, found)
+            candidate = z.copy()
+            candidate[column] = delay
+            if (point := fit.at(candidate, starts)) is not None:
+                reduced = fit.reduce(point)
+                dz = fit.step_of(candidate, reduced)
                 dz[column] = 0.0
-                tried.append((found.rest + float(np.sum((found.b - found.R @ dz) ** 2)), tuple(at)))
+                tried.append((reduced.rest + float(np.sum((reduced.b - reduced.R @ dz) ** 2)), tuple(candidate)))
         return np.array(min(tried)[1]) if tried else z
 
     def follows(self, fit: Fit, z: Array, starts: Array) -> bool:
@@ -345,11 +345,11 @@ class Problem:
             z, starts = solved.z, solved.starts
             if not self.follows(fit, z, starts):
                 return fit, solved
-            found = np.where(np.isfinite(self.stated), self.stated, np.fmax(noise_of(fit, solved), 1e-3 * self.scatter))
-            seen = np.isfinite(found)
-            if np.max(np.abs(found[seen] / fit.noise[seen] - 1)) < SAME_NOISE:
+            noise = np.where(np.isfinite(self.stated), self.stated, np.fmax(noise_of(fit, solved), 1e-3 * self.scatter))
+            seen = np.isfinite(noise)
+            if np.max(np.abs(noise[seen] / fit.noise[seen] - 1)) < SAME_NOISE:
                 return fit, solved
-            fit = self.fit(fit.law, fit.segments.pieces, found)
+            fit = self.fit(fit.law, fit.segments.pieces, noise)
         return fit, fit.solve(z, starts, most)
 
     def judged(self, fit: Fit, solved: Solved, why_steps: str) -> Identification:
@@ -370,10 +370,10 @@ class Problem:
             values=unknowns.named(values),
             start=unknowns.named(unknowns.start),
             intervals={
-                one.name: frozen(intervals[s][0] if len(one.start) == 1 else intervals[s])
-                for one, s in zip(unknowns.each, unknowns.slices, strict=True)
+                unknown.name: frozen(intervals[s][0] if len(unknown.start) == 1 else intervals[s])
+                for unknown, s in zip(unknowns.each, unknowns.slices, strict=True)
             },
-            units={one.name: one.unit for one in unknowns.each},
+            units={unknown.name: unknown.unit for unknown in unknowns.each},
             unidentifiable=open_,
             explained=not reason,
             reason=why,
@@ -401,17 +401,17 @@ class Problem:
         """(error with the model's own values, with those found, why that is too much: empty where not; the motions)."""
         held = [piece for piece in self.pieces if piece.held_out]
         pieces = held or list(fit.segments.pieces)
-        own = self.fit(fit.law, pieces, fit.noise, fixed=True)
-        found, moved = [], []
+        states_fit = self.fit(fit.law, pieces, fit.noise, fixed=True)
+        errors, moved = [], []
         for z in (self.unknowns.z_start, solved.z):
-            fixed = own.solve(z, self.guess(own), 20)
-            moved.append([frozen(xs) for xs in own.states(fixed)])
-            count, taken = freedom_of(own, fixed)
+            fixed = states_fit.solve(z, self.guess(states_fit), 20)
+            moved.append([frozen(xs) for xs in states_fit.states(fixed)])
+            count, taken = freedom_of(states_fit, fixed)
             total = sum(float(np.nansum(r**2)) for r in fixed.reduced.residuals)
-            found.append(float(np.sqrt(total / max(count - taken, 1))))
+            errors.append(float(np.sqrt(total / max(count - taken, 1))))
         fitted = [frozen(xs) for xs in fit.states(solved)]
         if not held:
-            return found[0], found[1], "", [*map(Followed, pieces, fitted, moved[0])]
+            return errors[0], errors[1], "", [*map(Followed, pieces, fitted, moved[0])]
         motions = [Followed(p, xs, None) for p, xs in zip(fit.segments.pieces, fitted, strict=True)]
         motions += map(Followed, held, moved[1], moved[0])
         finite = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
@@ -419,9 +419,14 @@ class Problem:
         allowed = float(stats.f.ppf(0.999, max(count - taken, 1), max(freedom, 1))) * (
             1 + extra / max(count - taken, 1)
         )
-        if fixed.converged and found[1] ** 2 <= allowed:
-            return found[0], found[1], "", motions
-        return found[0], found[1], f"samples that were held out are missed by {found[1]:.3g} times the noise", motions
+        if fixed.converged and errors[1] ** 2 <= allowed:
+            return errors[0], errors[1], "", motions
+        return (
+            errors[0],
+            errors[1],
+            f"samples that were held out are missed by {errors[1]:.3g} times the noise",
+            motions,
+        )
 
     def doubt(self, fit: Fit, solved: Solved, why_not: str) -> str:
         """Why the model does not explain the recordings; empty where it does."""
@@ -429,7 +434,7 @@ class Problem:
             return f"the fit did not converge: {solved.why}"
         off, _ = self.unknowns.prior_rows(solved.z)
         if len(off) and np.sum(off**2) > stats.chi2.ppf(0.9999, len(off)):
-            known = [name for one in self.unknowns.each if one.prior is not None for name in one.columns]
+            known = [name for unknown in self.unknowns.each if unknown.prior is not None for name in unknown.columns]
             worst = int(np.argmax(np.abs(off)))
             return f"{known[worst]} is {abs(off[worst]):.3g} standard deviations from its prior"
         names = self.entries
@@ -453,22 +458,22 @@ def _through_impacts(problem: Problem, names: Sequence[str] | str) -> Identifica
     """What the search through impacts finds, with its intervals."""
     nv, noise = problem.model.nv, problem.first_noise
     j = judged(problem.model, problem.pieces, names, noise[: 2 * nv])
-    search, found, h = j.search, j.found, j.search.law.model.time_step
-    without = "" if found.half is not None else "; intervals leave out what the step does: the model has but one"
-    unknowns, values, intervals = search.unknowns, search.values(found.w), search.intervals(found)
-    limits = np.concatenate([np.reshape(intervals[one.name], (-1, 2)) for one in unknowns.each])
+    search, solution, h = j.search, j.found, j.search.law.model.time_step
+    without = "" if solution.half is not None else "; intervals leave out what the step does: the model has but one"
+    unknowns, values, intervals = search.unknowns, search.values(solution.w), search.intervals(solution)
+    limits = np.concatenate([np.reshape(intervals[unknown.name], (-1, 2)) for unknown in unknowns.each])
     deviations = (limits[:, 1] - limits[:, 0]) / (2 * 1.96)
     known = np.isfinite(deviations)
-    covariance = np.where(np.outer(known, known), found.correlation * np.outer(deviations, deviations), 0.0)
+    covariance = np.where(np.outer(known, known), solution.correlation * np.outer(deviations, deviations), 0.0)
     covariance[~known, ~known] = np.inf
     every = np.concatenate(j.fitted)[:, :nv]
     motions = [Followed(p, frozen(a), frozen(b)) for p, a, b in zip(problem.pieces, j.after, j.before, strict=True)]
-    why, open_ = j.reason or NOISE_IS_LEFT, search.open(found)
+    why, open_ = j.reason or NOISE_IS_LEFT, search.open(solution)
     return Identification(
         values=unknowns.named(values),
         start=unknowns.named(unknowns.start),
         intervals=intervals,
-        units={one.name: one.unit for one in unknowns.each},
+        units={unknown.name: unknown.unit for unknown in unknowns.each},
         unidentifiable=open_,
         explained=not j.reason,
         reason=why,
@@ -478,14 +483,14 @@ def _through_impacts(problem: Problem, names: Sequence[str] | str) -> Identifica
         noise={name: float(s) for name, s in zip(problem.entries[:nv], noise[:nv], strict=True)},
         error_before=j.error_before,
         error_after=j.error_after,
-        residuals=tuple(frozen(each) for each in j.fitted),
+        residuals=tuple(frozen(rows) for rows in j.fitted),
         columns=unknowns.columns,
         entries=problem.entries,
         covariance=frozen(covariance),
         score=float(np.sum(every**2)) + 2 * len(every) * float(np.sum(np.log(noise[:nv]))),
         count=every.size,
-        converged=found.converged,
-        steps=found.rounds,
+        converged=solution.converged,
+        steps=solution.rounds,
         motion=f"the model's own steps of {1e3 * h:.4g} ms through impacts, slopes from clouds of values" + without,
         motions=tuple(sorted(motions, key=lambda motion: motion.piece.held_out)),
     )

@@ -51,12 +51,12 @@ def flights_of(model: Model, xs: Array) -> list[tuple[int, int]]:
         set_state(model.double, x)
         touching[k] = model.double.overlaps()
     edges = np.flatnonzero(np.diff(np.concatenate([[1], touching.astype(int), [1]])))
-    found = []
+    flights = []
     for first, end in edges.reshape(-1, 2):
         a, b = first + CLEAR * (first > 0), end - 1 - CLEAR * (end < len(xs))
         if b - a + 1 >= LEAST:
-            found.append((int(a), int(b)))
-    return found
+            flights.append((int(a), int(b)))
+    return flights
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,14 +77,14 @@ def start_of(model: Model, chart: Chart, piece: Piece, scale: Array) -> Start:
     By least squares, each position in units of its `scale` (nv,). Its spread is that of the scatter of what is left.
     Parameters that are applied act.
     """
-    each, nv = steps_between(model, piece), model.nv
-    us, x, none = np.repeat(piece.us, each, axis=0), piece.ys[0], select(model, ())
+    stride, nv = steps_between(model, piece), model.nv
+    us, x, none = np.repeat(piece.us, stride, axis=0), piece.ys[0], select(model, ())
     for _ in range(ITERATIONS):
         steps = derivatives_along(model, x, us, vector=none)
-        xs = np.array([x] + [step.x_next for step in steps[each - 1 :: each]])
+        xs = np.array([x] + [step.x_next for step in steps[stride - 1 :: stride]])
         by_start, slopes = chart.from_motion(x), []
         for k, step in enumerate(steps):
-            if k % each == 0:
+            if k % stride == 0:
                 slopes.append(by_start)
             by_start = step.A @ by_start
         slopes.append(by_start)
@@ -100,12 +100,12 @@ def start_of(model: Model, chart: Chart, piece: Piece, scale: Array) -> Start:
 def steps_between(model: Model, piece: Piece) -> int:
     """How many of the model's steps lie between two samples. InputError where it is no whole number."""
     periods = np.diff(piece.times)
-    each = max(1, round(float(np.median(periods)) / model.time_step))
-    if np.any(np.abs(periods - each * model.time_step) > CLOCK_TOLERANCE * model.time_step * each):
+    count = max(1, round(float(np.median(periods)) / model.time_step))
+    if np.any(np.abs(periods - count * model.time_step) > CLOCK_TOLERANCE * model.time_step * count):
         got = f"from {1e3 * np.min(periods):.6g} to {1e3 * np.max(periods):.6g} ms"
         expected = f"the same, and a whole number of steps of {1e3 * model.time_step:.6g} ms"
         raise InputError(f"times between samples of {piece.name}", got=got, expected=expected)
-    return each
+    return count
 
 
 def millisecond(chart: Chart, pieces: list[Piece]) -> Array:
@@ -146,11 +146,11 @@ def first_state(model: Model, recording: Recording, *, parameters: Mapping[str, 
     """
     (piece,) = read_pieces(model, recording, 0.0)
     chart, vector = Chart(coordinates_of(model)), select(model, parameters or ())
-    found = flights_of(model, piece.ys)
-    if not found or found[0][0] > 0:
+    flights = flights_of(model, piece.ys)
+    if not flights or flights[0][0] > 0:
         return np.array(piece.ys[0])
-    with applied(vector) as own:
-        return start_of(own, chart, piece.part(*found[0]), millisecond(chart, [piece])).x
+    with applied(vector) as applied_model:
+        return start_of(applied_model, chart, piece.part(*flights[0]), millisecond(chart, [piece])).x
 
 
 ROUNDS = 5  # of reweighting
@@ -187,7 +187,7 @@ def plane_at(residual: Callable[[Array], Array], w: Array, width: float, random:
     half = max(2 * n, 4)
     z = random.standard_normal((half, n))
     z = np.concatenate([z, -z])
-    R = np.array([residual(w + width * each) for each in z])
+    R = np.array([residual(w + width * direction) for direction in z])
     A = np.concatenate([np.ones((2 * half, 1)), z], axis=1)
     C = np.linalg.lstsq(A, R, rcond=None)[0]
     scatter = np.sum((R - A @ C) ** 2, axis=0) / (2 * half - n - 1)
@@ -258,9 +258,9 @@ class ContactIdentification(ShowsItsRepr):
     time_step: float  # [s] of the steps that were fitted
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name} {np.round(value, 7).tolist()}" for name, value in self.values.items())
+        text = ", ".join(f"{name} {np.round(value, 7).tolist()}" for name, value in self.values.items())
         left = f"; not determined: {', '.join(self.unidentifiable)}" if self.unidentifiable else ""
-        return f"{told}; the loss falls from {self.cost_before:.3g} to {self.cost_after:.3g}{left}"
+        return f"{text}; the loss falls from {self.cost_before:.3g} to {self.cost_after:.3g}{left}"
 
 
 @dataclass(frozen=True)
@@ -313,19 +313,19 @@ class Search:
 
     def _scales(self) -> tuple[Array, Array]:
         scales, logs = [], []
-        for one in self.unknowns.each:
-            if one.quantity in (INERTIA, STRENGTH):
+        for unknown in self.unknowns.each:
+            if unknown.quantity in (INERTIA, STRENGTH):
                 raise InputError(
-                    one.name, got="a quantity of smooth motion", expected="one of contact; see dd.identify"
+                    unknown.name, got="a quantity of smooth motion", expected="one of contact; see dd.identify"
                 )
-            by_log = one.quantity not in (BIAS, CENTER)
-            if by_log and not np.all(one.start > 0):
-                raise InputError(one.name, got=one.start, expected="a value above 0 to begin from")
-            size = LOG_SCALE if by_log else LENGTH_SCALE if one.quantity == BIAS else CENTER_SCALE * one.size
-            if one.quantity == "radius":
-                size = LENGTH_SCALE / one.size
-            scales += [size] * len(one.start)
-            logs += [by_log] * len(one.start)
+            by_log = unknown.quantity not in (BIAS, CENTER)
+            if by_log and not np.all(unknown.start > 0):
+                raise InputError(unknown.name, got=unknown.start, expected="a value above 0 to begin from")
+            size = LOG_SCALE if by_log else LENGTH_SCALE if unknown.quantity == BIAS else CENTER_SCALE * unknown.size
+            if unknown.quantity == "radius":
+                size = LENGTH_SCALE / unknown.size
+            scales += [size] * len(unknown.start)
+            logs += [by_log] * len(unknown.start)
         extra = len(self.lengths)
         return np.array(scales + [LENGTH_SCALE] * extra), np.array(logs + [False] * extra)
 
@@ -338,37 +338,37 @@ class Search:
         count = len(self.unknowns.start)
         return self.unknowns.named(values[:count]) | dict(zip(self.lengths, values[count:].tolist(), strict=True))
 
-    def intervals(self, found: Found) -> dict[str, Array]:
+    def intervals(self, solution: Found) -> dict[str, Array]:
         """By name (2,) or (k, 2)."""
-        wide = np.stack([self.values(found.w + s * found.spread) for s in (-1, 1)], axis=1)
+        wide = np.stack([self.values(solution.w + s * solution.spread) for s in (-1, 1)], axis=1)
         of_parameters = {
-            one.name: frozen(wide[s][0] if len(one.start) == 1 else wide[s])
-            for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)
+            unknown.name: frozen(wide[s][0] if len(unknown.start) == 1 else wide[s])
+            for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)
         }
         return of_parameters | dict(zip(self.lengths, map(frozen, wide[len(self.unknowns.start) :]), strict=True))
 
-    def open(self, found: Found) -> tuple[str, ...]:
+    def open(self, solution: Found) -> tuple[str, ...]:
         """What the recordings leave open: entries whose interval is wider than a factor of 3, 10 mm or 10 mrad."""
-        wide = np.where(self.by_log, self.scale * found.spread > np.log(3.0), self.scale * found.spread > 0.01)
+        wide = np.where(self.by_log, self.scale * solution.spread > np.log(3.0), self.scale * solution.spread > 0.01)
         columns = [*self.unknowns.columns, *self.lengths]
         return tuple(column for column, open_ in zip(columns, wide, strict=True) if open_)
 
     def vector(self, values: Array) -> ParameterVector:
         """The model's parameters at values (n,), of a model of its own where there are lengths."""
-        own = values[self.law.own]
+        parameters = values[self.law.own]
         if self.build is None:
-            return self.law.vector.at(own)
+            return self.law.vector.at(parameters)
         model = self.build(**dict(zip(self.lengths, values[len(self.unknowns.start) :].tolist(), strict=True)))
         if model.time_step != self.law.model.time_step:
             model = model.at_time_step(self.law.model.time_step)
-        return select(model, self.law.vector.to_dict()).at(own)
+        return select(model, self.law.vector.to_dict()).at(parameters)
 
     def segments(self, w: Array, length: float) -> tuple[list[Segment], int]:
         """From the first sample of each fitted recording and the start of each flight; how many start by a flight.
 
         Each goes on for `length` [s] after its flight. The end of each recording is one more.
         """
-        found, known, vector = [], 0, self.vector(self.values(w))
+        segments, known, vector = [], 0, self.vector(self.values(w))
         with applied(vector) as model:
             for p, piece in enumerate(self.pieces):
                 if piece.held_out:
@@ -378,26 +378,26 @@ class Search:
                 flights = flights_of(model, piece.ys)
                 known += len(flights) if np.isfinite(length) else bool(flights and flights[0][0] == 0)
                 if not flights or flights[0][0] > 0:
-                    found.append(Segment(p, 0, min(count, last), piece.ys[0]))
+                    segments.append(Segment(p, 0, min(count, last), piece.ys[0]))
                 for a, b in flights:
                     if a == 0 or np.isfinite(length):
                         start = start_of(model, self.chart, piece.part(a, b), self.unit)
-                        found.append(Segment(p, a, min(b + count, last), start.x))
+                        segments.append(Segment(p, a, min(b + count, last), start.x))
                 rest = max(0, last - max(5, round(REST / period)))
-                found.append(Segment(p, rest, last, piece.ys[rest]))
-        return found, known
+                segments.append(Segment(p, rest, last, piece.ys[rest]))
+        return segments, known
 
     def starts(self, w: Array, noise: Array) -> list[Start]:
         """Of each recording, those held out too, by its first flight; else as measured, with `noise` (2 nv,)."""
-        found = []
+        starts = []
         with applied(self.vector(self.values(w))) as model:
             for piece in self.pieces:
                 flights = flights_of(model, piece.ys)
                 if flights and flights[0][0] == 0:
-                    found.append(start_of(model, self.chart, piece.part(*flights[0]), self.unit))
+                    starts.append(start_of(model, self.chart, piece.part(*flights[0]), self.unit))
                 else:
-                    found.append(Start(piece.ys[0], np.diag(noise)))
-        return found
+                    starts.append(Start(piece.ys[0], np.diag(noise)))
+        return starts
 
     def whole(self, w: Array, starts: Sequence[Array]) -> list[Array]:
         """(n, nx) the motion of each recording, from starts (nx,)."""
@@ -409,28 +409,28 @@ class Search:
         values = self.values(w)
         shift = np.zeros(self.model.nx)
         names = self.model.state_names
-        for one, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
-            if one.quantity == BIAS:
-                shift[names.index(one.label)] = values[s][0]
-        vector, found = self.vector(values), []
+        for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
+            if unknown.quantity == BIAS:
+                shift[names.index(unknown.label)] = values[s][0]
+        vector, motions = self.vector(values), []
         with applied(vector) as model:
             for segment in segments:
                 piece = self.pieces[segment.piece].part(segment.first, segment.last)
-                each = steps_between(model, piece)
-                self.taken += each * len(piece.us)
+                stride = steps_between(model, piece)
+                self.taken += stride * len(piece.us)
                 try:
-                    found.append(_sampled(model, segment.x0 - shift, piece.us, each) + shift)
+                    motions.append(_sampled(model, segment.x0 - shift, piece.us, stride) + shift)
                 except SimulationError:
-                    found.append(np.full((len(piece.us), self.model.nx), np.nan))
-        return found
+                    motions.append(np.full((len(piece.us), self.model.nx), np.nan))
+        return motions
 
     def residual(self, w: Array, segments: Sequence[Segment]) -> Array:
         """Measured minus simulated positions of every third sample of all segments, one after the other."""
-        found = []
+        residuals = []
         for segment, xs in zip(segments, self.motions(w, segments), strict=True):
             e = self.chart.minus(self.pieces[segment.piece].ys[segment.first + 1 : segment.last + 1], xs)
-            found.append((e[:, : self.model.nv] / self.unit)[SAMPLES - 1 :: SAMPLES].ravel())
-        r = np.concatenate(found)
+            residuals.append((e[:, : self.model.nv] / self.unit)[SAMPLES - 1 :: SAMPLES].ravel())
+        r = np.concatenate(residuals)
         return np.asarray(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
 
     def run(self, seed: int) -> Found:
@@ -451,7 +451,7 @@ class Search:
         if half is not None:
             spread = np.hypot(spread, BY_HALF * (half - w))
         taken = self.taken
-        before, after = (float(np.mean(2 * (np.sqrt(1 + residual(at) ** 2) - 1))) for at in (np.zeros(len(w)), w))
+        before, after = (float(np.mean(2 * (np.sqrt(1 + residual(point) ** 2) - 1))) for point in (np.zeros(len(w)), w))
         self.taken = taken
         return Found(w, spread, half, correlation, (before, after), flights, converged, rounds + 1)
 
@@ -463,9 +463,9 @@ class Search:
         model = self.law.model.at_time_step(self.law.model.time_step / 2)
         finer = Search(model, self.pieces, self.names, self.lengths, self.build)
         segments, _ = finer.segments(w, np.inf)
-        found = shrink_to(lambda at: finer.residual(at, segments), w, HALF, random)
+        shrunk = shrink_to(lambda point: finer.residual(point, segments), w, HALF, random)
         self.taken += finer.taken
-        return found.w
+        return shrunk.w
 
 
 def identify_contact(
@@ -516,28 +516,28 @@ def identify_contact(
         expected = "a function that makes a model of `lengths`" if lengths else "a model, or `lengths` too"
         raise InputError("model", got=got, expected=expected)
     begin = {name: positive_float(name, value) for name, value in (lengths or {}).items()}
-    own, build = (model, None) if isinstance(model, Model) else (model(**begin), model)
-    search = Search(own, read_pieces(own, recordings, 0.0), parameters, begin, build)
-    found = search.run(seed)
+    first_model, build = (model, None) if isinstance(model, Model) else (model(**begin), model)
+    search = Search(first_model, read_pieces(first_model, recordings, 0.0), parameters, begin, build)
+    solution = search.run(seed)
     return ContactIdentification(
-        values=search.named(search.values(found.w)),
+        values=search.named(search.values(solution.w)),
         start=search.named(search.begin),
-        intervals=search.intervals(found),
-        at_half_step=None if found.half is None else search.named(search.values(found.half)),
-        unidentifiable=search.open(found),
-        cost_before=found.costs[0],
-        cost_after=found.costs[1],
-        flights=found.flights,
+        intervals=search.intervals(solution),
+        at_half_step=None if solution.half is None else search.named(search.values(solution.half)),
+        unidentifiable=search.open(solution),
+        cost_before=solution.costs[0],
+        cost_after=solution.costs[1],
+        flights=solution.flights,
         steps=search.taken,
         time_step=search.law.model.time_step,
     )
 
 
-def _sampled(model: Model, x0: Array, us: Array, each: int) -> Array:
-    """(n, nx) after every `each` steps under each of us (n, nu); which of them touched takes time, and is not asked."""
+def _sampled(model: Model, x0: Array, us: Array, count: int) -> Array:
+    """(n, nx) after every `count` steps under each of us (n, nu); which of them touched takes time and is not asked."""
     xs, x = np.empty((len(us), model.nx)), x0
     for k, u in enumerate(us):
-        for _ in range(each):
+        for _ in range(count):
             x = advance(model.double, x, u)
         xs[k] = x
     return xs
@@ -592,16 +592,18 @@ def judged(model: Model, pieces: Sequence[Piece], names: Sequence[str] | str, no
     cannot be taken.
     """
     search = Search(model, pieces, names)
-    found = search.run(SEED)
-    after, left = _followed(search, found.w, noise)
-    before, was = _followed(search, np.zeros(len(found.w)), noise)
+    solution = search.run(SEED)
+    after, left = _followed(search, solution.w, noise)
+    before, was = _followed(search, np.zeros(len(solution.w)), noise)
     fitted, held = ([r for r, p in zip(left, pieces, strict=True) if p.held_out == h] for h in (False, True))
     was_held = [r for r, piece in zip(was, pieces, strict=True) if piece.held_out]
     entries = tangent_space(model).names
-    reason = "" if found.converged else "the search did not converge: its last step was longer than the cloud is wide"
+    reason = (
+        "" if solution.converged else "the search did not converge: its last step was longer than the cloud is wide"
+    )
     reason = reason or _doubt(entries, fitted, "what is left of {} is {:.3g} times what noise explains")
     reason = reason or _doubt(entries, held, "{} of what was held out is missed by {:.3g} times the noise")
-    return Judged(search, found, after, before, fitted, _size(was_held or was), _size(held or left), reason)
+    return Judged(search, solution, after, before, fitted, _size(was_held or was), _size(held or left), reason)
 
 
 def _followed(search: Search, w: Array, noise: Array) -> tuple[list[Array], list[Array]]:
@@ -611,7 +613,7 @@ def _followed(search: Search, w: Array, noise: Array) -> tuple[list[Array], list
     others = [start.others(search.chart, OTHERS, random) for start in starts]
     squares = [np.zeros((len(x), 2 * nv)) for x in xs]
     for k in range(OTHERS):
-        for square, other, x in zip(squares, search.whole(w, [each[k] for each in others]), xs, strict=True):
+        for square, other, x in zip(squares, search.whole(w, [draws[k] for draws in others]), xs, strict=True):
             square += search.chart.minus(other, x) ** 2 / OTHERS
     left = []
     for piece, x, square in zip(search.pieces, xs, squares, strict=True):

@@ -56,7 +56,7 @@ def known_of(unknowns: Unknowns, z: Array, R: Array) -> Known:
 
 def _sparse(directions: Array) -> list[Array]:
     """The same space by directions of few entries each: elimination with the largest entry as pivot."""
-    rows, found = np.array(directions), []
+    rows, basis = np.array(directions), []
     for k in range(len(rows)):
         _, column = np.unravel_index(np.argmax(np.abs(rows[k:])), rows[k:].shape)
         best = k + int(np.argmax(np.abs(rows[k:, column])))
@@ -66,8 +66,8 @@ def _sparse(directions: Array) -> list[Array]:
             if other != k:
                 rows[other] -= rows[other, column] * rows[k]
     for row in rows:
-        found.append(row / np.max(np.abs(row)))
-    return found
+        basis.append(row / np.max(np.abs(row)))
+    return basis
 
 
 def deviations_of(unknowns: Unknowns, z: Array, covariance: Array) -> Array:
@@ -84,16 +84,16 @@ def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float
     """(np, 2) with 95 % in each; a mass's is about its logarithm, and none goes below what is possible."""
     t = float(stats.t.ppf((1 + CONFIDENCE) / 2, max(freedom, 1.0)))
     values, spread = unknowns.values(z), deviations_of(unknowns, z, covariance)
-    found = np.empty((len(z), 2))
-    for one, s in zip(unknowns.each, unknowns.slices, strict=True):
-        if one.quantity == MASS:
+    intervals = np.empty((len(z), 2))
+    for unknown, s in zip(unknowns.each, unknowns.slices, strict=True):
+        if unknown.quantity == MASS:
             wide = t * spread[s] / values[s]
             with np.errstate(over="ignore"):
-                found[s] = np.column_stack([values[s] * np.exp(-wide), values[s] * np.exp(wide)])
+                intervals[s] = np.column_stack([values[s] * np.exp(-wide), values[s] * np.exp(wide)])
         else:
-            found[s] = np.column_stack([values[s] - t * spread[s], values[s] + t * spread[s]])
-        found[s] = np.clip(found[s], one.lower, one.upper)
-    return found
+            intervals[s] = np.column_stack([values[s] - t * spread[s], values[s] + t * spread[s]])
+        intervals[s] = np.clip(intervals[s], unknown.lower, unknown.upper)
+    return intervals
 
 
 def freedom_of(fit: Fit, solved: Solved) -> tuple[int, float]:
@@ -132,8 +132,8 @@ def likelihood_of(fit: Fit, solved: Solved, stated: Array, scatter: Array) -> fl
     with np.errstate(divide="ignore", invalid="ignore"):
         size = fit.noise * np.sqrt(np.nansum(every**2, axis=0) / numbers)
         noise = np.where(np.isfinite(stated), stated, np.fmax(size, 1e-3 * scatter))
-        each = numbers * ((size / noise) ** 2 + 2 * np.log(noise))
-    return float(np.sum(each[numbers > 0]))
+        terms = numbers * ((size / noise) ** 2 + 2 * np.log(noise))
+    return float(np.sum(terms[numbers > 0]))
 
 
 def most_scatter(count: int, tests: int, *, jumps: bool = False) -> float:
@@ -181,8 +181,8 @@ def _ljung_box(rows: Array, lags: int) -> Array:
     r = rows - np.mean(rows, axis=1, keepdims=True)
     size = np.sum(r**2, axis=1)
     products = [np.sum(r[:, k:] * r[:, :-k], axis=1) for k in range(1, lags + 1)]
-    found = n * (n + 2) * sum((each / size) ** 2 / (n - k) for k, each in enumerate(products, 1))
-    return np.asarray(found)
+    statistics = n * (n + 2) * sum((product / size) ** 2 / (n - k) for k, product in enumerate(products, 1))
+    return np.asarray(statistics)
 
 
 @lru_cache

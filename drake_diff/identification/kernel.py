@@ -351,15 +351,15 @@ def _rate(s: System, q: Array, v: Array, out: Array) -> None:
     for k in range(len(s.single)):
         out[s.single[k, 0]] = v[s.single[k, 1]]
     for k in range(len(s.free)):
-        at, i = s.free[k, 0], s.free[k, 1]
-        w, x, y, z = q[at], q[at + 1], q[at + 2], q[at + 3]
+        start, i = s.free[k, 0], s.free[k, 1]
+        w, x, y, z = q[start], q[start + 1], q[start + 2], q[start + 3]
         a, b, c = v[i], v[i + 1], v[i + 2]
-        out[at] = -0.5 * (a * x + b * y + c * z)
-        out[at + 1] = 0.5 * (a * w + b * z - c * y)
-        out[at + 2] = 0.5 * (b * w + c * x - a * z)
-        out[at + 3] = 0.5 * (c * w + a * y - b * x)
+        out[start] = -0.5 * (a * x + b * y + c * z)
+        out[start + 1] = 0.5 * (a * w + b * z - c * y)
+        out[start + 2] = 0.5 * (b * w + c * x - a * z)
+        out[start + 3] = 0.5 * (c * w + a * y - b * x)
         for m in range(3):
-            out[at + 4 + m] = v[i + 3 + m]
+            out[start + 4 + m] = v[i + 3 + m]
 
 
 @inner
@@ -368,14 +368,14 @@ def _motion(s: System, q: Array, d: Array, out: Array) -> None:
     for k in range(len(s.single)):
         out[s.single[k, 1]] = d[s.single[k, 0]]
     for k in range(len(s.free)):
-        at, i = s.free[k, 0], s.free[k, 1]
-        w, x, y, z = q[at], q[at + 1], q[at + 2], q[at + 3]
+        start, i = s.free[k, 0], s.free[k, 1]
+        w, x, y, z = q[start], q[start + 1], q[start + 2], q[start + 3]
         scale = 2.0 / (w * w + x * x + y * y + z * z)
-        out[i] = scale * (w * d[at + 1] - x * d[at] - z * d[at + 2] + y * d[at + 3])
-        out[i + 1] = scale * (w * d[at + 2] - y * d[at] + z * d[at + 1] - x * d[at + 3])
-        out[i + 2] = scale * (w * d[at + 3] - z * d[at] - y * d[at + 1] + x * d[at + 2])
+        out[i] = scale * (w * d[start + 1] - x * d[start] - z * d[start + 2] + y * d[start + 3])
+        out[i + 1] = scale * (w * d[start + 2] - y * d[start] + z * d[start + 1] - x * d[start + 3])
+        out[i + 2] = scale * (w * d[start + 3] - z * d[start] - y * d[start + 1] + x * d[start + 2])
         for m in range(3):
-            out[i + 3 + m] = d[at + 4 + m]
+            out[i + 3 + m] = d[start + 4 + m]
 
 
 @inner

@@ -37,10 +37,12 @@ def search_ended(seconds: float) -> str:
     return f" The search was ended after {seconds:.3g} s of processor time."
 
 
-def also_touching(found: Explanation, touched: Explanation) -> Explanation:
+def also_touching(explanation: Explanation, touched: Explanation) -> Explanation:
     """Not explained by motion in which nothing touches, and not by motion in which bodies do."""
     rest = touched.sentence.removeprefix(NO_CHANGE)
-    return replace(found, sentence=f"{found.sentence} Where bodies touch, none that was tried explains it either{rest}")
+    return replace(
+        explanation, sentence=f"{explanation.sentence} Where bodies touch, none that was tried explains it either{rest}"
+    )
 
 
 def mistaken(first: str, others: Sequence[str], evidence: Mapping[str, float]) -> Explanation:
@@ -65,39 +67,43 @@ def changed_to(name: str, values: Array, intervals: Array, start: Array, unit: s
 def unidentifiable(unknowns: Unknowns, z: Array, directions: Sequence[Array]) -> tuple[str, ...]:
     """In words, the combinations that the data leave open, by their directions (np,) in z."""
     by_z, values = unknowns.by_z(z), unknowns.values(z)
-    found = []
+    sentences = []
     for direction in directions:
         change = by_z @ direction
-        found.append(_words(unknowns, values, change))
-    return tuple(dict.fromkeys(found))
+        sentences.append(_words(unknowns, values, change))
+    return tuple(dict.fromkeys(sentences))
 
 
 def _words(unknowns: Unknowns, values: Array, change: Array) -> str:
     sizes = np.concatenate(
-        [np.full(len(one.start), one.size or 1.0) for one in unknowns.each]
+        [np.full(len(unknown.start), unknown.size or 1.0) for unknown in unknowns.each]
     )  # of an inertia, a third of its trace
     parts = np.abs(change) / sizes
-    told = [int(j) for j in np.argsort(-parts, kind="stable") if parts[j] > PART * np.max(parts)]
-    names = [unknowns.columns[j] for j in told]
-    quantities = {unknowns.each[i].name for i in _owners(unknowns, told)}
+    columns = [int(j) for j in np.argsort(-parts, kind="stable") if parts[j] > PART * np.max(parts)]
+    names = [unknowns.columns[j] for j in columns]
+    quantities = {unknowns.each[i].name for i in _owners(unknowns, columns)}
     if len(quantities) == 1:
         (name,) = quantities
-        if len(told) == 1:
+        if len(columns) == 1:
             return f"{names[0]}: a change of it leaves the motion as it is"
         return f"{name}: a change of {_listed(names)} together leaves the motion as it is"
     both = {name.rsplit(".", 1)[1] for name in quantities}
-    seen = _seen_of_two(values[told], change[told], both.pop() if len(both) == 1 else "") if len(told) == 2 else ""
+    seen = (
+        _seen_of_two(values[columns], change[columns], both.pop() if len(both) == 1 else "")
+        if len(columns) == 2
+        else ""
+    )
     if seen:
         return f"{names[0]} and {names[1]}: only their {seen} is seen"
     # Told as what a tenth of the first one's size does.
-    factor = 0.1 / parts[told[0]]
-    if change[told[0]] < 0:
+    factor = 0.1 / parts[columns[0]]
+    if change[columns[0]] < 0:
         factor = -factor
-    each = [
-        f"{name} by {factor * change[j]:+.3g} {unknowns.units[j]}" for name, j in zip(names[:6], told, strict=False)
+    changes = [
+        f"{name} by {factor * change[j]:+.3g} {unknowns.units[j]}" for name, j in zip(names[:6], columns, strict=False)
     ]
-    more = f" and {len(told) - 6} more" if len(told) > 6 else ""
-    return f"a change of {' with '.join(each)}{more} leaves the motion as it is"
+    more = f" and {len(columns) - 6} more" if len(columns) > 6 else ""
+    return f"a change of {' with '.join(changes)}{more} leaves the motion as it is"
 
 
 def _seen_of_two(values: Array, change: Array, quantity: str) -> str:
@@ -135,39 +141,39 @@ def identification_sentence(
     reason: str,
 ) -> str:
     """What recordings say of parameters (np,) with intervals (np, 2), and by how much the error falls."""
-    changed, kept, vague = [], 0, 0
+    changed, unchanged, vague = [], 0, 0
     for j, name in enumerate(unknowns.columns):
         low, high = intervals[j]
         was, now, unit = unknowns.start[j], values[j], unknowns.units[j]
         if not (np.isfinite(low) and np.isfinite(high)):
             vague += 1
         elif low <= was <= high:
-            kept += 1
+            unchanged += 1
         else:
             by = f", {100 * (now / was - 1):+.3g} %" if was else ""
             size = abs(now - was) / max(high - low, 1e-300)
             changed.append((size, f"{name} is {now:.4g} {unit} ({low:.4g} to {high:.4g}), not {was:.4g}{by}"))
     changed.sort(key=lambda pair: -pair[0])
-    limits = [bound for one in unknowns.each for bound in [(one.lower, one.upper)] * len(one.start)]
+    limits = [bound for unknown in unknowns.each for bound in [(unknown.lower, unknown.upper)] * len(unknown.start)]
     at_bound = [
         f"{name} is at its bound, {now:.4g} {unit}".rstrip()
         for name, now, unit, bounds in zip(unknowns.columns, values, unknowns.units, limits, strict=True)
         if any(np.isfinite(bound) and bound != 0 and abs(now - bound) <= 1e-9 * abs(bound) for bound in bounds)
     ]
-    told = [text for _, text in changed[:4]] + at_bound[:3]
+    clauses = [text for _, text in changed[:4]] + at_bound[:3]
     if len(changed) > 4:
-        told.append(f"{len(changed) - 4} more differ")
+        clauses.append(f"{len(changed) - 4} more differ")
     if not changed:
-        told.append("no parameter differs from the model's by more than its interval")
-    if kept and changed:
-        told.append(f"{kept} {'stays' if kept == 1 else 'stay'} within the interval")
+        clauses.append("no parameter differs from the model's by more than its interval")
+    if unchanged and changed:
+        clauses.append(f"{unchanged} {'stays' if unchanged == 1 else 'stay'} within the interval")
     if vague:
         more = f", and {len(unidentifiable) - 1} more such" if len(unidentifiable) > 1 else ""
         first = f" ({unidentifiable[0]}{more})" if unidentifiable else ""
-        told.append(f"{vague} cannot be known from these recordings{first}")
+        clauses.append(f"{vague} cannot be known from these recordings{first}")
     verdict = "Explained" if explained else "Not explained"
     error = f"the error falls from {errors[0]:.3g} to {errors[1]:.3g} times the noise"
-    return f"{verdict}: {'; '.join(told)}; {error}; {reason}."
+    return f"{verdict}: {'; '.join(clauses)}; {error}; {reason}."
 
 
 def excitation_sentence(
@@ -180,19 +186,19 @@ def excitation_sentence(
     gain: float,
 ) -> str:
     """How well a motion tells parameters, beside a random one and a recording at rest."""
-    told = []
+    clauses = []
     for name, value in deviations.items():
         now, was = np.atleast_1d(value), np.atleast_1d(random[name])
         if len(now) == 1:
             unit = f" {units[name]}" if units[name] not in ("", "1") else ""
-            told.append(
+            clauses.append(
                 f"{name} to {now[0]:.3g}{unit} (random {was[0]:.3g}, at rest {np.atleast_1d(rest[name])[0]:.3g})"
             )
         else:
-            told.append(f"{name} to {', '.join(f'{d:.3g}' for d in now)} {units[name]}")
-    more = f" and {len(told) - 4} more" if len(told) > 4 else ""
+            clauses.append(f"{name} to {', '.join(f'{d:.3g}' for d in now)} {units[name]}")
+    more = f" and {len(clauses) - 4} more" if len(clauses) > 4 else ""
     open_ = f" Open: {'; '.join(unidentifiable[:3])}." if unidentifiable else ""
     return (
-        f"{duration:.3g} s that tell {', '.join(told[:4])}{more}, at one standard deviation: "
+        f"{duration:.3g} s that tell {', '.join(clauses[:4])}{more}, at one standard deviation: "
         f"{gain:.3g} times better than a random motion.{open_}"
     )

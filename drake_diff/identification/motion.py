@@ -59,7 +59,10 @@ class ContinuousMotion:
     @cached_property
     def dry(self) -> tuple[int, ...]:
         """The velocities of joints that friction holds; one that others follow has the friction of all of them."""
-        labels, coupling = {one.label for one in self.unknowns.each if one.quantity == COULOMB}, self.tree.coupling
+        labels, coupling = (
+            {unknown.label for unknown in self.unknowns.each if unknown.quantity == COULOMB},
+            self.tree.coupling,
+        )
         places = {link.joint.v_start for link in self.tree.links if link.joint.joint in labels and not self.smooth}
         return tuple(sorted(places if coupling is None else {int(coupling.of_v[i]) for i in places}))
 
@@ -93,7 +96,7 @@ class ContinuousMotion:
     def dynamics(self, values: Array) -> Dynamics:
         """The tree that unknowns of these values make."""
         numbers = set_numbers(self.model, self.tree, self.unknowns, values)
-        gives = any(one.quantity == HELD_INERTIA for one in self.unknowns.each)
+        gives = any(unknown.quantity == HELD_INERTIA for unknown in self.unknowns.each)
         return Dynamics(self.tree, numbers, self.dry, gives, self.method)
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
@@ -180,9 +183,9 @@ class EulerMotion(ContinuousMotion):
 
     def dynamics(self, values: Array) -> Dynamics:
         """With damping at the end of the step."""
-        own = super().dynamics(values)
-        numbers = own.numbers
-        return replace(own, numbers=replace(numbers, reflected=numbers.reflected + self.longest * numbers.damping))
+        dynamics = super().dynamics(values)
+        numbers = dynamics.numbers
+        return replace(dynamics, numbers=replace(numbers, reflected=numbers.reflected + self.longest * numbers.damping))
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
@@ -263,9 +266,9 @@ class DiscreteMotion:
         by_x, by = np.tile(np.eye(nx), (K, M, 1, 1)), np.zeros((K, M, nx, len(z)))
         taken = hs > 0
         with applied(vector) as model:
-            each = self.derivatives(model, vector, xs[:, :-1][taken], us[taken])
-        by_x[taken] = np.array([step.A for step in each])
-        by[taken] = np.array([step.C for step in each]) @ by_z
+            derivatives = self.derivatives(model, vector, xs[:, :-1][taken], us[taken])
+        by_x[taken] = np.array([step.A for step in derivatives])
+        by[taken] = np.array([step.C for step in derivatives]) @ by_z
         return by_x, by
 
 
@@ -286,7 +289,7 @@ def discrete_motion(model: Model, unknowns: Unknowns, pieces: Sequence[Piece]) -
     h = period / max(1, round(period / model.time_step))
     if abs(h - model.time_step) > CLOCK_TOLERANCE * model.time_step:
         model = model.at_time_step(h)
-    own = [one for one in unknowns.each if one.quantity != BIAS]
-    places = [s for one, s in zip(unknowns.each, unknowns.slices, strict=True) if one.quantity != BIAS]
+    parameters = [unknown for unknown in unknowns.each if unknown.quantity != BIAS]
+    places = [s for unknown, s in zip(unknowns.each, unknowns.slices, strict=True) if unknown.quantity != BIAS]
     entries = np.concatenate([np.arange(s.start, s.stop) for s in places]) if places else np.zeros(0, dtype=int)
-    return DiscreteMotion(model, unknowns, select(model, [one.name for one in own]), entries)
+    return DiscreteMotion(model, unknowns, select(model, [unknown.name for unknown in parameters]), entries)

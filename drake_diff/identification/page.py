@@ -21,9 +21,9 @@ def joined(motions: Sequence[Followed]) -> tuple[Array, Array, Array, Array]:
     for k, motion in enumerate(motions):
         count = len(motion.piece.times) - (k < len(motions) - 1)
         before = np.full_like(motion.xs, np.nan) if motion.xs_before is None else motion.xs_before
-        for part, values in zip(parts, (motion.piece.times, motion.piece.ys, motion.xs, before), strict=True):
-            part.append(values[:count])
-    times, ys, xs, before = (np.concatenate(part) for part in parts)
+        for arrays, values in zip(parts, (motion.piece.times, motion.piece.ys, motion.xs, before), strict=True):
+            arrays.append(values[:count])
+    times, ys, xs, before = (np.concatenate(arrays) for arrays in parts)
     return times, ys, xs, before
 
 

@@ -109,11 +109,11 @@ class Ranking(Candidates):
         with np.errstate(divide="ignore"):
             pull = float(np.sum(((solved.z - unknowns.z_start) / unknowns.widths) ** 2))
         shaped = {
-            one.name: frozen(intervals[s][0] if len(one.start) == 1 else intervals[s])
-            for one, s in zip(unknowns.each, unknowns.slices, strict=True)
+            unknown.name: frozen(intervals[s][0] if len(unknown.start) == 1 else intervals[s])
+            for unknown, s in zip(unknowns.each, unknowns.slices, strict=True)
         }
         values = unknowns.named(unknowns.values(solved.z))
-        own = solved.z, solved.starts
+        point = solved.z, solved.starts
         return Tried(
             names,
             likelihood_of(fit, solved, self.stated, self.scatter),
@@ -123,11 +123,11 @@ class Ranking(Candidates):
             doubt,
             values,
             shaped,
-            *own,
+            *point,
         )
 
-    def bic(self, one: Tried) -> float:
-        return one.score + one.pull + one.freedom * float(np.log(self.count))
+    def bic(self, candidate: Tried) -> float:
+        return candidate.score + candidate.pull + candidate.freedom * float(np.log(self.count))
 
     def least(self, freedom: float, count: int) -> float:
         """By how much a score must fall, where so many changes were tried."""
@@ -135,13 +135,13 @@ class Ranking(Candidates):
 
     def enough(self, base: Tried, tried: Sequence[Tried], count: int) -> list[Tried]:
         """The changes that explain and have the evidence, best first, and not told from the best."""
-        found = []
-        for one in tried:
-            freedom = max(one.freedom, 1.0)
-            if one.explains and base.score - one.score > self.least(freedom, count):
-                found.append(one)
-        found.sort(key=self.bic)
-        return [one for one in found if self.bic(one) - self.bic(found[0]) < SAME]
+        candidates = []
+        for candidate in tried:
+            freedom = max(candidate.freedom, 1.0)
+            if candidate.explains and base.score - candidate.score > self.least(freedom, count):
+                candidates.append(candidate)
+        candidates.sort(key=self.bic)
+        return [candidate for candidate in candidates if self.bic(candidate) - self.bic(candidates[0]) < SAME]
 
 
 LOOKED_AT = 8  # changes that enter the race, of those that promise most: of those of one number, and of others
@@ -169,26 +169,26 @@ class Runner:
 
     def step(self) -> bool:
         """Whether there is a motion to step from, if need be by steps that are shorter and stay so."""
-        found = self._reduced()
+        reduced = self._reduced()
         for _ in range(HALVED):
             shorter = self.fit.shorter
-            if found is not None or shorter is None:
+            if reduced is not None or shorter is None:
                 break
             self.fit = self.fit.by(shorter)
-            found = self._reduced()
-        if found is None:
+            reduced = self._reduced()
+        if reduced is None:
             return False
-        dz = self.fit.step_of(self.z, found)
-        self.starts = self.fit.moved(self.starts, found, dz, 1.0)
+        dz = self.fit.step_of(self.z, reduced)
+        self.starts = self.fit.moved(self.starts, reduced, dz, 1.0)
         self.z = self.z + dz
         pull = float(np.sum(((self.z - self.fit.unknowns.z_start) / self.fit.unknowns.widths) ** 2))
-        self.left = found.rest + float(np.sum((found.b - found.R @ dz) ** 2)) + pull
+        self.left = reduced.rest + float(np.sum((reduced.b - reduced.R @ dz) ** 2)) + pull
         return True
 
     def _reduced(self) -> Reduced | None:
         point = self.fit.at(self.z, self.starts)
-        found = None if point is None else self.fit.reduce(point)
-        return found if found is not None and found.finite else None
+        reduced = None if point is None else self.fit.reduce(point)
+        return reduced if reduced is not None and reduced.finite else None
 
 
 @dataclass(eq=False)
@@ -207,39 +207,41 @@ class Race(Ranking):
 
     def chosen(self, seen: View, changes: Iterable[tuple[int, ...]], most: int = LOOKED_AT) -> Chosen:
         """Those that promise most, and a delay."""
-        each, changes = self.unknowns.each, list(changes)
+        unknowns, changes = self.unknowns.each, list(changes)
         chosen: Chosen = {}
         places = {True: most, False: most}  # what has more numbers bends to more, and promises more than it keeps
         for promise in seen.promises(changes, float(np.log(self.count))):
-            small = all(len(each[i].start) == 1 for i in promise.members)
-            own = tuple(self.plain(each[i].name) for i in promise.members)
+            small = all(len(unknowns[i].start) == 1 for i in promise.members)
+            names = tuple(self.plain(unknowns[i].name) for i in promise.members)
             if (
                 places[small]
-                and own not in chosen
-                and len(set(own)) == len(own)
-                and sum(map(self.is_of_inputs, own)) <= 1
+                and names not in chosen
+                and len(set(names)) == len(names)
+                and sum(map(self.is_of_inputs, names)) <= 1
             ):
-                chosen[own] = promise
+                chosen[names] = promise
                 places[small] -= 1
-        for i, one in enumerate(each):  # none at all promises little of one of several samples
-            if one.quantity == DELAY and (i,) in changes:
-                chosen.setdefault((one.name,), Promise((i,), seen.most, 1.0, np.zeros(1)))
+        for i, unknown in enumerate(unknowns):  # none at all promises little of one of several samples
+            if unknown.quantity == DELAY and (i,) in changes:
+                chosen.setdefault((unknown.name,), Promise((i,), seen.most, 1.0, np.zeros(1)))
         return chosen
 
     def tried(self, seen: View, chosen: Chosen, base: Tried) -> tuple[list[Tried], list[Runner]]:
         """(those that are fitted, all that stayed in the race, best first)."""
-        plain = {own: promise for own, promise in chosen.items() if not any(map(self.is_of_inputs, own))}
-        found, every = self.raced([self.runner(seen, promise, own) for own, promise in plain.items()], base)
-        if any(one.explains for one in found):  # a search for a delay or a limit takes longer than the others together
+        plain = {names: promise for names, promise in chosen.items() if not any(map(self.is_of_inputs, names))}
+        candidates, every = self.raced([self.runner(seen, promise, names) for names, promise in plain.items()], base)
+        if any(
+            candidate.explains for candidate in candidates
+        ):  # a search for a delay or a limit takes longer than the others together
             first = min(promise.left for promise in chosen.values())
-            chosen = {own: promise for own, promise in chosen.items() if not self.is_behind(promise.left, first)}
+            chosen = {names: promise for names, promise in chosen.items() if not self.is_behind(promise.left, first)}
         others: list[Runner] = []
-        for own, promise in chosen.items():
-            if own in plain or (others and self.is_late):
+        for names, promise in chosen.items():
+            if names in plain or (others and self.is_late):
                 continue
-            others.append(self.runner(seen, promise, own))
+            others.append(self.runner(seen, promise, names))
         more, rest = self.raced(others, base)
-        return [*found, *more], sorted([*every, *rest], key=lambda one: one.left)
+        return [*candidates, *more], sorted([*every, *rest], key=lambda runner: runner.left)
 
     def runner(self, seen: View, promise: Promise, names: tuple[str, ...]) -> Runner:
         special = next((name for name in names if name.endswith(f".{LIMIT}")), None)
@@ -249,9 +251,14 @@ class Race(Ranking):
         if unknowns.delay is not None and seen.unknowns.delay is None:
             return self.delayed(names, unknowns, promise)
         z, starts = seen.ahead(promise)
-        own = [one.name for one in unknowns.each]
-        at = [i for one, s in self.each_of(seen.unknowns) if one.name in own for i in range(s.start, s.stop)]
-        z = np.clip(z[at], *unknowns.bounds)
+        unknown_names = [unknown.name for unknown in unknowns.each]
+        columns = [
+            i
+            for unknown, s in self.each_of(seen.unknowns)
+            if unknown.name in unknown_names
+            for i in range(s.start, s.stop)
+        ]
+        z = np.clip(z[columns], *unknowns.bounds)
         return self.running(names, unknowns, self.cut, starts, z, promise)
 
     def delayed(self, names: tuple[str, ...], unknowns: Unknowns, promise: Promise) -> Runner:
@@ -261,12 +268,12 @@ class Race(Ranking):
         for delay in self.delays:
             if worse > 1:
                 break
-            at = unknowns.z_start.copy()
-            at[unknowns.delay] = delay
+            z = unknowns.z_start.copy()
+            z[unknowns.delay] = delay
             worse += 1
-            one = self.running(names, unknowns, self.cut, self.starts_at(float(delay)), at, promise)
-            if all(one.step() for _ in names) and one.left < best.left:  # two where another change bends as well
-                best, worse = one, 0
+            runner = self.running(names, unknowns, self.cut, self.starts_at(float(delay)), z, promise)
+            if all(runner.step() for _ in names) and runner.left < best.left:  # two where another change bends as well
+                best, worse = runner, 0
         return best
 
     def running(
@@ -287,75 +294,77 @@ class Race(Ranking):
         for most in RACE:
             if most < RACE[0] and self.is_late:
                 most = 1
-            before = {one.names: one.left for one in alive}
-            alive = sorted((one for one in alive if one.step()), key=lambda one: one.left)
-            there += [one for one in alive if not self.is_hopeless(one.left)]
+            before = {runner.names: runner.left for runner in alive}
+            alive = sorted((runner for runner in alive if runner.step()), key=lambda runner: runner.left)
+            there += [runner for runner in alive if not self.is_hopeless(runner.left)]
             alive = [
-                one
-                for one in alive[:most]
-                if self.is_hopeless(one.left) and (most == RACE[0] or one.left < FALLS * before[one.names])
+                runner
+                for runner in alive[:most]
+                if self.is_hopeless(runner.left) and (most == RACE[0] or runner.left < FALLS * before[runner.names])
             ]
         self.improve(there)
-        every = sorted(runners, key=lambda one: one.left)
+        every = sorted(runners, key=lambda runner: runner.left)
         alive = there + alive
         price = float(np.log(self.count))
-        alive.sort(key=lambda one: one.left + price * one.freedom)
-        found: list[Tried] = []
-        for one in alive:
+        alive.sort(key=lambda runner: runner.left + price * runner.freedom)
+        candidates: list[Tried] = []
+        for runner in alive:
             first = alive[0].left + price * alive[0].freedom
-            enough = any(each.explains for each in found) and self.is_behind(one.left + price * one.freedom, first)
-            enough = enough or (bool(found) and (self.is_late or one.left > self.plausible))
-            if enough or self.is_hopeless(one.left) or one.fit.at(one.z, one.starts) is None:
+            enough = any(candidate.explains for candidate in candidates) and self.is_behind(
+                runner.left + price * runner.freedom, first
+            )
+            enough = enough or (bool(candidates) and (self.is_late or runner.left > self.plausible))
+            if enough or self.is_hopeless(runner.left) or runner.fit.at(runner.z, runner.starts) is None:
                 continue
             try:
-                found.append(self.ended(one))
+                candidates.append(self.ended(runner))
             except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
                 continue
-            self.evidence[" and ".join(one.names)] = base.score - found[-1].score
-        return found, every
+            self.evidence[" and ".join(runner.names)] = base.score - candidates[-1].score
+        return candidates, every
 
     def improve(self, there: Sequence[Runner]) -> None:
         """Steps of those that came near the noise, for as long as these help."""
         best = np.inf
-        for one in sorted(there, key=lambda one: one.left):
+        for runner in sorted(there, key=lambda runner: runner.left):
             for _ in range(STEPS):
-                last = one.left
-                if self.is_late or not one.step() or last - one.left < CLOSE:
+                last = runner.left
+                if self.is_late or not runner.step() or last - runner.left < CLOSE:
                     break
-                if one.left > FALLS * last and (self.is_behind(one.left, best) or self.is_hopeless(one.left)):
+                if runner.left > FALLS * last and (self.is_behind(runner.left, best) or self.is_hopeless(runner.left)):
                     break
-            best = min(best, one.left)
+            best = min(best, runner.left)
 
     def is_behind(self, left: float, best: float) -> bool:
         """Whether a change that leaves so much is told from the one that leaves least."""
         return left - best > TOLD_APART * max(1.0, best / self.count)
 
-    def ended(self, one: Runner) -> Tried:
+    def ended(self, runner: Runner) -> Tried:
         """The change where it fits best, with the noise estimated anew."""
-        pieces = one.fit.segments.pieces
-        found = self.solved(one.names, one.fit.unknowns, one.fit.law, pieces, one.starts, one.z)
-        if not one.special:
-            return found
-        return found._replace(
-            freedom=found.freedom + 1.0,
-            values={**found.values, **one.special},
-            intervals={**found.intervals, **one.interval},
+        pieces = runner.fit.segments.pieces
+        candidate = self.solved(runner.names, runner.fit.unknowns, runner.fit.law, pieces, runner.starts, runner.z)
+        if not runner.special:
+            return candidate
+        return candidate._replace(
+            freedom=candidate.freedom + 1.0,
+            values={**candidate.values, **runner.special},
+            intervals={**candidate.intervals, **runner.interval},
         )
 
     def searched(
         self, special: str, names: tuple[str, ...], unknowns: Unknowns, promise: Promise, near: float | None = None
     ) -> Runner:
         """At the limit by which the rest fits best, with its interval by how what is left bends there."""
-        found: dict[float, Runner] = {}
+        runners: dict[float, Runner] = {}
 
         def left(value: float) -> float:
-            if value not in found:
+            if value not in runners:
                 pieces = [self.acted(piece, special, value) for piece in self.cut]
-                one = self.running(names, unknowns, pieces, self.starts, unknowns.z_start, promise)
-                if not all(one.step() for _ in range(2)):
-                    one.left = np.inf
-                found[value] = one
-            return found[value].left
+                runner = self.running(names, unknowns, pieces, self.starts, unknowns.z_start, promise)
+                if not all(runner.step() for _ in range(2)):
+                    runner.left = np.inf
+                runners[value] = runner
+            return runners[value].left
 
         i = self.model.input_names.index(special.rsplit(".", 1)[0])
         largest = max(float(np.max(np.abs(p.us[:, i]))) for p in self.pieces)
@@ -373,9 +382,9 @@ class Race(Ranking):
         bend = (left(value + width) + left(value - width) - 2 * left(value)) / width**2
         noise = left(value) / self.count
         half = 1.96 * float(np.sqrt(2 * noise / bend)) if bend > 0 else np.inf
-        one = found[value]
-        one.special, one.interval = {special: value}, {special: frozen([max(value - half, 0.0), value + half])}
-        return one
+        runner = runners[value]
+        runner.special, runner.interval = {special: value}, {special: frozen([max(value - half, 0.0), value + half])}
+        return runner
 
     def acted(self, piece: Piece, special: str, value: float) -> Piece:
         """The piece with an input that is cut."""

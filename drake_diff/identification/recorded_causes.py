@@ -146,34 +146,34 @@ def _motion_hash(record: ComparisonRecord) -> str | None:
     return next((use.sha256 for use in uses if use.name == MOTION), None)
 
 
-def as_recorded(name: str, recorded: CauseEvidence, found: CauseEvidence) -> tuple[CauseEvidence, list[str]]:
+def as_recorded(name: str, recorded: CauseEvidence, repeated: CauseEvidence) -> tuple[CauseEvidence, list[str]]:
     """The cause that was found again, as it is recorded where it is the same within SAME_VALUE; and what is in doubt.
 
     In doubt is what a search that its limit of processor time ended says: no run repeats that.
     """
     same = (recorded.names, recorded.alternatives, recorded.explained) == (
-        found.names,
-        found.alternatives,
-        found.explained,
+        repeated.names,
+        repeated.alternatives,
+        repeated.explained,
     )
     same = same and all(
-        old.keys() == new.keys() and all(_is_same(old[q], new[q], found.intervals.get(q, [])) for q in new)
-        for old, new in ((recorded.values, found.values), (recorded.intervals, found.intervals))
+        old.keys() == new.keys() and all(_is_same(old[q], new[q], repeated.intervals.get(q, [])) for q in new)
+        for old, new in ((recorded.values, repeated.values), (recorded.intervals, repeated.intervals))
     )
-    same = same and _is_same_sentence(recorded.sentence, found.sentence)
-    if same or recorded == found:
+    same = same and _is_same_sentence(recorded.sentence, repeated.sentence)
+    if same or recorded == repeated:
         return recorded, []
-    if ENDED in recorded.sentence or ENDED in found.sentence:
+    if ENDED in recorded.sentence or ENDED in repeated.sentence:
         why = "a search that its limit of processor time ends is not repeated"
-        return recorded, [f"{name}: recorded {recorded.sentence!r}, again {found.sentence!r}: {why}"]
-    return found, []
+        return recorded, [f"{name}: recorded {recorded.sentence!r}, again {repeated.sentence!r}: {why}"]
+    return repeated, []
 
 
-def _is_same(told: Any, found: Any, intervals: Sequence[Numbers]) -> bool:
+def _is_same(recorded: Any, repeated: Any, intervals: Sequence[Numbers]) -> bool:
     """Whether the numbers of a value, or both ends of each interval, are those found again."""
-    if len(told) != len(found) or len(found) != len(intervals):
+    if len(recorded) != len(repeated) or len(repeated) != len(intervals):
         return False
-    for old, new, ends in zip(told, found, intervals, strict=True):
+    for old, new, ends in zip(recorded, repeated, intervals, strict=True):
         low, high = (None, None) if len(ends) != 2 else ends
         least = 0.0 if low is None or high is None else SAME_VALUE * abs(high - low) / 2
         pairs = zip(old, new, strict=True) if isinstance(old, list) and isinstance(new, list) else ((old, new),)
@@ -186,11 +186,11 @@ def _is_same(told: Any, found: Any, intervals: Sequence[Numbers]) -> bool:
     return True
 
 
-def _is_same_sentence(told: str, found: str) -> bool:
+def _is_same_sentence(recorded: str, repeated: str) -> bool:
     """Whether two sentences have the same words, and numbers that are the same but for the fourth digit's rounding."""
-    if NUMBER.split(told) != NUMBER.split(found):
+    if NUMBER.split(recorded) != NUMBER.split(repeated):
         return False
-    pairs = [(float(a), float(b)) for a, b in zip(NUMBER.findall(told), NUMBER.findall(found), strict=True)]
+    pairs = [(float(a), float(b)) for a, b in zip(NUMBER.findall(recorded), NUMBER.findall(repeated), strict=True)]
     return all(a == b or abs(a - b) <= SAME_DIGIT * _fourth_digit(max(abs(a), abs(b))) for a, b in pairs)
 
 
@@ -216,17 +216,19 @@ def cause_of(model: Model, recording: Recording) -> CauseEvidence:
         'No cause was looked for: recording lab'
     """
     try:
-        found = explain(model, recording)
+        explanation = explain(model, recording)
     except DrakeDiffError as error:
         sentence = f"No cause was looked for: {error}"
         return CauseEvidence(names=[], values={}, intervals={}, alternatives=[], explained=False, sentence=sentence)
     return CauseEvidence(
-        names=list(found.names),
-        values={name: _numbers(np.atleast_1d(value)) for name, value in found.values.items()},
-        intervals={name: [_numbers(row) for row in np.atleast_2d(each)] for name, each in found.intervals.items()},
-        alternatives=[list(names) for names in found.alternatives],
-        explained=found.explained,
-        sentence=found.sentence,
+        names=list(explanation.names),
+        values={name: _numbers(np.atleast_1d(value)) for name, value in explanation.values.items()},
+        intervals={
+            name: [_numbers(row) for row in np.atleast_2d(interval)] for name, interval in explanation.intervals.items()
+        },
+        alternatives=[list(names) for names in explanation.alternatives],
+        explained=explanation.explained,
+        sentence=explanation.sentence,
     )
 
 

@@ -47,32 +47,32 @@ class Chart:
     def minus(self, y: Array, x: Array) -> Array:
         """The small motion from x to y; NaN where y has NaN."""
         nq, nv = self.coordinates.nq, self.coordinates.nv
-        found = np.empty((*np.broadcast_shapes(y.shape, x.shape)[:-1], 2 * nv))
-        found[..., nv:] = y[..., nq:] - x[..., nq:]
+        motion = np.empty((*np.broadcast_shapes(y.shape, x.shape)[:-1], 2 * nv))
+        motion[..., nv:] = y[..., nq:] - x[..., nq:]
         for i, j in self.coordinates.single:
-            found[..., j] = y[..., i] - x[..., i]
+            motion[..., j] = y[..., i] - x[..., i]
         for i, j in self.coordinates.free:
             between = _product(y[..., i : i + 4], x[..., i : i + 4] * np.array([1.0, -1.0, -1.0, -1.0]))
             with np.errstate(divide="ignore", invalid="ignore"):
-                found[..., j : j + 3] = 2 * between[..., 1:] / between[..., :1]
-            found[..., j + 3 : j + 6] = y[..., i + 4 : i + 7] - x[..., i + 4 : i + 7]
-        return found
+                motion[..., j : j + 3] = 2 * between[..., 1:] / between[..., :1]
+            motion[..., j + 3 : j + 6] = y[..., i + 4 : i + 7] - x[..., i + 4 : i + 7]
+        return motion
 
     def to_motion(self, x: Array) -> Array:
         """(..., 2 nv, nx): the small motion that a change of the state is."""
         nq, nv = self.coordinates.nq, self.coordinates.nv
-        found = np.zeros((*x.shape[:-1], 2 * nv, nq + nv))
-        found[..., :nv, :nq] = self.coordinates.motion(x[..., :nq])
-        found[..., nv:, nq:] = np.eye(nv)
-        return found
+        matrix = np.zeros((*x.shape[:-1], 2 * nv, nq + nv))
+        matrix[..., :nv, :nq] = self.coordinates.motion(x[..., :nq])
+        matrix[..., nv:, nq:] = np.eye(nv)
+        return matrix
 
     def from_motion(self, x: Array) -> Array:
         """(..., nx, 2 nv): how the state changes with a small motion."""
         nq, nv = self.coordinates.nq, self.coordinates.nv
-        found = np.zeros((*x.shape[:-1], nq + nv, 2 * nv))
-        found[..., :nq, :nv] = self.coordinates.rate(x[..., :nq])
-        found[..., nq:, nv:] = np.eye(nv)
-        return found
+        matrix = np.zeros((*x.shape[:-1], nq + nv, 2 * nv))
+        matrix[..., :nq, :nv] = self.coordinates.rate(x[..., :nq])
+        matrix[..., nq:, nv:] = np.eye(nv)
+        return matrix
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -146,8 +146,8 @@ def read_pieces(
     given = [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
     if not given:
         raise InputError("recordings", got="none", expected="one or more of dd.Recording, or their files")
-    each = [r if isinstance(r, Recording) else read_recording(r, model, gaps=True) for r in given]
-    names = [r.name for r in each]
+    logs = [r if isinstance(r, Recording) else read_recording(r, model, gaps=True) for r in given]
+    names = [r.name for r in logs]
     if isinstance(held_out, str):
         if held_out not in names:
             raise UnknownNameError("recording to be held out", got=held_out, known=names)
@@ -156,7 +156,7 @@ def read_pieces(
     elif not 0 <= held_out <= 0.8:
         raise InputError("held_out", got=held_out, expected="from 0 to 0.8 of the samples, or a recording's name")
     pieces = []
-    for i, r in enumerate(each):
+    for i, r in enumerate(logs):
         whole = replace(_checked(r, model, columns), recording=i)
         if isinstance(held_out, str):
             pieces.append(replace(whole, held_out=r.name == held_out))
@@ -174,11 +174,15 @@ def read_given(
 ) -> tuple[tuple[Recording, ...], tuple[tuple[Path, str] | None, ...]]:
     """Every recording, and the file that it was read from with its hash, where there is one."""
     given = [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
-    found, files = [], []
-    for one in given:
-        files.append(None if isinstance(one, Recording) or not Path(one).exists() else (Path(one), hash_of(Path(one))))
-        found.append(one if isinstance(one, Recording) else read_recording(one, model, gaps=True))
-    return tuple(found), tuple(files)
+    logs, files = [], []
+    for source in given:
+        files.append(
+            None
+            if isinstance(source, Recording) or not Path(source).exists()
+            else (Path(source), hash_of(Path(source)))
+        )
+        logs.append(source if isinstance(source, Recording) else read_recording(source, model, gaps=True))
+    return tuple(logs), tuple(files)
 
 
 def hash_of(path: Path) -> str:
@@ -236,14 +240,14 @@ def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, c
     Names are those of states; a free body's turn is called base_rx, base_ry, base_rz.
     """
     names = (*tangent_space(model).names, *columns)
-    found = np.full(len(names), np.nan)
+    deviations = np.full(len(names), np.nan)
     for name, value in (noise or {}).items():
         if name not in names:
             raise UnknownNameError("noise of", got=name, known=names)
         if isinstance(value, bool) or not np.isfinite(value) or value <= 0:
             raise InputError(f"noise of {name}", got=value, expected="a standard deviation above 0")
-        found[names.index(name)] = value
-    return found
+        deviations[names.index(name)] = value
+    return deviations
 
 
 def noise_by_differences(chart: Chart, pieces: Sequence[Piece], *, jumps: bool = False) -> Array:
@@ -254,36 +258,36 @@ def noise_by_differences(chart: Chart, pieces: Sequence[Piece], *, jumps: bool =
     """
     increments = [chart.minus(piece.ys[1:], piece.ys[:-1]) for piece in pieces]
     increments = [
-        each if piece.outs is None else np.hstack([each, np.diff(piece.outs, axis=0)])
-        for each, piece in zip(increments, pieces, strict=True)
+        rows if piece.outs is None else np.hstack([rows, np.diff(piece.outs, axis=0)])
+        for rows, piece in zip(increments, pieces, strict=True)
     ]
     count = increments[0].shape[1]
     least, reach = np.full(count, np.inf), np.zeros(count)
     for j in range(count):
         for order in range(1, ORDERS + 1):
-            parts = [np.diff(each[:, j], n=order - 1) for each in increments]
-            known = np.concatenate([part[np.isfinite(part)] for part in parts])
+            parts = [np.diff(rows[:, j], n=order - 1) for rows in increments]
+            known = np.concatenate([differences[np.isfinite(differences)] for differences in parts])
             size = np.inf
             if jumps and len(known) >= FEWEST_WITH_JUMPS:
                 size = MAD * float(np.median(np.abs(known)))
             elif len(known) >= FEWEST:
                 size = float(np.sqrt(np.mean(known**2)))
             least[j] = min(least[j], size / float(np.sqrt(comb(2 * order, order))))
-        travelled = np.concatenate([each[:, j] for each in increments])
+        travelled = np.concatenate([rows[:, j] for rows in increments])
         reach[j] = np.nansum(np.abs(travelled)) if np.any(np.isfinite(travelled)) else 0.0
-    seen = np.any([np.isfinite(each).any(axis=0) for each in increments], axis=0)
+    seen = np.any([np.isfinite(rows).any(axis=0) for rows in increments], axis=0)
     least = np.where(np.isfinite(least), least, 1.0)  # where samples are too few to say
     return np.where(seen, np.maximum(least, NO_NOISE * np.maximum(reach, 1e-3)), np.nan)
 
 
-def guess_states(model: Model, chart: Chart, piece: Piece, at: NDArray[np.intp]) -> Array:
-    """(len(at), nx) states at some samples: cubics through the samples around each.
+def guess_states(model: Model, chart: Chart, piece: Piece, samples: NDArray[np.intp]) -> Array:
+    """(len(samples), nx) states at some samples: cubics through the samples around each.
 
     A velocity that was not measured is the slope of its position; a position that was not measured is the model's own.
     """
     nq, default = model.nq, model.default_state
-    found = np.empty((len(at), model.nx))
-    for row, k in enumerate(at):
+    states = np.empty((len(samples), model.nx))
+    for row, k in enumerate(samples):
         t = piece.times - piece.times[k]
         q, q_dot, v = default[:nq].copy(), np.zeros(nq), np.full(model.nv, np.nan)
         for i in range(nq):
@@ -297,8 +301,8 @@ def guess_states(model: Model, chart: Chart, piece: Piece, at: NDArray[np.intp])
             if fitted is not None:
                 v[i] = fitted[0]
         slope = chart.coordinates.motion(q) @ q_dot
-        found[row] = np.concatenate([q, np.where(np.isnan(v), slope, v)])
-    return found
+        states[row] = np.concatenate([q, np.where(np.isnan(v), slope, v)])
+    return states
 
 
 def _cubic(t: Array, y: Array) -> Any:

@@ -67,27 +67,29 @@ def choose_sensors(
             raise UnknownNameError("sensor of which there are columns", got=name, known=[s for s, _ in wanted])
     if tree is None:
         return Sensors(None, (), ())
-    return Sensors(tree, tuple(_sensor(model, tree, *one, mounted.get(one[0])) for one in wanted), tuple(columns))
+    return Sensors(
+        tree, tuple(_sensor(model, tree, *sensor, mounted.get(sensor[0])) for sensor in wanted), tuple(columns)
+    )
 
 
 def _sensor(model: Model, tree: Tree, label: str, quantity: str, mounted: Any) -> Sensor:
     if quantity == FORCE:
-        found = labelled(joints(model.plant))
-        known = [name for name, joint in found.items() if joint.num_velocities() == 1]
+        by_label = labelled(joints(model.plant))
+        known = [name for name, joint in by_label.items() if joint.num_velocities() == 1]
         if label not in known:
             raise UnknownNameError("joint with a force", got=label, known=known)
-        at = next(i for i, link in enumerate(tree.links) if link.joint.joint == label)
-        return Sensor(label, quantity, at, np.eye(3), np.zeros(3))
+        index = next(i for i, link in enumerate(tree.links) if link.joint.joint == label)
+        return Sensor(label, quantity, index, np.eye(3), np.zeros(3))
     body, turn, point = label, np.eye(3), np.zeros(3)
     if mounted is not None:
         body, turn, point = _mounted(label, mounted)
     if body not in tree.placed:
         raise UnknownNameError(f"body of sensor {label}", got=body, known=list(labelled(bodies(model.plant))))
-    at, pose = tree.placed[body]
-    if at < 0:
+    index, pose = tree.placed[body]
+    if index < 0:
         raise InputError(f"sensor {label}", got=f"on {body}, which is fixed to the world", expected="one that moves")
     R = pose.rotation().matrix()
-    return Sensor(label, quantity, at, R @ turn, R @ point + pose.translation())
+    return Sensor(label, quantity, index, R @ turn, R @ point + pose.translation())
 
 
 def _mounted(label: str, given: Any) -> tuple[str, Array, Array]:
@@ -174,8 +176,8 @@ class Sensors:
     def _forces(self) -> list[tuple[int, int]]:
         """(column, degree of freedom) of each force."""
         tree = self._tree
-        found = [sensor for sensor in self.each if sensor.quantity == FORCE]
-        return [(self.columns.index(sensor.columns[0]), int(tree.first[sensor.link])) for sensor in found]
+        sensors = [sensor for sensor in self.each if sensor.quantity == FORCE]
+        return [(self.columns.index(sensor.columns[0]), int(tree.first[sensor.link])) for sensor in sensors]
 
     def slopes(self, dynamics: Dynamics, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
         """(N, m, 2 nv) by small motions of the state, and (N, m, np) by parameters, of which `by` moves the numbers."""
@@ -192,21 +194,25 @@ class Sensors:
             moved[..., nv + j] = self._read(numbers, q, v + step, a).imag / TINY
             if by_state is not None:
                 by_a[..., j] = self._read(numbers, q, v, a + step).imag / TINY
-        found = np.zeros((len(q), self.count, by.shape[1]))
+        by_parameters = np.zeros((len(q), self.count, by.shape[1]))
         flat = numbers.flat
         for column in range(by.shape[1]):
             if np.any(by[:, column] != 0):
                 turned = flat + 1j * TINY * by[:, column]
                 parts = {name: turned[numbers.places(name)] for name in Numbers.__dataclass_fields__}
-                found[..., column] = self._read(Numbers(**parts), q, v, a).imag / TINY
+                by_parameters[..., column] = self._read(Numbers(**parts), q, v, a).imag / TINY
         if self._forces:
             _, mass, slopes = dynamics.inverse_dynamics(q, v, a, by)
             for i, k in self._forces:
-                moved[:, i], by_a[:, i], found[:, i] = slopes[:, k, : 2 * nv], mass[:, k], slopes[:, k, 2 * nv :]
+                moved[:, i], by_a[:, i], by_parameters[:, i] = (
+                    slopes[:, k, : 2 * nv],
+                    mass[:, k],
+                    slopes[:, k, 2 * nv :],
+                )
         if by_state is not None:
             moved += by_a @ by_state[..., : 2 * nv]
-            found += by_a @ by_state[..., 2 * nv :]
-        return moved, found
+            by_parameters += by_a @ by_state[..., 2 * nv :]
+        return moved, by_parameters
 
     def _above(self) -> Array:
         """(nv,) which coordinates any of the sensors sees by its place or motion."""
@@ -230,12 +236,12 @@ class Sensors:
                 k = int(self._tree.first[sensor.link])
                 every.append(np.zeros((len(q), 1)) if forces is None else forces[:, [k]])
                 continue
-            at = self._frame(sensor.link, numbers, q, v, a, small, known).to(sensor.turn, sensor.point)
+            frame = self._frame(sensor.link, numbers, q, v, a, small, known).to(sensor.turn, sensor.point)
             if sensor.quantity == "position":
-                every.append(at.p)
+                every.append(frame.p)
             else:
-                of = at.w if sensor.quantity == "gyro" else at.a
-                every.append((np.swapaxes(at.R, -1, -2) @ of[..., None])[..., 0])
+                vector = frame.w if sensor.quantity == "gyro" else frame.a
+                every.append((np.swapaxes(frame.R, -1, -2) @ vector[..., None])[..., 0])
         return np.concatenate(every, axis=1)[:, self._entries()]
 
     def _frame(self, i: int, numbers: Numbers, q: Any, v: Any, a: Any, small: Any, known: dict[int, _At]) -> _At:
@@ -246,28 +252,40 @@ class Sensors:
         link, k = tree.links[i], tree.first[i]
         if link.free:
             s = link.joint.q_start
-            quaternion, place = q[:, s : s + 4], q[:, s + 4 : s + 7] + small[k + 3 : k + 6]
+            quaternion, position = q[:, s : s + 4], q[:, s + 4 : s + 7] + small[k + 3 : k + 6]
             vector = skew(quaternion[:, 1:])
             scale = 2 / np.sum(quaternion * quaternion, axis=1)[:, None, None]
             R = np.eye(3) + scale * (quaternion[:, :1, None] * vector + vector @ vector)
             w = small[k : k + 3]
             R = R + np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]) @ R
-            found = _At(
-                R, place, v[:, k : k + 3], v[:, k + 3 : k + 6], a[:, k : k + 3], a[:, k + 3 : k + 6] - numbers.gravity
+            frame = _At(
+                R,
+                position,
+                v[:, k : k + 3],
+                v[:, k + 3 : k + 6],
+                a[:, k : k + 3],
+                a[:, k + 3 : k + 6] - numbers.gravity,
             )
         else:
             zero = np.zeros((len(q), 3))
             ground = _At(np.broadcast_to(np.eye(3), (len(q), 3, 3)), zero, zero, zero, zero, zero - numbers.gravity)
             before = self._frame(link.parent, numbers, q, v, a, small, known) if link.parent >= 0 else ground
-            at = before.to(link.on_parent.rotation().matrix(), numbers.offset[i])
+            joint_frame = before.to(link.on_parent.rotation().matrix(), numbers.offset[i])
             angle, speed, change = q[:, link.joint.q_start] + small[k], v[:, k, None], a[:, k, None]
-            axis = at.R @ link.axis
+            axis = joint_frame.R @ link.axis
             if link.joint.kind == "revolute":
-                w_dot = at.w_dot + axis * change + np.cross(at.w, axis * speed)
-                found = _At(at.R @ _about(link.axis, angle), at.p, at.w + axis * speed, at.v, w_dot, at.a)
+                w_dot = joint_frame.w_dot + axis * change + np.cross(joint_frame.w, axis * speed)
+                frame = _At(
+                    joint_frame.R @ _about(link.axis, angle),
+                    joint_frame.p,
+                    joint_frame.w + axis * speed,
+                    joint_frame.v,
+                    w_dot,
+                    joint_frame.a,
+                )
             else:
-                moved = at.to(np.eye(3), angle[:, None] * link.axis)
-                acceleration = moved.a + 2 * np.cross(at.w, axis * speed) + axis * change
-                found = _At(moved.R, moved.p, moved.w, moved.v + axis * speed, moved.w_dot, acceleration)
-        known[i] = found
-        return found
+                moved = joint_frame.to(np.eye(3), angle[:, None] * link.axis)
+                acceleration = moved.a + 2 * np.cross(joint_frame.w, axis * speed) + axis * change
+                frame = _At(moved.R, moved.p, moved.w, moved.v + axis * speed, moved.w_dot, acceleration)
+        known[i] = frame
+        return frame

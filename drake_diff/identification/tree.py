@@ -206,7 +206,7 @@ class Dynamics:
 
     def _tables(self, shifted: tuple[int, ...]) -> Any:
         """With three virtual slides before each joint that is shifted."""
-        tree, own, compiled, t = self.tree, self.numbers, kernel(KERNEL), kernel(TREE)
+        tree, numbers, compiled, t = self.tree, self.numbers, kernel(KERNEL), kernel(TREE)
         rows, joints = list[tuple[Any, ...]](), list[tuple[int, int, int]]()
         table_of, joint_of = list[int](), list[int]()
         n, nq = tree.n, sum(7 if link.free else 1 for link in tree.links)
@@ -214,17 +214,17 @@ class Dynamics:
         for i, link in enumerate(tree.links):
             parent, joint = (-1, -1) if link.parent < 0 else (table_of[link.parent], joint_of[link.parent])
             for k in range(3) if i in shifted else ():
-                at = 3 * shifted.index(i) + k
-                joints.append((joint, n + at, 1))
+                index = 3 * shifted.index(i) + k
+                joints.append((joint, n + index, 1))
                 joint = len(joints) - 1
-                rows.append((parent, t.SLIDE, joint, nq + at, n + at, np.eye(3)[k], np.eye(3, 4), np.zeros(10)))
+                rows.append((parent, t.SLIDE, joint, nq + index, n + index, np.eye(3)[k], np.eye(3, 4), np.zeros(10)))
                 parent = len(rows) - 1
             for start in (3, 0) if link.free else (0,):
                 joints.append((joint, link.joint.v_start + start, 3 if link.free else 1))
                 joint = len(joints) - 1
-            frame = np.hstack([link.on_parent.rotation().matrix(), own.offset[i][:, None]])
+            frame = np.hstack([link.on_parent.rotation().matrix(), numbers.offset[i][:, None]])
             starts = link.joint.q_start, link.joint.v_start
-            rows.append((parent, kinds[link.joint.kind], joint, *starts, link.axis, frame, own.inertial[i]))
+            rows.append((parent, kinds[link.joint.kind], joint, *starts, link.axis, frame, numbers.inertial[i]))
             table_of.append(len(rows) - 1)
             joint_of.append(joint)
         parents, kind, joint_at, q_start, v_start, axis, frames, ten = (np.array(c) for c in zip(*rows, strict=True))
@@ -238,7 +238,7 @@ class Dynamics:
         chain = (np.array(column) for column in zip(*joints, strict=True))
         tables = (
             parents, kind, joint_at, q_start, v_start, axis, frames, identity, mass, center, inertia, *chain,
-            own.gravity,
+            numbers.gravity,
         )  # fmt: skip
         positions = np.zeros(n, dtype=np.int64)
         for link in tree.links:
@@ -255,9 +255,9 @@ class Dynamics:
             _array(np.array(coordinates.single, dtype=np.int64).reshape(-1, 2)),
             _array(np.array(coordinates.free, dtype=np.int64).reshape(-1, 2)),
             positions,
-            *(_array(getattr(own, name)) for name in OF_JOINTS),
+            *(_array(getattr(numbers, name)) for name in OF_JOINTS),
             SLIP_SPEED,
-            _array(tree.actuation * own.strength),
+            _array(tree.actuation * numbers.strength),
             np.isin(np.arange(tree.spread.shape[1]), self.dry),
             self.gives,
             *map(_array, self.method),
@@ -305,10 +305,10 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         raise ModelError("a free body has a spring")
     n, inertial = len(dynamics.damping), np.zeros((len(links), 10))
     for link in every:
-        place, pose = placed[link.body]
-        if place >= 0:
-            own = ten_numbers(link.mass, link.center_of_mass, link.inertia[tuple(np.transpose(INERTIA))])
-            inertial[place] += _moved_by(pose) @ own
+        index, pose = placed[link.body]
+        if index >= 0:
+            body_numbers = ten_numbers(link.mass, link.center_of_mass, link.inertia[tuple(np.transpose(INERTIA))])
+            inertial[index] += _moved_by(pose) @ body_numbers
     numbers = Numbers(
         inertial=inertial,
         offset=np.array([link.on_parent.translation() for link in links]).reshape(-1, 3),

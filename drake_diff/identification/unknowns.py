@@ -87,74 +87,80 @@ class Unknowns:
 
     @property
     def slices(self) -> tuple[slice, ...]:
-        return slices_of(len(one.start) for one in self.each)
+        return slices_of(len(unknown.start) for unknown in self.each)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        return tuple(name for one in self.each for name in one.columns)
+        return tuple(name for unknown in self.each for name in unknown.columns)
 
     @property
     def units(self) -> tuple[str, ...]:
-        return tuple(one.unit for one in self.each for _ in one.start)
+        return tuple(unknown.unit for unknown in self.each for _ in unknown.start)
 
     @property
     def start(self) -> Array:
         """(np,) the model's values."""
-        return np.concatenate([one.start for one in self.each]) if self.each else np.zeros(0)
+        return np.concatenate([unknown.start for unknown in self.each]) if self.each else np.zeros(0)
 
     @property
     def sizes(self) -> Array:
         """(np,) what counts as 100 % of each entry; 0 where nothing says it."""
-        return np.concatenate([np.full(len(one.start), one.size) for one in self.each]) if self.each else np.zeros(0)
+        return (
+            np.concatenate([np.full(len(unknown.start), unknown.size) for unknown in self.each])
+            if self.each
+            else np.zeros(0)
+        )
 
     @property
     def z_start(self) -> Array:
         z = self.start.copy()
-        for one, s in zip(self.each, self.slices, strict=True):
-            if one.quantity in LOGARITHMS:
-                z[s] = np.log(one.start)
-            elif one.quantity == INERTIA:
-                z[s] = to_log_cholesky(one.start)
-                z[s][3:] /= _spread(one)
+        for unknown, s in zip(self.each, self.slices, strict=True):
+            if unknown.quantity in LOGARITHMS:
+                z[s] = np.log(unknown.start)
+            elif unknown.quantity == INERTIA:
+                z[s] = to_log_cholesky(unknown.start)
+                z[s][3:] /= _spread(unknown)
         return z
 
     @property
     def widths(self) -> Array:
         """(np,) in z, how far the data may move it before they must say more than the file; infinite without a size."""
         widths = np.empty(len(self.start))
-        for one, s in zip(self.each, self.slices, strict=True):
-            relative = one.quantity in (*LOGARITHMS, INERTIA)
-            widths[s] = 1.0 if relative else one.size or np.inf
+        for unknown, s in zip(self.each, self.slices, strict=True):
+            relative = unknown.quantity in (*LOGARITHMS, INERTIA)
+            widths[s] = 1.0 if relative else unknown.size or np.inf
         return FAR * widths
 
     @property
     def pulls(self) -> Array:
         """(np,) the widths of those whose file's value is all that is known before; infinite where there is a prior."""
         pulls = self.widths
-        for one, s in zip(self.each, self.slices, strict=True):
-            if one.prior is not None:
+        for unknown, s in zip(self.each, self.slices, strict=True):
+            if unknown.prior is not None:
                 pulls[s] = np.inf
         return pulls
 
     def prior_rows(self, z: Array) -> tuple[Array, Array]:
         """How far the values (m, in standard deviations) are from their priors, and by z (m, np)."""
-        told = [(one.prior, s) for one, s in zip(self.each, self.slices, strict=True) if one.prior is not None]
-        if not told:
+        priors = [
+            (unknown.prior, s) for unknown, s in zip(self.each, self.slices, strict=True) if unknown.prior is not None
+        ]
+        if not priors:
             return np.zeros(0), np.zeros((0, len(z)))
         values, by_z = self.values(z), self.by_z(z)
-        off = [(values[s] - mean) / deviation for (mean, deviation), s in told]
-        return np.concatenate(off), np.vstack([by_z[s] / deviation[:, None] for (_, deviation), s in told])
+        off = [(values[s] - mean) / deviation for (mean, deviation), s in priors]
+        return np.concatenate(off), np.vstack([by_z[s] / deviation[:, None] for (_, deviation), s in priors])
 
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper z (np,)."""
         lower, upper = np.full(len(self.start), -np.inf), np.full(len(self.start), np.inf)
-        for one, s in zip(self.each, self.slices, strict=True):
-            if one.quantity in LOGARITHMS:
-                lower[s] = np.log(one.lower) if one.lower > 0 else -np.inf
-                upper[s] = np.log(one.upper)
-            elif one.quantity != INERTIA:
-                lower[s], upper[s] = one.lower, one.upper
+        for unknown, s in zip(self.each, self.slices, strict=True):
+            if unknown.quantity in LOGARITHMS:
+                lower[s] = np.log(unknown.lower) if unknown.lower > 0 else -np.inf
+                upper[s] = np.log(unknown.upper)
+            elif unknown.quantity != INERTIA:
+                lower[s], upper[s] = unknown.lower, unknown.upper
         return lower, upper
 
     @property
@@ -165,18 +171,18 @@ class Unknowns:
     @property
     def delay(self) -> int | None:
         """Which column of z is a delay of inputs."""
-        return next((s.start for one, s in zip(self.each, self.slices, strict=True) if one.shifts), None)
+        return next((s.start for unknown, s in zip(self.each, self.slices, strict=True) if unknown.shifts), None)
 
     def values(self, z: Any) -> Any:
         """(np,) of z (np,), complex or float."""
         values = np.array(z)
-        for one, s in zip(self.each, self.slices, strict=True):
-            if one.quantity in LOGARITHMS:
+        for unknown, s in zip(self.each, self.slices, strict=True):
+            if unknown.quantity in LOGARITHMS:
                 values[s] = np.exp(z[s])
-            elif one.quantity == INERTIA:
-                own = np.array(z[s])
-                own[3:] = own[3:] * _spread(one)
-                values[s] = from_log_cholesky(own)
+            elif unknown.quantity == INERTIA:
+                entries = np.array(z[s])
+                entries[3:] = entries[3:] * _spread(unknown)
+                values[s] = from_log_cholesky(entries)
         return values
 
     def by_z(self, z: Array) -> Array:
@@ -186,8 +192,8 @@ class Unknowns:
     def named(self, values: Array) -> dict[str, Any]:
         """By name; a number where it is one."""
         return {
-            one.name: float(values[s][0]) if len(one.start) == 1 else frozen(values[s])
-            for one, s in zip(self.each, self.slices, strict=True)
+            unknown.name: float(values[s][0]) if len(unknown.start) == 1 else frozen(values[s])
+            for unknown, s in zip(self.each, self.slices, strict=True)
         }
 
     def consistent(self, values: Array, tree: Tree) -> bool:
@@ -196,11 +202,11 @@ class Unknowns:
         Points and rods have no room to begin with, and are not looked at.
         """
         given = self.named(values)
-        for one in self.each:
-            if one.quantity == CENTER and f"{one.label}.{INERTIA}" not in given:
-                if self.as_in_files or room_of_inertia(np.asarray(_central(tree, one.label, {})[2])) <= 0:
+        for unknown in self.each:
+            if unknown.quantity == CENTER and f"{unknown.label}.{INERTIA}" not in given:
+                if self.as_in_files or room_of_inertia(np.asarray(_central(tree, unknown.label, {})[2])) <= 0:
                     continue
-                _, _, inertia = _central(tree, one.label, given)
+                _, _, inertia = _central(tree, unknown.label, given)
                 if room_of_inertia(np.asarray(inertia, dtype=float)) < 0:
                     return False
         return True
@@ -216,9 +222,9 @@ def by_complex_step(function: Any, z: Array) -> Array:
     return np.array(columns).T if columns else np.zeros((len(function(z)), 0))
 
 
-def _spread(one: Unknown) -> float:
+def _spread(unknown: Unknown) -> float:
     """[m sqrt(kg)] the size of the entries beside the diagonal of the Cholesky factor."""
-    return float(np.sqrt(max(np.trace(second_moment(one.start)) / 3, 1e-300)))
+    return float(np.sqrt(max(np.trace(second_moment(unknown.start)) / 3, 1e-300)))
 
 
 def choose_unknowns(
@@ -234,16 +240,16 @@ def choose_unknowns(
     Raises UnknownNameError, which lists those that exist, or InputError where one cannot be estimated.
     """
     known = {p.name: (p.unit, p.value, p.lower) for p in list_parameters(model)}
-    own = list(known)
+    parameters = list(known)
     known[f"model.{DELAY}"] = ("s", np.zeros(1), 0.0)
     known |= {f"{column}.{BIAS}": ("", np.zeros(1), -np.inf) for column in columns}
     known = {n: e for n, e in _extra(model).items() if tree is not None or n.endswith(f".{BIAS}")} | known
     if isinstance(names, str) and names == "all":
-        names = [name for name in own if name.rsplit(".", 1)[1] in OF_ALL]
+        names = [name for name in parameters if name.rsplit(".", 1)[1] in OF_ALL]
         names = [name for name in names if _why_not(model, tree, name, known[name][1]) is None]
     elif isinstance(names, str):
         names = [names]
-    found = []
+    unknowns = []
     for name in names:
         if name not in known:
             raise UnknownNameError("parameter", got=name, known=known)
@@ -255,14 +261,14 @@ def choose_unknowns(
         start = np.array(value, dtype=float)
         prior = _prior_of(name, priors[name], len(start)) if priors and name in priors else None
         shifts = name.endswith(f".{DELAY}")
-        found.append(Unknown(name, unit, start, low, _size(model, name, value), high, prior, shifts))
+        unknowns.append(Unknown(name, unit, start, low, _size(model, name, value), high, prior, shifts))
     for subject, given in (("prior of", priors), ("bounds of", bounds)):
         for name in given or {}:
             if name not in names:
                 raise UnknownNameError(subject, got=name, known=names)
-    if len({one.name for one in found}) < len(found) or not found:
+    if len({unknown.name for unknown in unknowns}) < len(unknowns) or not unknowns:
         raise InputError("parameters", got=", ".join(names) or "none", expected="one or more names, each once")
-    return Unknowns(tuple(found))
+    return Unknowns(tuple(unknowns))
 
 
 def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
@@ -285,7 +291,7 @@ def _prior_of(name: str, given: Any, count: int) -> tuple[Array, Array]:
     """Mean and standard deviation (count,)."""
     expected = f"a mean and a standard deviation above 0, of 1 or {count} numbers each"
     try:
-        mean, deviation = (np.array(np.broadcast_to(np.asarray(part, dtype=float), count)) for part in given)
+        mean, deviation = (np.array(np.broadcast_to(np.asarray(values, dtype=float), count)) for values in given)
     except (TypeError, ValueError) as error:
         raise InputError(f"prior of {name}", got=given, expected=expected) from error
     if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(deviation)) and np.all(deviation > 0)):
@@ -297,21 +303,21 @@ def _prior_of(name: str, given: Any, count: int) -> tuple[Array, Array]:
 
 def _extra(model: Model) -> dict[str, tuple[str, Array, float]]:
     """What Drake's plant has no number for."""
-    found = {}
+    quantities = {}
     for label, joint in labelled(joints(model.plant)).items():
         if joint.num_velocities() == 1:
             unit = "N" if joint.type_name() == "prismatic" else "N m"
-            found[f"{label}.{COULOMB}"] = (unit, np.zeros(1), 0.0)
-            found[f"{label}.spring_stiffness"] = (
+            quantities[f"{label}.{COULOMB}"] = (unit, np.zeros(1), 0.0)
+            quantities[f"{label}.spring_stiffness"] = (
                 f"{unit}/{'m' if unit == 'N' else 'rad'}",
                 np.zeros(1),
                 0.0,
             )  # rest: 0
     for name in model.input_names:
-        found[f"{name}.{STRENGTH}"] = ("1", np.ones(1), -np.inf)
+        quantities[f"{name}.{STRENGTH}"] = ("1", np.ones(1), -np.inf)
     for name in (*model.position_names, *model.velocity_names):
-        found[f"{name}.{BIAS}"] = ("", np.zeros(1), -np.inf)
-    return found
+        quantities[f"{name}.{BIAS}"] = ("", np.zeros(1), -np.inf)
+    return quantities
 
 
 def _why_not(model: Model, tree: Tree | None, name: str, value: Array) -> str | None:
@@ -351,12 +357,12 @@ def _central(tree: Tree, label: str, given: dict[str, Any], *, as_in_files: bool
     """Mass, centre of mass and inertia (6,) about it of a body, as Drake's parameters set them one after the other."""
     link = tree.bodies[label]
     mass, center = given.get(f"{label}.{MASS}", link.mass), given.get(f"{label}.{CENTER}", link.center_of_mass)
-    own = np.array([link.inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
+    inertia = np.array([link.inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
     if f"{label}.{INERTIA}" in given:
         return mass, center, given[f"{label}.{INERTIA}"]
     if as_in_files:
-        return mass, center, own * (mass / link.mass)
-    unit = ten_numbers(1.0, link.center_of_mass, own / link.mass)[4:]  # about the body's origin, which stays
+        return mass, center, inertia * (mass / link.mass)
+    unit = ten_numbers(1.0, link.center_of_mass, inertia / link.mass)[4:]  # about the body's origin, which stays
     shift = ten_numbers(1.0, center, np.zeros(6))[4:]
     return mass, center, mass * (unit - shift)
 
@@ -373,27 +379,27 @@ def numbers_at(model: Model, tree: Tree, unknowns: Unknowns, z: Array) -> tuple[
 def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Numbers:
     """The tree's numbers where the unknowns have `values` (np,), complex or float."""
     given: dict[str, Any] = {}
-    for one, s in zip(unknowns.each, unknowns.slices, strict=True):
-        given[one.name] = values[s][0] if len(one.start) == 1 else values[s]
+    for unknown, s in zip(unknowns.each, unknowns.slices, strict=True):
+        given[unknown.name] = values[s][0] if len(unknown.start) == 1 else values[s]
     kind = np.result_type(np.asarray(values).dtype, float)
-    own = {name: np.array(getattr(tree.numbers, name), dtype=kind) for name in Numbers.__dataclass_fields__}
-    _set_bodies(tree, given, own["inertial"], as_in_files=unknowns.as_in_files)
+    arrays = {name: np.array(getattr(tree.numbers, name), dtype=kind) for name in Numbers.__dataclass_fields__}
+    _set_bodies(tree, given, arrays["inertial"], as_in_files=unknowns.as_in_files)
     by_joint = {link.joint: link for link in tree.bodies.values() if link.kind != "weld"}
-    at = {link.joint.joint: i for i, link in enumerate(tree.links)}
+    indices = {link.joint.joint: i for i, link in enumerate(tree.links)}
     for name, value in given.items():
         label, quantity = name.rsplit(".", 1)
         if quantity in OF_JOINTS:
-            own[OF_JOINTS[quantity]][by_joint[label].v_start] = value
+            arrays[OF_JOINTS[quantity]][by_joint[label].v_start] = value
         elif quantity == "offset":
             pose = tree.placed[by_joint[label].parent][1]
-            own["offset"][at[label]] = pose.rotation().matrix() @ value + pose.translation()
+            arrays["offset"][indices[label]] = pose.rotation().matrix() @ value + pose.translation()
         elif quantity == "gravity":
-            own["gravity"][:] = value
+            arrays["gravity"][:] = value
         elif quantity == STRENGTH:
-            own["strength"][model.input_names.index(label)] = value
+            arrays["strength"][model.input_names.index(label)] = value
     if any(name.rsplit(".", 1)[1] in ("gear_ratio", "rotor_inertia") for name in given):
-        _set_rotors(model, by_joint, given, own["reflected"])
-    return Numbers(**own)
+        _set_rotors(model, by_joint, given, arrays["reflected"])
+    return Numbers(**arrays)
 
 
 def _set_bodies(tree: Tree, given: dict[str, Any], inertial: Any, *, as_in_files: bool) -> None:

@@ -91,16 +91,16 @@ def write_model(identification: Identification, path: str | Path) -> Path:
         texts = _overlay(identification, asked, source, path)
     else:
         texts = {path: _Corrected(identification, asked, source, _changed(identification)).text()}
-    for place in texts:
-        if place.exists() or not place.parent.is_dir():
-            raise InputError("path", got=str(place), expected="a file that does not exist, in a folder that does")
+    for target in texts:
+        if target.exists() or not target.parent.is_dir():
+            raise InputError("path", got=str(target), expected="a file that does not exist, in a folder that does")
     try:
-        for place, text in texts.items():
-            write_whole(place, text.encode())
+        for target, text in texts.items():
+            write_whole(target, text.encode())
         _check(identification, asked.model, path)
     except DrakeDiffError as error:
-        for place in texts:
-            place.unlink(missing_ok=True)
+        for target in texts:
+            target.unlink(missing_ok=True)
         raise ModelError(f"no corrected model is written: {error}") from error
     return path
 
@@ -137,22 +137,22 @@ def _overlay(e: Identification, asked: Asked, source: Path, path: Path) -> dict[
         texts[beside] = _Corrected(e, asked, files[uri], values).text()
         text = _pointed(text, uri, f"file://{beside}", source)
     data = " ".join(_data(asked).split())
-    said = "".join(c if c.isprintable() else " " for c in f"{e.sentence} By drake_diff from {data}; {e.motion}.")
-    return {**texts, path: f"# {said}\n{text}"}
+    comment = "".join(c if c.isprintable() else " " for c in f"{e.sentence} By drake_diff from {data}; {e.motion}.")
+    return {**texts, path: f"# {comment}\n{text}"}
 
 
 def _pointed(text: str, uri: str, new: str, source: Path) -> str:
     """A .dmd.yaml that names the file `new` in place of `uri`."""
     line = re.compile(rf"^([^#\n]*\bfile:\s*)(['\"]?){re.escape(uri)}\2(?=[\s,}}]|$)", re.MULTILINE)
-    found = list(line.finditer(text))
-    if len(found) != 1:
-        raise InputError(source.name, got=f"{uri} in {len(found)} of its lines", expected="file: with it in one line")
-    return f"{text[: found[0].start()]}{found[0][1]}{json.dumps(new)}{text[found[0].end() :]}"
+    matches = list(line.finditer(text))
+    if len(matches) != 1:
+        raise InputError(source.name, got=f"{uri} in {len(matches)} of its lines", expected="file: with it in one line")
+    return f"{text[: matches[0].start()]}{matches[0][1]}{json.dumps(new)}{text[matches[0].end() :]}"
 
 
 def _names_in(file: Path) -> set[str]:
     root = XmlText(file.read_bytes()).root
-    return {str(one.get("name")) for one in root.iter("link", "joint", "actuator") if one.get("name")}
+    return {str(element.get("name")) for element in root.iter("link", "joint", "actuator") if element.get("name")}
 
 
 def _data(asked: Asked) -> str:
@@ -199,12 +199,12 @@ class _Corrected:
 
     def _element(self, label: str, *tags: str) -> Element:
         # A joint that has no type is a mention of one, in a transmission.
-        named = [one for one in self.xml.root.iter(*tags) if one.get("name") == label]
-        found = [one for one in named if one.tag != "joint" or one.get("type")]
-        if len(found) != 1:
-            where = f"the file has {len(found)} elements {' or '.join(tags)} of this name"
+        named = [element for element in self.xml.root.iter(*tags) if element.get("name") == label]
+        elements = [element for element in named if element.tag != "joint" or element.get("type")]
+        if len(elements) != 1:
+            where = f"the file has {len(elements)} elements {' or '.join(tags)} of this name"
             raise InputError(label, got=where, expected="one, in the model's own file and not in one that it includes")
-        return found[0]
+        return elements[0]
 
     def _told(self, label: str, quantities: Sequence[str]) -> str:
         parts = []
@@ -239,14 +239,14 @@ class _Corrected:
         self.xml.replace(inertial, f"{self._told(label, quantities)}<inertial>{inside}</inertial>")
 
     def _write_dynamics(self, label: str, values: dict[str, Any]) -> None:
-        joint, told = self._element(label, "joint"), self._told(label, list(values))
+        joint, comment = self._element(label, "joint"), self._told(label, list(values))
         tags = {SPRING.get(quantity, quantity): _number(float(value)) for quantity, value in values.items()}
         if not self.is_sdf:
             dynamics = joint.find("dynamics")
             if dynamics is None:
-                self.xml.append(joint, f'{told}<dynamics damping="{tags["damping"]}"/>')
+                self.xml.append(joint, f'{comment}<dynamics damping="{tags["damping"]}"/>')
                 return
-            self.xml.before(dynamics, told)
+            self.xml.before(dynamics, comment)
             self.xml.set(dynamics, "damping", tags["damping"])
             return
         axis = joint.find("axis")
@@ -255,53 +255,55 @@ class _Corrected:
         dynamics = axis.find("dynamics")
         if dynamics is None:
             inside = "".join(f"<{tag}>{value}</{tag}>" for tag, value in tags.items())
-            self.xml.append(axis, f"{told}<dynamics>{inside}</dynamics>")
+            self.xml.append(axis, f"{comment}<dynamics>{inside}</dynamics>")
             return
-        self.xml.before(dynamics, told)
+        self.xml.before(dynamics, comment)
         self._set_children(dynamics, tags)
 
     def _set_children(self, element: Element, tags: dict[str, str]) -> None:
         missing = []
         for tag, value in tags.items():
-            own = element.find(tag)
-            if own is None:
+            child = element.find(tag)
+            if child is None:
                 missing.append(f"<{tag}>{value}</{tag}>")
             else:
-                self.xml.replace(own, f"<{tag}>{value}</{tag}>")
+                self.xml.replace(child, f"<{tag}>{value}</{tag}>")
         if missing:
             self.xml.append(element, "".join(missing))
 
     def _write_rotor(self, label: str, values: dict[str, Any]) -> None:
-        told, tags = self._told(label, list(values)), {f"drake:{q}": _number(float(v)) for q, v in values.items()}
+        comment, tags = self._told(label, list(values)), {f"drake:{q}": _number(float(v)) for q, v in values.items()}
         if not self.xml.root.get("xmlns:drake"):
             self.xml.set(self.xml.root, "xmlns:drake", "http://drake.mit.edu")
         if self.is_sdf:
             joint = self._element(label, "joint")
-            self.xml.before(joint, told)
+            self.xml.before(joint, comment)
             self._set_children(joint, tags)
             return
-        found = [a for t in self.xml.root.iter("transmission") for a in t.findall("actuator") if a.get("name") == label]
-        if len(found) != 1:
-            got = f"{len(found)} transmissions in the file that have this actuator"
+        actuators = [
+            a for t in self.xml.root.iter("transmission") for a in t.findall("actuator") if a.get("name") == label
+        ]
+        if len(actuators) != 1:
+            got = f"{len(actuators)} transmissions in the file that have this actuator"
             raise InputError(f"{label}.{next(iter(values))}", got=got, expected="one, to be changed")
-        self.xml.before(found[0], told)
+        self.xml.before(actuators[0], comment)
         missing = []
         for tag, value in tags.items():
-            own = found[0].find(tag)
-            if own is None:
+            child = actuators[0].find(tag)
+            if child is None:
                 missing.append(f'<{tag} value="{value}"/>')
             else:
-                self.xml.set(own, "value", value)
+                self.xml.set(child, "value", value)
         if missing:
-            self.xml.append(found[0], "".join(missing))
+            self.xml.append(actuators[0], "".join(missing))
 
     def _write_offset(self, label: str, value: Array) -> None:
         joint = self._element(label, "joint")
-        origin, told = joint.find("origin"), self._told(label, ["offset"])
+        origin, comment = joint.find("origin"), self._told(label, ["offset"])
         if origin is None:
-            self.xml.append(joint, f'{told}<origin xyz="{_row(value)}"/>')
+            self.xml.append(joint, f'{comment}<origin xyz="{_row(value)}"/>')
             return
-        self.xml.before(origin, told)
+        self.xml.before(origin, comment)
         self.xml.set(origin, "xyz", _row(value))
 
 
