@@ -27,7 +27,7 @@ from drake_diff.optimize.ilqr.expansion import Motion, curvature_along, expand_r
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import differentiate_final_cost, final_cost_hessian
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Iterate, Limits, Multipliers, NlpResult, Outcome, Report
+from drake_diff.optimize.program import Iterate, Iteration, Limits, Multipliers, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.program import solve_ipopt
 
 DIFFERENCE = 1e-5  # of max(1, |z|): of exact Jacobians, known to 1e-12
@@ -66,9 +66,13 @@ def solve_shooting(
     program.require(guess)
     known = begun if begun is not None and begun.sizes == (program.size, len(program.sides[0])) else None
     exact = not program.functions.why_not
-    result = solve_ipopt(
-        program, guess, limits, report, exact=exact, begun=known, more=CALLED_BACK, motions=program.iterates
-    )
+    result = program.optimum_at(guess, limits.tolerance)
+    if result is None:
+        result = solve_ipopt(
+            program, guess, limits, report, exact=exact, begun=known, more=CALLED_BACK, motions=program.iterates
+        )
+    elif report is not None:
+        report.row(result.iterations[0], lambda: program.iterates(guess))
     if program.refusals:
         count = f"{program.refusals} point{'s' * (program.refusals > 1)}"
         remark = f"; backed off from {count} that could not be stepped or differentiated, the last: {program.refusal}"
@@ -154,6 +158,21 @@ class StepProgram:
     def require(self, z: Array) -> None:
         """Raise GradientError or SimulationError where a step at z (n,) cannot be taken or differentiated."""
         self._steps(z)
+
+    def optimum_at(self, z: Array, tolerance: float) -> NlpResult | None:
+        """z (n,) with multipliers of 0 if it keeps every row and the cost has no slope there; None else.
+
+        An interior-point method would leave such a point for the middle of the bounds.
+        """
+        cost, gradient = self._gradient(z, z)
+        rows, (lower, upper) = self._values(z)[1], self.sides
+        violation = float(np.max(np.maximum(lower - rows, rows - upper), initial=0.0))
+        if np.any(gradient) or not violation <= tolerance:
+            return None
+        table = (Iteration(0, float(cost), violation, 0.0, 0.0),)
+        message = "the guess keeps every constraint, and the cost has no slope there"
+        multipliers = Multipliers(np.zeros(self.size), np.zeros(len(rows)))
+        return NlpResult(z, Outcome.SOLVED, message, table, stationarity=0.0, multipliers=multipliers)
 
     def iterates(self, z: Array) -> tuple[Iterate, ...]:
         """The motion at z, for callbacks."""
