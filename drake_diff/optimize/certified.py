@@ -61,16 +61,16 @@ def certify_equations(
         "method": "discrete map" if is_map else "continuous time",
         "subject": f"the map of {problem.name}" if is_map else f"the equations of motion of {problem.name}",
     }
-    found = []
+    certificates = []
     for k in (telling_knots(xs[: len(us) + 1]) if knots is None else knots).tolist():
         knot = np.concatenate([xs[k], us[k]])
         point, scale = np.concatenate([knot, tail]), np.concatenate([np.maximum(1.0, np.abs(knot)), sizes])
         f = system.at_step(k).values if isinstance(system, DiscreteMap) else values
-        own = partial(jacobian, k=k) if is_map else jacobian
-        plan = LookAt(np.asarray(own(point), dtype=float) * scale)
+        derivative = partial(jacobian, k=k) if is_map else jacobian
+        plan = LookAt(np.asarray(derivative(point), dtype=float) * scale)
         look = plan.taken(np.asarray(f(point + scale * plan.displacements), dtype=float))
         if look.doubt():
-            found.append(certify_jacobian(f, point, own, batched=True, scale=scale, **named))
+            certificates.append(certify_jacobian(f, point, derivative, batched=True, scale=scale, **named))
         else:
-            found.append(certificate_by(look, scale=scale, told="", **named))
-    return tuple(found)
+            certificates.append(certificate_by(look, scale=scale, told="", **named))
+    return tuple(certificates)

@@ -128,14 +128,14 @@ class _Stages:
             softer = replace(problem, system=softened(problem.model, contact))
             iterations, tolerance = min(STAGE_ITERATIONS, limits.max_iterations), max(STAGE_TOLERANCE, limits.tolerance)
             short = Limits(iterations, self.deadline - now(), tolerance)
-            told: tuple[Any, ...]
+            record: tuple[Any, ...]
             try:
                 xs = roll_states(softer.model, x0, us)
                 result, xs, us = solve_ilqr(softer, xs, us, limits=short, report=self.report, patience=PATIENCE)
-                x0, outcome, told = xs[0], result.outcome, _told(softer, result, xs, us)
+                x0, outcome, record = xs[0], result.outcome, _told(softer, result, xs, us)
             except (GradientError, SimulationError) as error:
-                outcome, told = Outcome.NO_GRADIENT, (f"refused: {error}", 0, None, None, None)
-            self.log(contact.distance, contact.stiffness, *told, kind="softened")
+                outcome, record = Outcome.NO_GRADIENT, (f"refused: {error}", 0, None, None, None)
+            self.log(contact.distance, contact.stiffness, *record, kind="softened")
             if self.interrupted.is_set() or outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
                 self.ended = Outcome.TIME_LIMIT if outcome is Outcome.TIME_LIMIT else Outcome.INTERRUPTED
                 break
@@ -149,10 +149,10 @@ class _Stages:
             if self.report:
                 self.report.say(line)
 
-        def log(soft: Softness, found: Found) -> None:
-            miss = float(np.abs(problem.goal_error(found.motion.xs[-1])).max())
+        def log(soft: Softness, result: Found) -> None:
+            miss = float(np.abs(problem.goal_error(result.motion.xs[-1])).max())
             stiffness = float(np.max(soft.force)) / (soft.reach * math.log(2))
-            self.log(soft.reach, stiffness, found.ended, found.iterations, found.cost, miss, None, kind="relaxed")
+            self.log(soft.reach, stiffness, result.ended, result.iterations, result.cost, miss, None, kind="relaxed")
 
         try:
             with until_set(self.interrupted):

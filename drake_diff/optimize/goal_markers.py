@@ -29,7 +29,7 @@ def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn,
     frames: dict[str, Any] = {}
     for frame in (plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())):
         frames.setdefault(frame.name(), frame)
-    found: list[Drawn] = []
+    shapes: list[Drawn] = []
     for mark, above in marks:
         if mark.frame not in frames:
             raise UnknownNameError("frame", got=mark.frame, known=tuple(frames))
@@ -39,14 +39,14 @@ def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn,
         if not path:
             pose = plant.EvalBodyPoseInWorld(context, body) @ pose
         if not mark.in_world:
-            found += _shapes(mark, path, pose @ RigidTransform(mark.position), above)
+            shapes += _shapes(mark, path, pose @ RigidTransform(mark.position), above)
             continue
-        place = pose @ np.array(mark.position)  # on the body, which may turn as it likes
+        origin = pose @ np.array(mark.position)  # on the body, which may turn as it likes
         if path:
-            found += [replace(shape, origin=place) for shape in _shapes(mark, path, RigidTransform(), above)]
+            shapes += [replace(shape, origin=origin) for shape in _shapes(mark, path, RigidTransform(), above)]
         else:
-            found += _shapes(mark, path, RigidTransform(place), above)
-    return tuple(found)
+            shapes += _shapes(mark, path, RigidTransform(origin), above)
+    return tuple(shapes)
 
 
 def _shapes(mark: Mark, path: str, pose: RigidTransform, above: bool) -> list[Drawn]:
@@ -55,28 +55,28 @@ def _shapes(mark: Mark, path: str, pose: RigidTransform, above: bool) -> list[Dr
 
 
 def _shapes_of(mark: Mark, path: str, pose: RigidTransform, above: bool) -> list[Drawn]:
-    at = pose @ RigidTransform(RotationMatrix(np.array(mark.rotation)), np.zeros(3))
+    frame = pose @ RigidTransform(RotationMatrix(np.array(mark.rotation)), np.zeros(3))
     colour = Rgba(*mark.colour)
     if above and mark.shape in ("sphere", "box") and max(mark.size) / 2 > LARGE:
         colour = Rgba(*mark.colour[:3], 0.2)
     if mark.shape == "sphere":
-        return [_drawn(path, Sphere(mark.size[0]), at, colour, mark.size[0])]
+        return [_drawn(path, Sphere(mark.size[0]), frame, colour, mark.size[0])]
     if mark.shape == "box":
-        return [_drawn(path, Box(*mark.size), at, colour, float(np.linalg.norm(mark.size)) / 2)]
+        return [_drawn(path, Box(*mark.size), frame, colour, float(np.linalg.norm(mark.size)) / 2)]
     if mark.shape == "axes":
         parts = zip(np.eye(3) * mark.size[0], AXES, strict=True)
-        return [drawn for along, shade in parts for drawn in _arrow(path, at, along, shade)[:1]]
-    return _arrow(path, at, np.array(mark.size), colour)
+        return [drawn for along, shade in parts for drawn in _arrow(path, frame, along, shade)[:1]]
+    return _arrow(path, frame, np.array(mark.size), colour)
 
 
-def _arrow(path: str, at: RigidTransform, along: Array, colour: Rgba) -> list[Drawn]:
-    """A shaft from the origin of `at` along a vector (3,) [m], and its tip; nothing along a vector of length 0."""
+def _arrow(path: str, frame: RigidTransform, along: Array, colour: Rgba) -> list[Drawn]:
+    """A shaft from the origin of `frame` along a vector (3,) [m], and its tip; nothing along a vector of length 0."""
     length = float(np.linalg.norm(along))
     if length == 0.0:
         return []
-    turned = at @ RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), np.zeros(3))
+    turned = frame @ RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), np.zeros(3))
     radius = THIN * length
-    middle, end = (turned @ RigidTransform([0.0, 0.0, part * length]) for part in (0.5, 1.0))
+    middle, end = (turned @ RigidTransform([0.0, 0.0, fraction * length]) for fraction in (0.5, 1.0))
     tip = end @ RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 4 * radius])  # a cone's apex is its origin
     shaft = _drawn(path, Cylinder(radius, length), middle, colour, length / 2)
     return [shaft, _drawn(path, MeshcatCone(8 * radius, 3 * radius, 3 * radius), tip, colour, 4 * radius)]
@@ -97,15 +97,15 @@ def meaning_of(goals: Sequence[Goal]) -> list[Colour]:
 
 def colours_of(*, plan: bool, contacts: bool, thrusts: bool) -> list[Colour]:
     """What is drawn of a motion beside the robot: its path, and where there are any a ghost and forces."""
-    found = [(css(BLUE), "dot", "the plan, where the motion is elsewhere")] if plan else []
-    found.append((css(TRAIL), "line", "path of the centre of mass of the body that moves most"))
+    colours = [(css(BLUE), "dot", "the plan, where the motion is elsewhere")] if plan else []
+    colours.append((css(TRAIL), "line", "path of the centre of mass of the body that moves most"))
     if contacts:
-        found.append((css(RED), "arrow", "contact forces: longer is more, and the largest tenth may be cut"))
+        colours.append((css(RED), "arrow", "contact forces: longer is more, and the largest tenth may be cut"))
     if thrusts:
-        found.append((css(VIOLET), "arrow", "forces of the inputs on bodies"))
-    return found
+        colours.append((css(VIOLET), "arrow", "forces of the inputs on bodies"))
+    return colours
 
 
 def css(colour: Any) -> str:
     """A colour of Drake's for a style sheet, without its opacity."""
-    return f"rgb({', '.join(str(round(255 * part)) for part in (colour.r(), colour.g(), colour.b()))})"
+    return f"rgb({', '.join(str(round(255 * channel)) for channel in (colour.r(), colour.g(), colour.b()))})"

@@ -89,8 +89,8 @@ def _of_solution(problem: Problem, given: Solution, continuous: bool) -> Guess:
 def _means(us: Array, ends: Array) -> Array:
     """(M, nu) the means of held inputs us (N, nu) between `ends` (M+1,), counted in steps from 0 to N."""
     summed = np.vstack([np.zeros((1, us.shape[1])), np.cumsum(us, axis=0)])
-    at = np.array([np.interp(ends, np.arange(len(summed)), column) for column in summed.T]).T
-    return np.asarray(np.diff(at, axis=0) / np.diff(ends)[:, None])
+    sums_at_ends = np.array([np.interp(ends, np.arange(len(summed)), column) for column in summed.T]).T
+    return np.asarray(np.diff(sums_at_ends, axis=0) / np.diff(ends)[:, None])
 
 
 def sampled(problem: Problem, method: str, given: Any) -> Any:
@@ -98,15 +98,17 @@ def sampled(problem: Problem, method: str, given: Any) -> Any:
 
     Inputs that are held are taken in the middle of a step.
     """
-    if not (isinstance(given, (tuple, list)) and any(isinstance(part, Trajectory) for part in given)):
+    if not (isinstance(given, (tuple, list)) and any(isinstance(signal, Trajectory) for signal in given)):
         return given
     if len(given) != 2:
         raise InputError("initial_guess", got=f"{len(given)} entries", expected="two trajectories: (state, input)")
-    for name, part, rows in zip(("state", "input"), given, (problem.nx, problem.nu), strict=True):
-        if not isinstance(part, Trajectory):
-            raise InputError(f"initial_guess {name}", got=type(part).__name__, expected="a trajectory, as the other is")
-        if (part.rows(), part.cols()) != (rows, 1):
-            raise ShapeError(f"initial_guess {name}", got=(part.rows(), part.cols()), expected=(rows, 1))
+    for name, signal, rows in zip(("state", "input"), given, (problem.nx, problem.nu), strict=True):
+        if not isinstance(signal, Trajectory):
+            raise InputError(
+                f"initial_guess {name}", got=type(signal).__name__, expected="a trajectory, as the other is"
+            )
+        if (signal.rows(), signal.cols()) != (rows, 1):
+            raise ShapeError(f"initial_guess {name}", got=(signal.rows(), signal.cols()), expected=(rows, 1))
     state, held = given
     start, end = state.start_time(), state.end_time()
     if not (np.isfinite(end - start) and end > start):
@@ -146,10 +148,10 @@ def _way(problem: Problem) -> tuple[Array, Array | None]:
     s, goal = np.linspace(0, 1, problem.num_steps + 1)[:, None], np.array(problem.goal)
     line = problem.x0 + s * (np.where(np.isnan(goal), problem.x0, goal) - problem.x0)
     cost = problem.running_cost
-    found = cost.followed(problem.start_horizon * s[:, 0]) if isinstance(cost, TimedCost) else None
-    if found is None:
+    reference = cost.followed(problem.start_horizon * s[:, 0]) if isinstance(cost, TimedCost) else None
+    if reference is None:
         return line, None
-    xs, us = found
+    xs, us = reference
     bent = xs + (1 - s) * (problem.x0 - xs[0]) + s * (np.where(np.isnan(goal), xs[-1], goal) - xs[-1])
     return np.where(np.isnan(bent), line, bent), us
 
@@ -196,5 +198,5 @@ def _holding(problem: Problem) -> Array:
     except DrakeDiffError:
         return none
     by_u, missing = d.B[model.nq :], d.B[model.nq :] @ none - d.x_next[model.nq :]
-    found = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
-    return np.asarray(np.where(np.abs(found) > ROUNDED * np.abs(found).max(), found, none))
+    inputs = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
+    return np.asarray(np.where(np.abs(inputs) > ROUNDED * np.abs(inputs).max(), inputs, none))

@@ -107,19 +107,23 @@ class LiveSearch:
 
     def _scene(self, motion: Iterate) -> Scene:
         """Of some of its states, which are enough to see it by."""
-        count, own = len(motion.us), self.problem.design.own(motion.vector.values)
-        kept = np.unique(np.round(np.linspace(0, count, min(count, TRAIL_POINTS) + 1)).astype(int))
-        seen = stills_of(len(kept))[:-1]
-        contacts: list[Any] = [()] * (len(kept) - 1)
+        count, parameters = len(motion.us), self.problem.design.own(motion.vector.values)
+        knots = np.unique(np.round(np.linspace(0, count, min(count, TRAIL_POINTS) + 1)).astype(int))
+        seen = stills_of(len(knots))[:-1]
+        contacts: list[Any] = [()] * (len(knots) - 1)
         if motion.problem.motion == STEPS:
             try:
-                for place, found in zip(seen, motion.contacts_in(kept[seen].tolist()), strict=True):
-                    contacts[place] = found
+                for index, points in zip(seen, motion.contacts_in(knots[seen].tolist()), strict=True):
+                    contacts[index] = points
             except DrakeDiffError as error:
                 self._told(line=f"contact forces are not drawn: {error}")
-        with applied(self.problem.parameters.at(own)) as model:
-            xs, us, shown = motion.xs[kept], motion.us[kept[:-1]], dict[str, Any](marks=self.marks, shapes=self.shapes)
-            return scene_of(model, motion.times[kept], xs, us=us, contacts=contacts, **shown)
+        with applied(self.problem.parameters.at(parameters)) as model:
+            xs, us, shown = (
+                motion.xs[knots],
+                motion.us[knots[:-1]],
+                dict[str, Any](marks=self.marks, shapes=self.shapes),
+            )
+            return scene_of(model, motion.times[knots], xs, us=us, contacts=contacts, **shown)
 
     @contextmanager
     def running(self, started: Callable[[], None] | None) -> Iterator[Callable[[], None]]:

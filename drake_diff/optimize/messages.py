@@ -53,8 +53,8 @@ def under(control: str) -> str:
 
 def followed(checks: Sequence[Any]) -> str:
     """Where the dynamics lead from the first state of a plan, under each feedback that was tried."""
-    told = "; ".join(f"{under(c.feedback or 'open loop')}, {c}" for c in checks)
-    return f"integrated from its first state the plan does not hold: {told}"
+    verdicts = "; ".join(f"{under(c.feedback or 'open loop')}, {c}" for c in checks)
+    return f"integrated from its first state the plan does not hold: {verdicts}"
 
 
 def broken_variant(variant: str, replays: Sequence[Any]) -> str:

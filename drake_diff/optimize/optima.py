@@ -26,10 +26,10 @@ class Optimum:
         return {"cost": s.cost, "horizon": s.horizon, "guess": self.guess, "count": self.count}
 
 
-def distinct(found: Sequence[tuple[Solution, str]]) -> list[Optimum]:
+def distinct(pairs: Sequence[tuple[Solution, str]]) -> list[Optimum]:
     """Those of the verified solutions and their guesses that are no other's motion, the cheapest first."""
     optima: list[Optimum] = []
-    for solution, guess in found:
+    for solution, guess in pairs:
         if not solution.success:
             continue
         for i, other in enumerate(optima):
@@ -42,10 +42,10 @@ def distinct(found: Sequence[tuple[Solution, str]]) -> list[Optimum]:
     return sorted(optima, key=lambda optimum: optimum.solution.cost)
 
 
-def _are_same(one: Solution, other: Solution) -> bool:
+def _are_same(solution: Solution, other: Solution) -> bool:
     """Whether two solutions of one problem have one cost and one motion at its knots."""
-    if abs(one.cost - other.cost) > SAME_COST * max(1.0, abs(one.cost), abs(other.cost)):
+    if abs(solution.cost - other.cost) > SAME_COST * max(1.0, abs(solution.cost), abs(other.cost)):
         return False
-    first, second = (np.asarray(s.xs)[s.knots] for s in (one, other))
-    apart = np.abs(first - second) / one.problem.ranges(np.vstack([first, second]))
+    first, second = (np.asarray(s.xs)[s.knots] for s in (solution, other))
+    apart = np.abs(first - second) / solution.problem.ranges(np.vstack([first, second]))
     return bool(np.max(np.sqrt(np.mean(apart**2, axis=0))) <= SAME_MOTION)

@@ -153,8 +153,8 @@ def _rows(problem: Problem, xs: Array, us: Array) -> Iterator[_Row]:
         for k in problem.knots_of(constraint, input_at_end=False):
             yield from _held(constraint, (k,), xs[k], us[min(k, len(us) - 1)])
     for coupling in problem.coupled_steps():
-        for at in coupling.knots:
-            yield from _held(coupling.rows, tuple(at.tolist()), *coupling.packed(xs, us, at))
+        for knots in coupling.knots:
+            yield from _held(coupling.rows, tuple(knots.tolist()), *coupling.packed(xs, us, knots))
 
 
 def _held(constraint: Constraint, knots: tuple[int, ...], x: Array, u: Array) -> Iterator[_Row]:
@@ -187,14 +187,14 @@ def _multipliers(of_cost: Array, jacobian: Array, rows: list[_Row]) -> Array:
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0] = 1.0
     unit, acts = jacobian / scale, np.ones(len(rows), dtype=bool)
-    found = np.linalg.lstsq(unit, -of_cost)[0]
-    if np.any((found < lowest) | (found > highest)):
+    multipliers = np.linalg.lstsq(unit, -of_cost)[0]
+    if np.any((multipliers < lowest) | (multipliers > highest)):
         hessian = unit.T @ unit + RIDGE * np.eye(len(rows))
         _, acts = minimize_in_box(hessian, unit.T @ of_cost, lowest, highest)
-        found = np.zeros(len(rows))
-        found[acts] = np.linalg.lstsq(unit[:, acts], -of_cost)[0]
-        found = np.clip(found, lowest, highest)
-    return np.asarray(found / scale)
+        multipliers = np.zeros(len(rows))
+        multipliers[acts] = np.linalg.lstsq(unit[:, acts], -of_cost)[0]
+        multipliers = np.clip(multipliers, lowest, highest)
+    return np.asarray(multipliers / scale)
 
 
 @dataclass(frozen=True)
@@ -243,15 +243,17 @@ def out_of_reach(problem: Problem, variables: ShootingVariables, z: Array) -> Ou
     names = problem.model.state_names
     fixed = [i for i in asked if not plan.can_move(i)]
     if fixed and len(fixed) == len(asked) and plan.asks_of_what_moves():
-        told = ", ".join(names[i] for i in fixed)
-        return OutOfReach(constant=f"the cost depends on {told}, which nothing that may change can move")
+        labels = ", ".join(names[i] for i in fixed)
+        return OutOfReach(constant=f"the cost depends on {labels}, which nothing that may change can move")
     worst = max(asked, key=lambda i: (i not in fixed, asked[i][0]))
     distance, knot = asked[worst]
     far = f" by {distance:.3g}" if np.isfinite(distance) else ""
-    told = f"the cost asks {names[worst]} to move{far} at knot {knot}, and no variable moves it along the plan"
+    message = f"the cost asks {names[worst]} to move{far} at knot {knot}, and no variable moves it along the plan"
     if worst in fixed:
-        return OutOfReach(f"{told}; nothing that may change can: leave it out of the cost, or let something reach it")
-    return OutOfReach(f"{told}{_what_is_apart(problem, variables.states(z))}")
+        return OutOfReach(
+            f"{message}; nothing that may change can: leave it out of the cost, or let something reach it"
+        )
+    return OutOfReach(f"{message}{_what_is_apart(problem, variables.states(z))}")
 
 
 class _Plan:
@@ -293,11 +295,11 @@ class _Plan:
         """(N,) the pairs of trees that push each other in each step; empty if nothing can, or it does not matter."""
         if self.linked or not self.model.contract.contact.collision_pairs:
             return []
-        found = []
+        touching = []
         with self.problem.intervals(self.variables.parameters(self.z)) as intervals:
             for x, u in zip(self.xs, self.us, strict=False):
-                found.append(tuple(pair for a, b in intervals.touching(x, u) for pair in self.trees.pairs(a, b)))
-        return found
+                touching.append(tuple(pair for a, b in intervals.touching(x, u) for pair in self.trees.pairs(a, b)))
+        return touching
 
     def asked(self) -> Iterator[tuple[int, tuple[float, int]]]:
         """(coordinate that nothing moves, (how far the cost asks it to go, at which knot)), the furthest knot each."""
@@ -398,9 +400,9 @@ class _Trees:
 
     def pairs(self, a: str, b: str) -> Iterator[tuple[int, int]]:
         """The trees of two bodies by their names; none where one of them is fixed to the world."""
-        for one in self.names.get(a, ()):
+        for tree in self.names.get(a, ()):
             for other in self.names.get(b, ()):
-                yield one, other
+                yield tree, other
 
     def _candidates(self, model: Model) -> Iterator[tuple[int, int]]:
         inspector = model.double.inspector
@@ -414,20 +416,20 @@ class _Trees:
 
 def _joined(reached: set[int], pairs: tuple[tuple[int, int], ...]) -> set[int]:
     """`reached` and all that is joined to it by the pairs."""
-    found, size = set(reached), -1
-    while size != len(found):
-        size = len(found)
+    trees, size = set(reached), -1
+    while size != len(trees):
+        size = len(trees)
         for pair in pairs:
-            if found & set(pair):
-                found |= set(pair)
-    return found
+            if trees & set(pair):
+                trees |= set(pair)
+    return trees
 
 
 def _is_coupled(model: Model) -> bool:
     """Whether something beside joints and contact holds bodies together: constraints, springs between them."""
-    own = (UniformGravityFieldElement, RevoluteSpring, PrismaticSpring)
+    uncoupled = (UniformGravityFieldElement, RevoluteSpring, PrismaticSpring)
     elements = (model.plant.get_force_element(ForceElementIndex(i)) for i in range(model.plant.num_force_elements()))
-    return bool(model.contract.constraints or model.forces) or not all(isinstance(e, own) for e in elements)
+    return bool(model.contract.constraints or model.forces) or not all(isinstance(e, uncoupled) for e in elements)
 
 
 def _what_is_apart(problem: Problem, xs: Array) -> str:
@@ -440,14 +442,14 @@ def _what_is_apart(problem: Problem, xs: Array) -> str:
                 nearest[pair] = min((distance, k), nearest.get(pair, (np.inf, k)))
     except ModelError:  # Drake knows no distance of some pair
         return ""
-    apart = {pair: found for pair, found in nearest.items() if found[0] > 0}
+    apart = {pair: closest for pair, closest in nearest.items() if closest[0] > 0}
     if not apart:
         return ""
-    told = "; ".join(
+    sentences = "; ".join(
         f"{a} and {b} stay {d:.3g} m apart or more, nearest at knot {k}" for (a, b), (d, k) in apart.items()
     )
     head = "nothing touches" if len(apart) == len(nearest) else "some bodies never touch"
-    return f": at knots 0-{len(xs) - 1} {head} ({told})"
+    return f": at knots 0-{len(xs) - 1} {head} ({sentences})"
 
 
 def doubt_of_the_slope(problem: Problem, vector: ParameterVector, x0: Array, us: Array) -> tuple[str, str] | None:
@@ -480,13 +482,13 @@ def doubt_of_the_slope(problem: Problem, vector: ParameterVector, x0: Array, us:
                 continue
             apart = float(np.linalg.norm(slopes[-2] - slopes[-1])) / size
             if apart > SETTLED:
-                told = (
+                message = (
                     f"slopes over +-{widths[-2]:.1g} and +-{widths[-1]:.1g} along its own direction differ by "
                     f"{apart:.0%}"
                 )
-                return "no_gradient", f"the derivative of the plan's end is that of a point alone: {told}"
-            told = f"the derivative of the plan's end is {off[-1]:.1%} off the slope that another integration has"
-            return "converged_not_verified", told
+                return "no_gradient", f"the derivative of the plan's end is that of a point alone: {message}"
+            message = f"the derivative of the plan's end is {off[-1]:.1%} off the slope that another integration has"
+            return "converged_not_verified", message
     except (GradientError, SimulationError) as error:
         return "no_gradient", f"beside the plan there is no motion: {error}"
     return None

@@ -124,12 +124,12 @@ class PhasedSolution(PicklesItsFields, ShowsItsRepr):
     @cached_property
     def link_errors(self) -> dict[str, Array]:
         """By the name of each reset: (n,) how far the first state after it is from where it leads; inf if unknown."""
-        found = {}
+        errors = {}
         for s in self.problem.switches:
             before, after = self.phases[s.before].xs[-1], self.phases[s.after].xs[0]
             with np.errstate(all="ignore"):
-                found[s.label] = np.nan_to_num(np.abs(s.link(before, after)), nan=np.inf)
-        return found
+                errors[s.label] = np.nan_to_num(np.abs(s.link(before, after)), nan=np.inf)
+        return errors
 
     @property
     def link_error(self) -> float:
@@ -189,20 +189,23 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
         beyond = np.max(np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)[1:], axis=0)
         at_knots = xs[::SUBSTEPS] if impact is None else np.vstack([xs[:-1:SUBSTEPS][: len(wanted) - 1], xs[-1:]])
         apart = np.max(np.abs(at_knots - wanted), axis=0)
-        found = [(f"at most {{:.2g}} from the plan in {name}", apart), (f"{{:.2g}} beyond its bound in {name}", beyond)]
+        deviations = [
+            (f"at most {{:.2g}} from the plan in {name}", apart),
+            (f"{{:.2g}} beyond its bound in {name}", beyond),
+        ]
         if switch is not None:
             with np.errstate(all="ignore"):
                 x = switch(xs[-1]) if impact is None else impact.by_drake(xs[-1])
             if switch.after == 0:
-                found.append((f"{{:.2g}} from its first value after {name}", np.abs(x - motions[0].xs[0])))
+                deviations.append((f"{{:.2g}} from its first value after {name}", np.abs(x - motions[0].xs[0])))
                 ranges = np.concatenate([ranges, motions[0].task.problem.ranges(motions[0].xs)])
-        for k, (told, values) in enumerate(found):
+        for k, (sentence, values) in enumerate(deviations):
             scale = ranges[-len(values) :] if k == 2 else ranges[: len(values)]
-            part = np.nan_to_num(values / scale, nan=np.inf)
-            j = int(np.argmax(part))
-            if part[j] > worst:
+            fractions = np.nan_to_num(values / scale, nan=np.inf)
+            j = int(np.argmax(fractions))
+            if fractions[j] > worst:
                 label = names[j] if k < 2 else motions[0].task.dynamics.state_names[j]
-                worst, where = float(part[j]), f"{label} is {told.format(values[j])}"
+                worst, where = float(fractions[j]), f"{label} is {sentence.format(values[j])}"
     return worst, where
 
 
@@ -221,9 +224,9 @@ def _until_it_touches(motion: Collocated, xs: Array, gains: Array | None, impact
     step = times[-1] - times[-2]
 
     def rate(x: Array, t: float) -> Array:
-        at = np.array([min(t, T)])
-        plan, u = (a[0] for a in motion.at(at))
-        j = min(int(np.searchsorted(T * motion.mesh, at[0], side="right")) - 1, count - 1)
+        moment = np.array([min(t, T)])
+        plan, u = (a[0] for a in motion.at(moment))
+        j = min(int(np.searchsorted(T * motion.mesh, moment[0], side="right")) - 1, count - 1)
         if gains is not None:
             b = motion.task.bounds
             u = np.clip(u + gains[j] @ (plan - x), b.u_lower, b.u_upper)
@@ -237,34 +240,34 @@ def _until_it_touches(motion: Collocated, xs: Array, gains: Array | None, impact
         k3 = rate(x + h / 2 * k2, t + h / 2)
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, t + h))
 
-    found = list(xs[:k])
+    states = list(xs[:k])
     while True:
         t = times[k - 1] if k <= len(times) else T + (k - len(times)) * step
         h = times[k] - t if k < len(times) else step
         if t > T * (1 + LATE):
             return None
-        x = xs[k] if k < len(xs) else ahead(found[-1], t, h)
-        if impact.first_gap(x) <= 0 < impact.first_gap(found[-1]):
+        x = xs[k] if k < len(xs) else ahead(states[-1], t, h)
+        if impact.first_gap(x) <= 0 < impact.first_gap(states[-1]):
             low, high = 0.0, h
             for _ in range(HALVES):
                 middle = (low + high) / 2
-                low, high = (middle, high) if impact.first_gap(ahead(found[-1], t, middle)) > 0 else (low, middle)
-            return np.array([*found, ahead(found[-1], t, high)])
-        found.append(x)
+                low, high = (middle, high) if impact.first_gap(ahead(states[-1], t, middle)) > 0 else (low, middle)
+            return np.array([*states, ahead(states[-1], t, high)])
+        states.append(x)
         k += 1
 
 
 def _gains(problem: PhasedProblem, motions: Sequence[Collocated]) -> list[Array | None]:
     """TVLQR's gains of each phase, whose cost to go at its end is that of the next phase through the reset."""
-    found: list[Array | None] = [None] * len(motions)
+    gains: list[Array | None] = [None] * len(motions)
     at_end: Array | None = None
     for i in range(len(motions) - 1, -1, -1):
-        found[i], P = motions[i].gains(at_end)
+        gains[i], P = motions[i].gains(at_end)
         for switch in problem.switches:
             if switch.after == i and switch.before == i - 1:
                 slope = _across(switch, motions[i - 1], motions[i])
                 at_end = slope.T @ P @ slope
-    return found
+    return gains
 
 
 def _impact_of(switch: Switch) -> Impact | None:
@@ -299,19 +302,19 @@ def solve_phased(
             on_start()
     if interrupted.is_set():
         return replace(run.not_begun(guesses), search=Search(arguments, given))
-    found, chain = [], []
+    solutions, chain = [], []
     for number, begun in enumerate(_guesses(problem, guesses, given, arguments["seed"])):
-        found.append(run.attempt(begun, other=number > 0))
+        solutions.append(run.attempt(begun, other=number > 0))
         reason = "a straight line" if given is None else "given"
-        chain.append({"guess": reason if number == 0 else f"random {number}", "ended": found[-1].status.value})
-        report.say(f"from the guess {chain[-1]['guess']}: {found[-1].status.value}")
-        if not _may_mend(found[-1], arguments["refine"]):
+        chain.append({"guess": reason if number == 0 else f"random {number}", "ended": solutions[-1].status.value})
+        report.say(f"from the guess {chain[-1]['guess']}: {solutions[-1].status.value}")
+        if not _may_mend(solutions[-1], arguments["refine"]):
             break
-    best = min(found, key=_preference)
-    told = best.message
-    if len(found) > 1 and best.status not in PLANS:
-        told += f"; from none of {len(found)} first guesses was a plan found"
-    return replace(best, message=told, options={**best.options, "chain": chain}, search=Search(arguments, given))
+    best = min(solutions, key=_preference)
+    message = best.message
+    if len(solutions) > 1 and best.status not in PLANS:
+        message += f"; from none of {len(solutions)} first guesses was a plan found"
+    return replace(best, message=message, options={**best.options, "chain": chain}, search=Search(arguments, given))
 
 
 def _may_mend(solution: PhasedSolution, refine: bool | None) -> bool:
@@ -362,7 +365,7 @@ def _first_guesses(problem: PhasedProblem, given: Any, seed: int) -> list[Guess]
         expected = f"None, a PhasedSolution, or {len(problem.phases)} guesses, one for each phase"
         raise InputError("initial_guess", got=f"{len(parts)} guesses", expected=expected)
     pairs = zip(_aimed(problem), parts, strict=True)
-    return [first_guess(phase, "collocation", sampled(phase, "collocation", part), seed) for phase, part in pairs]
+    return [first_guess(phase, "collocation", sampled(phase, "collocation", guess), seed) for phase, guess in pairs]
 
 
 def _aimed(problem: PhasedProblem) -> list[Problem]:
@@ -370,15 +373,15 @@ def _aimed(problem: PhasedProblem) -> list[Problem]:
 
     That is its state before a linear reset; before another it is the same state, where there are as many.
     """
-    found = list(problem.phases)
+    phases = list(problem.phases)
     for switch in problem.switches:
-        one, other = found[switch.before], problem.phases[switch.after]
-        if switch.after == 0 or (switch.matrix is None and one.nx != other.nx):
+        phase, other = phases[switch.before], problem.phases[switch.after]
+        if switch.after == 0 or (switch.matrix is None and phase.nx != other.nx):
             continue
         end = other.x0 if switch.matrix is None else np.linalg.lstsq(switch.matrix, other.x0, rcond=None)[0]
-        end = np.clip(end, one.bounds.x_lower, one.bounds.x_upper)
-        found[switch.before] = replace(one, x_goal=np.where(np.isnan(one.goal), end, one.goal))
-    return found
+        end = np.clip(end, phase.bounds.x_lower, phase.bounds.x_upper)
+        phases[switch.before] = replace(phase, x_goal=np.where(np.isnan(phase.goal), end, phase.goal))
+    return phases
 
 
 def _guesses(problem: PhasedProblem, first: list[Guess], given: Any, seed: int) -> Iterator[list[Guess]]:
@@ -428,9 +431,9 @@ class _PhasedRun:
             for t, guess in self._with(guesses):
                 us_end = guess.us[-1:] if guess.u_final is None else guess.u_final[None]
                 begun.append(t.nodes_at(t.mesh, guess.motion or (guess.xs, np.vstack([guess.us, us_end]))))
-            result, motions, told = self._solve_on(meshes, begun, horizons, most)
+            result, motions, derivatives = self._solve_on(meshes, begun, horizons, most)
             result = heard(result, interrupted)
-        solution = self._judged(result, motions, told)
+        solution = self._judged(result, motions, derivatives)
         rounds = [[len(motion.mesh) - 1 for motion in motions]]
         while len(rounds) <= FINER_ROUNDS and self.asked["refine"] is not False:
             finer = self._finer(solution, motions)
@@ -447,8 +450,8 @@ class _PhasedRun:
                 solution = replace(solution, message=f"{solution.message}; {counts}")
                 del rounds[-1]
                 break
-            result, motions, told = again
-            solution = self._judged(result, motions, told)
+            result, motions, derivatives = again
+            solution = self._judged(result, motions, derivatives)
         return replace(solution, options={**solution.options, "refinements": rounds}) if len(rounds) > 1 else solution
 
     def not_begun(self, guesses: list[Guess]) -> PhasedSolution:
@@ -480,17 +483,20 @@ class _PhasedRun:
         guess = np.concatenate([p.pack(z, T) for p, z, T in zip(programs, nodes, inside, strict=True)])
         left = max(0.0, self.limits.time_limit - (now() - self.start))
         limits, why = replace(self.limits, time_limit=left, max_iterations=most), program.functions.why_not
-        told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+        derivatives = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
         result = solve_ipopt(program, guess, limits, self.report, exact=not why, motions=program.iterates)
         if not why and result.message == NOT_FINITE:
             again = solve_ipopt(program, guess, limits, self.report, exact=False, motions=program.iterates)
             if again.message != NOT_FINITE:  # then it was the Hessian
-                told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
+                derivatives, result = (
+                    "symbolic, limited-memory Hessian: the exact one is not finite at an iterate",
+                    again,
+                )
         motions = []
         for p, mesh, z in zip(programs, meshes, program.split(result.z), strict=True):
-            found, horizon = p.unpack(z)
-            motions.append(Transcribed(p.task, frozen(mesh), frozen(found), horizon, result, told))
-        return result, motions, told
+            node_values, horizon = p.unpack(z)
+            motions.append(Transcribed(p.task, frozen(mesh), frozen(node_values), horizon, result, derivatives))
+        return result, motions, derivatives
 
     def _finer(self, solution: PhasedSolution, motions: list[Transcribed]) -> list[Array] | None:
         """The meshes to try next; None where the plan holds, or where finer ones cannot mend it."""
@@ -506,13 +512,13 @@ class _PhasedRun:
             coarse = [(wanted or drifts) and (far or beyond) for wanted, far, beyond in every]
         if not any(coarse):
             return None
-        found = []
+        meshes = []
         for motion, wanted in zip(motions, coarse, strict=True):
             mesh = finer_mesh(motion, violation_between_nodes(motion).intervals, most) if wanted else motion.mesh
             if mesh is None:
                 return None
-            found.append(mesh)
-        return found
+            meshes.append(mesh)
+        return meshes
 
     def _judged(self, result: NlpResult, motions: list[Transcribed], derivatives: str) -> PhasedSolution:
         error: Exception | None = None
@@ -548,36 +554,36 @@ class _PhasedRun:
         return solution
 
     def _draft(self, t: Transcription, motion: Transcribed, options: dict[str, Any]) -> Solution:
-        found = {name: value for name, value in _arrays(motion).items() if value is not None}
-        found |= {"scheme": self.scheme, "options": dict(options)}
+        fields = {name: value for name, value in _arrays(motion).items() if value is not None}
+        fields |= {"scheme": self.scheme, "options": dict(options)}
         by = t.problem, "collocation", "ipopt", Status.FAILED, ""
-        return Solution(*by, frozen(motion.xs), frozen(motion.us[:-1]), **found)
+        return Solution(*by, frozen(motion.xs), frozen(motion.us[:-1]), **fields)
 
     def _offer(self, drafts: Sequence[Solution], result: NlpResult, options: dict[str, Any]) -> None:
         """Hand on what a search came to; what it claims is not looked at yet."""
         phases = tuple(unmeasured(draft, result) for draft in drafts)
-        told = phases[0].status, phases[0].message, phases
-        self.report.found(PhasedSolution(self.problem, *told, iterations=result.iterations, options=options))
+        summary = phases[0].status, phases[0].message, phases
+        self.report.found(PhasedSolution(self.problem, *summary, iterations=result.iterations, options=options))
 
     def _certified_links(self, motions: list[Transcribed]) -> tuple[Certificate, ...]:
         """GradientError where a derivative is refused."""
-        found = []
+        certificates = []
         for s, function in zip(self.problem.switches, self.links, strict=True):
-            at, count = np.concatenate([motions[s.before].xs[-1], motions[s.after].xs[0]]), len(s.columns)
-            if not np.all(np.isfinite(at)):
+            point, count = np.concatenate([motions[s.before].xs[-1], motions[s.after].xs[0]]), len(s.columns)
+            if not np.all(np.isfinite(point)):
                 continue
             with np.errstate(all="ignore"):
                 certificate = certify_jacobian(
                     lambda x, s=s, count=count: s.link(x[:count], x[count:]),
-                    at,
+                    point,
                     function.jacobian_of,
                     rows=s.rows,
                     columns=[*(f"last {name}" for name in s.columns), *(f"first {name}" for name in s.rows)],
                     method="reset",
                     subject=s.label,
                 )
-            found.append(certificate)
-        return tuple(found)
+            certificates.append(certificate)
+        return tuple(certificates)
 
 
 def _arrays(motion: Transcribed) -> dict[str, Any]:
@@ -631,5 +637,5 @@ def _link_checks(draft: PhasedSolution) -> Iterator[Check]:
 
 
 def _ended(draft: PhasedSolution, status: Status, details: Sequence[str]) -> PhasedSolution:
-    told = "; ".join(detail for detail in details if detail)
-    return replace(draft, status=status, message=f"{status.sentence}: {told}" if told else status.sentence)
+    sentences = "; ".join(detail for detail in details if detail)
+    return replace(draft, status=status, message=f"{status.sentence}: {sentences}" if sentences else status.sentence)

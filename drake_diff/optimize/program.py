@@ -61,12 +61,12 @@ class Iterate:
         touches = self.problem.has_model and self.problem.model.contract.contact.collision_pairs
         if not (self.by_steps and touches):
             return [() for _ in steps]
-        found = []
+        contacts = []
         with applied(self.vector) as model:
             for k in steps:
                 advance(model.double, self.xs[k], self.us[k])
-                found.append(contacts_of_the_step(model))
-        return found
+                contacts.append(contacts_of_the_step(model))
+        return contacts
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,13 +239,13 @@ class Watch:
 
     def look_up(self) -> bool:
         """Note what ends the solve, if anything does; whether a report is due."""
-        at = now()
+        moment = now()
         if self.interrupted.is_set():
             self.stopped_by = Outcome.INTERRUPTED
-        elif at - self.start > self.limits.time_limit:
+        elif moment - self.start > self.limits.time_limit:
             self.stopped_by = Outcome.TIME_LIMIT
-        due = at - self.last_report > REPORT_PERIOD or self.stopped_by is not None
-        self.last_report = at if due else self.last_report
+        due = moment - self.last_report > REPORT_PERIOD or self.stopped_by is not None
+        self.last_report = moment if due else self.last_report
         return due
 
     def offer(self, z: Array, cost: float, violation: float) -> None:

@@ -224,7 +224,7 @@ def deciding(plan: Plan, rows: Sequence[Replay]) -> list[str]:
 def broken_variants(plan: Plan, rows: Sequence[Replay]) -> dict[str, list[Replay]]:
     """The replays of each variant in which the plan has to hold and does not, whatever the control."""
     tried = {variant: [r for r in rows if r.variant == variant] for variant in deciding(plan, rows)}
-    return {variant: found for variant, found in tried.items() if not _any_holds(found)}
+    return {variant: replays for variant, replays in tried.items() if not _any_holds(replays)}
 
 
 def judged_replay(plan: Plan, rows: Sequence[Replay]) -> Replay | None:
@@ -274,8 +274,8 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
     except BROKEN as error:
         return missing_replay(plan, variant, control, str(error))
     # Feedback corrects what the laws of contact differ by: there nothing tighter can be asked of it.
-    part = STATE_TOLERANCE if control == OPEN_LOOP or law_is_another else FEEDBACK_TOLERANCE
-    checks = (*motion_checks(plan, model, motion, parts, part), energy_check(motion))
+    fraction = STATE_TOLERANCE if control == OPEN_LOOP or law_is_another else FEEDBACK_TOLERANCE
+    checks = (*motion_checks(plan, model, motion, parts, fraction), energy_check(motion))
     return measured_replay(plan, variant, control, model, motion, checks)
 
 
@@ -321,11 +321,11 @@ def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, c
 def regulator(plan: Plan, model: Model, xs: Array, us: Array) -> TVLQR:
     """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan."""
     Q, R, final = regulator_weights(plan, us)
-    part = model.time_step / plan.time_step  # a running cost is summed over more steps where they are finer
+    ratio = model.time_step / plan.time_step  # a running cost is summed over more steps where they are finer
     jacobians = None
     if plan.problem.motion == CONTINUOUS:
         jacobians = intervals_of(model, select(model, ()), CONTINUOUS).jacobians(xs, us)
-    return TVLQR(model, xs, us, part * Q, part * R, final, jacobians=jacobians)
+    return TVLQR(model, xs, us, ratio * Q, ratio * R, final, jacobians=jacobians)
 
 
 def track(plan: Plan, model: Model, xs: Array, us: Array, gains: Array | None = None) -> Policy:
@@ -380,15 +380,15 @@ def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
 
 
 def motion_checks(
-    plan: Plan, model: Model, motion: Motion, parts: int, part: float, wider: float = 1.0
+    plan: Plan, model: Model, motion: Motion, parts: int, fraction: float, wider: float = 1.0
 ) -> Iterator[Check]:
     """All that the problem asks of `motion`, of which `parts` steps make one of the plan's; energy apart.
 
-    It may end `part` of each state's range from x_goal; every other tolerance is `wider` than a replay's.
+    It may end `fraction` of each state's range from x_goal; every other tolerance is `wider` than a replay's.
     """
     problem = plan.problem
     if not np.all(np.isnan(problem.goal)):
-        yield goal_check(plan, problem.goal_error(motion.xs[-1]), part)
+        yield goal_check(plan, problem.goal_error(motion.xs[-1]), fraction)
     yield bounds_check(plan, motion, wider)
     for c in problem.kept_goals:
         if not isinstance(c, ClearanceConstraint):
@@ -402,11 +402,11 @@ def motion_checks(
         yield penetration_check(model, motion)
 
 
-def goal_check(plan: Plan, distance: Array, part: float = STATE_TOLERANCE) -> Check:
+def goal_check(plan: Plan, distance: Array, fraction: float = STATE_TOLERANCE) -> Check:
     """The `distance` (nx,) from the goal of the state that is furthest from it, of that part of its range."""
     i = int(np.argmax(np.nan_to_num(np.abs(distance) / plan.scale, nan=np.inf)))
     name, unit = plan.problem.state_names[i], units_of(plan.problem)[i]
-    return check("goal", name, abs(distance[i]), part * plan.scale[i], unit)
+    return check("goal", name, abs(distance[i]), fraction * plan.scale[i], unit)
 
 
 def bounds_check(plan: Plan, motion: Motion, wider: float = 1.0) -> Check:
@@ -445,8 +445,8 @@ def penetration_check(model: Model, motion: Motion) -> Check:
 def energy_check(motion: Rollout) -> Check:
     """Energy out of nothing, or gone; what constraints (couplers, balls, welds) take is not told."""
     gained, tolerance = motion.energy_drift, energy_tolerance(motion)
-    told = gained > 0 or np.all(np.isfinite(motion.constraint_violation))
-    return check("energy", "gained" if gained > 0 else "lost", abs(gained) if told else 0.0, tolerance, "J")
+    is_measured = gained > 0 or np.all(np.isfinite(motion.constraint_violation))
+    return check("energy", "gained" if gained > 0 else "lost", abs(gained) if is_measured else 0.0, tolerance, "J")
 
 
 def energy_tolerance(motion: Rollout) -> float:

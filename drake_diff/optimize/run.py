@@ -163,9 +163,9 @@ class Run:
             )
             motion = motion.told(result=heard(motion.result, interrupted))
         if refine:
-            self.options["refinements"] = [list(each) for each in motion.refinements]
+            self.options["refinements"] = [list(row) for row in motion.refinements]
         if motion.cleared:
-            self.options["clearance_rounds"] = [list(each) for each in motion.cleared]
+            self.options["clearance_rounds"] = [list(row) for row in motion.cleared]
 
         def judged(motion: Transcribed) -> Solution:
             return self._judge_collocated(transcription, motion, before)
@@ -212,11 +212,11 @@ class Run:
                 return solution.told(message=f"{solution.message}; {last.note}")
             motion = finer
             rounds.append((len(finer.mesh) - 1, finer.largest_error))
-            self.options["refinements"] = [list(each) for each in rounds]
+            self.options["refinements"] = [list(row) for row in rounds]
             solution = judged(motion)
         if len(rounds) > 1:
-            told = f"the mesh was refined from {rounds[0][0]} to {rounds[-1][0]} intervals"
-            solution = solution.told(message=f"{solution.message}; {told}")
+            note = f"the mesh was refined from {rounds[0][0]} to {rounds[-1][0]} intervals"
+            solution = solution.told(message=f"{solution.message}; {note}")
         return solution
 
     def _collocate_in_drake(self, guess: Guess) -> Solution:
@@ -244,7 +244,7 @@ class Run:
     ) -> Solution:
         xs, us = motion.xs, motion.us[:-1]
         self.options["derivatives"] = motion.derivatives
-        found: dict[str, Any] = {
+        fields: dict[str, Any] = {
             "u_final": None if self.problem.is_map else motion.us[-1],
             "us_mid": None if self.scheme == "drake" else motion.us_mid,
             "free_horizon": motion.horizon if self.problem.horizon else None,
@@ -252,11 +252,11 @@ class Run:
             "parameters": frozen(motion.task.parameters),
             "multipliers": motion.result.multipliers,
         }
-        self._offer(self._draft(xs, us, **found), motion.result)
-        self._reach(2, self._draft(xs, us, certificates=certificates, **found), motion.result)
+        self._offer(self._draft(xs, us, **fields), motion.result)
+        self._reach(2, self._draft(xs, us, certificates=certificates, **fields), motion.result)
         if np.all(np.isfinite(xs)):
             certificates += certify_equations(self.problem, transcription.jacobian, xs, us, motion.task)
-        draft = self._draft(xs, us, certificates=certificates, **found)
+        draft = self._draft(xs, us, certificates=certificates, **fields)
         if self.searched is None and draft.transcribed is not None:  # else it was measured under another cost
             draft.transcribed.measured_as(motion)
         return self._judge(draft, motion.result)
@@ -351,12 +351,12 @@ class Run:
         search: Searcher,
         guess: Guess,
         interrupted: threading.Event,
-        found: Callable[[], None],
+        after_search: Callable[[], None],
         *,
         may_be_blind: bool,
         around: bool,
     ) -> Solution:
-        """Certify, search, call `found`, certify again, on Drake's own steps: at the states that a search gives.
+        """Certify, search, call `after_search`, certify again, on Drake's own steps: at the states that a search gives.
 
         Of the guess at its rollout, or `around` its states as they are.
         """
@@ -385,14 +385,14 @@ class Run:
             if self.report is not None and self.report.plan is not None:  # else it need not be rolled out
                 drawn = variables.states(z), variables.unpack(z)[1]
                 self._offer(self._draft(*drawn, **self._design_of(variables, z)), result)
-            found()
+            after_search()
             xs, us, after, blindness = self._look_at(variables, z, found=True)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us, certificates=before), error)
         if result.note:
             self.options["contact_sequence"] = result.note
-        told = {"certificates": before + after, **self._design_of(variables, z)}
-        solution = self._judge(self._draft(xs, us, multipliers=result.multipliers, **told), result)
+        fields = {"certificates": before + after, **self._design_of(variables, z)}
+        solution = self._judge(self._draft(xs, us, multipliers=result.multipliers, **fields), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
 
     def _with_its_end(self, xs: Array, us: Array, values: Array) -> Array:
@@ -415,10 +415,10 @@ class Run:
     def _first_values(self, guess: Guess) -> Array:
         """(np,) those of the problem's `design` where a search begins."""
         problem, design = self.problem, self.problem.design
-        own = problem.parameters.values if guess.parameters is None else guess.parameters
+        parameters = problem.parameters.values if guess.parameters is None else guess.parameters
         first = problem.start_horizon if guess.horizon is None else guess.horizon
         h = (first if problem.horizon is None else float(np.clip(first, *problem.horizon))) / problem.num_steps
-        return np.clip(design.whole(own, h), design.lower, design.upper)
+        return np.clip(design.whole(parameters, h), design.lower, design.upper)
 
     def _keeping_clear(self, search: Searcher, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
         """What `search` finds; where it comes too near to an obstacle between two states, again with these in view."""
@@ -463,19 +463,19 @@ class Run:
         xs, us = solution.plan.sample(1)
         variables = ShootingVariables(problem, around=xs)
         try:
-            found = out_of_reach(problem, variables, variables.pack(xs[0], us, solution.step_vector.values))
+            reach = out_of_reach(problem, variables, variables.pack(xs[0], us, solution.step_vector.values))
         except (GradientError, SimulationError) as error:
             detail = f"whether the cost asks for what nothing moves cannot be told: {error}"
             return ended(solution, Status.CONVERGED_NOT_VERIFIED, detail)
-        if found.silent:
-            return ended(solution, Status.NO_GRADIENT, found.silent)
-        return solution.told(message=f"{solution.message}; {found.constant}") if found.constant else solution
+        if reach.silent:
+            return ended(solution, Status.NO_GRADIENT, reach.silent)
+        return solution.told(message=f"{solution.message}; {reach.constant}") if reach.constant else solution
 
-    def _draft(self, xs: Array, us: Array, **found: Any) -> Solution:
+    def _draft(self, xs: Array, us: Array, **fields: Any) -> Solution:
         arrays = ("u_final", "us_mid", "mesh")
-        found |= {name: frozen(found[name]) for name in arrays if found.get(name) is not None}
-        found |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.begun}
-        return Solution(self.problem, self.method, self.solver, Status.FAILED, "", frozen(xs), frozen(us), **found)
+        fields |= {name: frozen(fields[name]) for name in arrays if fields.get(name) is not None}
+        fields |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.begun}
+        return Solution(self.problem, self.method, self.solver, Status.FAILED, "", frozen(xs), frozen(us), **fields)
 
     def _look_at(
         self, variables: ShootingVariables, z: Array, *, found: bool

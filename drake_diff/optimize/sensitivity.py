@@ -83,8 +83,8 @@ class Sensitivity(ShowsItsRepr):
         return "agree" if np.all(self.differences <= SAME) else "disagree"
 
     def __repr__(self) -> str:
-        told = f"by {', '.join(self.columns)}"
-        lines = [f"Sensitivity of {self.solution.problem.name} {told}: {self.verdict}"]
+        columns = f"by {', '.join(self.columns)}"
+        lines = [f"Sensitivity of {self.solution.problem.name} {columns}: {self.verdict}"]
         if self.differences is not None:
             worst = float(np.max(np.nan_to_num(self.differences, nan=np.inf)))
             lines.append(f"{worst:.2g} of a column from differences of re-solves, {SAME:g} allowed")
@@ -136,8 +136,8 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
     change = _change(solution, by)
     plan = _plan(solution)
     plan_held = _held(plan)
-    program, found = plan_held.program, plan_held.solve(change)
-    dz, knots = found.dz, len(program.states_at) - 1
+    program, response = plan_held.program, plan_held.solve(change)
+    dz, knots = response.dz, len(program.states_at) - 1
     sensitive = Sensitivity(
         solution=solution,
         columns=change.columns,
@@ -147,14 +147,14 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         horizon=frozen(
             np.zeros(dz.shape[1]) if program.horizon_at is None else program.horizon_unit * dz[program.horizon_at]
         ),
-        cost=frozen(found.cost),
-        active=found.active,
-        weak=(*found.weak, *_changes_of_contact(plan, plan_held, change, dz)),
+        cost=frozen(response.cost),
+        active=response.active,
+        weak=(*response.weak, *_changes_of_contact(plan, plan_held, change, dz)),
         derivatives=plan.derivatives(program),
     )
     if not certified:
         return sensitive
-    apart, corners = _differences(plan, plan_held, change, found)
+    apart, corners = _differences(plan, plan_held, change, response)
     return replace(sensitive, differences=frozen(apart), weak=(*sensitive.weak, *corners))
 
 
@@ -247,7 +247,7 @@ def _changes_of_contact(plan: _Plan, held: HeldPlan, change: Change, dz: Array) 
     """The contacts that are others a little way along a column: they begin, end, or begin to slip or to stick."""
     if not plan.discrete or not plan.problem.model.contract.contact.collision_pairs:
         return []
-    found: dict[str, None] = {}
+    changes: dict[str, None] = {}
     here = _modes(plan.problem, held.program, held.z)
     for i, value in enumerate(change.values):
         for side in (-1, 1):
@@ -256,37 +256,37 @@ def _changes_of_contact(plan: _Plan, held: HeldPlan, change: Change, dz: Array) 
                 there = _modes(problem, held.program, held.z + step * dz[:, i])
             for k, (before, after) in enumerate(zip(here, there, strict=True)):
                 pairs = sorted({pair for pair, _ in before.items() ^ after.items()})
-                found |= {f"contact of {a} with {b} at knot {k}": None for a, b in pairs}
-    return list(found)
+                changes |= {f"contact of {a} with {b} at knot {k}": None for a, b in pairs}
+    return list(changes)
 
 
 def _modes(problem: Problem, program: KnotProgram, z: Array) -> list[dict[tuple[str, str], str]]:
     """(N,) the modes of the pairs that push each other in each step; one that cannot be taken has a mode of its own."""
-    found: list[dict[tuple[str, str], str]] = []
+    modes: list[dict[tuple[str, str], str]] = []
     with applied(StepProgram(problem).vector(z)) as model:
         for x, u in zip(z[program.states_at[:-1]], z[program.inputs_at], strict=True):
             try:
                 advance(model.double, x, u)
-                found.append(active_modes(model))
+                modes.append(active_modes(model))
             except SimulationError:
-                found.append({("a step", "nothing, as it cannot be taken"): ""})
-    return found
+                modes.append({("a step", "nothing, as it cannot be taken"): ""})
+    return modes
 
 
-def _differences(plan: _Plan, held: HeldPlan, change: Change, found: Held) -> tuple[Array, list[str]]:
+def _differences(plan: _Plan, held: HeldPlan, change: Change, response: Held) -> tuple[Array, list[str]]:
     """(p,) how far the derivative is from central differences of re-solves, extrapolated, as a part of each column.
 
     And the columns whose two sides differ, where it is far.
     """
     base, apart, corners = _read(held.program, held.z), [], []
-    derivative = [found.dz[held.program.states_at], found.dz[held.program.inputs_at], found.cost[None]]
+    derivative = [response.dz[held.program.states_at], response.dz[held.program.inputs_at], response.cost[None]]
     for i, value in enumerate(change.values):
-        unit, ours = max(1.0, abs(value)), [each[..., i] for each in derivative]
-        least = [LEAST * _size(each) / unit for each in base]
+        unit, ours = max(1.0, abs(value)), [array[..., i] for array in derivative]
+        least = [LEAST * _size(array) / unit for array in base]
         off, sides = np.inf, 0.0
-        for part in RESOLVED:  # nearer, where another bound begins to hold on the way
+        for fraction in RESOLVED:  # nearer, where another bound begins to hold on the way
             slopes = [
-                _one_sided(plan, held, change, i, side * part * unit / n, base) for n in (1, 2) for side in (-1, 1)
+                _one_sided(plan, held, change, i, side * fraction * unit / n, base) for n in (1, 2) for side in (-1, 1)
             ]
             low, high, near_low, near_high = slopes
             coarse, fine = _means(low, high), _means(near_low, near_high)
@@ -296,7 +296,7 @@ def _differences(plan: _Plan, held: HeldPlan, change: Change, found: Held) -> tu
                 break
             # at a corner these go to two limits; elsewhere to one, with the step
             left, right = (
-                [2 * b - a for a, b in zip(*each, strict=True)] for each in ((low, near_low), (high, near_high))
+                [2 * b - a for a, b in zip(*pair, strict=True)] for pair in ((low, near_low), (high, near_high))
             )
             sides = _distance(left, right, least)
         apart.append(off)
@@ -309,9 +309,9 @@ def _means(low: list[Array], high: list[Array]) -> list[Array]:
     return [(a + b) / 2 for a, b in zip(low, high, strict=True)]
 
 
-def _distance(one: list[Array], other: list[Array], least: list[float]) -> float:
+def _distance(arrays: list[Array], other: list[Array], least: list[float]) -> float:
     """The largest of their entries' differences, as a part of the largest entry; NaN where one is no number."""
-    pairs = zip(one, other, least, strict=True)
+    pairs = zip(arrays, other, least, strict=True)
     return float(np.max([_size(a - b) / max(_size(a), _size(b), smallest, 1e-300) for a, b, smallest in pairs]))
 
 
@@ -331,8 +331,8 @@ def _one_sided(plan: _Plan, held: HeldPlan, change: Change, column: int, step: f
     with change.moved(plan.problem, column, step) as moved:
         program = plan.make(moved)
         z, solved = _resolved(program, held.z, held.multipliers)
-        found = _read(program, z)
-    return [(a - b) / step if solved else np.full_like(a, np.nan) for a, b in zip(found, base, strict=True)]
+        arrays = _read(program, z)
+    return [(a - b) / step if solved else np.full_like(a, np.nan) for a, b in zip(arrays, base, strict=True)]
 
 
 def _resolved(program: KnotProgram, z: Array, multipliers: Multipliers) -> tuple[Array, bool]:

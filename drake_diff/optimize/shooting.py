@@ -94,17 +94,17 @@ def final_sensitivity(variables: ShootingVariables, z: Array) -> Array:
     Forward, all inputs' columns are carried through every step, which takes n^2.
     """
     steps, nu = variables.linearization(z), variables.shape[1]
-    found, after = np.zeros((variables.problem.model.nx, variables.size)), np.eye(variables.problem.model.nx)
+    jacobian, after = np.zeros((variables.problem.model.nx, variables.size)), np.eye(variables.problem.model.nx)
     for k in reversed(range(len(steps))):
         check_time()
         d = steps[k]
         if variables.problem.optimizes_controls:
             start = variables.inputs.start + k * nu
-            found[:, start : start + nu] = after @ d.B
-        found[:, variables.inputs.stop :] += after @ variables.pull_back(z, d.C)
+            jacobian[:, start : start + nu] = after @ d.B
+        jacobian[:, variables.inputs.stop :] += after @ variables.pull_back(z, d.C)
         after = after @ d.A
-    found[:, np.arange(len(variables.free))] = after[:, variables.free]
-    return found
+    jacobian[:, np.arange(len(variables.free))] = after[:, variables.free]
+    return jacobian
 
 
 class RolloutCost:
@@ -125,8 +125,8 @@ class RolloutCost:
         design, gradient, total = self.variables.design, np.zeros(self.variables.size), 0.0
         by_values = np.zeros(len(design.vector.values))
         if self.of_parameters is not None:
-            own = np.array(design.own(self.variables.parameters(z).values))
-            total, by_values[: len(own)] = differentiate_final_cost(self.of_parameters, own)
+            parameters = np.array(design.own(self.variables.parameters(z).values))
+            total, by_values[: len(parameters)] = differentiate_final_cost(self.of_parameters, parameters)
         if design.moves_step and self.running is not None:
             pairs = zip(self.variables.states(z), self.variables.unpack(z)[1], strict=False)
             by_values[design.own_count] = sum(float(self._rate(k)(x, u)) for k, (x, u) in enumerate(pairs))

@@ -173,9 +173,9 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         for name in fields:
             if name not in TOLD:
                 raise UnknownNameError("field to be told", got=name, known=TOLD)
-        found = copy.copy(self)
-        vars(found).update(fields)
-        return found
+        changed = copy.copy(self)
+        vars(changed).update(fields)
+        return changed
 
     @property
     def success(self) -> bool:
@@ -281,12 +281,12 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             return np.full(self._num_intervals, np.inf)
         if self.transcribed is not None:
             return np.nan_to_num(self.transcribed.defects, nan=np.inf)
-        found = np.full(len(self.us), np.inf)
+        defects = np.full(len(self.us), np.inf)
         with self.problem.intervals(self.step_vector) as intervals:
             for k, u in enumerate(self.us):
                 with suppress(SimulationError):
-                    found[k] = _largest(np.abs(self.xs[k + 1] - intervals.end(self.xs[k], u)))
-        return found
+                    defects[k] = _largest(np.abs(self.xs[k + 1] - intervals.end(self.xs[k], u)))
+        return defects
 
     @property
     def defect(self) -> float:
@@ -339,13 +339,13 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         if self.problem.horizon is not None:
             shortest, longest = (np.array([end]) for end in self.problem.horizon)
             sides.append((("horizon",), np.array([[self.horizon]]), shortest, longest))
-        found: dict[str, tuple[float, int]] = {}
+        excesses: dict[str, tuple[float, int]] = {}
         for labels, values, lower, upper in sides:
             excess = np.where(np.isfinite(values), np.maximum(lower - values, values - upper), np.inf)
             for i in np.flatnonzero(excess.max(axis=0, initial=0.0) > 0):
                 k = int(np.argmax(excess[:, i]))
-                found[labels[i]] = max((float(excess[k, i]), k), found.get(labels[i], (0.0, 0)))
-        return found
+                excesses[labels[i]] = max((float(excess[k, i]), k), excesses.get(labels[i], (0.0, 0)))
+        return excesses
 
     @cached_property
     def constraint_excess(self) -> dict[str, tuple[float, int]]:
@@ -358,8 +358,8 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             return self.problem.constraint_excess(self.xs, self.inputs_at_knots, coupled=coupled)
         nodes, every = self.transcribed.nodes, self.transcribed.task.scheme.nodes
         xs, us = np.split(nodes, [self.problem.nx], axis=1)
-        found = self.problem.constraint_excess(xs, us, every * self.knots, self.transcribed.task.couplings)
-        return {name: (excess, row // every) for name, (excess, row) in found.items()} | self.transcribed.rate_excess
+        excesses = self.problem.constraint_excess(xs, us, every * self.knots, self.transcribed.task.couplings)
+        return {name: (excess, row // every) for name, (excess, row) in excesses.items()} | self.transcribed.rate_excess
 
     @property
     def constraint_violation(self) -> float:
@@ -502,8 +502,8 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         count, nx, nu = self._num_intervals, self.problem.nx, self.problem.nu
         if self.us.shape != (count, nu) or self.xs.shape != (count + 1, nx):
             return False
-        parts = [part for part in (self.xs, self.inputs_at_knots, self.us_mid) if part is not None]
-        return self.scheme == "step" or all(bool(np.all(np.isfinite(part))) for part in parts)
+        parts = [array for array in (self.xs, self.inputs_at_knots, self.us_mid) if array is not None]
+        return self.scheme == "step" or all(bool(np.all(np.isfinite(array))) for array in parts)
 
 
 class Trajectories(NamedTuple):

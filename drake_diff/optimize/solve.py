@@ -196,11 +196,11 @@ def _with_compilation(solution: Solution | PhasedSolution, seconds: float, repor
     """Say for how long Numba compiled, where that is worth a word; the message of a solve that the limit ended does."""
     if seconds < COMPILED:
         return solution
-    told = f"Numba compiled for {seconds:.2g} s, once on this machine, which no time limit counts"
-    report.say(told)
+    note = f"Numba compiled for {seconds:.2g} s, once on this machine, which no time limit counts"
+    report.say(note)
     if solution.status is not Status.TIME_LIMIT:
         return solution
-    message = f"{solution.message}; {told}"
+    message = f"{solution.message}; {note}"
     return solution.told(message=message) if isinstance(solution, Solution) else replace(solution, message=message)
 
 
@@ -235,10 +235,10 @@ def _solved(
     if restarts:
         solution = _restarted(task, asked, solution, restarts)
     tried = {link["method"] for link in solution.options.get("chain", ())} | {solution.method}
-    told = advice(
+    suggestion = advice(
         solution, arguments, [other for other in METHODS[1:] if other not in tried and _takes(problem, other)]
     )
-    message = f"{solution.message}; {told}" if told else solution.message
+    message = f"{solution.message}; {suggestion}" if suggestion else solution.message
     return solution.told(message=message, search=Search(arguments, initial_guess))
 
 
@@ -255,10 +255,10 @@ def _check_common(problem: Any, seed: Any, callback: Any, progress: Any, view: A
 
 
 def _tolerance(name: str, given: Any) -> float:
-    found = positive_float(name, given)
-    if found > LARGEST_TOLERANCE:
-        raise InputError(name, got=found, expected=f"at most {LARGEST_TOLERANCE:g}")
-    return found
+    tolerance = positive_float(name, given)
+    if tolerance > LARGEST_TOLERANCE:
+        raise InputError(name, got=tolerance, expected=f"at most {LARGEST_TOLERANCE:g}")
+    return tolerance
 
 
 def _takes(problem: Problem, method: str) -> bool:
@@ -367,21 +367,21 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
 
     A collocation that was asked for is tried from other first guesses alone.
     """
-    found: list[Solution] = []
+    solutions: list[Solution] = []
     chain: list[dict[str, str]] = []
-    for attempt, guess in _attempts(task.problem, asked, given, found):
-        if found and task.is_late:
+    for attempt, guess in _attempts(task.problem, asked, given, solutions):
+        if solutions and task.is_late:
             chain.append({"method": attempt.method, "reason": attempt.reason, "ended": "not begun: time limit"})
             break
         try:
             make = task.prepare(attempt, guess)
         except DrakeDiffError as error:
-            if not found:
+            if not solutions:
                 raise
             chain.append({"method": attempt.method, "reason": attempt.reason, "ended": f"not possible: {error}"})
             continue
-        found.append(make())
-        last = found[-1]
+        solutions.append(make())
+        last = solutions[-1]
         if last.status is not Status.INTERRUPTED:
             task.report.say(f"{attempt.method} ({attempt.reason}): {last.status.value}")
         chain.append({"method": attempt.method, "reason": attempt.reason, "ended": last.status.value})
@@ -390,18 +390,18 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
         if last.status in ENDED:
             break
 
-    best = _best_of(found)
+    best = _best_of(solutions)
     if asked.method != "auto" and len(chain) == 1:
         return best
-    if len(found) > 1 and best.status not in PLANS and all(s.method == "collocation" for s in found):
-        best = best.told(message=f"{best.message}; from none of {len(found)} first guesses was a plan found")
+    if len(solutions) > 1 and best.status not in PLANS and all(s.method == "collocation" for s in solutions):
+        best = best.told(message=f"{best.message}; from none of {len(solutions)} first guesses was a plan found")
     return best.told(options=best.options | {"chain": chain})
 
 
-def _best_of(found: list[Solution]) -> Solution:
+def _best_of(solutions: list[Solution]) -> Solution:
     """The one that is preferred; where a signal ended what was tried after it, its message says so."""
-    best = min(found, key=_preference) if len(found) > 1 else found[0]
-    if found[-1].status is Status.INTERRUPTED and best is not found[-1]:
+    best = min(solutions, key=_preference) if len(solutions) > 1 else solutions[0]
+    if solutions[-1].status is Status.INTERRUPTED and best is not solutions[-1]:
         return best.told(message=f"{best.message}; what was tried after it: {Status.INTERRUPTED.sentence}")
     return best
 
@@ -411,14 +411,14 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> S
 
     Ctrl-C and the time limit end it; an attempt that fails is told in the chain.
     """
-    told = {"method": first.method, "reason": asked.reason, "ended": first.status.value}
-    chain = list(first.options.get("chain", (told,)))
+    first_link = {"method": first.method, "reason": asked.reason, "ended": first.status.value}
+    chain = list(first.options.get("chain", (first_link,)))
     used = sum(OTHER_GUESS in link["reason"] for link in chain)
     solver = asked.solver if first.method == asked.method else None
     base = replace(asked, method=first.method, solver=solver, continuation=None)
-    found = [(first, f"that of {len(chain)} in the chain" if len(chain) > 1 else "the first")]
+    attempts = [(first, f"that of {len(chain)} in the chain" if len(chain) > 1 else "the first")]
     for number in range(1, restarts + 1):
-        if found[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+        if attempts[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
             break
         which = f"{OTHER_GUESS}, number {used + number} of seed {asked.seed}"
         attempt = replace(base, reason=f"restart {number} of {restarts}: {which}")
@@ -427,23 +427,23 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> S
         else:
             begun = _rolled_guess(task.problem, asked.seed, used + number)
         try:
-            found.append((task.prepare(attempt, begun)(), which))
-            ended = found[-1][0].status.value
+            attempts.append((task.prepare(attempt, begun)(), which))
+            ended = attempts[-1][0].status.value
         except DrakeDiffError as error:
             ended = f"not possible: {error}"
         task.report.say(f"{first.method} ({attempt.reason}): {ended}")
         chain.append({"method": first.method, "reason": attempt.reason, "ended": ended})
-    best = min((solution for solution, _ in found), key=_preference)
-    optima = distinct(found)
+    best = min((solution for solution, _ in attempts), key=_preference)
+    optima = distinct(attempts)
     options = best.options | {"chain": chain, "optima": [optimum.to_dict() for optimum in optima]}
     best = best.told(options=options, optima=tuple(optimum.solution for optimum in optima))
-    if len(found) > 1 and found[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
-        best = best.told(message=f"{best.message}; the restarts were ended: {found[-1][0].status.sentence}")
+    if len(attempts) > 1 and attempts[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+        best = best.told(message=f"{best.message}; the restarts were ended: {attempts[-1][0].status.sentence}")
     if not optima:
         return best
     costs = ", ".join(f"{optimum.solution.cost:.4g} ({optimum.count})" for optimum in optima)
     verified = sum(optimum.count for optimum in optima)
-    message = f"{verified} of {len(found)} first guesses were verified, at cost (how many): {costs}"
+    message = f"{verified} of {len(attempts)} first guesses were verified, at cost (how many): {costs}"
     return best.told(message=f"{best.message}; {message}")
 
 
@@ -453,46 +453,46 @@ def _preference(solution: Solution) -> tuple[int, float, float]:
     return rank, 0.0 if solution.success else solution.defect + solution.goal_error, solution.cost
 
 
-def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
-    """What to try next and from which guess, by what the attempts before, in `found`, came to."""
+def _attempts(problem: Problem, asked: Attempt, given: Any, solutions: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
+    """What to try next and from which guess, by what the attempts before, in `solutions`, came to."""
     if asked.method == "collocation":
         yield asked, given
-        yield from _other_guesses(problem, asked, given, found)
-        yield from _kept_apart(problem, asked, found)
+        yield from _other_guesses(problem, asked, given, solutions)
+        yield from _kept_apart(problem, asked, solutions)
         return
     method, reason = choose_method(problem)
     if problem.motion == CONTINUOUS:
-        yield from _in_continuous_time(problem, replace(asked, method=method, reason=reason), given, found)
+        yield from _in_continuous_time(problem, replace(asked, method=method, reason=reason), given, solutions)
         return
     first = replace(asked, method=method, reason=reason, solver=asked.solver if method == "collocation" else None)
-    told = "nothing touches at first, and every coordinate is driven"
-    free = replace(asked, method="collocation", reason=told)
+    explanation = "nothing touches at first, and every coordinate is driven"
+    free = replace(asked, method="collocation", reason=explanation)
     by_steps = method == "ilqr" or (method == "shooting" and problem.couplings)
     if by_steps and _is_free_at_first(problem) and _is_possible(problem, free):
         yield free, given
-        yield from _other_guesses(problem, free, given, found)
-        yield from _kept_apart(problem, free, found)
+        yield from _other_guesses(problem, free, given, solutions)
+        yield from _kept_apart(problem, free, solutions)
     yield first, given
     if method == "collocation":
-        yield from _other_guesses(problem, first, given, found)
-        yield from _kept_apart(problem, first, found)
-    if found[-1].status is Status.NO_GRADIENT and method == "ilqr":
+        yield from _other_guesses(problem, first, given, solutions)
+        yield from _kept_apart(problem, first, solutions)
+    if solutions[-1].status is Status.NO_GRADIENT and method == "ilqr":
         yield Attempt("ilqr", "the guess has no gradient", continuation="auto"), given
     if method == "shooting" or not problem.has_model or problem.couplings:  # which iLQR does not take
         return
     if method == "collocation":
         reason = "collocation was not verified: a guess for it"
         yield Attempt("ilqr", reason, max_iterations=GUESS_ITERATIONS), given
-    if np.all(np.isfinite(found[-1].xs)):
-        begun: Any = (found[-1].xs, found[-1].us)
+    if np.all(np.isfinite(solutions[-1].xs)):
+        begun: Any = (solutions[-1].xs, solutions[-1].us)
         if problem.design.vector.parameters:
-            begun = found[-1]
+            begun = solutions[-1]
         after = "collocation" if method == "collocation" else "shooting"
         yield replace(asked, method=after, reason="from the motion that iLQR found"), begun
 
 
 def _in_continuous_time(
-    problem: Problem, first: Attempt, given: Any, found: list[Solution]
+    problem: Problem, first: Attempt, given: Any, solutions: list[Solution]
 ) -> Iterator[tuple[Attempt, Any]]:
     """One method, shooting from what iLQR found, and other first guesses: one that touches nothing has no slope."""
     first = replace(first, solver=None)
@@ -501,7 +501,7 @@ def _in_continuous_time(
         if number:
             reason = f"no plan was found: {OTHER_GUESS} ({number} of {OTHER_GUESSES})"
             yield replace(first, reason=reason), _rolled_guess(problem, first.seed, number)
-        last = found[-1]
+        last = solutions[-1]
         if (
             first.method == "ilqr"
             and last.method == "ilqr"
@@ -523,22 +523,22 @@ def _rolled_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
 
 
 def _other_guesses(
-    problem: Problem, attempt: Attempt, given: Any, found: list[Solution]
+    problem: Problem, attempt: Attempt, given: Any, solutions: list[Solution]
 ) -> Iterator[tuple[Attempt, Any]]:
     """A collocation from other first guesses than a straight line, from which no motion was found."""
     if given is not None or attempt.solver == "snopt":
         return
     for number in range(1, OTHER_GUESSES + 1):
-        if found[-1].status not in NOT_FOUND:
+        if solutions[-1].status not in NOT_FOUND:
             return
         reason = f"no motion was found: {OTHER_GUESS} ({number} of {OTHER_GUESSES})"
         begun = another_guess(problem, attempt.seed, number)
         yield replace(attempt, reason=reason, max_iterations=OTHER_ITERATIONS), begun
 
 
-def _kept_apart(problem: Problem, attempt: Attempt, found: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
+def _kept_apart(problem: Problem, attempt: Attempt, solutions: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
     """A collocation whose links went through each other, from where it ended, with these kept apart."""
-    last = found[-1]
+    last = solutions[-1]
     if attempt.solver == "snopt" or last.status is not Status.CONVERGED_NOT_VERIFIED or is_kept_apart(problem):
         return
     if overlaps(last):
@@ -660,12 +660,12 @@ def _check_timed_cost(problem: Problem) -> None:
 def choose_method(problem: Problem) -> tuple[str, str]:
     """(method, why)."""
     if not problem.has_model:
-        told = "a discrete map is one sparse program" if problem.is_map else "plain dynamics have no discrete step"
-        return "collocation", told
+        reason = "a discrete map is one sparse program" if problem.is_map else "plain dynamics have no discrete step"
+        return "collocation", reason
     contract = problem.model.contract
     if problem.motion == CONTINUOUS:
-        told = "the motion is in continuous time, which collocation does not take"
-        return "ilqr" if takes(problem) else "shooting", told
+        reason = "the motion is in continuous time, which collocation does not take"
+        return "ilqr" if takes(problem) else "shooting", reason
     if problem.horizon is not None and not _touches_at_first(problem):
         return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
     if not problem.optimizes_controls:

@@ -48,17 +48,17 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
             broken = broken_variants(draft.plan, draft.replays)
             complaints = [messages.broken_variant(variant, rows) for variant, rows in broken.items()]
     if complaints:
-        told = [*complaints, *filter(None, [_remedy(draft, failing)]), *notes]
-        return ended(draft, Status.CONVERGED_NOT_VERIFIED, "; ".join(told), **fields)
+        sentences = [*complaints, *filter(None, [_remedy(draft, failing)]), *notes]
+        return ended(draft, Status.CONVERGED_NOT_VERIFIED, "; ".join(sentences), **fields)
     return ended(draft, Status.CONVERGED, "; ".join(filter(None, [*_holding(draft), *notes])), **fields)
 
 
 def _holding(s: Solution) -> list[str]:
     """Under which controls a plan holds, on the plant and where its dynamics are integrated."""
-    found = [f"integrated {messages.under(s.following[-1].feedback or 'open loop')}"] if s.following else []
+    sentences = [f"integrated {messages.under(s.following[-1].feedback or 'open loop')}"] if s.following else []
     if s.problem.has_model:
-        found.insert(0, messages.controls(s.replays, deciding(s.plan, s.replays), finest=s.plan.continuous))
-    return found
+        sentences.insert(0, messages.controls(s.replays, deciding(s.plan, s.replays), finest=s.plan.continuous))
+    return sentences
 
 
 def _remedy(draft: Solution, failing: list[Check]) -> str:
@@ -84,8 +84,8 @@ def _by_our_measures(draft: Solution, result: NlpResult) -> tuple[Outcome, tuple
     if not ratio <= STATIONARY:  # NaN where it is not known
         goes_on = result.outcome in (Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT)  # the words say why it did not
         return result.outcome if goes_on else Outcome.INACCURATE, ()
-    told = f"what was asked is kept, and the Lagrangian's gradient is {ratio:.1g} of its terms"
-    return Outcome.SOLVED, (f"by our own measures, where the solver says {result.message!r}: {told}",)
+    sentence = f"what was asked is kept, and the Lagrangian's gradient is {ratio:.1g} of its terms"
+    return Outcome.SOLVED, (f"by our own measures, where the solver says {result.message!r}: {sentence}",)
 
 
 def may_be_too_coarse(solution: Solution) -> bool:
@@ -126,8 +126,8 @@ def advice(solution: Solution, arguments: dict[str, Any], other_methods: Sequenc
 
     `arguments` are those of `solve`, `other_methods` those that take the problem and were not tried.
     """
-    found = list(_remedies(solution, arguments, other_methods))
-    return f"to try: {', or '.join(dict.fromkeys(found))}" if found else ""
+    remedies = list(_remedies(solution, arguments, other_methods))
+    return f"to try: {', or '.join(dict.fromkeys(remedies))}" if remedies else ""
 
 
 def _remedies(solution: Solution, arguments: dict[str, Any], other_methods: Sequence[str]) -> Iterator[str]:

@@ -91,7 +91,7 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
         lower, upper, nx = np.zeros_like(us), np.zeros_like(us), model.nx
         gradients[:, nx:], hessians[:, nx:], hessians[:, :, nx:] = 0.0, 0.0, 0.0
         hessians[:, nx:, nx:] = np.eye(us.shape[1])
-    found = LinearQuadratic(
+    expansion = LinearQuadratic(
         F=jacobians,
         gaps=motion.gaps,
         gradients=gradients,
@@ -103,7 +103,7 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
         start_lower=np.where(free, bounds.x_lower - xs[0], 0.0),
         start_upper=np.where(free, bounds.x_upper - xs[0], 0.0),
     )
-    return _with_design(problem, motion, found, h) if len(motion.c) else found
+    return _with_design(problem, motion, expansion, h) if len(motion.c) else expansion
 
 
 def with_active(
@@ -111,13 +111,13 @@ def with_active(
 ) -> LinearQuadratic:
     """`model` of `motion`, in which the `old` rows push, as if the `new` ones pushed, and they alone."""
     nx, n = motion.xs.shape[1], model.F.shape[2]
-    kept = np.r_[:nx, nx + len(motion.c) : n]  # where x and u are in [x, c, u]
+    columns = np.r_[:nx, nx + len(motion.c) : n]  # where x and u are in [x, c, u]
     before, after = rows.differentiate(*motion.point, old), rows.differentiate(*motion.point, new)
     gradient, curvature = after[0] - before[0], after[1] - before[1]
     gradients, hessians = np.array(model.gradients), np.array(model.hessians)
     final_gradient, final_hessian = np.array(model.final_gradient), np.array(model.final_hessian)
-    gradients[:, kept] += gradient[:-1]
-    hessians[:, kept[:, None], kept] += curvature[:-1]
+    gradients[:, columns] += gradient[:-1]
+    hessians[:, columns[:, None], columns] += curvature[:-1]
     final_gradient[:nx] += gradient[-1, :nx]
     final_hessian[:nx, :nx] += curvature[-1, :nx, :nx]
     return replace(
@@ -128,12 +128,12 @@ def with_active(
 def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: float) -> LinearQuadratic:
     """The same with c as a part of the state; F has its columns already: (N, nx, nx + nc + nu)."""
     design, c, (count, nx), nu = problem.design, motion.c, motion.gaps.shape, motion.us.shape[1]
-    nc, kept = len(c), np.r_[:nx, nx + len(c) : nx + len(c) + nu]  # where x and u are in [x, c, u]
+    nc, columns = len(c), np.r_[:nx, nx + len(c) : nx + len(c) + nu]  # where x and u are in [x, c, u]
     F, gaps = np.zeros((count, nx + nc, nx + nc + nu)), np.zeros((count, nx + nc))
     F[:, :nx], gaps[:, :nx] = model.F, motion.gaps
     F[:, nx:, nx : nx + nc] = np.eye(nc)
     gradients, hessians = np.zeros((count, nx + nc + nu)), np.zeros((count, nx + nc + nu, nx + nc + nu))
-    gradients[:, kept], hessians[:, kept[:, None], kept] = model.gradients, model.hessians
+    gradients[:, columns], hessians[:, columns[:, None], columns] = model.gradients, model.hessians
     if design.moves_step and problem.total_running_cost is not None:  # h(c) L(x, u): h is linear in c
         by_step = np.zeros(len(design.vector.values))
         by_step[design.own_count] = 1.0
@@ -145,15 +145,15 @@ def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: fl
         rates = np.array([float(cost_at(problem.total_running_cost, k * h)(x, u)) for k, (x, u) in enumerate(along)])
         gradients[:, nx : nx + nc] = rates[:, None] * slope
         across = unit[:, :, None] * slope
-        hessians[:, kept[:, None], np.arange(nx, nx + nc)] += across
-        hessians[:, np.arange(nx, nx + nc)[:, None], kept] += across.swapaxes(1, 2)
+        hessians[:, columns[:, None], np.arange(nx, nx + nc)] += across
+        hessians[:, np.arange(nx, nx + nc)[:, None], columns] += across.swapaxes(1, 2)
     final_gradient, final_hessian = np.zeros(nx + nc), np.zeros((nx + nc, nx + nc))
     final_gradient[:nx], final_hessian[:nx, :nx] = model.final_gradient, model.final_hessian
     if problem.parameter_cost is not None:
         cost = problem.parameter_cost
 
-        def of_coordinates(at: Any) -> Any:
-            return cost(design.own_at(at))
+        def of_coordinates(coordinates: Any) -> Any:
+            return cost(design.own_at(coordinates))
 
         final_gradient[nx:] = differentiate_final_cost(of_coordinates, c)[1]
         final_hessian[nx:, nx:] = final_cost_hessian(of_coordinates, c)
@@ -204,8 +204,8 @@ def jacobians_along(problem: Problem, motion: Motion) -> Array:
     with problem.intervals(vector) as intervals:
         if not design.count:
             return intervals.jacobians(motion.xs, us, motion.ends)
-        found = intervals.derivatives(motion.xs[0], us, motion.xs[:-1])
-    return np.array([np.hstack([d.A, design.pull_back(motion.c, d.C), d.B]) for d in found])
+        derivatives = intervals.derivatives(motion.xs[0], us, motion.xs[:-1])
+    return np.array([np.hstack([d.A, design.pull_back(motion.c, d.C), d.B]) for d in derivatives])
 
 
 def _off_bounds(problem: Problem, us: Array) -> Array:

@@ -121,8 +121,8 @@ def solve_ilqr(
     with noted_interrupts() as interrupted:
         outcome = search.run(interrupted)
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps{search.told_of_refusals}"
-    motion, found = search.motion, problem.design.values(search.motion.c)
-    result = NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows), parameters=found)
+    motion, parameters = search.motion, problem.design.values(search.motion.c)
+    result = NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows), parameters=parameters)
     multipliers = Multipliers(np.zeros(0), search.constraints.forces)
     return replace(result, multipliers=multipliers), motion.xs, motion.us
 
@@ -140,7 +140,7 @@ def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
     nx = problem.nx
     gradients, hessians = policy.value_gradients[:, :nx], policy.value_hessians[:, :nx, :nx]
     parts = zip(search.motion.xs, gradients, hessians, strict=True)
-    return tuple(CostToGo(*part) for part in parts)
+    return tuple(CostToGo(*row) for row in parts)
 
 
 def _least_regularized(solve: _Solve, model: LinearQuadratic) -> AffinePolicy | None:
@@ -149,13 +149,13 @@ def _least_regularized(solve: _Solve, model: LinearQuadratic) -> AffinePolicy | 
 
 def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: float) -> bool:
     """Whether no model, regularized as little as it allows, promises more than `limit`, and one of them that much."""
-    found = False
+    promises = False
     for model in models:
         policy = _least_regularized(solve, model)
         if policy is not None and not abs(policy.expected) <= limit:
             return False
-        found = found or policy is not None
-    return found
+        promises = promises or policy is not None
+    return promises
 
 
 def _smooth_roll(problem: Problem) -> SmoothRoll | None:
@@ -183,12 +183,12 @@ class _Bends:
 
     def lower_between(self, old: tuple[Array, Array], new: tuple[Array, Array]) -> tuple[Array, Array]:
         """The first step on the way back from `new` to `old` that is lower than `old`."""
-        before, found = self(old)[1], new
-        for part in PARTS:
-            found = tuple(a + part * (b - a) for a, b in zip(old, new, strict=True))
-            if self(found)[1] < before:
+        before, step = self(old)[1], new
+        for fraction in PARTS:
+            step = tuple(a + fraction * (b - a) for a, b in zip(old, new, strict=True))
+            if self(step)[1] < before:
                 break
-        return found
+        return step
 
 
 class _Search:
@@ -301,9 +301,9 @@ class _Search:
         moved = np.tile(new.c - old.c, (len(new.us), 1))
         self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], moved, new.us - old.us]))
         if new.is_rollout and self.gains[1] > SLOW * self.gains[0]:  # steps with gaps are short for these
-            found = curvature_along(self.problem, new, model.multipliers())
-            if found is not None:
-                curvature, known = found
+            estimate = curvature_along(self.problem, new, model.multipliers())
+            if estimate is not None:
+                curvature, known = estimate
                 self.curvature.M[known] = curvature
         self.expanded = new
         return model
@@ -329,7 +329,7 @@ class _Search:
         refusals = self.refusals
         while self.regularization <= LARGEST_REGULARIZATION:
             with np.errstate(all="ignore"):  # a policy that leads to infinity promises nothing
-                policies = (self._settled(one, solve(one, self.regularization)) for one in models)
+                policies = (self._settled(candidate, solve(candidate, self.regularization)) for candidate in models)
                 policy = next((p for p in policies if p is not None and p.expected >= 0), None)
             if policy is not None and self._search_along(model, policy):
                 return None
@@ -389,8 +389,8 @@ class _Search:
             slope -= self.gap_weight * distance
         merit, size = self._merit(self.motion, self.cost), min(1.0, self.ahead * (1 + self.regularization))
         for trial in range(TRIALS):
-            found = self._try(policy, size, merit, slope)
-            if found is None:
+            trial_merit = self._try(policy, size, merit, slope)
+            if trial_merit is None:
                 self.ahead = LONGER * size / (1 + self.regularization) if trial else 1.0
                 crawls = size < SHORT and self.gains[1] < LITTLE * abs(merit)
                 self.crawled = self.crawled + (trial > 0) if crawls else 0
@@ -401,7 +401,7 @@ class _Search:
                 elif size < TINY and trial:
                     self.regularization = self._tightened()
                 return True
-            excess = found - merit - slope * size
+            excess = trial_merit - merit - slope * size
             least = -slope * size**2 / (2 * excess) if excess > 0 else 0.0  # 0 where what was found is infinite
             size = min(max(least, MOST_CUT * size), LEAST_CUT * size)
         self.ahead = 1.0  # the next policy is shorter itself
@@ -415,16 +415,16 @@ class _Search:
             return math.inf
         with np.errstate(all="ignore"):  # a merit that is not finite is no decrease
             cost = self._objective(motion)
-            found = self._merit(motion, cost)
-        if not found <= merit + SUFFICIENT_DECREASE * size * slope:
-            return found if math.isfinite(found) else math.inf
+            trial_merit = self._merit(motion, cost)
+        if not trial_merit <= merit + SUFFICIENT_DECREASE * size * slope:
+            return trial_merit if math.isfinite(trial_merit) else math.inf
         try:
             jacobians = jacobians_along(self.problem, motion)
         except (GradientError, SimulationError) as error:
             self.refusals, self.refusal = self.refusals + 1, str(error)
             return math.inf
         self.motion, self.cost, self.jacobians, self.policy = motion, cost, jacobians, policy
-        self.gains = self.gains[1], merit - found
+        self.gains = self.gains[1], merit - trial_merit
         self.rows.append(Iteration(len(self.rows), cost, self._infeasibility(), policy.gradient, size))
         self._report()
         return None
@@ -451,9 +451,9 @@ class _Search:
             wanted = wanted + policy.feedback[:, :, nx:] @ (c - old.c)
         if self.tried_by is not None:
             bounds = *self.inner, self.problem.bounds.u_lower, self.problem.bounds.u_upper
-            found = self.tried_by(xs[0], old.xs, gaps, wanted, policy.feedback, bounds)
-            if found is not None:  # else a joint is at its limit, or something is not finite: Drake's step says it
-                return Motion(*found, gaps, c)
+            rollout = self.tried_by(xs[0], old.xs, gaps, wanted, policy.feedback, bounds)
+            if rollout is not None:  # else a joint is at its limit, or something is not finite: Drake's step says it
+                return Motion(*rollout, gaps, c)
         with self.problem.intervals(self.design.at(c)) as intervals:
             for k, feedback in enumerate(policy.feedback[:, :, :nx]):
                 us[k] = self._inside(wanted[k] + feedback.dot(xs[k] - old.xs[k]))
@@ -475,9 +475,9 @@ class _Search:
         with self.problem.intervals(self.design.at(c)) as intervals:
             for k, u in enumerate(us):
                 x_next = intervals.end(xs[k], u)
-                for part in (slice(start, start + 4) for start in quaternions):
-                    if x_next[part] @ xs[k + 1, part] < 0:  # the same rotation, further off
-                        xs[k + 1, part] *= -1
+                for quaternion in (slice(start, start + 4) for start in quaternions):
+                    if x_next[quaternion] @ xs[k + 1, quaternion] < 0:  # the same rotation, further off
+                        xs[k + 1, quaternion] *= -1
                 gaps[k] = x_next - xs[k + 1]
         return Motion(xs, us, gaps, c)
 

@@ -35,17 +35,17 @@ def _solve(L: Array, m: int, B: Array, width: int) -> None:
     """B = -(L D L')^-1 B, of the first m rows of B and its first `width` columns."""
     for i in range(m):
         for k in range(i):
-            part = L[i, k]
+            entry = L[i, k]
             for c in range(width):
-                B[i, c] -= part * B[k, c]
+                B[i, c] -= entry * B[k, c]
     for i in range(m):
         for c in range(width):
             B[i, c] /= -L[i, i]
     for i in range(m - 1, -1, -1):
         for k in range(i + 1, m):
-            part = L[k, i]
+            entry = L[k, i]
             for c in range(width):
-                B[i, c] -= part * B[k, c]
+                B[i, c] -= entry * B[k, c]
 
 
 @compiled
@@ -68,8 +68,8 @@ def minimize_in_box(
     H (m, m) is positive definite. By projected Newton steps.
     """
     m = len(g)
-    part, L, step = np.empty((m, m)), np.empty((m, m)), np.empty((m, 1))
-    slope, moved, of = np.empty(m), np.empty(m), np.empty(m, dtype=np.int64)
+    block, L, step = np.empty((m, m)), np.empty((m, m)), np.empty((m, 1))
+    slope, moved, indices = np.empty(m), np.empty(m), np.empty(m, dtype=np.int64)
     for i in range(m):
         d[i] = min(max(0.0, lower[i]), upper[i])
     for _ in range(iterations):
@@ -80,15 +80,15 @@ def minimize_in_box(
                 slope[i] += H[i, j] * d[j]
             free[i] = not ((d[i] <= lower[i] and slope[i] > 0) or (d[i] >= upper[i] and slope[i] < 0))
             if free[i]:
-                of[count] = i
+                indices[count] = i
                 count += 1
         if count == 0:
             return True
         for a in range(count):
-            step[a, 0] = slope[of[a]]
+            step[a, 0] = slope[indices[a]]
             for b in range(count):
-                part[a, b] = H[of[a], of[b]]
-        if not _factor(part, count, L):
+                block[a, b] = H[indices[a], indices[b]]
+        if not _factor(block, count, L):
             return False
         _solve(L, count, step, 1)
         value, same = _value(H, g, d), True
@@ -96,7 +96,7 @@ def minimize_in_box(
             for i in range(m):
                 moved[i] = d[i]
             for a in range(count):
-                i = of[a]
+                i = indices[a]
                 moved[i] = min(max(d[i] + size * step[a, 0], lower[i]), upper[i])
             if _value(H, g, moved) < value:
                 for i in range(m):
@@ -119,21 +119,21 @@ def _hold(
         leaves = leaves or not (K[i, 0] >= lower[i] and K[i, 0] <= upper[i])
     if not leaves:
         return True
-    d, part, L = np.empty(m), np.empty((m, m)), np.empty((m, m))
+    d, block, L = np.empty(m), np.empty((m, m)), np.empty((m, m))
     if not minimize_in_box(hessian, Q_ux[:, 0].copy(), lower, upper, iterations, sizes, d, free):
         return False
     rows, count = np.empty((m, w)), 0
-    of = np.empty(m, dtype=np.int64)
+    indices = np.empty(m, dtype=np.int64)
     for i in range(m):
         if free[i]:
-            of[count] = i
+            indices[count] = i
             count += 1
     for a in range(count):
         for b in range(count):
-            part[a, b] = hessian[of[a], of[b]]
+            block[a, b] = hessian[indices[a], indices[b]]
         for c in range(w):
-            rows[a, c] = Q_ux[of[a], c]
-    if not _factor(part, count, L):
+            rows[a, c] = Q_ux[indices[a], c]
+    if not _factor(block, count, L):
         return False
     _solve(L, count, rows, w)
     for i in range(m):
@@ -141,7 +141,7 @@ def _hold(
             K[i, c] = 0.0
     for a in range(count):
         for c in range(w):
-            K[of[a], c] = rows[a, c]
+            K[indices[a], c] = rows[a, c]
     for i in range(m):
         K[i, 0] = d[i]
     return True
@@ -244,10 +244,10 @@ def sweep(
             for c in range(n):
                 T[a, c] = Q_ux[a, 1 + c]
             for b in range(m):
-                part = of_inputs[k, a, b]
-                total += part * gain[b, 0]
+                entry = of_inputs[k, a, b]
+                total += entry * gain[b, 0]
                 for c in range(n):
-                    T[a, c] += part * gain[b, 1 + c]
+                    T[a, c] += entry * gain[b, 1 + c]
             for i in range(n):
                 left, right = gain[a, 1 + i], Q_ux[a, 1 + i]
                 s[k, i] += left * total + right * gain[a, 0]

@@ -55,10 +55,10 @@ def where_it_jumps(problem: Problem, xs: Array) -> str:
     for k, x in enumerate(xs[:-1]):
         set_state(problem.model.double, x)
         try:
-            found = distances(problem.model.double)
+            gaps = distances(problem.model.double)
         except ModelError as error:  # Drake knows no distance of some pair
             return f", and where bodies just touch is not known: {error}"
-        for (a, b), distance in found.items():
+        for (a, b), distance in gaps.items():
             if abs(distance) < JUST_TOUCHING:
                 return (
                     f", with {a} and {b} just touching at knot {k}: the step jumps there, and a minimum at a jump "
@@ -82,8 +82,8 @@ class ContactHold:
         def distance(x: Any) -> Any:
             if x.dtype == float:
                 return _separation(model, x, self.pair).distance
-            found = _separation(model, ExtractValue(x.reshape(-1, 1)).ravel(), self.pair)
-            return chain(found.distance, np.pad(found.gradient, (0, model.nv)), x)
+            separation = _separation(model, ExtractValue(x.reshape(-1, 1)).ravel(), self.pair)
+            return chain(separation.distance, np.pad(separation.gradient, (0, model.nv)), x)
 
         sides = {"lower": MARGIN} if self.apart else {"upper": -MARGIN}
         return Constraint(distance, knots=[self.knot], name=str(self), **sides)
@@ -129,22 +129,22 @@ class _Sequences:
 
     def run(self, xs: Array, us: Array, interrupted: threading.Event) -> Minimum:
         """Let the search go free until it stalls, then from sequence to cheaper sequence."""
-        found, holds, stuck = self._minimize(xs, us, (), PATIENCE), tuple[ContactHold, ...](), False
-        while found[0].outcome is Outcome.INACCURATE and not stuck and len(self.costs) < MOST_SEQUENCES:
+        minimum, holds, stuck = self._minimize(xs, us, (), PATIENCE), tuple[ContactHold, ...](), False
+        while minimum[0].outcome is Outcome.INACCURATE and not stuck and len(self.costs) < MOST_SEQUENCES:
             try:
-                ahead = beginnings(self.problem, found[1])
+                ahead = beginnings(self.problem, minimum[1])
             except ModelError as error:  # Drake knows no distance of some pair
                 ahead = ()
                 self._say(f"nothing can be held: {error}")
             stuck, holds = ahead == holds, ahead
-            found = self._minimize(*found[1:], holds, MORE_PATIENCE if stuck else PATIENCE)
-        if found[0].outcome is Outcome.SOLVED and holds:
-            return self._improve(found, interrupted)
-        return found
+            minimum = self._minimize(*minimum[1:], holds, MORE_PATIENCE if stuck else PATIENCE)
+        if minimum[0].outcome is Outcome.SOLVED and holds:
+            return self._improve(minimum, interrupted)
+        return minimum
 
     def _improve(self, best: Minimum, interrupted: threading.Event) -> Minimum:
         """Cross what holds the motion while that is cheaper."""
-        told, left = list[str](), self._pressing(best[1])
+        sentences, left = list[str](), self._pressing(best[1])
         while left and len(self.costs) < MOST_SEQUENCES and not interrupted.is_set():
             if now() > self.deadline or len(self.rows) > self.limits.max_iterations:
                 break
@@ -156,14 +156,14 @@ class _Sequences:
                 break
             new = cost_of(self.problem, *other) if isinstance(other, tuple) else other
             if isinstance(other, tuple) and new < cost:
-                best, told, left = other, [], self._pressing(other[1])
+                best, sentences, left = other, [], self._pressing(other[1])
             else:
-                told.append(f"{hold} (beyond: {f'cost {new:.6g}' if np.isfinite(new) else 'no minimum found'})")
-        told += [f"{hold} (beyond: not tried)" for hold in left]
-        if not told:
+                sentences.append(f"{hold} (beyond: {f'cost {new:.6g}' if np.isfinite(new) else 'no minimum found'})")
+        sentences += [f"{hold} (beyond: not tried)" for hold in left]
+        if not sentences:
             return best
         cost = cost_of(self.problem, *best)
-        note = f"a minimum for its own sequence of contacts, cost {cost:.6g}, held by " + "; ".join(told)
+        note = f"a minimum for its own sequence of contacts, cost {cost:.6g}, held by " + "; ".join(sentences)
         return replace(best[0], note=note), *best[1:]
 
     def _beyond(self, hold: ContactHold, xs: Array, us: Array) -> Minimum | float:
@@ -198,14 +198,14 @@ class _Sequences:
             self._say("held: " + "; ".join(map(str, holds)))
         penalty, report = HOLDING if holds else 0.0, self.report
         options: dict[str, Any] = {"patience": patience, "least_penalty": penalty, "values": self.values}
-        found = solve_ilqr(held, xs, us, limits=limits, report=report, **options)
-        result, xs, us = found
+        minimum = solve_ilqr(held, xs, us, limits=limits, report=report, **options)
+        result, xs, us = minimum
         self.ended = result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT)
         first = len(self.rows) - 1 if self.rows else 0
         self.rows += [replace(r, iteration=first + r.iteration) for r in result.iterations[bool(self.rows) :]]
         self.values = result.parameters
         self.costs[holds] = cost_of(self.problem, result, xs, us) if result.outcome is Outcome.SOLVED else np.inf
-        return found
+        return minimum
 
     def _say(self, text: str) -> None:
         if self.report:
@@ -222,12 +222,12 @@ def beginnings(problem: Problem, xs: Array) -> tuple[ContactHold, ...]:
         set_state(problem.model.double, x)
         distances.append([s.distance for s in separations(problem.model.double)])
     phi, names = np.array(distances), [s.bodies for s in separations(problem.model.double)]
-    found = list[ContactHold]()
+    holds = list[ContactHold]()
     for before, pair in np.argwhere((phi[:-1] >= 0) & (phi[1:] < 0)):
         for k, apart in ((int(before), True), (int(before) + 1, False)):
             if k or not problem.initial_state_is_given:
-                found.append(ContactHold(int(pair), names[pair], k, apart))
-    return tuple(found)
+                holds.append(ContactHold(int(pair), names[pair], k, apart))
+    return tuple(holds)
 
 
 def _separation(model: Model, x: Array, pair: int) -> Separation:

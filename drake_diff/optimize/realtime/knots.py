@@ -46,10 +46,10 @@ def knot_cost(cost: Any, nx: int, nu: int, probe: Array) -> KnotCost:
     if cost is None:
         return _Sum(())
     if isinstance(cost, SumOfCosts):
-        return _Sum(tuple(knot_cost(part, nx, nu, probe) for part in cost.costs))
+        return _Sum(tuple(knot_cost(term, nx, nu, probe) for term in cost.costs))
     if isinstance(cost, WithGoals):
-        own = knot_cost(cost.own, nx, nu, probe)
-        return _Sum((own, *(_Missed(weight, goal, nx, nu, probe) for weight, goal in cost.goals)))
+        inner = knot_cost(cost.own, nx, nu, probe)
+        return _Sum((inner, *(_Missed(weight, goal, nx, nu, probe) for weight, goal in cost.goals)))
     if isinstance(cost, QuadraticCost):
         return _Quadratic(cost, nx, nu)
     if isinstance(cost, TrackingCost):
@@ -66,13 +66,13 @@ class _Sum:
         self.parts = parts
 
     def values(self, knots: Array, times: Array) -> Array:
-        return sum((part.values(knots, times) for part in self.parts), np.zeros(len(knots)))
+        return sum((term.values(knots, times) for term in self.parts), np.zeros(len(knots)))
 
     def expand(self, knots: Array, times: Array) -> tuple[Array, Array]:
         count, n = knots.shape
         gradients, hessians = np.zeros((count, n)), np.zeros((count, n, n))
-        for part in self.parts:
-            gradient, hessian = part.expand(knots, times)
+        for term in self.parts:
+            gradient, hessian = term.expand(knots, times)
             gradients += gradient
             hessians += hessian
         return gradients, hessians
@@ -93,9 +93,9 @@ class _Quadratic:
     def __init__(self, cost: QuadraticCost, nx: int, nu: int):
         self.weight, self.reference = np.zeros((nx + nu, nx + nu)), np.zeros(nx + nu)
         parts = [(slice(0, nx), cost.Q, cost.x_ref), (slice(nx, nx + nu), cost.R, cost.u_ref)][: 1 + (nu > 0)]
-        for at, weight, reference in parts:
-            self.weight[at, at] = 0.0 if weight is None else weight
-            self.reference[at] = 0.0 if reference is None else reference
+        for columns, weight, reference in parts:
+            self.weight[columns, columns] = 0.0 if weight is None else weight
+            self.reference[columns] = 0.0 if reference is None else reference
 
     def _apart(self, knots: Array, times: Array) -> Array:
         return knots - self.reference
@@ -116,9 +116,9 @@ class _Tracking(_Quadratic):
 
     def _apart(self, knots: Array, times: Array) -> Array:
         known = self.cost.known_at(times)
-        found = np.array(knots)
-        found[:, : known.shape[1]] -= known
-        return found
+        deviations = np.array(knots)
+        deviations[:, : known.shape[1]] -= known
+        return deviations
 
 
 class _Remaining:
@@ -174,8 +174,8 @@ def _traced_cost(cost: Any, nx: int, nu: int, probe: Array) -> KnotCost:
     tried = np.hstack([probe, known])
     with np.errstate(all="ignore"):
         wanted = np.array([[float(of(z[:nx], z[nx:]))] for z in tried])
-        found = trace(of, nx, tried, wanted)
-    return _Called(cost, nx, nu) if isinstance(found, Refusal) else _Traced(cost, found, nx + nu)
+        traced = trace(of, nx, tried, wanted)
+    return _Called(cost, nx, nu) if isinstance(traced, Refusal) else _Traced(cost, traced, nx + nu)
 
 
 class _Traced:
@@ -253,8 +253,8 @@ def knot_function(constraint: Constraint, nx: int, nu: int, probe: Array) -> Kno
         return np.atleast_1d(np.asarray(constraint.function(x, u) if takes_input else constraint.function(x)))
 
     with np.errstate(all="ignore"):
-        found = trace(function, nx, probe, np.array([constraint(z[:nx], z[nx:]) for z in probe]))
-    return _CalledRows(constraint, nx, nu) if isinstance(found, Refusal) else _TracedRows(found)
+        traced = trace(function, nx, probe, np.array([constraint(z[:nx], z[nx:]) for z in probe]))
+    return _CalledRows(constraint, nx, nu) if isinstance(traced, Refusal) else _TracedRows(traced)
 
 
 class Selected:
@@ -296,8 +296,8 @@ class _CalledRows:
         return np.array([self.constraint(z[: self.nx], z[self.nx :]) for z in knots])
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
-        found = [self.constraint.differentiate(z[: self.nx], z[self.nx :]) for z in knots]
-        return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
+        pairs = [self.constraint.differentiate(z[: self.nx], z[self.nx :]) for z in knots]
+        return np.array([value for value, _ in pairs]), np.array([rows for _, rows in pairs])
 
 
 class _Clear:
@@ -325,13 +325,13 @@ class Columns:
         if count not in self._kept:
             mapped, f = self.function.map(count), self.function
             buffer, evaluate = mapped.buffer()
-            found = [np.empty((count, f.size2_out(i), f.size1_out(i))) for i in range(f.n_out())]
-            for i, array in enumerate(found):
+            arrays = [np.empty((count, f.size2_out(i), f.size1_out(i))) for i in range(f.n_out())]
+            for i, array in enumerate(arrays):
                 buffer.set_res(i, array.reshape(-1).data)
-            self._kept[count] = buffer, evaluate, found, mapped
-        buffer, evaluate, found, _ = self._kept[count]
+            self._kept[count] = buffer, evaluate, arrays, mapped
+        buffer, evaluate, arrays, _ = self._kept[count]
         given = [np.ascontiguousarray(array, dtype=float).reshape(-1) for array in rows]
         for i, array in enumerate(given):
             buffer.set_arg(i, array.data)
         evaluate()
-        return [np.array(array) for array in found]
+        return [np.array(array) for array in arrays]

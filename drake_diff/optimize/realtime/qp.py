@@ -87,18 +87,18 @@ class SoftProgram:
         self.slack_at = np.cumsum([moves, *(r.count * r.size for r in self.rows)])
         self.size = int(self.slack_at[-1])
         places, sides = [self._dynamics()], count * nx
-        self.sides: list[tuple[int, Indices, Indices]] = []  # (+1 upper or -1 lower, index of the rows, kept (m,))
+        self.sides: list[tuple[int, Indices, Indices]] = []  # (+1 upper or -1 lower, index of the rows, bounded (m,))
         for i, r in enumerate(self.rows):
             for sign, has in ((1, r.has_upper), (-1, r.has_lower)):
-                kept = np.flatnonzero(has)
-                self.sides.append((sign, np.array([i]), kept))
-                places.append(self._soft(i, kept, sides))
-                sides += r.count * len(kept)
+                bounded = np.flatnonzero(has)
+                self.sides.append((sign, np.array([i]), bounded))
+                places.append(self._soft(i, bounded, sides))
+                sides += r.count * len(bounded)
         self.height = sides
-        at = np.concatenate([np.stack(place) for place in places], axis=1)
-        self._inside = at[1] >= 0  # what depends on the first state, which is given, has no column
-        self._order = np.lexsort((at[0][self._inside], at[1][self._inside]))
-        a = _sparsity(at[:, self._inside][:, self._order], (sides, self.size))
+        entries = np.concatenate([np.stack(pair) for pair in places], axis=1)
+        self._inside = entries[1] >= 0  # what depends on the first state, which is given, has no column
+        self._order = np.lexsort((entries[0][self._inside], entries[1][self._inside]))
+        a = _sparsity(entries[:, self._inside][:, self._order], (sides, self.size))
         h = self._set_hessian(n)
         shapes = {"h": h, "a": a}
         self._solvers = [ca.conic("step", "piqp", shapes, {"error_on_fail": False, "piqp": o}) for o in OPTIONS]
@@ -109,45 +109,51 @@ class SoftProgram:
         """(rows, columns) of dx_(k+1), then of -F_k."""
         nx, n = self.nx, self.nx + self.nu
         k, i = _all(self.count, nx)
-        each, of, j = _all(self.count, nx, n)
-        rows = np.concatenate([k * nx + i, each * nx + of])
-        return rows, np.concatenate([k * n + self.nu + i, self._column(each, j)])
+        steps, entries, j = _all(self.count, nx, n)
+        rows = np.concatenate([k * nx + i, steps * nx + entries])
+        return rows, np.concatenate([k * n + self.nu + i, self._column(steps, j)])
 
     def _column(self, k: Indices, j: Indices) -> Indices:
         """Where entry j of [x, u] at knot k is among the variables; negative for the first state, which is given."""
         n = self.nx + self.nu
-        found = np.where(j < self.nx, (k - 1) * n + self.nu + j, k * n + j - self.nx)
-        return np.where((k == 0) & (j < self.nx), -1, found)
+        positions = np.where(j < self.nx, (k - 1) * n + self.nu + j, k * n + j - self.nx)
+        return np.where((k == 0) & (j < self.nx), -1, positions)
 
-    def _soft(self, i: int, kept: Indices, first: int) -> tuple[Indices, Indices]:
+    def _soft(self, i: int, bounded: Indices, first: int) -> tuple[Indices, Indices]:
         """(rows, columns) of one side's Jacobian, then of its slacks."""
         r = self.rows[i]
-        k, a = _all(r.count, len(kept))
-        each, of, j = _all(r.count, len(kept), len(r.columns))
-        rows = np.concatenate([each * len(kept) + of, k * len(kept) + a])
-        slacks = self.slack_at[i] + k * r.size + kept[a]
-        return first + rows, np.concatenate([self._column(each + r.first, r.columns[j]), slacks])
+        k, a = _all(r.count, len(bounded))
+        steps, entries, j = _all(r.count, len(bounded), len(r.columns))
+        rows = np.concatenate([steps * len(bounded) + entries, k * len(bounded) + a])
+        slacks = self.slack_at[i] + k * r.size + bounded[a]
+        return first + rows, np.concatenate([self._column(steps + r.first, r.columns[j]), slacks])
 
     def _set_hessian(self, n: int) -> ca.Sparsity:
         k, i, j = _all(self.count + 1, n, n)
         last = (k == self.count) & ((i >= self.nx) | (j >= self.nx))
         rows, columns = self._column(k, i), self._column(k, j)
         self._curved = (rows >= 0) & (columns >= 0) & ~last
-        at = np.stack([rows[self._curved], columns[self._curved]])
-        self._hessian_order = np.lexsort((at[0], at[1]))
-        return _sparsity(at[:, self._hessian_order], (self.size, self.size))
+        entries = np.stack([rows[self._curved], columns[self._curved]])
+        self._hessian_order = np.lexsort((entries[0], entries[1]))
+        return _sparsity(entries[:, self._hessian_order], (self.size, self.size))
 
     def solve(self, model: LinearQuadratic, limited: Sequence[Limited]) -> Moves | Refusal:
         """A Refusal where PIQP finds no solution, as of numbers that are not finite or far too large."""
         n, nx, nu, count = self.nx + self.nu, self.nx, self.nu, self.count
-        dearest = max((float(np.max(one.prices, initial=0.0)) for one in limited), default=0.0)
+        dearest = max((float(np.max(linearized.prices, initial=0.0)) for linearized in limited), default=0.0)
         unit = DEAREST / dearest if dearest > DEAREST else 1.0  # of the cost
         data = [np.ones(count * nx), -model.F.ravel()]
         lower, upper = [model.gaps.ravel()], [model.gaps.ravel()]
-        for sign, (i,), kept in self.sides:
-            r, one = self.rows[i], limited[i]
-            data += [one.jacobians[:, kept][:, :, r.columns].ravel(), np.full(r.count * len(kept), -float(sign))]
-            side, far = (one.upper if sign > 0 else one.lower)[:, kept], FAR * one.ranges[kept]
+        for sign, (i,), bounded in self.sides:
+            r, linearized = self.rows[i], limited[i]
+            data += [
+                linearized.jacobians[:, bounded][:, :, r.columns].ravel(),
+                np.full(r.count * len(bounded), -float(sign)),
+            ]
+            side, far = (
+                (linearized.upper if sign > 0 else linearized.lower)[:, bounded],
+                FAR * linearized.ranges[bounded],
+            )
             side = np.clip(side, -far, far).ravel()  # PIQP complains of rows without a limit
             lower.append(side if sign < 0 else np.full(side.size, -np.inf))
             upper.append(side if sign > 0 else np.full(side.size, np.inf))
@@ -157,30 +163,30 @@ class SoftProgram:
         h = hessians.ravel()[self._curved][self._hessian_order]
         g = np.zeros(self.size)
         g[: count * n] = np.append(model.gradients.ravel()[nx:], model.final_gradient)
-        for start, r, one in zip(self.slack_at[:-1], self.rows, limited, strict=True):
-            g[start : start + r.count * r.size] = np.tile(one.prices, r.count)
+        for start, r, linearized in zip(self.slack_at[:-1], self.rows, limited, strict=True):
+            g[start : start + r.count * r.size] = np.tile(linearized.prices, r.count)
         least, most = np.full((count, n), -np.inf), np.full((count, n), np.inf)
         least[:, :nu], most[:, :nu] = model.lower, model.upper
         sides = {"lba": np.concatenate(lower), "uba": np.concatenate(upper)}
         sides |= {"lbx": np.append(least.ravel(), 0.0 * self._free), "ubx": np.append(most.ravel(), self._free)}
         given = {"h": ca.DM(self._h, unit * h), "g": unit * g, "a": ca.DM(self._a, a), **sides}
         for solver in self._solvers:
-            found, stats = solver(**given), solver.stats()
-            z = np.asarray(found["x"]).ravel()
+            solution, stats = solver(**given), solver.stats()
+            z = np.asarray(solution["x"]).ravel()
             if stats["success"] and np.all(np.isfinite(z)):
                 break
         else:
             return Refusal(f"PIQP: {stats['return_status']}")
-        return self._unpacked(z, *(np.asarray(found[name]).ravel() / unit for name in ("lam_a", "lam_x")))
+        return self._unpacked(z, *(np.asarray(solution[name]).ravel() / unit for name in ("lam_a", "lam_x")))
 
     def _unpacked(self, z: Array, by_row: Array, by_variable: Array) -> Moves:
         count, nx, nu = self.count, self.nx, self.nu
         moves = z[: count * (nx + nu)].reshape(count, nx + nu)
         multipliers = [np.zeros((r.count, r.size)) for r in self.rows]
         first = count * nx
-        for _, (i,), kept in self.sides:
-            size = self.rows[i].count * len(kept)
-            multipliers[i][:, kept] += by_row[first : first + size].reshape(self.rows[i].count, len(kept))
+        for _, (i,), bounded in self.sides:
+            size = self.rows[i].count * len(bounded)
+            multipliers[i][:, bounded] += by_row[first : first + size].reshape(self.rows[i].count, len(bounded))
             first += size
         places = zip(self.slack_at[:-1], self.rows, strict=True)
         return Moves(
@@ -198,7 +204,7 @@ def _all(*counts: int) -> Indices:
     return np.indices(counts, dtype=np.intp).reshape(len(counts), -1)
 
 
-def _sparsity(at: Array, shape: tuple[int, int]) -> ca.Sparsity:
+def _sparsity(entries: Array, shape: tuple[int, int]) -> ca.Sparsity:
     """Of (rows, columns), in the order of columns and then rows."""
-    starts = np.searchsorted(at[1], np.arange(shape[1] + 1))
-    return ca.Sparsity(*shape, starts.tolist(), at[0].tolist())
+    starts = np.searchsorted(entries[1], np.arange(shape[1] + 1))
+    return ca.Sparsity(*shape, starts.tolist(), entries[0].tolist())

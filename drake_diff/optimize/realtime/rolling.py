@@ -86,10 +86,10 @@ class Rolling:
     def _costs(self, begin: int, count: int) -> tuple[list[Stage], list[Stage]]:
         h, end, last = self.problem.model.time_step, begin + count, self.problem.num_steps
         times: Array = h * np.arange(begin, end + 1, dtype=float)
-        own = count if self.staying is None else int(np.clip(last - begin, 0, count))
-        running, final = [Stage(self._running, slice(0, own), times[:own], h)], []
-        if own < count:
-            running.append(Stage(self._stay, slice(own, count), times[own:count], h))
+        planned = count if self.staying is None else int(np.clip(last - begin, 0, count))
+        running, final = [Stage(self._running, slice(0, planned), times[:planned], h)], []
+        if planned < count:
+            running.append(Stage(self._stay, slice(planned, count), times[planned:count], h))
         at_end = slice(count, count + 1), times[count:], 1.0
         if end < last:
             final.append(Stage(knot_cost(self.tails[end], self.nx, 0, np.empty((0, self.nx))), *at_end))
@@ -107,21 +107,21 @@ class Rolling:
         for wanted in problem.waypoints.values():
             limited |= ~np.isnan(wanted)
         which, ones = np.flatnonzero(limited), np.ones(int(np.sum(limited)))
-        found = []
+        groups = []
         if len(which):
             labels = tuple(problem.state_names[i] for i in which)
             special = {k: wanted[which] for k, wanted in problem.waypoints.items()}
             lower, upper = b.x_lower[which], b.x_upper[which]
             states = Selected(which, self.nx + self.nu)
-            found.append(_Group(labels, states, False, lower, upper, None, special, ones, ones))
+            groups.append(_Group(labels, states, False, lower, upper, None, special, ones, ones))
         for c in problem.kept:
             if self.staying is not None and isinstance(c, GoalConstraint) and c.knots == LAST:
                 continue  # the plan keeps it, and its end is stayed at
-            at = None if c.knots is None else frozenset(problem.knots_of(c, input_at_end=False))
+            knots = None if c.knots is None else frozenset(problem.knots_of(c, input_at_end=False))
             function = knot_function(c, self.nx, self.nu, probe)
             ones, (lower, upper) = np.ones(len(c.lower)), _wide(c)
-            found.append(_Group(_labels(c), function, c.takes_input, lower, upper, at, {}, ones, ones))
-        return found
+            groups.append(_Group(_labels(c), function, c.takes_input, lower, upper, knots, {}, ones, ones))
+        return groups
 
     def _limits(self, group: _Group, begin: int, count: int) -> Limits:
         first, last = (0, count - 1) if group.takes_input else (1, count)

@@ -60,9 +60,9 @@ class Limits:
 
     def at(self, xs: Array, us: Array) -> Array:
         """(K, nx + nu) the knots of a motion where they hold."""
-        found = np.concatenate([xs, np.zeros((len(xs), us.shape[1]))], axis=1)
-        found[:-1, xs.shape[1] :] = us
-        return found[self.rows.first : self.rows.last + 1]
+        knots = np.concatenate([xs, np.zeros((len(xs), us.shape[1]))], axis=1)
+        knots[:-1, xs.shape[1] :] = us
+        return knots[self.rows.first : self.rows.last + 1]
 
     def beyond(self, values: Array) -> Array:
         """(K, m) how far `values` are beyond a limit."""
@@ -116,7 +116,9 @@ class Stretch:
         """The cost of the plant's own motion, and the prices of what is beyond limits."""
         with np.errstate(all="ignore"):
             far = zip(self.limits, self.beyond(motion.xs, motion.us), strict=True)
-            return self.cost(motion.xs, motion.us) + sum(float(np.sum(one.prices * beyond)) for one, beyond in far)
+            return self.cost(motion.xs, motion.us) + sum(
+                float(np.sum(linearized.prices * beyond)) for linearized, beyond in far
+            )
 
     def ends(self, xs: Array, us: Array) -> Array:
         """(N, nx) where the plant's steps from xs (N, nx) under us (N, nu) lead."""
@@ -192,7 +194,7 @@ class Step:
         if policy is None:
             return None
         parts = zip(self.motion.xs, policy.value_gradients, policy.value_hessians, strict=True)
-        return tuple(CostToGo(*part) for part in parts)
+        return tuple(CostToGo(*row) for row in parts)
 
     @property
     def is_reached(self) -> bool:
@@ -202,16 +204,16 @@ class Step:
     @property
     def given_way(self) -> tuple[str, float, int] | None:
         """(label, how far, knot) of the limit that the solution passes at the highest price, if it passes one."""
-        worst, found = 0.0, None
-        prices = [one.prices for one in self.expansion.limited]
+        worst, passed = 0.0, None
+        prices = [linearized.prices for linearized in self.expansion.limited]
         rows = zip(self.stretch.limits, prices, self.moves.slacks, self.moves.multipliers, strict=True)
         for limit, price, slack, force in rows:
             gives = (np.abs(force) >= GIVES * price) & (slack > SLIGHT * limit.ranges)
             paid = np.where(gives, slack * price, 0.0)
             if np.max(paid, initial=0.0) > worst:
                 k, i = np.unravel_index(int(np.argmax(paid)), paid.shape)
-                worst, found = float(paid[k, i]), (limit.labels[i], float(slack[k, i]), int(k) + limit.rows.first)
-        return found
+                worst, passed = float(paid[k, i]), (limit.labels[i], float(slack[k, i]), int(k) + limit.rows.first)
+        return passed
 
 
 def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) -> Step | Refusal:
@@ -227,15 +229,18 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
     solved = _solve(stretch, expansion)
     if isinstance(solved, Refusal):
         return solved
-    expansion, found = solved.expansion, solved.moves
-    gap_prices = GAP_PRICE * np.max(np.abs(found.dynamics), axis=0)
+    expansion, moves = solved.expansion, solved.moves
+    gap_prices = GAP_PRICE * np.max(np.abs(moves.dynamics), axis=0)
     before = merit(stretch, expansion, motion, gap_prices)
-    saved = [one.prices * (one.beyond - slack) for one, slack in zip(expansion.limited, found.slacks, strict=True)]
-    slope, curvature = _along(expansion.quadratic, found)
-    slope -= sum(float(np.sum(one)) for one in saved) + float(np.sum(gap_prices * np.abs(motion.gaps)))
+    saved = [
+        linearized.prices * (linearized.beyond - slack)
+        for linearized, slack in zip(expansion.limited, moves.slacks, strict=True)
+    ]
+    slope, curvature = _along(expansion.quadratic, moves)
+    slope -= sum(float(np.sum(saving)) for saving in saved) + float(np.sum(gap_prices * np.abs(motion.gaps)))
     promised = -(slope + curvature / 2)
     rounding = ROUNDING * (1 + abs(before))
-    step = Step(stretch, motion, 0.0, promised, before, expansion, found, solved.whole, True, solved.feedback)
+    step = Step(stretch, motion, 0.0, promised, before, expansion, moves, solved.whole, True, solved.feedback)
     if stretch.rolls and not motion.is_rollout:
         return _first_rollout(step)
     for size in ROLLED_SIZES if stretch.rolls else STEP_SIZES:
@@ -255,8 +260,8 @@ def merit(stretch: Stretch, expansion: Expansion, motion: Motion, gap_prices: Ar
     """What a motion costs, with the prices of what is beyond limits and of gaps, `gap_prices` (nx,)."""
     with np.errstate(all="ignore"):
         paid = sum(
-            float(np.sum(one.prices * beyond))
-            for one, beyond in zip(expansion.limited, stretch.beyond(motion.xs, motion.us), strict=True)
+            float(np.sum(linearized.prices * beyond))
+            for linearized, beyond in zip(expansion.limited, stretch.beyond(motion.xs, motion.us), strict=True)
         )
         return stretch.cost(motion.xs, motion.us) + paid + float(np.sum(gap_prices * np.abs(motion.gaps)))
 
@@ -311,7 +316,7 @@ class _Solved:
 def _solve(stretch: Stretch, expansion: Expansion) -> _Solved | Refusal:
     """The quadratic program; where motions are rolled out and bounds of inputs alone push, by Riccati's sweep."""
     quadratic = expansion.quadratic
-    nothing = tuple(np.zeros_like(one.lower) for one in expansion.limited)
+    nothing = tuple(np.zeros_like(linearized.lower) for linearized in expansion.limited)
     free, policy = _swept(_unbounded(quadratic)), None
     if free is not None:
         moves, policy = free
@@ -321,8 +326,8 @@ def _solve(stretch: Stretch, expansion: Expansion) -> _Solved | Refusal:
         if stretch.rolls and not within:
             boxed = _swept(quadratic)
             if boxed is not None and _is_kept(stretch, expansion, boxed[0]):
-                found = replace(boxed[0], slacks=nothing, multipliers=nothing)
-                return _Solved(expansion, found, False, boxed[1].feedback)
+                boxed_moves = replace(boxed[0], slacks=nothing, multipliers=nothing)
+                return _Solved(expansion, boxed_moves, False, boxed[1].feedback)
         expansion = replace(expansion, limited=_dear_enough(expansion.limited, moves.dynamics))
     found_by_piqp = stretch.program.solve(quadratic, expansion.limited)
     return found_by_piqp if isinstance(found_by_piqp, Refusal) else _Solved(expansion, found_by_piqp, False, None)
@@ -342,8 +347,8 @@ def _is_doubtful(step: Step, before: Motion) -> bool:
     linear = np.einsum("kij,kj->ki", step.expansion.quadratic.F, np.hstack([dxs[:-1], dus]))
     change = float(np.max(np.abs(linear - dxs[:-1])))  # beside what a state moves by anyway
 
-    def error(motion: Motion, part: float) -> float:
-        return float(np.max(np.abs(motion.ends - before.ends - part * linear)))
+    def error(motion: Motion, fraction: float) -> float:
+        return float(np.max(np.abs(motion.ends - before.ends - fraction * linear)))
 
     large = error(step.motion, 1.0)
     if large <= max(SUSPECT * change, UNSEEN * (1 + float(np.max(np.abs(before.ends))))):
@@ -417,9 +422,9 @@ def _within_bounds(quadratic: LinearQuadratic, moves: Moves) -> bool:
 
 def _is_kept(stretch: Stretch, expansion: Expansion, moves: Moves) -> bool:
     """Whether moves leave no limit of states."""
-    for limit, one in zip(stretch.limits, expansion.limited, strict=True):
-        moved = np.einsum("kri,ki->kr", one.jacobians, limit.at(moves.dxs, moves.dus))
-        if np.any(moved < one.lower) or np.any(moved > one.upper):
+    for limit, linearized in zip(stretch.limits, expansion.limited, strict=True):
+        moved = np.einsum("kri,ki->kr", linearized.jacobians, limit.at(moves.dxs, moves.dus))
+        if np.any(moved < linearized.lower) or np.any(moved > linearized.upper):
             return False
     return True
 
@@ -430,13 +435,13 @@ def _dear_enough(limited: Sequence[Limited], forces: Array) -> tuple[Limited, ..
     `forces` (N, nx) are its multipliers: far from the plan they are larger than the plan's own.
     """
     worth, factor = np.max(np.abs(forces), axis=0), 1.0
-    for one in limited:
-        slopes = np.abs(one.jacobians[:, :, : len(worth)])
+    for linearized in limited:
+        slopes = np.abs(linearized.jacobians[:, :, : len(worth)])
         squared = np.sum(slopes**2, axis=2)
         seen = squared > NO_SLOPE
         wanted = DEAR * (slopes @ worth) / np.where(seen, squared, 1.0)
-        factor = max(factor, float(np.max(np.where(seen, wanted / one.prices, 0.0), initial=0.0)))
-    return tuple(replace(one, prices=factor * one.prices) for one in limited)
+        factor = max(factor, float(np.max(np.where(seen, wanted / linearized.prices, 0.0), initial=0.0)))
+    return tuple(replace(linearized, prices=factor * linearized.prices) for linearized in limited)
 
 
 def free_policy(quadratic: LinearQuadratic) -> AffinePolicy | None:
@@ -483,17 +488,17 @@ def _held(expansion: Expansion, moves: Moves, stretch: Stretch, *, one_sided: bo
     gradients, hessians = np.vstack([gradients, np.zeros((1, n))]), np.zeros((count + 1, n, n))
     gradients[-1, :nx] = final_gradient
     hessians[:-1], hessians[-1, :nx, :nx] = q.hessians, q.final_hessian
-    for limit, one, forces in zip(stretch.limits, expansion.limited, moves.multipliers, strict=True):
-        at = slice(limit.rows.first, limit.rows.last + 1)
-        part = np.abs(forces) / one.prices
-        holds = (part > HOLDS) & (part < GIVES)
+    for limit, linearized, forces in zip(stretch.limits, expansion.limited, moves.multipliers, strict=True):
+        knots = slice(limit.rows.first, limit.rows.last + 1)
+        ratios = np.abs(forces) / linearized.prices
+        holds = (ratios > HOLDS) & (ratios < GIVES)
         if one_sided:
-            stiff = np.where(holds, STIFF * one.prices, 0.0)
+            stiff = np.where(holds, STIFF * linearized.prices, 0.0)
         else:
             met = limit.upper - limit.lower < NARROW * limit.ranges
-            stiff = np.where(met, one.prices / limit.ranges, 0.0)
-        gradients[at] += np.einsum("kr,kri->ki", forces, one.jacobians)
-        hessians[at] += np.einsum("kri,kr,krj->kij", one.jacobians, stiff, one.jacobians)
+            stiff = np.where(met, linearized.prices / limit.ranges, 0.0)
+        gradients[knots] += np.einsum("kr,kri->ki", forces, linearized.jacobians)
+        hessians[knots] += np.einsum("kri,kr,krj->kij", linearized.jacobians, stiff, linearized.jacobians)
     F, on_bound = np.array(q.F), _on_bound(q, moves)
     for k, i in np.argwhere(on_bound):
         F[k, :, nx + i] = 0.0

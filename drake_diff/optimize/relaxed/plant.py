@@ -130,14 +130,14 @@ class RelaxedPlant:
     def distances(self, q: Array) -> Array:
         """(N, P) the signed distance of each pair at q (N, nq), infinite where it is further than 1e3 m."""
         touch = _within(self.pairs, self.place(q)[1], 1e3)
-        found = np.full((len(q), len(self.pairs.ids)), np.inf)
-        found[touch.state, touch.pair] = touch.phi
-        return found
+        gaps = np.full((len(q), len(self.pairs.ids)), np.inf)
+        gaps[touch.state, touch.pair] = touch.phi
+        return gaps
 
     def _contacts(self, poses: Array, S: Array, v_next: Array, soft: Softness) -> tuple[Contacts, "Law"]:
         touch = _within(self.pairs, poses, FAR * soft.reach)
-        own, (point, change) = S[touch.state], touch.contact_points(np.full(len(touch.pair), 0.5))
-        linear, angular = own[..., :3], own[..., 3:]
+        spatial, (point, change) = S[touch.state], touch.contact_points(np.full(len(touch.pair), 0.5))
+        linear, angular = spatial[..., :3], spatial[..., 3:]
         contacts = Contacts(
             touch=touch,
             moves=self.topology.moves,
@@ -241,9 +241,9 @@ def _of_one_tree(pairs: ContactPairs, rows: Array, topology: Topology) -> NDArra
     return np.asarray(first[pairs.sphere_body] == first[pairs.other_body])
 
 
-def _part(pairs: ContactPairs, kept: NDArray[np.bool_]) -> ContactPairs:
-    ids = tuple(pair for pair, keep in zip(pairs.ids, kept, strict=True) if keep)
-    arrays = {f.name: getattr(pairs, f.name)[kept] for f in fields(pairs) if f.name not in ("bodies", "ids")}
+def _part(pairs: ContactPairs, mask: NDArray[np.bool_]) -> ContactPairs:
+    ids = tuple(pair for pair, keep in zip(pairs.ids, mask, strict=True) if keep)
+    arrays = {f.name: getattr(pairs, f.name)[mask] for f in fields(pairs) if f.name not in ("bodies", "ids")}
     return replace(pairs, ids=ids, **arrays)
 
 

@@ -53,10 +53,10 @@ class Band:
         diagonal = np.array(self.diagonal)
         try:
             for k in range(N):  # what column k adds to the columns and rows after it
-                own = np.linalg.inv(np.linalg.cholesky(diagonal[k]))
-                inverse[k] = own
-                y[k] = own.dot(y[k])
-                factors[k] = factor = columns[k].dot(own.T)
+                inverted = np.linalg.inv(np.linalg.cholesky(diagonal[k]))
+                inverse[k] = inverted
+                y[k] = inverted.dot(y[k])
+                factors[k] = factor = columns[k].dot(inverted.T)
                 y[k + 1 : k + 3] -= factor.dot(y[k]).reshape(2, n)
                 if k + 1 < N:
                     square = factor.dot(factor.T)
@@ -69,8 +69,8 @@ class Band:
         y[N:] = 0.0
         for k in range(N - 1, -1, -1):
             y[k] = inverse[k].T.dot(y[k] - factors[k].T.dot(y[k + 1 : k + 3].ravel()))
-        found = y[:N].ravel()
-        return found if np.all(np.isfinite(found)) else None
+        solution = y[:N].ravel()
+        return solution if np.all(np.isfinite(solution)) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,8 +190,8 @@ class RelaxedSearch:
     @property
     def learned(self) -> tuple[Any, ...]:
         """Multipliers and penalties, to go back to."""
-        own = self.rest_multipliers, self.input_multipliers, self.rest_penalty, self.input_penalty
-        return (*own, self.constraints.forces, self.constraints.penalty)
+        learned = self.rest_multipliers, self.input_multipliers, self.rest_penalty, self.input_penalty
+        return (*learned, self.constraints.forces, self.constraints.penalty)
 
     @learned.setter
     def learned(self, learned: tuple[Any, ...]) -> None:
@@ -344,15 +344,15 @@ def _conjugate_product(p: Array, q: Array) -> Array:
 
 def between(coordinates: Coordinates, q: Array, q_next: Array) -> tuple[Array, list[Array]]:
     """(N, nv) the small motion from q to q_next (each (N, nq)), h v' of Drake's step; and the turns (N, 3) in it."""
-    found, turns = np.empty((len(q), coordinates.nv)), []
+    moves, turns = np.empty((len(q), coordinates.nv)), []
     for i, j in coordinates.single:
-        found[:, j] = q_next[:, i] - q[:, i]
+        moves[:, j] = q_next[:, i] - q[:, i]
     for i, j in coordinates.free:
         turn = _conjugate_product(q_next[:, i : i + 4], q[:, i : i + 4])
-        found[:, j : j + 3] = 2 * turn[:, 1:] / turn[:, :1]
-        found[:, j + 3 : j + 6] = q_next[:, i + 4 : i + 7] - q[:, i + 4 : i + 7]
-        turns.append(found[:, j : j + 3])
-    return found, turns
+        moves[:, j : j + 3] = 2 * turn[:, 1:] / turn[:, :1]
+        moves[:, j + 3 : j + 6] = q_next[:, i + 4 : i + 7] - q[:, i + 4 : i + 7]
+        turns.append(moves[:, j : j + 3])
+    return moves, turns
 
 
 def slopes_of(coordinates: Coordinates, q: Array, q_next: Array) -> tuple[Array, Array]:
@@ -361,7 +361,7 @@ def slopes_of(coordinates: Coordinates, q: Array, q_next: Array) -> tuple[Array,
     first = np.repeat(-np.eye(coordinates.nv)[None], len(q), axis=0)
     second = -first
     for (_, j), r in zip(coordinates.free, turns, strict=True):
-        part, across, outer = slice(j, j + 3), skew(r) / 2, r[:, :, None] * r[:, None, :] / 4
-        first[:, part, part] = -np.eye(3) - across - outer
-        second[:, part, part] = np.eye(3) - across + outer
+        block, across, outer = slice(j, j + 3), skew(r) / 2, r[:, :, None] * r[:, None, :] / 4
+        first[:, block, block] = -np.eye(3) - across - outer
+        second[:, block, block] = np.eye(3) - across + outer
     return first, second

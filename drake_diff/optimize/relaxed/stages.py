@@ -53,12 +53,12 @@ def relaxed_schedule(problem: Problem, plant: RelaxedPlant) -> tuple[Softness, .
     model = problem.model
     gap = float(np.min(plant.distances(problem.x0[None, : model.nq])))
     first = float(np.clip(max(thinnest_geometry(model)[0] / 2, gap / NEAREST), SMALLEST_REACH, LARGEST_REACH))
-    weight, stiffest, found = _weights(problem, plant) * SHARE, plant.material.stiffness * np.log(2), []
+    weight, stiffest, schedule = _weights(problem, plant) * SHARE, plant.material.stiffness * np.log(2), []
     for number in range(STAGES):
         reach = first / 2**number
         force = np.minimum(weight, stiffest * reach)
-        found.append(Softness(reach, force, max(LEAST_SLIP, SLIP / 2**number), REBOUND))
-    return tuple(found)
+        schedule.append(Softness(reach, force, max(LEAST_SLIP, SLIP / 2**number), REBOUND))
+    return tuple(schedule)
 
 
 def _weights(problem: Problem, plant: RelaxedPlant) -> Array:
@@ -98,17 +98,17 @@ def solve_relaxed(
         q[:, i : i + 4] /= np.linalg.norm(q[:, i : i + 4], axis=1, keepdims=True)
     try:
         for softness in relaxed_schedule(problem, plant):
-            found = search.run(q, softness, ITERATIONS, is_over, tell)
-            q = found.motion.q
-            log(softness, found)
+            result = search.run(q, softness, ITERATIONS, is_over, tell)
+            q = result.motion.q
+            log(softness, result)
             for weight in WEIGHTS:
-                followed = follow(problem, found.motion.xs, found.motion.us, weight)
+                followed = follow(problem, result.motion.xs, result.motion.us, weight)
                 if followed is not None:
-                    apart = (followed[0] - found.motion.xs) / problem.ranges(found.motion.xs)
-                    starts.append((float(np.mean(apart**2)) + found.gap + found.violation, *followed))
+                    apart = (followed[0] - result.motion.xs) / problem.ranges(result.motion.xs)
+                    starts.append((float(np.mean(apart**2)) + result.gap + result.violation, *followed))
             if is_over():
                 break
-            if found.ended != "inaccurate":
+            if result.ended != "inaccurate":
                 closed = q, search.learned
             elif closed is not None:  # the next one begins where the last that closed ended
                 q, search.learned = closed
@@ -130,14 +130,14 @@ def follow(problem: Problem, xs: Array, us: Array, weight: float) -> tuple[Array
             for k, u in enumerate(us):
                 ends[k] = intervals.end(xs[k], u)
             feedback = _feedback(problem, xs, us, ends, weight)
-            found, inputs = np.array(xs), np.array(us)
-            found[0] = problem.x0
+            states, inputs = np.array(xs), np.array(us)
+            states[0] = problem.x0
             for k in range(len(us)):
-                inputs[k] = np.clip(us[k] + feedback[k] @ (found[k] - xs[k]), bounds.u_lower, bounds.u_upper)
-                found[k + 1] = intervals.end(found[k], inputs[k])
+                inputs[k] = np.clip(us[k] + feedback[k] @ (states[k] - xs[k]), bounds.u_lower, bounds.u_upper)
+                states[k + 1] = intervals.end(states[k], inputs[k])
     except (GradientError, SimulationError):
         return None
-    return (found, inputs) if np.all(np.isfinite(found)) else None
+    return (states, inputs) if np.all(np.isfinite(states)) else None
 
 
 def _feedback(problem: Problem, xs: Array, us: Array, ends: Array, weight: float) -> Array:

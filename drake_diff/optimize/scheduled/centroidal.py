@@ -56,24 +56,24 @@ def plan_forces(
     eased, unloaded = _eased(stands, slow, round(EASES / time_step))
 
     def rounds(least: float) -> tuple[Array, Array] | Refusal:
-        found: tuple[Array, Array] | Refusal = (np.array(way), np.zeros(0))
+        plan: tuple[Array, Array] | Refusal = (np.array(way), np.zeros(0))
         for _ in range(ROUNDS):
-            if isinstance(found, Refusal):
+            if isinstance(plan, Refusal):
                 break
             program = _Program(mass, gravity, time_step, size, stands)
             program.follow(start, way)
             program.share(friction, least * eased)
             program.ease(unloaded)
-            program.keep_turn(places, found[0])
-            found = program.solve()
-        return found
+            program.keep_turn(places, plan[0])
+            plan = program.solve()
+        return plan
 
     tried = (rounds(least) for least in SHARES)
-    found: tuple[Array, Array] | Refusal = Refusal("")
-    for found in tried:
-        if not isinstance(found, Refusal):
+    plan: tuple[Array, Array] | Refusal = Refusal("")
+    for plan in tried:
+        if not isinstance(plan, Refusal):
             break
-    return found
+    return plan
 
 
 class _Program:
@@ -90,27 +90,27 @@ class _Program:
 
     def follow(self, start: tuple[Array, Array], way: Array) -> None:
         """Newton's law by the step's own rule, the given first state, and rest at the end of the way."""
-        program, at, h = self.program, self.at, self.h
+        program, positions, h = self.program, self.at, self.h
         first, speed = start
-        program.AddBoundingBoxConstraint(first, first, at[0])
-        program.AddBoundingBoxConstraint(way[-1], way[-1], at[-1])
+        program.AddBoundingBoxConstraint(first, first, positions[0])
+        program.AddBoundingBoxConstraint(way[-1], way[-1], positions[-1])
         program.AddLinearEqualityConstraint(
-            np.hstack([np.eye(3), -np.eye(3)]), np.zeros(3), np.concatenate([at[-1], at[-2]])
+            np.hstack([np.eye(3), -np.eye(3)]), np.zeros(3), np.concatenate([positions[-1], positions[-2]])
         )
         push = -(h**2) * self.pull * np.eye(3)
         for k, carrying in enumerate(self.of_step):
             blocks, known = [np.eye(3)], h**2 * self.gravity
-            variables = [at[k + 1]]
+            variables = [positions[k + 1]]
             if k == 0:
                 known = known + first + h * speed
             else:
                 blocks += [-2 * np.eye(3), np.eye(3)]
-                variables += [at[k], at[k - 1]]
+                variables += [positions[k], positions[k - 1]]
             blocks += [push] * len(carrying)
             variables += [self.forces[j] for j in carrying]
             program.AddLinearEqualityConstraint(np.hstack(blocks), known, np.concatenate(variables))
-        near = np.sqrt(NEAR * self.part) / self.size * np.eye(at.size)
-        program.Add2NormSquaredCost(near, near @ way.ravel(), at.ravel())
+        near = np.sqrt(NEAR * self.part) / self.size * np.eye(positions.size)
+        program.Add2NormSquaredCost(near, near @ way.ravel(), positions.ravel())
 
     def share(self, friction: float, least: Array) -> None:
         """Forces within friction, upwards, alike among the points, and alike from step to step."""
@@ -155,16 +155,16 @@ class _Program:
 
 def _eased(stands: NDArray[np.bool_], slow: Sequence[tuple[int, int]], steps: int) -> tuple[Array, NDArray[np.bool_]]:
     """(N, n) parts of the least share; and whether a step is a point's last before a slow phase, or its first after."""
-    part, last = np.ones(stands.shape), np.zeros(stands.shape, dtype=bool)
+    shares, last = np.ones(stands.shape), np.zeros(stands.shape, dtype=bool)
     for a, b in slow:
         leaves, lands = stands[a - 1] & ~stands[a], stands[b] & ~stands[b - 1]
         last[a - 1, leaves] = last[b, lands] = True
         for i in range(steps):
             if a - 1 - i >= 0:
-                part[a - 1 - i, leaves] = np.minimum(part[a - 1 - i, leaves], i / steps)
+                shares[a - 1 - i, leaves] = np.minimum(shares[a - 1 - i, leaves], i / steps)
             if b + i < len(stands):
-                part[b + i, lands] = np.minimum(part[b + i, lands], i / steps)
-    return part, last
+                shares[b + i, lands] = np.minimum(shares[b + i, lands], i / steps)
+    return shares, last
 
 
 def _cross(arm: Array) -> Array:

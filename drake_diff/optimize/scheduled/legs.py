@@ -44,12 +44,12 @@ class Legs:
         self.feet = tuple(feet)
         self.mass = float(self.twin.plant.CalcTotalMass(self.twin.context))
         self.put(q0)
-        found = [_sole(model, foot) for foot in self.feet]
-        self.frames = [self.twin.plant.get_frame(sole.frame) for sole in found]
-        self.centres = [sole.centres for sole in found]
-        self.radii = np.concatenate([sole.radii for sole in found])
-        self.frictions = [sole.friction for sole in found]
-        self.owners: Indices = np.concatenate([np.full(len(sole.radii), i) for i, sole in enumerate(found)])
+        soles = [_sole(model, foot) for foot in self.feet]
+        self.frames = [self.twin.plant.get_frame(sole.frame) for sole in soles]
+        self.centres = [sole.centres for sole in soles]
+        self.radii = np.concatenate([sole.radii for sole in soles])
+        self.frictions = [sole.friction for sole in soles]
+        self.owners: Indices = np.concatenate([np.full(len(sole.radii), i) for i, sole in enumerate(soles)])
 
     def friction(self) -> float:
         """The least coefficient between a sole and the ground, by Drake's rule for two of them."""
@@ -126,11 +126,11 @@ class Legs:
     def moved(self, q: Array, d: Array) -> Array:
         """Posture q (nq,) moved by d (nv,), joints inside their limits."""
         still = np.zeros(self.model.nv)
-        found = self.space.plus(np.concatenate([q, still]), np.concatenate([d, still]))[: self.model.nq]
+        q_moved = self.space.plus(np.concatenate([q, still]), np.concatenate([d, still]))[: self.model.nq]
         lower, upper = self.model.position_limits
-        inside = np.clip(found, lower + INSIDE, np.maximum(upper - INSIDE, lower + INSIDE))
+        inside = np.clip(q_moved, lower + INSIDE, np.maximum(upper - INSIDE, lower + INSIDE))
         base = slice(self.base_q, self.base_q + 7)
-        inside[base] = found[base]
+        inside[base] = q_moved[base]
         return inside
 
     def apart(self, q: Array, origin: Array) -> Array:
@@ -160,8 +160,8 @@ class Legs:
             off[:, 1] += radius * angle[:, 0]
             move[:, 0] += (self.radii - radius)[:, None] * turn[:, 1]  # of a centre where it does not roll
             move[:, 1] -= (self.radii - radius)[:, None] * turn[:, 0]
-            at, by_v = self.center_of_mass()
-            error = np.concatenate([off.ravel() / AT_PLACE, (at - mass) / OVER, self.apart(q, wish) / near])
+            centre, by_v = self.center_of_mass()
+            error = np.concatenate([off.ravel() / AT_PLACE, (centre - mass) / OVER, self.apart(q, wish) / near])
             slope = np.vstack([move.reshape(-1, nv) / AT_PLACE, by_v / OVER, np.diag(1 / near)])
             change = -np.linalg.solve(slope.T @ slope + DAMPING * np.eye(nv), slope.T @ error)
             size = float(np.max(np.abs(change)))
@@ -172,8 +172,8 @@ class Legs:
 
     def _turns(self) -> list[Array]:
         """(3, 3) of each point, its body's rotation in the twin's state."""
-        found = [frame.CalcPoseInWorld(self.twin.context).rotation().matrix() for frame in self.frames]
-        return [found[i] for i in self.owners]
+        rotations = [frame.CalcPoseInWorld(self.twin.context).rotation().matrix() for frame in self.frames]
+        return [rotations[i] for i in self.owners]
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,12 +208,12 @@ class Soles:
         later, after = _from_here_on(turning), _from_here_on(moving)
         spin = (v[:, None, None, base] @ base_turn)[:, :, 0]  # (K, n, 3) of the base
         before = spin[:, :, None] + turning.cumsum(axis=2) - turning
-        turned, found = np.zeros(self.turns.shape), np.zeros(self.turns.shape)
+        turned, slopes = np.zeros(self.turns.shape), np.zeros(self.turns.shape)
         turned[:, :, joints] = cross(turn, later - turning)
         turned[:, :, base] = cross(base_turn, later[:, :, :1])
-        found[:, :, joints] = cross(turn, after) + cross(before, move)
-        found[:, :, base] = cross(base_turn, after[:, :, :1]) + cross(spin[:, :, None], self.centres[:, :, base])
-        return np.asarray(found + cross(turned, self.down[:, None]))
+        slopes[:, :, joints] = cross(turn, after) + cross(before, move)
+        slopes[:, :, base] = cross(base_turn, after[:, :, :1]) + cross(spin[:, :, None], self.centres[:, :, base])
+        return np.asarray(slopes + cross(turned, self.down[:, None]))
 
 
 def _from_here_on(parts: Array) -> Array:

@@ -70,10 +70,10 @@ def scheduled_motion(
     for a, b in slow:
         middle = np.mean(places[a : b + 1, carries[a], :2], axis=1)
         way[a : b + 1, :2] += INWARD * (middle - way[a : b + 1, :2])
-    found = plan_forces(legs.mass, gravity, h, start, way, places, carries, friction, slow)
-    if not isinstance(found, tuple):
-        raise InputError("ContactSchedule", got=str(found), expected="phases in which there are such forces")
-    mass, forces = found
+    plan = plan_forces(legs.mass, gravity, h, start, way, places, carries, friction, slow)
+    if not isinstance(plan, tuple):
+        raise InputError("ContactSchedule", got=str(plan), expected="phases in which there are such forces")
+    mass, forces = plan
     landing = on & ~np.vstack([on[:1], on[:-1]])
     if slow or len(legs.owners) > len(legs.feet):
         places[:, :, 2] -= _sunk(-float(np.mean(places[-1, :, 2])), forces[:, :, 2] / weight, landing)
@@ -115,8 +115,8 @@ def _foot_ways(first: Array, last: Array, on: Mask, clearance: float) -> tuple[A
         ways = swings(on[:, i])
         for number, (a, b) in enumerate(ways):
             s = np.linspace(0, 1, b - a + 1)
-            part = (number + smooth(s)) / len(ways)
-            places[a : b + 1, i] = first[i] + part[:, None] * (last[i] - first[i])
+            fractions = (number + smooth(s)) / len(ways)
+            places[a : b + 1, i] = first[i] + fractions[:, None] * (last[i] - first[i])
             places[b + 1 :, i] = places[b, i]
             open_end = b == len(on) - 1 and not on[b, i]
             arcs[a : b + 1, i] = clearance * (smooth(s) if open_end else (4 * s * (1 - s)) ** RISE)
@@ -181,7 +181,7 @@ def _inputs(legs: Legs, x: Array, v_next: Array, forces: Array, carries: Array) 
     by_force = legs.jacobians()[0][carries].reshape(-1, model.nv).T
     needed = needed - by_force @ forces[carries].ravel()
     gives = -np.asarray(twin.mass_matrix())[:, base : base + 6]
-    part = forces[carries][:, 2] / max(float(np.mean(forces[carries][:, 2])), 1e-9) if carries.any() else np.zeros(0)
-    columns = np.hstack([BY_INPUT * model.actuation, BY_FORCE * by_force * np.repeat(part, 3), BY_BASE * gives])
-    found = np.linalg.lstsq(columns, needed, rcond=1e-9)[0]
-    return np.asarray(BY_INPUT * found[: model.nu])
+    loads = forces[carries][:, 2] / max(float(np.mean(forces[carries][:, 2])), 1e-9) if carries.any() else np.zeros(0)
+    columns = np.hstack([BY_INPUT * model.actuation, BY_FORCE * by_force * np.repeat(loads, 3), BY_BASE * gives])
+    solution = np.linalg.lstsq(columns, needed, rcond=1e-9)[0]
+    return np.asarray(BY_INPUT * solution[: model.nu])
