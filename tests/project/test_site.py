@@ -76,3 +76,12 @@ def test_the_pictures_of_contact_models_are_those_that_the_command_draws(tmp_pat
     assert all((DOCS / f"pictures/{name}.svg").is_file() for name in shown)
     pictures.draw("contact_shapes", tmp_path)  # the one that simulates nothing
     assert (tmp_path / "contact_shapes.svg").read_text().startswith("<?xml")
+
+
+def test_every_page_of_the_reference_is_in_the_navigation():
+    pytest.importorskip("mkdocs")
+    spec = importlib.util.spec_from_file_location("site_pages", DOCS / "site.py")
+    site = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(site)
+    listed = re.findall(r"^ +- (reference/\w+\.md)$", (ROOT / ".mkdocs.yml").read_text(), re.MULTILINE)
+    assert sorted(listed) == sorted(site.reference())

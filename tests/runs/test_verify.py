@@ -218,7 +218,7 @@ def set_value(index, key, value):
         ("replays", lambda part: part.pop(), "record.json: replays: recorded"),
         ("contract", lambda part: part["bodies"][0].update(mass=2.0), "contract.bodies[pole].mass: recorded 2"),
         ("model", lambda part: part["options"].update(time_step=0.01), "contract.time_step"),
-        ("solver", lambda part: part.update(solver="ipopt"), "solver.solver: recorded ipopt, again snopt"),
+        ("solver", lambda part: part.update(solver="snopt"), "solver.solver: recorded snopt, again ipopt"),
         ("gradient", lambda part: part["certificates"].pop(), "gradient.certificates: recorded"),
         ("inputs", lambda part: part.update(seed=3), "inputs.seed: recorded 3, again 0"),
         ("claim", lambda part: part.update(statement="it is safe"), "claim.statement: recorded it is safe"),
