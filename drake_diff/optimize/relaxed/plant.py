@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_diff._base.arrays import Array, cross, skew
+from drake_diff._base.arrays import Array, Indices, cross, own_array, skew
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.contact.active_contacts import (
     ContactPairs,
@@ -35,12 +35,11 @@ from drake_diff.derivatives.contact.laws import Material, read_material
 from drake_diff.derivatives.implicit import form_of
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
-from drake_diff.mechanics.numpy_tree import TreeDynamics, poses_of, tree_of
+from drake_diff.mechanics.tree import Tree, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 
 FAR = 12.0  # reaches: beyond it the force is 1e-5 of that of what touches, and left out
-SWAP = np.r_[3:6, 0:3]  # [angular; linear] to [linear; angular]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +67,12 @@ class RelaxedPlant:
     """What of a model does not change from step to step."""
 
     model: Model
-    tree: TreeDynamics
+    tree: Tree
     coordinates: Coordinates
     pairs: ContactPairs
     topology: Topology
     by_body: Array  # (bodies of pairs, nv)
+    carriers: Indices  # (bodies of pairs,) the link of each body, -1 of the world
     material: Material
     actuation: Array  # (nv, nu)
     labels: dict[Any, str]  # of Drake's bodies, by their index, as in the topology
@@ -93,31 +93,30 @@ class RelaxedPlant:
         """(nv,) 1 for the degrees of freedom that move one of Drake's bodies."""
         return self.topology.bodies[self.labels[body.index()]]
 
-    def place(self, q: Array) -> tuple[Array, Array]:
-        """The poses (N, n, 3, 4) of the tree's bodies and (N, bodies, 3, 4) of the pairs' at q (N, nq)."""
-        poses = poses_of(self.model, (*self.tree.bodies, *self.pairs.bodies), q)
-        count = len(self.tree.bodies)
-        return np.ascontiguousarray(poses[:, :count]), np.ascontiguousarray(poses[:, count:])
+    def _poses(self, links: Array) -> Array:
+        """(N, bodies, 3, 4) of the bodies of the pairs, from those of the links."""
+        poses = own_array(links[:, self.carriers])
+        poses[:, self.carriers < 0] = np.eye(3, 4)
+        return poses
 
     def forces(self, q: Array, v: Array, v_next: Array, soft: Softness, *, slopes: bool) -> Forces:
         """At q (N, nq), v and v_next (N, nv); without `slopes` the derivatives are empty."""
         tree, h, n = self.tree, self.model.time_step, self.coordinates.nv
-        of_tree, of_pairs = self.place(q)
-        moving, a = tree.moving(of_tree, v), (v_next - v) / h
+        a = (v_next - v) / h
+        moved = tree.compiled(q, v, a, derivatives=slopes)
         stretched = np.where(tree.free, 0.0, q[:, tree.positions] - tree.rest) * tree.stiffness
         added = stretched + tree.damping * v_next + tree.reflected * a
-        contacts, law = self._contacts(of_pairs, moving.S[..., SWAP], v_next, soft)
+        contacts, law = self._contacts(self._poses(moved.poses), moved.S, v_next, soft)
         state = contacts.touch.state
         push = np.zeros_like(v)
         np.add.at(push, state, (contacts.jacobian @ law.force[..., None])[..., 0])
         if not slopes:
-            return Forces(moving.forces(a)[0] + added - push, *3 * (np.empty(0),))
-        tau, by_q, by_v = moving.derivatives(a)
-        mass, diagonal = moving.mass, np.arange(n)
+            return Forces(moved.tau + added - push, *3 * (np.empty(0),))
+        by_q, mass, diagonal = moved.by_q, moved.mass, np.arange(n)
         mass[:, diagonal, diagonal] += tree.reflected
         by_q[:, diagonal, diagonal] += tree.stiffness
         by_next = mass / h
-        by_v = by_v - by_next
+        by_v = moved.by_v - by_next
         by_next = by_next + np.diag(tree.damping)
         J = contacts.jacobian
         point, normal, phi = contacts.displacement()
@@ -125,11 +124,13 @@ class RelaxedPlant:
         changed = law.change(velocity, normal, phi)
         np.subtract.at(by_q, state, contacts.force_change(law.force, point) + J @ changed.swapaxes(-1, -2))
         np.subtract.at(by_next, state, J @ law.by_velocity() @ J.swapaxes(-1, -2))
-        return Forces(tau + added - push, by_q, by_v, by_next)
+        return Forces(moved.tau + added - push, by_q, by_v, by_next)
 
     def distances(self, q: Array) -> Array:
         """(N, P) the signed distance of each pair at q (N, nq), infinite where it is further than 1e3 m."""
-        touch = _within(self.pairs, self.place(q)[1], 1e3)
+        still = np.zeros((len(q), self.coordinates.nv))
+        links = self.tree.compiled(q, still, still, derivatives=False).poses
+        touch = _within(self.pairs, self._poses(links), 1e3)
         gaps = np.full((len(q), len(self.pairs.ids)), np.inf)
         gaps[touch.state, touch.pair] = touch.phi
         return gaps
@@ -137,7 +138,7 @@ class RelaxedPlant:
     def _contacts(self, poses: Array, S: Array, v_next: Array, soft: Softness) -> tuple[Contacts, "Law"]:
         touch = _within(self.pairs, poses, FAR * soft.reach)
         spatial, (point, change) = S[touch.state], touch.contact_points(np.full(len(touch.pair), 0.5))
-        linear, angular = spatial[..., :3], spatial[..., 3:]
+        angular, linear = spatial[..., :3], spatial[..., 3:]
         contacts = Contacts(
             touch=touch,
             moves=self.topology.moves,
@@ -264,7 +265,8 @@ def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
     labels[model.plant.world_body().index()] = "world"
     all_pairs = read_pairs(model)
-    rows = np.array([topology.bodies[labels[body.index()]] for body in all_pairs.bodies]).reshape(-1, model.nv)
+    names = [labels[body.index()] for body in all_pairs.bodies]
+    rows = np.array([topology.bodies[name] for name in names]).reshape(-1, model.nv)
     pairs = _part(all_pairs, ~_of_one_tree(all_pairs, rows, topology))
     return RelaxedPlant(
         model=model,
@@ -273,6 +275,7 @@ def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
         pairs=pairs,
         topology=topology,
         by_body=rows,
+        carriers=np.array([tree.compiled.links.get(name, -1) for name in names], dtype=np.intp),
         material=read_material(model.double, pairs),
         actuation=np.asarray(form.actuation),
         labels=labels,

@@ -114,9 +114,9 @@ class RelaxedSearch:
     def _scales(self) -> tuple[Array, Array]:
         """What a force of 1 along each undriven direction and each input changes in a step, as a speed."""
         x0, model, plant = self.problem.x0, self.problem.model, self.plant
-        v = x0[None, model.nq :]
-        poses, _ = plant.place(x0[None, : model.nq])
-        mass = plant.tree.moving(poses, v).mass[0] + np.diag(plant.tree.reflected)
+        still = np.zeros((1, model.nv))
+        moved = plant.tree.compiled(x0[None, : model.nq], still, still, derivatives=False)
+        mass = moved.mass[0] + np.diag(plant.tree.reflected)
         inverse = np.linalg.inv(mass)
         of_rest = np.einsum("ir,ij,jr->r", self.undriven, inverse, self.undriven)
         of_inputs = np.einsum("ir,ij,jr->r", plant.actuation, inverse, plant.actuation)
