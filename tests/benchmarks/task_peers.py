@@ -271,7 +271,7 @@ def ratios(rows: list[Row]) -> tuple[list[float], list[float], list[float]]:
 
 
 def told(rows: list[Row]) -> list[str]:
-    """Tables in Markdown: the peers, then each peer's tasks, then what it fails at and is not told."""
+    """Tables in Markdown: the peers, then the tasks of each with its failures and what it is not told."""
     lines = [
         "| Peer | Tasks | Solves | We solved | It solved | It says solved, plan false | Time of `dd.solve` over its | "
         "Search alone over its | Search over its solver alone | Cheaper plan: ours, its |",
@@ -290,15 +290,13 @@ def told(rows: list[Row]) -> list[str]:
             f"{false} | {' | '.join(map(quartiles, ratios(own)))} | "
             f"{f'{cheaper[0]}, {cheaper[1]}' if both else '-'} |"
         )
+    lines += [
+        "",
+        "| Peer | Task | Solved: we, it | Time of `dd.solve` over its | Search alone over its | Its failures |",
+        "|---|---|---|---|---|---|",
+    ]
     for peer in names:
         own = [row for row in rows if row["peer"] == peer and "ours" in row]
-        lines += [
-            "",
-            f"### {peer}",
-            "",
-            "| Task | Solved: we, it | Time of `dd.solve` over its | Search alone over its | Its failures |",
-            "|---|---|---|---|---|",
-        ]
         for name in dict.fromkeys(row["name"] for row in own):
             some = [row for row in own if row["name"] == name]
             bad = [row["theirs"] for row in some if not good(row)]
@@ -306,10 +304,9 @@ def told(rows: list[Row]) -> list[str]:
             why = " ".join(why.replace("|", " ").replace("<", " ").split())[:160]
             whole, alone, _ = ratios(some)
             solved = f"{sum(row['ours']['solved'] for row in some)} and {sum(map(good, some))} of {len(some)}"
-            lines.append(f"| {name.replace('_', ' ')} | {solved} | {quartiles(whole)} | {quartiles(alone)} | {why} |")
-        left = [row for row in rows if row["peer"] == peer and "left out" in row]
-        reasons = dict.fromkeys(row["left out"] for row in left)
-        for why in reasons:
-            tasks = ", ".join(row["name"].replace("_", " ") for row in left if row["left out"] == why)
-            lines += ["", f"Not told to it, {why}: {tasks}."]
+            cells = [peer, name.replace("_", " "), solved, quartiles(whole), quartiles(alone), why]
+            lines.append(f"| {' | '.join(cells)} |")
+        for row in rows:
+            if row["peer"] == peer and "left out" in row:
+                lines.append(f"| {peer} | {row['name'].replace('_', ' ')} | left out | - | - | {row['left out']} |")
     return lines

@@ -32,6 +32,7 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np  # noqa: E402
+from pages import write_page  # noqa: E402
 from rates import success_rate  # noqa: E402
 from referee import judge, judge_phases  # noqa: E402
 from task_cases import FAMILIES, NOT_EXPRESSED, Case  # noqa: E402
@@ -153,6 +154,17 @@ def table(rows: dict[str, Row], only: str) -> list[str]:
     return lines
 
 
+def families(rows: dict[str, Row]) -> list[str]:
+    """A table of the families: tasks, and solves that count."""
+    lines = ["| Family | Tasks | Solved |", "|---|---|---|"]
+    for family in dict.fromkeys(family for family, _ in TASKS.values()):
+        own = [row for row in rows.values() if row["name"] in TASKS and TASKS[row["name"]][0] == family]
+        if own:
+            good = sum(is_solved(row) for row in own)
+            lines.append(f"| {family} | {len({row['name'] for row in own})} | {good} of {len(own)} |")
+    return lines
+
+
 def optima(rows: dict[str, Row]) -> list[str]:
     """A line for each task whose optimum is known: how far the costs of what is solved are from it."""
     lines = []
@@ -184,7 +196,8 @@ depend on the machine. Tasks with fewer starts are slower ones in a run that was
 guesses and methods that a solve took.
 
 """
-    text += "\n".join([*(f"- {line}" for line in told(rows, only)), "", *table(rows, only), *optima(rows)]) + "\n"
+    lines = [*(f"- {line}" for line in told(rows, only)), "", *families(rows), "", *table(rows, only), *optima(rows)]
+    text += "\n".join(lines) + "\n"
     if peers:
         import task_peers
 
@@ -267,7 +280,7 @@ def main() -> None:
     print("\n".join([*told(shown, given.only), *optima(shown)]))
     if given.markdown:
         peers = json.loads(given.peers.read_text()) if given.peers else []
-        given.markdown.write_text(markdown(shown, peers, given.seed, given.only))
+        write_page(given.markdown, markdown(shown, peers, given.seed, given.only))
 
 
 if __name__ == "__main__":

@@ -27,6 +27,8 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+from pages import write_page
+
 ROOT = Path(__file__).parents[2]
 CPU_LIMIT, MEMORY = 60, 8 * 2**30  # [s], [bytes]
 AIM = 0.95
@@ -233,7 +235,7 @@ def main() -> None:
     shown = {name: row for name, row in rows.items() if fnmatch.fnmatch(name, given.only)}
     print("\n".join(told(shown)))
     if given.markdown:
-        given.markdown.write_text(markdown(shown, given.seed))
+        write_page(given.markdown, markdown(shown, given.seed))
 
 
 if __name__ == "__main__":
