@@ -2,22 +2,34 @@
 
 What is written is on the disk before it is moved: a power cut leaves the old or the new, as the death of the process.
 Where the disk refuses, a WriteError says what could not be done to which file. `record.directory` writes whole folders.
+
+Files that a stranger made are read with limits: plain files alone, never through a link, and no more than a limit of
+bytes. What a file states as its size (an archive's index, an array's header) is checked before anything is unpacked.
 """
 
 import ctypes
 import errno
 import fcntl
+import io
+import json
+import math
 import os
+import re
 import shutil
 import stat
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
+from hashlib import sha256
 from io import BufferedIOBase, FileIO
 from pathlib import Path
 from typing import Any
 
-from drake_diff.exceptions import WriteError
+import numpy as np
+
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.exceptions import ArtifactError, WriteError
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux' renameat2, which Python's os has not
 CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EXDEV, errno.EOPNOTSUPP)
@@ -188,3 +200,170 @@ def _open_locked(path: Path) -> int | None:
                 os.close(number)
                 raise
             os.close(number)
+
+
+MIB, GIB = 2**20, 2**30
+MOST_TEXT = 32 * MIB  # of a record
+MOST_VALUES = 1_000_000  # in a record: as objects they take some 100 times their text
+DEEPEST = 64  # lists and objects of a record, one inside another: ours has 10
+MOST_ARRAYS = 256 * MIB  # of an .npz file, unpacked: a million steps of 30 numbers
+MOST_MEMBERS = 100  # of an .npz file
+MOST_FILE = GIB  # of any file
+MOST_FILES = 10_000  # in a directory and those in it
+MOST_READ = 4 * GIB  # of all these together: holes in a file take no room, and as long to read as anything
+SURROGATE = re.compile("[\ud800-\udfff]")
+
+
+@contextmanager
+def plain_file(path: Path, most: int = MOST_FILE, *, links: bool = False) -> Iterator[io.BufferedReader]:
+    """The file at `path`, opened; ArtifactError where it is no plain file, larger than `most` bytes, or not readable.
+
+    A link is followed with `links` alone: where the user named the file, and not a record. A FIFO or a device is not
+    waited for.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        kind = (path.stat() if links else path.lstat()).st_mode
+        if not stat.S_ISREG(kind):
+            raise ArtifactError(f"{path}: expected a plain file, got {_kind(kind)}")
+        number = os.open(path, flags | (0 if links else getattr(os, "O_NOFOLLOW", 0)))
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+        raise ArtifactError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    with os.fdopen(number, "rb") as file:
+        found = os.fstat(number)
+        if not stat.S_ISREG(found.st_mode):  # exchanged since it was looked at
+            raise ArtifactError(f"{path}: expected a plain file, got {_kind(found.st_mode)}")
+        if found.st_size > most:
+            raise ArtifactError(f"{path}: expected at most {most} bytes, got {found.st_size}")
+        yield file
+
+
+def _kind(mode: int) -> str:
+    kinds = {stat.S_IFLNK: "a link", stat.S_IFDIR: "a directory", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
+    return kinds.get(stat.S_IFMT(mode), "a device")
+
+
+def read_plain(path: Path, most: int = MOST_FILE, *, links: bool = False) -> bytes:
+    """The bytes of a plain file; see `plain_file`."""
+    with plain_file(path, most, links=links) as file:
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(size + 1)  # Python takes the memory for all that it is asked for
+    if len(data) != size:
+        raise ArtifactError(f"{path}: it was changed while it was read")
+    return data
+
+
+def sha256_of(path: Path, most: int = MOST_FILE) -> tuple[int, str]:
+    """How many bytes a plain file has, and their hash; never more than a piece of it in memory."""
+    found, count = sha256(), 0
+    with plain_file(path, most) as file:
+        while piece := file.read(MIB):
+            found.update(piece)
+            count += len(piece)
+            if count > most:
+                raise ArtifactError(f"{path}: expected at most {most} bytes, got more")
+    return count, found.hexdigest()
+
+
+def files_in(folder: Path) -> dict[str, os.DirEntry[str]]:
+    """All that is below a folder and no folder, by its path in it; no link is followed.
+
+    ArtifactError where there are more than `MOST_FILES`, or a folder cannot be read.
+    """
+    found: dict[str, os.DirEntry[str]] = {}
+    waiting, seen = [(folder, "")], 0
+    while waiting:
+        place, before = waiting.pop()
+        try:
+            with os.scandir(place) as entries:
+                for entry in entries:
+                    seen += 1
+                    if seen > MOST_FILES:
+                        raise ArtifactError(f"{folder}: expected at most {MOST_FILES} files, got more")
+                    if entry.is_dir(follow_symlinks=False):
+                        waiting.append((Path(entry.path), f"{before}{entry.name}/"))
+                    else:
+                        found[before + entry.name] = entry
+        except OSError as error:
+            raise ArtifactError(f"{place}: cannot be read: {error.strerror}") from error
+    return found
+
+
+def json_of(data: bytes) -> Any:
+    """The value of a JSON text in UTF-8; ValueError where it is none, or too large, too deep or no numbers in it."""
+    values = sum(data.count(mark) for mark in (b",", b"[", b"{"))
+    if values > MOST_VALUES:
+        raise ValueError(f"expected at most {MOST_VALUES} values, got more")
+    try:
+        found = json.loads(data.decode("utf-8"), parse_constant=_refuse, parse_float=_finite)
+    except RecursionError as error:
+        raise ValueError(f"expected at most {DEEPEST} lists and objects inside one another") from error
+    level = [found]
+    for _ in range(DEEPEST):
+        inner: list[Any] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner += value.keys()
+                inner += value.values()
+            elif isinstance(value, list):
+                inner += value
+            elif isinstance(value, str) and SURROGATE.search(value):
+                raise ValueError("a text in it is no Unicode: half of a surrogate pair")
+        if not inner:
+            return found
+        level = inner
+    raise ValueError(f"expected at most {DEEPEST} lists and objects inside one another")
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is not a number in JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is larger than any number of 64 bits")
+    return value
+
+
+def arrays_of(path: Path, most: int = MOST_ARRAYS) -> dict[str, Array]:
+    """The arrays of float64 in an .npz file, read-only, by name. ArtifactError where it is none, or unpacks to more.
+
+    The archive's index and every array's header are read first, and nothing is unpacked that they do not allow.
+    """
+    data = read_plain(path, most)
+    try:
+        if data.count(b"PK\x01\x02") > MOST_MEMBERS:  # what zipfile makes of a million takes 1 GB
+            raise ValueError(f"expected at most {MOST_MEMBERS} arrays, got more")
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if len({m.filename for m in members}) < len(members):
+                raise ValueError(f"expected each array once, got {len(members)}")
+            whole = sum(member.file_size for member in members)
+            if whole > most:
+                raise ValueError(f"expected at most {most} bytes, unpacked, got {whole}")
+            return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+    except ArtifactError:
+        raise
+    except Exception as error:  # zipfile and NumPy fail in many ways on what is no such file
+        raise ArtifactError(f"{path} is no file of arrays: {type(error).__name__}: {error}") from error
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Array:
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # the others unpack without a limit
+        raise ValueError(f"{member.filename}: it is packed in a way that NumPy does not use")
+    with archive.open(member) as packed:
+        data = packed.read(member.file_size + 1)  # read() alone would unpack what the index does not tell
+    file = io.BytesIO(data)
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if read is None:
+        raise ValueError(f"{member.filename}: a header of version {version}")
+    shape, by_columns, dtype = read(file)
+    if dtype != np.dtype("<f8"):
+        raise ValueError(f"{member.filename}: expected numbers of 64 bits, got {dtype}")
+    count = len(data) - file.tell()
+    if any(n < 0 for n in shape) or 8 * math.prod(shape) != count:
+        raise ValueError(f"{member.filename}: {count} bytes are not the numbers of an array of shape {shape}")
+    numbers = np.frombuffer(data, dtype="<f8", offset=file.tell())
+    return frozen(numbers.reshape(shape, order="F" if by_columns else "C"))

@@ -1,5 +1,5 @@
 """Is a derivative true? And what a model has in it that cannot be differentiated."""
 
-from drake_diff._base.lazy import attach_stub as _attach_stub
+from drake_diff._base import attach_stub as _attach_stub
 
 __getattr__, __dir__, __all__ = _attach_stub(__name__, __file__)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.differences import Difference, Function, Many, one_by_one
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.certificates.differences import DIFFERENCES, TINY, Neighbourhood, look_around
 from drake_diff.exceptions import CertificateError, GradientError, InputError, ShapeError
 from drake_diff.model.contact import Pair

@@ -10,7 +10,7 @@ from pydrake.geometry import HalfSpace, ProximityProperties, VolumeMesh
 from pydrake.multibody.plant import ContactModel
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
 from drake_diff.model.contact_geometry import autodiff_supports

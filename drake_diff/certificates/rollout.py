@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
 from drake_diff._base.differences import Many
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.certificates.certificate import JITTER, VERDICTS, Certificate, certify_displacement, jitter
 from drake_diff.certificates.certify import differences_of_drake, differences_of_solved
 from drake_diff.certificates.directions import SAMPLE, Gaps, Probe, judge, weights

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.certificates.certificate import VERDICTS
 from drake_diff.certificates.differences import TINY
 from drake_diff.certificates.displaced import Displaced, Line

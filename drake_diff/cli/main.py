@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from drake_diff._base.signals import interrupt_alike
+from drake_diff._base.clock import interrupt_alike
 from drake_diff.cli import models, plans, runs
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drake_diff._base.signals import INTERRUPTED
+from drake_diff._base.clock import INTERRUPTED
 from drake_diff.cli.text import (
     ModelFolder,
     RunDirectory,

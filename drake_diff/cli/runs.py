@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
+from drake_diff._base.clock import INTERRUPTED, held_interrupts
 from drake_diff._base.sandbox import memory_at_most
-from drake_diff._base.signals import INTERRUPTED, held_interrupts
 from drake_diff.cli.text import ModelFolder, RunDirectory, judged, out_option, plain, progress_line, show, table
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, WriteError
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.differences import central_differences, one_by_one
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.certificates.certificate import Certificate, certify_displacement
 from drake_diff.comparison.recordings import Recording
 from drake_diff.engines.contract import NOT_TOLD, SAME_NUMBER, ContractLine, match_contracts

@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff._base.files import make_folder, write_whole
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.untrusted import arrays_of
+from drake_diff._base.files import arrays_of, make_folder, write_whole
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError, UnknownNameError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.mechanics.coordinates import rotation

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.jupyter import preformatted
+from drake_diff._base.values import preformatted
 from drake_diff.comparison.attribution import AGREES, BROKE_OFF, Attribution, EngineMotion, JacobianAt
 from drake_diff.comparison.recordings import Recording
 from drake_diff.engines.contract import LAWS, UNKNOWN, ContractLine, is_another_model

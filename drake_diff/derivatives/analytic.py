@@ -13,7 +13,7 @@ from pydrake.autodiffutils import InitializeAutoDiff
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.contact.active_contacts import JOINT_LIMITS, is_iterated
 from drake_diff.derivatives.contact.jacobian import contact_form, contact_jacobians, material_of
 from drake_diff.derivatives.contact.laws import QUANTITIES, material_change

@@ -24,7 +24,7 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.steps import Jacobians, NotSmoothError, Steps
 from drake_diff.exceptions import DrakeDiffError
 from drake_diff.model.model import Model

@@ -30,7 +30,7 @@ from pydrake.geometry import CollisionFilterDeclaration, GeometrySet
 from pydrake.multibody.tree import MultibodyForces
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.model.mimic import joints_of_mimics
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_diff._base.arrays import Array, Indices, cross
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.contact.active_contacts import weigh
 from drake_diff.derivatives.contact.laws import QUANTITIES, ContactLaw, combine
 from drake_diff.derivatives.implicit import Form, form_of

@@ -22,7 +22,7 @@ from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.differences import Many, plateau, sweep_of
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives import METHODS
 from drake_diff.derivatives.analytic import Analytic
 from drake_diff.derivatives.implicit import Implicit, form_of

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.derivatives.analytic import one_smooth_step
 from drake_diff.derivatives.sources import ANALYTIC, CERTIFIED, IMPLICIT, OF_ONE_KIND, Chosen, check_method, choose
 from drake_diff.derivatives.steps import Steps, known_steps, take_step, take_steps

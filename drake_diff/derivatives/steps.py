@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import DrakeDiffError, GradientError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector

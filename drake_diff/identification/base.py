@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification.tree import Dynamics, Tree, ten_numbers, tree_for_identification
 from drake_diff.model.model import Model

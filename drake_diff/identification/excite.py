@@ -15,8 +15,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.fit import Fit, growth_cuts

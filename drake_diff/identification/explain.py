@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.identification.candidates import DELAY, LIMIT, LONGEST_DELAY, NO_PROMISE, Promise, View

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.files import make_folder, write_whole
-from drake_diff._base.untrusted import read_plain
+from drake_diff._base.files import make_folder, read_plain, write_whole
 from drake_diff.comparison.recordings import (
     ARRAYS,
     LARGEST,

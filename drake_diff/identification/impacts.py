@@ -23,7 +23,7 @@ import numpy as np
 from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_float
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE, Recording
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError, SimulationError

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.identification.unknowns import Unknowns
 
 PART = 0.03  # of the largest change in a combination: what is not told

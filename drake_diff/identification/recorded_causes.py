@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.untrusted import read_plain
+from drake_diff._base.files import read_plain
 from drake_diff.comparison.files import MOTION, PAGE, REPLAY, TRACE, hash_of_arrays, row_of
 from drake_diff.comparison.recordings import Recording, place_of, read_arrays
 from drake_diff.comparison.result import slug

@@ -20,7 +20,7 @@ from scipy.integrate import DOP853
 
 from drake_diff._base.arrays import Array, Indices, own_array, skew
 from drake_diff._base.compiled import kernel
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import Link, RigidLink, coordinates_of, read_links, springs_of

@@ -26,10 +26,9 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from drake_diff._base.files import whole_file
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.files import GIB, MIB, read_plain, whole_file
 from drake_diff._base.sandbox import check_memory
-from drake_diff._base.untrusted import GIB, MIB, read_plain
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 
 CHUNK_SIZE = 64 * 1024  # the most that is lost if a process is killed or a file damaged

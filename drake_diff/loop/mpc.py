@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError
 from drake_diff.loop.run import LATE, OK

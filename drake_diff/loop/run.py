@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_diff._base.arrays import LARGEST_SEED, Array, array_with_gaps, count, finite_array, frozen, positive_float
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import InputError, NonFiniteError, SimulationError, UnknownNameError
 from drake_diff.loop.parts import Actuator, Estimator, Fallback, Hold, Sensor
 from drake_diff.model.model import Model

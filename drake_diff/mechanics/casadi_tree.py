@@ -23,7 +23,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.clock import Pace, check_time
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.mechanics.description import Link, RigidLink, read_links, springs_of
 from drake_diff.mechanics.tree import Tree, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import ForceElementIndex, PrismaticSpring, RevoluteSpring, UniformGravityFieldElement
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.model.model import Model

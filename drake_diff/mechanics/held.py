@@ -18,7 +18,7 @@ from pydrake.autodiffutils import InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.mechanics.casadi_tree import SAME_PLANT, SymbolicTree, agrees
 from drake_diff.mechanics.symbol import Symbol, called, symbols
 from drake_diff.mechanics.tree import Tree, tree_for, tree_of

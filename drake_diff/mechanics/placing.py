@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from drake_diff._base.arrays import Array, Indices, cross, skew
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.mechanics.description import Link, RigidLink, read_links, without_welds
 from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model

@@ -32,7 +32,7 @@ from pydrake.math import RigidTransform
 
 from drake_diff._base.arrays import Array, Indices, own_array
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.mechanics import tree_kernel
 from drake_diff.mechanics.compiled_tree import CompiledTree, compile_links
 from drake_diff.mechanics.description import RigidLink, read_links, springs_of, without_welds

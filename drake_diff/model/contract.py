@@ -6,7 +6,7 @@ from typing import Any
 
 from pydrake.geometry import Role
 
-from drake_diff._base.jupyter import preformatted
+from drake_diff._base.values import preformatted
 from drake_diff.model.plant import PROXIMITY, actuators, bodies, joints, proximity_property
 from drake_diff.model.twin import Twin
 

@@ -19,7 +19,7 @@ from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_diff._base.arrays import finite_array, positive_float, seconds
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.model.contact_geometry import CONTACT_MODELS, ROUTES, replace_collision_geometry
 from drake_diff.model.contract import Contract, read_contract

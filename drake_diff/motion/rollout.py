@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import ContactPoint, contacts_of_the_step, penetration
 from drake_diff.model.model import Model

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_diff._base.arrays import Array, own_array
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import ModelError

@@ -36,7 +36,7 @@ from drake_diff._base.arrays import (
     positive_float,
     positive_int,
 )
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
 from drake_diff.model.model import Model

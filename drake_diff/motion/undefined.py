@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, positive_int
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.model import Model

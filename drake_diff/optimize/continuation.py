@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.clock import now, until_set
-from drake_diff._base.signals import noted_interrupts
+from drake_diff._base.clock import noted_interrupts, now, until_set
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.soft_contact import SoftContact, distances, separations, softened

@@ -14,10 +14,8 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
-from drake_diff._base.clock import StoppedError, now, until_set
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.pickling import PicklesItsFields
-from drake_diff._base.signals import noted_interrupts
+from drake_diff._base.clock import StoppedError, noted_interrupts, now, until_set
+from drake_diff._base.values import PicklesItsFields, ShowsItsRepr
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.optimize.certified import certify_equations

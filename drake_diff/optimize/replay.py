@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
 from drake_diff.model.contact import deepest_overlap, thinnest_geometry
 from drake_diff.model.model import Model

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.clock import StoppedError, TimeIsUpError, now, until, until_set
-from drake_diff._base.signals import noted_interrupts
+from drake_diff._base.clock import StoppedError, TimeIsUpError, noted_interrupts, now, until, until_set
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.certify import certify_steps
 from drake_diff.exceptions import GradientError, SimulationError

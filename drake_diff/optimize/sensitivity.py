@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.contact import active_modes
 from drake_diff.model.parameters import applied, select

@@ -13,9 +13,7 @@ import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.pickling import PicklesItsFields
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import PicklesItsFields, Refusal, ShowsItsRepr
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.parameters import ParameterVector, applied, select

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.optimize import messages
 from drake_diff.optimize.checks import PLAN, Check

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from drake_diff._base.untrusted import MOST_TEXT, read_plain
+from drake_diff._base.files import MOST_TEXT, read_plain
 from drake_diff.exceptions import ArtifactError
 from drake_diff.panels.panel_file import PanelTrial, canonical
 from drake_diff.panels.results import JOURNAL, SUMMARY, TABLE, ended_record, read_journal, write_table

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from drake_diff._base.files import doing, make_folder, write_whole
-from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import success_rate
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.pages.html import page_data, write_page
 from drake_diff.panels.panel_file import PanelTrial, Row, canonical, cell_name

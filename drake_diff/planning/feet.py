@@ -8,7 +8,7 @@ from pydrake.geometry import Sphere
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.model import Model
 from drake_diff.model.plant import FLOATING, bodies, joints, proximity_property

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.certificates.audit import audit
 from drake_diff.certificates.finding import Finding
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning, WriteError

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
 from drake_diff.model.model import Model, load_model

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.quantities import frame_position
 from drake_diff.model.step import advance, set_state

@@ -13,7 +13,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.step import linearize
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.contact import contacts_of_the_step

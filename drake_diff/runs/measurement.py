@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.model import Model

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, positive_float
-from drake_diff._base.files import write_whole
-from drake_diff._base.untrusted import arrays_of
+from drake_diff._base.files import arrays_of, write_whole
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model

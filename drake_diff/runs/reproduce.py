@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.untrusted import read_plain
+from drake_diff._base.files import read_plain
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, ModelError
 from drake_diff.model.model import Model
 from drake_diff.optimize.phased import PhasedSolution

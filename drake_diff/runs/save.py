@@ -14,8 +14,8 @@ from typing import Any, overload
 
 import numpy as np
 
+from drake_diff._base.clock import held_interrupts
 from drake_diff._base.files import make_folder, remove_folder
-from drake_diff._base.signals import held_interrupts
 from drake_diff.exceptions import ArtifactError, InputError, WriteError
 from drake_diff.optimize.checks import Check
 from drake_diff.optimize.messages import under

@@ -13,9 +13,8 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
-from drake_diff._base.files import make_folder, write_whole
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.untrusted import MOST_TEXT, json_of, read_plain
+from drake_diff._base.files import MOST_TEXT, json_of, make_folder, read_plain, write_whole
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError
 from drake_diff.runs.fields import DataBoundary, Embodiment, Fields, FileEvidence, ModelInput, Provenance, canonical
 from drake_diff.runs.provenance import file_evidence

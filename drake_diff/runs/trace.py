@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.channels import (

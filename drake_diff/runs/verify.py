@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from drake_diff._base.arrays import positive_float
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.files import MOST_READ, MOST_TEXT, files_in, read_plain, sha256_of
 from drake_diff._base.sandbox import Outcome, call
-from drake_diff._base.untrusted import MOST_READ, MOST_TEXT, files_in, read_plain, sha256_of
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, MissingDependencyError, ModelError
 from drake_diff.model.step import step
 from drake_diff.optimize.solution import Solution

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_diff._base.arrays import LARGEST_SEED, Array, count, positive_int
-from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import Rate, margin, success_rate
+from drake_diff._base.values import ShowsItsRepr
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError
 from drake_diff.loop.mpc import MPC

@@ -11,7 +11,7 @@ from pydrake.multibody.tree import PdControllerGains
 
 import drake_diff as dd
 from drake_diff._base.differences import sweep_of
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.certificates import certify_jacobian
 from drake_diff.certificates.certificate import judge
 from drake_diff.certificates.differences import look_around

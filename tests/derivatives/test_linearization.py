@@ -15,7 +15,7 @@ from helpers.table import each_row
 from pydrake.multibody.tree import RpyFloatingJoint
 
 import drake_diff as dd
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives import analytic
 from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified
 from drake_diff.derivatives.joint_impulses import NEAR_RIGID

@@ -14,7 +14,7 @@ from pydrake.multibody.tree import BodyIndex, PdControllerGains, SpatialInertia
 from scipy.optimize import bisect
 
 import drake_diff as dd
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives import joint_impulses, sources
 from drake_diff.derivatives import refine_step as refining
 from drake_diff.derivatives.contact import laws

@@ -37,7 +37,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial import ConvexHull
 
 import drake_diff as dd
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.mechanics import placing
 from drake_diff.mechanics.clearance import FromBall, FromBox, OfPairs, Swept, balls_of

@@ -15,7 +15,7 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.multibody.tree import QuaternionFloatingJoint
 
 import drake_diff as dd
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.mechanics import casadi_tree as symbolic_tree
 from drake_diff.mechanics.casadi_tree import PlantFunctions, symbolic_plant
 from drake_diff.model.equations import EquationsOfMotion

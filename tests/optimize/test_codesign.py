@@ -10,7 +10,7 @@ from helpers.plants import block, pd_pendulum, random_tree, springs_and_motors
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.mechanics.casadi_tree import symbolic_plant
 from drake_diff.model.parameters import ParameterCoordinates, applied, select

@@ -9,7 +9,7 @@ from helpers.plants import block
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 
 H, N = 0.1, 10
 EFFORT = dd.QuadraticCost(R=[[1.0]])

@@ -8,7 +8,7 @@ from helpers.robots import example_robot, state_in_contact, state_in_range
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.model.tangent import tangent_space

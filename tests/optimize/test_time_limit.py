@@ -12,9 +12,17 @@ import pytest
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, uncounted, until, until_set
+from drake_diff._base.clock import (
+    Pace,
+    StoppedError,
+    TimeIsUpError,
+    check_time,
+    noted_interrupts,
+    uncounted,
+    until,
+    until_set,
+)
 from drake_diff._base.compiled import time_compilations
-from drake_diff._base.signals import noted_interrupts
 from drake_diff.model import twin
 from drake_diff.optimize import run
 from drake_diff.optimize.program import Watch

@@ -8,7 +8,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 import drake_diff as dd
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError
 from drake_diff.model.contact import contacts_of_the_step, deepest_overlap, thinnest_geometry
 from drake_diff.model.step import advance

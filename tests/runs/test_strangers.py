@@ -19,9 +19,9 @@ from helpers.models import ROOT
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base import untrusted
+from drake_diff._base import files as untrusted
+from drake_diff._base.files import arrays_of, files_in, read_plain
 from drake_diff._base.sandbox import memory_at_most
-from drake_diff._base.untrusted import arrays_of, files_in, read_plain
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.mcap_file import read_mcap, recover_mcap
 from drake_diff.runs import list_runs

@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 from mcap.reader import make_reader
 
 import drake_diff as dd
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.certificates import certify_jacobian
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs import read_mcap

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, cross, own_array
 from drake_diff._base.compiled import kernel
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives import joint_impulses
 from drake_diff.derivatives.contact import laws
 from drake_diff.derivatives.contact.active_contacts import AllPairs, Placed, read_all_pairs, topology_of

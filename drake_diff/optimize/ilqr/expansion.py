@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.steps import known_steps
 from drake_diff.model.parameters import select

@@ -16,8 +16,7 @@ from functools import cache
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.clock import TimeIsUpError, now, until_set
-from drake_diff._base.signals import noted_interrupts
+from drake_diff._base.clock import TimeIsUpError, noted_interrupts, now, until_set
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS

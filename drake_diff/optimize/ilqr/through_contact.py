@@ -16,8 +16,7 @@ from pydrake.autodiffutils import ExtractValue
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
-from drake_diff._base.clock import now
-from drake_diff._base.signals import noted_interrupts
+from drake_diff._base.clock import noted_interrupts, now
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.soft_contact import Separation, distances, separations

@@ -9,7 +9,7 @@ from pydrake.autodiffutils import InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.model.model import Model
 from drake_diff.model.quantities import frame_position, frame_velocity

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, positive_float
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.mechanics.clearance import Clearance, FromBall, FromBox, OfPairs, Swept
 from drake_diff.mechanics.cover import Piece, cover_of

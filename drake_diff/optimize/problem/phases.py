@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.pickling import PicklesItsFields
+from drake_diff._base.values import PicklesItsFields, ShowsItsRepr
 from drake_diff.exceptions import InputError
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import TimedCost

@@ -19,8 +19,7 @@ from drake_diff._base.arrays import (
     positive_float,
     seconds,
 )
-from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff._base.pickling import PicklesItsFields
+from drake_diff._base.values import PicklesItsFields, ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import (
     ConstantCost,

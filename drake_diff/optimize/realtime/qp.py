@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.steps import Flags
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 

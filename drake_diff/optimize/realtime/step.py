@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.step import linearize
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.model import Model

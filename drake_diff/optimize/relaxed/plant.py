@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, Indices, cross, own_array, skew
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.contact.active_contacts import (
     ContactPairs,
     Contacts,

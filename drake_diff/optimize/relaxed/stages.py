@@ -12,7 +12,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.clock import TimeIsUpError
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.plant import bodies

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 
 ROUNDS = 3
 ALIKE, CHANGE, MOMENT, NEAR = (

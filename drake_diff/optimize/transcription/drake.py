@@ -16,8 +16,7 @@ from pydrake.solvers import MathematicalProgram, SnoptSolver, SolutionResult
 
 from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff._base.autodiff import chain
-from drake_diff._base.clock import TimeIsUpError, check_time, now, until_set
-from drake_diff._base.signals import noted_interrupts
+from drake_diff._base.clock import TimeIsUpError, check_time, noted_interrupts, now, until_set
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 from drake_diff.model.equations import ContinuousSystem, EquationsOfMotion
 from drake_diff.optimize.problem.cost import QuadraticCost, differentiate_cost, differentiate_final_cost

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
 from drake_diff.mechanics.held import HeldPlant
 from drake_diff.mechanics.symbol import Symbol, symbols

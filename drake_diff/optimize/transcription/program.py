@@ -18,8 +18,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
-from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, now, until_set
-from drake_diff._base.signals import noted_interrupts
+from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, noted_interrupts, now, until_set
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,

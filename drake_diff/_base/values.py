@@ -1,8 +1,9 @@
-"""Values that pickle by their fields, with the functions in them: lambdas, closures, what a script defines."""
+"""Results: how they pickle, show in Jupyter, and say that what was asked for is not possible."""
 
 import pickle
 from contextvars import ContextVar
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from html import escape
 from typing import Any, TypeVar
 
 import cloudpickle
@@ -50,3 +51,31 @@ def _check(name: str, value: Any) -> None:
         cloudpickle.dumps(value)
     except Exception as error:
         raise InputError(name, got=f"{value!r:.80}: {error}", expected="what can be pickled") from error
+
+
+BETWEEN_WORDS = "white-space: pre-wrap; word-break: normal; overflow-wrap: anywhere"  # JupyterLab breaks inside them
+
+
+def preformatted(text: str) -> str:
+    """`text` as HTML, line by line as it is; what is too long for the page goes on in the next line."""
+    return f'<pre style="{BETWEEN_WORDS}">{escape(text)}</pre>'
+
+
+class ShowsItsRepr:
+    """Shows in Jupyter what `repr` gives."""
+
+    def _repr_html_(self) -> str:
+        return preformatted(repr(self))
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Returned in place of a result that cannot be had; the caller takes another way and can say why.
+
+    A function that may refuse returns `Result | Refusal`, and its caller asks `isinstance(found, Refusal)`.
+    """
+
+    reason: str  # a sentence without its full stop: "joint elbow is of type planar"
+
+    def __str__(self) -> str:
+        return self.reason
