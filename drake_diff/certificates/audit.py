@@ -18,14 +18,23 @@ from pydrake.multibody.plant import ContactModel, DiscreteContactApproximation
 from pydrake.multibody.tree import FixedOffsetFrame, WeldJoint
 
 from drake_diff._base.arrays import Array
-from drake_diff.certificates.audit_model import FILE_CHECKS
-from drake_diff.certificates.finding import PARALLEL, SEVERITIES, Collider, Finding, Findings, Pair, Place, Severity
+from drake_diff.certificates.finding import (
+    FILE_CHECKS,
+    PARALLEL,
+    SEVERITIES,
+    Collider,
+    Finding,
+    Findings,
+    Pair,
+    Place,
+    Severity,
+)
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
 from drake_diff.model.contact_geometry import MEETS_A_SPHERE
 from drake_diff.model.file_facts import Mimic
 from drake_diff.model.model import Model
-from drake_diff.model.parameter_kinds import IDENTITY_OFFSET
+from drake_diff.model.parameters import IDENTITY_OFFSET
 from drake_diff.model.plant import PROXIMITY, actuators, instances, joints
 from drake_diff.model.step import advance, check_point, set_state
 

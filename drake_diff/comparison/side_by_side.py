@@ -33,8 +33,7 @@ from drake_diff.engines.load import ELSEWHERE, ENGINES, load_spec
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
-from drake_diff.model.sampling import sample_states
-from drake_diff.model.tangent import tangent_space
+from drake_diff.model.tangent import sample_states, tangent_space
 from drake_diff.motion.rollout import check_inputs
 
 DURATION, MOST_STEPS = 1.0, 500  # [s]; of a motion that is not given

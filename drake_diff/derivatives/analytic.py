@@ -25,9 +25,9 @@ from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
 from drake_diff.mechanics.compiled_tree import CompiledTree, compiled_tree
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
-from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select, write_autodiff
+from drake_diff.model.repairs import Coupling
 from drake_diff.model.step import advance, set_state
 
 # Of the largest entry: two derivatives of one smooth step differ by rounding, which a mass matrix may magnify.

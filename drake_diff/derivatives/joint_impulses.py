@@ -31,9 +31,9 @@ from pydrake.multibody.tree import MultibodyForces
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.values import Refusal
-from drake_diff.model.mimic import joints_of_mimics
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
+from drake_diff.model.repairs import joints_of_mimics
 
 NEAR_RIGID = 0.1**2 / (4 * np.pi**2)
 LIMIT_STIFFNESS = 1e12  # Drake's [N/m or N m/rad]

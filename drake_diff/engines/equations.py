@@ -23,7 +23,7 @@ from drake_diff.exceptions import InputError, NotOfferedError, SimulationError, 
 from drake_diff.mechanics.coordinates import euler_step
 from drake_diff.mechanics.description import JointContract, coordinates_of
 from drake_diff.model.model import Model
-from drake_diff.model.sampling import sample_states
+from drake_diff.model.tangent import sample_states
 
 EXPLICIT, RK4 = "semi-implicit Euler, joint damping explicit, q' = q + h N(q) v'", "Runge-Kutta of order 4"
 INTEGRATORS: Mapping[str, str] = {"drake": DRAKES_STEP, "semi-implicit Euler": EXPLICIT, "RK4": RK4}

@@ -12,8 +12,8 @@ from drake_diff._base.arrays import Array
 from drake_diff.engines.interface import Engine, EngineContract, EulerEngine, float_rows
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, UnknownNameError
 from drake_diff.mechanics.description import coordinates_of
-from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
+from drake_diff.model.repairs import Coupling
 
 ENGINES = {
     "numpy": ("engines.closed_form", "NumpyEngine"),

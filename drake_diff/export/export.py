@@ -37,8 +37,7 @@ from drake_diff.exceptions import (
 )
 from drake_diff.mechanics.description import Description, Follower, describe_whole
 from drake_diff.model.model import Model, load_model
-from drake_diff.model.sampling import ATTEMPTS, DEPTH, EFFORT, REACH, SPEED, sample_states
-from drake_diff.model.tangent import tangent_space
+from drake_diff.model.tangent import ATTEMPTS, DEPTH, EFFORT, REACH, SPEED, sample_states, tangent_space
 
 # What Drake does not read in a format, or it cannot say: contract.json has it, as the README tells.
 IN_THE_CONTRACT = {

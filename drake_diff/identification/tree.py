@@ -25,9 +25,9 @@ from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import Link, RigidLink, coordinates_of, read_links, springs_of
 from drake_diff.mechanics.tree import tree_of
-from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators
+from drake_diff.model.repairs import Coupling
 
 KERNEL = "drake_diff.identification.kernel"
 FRICTION = "drake_diff.identification.coulomb_friction"

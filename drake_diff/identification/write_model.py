@@ -17,9 +17,9 @@ from drake_diff._base.files import write_whole
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
 from drake_diff.identification.identify import Asked, Identification
 from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, INERTIA, MASS, STRENGTH
+from drake_diff.model.load_file import add_packages
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.parameters import applied, list_parameters, select
-from drake_diff.model.robot_text import add_packages
 from drake_diff.model.xml_text import Element, XmlText
 
 BODY = (MASS, CENTER, INERTIA)

@@ -18,9 +18,9 @@ from pydrake.math import RigidTransform
 from drake_diff._base.arrays import Array, Indices, cross, skew
 from drake_diff._base.values import Refusal
 from drake_diff.mechanics.description import Link, RigidLink, read_links, without_welds
-from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
+from drake_diff.model.repairs import Coupling
 from drake_diff.model.step import set_state
 
 X, Y, Z = np.eye(3)

@@ -36,9 +36,9 @@ from drake_diff._base.values import Refusal
 from drake_diff.mechanics import tree_kernel
 from drake_diff.mechanics.compiled_tree import CompiledTree, compile_links
 from drake_diff.mechanics.description import RigidLink, read_links, springs_of, without_welds
-from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
+from drake_diff.model.repairs import Coupling
 from drake_diff.model.step import set_state
 
 SAME_TREE = 1e-11  # of the largest entry: these formulas and AutoDiffXd differ by rounding

@@ -3,19 +3,25 @@
 In point contact the AutoDiffXd step takes a sphere against a sphere, box, cylinder, capsule or half space and nothing
 else. One other pair whose bounding boxes meet is enough for the whole step to throw, so there are routes around such
 pairs, chosen before the plant is finalized.
+
+Here are also the distance of shapes from a half space, which Drake does not compute, and the pairs of shapes that
+overlap wherever the joints are, such as the cover of a joint: their contact pushes in every step.
 """
 
+from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 from pydrake import geometry as pg
-from pydrake.math import RigidTransform
+from pydrake.geometry import Box, Capsule, Convex, Cylinder, Ellipsoid, HalfSpace, Mesh
+from pydrake.math import RigidTransform, sqrt
 from pydrake.multibody.plant import ContactModel, MultibodyPlant
+from pydrake.systems.framework import Diagram
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.model.plant import bodies
+from drake_diff.model.plant import bodies, joints
 
 ROUTES = ("corner_spheres", "hydroelastic", "differences")
 CORNER_RADIUS = 0.05  # of a corner sphere [1], relative to the smallest edge: small enough to leave the shape its size
@@ -183,3 +189,139 @@ def _taken(properties: pg.ProximityProperties, name: str, default: float) -> flo
     value = float(properties.GetPropertyOrDefault("hydroelastic", name, default))
     properties.RemoveProperty("hydroelastic", name)
     return value
+
+
+@dataclass(frozen=True, eq=False)
+class ClosestPoints:
+    """As Drake's SignedDistancePair: of the geometries A and B, of floats or AutoDiffXd."""
+
+    id_A: Any
+    id_B: Any
+    p_ACa: Any  # (3,) the closest point of A, in its own frame [m]
+    p_BCb: Any
+    distance: Any  # [m], signed
+    nhat_BA_W: Any  # (3,)
+
+
+def from_half_space(query: Any, ids: tuple[Any, Any]) -> ClosestPoints | None:
+    """Of a half space and a box, capsule, cylinder, ellipsoid or mesh's hull; None where Drake is to be asked."""
+    inspector = query.inspector()
+    shapes = [inspector.GetShape(i) for i in ids]
+    grounds = [i for i, shape in enumerate(shapes) if isinstance(shape, HalfSpace)]
+    if len(grounds) != 1:
+        return None
+    ground, other = ids[grounds[0]], ids[1 - grounds[0]]
+    X_WG, X_WO = query.GetPoseInWorld(ground), query.GetPoseInWorld(other)
+    up = X_WG.rotation().matrix()[:, 2]
+    low = _furthest(shapes[1 - grounds[0]], -(X_WO.rotation().matrix().T @ up))
+    if low is None:
+        return None
+    from_ground = X_WG.rotation().matrix().T @ (
+        X_WO.rotation().matrix() @ low + X_WO.translation() - X_WG.translation()
+    )
+    distance = from_ground[2]
+    below = np.array([from_ground[0], from_ground[1], 0 * distance])
+    if grounds[0] == 0:
+        return ClosestPoints(ground, other, below, low, distance, -up)
+    return ClosestPoints(other, ground, low, below, distance, up)
+
+
+def _furthest(shape: Any, along: Any) -> Any:
+    """(3,) the point of a shape, in its frame, that is furthest along a unit vector; None of a shape not known here."""
+    if isinstance(shape, Box):
+        return np.where(along > 0, 1, -1) * (np.array(shape.size()) / 2)
+    if isinstance(shape, Capsule | Cylinder):
+        end = np.array([0, 0, shape.length() / 2 if along[2] > 0 else -shape.length() / 2])
+        if isinstance(shape, Capsule):
+            return end + shape.radius() * along
+        across = along * np.array([1, 1, 0])
+        size = across @ across
+        return end + (shape.radius() / sqrt(size) * across if size > 0 else 0)
+    if isinstance(shape, Ellipsoid):
+        half = np.array([shape.a(), shape.b(), shape.c()])
+        return half**2 * along / sqrt(np.sum((half * along) ** 2))
+    if isinstance(shape, Convex | Mesh):
+        hull = shape.GetConvexHull()
+        vertices = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+        return vertices[np.argmax(vertices @ along)]
+    return None
+
+
+POSTURES = 100  # beside the default one
+FIRST = 10  # of them, in which a pair has to overlap once
+FLUSH = 1e-9  # [m]
+REACH = 4.0  # [m or rad] of a joint without limits, and of a free body
+TOLD = 6  # pairs of links named in a sentence
+Pairs = tuple[tuple[Any, Any], ...]
+
+
+def inseparable_pairs(plant: MultibodyPlant, diagram: Diagram) -> Pairs:
+    """The pairs of geometries that overlap at the default positions and in 100 seeded postures within the limits.
+
+    What is flush counts, as there rounding decides. Joints that follow others move freely here, and free bodies are
+    anywhere. Raises ModelError where Drake cannot tell what overlaps.
+    """
+    root, random = diagram.CreateDefaultContext(), np.random.default_rng(0)
+    context, port = plant.GetMyMutableContextFromRoot(root), plant.get_geometry_query_input_port()
+    if not port.HasValue(context):
+        return ()
+    postures = [plant.GetPositions(context)] + [_posture(plant, random) for _ in range(POSTURES)]
+    pairs: set[tuple[Any, Any]] = set()
+    for k, q in enumerate([*postures[:FIRST], *postures]):
+        plant.SetPositions(context, q)
+        query = port.Eval(context)
+        try:
+            here = {tuple(sorted((contact.id_A, contact.id_B))) for contact in query.ComputePointPairPenetration()}
+        except RuntimeError as error:
+            raise ModelError(f"Drake cannot tell which shapes overlap: {error}") from error
+        pairs = pairs | here if k < FIRST else {pair for pair in pairs if pair in here or _are_flush(query, *pair)}
+        if not pairs and k >= FIRST:
+            break
+    return tuple(sorted(pairs))
+
+
+def _are_flush(query: Any, a: Any, b: Any) -> bool:
+    """Whether two geometries that do not overlap touch, to rounding; no where Drake does not measure such shapes."""
+    try:
+        return bool(query.ComputeSignedDistancePairClosestPoints(a, b).distance <= FLUSH)
+    except RuntimeError:
+        return False
+
+
+def _posture(plant: MultibodyPlant, random: np.random.Generator) -> Array:
+    """(nq,) positions within the limits; quaternions of unit norm."""
+    lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
+    middle = np.clip(0.0, lower, upper)
+    lower, upper = np.maximum(lower, middle - REACH), np.minimum(upper, middle + REACH)
+    q = np.array(random.uniform(lower, upper))
+    for joint in joints(plant):
+        if joint.type_name() == "quaternion_floating":
+            start = joint.position_start()
+            q[start : start + 4] = random.standard_normal(4)
+            q[start : start + 4] /= np.linalg.norm(q[start : start + 4])
+    return q
+
+
+def links_of(plant: MultibodyPlant, scene_graph: pg.SceneGraph, pairs: Pairs) -> str:
+    """The links of the pairs, for a sentence: each two once, and how many more there are."""
+    inspector = scene_graph.model_inspector()
+    names = (
+        " - ".join(sorted(str(plant.GetBodyFromFrameId(inspector.GetFrameId(g)).name()) for g in pair))
+        for pair in pairs
+    )
+    links = list(dict.fromkeys(names))
+    return ", ".join(links[:TOLD]) + (f" and {len(links) - TOLD} more" if len(links) > TOLD else "")
+
+
+def touch_what_can_separate(plant: MultibodyPlant, scene_graph: pg.SceneGraph, diagram: Diagram) -> tuple[str, ...]:
+    """Filter what overlaps in every posture; to be called when the diagram is built, before it has contexts in use."""
+    pairs = inseparable_pairs(plant, diagram)
+    for a, b in pairs:
+        apart = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet([a]), pg.GeometrySet([b]))
+        scene_graph.collision_filter_manager().Apply(apart)
+    if not pairs:
+        return ()
+    number = f"{len(pairs)} pairs of shapes pass" if len(pairs) > 1 else "One pair of shapes passes"
+    return (
+        f"{number} through each other, as they overlap wherever the joints are: {links_of(plant, scene_graph, pairs)}.",
+    )

@@ -19,9 +19,16 @@ from pydrake.multibody.parsing import PackageMap
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_diff.exceptions import ModelError
-from drake_diff.model.robot_text import DOWNLOADED
-from drake_diff.model.sphere_fit import Spheres, fit_spheres
-from drake_diff.model.triangles import OF_MUJOCO, READ_BY_TRIMESH, Hull, as_obj, hull_of_file, read_mesh
+from drake_diff.model.triangles import (
+    OF_MUJOCO,
+    READ_BY_TRIMESH,
+    Hull,
+    Spheres,
+    as_obj,
+    fit_spheres,
+    hull_of_file,
+    read_mesh,
+)
 from drake_diff.model.xml_text import Element, XmlText
 
 TREATMENTS = ("skip", "convex", "spheres")
@@ -31,6 +38,7 @@ PLACEHOLDER = 1.2345678e-9  # [m] the radius of the first; no file has such a sp
 MOST_TOLD = 12  # in a note; links with the same file and scale count once
 
 Scale = tuple[float, float, float]
+DOWNLOADED = "drake_models"  # the package that Drake would fetch over the network
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,17 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from drake_diff._base.arrays import finite_array, positive_float, seconds
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
-from drake_diff.model.contact_geometry import CONTACT_MODELS, ROUTES, replace_collision_geometry
+from drake_diff.model.contact_geometry import (
+    CONTACT_MODELS,
+    ROUTES,
+    replace_collision_geometry,
+    touch_what_can_separate,
+)
 from drake_diff.model.contract import Contract, read_contract
 from drake_diff.model.file_facts import FileFacts, Mimic, file_facts
 from drake_diff.model.inputs import TIMES, BodyForce, add_body_forces, check_body_forces, read_inputs
 from drake_diff.model.load_file import DRAKES_REFUSALS, as_packages, read_into
 from drake_diff.model.meshes import TREATMENTS
-from drake_diff.model.mimic import Coupling, check_mimic, couple, coupling_of, fix_mimics, still_moving, uncoupled
 from drake_diff.model.plant import (
     actuators,
     follow,
@@ -37,6 +41,7 @@ from drake_diff.model.plant import (
     scene_graph_beside,
 )
 from drake_diff.model.repairs import (
+    Coupling,
     add_actuators,
     add_ground,
     add_springs,
@@ -44,15 +49,19 @@ from drake_diff.model.repairs import (
     as_ground,
     as_names,
     check_contact,
+    check_mimic,
+    couple,
+    coupling_of,
     fix,
+    fix_mimics,
     hold_base,
+    still_moving,
     take_away_contact,
     touch_the_world_alone,
+    uncoupled,
     weld_link,
 )
-from drake_diff.model.separable import touch_what_can_separate
-from drake_diff.model.threads import OfThread, SharedPlant
-from drake_diff.model.twin import AddedForce, Twin
+from drake_diff.model.twin import AddedForce, OfThread, SharedPlant, Twin
 
 T = TypeVar("T")
 CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")

@@ -1,9 +1,13 @@
-"""One scalar type of a model: its diagram, its plant, the context that is kept and reused, and forces added to them."""
+"""One scalar type of a model: its diagram, plant, context and added forces; and what threads share of a model."""
 
+import threading
+from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import get_ident
 from typing import Any, Protocol
+from weakref import WeakSet
 
 import numpy as np
 from pydrake.multibody.tree import MultibodyForces_
@@ -12,8 +16,8 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.clock import check_time
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.inputs import Inputs
-from drake_diff.model.mimic import Coupling
 from drake_diff.model.plant import actuators, bodies, instances, joints, labelled
+from drake_diff.model.repairs import Coupling
 
 
 class AddedForce(Protocol):
@@ -297,3 +301,57 @@ class Twin:
             self.added.clear()
             port = self.plant.get_applied_generalized_force_input_port()
             port.FixValue(self.context, np.zeros(self.plant.num_velocities()).astype(self.scalar))
+
+
+REMEDY = "which Drake keeps in the plant, not in a context: load a model of its own for each thread"
+
+
+class OfThread(threading.local):
+    """What a model keeps for one thread: a context holds one state, and so does much that is made of it.
+
+    Nobody else sees it, so that threads which share a model cannot read each other's states. It ends with its thread.
+    """
+
+    def __init__(self) -> None:
+        self.double: Twin | None = None
+        self.autodiff: Twin | None = None
+        self.cache: dict[Hashable, Any] = {}
+        # What parameters in the contexts are, for the time being, not the model's own: see `parameters.applied`.
+        self.other_quantities: frozenset[str] = frozenset()
+        self.applied: Any = None  # the ParameterVector that is applied, if one is
+
+
+class SharedPlant:
+    """Which threads have contexts of one plant, and whether one of them has changed the plant itself."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self._users: WeakSet[threading.Thread] = WeakSet()
+        self._changed: tuple[threading.Thread, str] | None = None  # by whom, and what
+
+    def enter(self) -> None:
+        """Before a thread makes a context. ModelError where another one has changed the plant."""
+        me = threading.current_thread()
+        with self.lock:
+            if self._changed is not None and self._changed[0] is not me:
+                thread, names = self._changed
+                raise ModelError(f"another thread ({thread.name}) has set {names} of this model, {REMEDY}")
+            self._users.add(me)
+
+    @contextmanager
+    def changed(self, names: str) -> Iterator[None]:
+        """For as long as the parameters `names` are written into the plant itself.
+
+        Raises ModelError where another thread uses the plant; until the end no other one may begin to.
+        """
+        me = threading.current_thread()
+        with self.lock:
+            others = [thread.name for thread in self._users if thread is not me and thread.is_alive()]
+            if others:
+                raise ModelError(f"another thread ({others[0]}) uses this model: none may set {names}, {REMEDY}")
+            outer, self._changed = self._changed, (me, names)
+        try:
+            yield
+        finally:
+            with self.lock:
+                self._changed = outer

@@ -17,8 +17,8 @@ from drake_diff.exceptions import ModelError
 from drake_diff.mechanics import tree_kernel
 from drake_diff.mechanics.compiled_tree import compiled_tree
 from drake_diff.mechanics.description import describe_tree
-from drake_diff.model.counted import stepped
 from drake_diff.model.model import Model
+from drake_diff.model.step import stepped
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.clock import noted_interrupts, now, until_set
 from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.model.contact import thinnest_geometry
-from drake_diff.model.soft_contact import SoftContact, distances, separations, softened
+from drake_diff.model.contact import SoftContact, distances, separations, softened, thinnest_geometry
 from drake_diff.model.step import set_state
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr

@@ -31,10 +31,10 @@ from pydrake.multibody.tree import (
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
+from drake_diff.model.contact import distances
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.plant import bodies, joints
-from drake_diff.model.soft_contact import distances
 from drake_diff.model.step import set_state
 from drake_diff.motion.continuous import ContinuousMotion
 from drake_diff.motion.loss import Totals, accumulate

@@ -12,9 +12,8 @@ import numpy as np
 from drake_diff._base.arrays import LARGEST_SEED, count, positive_float, positive_int
 from drake_diff._base.clock import now, uncounted
 from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError, UnknownNameError
-from drake_diff.model.contact import penetration
+from drake_diff.model.contact import SoftContact, penetration
 from drake_diff.model.parameters import applied
-from drake_diff.model.soft_contact import SoftContact
 from drake_diff.model.step import set_state
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.rollout import CONTINUOUS

@@ -17,8 +17,8 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import active_modes
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, select
-from drake_diff.model.sampling import SampledState, sample_states
 from drake_diff.model.step import advance
+from drake_diff.model.tangent import SampledState, sample_states
 from drake_diff.runs.directory import written_whole
 from drake_diff.runs.fields import evidence
 from drake_diff.runs.plan_record import (

@@ -22,13 +22,12 @@ import numpy as np
 from drake_diff.certificates.certificate import VERDICTS, Certificate
 from drake_diff.exceptions import ModelError
 from drake_diff.model.contract import Contract, CoordinateTerms, JointTerms
+from drake_diff.model.file_facts import with_includes
 from drake_diff.model.inputs import BodyForce
-from drake_diff.model.load_file import FORMATS
+from drake_diff.model.load_file import FORMATS, files_of_directives, package_above
 from drake_diff.model.meshes import in_any_case
-from drake_diff.model.mjcf import with_includes
 from drake_diff.model.model import Model
 from drake_diff.model.plant import FLOATING
-from drake_diff.model.robot_text import files_of_directives, package_above
 from drake_diff.model.xml_text import XmlText
 from drake_diff.runs.fields import Certified, Drive, Embodiment, FileEvidence, ModelInput, Provenance
 

@@ -20,9 +20,9 @@ import numpy as np
 from drake_diff._base.arrays import Array, positive_float
 from drake_diff._base.files import arrays_of, write_whole
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
+from drake_diff.model.contact import SoftContact
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
-from drake_diff.model.soft_contact import SoftContact
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.solution import Search, Solution, Status

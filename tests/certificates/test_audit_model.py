@@ -12,7 +12,7 @@ from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.certificates.audit_model import FILE_CHECKS
+from drake_diff.certificates.finding import FILE_CHECKS
 
 CODES = [
     "no_actuator",

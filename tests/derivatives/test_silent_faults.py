@@ -45,7 +45,7 @@ def test_the_derivative_by_an_identity_offset_is_kept():
 
 
 def test_the_derivative_that_drake_drops_at_an_identity_offset_is_caught(monkeypatch):
-    monkeypatch.setattr("drake_diff.model.parameter_kinds.IDENTITY_OFFSET", 0.0)
+    monkeypatch.setattr("drake_diff.model.parameters.IDENTITY_OFFSET", 0.0)
     certificate = certify_offset()
     assert certificate.verdict == "disagree"
     assert certificate.worst.column.startswith("second.offset")

@@ -25,7 +25,7 @@ from drake_diff.exceptions import CertificateError, InputError, ModelError, Mode
 from drake_diff.export import export
 from drake_diff.export.export import check_small_models, complaints, export_model, written
 from drake_diff.mechanics.description import describe, describe_whole
-from drake_diff.model.sampling import sample_states
+from drake_diff.model.tangent import sample_states
 
 FILES = {"contract.json", "initial_states.csv", "inputs.csv", "README.md"}
 MODEL_FILE = {

@@ -46,7 +46,7 @@ from drake_diff.mechanics.description import read_links
 from drake_diff.mechanics.distance import along_segment, along_segments, length, to_box
 from drake_diff.mechanics.placing import placing_of
 from drake_diff.model.parameters import applied, select
-from drake_diff.model.sampling import any_state
+from drake_diff.model.tangent import any_state
 
 ROBOTS = ("ur5_robot.urdf", "panda.urdf", "a1.urdf")  # hinges; hinges and slides; a free base
 CLOSED = 1e-9  # [m] of metres: closed forms on both sides

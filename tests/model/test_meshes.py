@@ -14,8 +14,7 @@ from pydrake.geometry import CalcVolume, Convex, Role, Sphere
 import drake_diff as dd
 from drake_diff.exceptions import ModelError, ModelWarning, SimulationError
 from drake_diff.model import triangles
-from drake_diff.model.sphere_fit import MOST_SPHERES, fit_spheres
-from drake_diff.model.triangles import MOST_CORNERS, hull_of, read_mesh
+from drake_diff.model.triangles import MOST_CORNERS, MOST_SPHERES, fit_spheres, hull_of, read_mesh
 
 EDGES = np.array([0.2, 0.3, 0.5])
 ROUNDING = 1e-6  # the numbers of an STL have 32 bits, and pycollada keeps those of a DAE so
@@ -250,7 +249,7 @@ def bodies_of(model):
 def test_the_same_file_gives_the_same_bytes_in_another_process(tmp_path):
     code = (
         "import sys; from pathlib import Path; from drake_diff.model.triangles import *\n"
-        "from drake_diff.model.sphere_fit import fit_spheres\n"
+        "from drake_diff.model.triangles import fit_spheres\n"
         "h = hull_of_file(Path(sys.argv[1]), (1.0, 1.0, 1.0)); s = fit_spheres(h, 'x')\n"
         "print(h.corners.tobytes().hex(), s.centres.tobytes().hex(), s.radius)"
     )

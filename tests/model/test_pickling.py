@@ -13,7 +13,7 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff import exceptions
 from drake_diff.exceptions import InputError, ModelError, NonFiniteError, ShapeError, UnknownNameError
-from drake_diff.model.soft_contact import SoftContact, softened
+from drake_diff.model.contact import SoftContact, softened
 
 SECONDS = 120  # a pool that waits for ever fails here
 GIVEN = {

@@ -5,7 +5,7 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
-from drake_diff.model.separable import inseparable_pairs
+from drake_diff.model.contact_geometry import inseparable_pairs
 from drake_diff.model.step import set_state
 
 # Three links in a row, hinged about z. On the last is a ball that always overlaps the first one's disc, a second that

@@ -12,7 +12,7 @@ from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
-from drake_diff.model.soft_contact import separations
+from drake_diff.model.contact import separations
 from drake_diff.model.step import set_state
 
 SOFT = dd.model.SoftContact(0.05, 200.0)

@@ -8,7 +8,7 @@ from helpers.problems import push
 from helpers.table import each_row, slow_after
 
 import drake_diff as dd
-from drake_diff.model.soft_contact import separations
+from drake_diff.model.contact import separations
 from drake_diff.model.step import set_state
 from drake_diff.optimize.ilqr.through_contact import MARGIN, beginnings, restore_goal
 from drake_diff.optimize.shooting import ShootingVariables

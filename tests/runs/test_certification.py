@@ -14,8 +14,8 @@ import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import InputError, ModelWarning
 from drake_diff.model.contact import penetration
-from drake_diff.model.sampling import sample_states
 from drake_diff.model.step import set_state
+from drake_diff.model.tangent import sample_states
 from drake_diff.runs import PlanRecord, certify_model
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
@@ -77,7 +77,7 @@ def test_a_model_that_cannot_touch_is_sampled_in_free_motion(load):
 
 
 def test_a_wrong_derivative_fails_the_model(load, monkeypatch):
-    monkeypatch.setattr("drake_diff.model.parameter_kinds.IDENTITY_OFFSET", 0.0)
+    monkeypatch.setattr("drake_diff.model.parameters.IDENTITY_OFFSET", 0.0)
 
     record = certify_model(offset_pendulum(), states=4, parameters=("second.offset",))
     assert record.verdict == "fail"

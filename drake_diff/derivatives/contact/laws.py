@@ -37,8 +37,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices, own_array
 from drake_diff._base.compiled import kernel
 from drake_diff.derivatives.contact.active_contacts import AllPairs, ContactPairs
-from drake_diff.model.parameter_kinds import geometries_of
-from drake_diff.model.parameters import ParameterVector
+from drake_diff.model.parameters import ParameterVector, geometries_of
 from drake_diff.model.plant import proximity_property
 from drake_diff.model.twin import Twin
 

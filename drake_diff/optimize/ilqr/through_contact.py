@@ -18,8 +18,8 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
 from drake_diff._base.clock import noted_interrupts, now
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
+from drake_diff.model.contact import Separation, distances, separations
 from drake_diff.model.model import Model
-from drake_diff.model.soft_contact import Separation, distances, separations
 from drake_diff.model.step import advance, set_state
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr

@@ -18,8 +18,8 @@ from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
 from drake_diff.mechanics.tree import tree_for
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
-from drake_diff.model.parameter_kinds import CONTACT_KINDS
 from drake_diff.model.parameters import (
+    CONTACT_KINDS,
     ParameterCoordinates,
     ParameterVector,
     applied,

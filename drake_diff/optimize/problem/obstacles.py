@@ -21,7 +21,7 @@ from drake_diff.mechanics.cover import Piece, cover_of
 from drake_diff.mechanics.placing import Placing, placing_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
-from drake_diff.model.sampling import any_state
+from drake_diff.model.tangent import any_state
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, checked_weight, name_of, rotation_of
