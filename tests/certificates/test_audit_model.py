@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from helpers.models import MODELS
 from helpers.table import each_row
 
@@ -80,16 +79,17 @@ GRASP = (
 
 def audited(tmp_path, text, **options):
     """What the audit of that file says, by its codes."""
+    from trimesh import creation  # takes long to import
+
     name = {"<r": "m.urdf", "<s": "m.sdf", "<m": "m.xml"}[text[:2]]
     (tmp_path / name).write_text(text)
-    CUBE.export(tmp_path / "hand.STL")
+    creation.box((0.06, 0.06, 0.06)).export(tmp_path / "hand.STL")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model = dd.load_model(tmp_path / name, **{"time_step": 0.01, **options})
     return {finding.code: finding for finding in dd.audit(model)}
 
 
-CUBE = trimesh.creation.box((0.06, 0.06, 0.06))
 PACKAGE = Path(dd.__file__).parent
 MESH = '<{}><geometry><mesh filename="hand.{}"/></geometry></{}>'
 # The code, the severity, the file and options in which it is found, words of it, and what mends it.

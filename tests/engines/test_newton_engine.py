@@ -6,7 +6,7 @@ All are slow: the first to ask builds Newton's kernels, half a minute on an empt
 import numpy as np
 import pytest
 from helpers.contracts import different
-from helpers.engines import free_state, on_tangent
+from helpers.engines import free_state, needs, on_tangent
 from helpers.forward_formula import formula, free_box
 from helpers.models import robot
 from helpers.plants import block_on_rails
@@ -15,7 +15,7 @@ import drake_diff as dd
 from drake_diff.exceptions import NotOfferedError
 from drake_diff.model.tangent import tangent_space
 
-pytest.importorskip("newton", reason="newton is not installed: pip install 'drake-diff[forward]'")
+needs("newton")
 
 pytestmark = pytest.mark.slow
 G = 9.81

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 from helpers.contracts import CHANGES, arms, different
+from helpers.engines import needs
 from helpers.forward_formula import formula, free_box
 from helpers.models import Plant, contact_properties
 from helpers.plants import block_on_rails
@@ -17,7 +18,7 @@ from drake_diff.engines.formats import bullet_urdf
 from drake_diff.exceptions import ModelError, NonFiniteError, NotOfferedError, ShapeError, SimulationError
 from drake_diff.mechanics.description import Geometry, describe, rigid_links
 
-pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'drake-diff[forward]' (Python 3.11)")
+needs("pybullet")
 G = 9.81
 # What no engine but Drake has as Drake has it, and Bullet's damping, which is explicit.
 OWN = {"limit law", "solver tolerance", "integrator", "derivative convention"}

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 from helpers.contracts import FOLLOWS, different
+from helpers.engines import needs
 from helpers.forward_formula import formula, free_box
 from helpers.models import MODELS, Plant, contact_properties
 from helpers.plants import block_on_rails, tetrahedron_on_ground
@@ -22,7 +23,7 @@ from drake_diff.exceptions import (
     SimulationError,
 )
 
-pytest.importorskip("sapien", reason="sapien is not installed: pip install 'drake-diff[forward]'")
+needs("sapien")
 G = 9.81
 # What no engine but Drake has as Drake has it, and what PhysX does not give.
 OWN = {"limit law", "solver tolerance", "scalar type", "derivative convention", *FOLLOWS}

@@ -5,14 +5,14 @@ import re
 import numpy as np
 import pytest
 from helpers.contracts import arms
-from helpers.engines import engine_of
+from helpers.engines import engine_of, needs
 from helpers.followers import followed
 
 from drake_diff.exceptions import ModelError
 from drake_diff.export.export import export_model
 from drake_diff.mechanics.description import describe, describe_whole
 
-pytest.importorskip("pxr", reason="no usd-core (the extra `usd`)")
+needs("usd")
 
 
 def newton_of(model, tmp_path):

@@ -15,7 +15,8 @@ ROBOTS = ["panda.urdf", "ur5_robot.urdf", "solo12.urdf", "double_pendulum_contin
 G = 9.81
 
 
-# The modules that an engine needs, and the extra that has them.
+# The modules that an engine or a reader of files needs, and the extra that has them. Importing them to see whether they
+# are there takes seconds of the collection.
 NEEDED = {
     "mujoco": (["mujoco"], "engines"),
     "pinocchio": (["pinocchio"], "engines"),
@@ -24,14 +25,17 @@ NEEDED = {
     "newton": (["newton"], "forward"),
     "sapien": (["sapien"], "forward"),
     "pybullet": (["pybullet"], "forward"),
+    "ray": (["ray"], "cluster"),
+    "rosbags": (["rosbags"], "ros2"),
+    "usd": (["pxr"], "usd"),
 }
 
 
 def needs(engine):
-    """Skip, saying what is missing, where the engine is not installed."""
+    """Skip the test, or the module that calls this, where the engine is not installed."""
     modules, extra = NEEDED.get(engine, ([], ""))
     if any(find_spec(module.split(".")[0]) is None or find_spec(module) is None for module in modules):
-        pytest.skip(f"{engine} is not installed: pip install 'drake-diff[{extra}]'")
+        pytest.skip(f"{engine} is not installed: pip install 'drake-diff[{extra}]'", allow_module_level=True)
 
 
 def engine_of(name, model, **options):

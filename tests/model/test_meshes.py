@@ -6,7 +6,6 @@ import warnings
 
 import numpy as np
 import pytest
-import trimesh
 from helpers.models import robot_file
 from helpers.table import each_row
 from pydrake.geometry import CalcVolume, Convex, Role, Sphere
@@ -20,9 +19,16 @@ EDGES = np.array([0.2, 0.3, 0.5])
 ROUNDING = 1e-6  # the numbers of an STL have 32 bits, and pycollada keeps those of a DAE so
 
 
+def shapes():
+    """A library that takes long to import."""
+    from trimesh import creation
+
+    return creation
+
+
 def box_as_dae(edges, metre, up):
     """A box about the origin as COLLADA whose lengths are in units of `metre` [m]."""
-    box = trimesh.creation.box(edges / metre)
+    box = shapes().box(edges / metre)
     points, faces = box.vertices, box.faces
     return f"""<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -76,7 +82,7 @@ def saved(folder, name, text):
     [("stl", "1"), ("STL", "2 0.5 3"), ("obj", "1 1 1"), ("ply", "0.1"), ("off", "1 -1 1")],
 )
 def test_a_box_becomes_a_hull_of_its_volume(tmp_path, ending, scale):
-    trimesh.creation.box(EDGES).export(tmp_path / f"box.{ending.lower()}")
+    shapes().box(EDGES).export(tmp_path / f"box.{ending.lower()}")
     model = load(saved(tmp_path, "r.urdf", urdf(f'<mesh filename="box.{ending}" scale="{scale}"/>')))
     [(shape, _)] = shapes_of(model)
     factors = np.broadcast_to([float(n) for n in scale.split()], 3)
@@ -113,7 +119,7 @@ def test_a_dae_has_its_unit_and_as_in_rviz_no_axis_that_is_up(tmp_path, metre, u
 )
 def test_a_mesh_is_found_by_any_of_its_names(tmp_path, uri):
     (tmp_path / "robot/meshes").mkdir(parents=True)
-    trimesh.creation.box(EDGES).export(tmp_path / "robot/meshes/my box.stl")
+    shapes().box(EDGES).export(tmp_path / "robot/meshes/my box.stl")
     text = urdf(f'<mesh filename="{uri.format(folder=tmp_path)}"/>')
     [(shape, _)] = shapes_of(load(saved(tmp_path / "robot", "r.urdf", text)))
     assert CalcVolume(shape) == pytest.approx(np.prod(EDGES), rel=ROUNDING)
@@ -129,7 +135,7 @@ SDF = """<sdf version="1.9"><model name="r"><link name="base"/><link name="foot"
 
 
 def test_sdf_has_its_own_words_for_the_same(tmp_path):
-    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    shapes().box(EDGES).export(tmp_path / "box.stl")
     path = saved(tmp_path, "r.sdf", SDF.format(uri="box.stl"))
     [(shape, pose)] = shapes_of(load(path))
     assert CalcVolume(shape) == pytest.approx(2 * np.prod(EDGES), rel=ROUNDING)
@@ -144,7 +150,7 @@ def test_sdf_has_its_own_words_for_the_same(tmp_path):
 
 
 def test_a_ball_becomes_one_sphere_of_its_size(tmp_path):
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    ball = shapes().icosphere(subdivisions=3, radius=0.05)
     ball.export(tmp_path / "ball.stl")
     inside = np.min(np.sum(ball.triangles_center * ball.face_normals, axis=1))  # the distance of the closest face
     model = load(saved(tmp_path, "r.urdf", urdf('<mesh filename="ball.stl"/>', origin="0 0 0.3")), "spheres")
@@ -155,7 +161,7 @@ def test_a_ball_becomes_one_sphere_of_its_size(tmp_path):
 
 
 def test_a_box_becomes_eight_spheres_that_touch_its_faces():
-    hull = hull_of(np.array(trimesh.creation.box(EDGES).vertices), "box")
+    hull = hull_of(np.array(shapes().box(EDGES).vertices), "box")
     spheres = fit_spheres(hull, "box")
     r = 0.1 * 0.5  # half of the largest sphere inside
     assert spheres.radius == pytest.approx(r, rel=1e-5)
@@ -186,7 +192,7 @@ def test_spheres_are_inside_and_their_gaps_are_true():
 
 @each_row("treatment", ["convex", "spheres"])
 def test_a_foot_rests_at_its_height(tmp_path, treatment):
-    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    shapes().box(EDGES).export(tmp_path / "box.stl")
     path = saved(tmp_path, "r.urdf", urdf('<mesh filename="box.stl"/>'))
     model = load(path, treatment, ground=0.5)
     rollout = dd.rollout(model, [EDGES[2] / 2 + 0.01, 0.0], np.zeros((300, 0)))
@@ -196,7 +202,7 @@ def test_a_foot_rests_at_its_height(tmp_path, treatment):
 
 
 def test_spheres_are_differentiated_and_hulls_are_refused(tmp_path):
-    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    shapes().box(EDGES).export(tmp_path / "box.stl")
     path = saved(tmp_path, "r.urdf", urdf('<mesh filename="box.stl"/>'))
     x = [EDGES[2] / 2 - 1e-4, 0.0]
     model = load(path, "spheres", ground=0.5)
@@ -207,7 +213,7 @@ def test_spheres_are_differentiated_and_hulls_are_refused(tmp_path):
 
 
 def test_all_spheres_have_what_the_file_gives_to_the_mesh(tmp_path):
-    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    shapes().box(EDGES).export(tmp_path / "box.stl")
     other = """<link name="hand"><inertial><mass value="1"/>
     <inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>
     <collision name="c"><geometry><sphere radius="0.1"/></geometry></collision></link>
@@ -253,7 +259,7 @@ def test_the_same_file_gives_the_same_bytes_in_another_process(tmp_path):
         "h = hull_of_file(Path(sys.argv[1]), (1.0, 1.0, 1.0)); s = fit_spheres(h, 'x')\n"
         "print(h.corners.tobytes().hex(), s.centres.tobytes().hex(), s.radius)"
     )
-    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    mesh = shapes().icosphere(subdivisions=2, radius=0.1)
     mesh.vertices *= [1, 2, 3]
     mesh.export(tmp_path / "m.stl")
     run = subprocess.run([sys.executable, "-c", code, tmp_path / "m.stl"], capture_output=True, text=True, check=True)
@@ -264,7 +270,7 @@ def test_the_same_file_gives_the_same_bytes_in_another_process(tmp_path):
 
 @pytest.mark.slow
 def test_a_mesh_of_a_million_faces_keeps_a_thousand_corners(tmp_path):
-    ball = trimesh.creation.icosphere(subdivisions=8, radius=0.05)
+    ball = shapes().icosphere(subdivisions=8, radius=0.05)
     assert len(ball.faces) > 1e6
     ball.export(tmp_path / "ball.stl")
     hull = triangles.hull_of_file(tmp_path / "ball.stl", (1.0, 1.0, 1.0))
@@ -311,7 +317,7 @@ def test_a_mesh_that_is_missing_is_told_and_left_out(tmp_path, uri):
 
 @each_row("scale", ["0 1 1", "1 2", "large", "nan", "1 inf 1"])
 def test_a_scale_that_is_none_is_refused(tmp_path, scale):
-    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    shapes().box(EDGES).export(tmp_path / "box.stl")
     path = saved(tmp_path, "r.urdf", urdf(f'<mesh filename="box.stl" scale="{scale}"/>'))
     with pytest.raises(ModelError, match=r"box\.stl.*scale of one or three numbers"):
         dd.load_model(path, time_step=0.01, meshes="convex")

@@ -8,9 +8,13 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.motion import TVLQR
 
-control = pytest.importorskip("control", reason="python-control is not installed")
 ENGINES = ["numpy", "drake", "mujoco", "pinocchio"]
 H, G = 0.01, 9.81
+
+
+@pytest.fixture(scope="module")
+def control():
+    return pytest.importorskip("control", reason="python-control is not installed")
 
 
 def linearized(engine, model):
@@ -19,7 +23,7 @@ def linearized(engine, model):
 
 
 @each_row("name", ENGINES)
-def test_the_poles_of_a_mass_on_a_spring(load, name):
+def test_the_poles_of_a_mass_on_a_spring(load, control, name):
     """M v' = M v - h (k q + d v'), q' = q + h v': poles of det (z^2 (1 + h d/m) - z (2 + h d/m - h^2 k/m) + 1) = 0."""
     model = load("mass_spring_damper.sdf", time_step=H)
     A, B, _ = linearized(engine_of(name, model), model)
@@ -32,7 +36,7 @@ def test_the_poles_of_a_mass_on_a_spring(load, name):
 
 
 @each_row("name", ENGINES)
-def test_the_poles_of_a_hanging_pendulum(load, name):
+def test_the_poles_of_a_hanging_pendulum(load, control, name):
     """With w^2 = m g l / J the free pendulum is the oscillator above, damped as there."""
     model = load("pendulum.urdf", time_step=H)
     engine = engine_of(name, model)
@@ -48,7 +52,7 @@ def test_the_poles_of_a_hanging_pendulum(load, name):
 
 
 @each_row("name", ENGINES)
-def test_the_lqr_gain_of_the_cart_pole_upright(load, name):
+def test_the_lqr_gain_of_the_cart_pole_upright(load, control, name):
     """python-control's gain solves the Riccati equation for each engine's A and B, balances, and is the same in all."""
     model = load("cart_pole.urdf", time_step=H)
     x = np.array([0.0, np.pi, 0.0, 0.0])
@@ -63,7 +67,7 @@ def test_the_lqr_gain_of_the_cart_pole_upright(load, name):
     np.testing.assert_allclose(K, control.dlqr(reference.A, reference.B, Q, R)[0], rtol=1e-6)
 
 
-def test_ilqrs_gain_at_rest_is_python_controls(load):
+def test_ilqrs_gain_at_rest_is_python_controls(load, control):
     """Far from the horizon's end the time-varying gain is the Riccati equation's fixed point."""
     model = load("cart_pole.urdf", time_step=H)
     x = np.array([0.0, np.pi, 0.0, 0.0])

@@ -12,10 +12,11 @@ import sys
 import time
 
 import pytest
+from helpers.engines import needs
 
 import drake_diff as dd
 
-pytest.importorskip("ray")
+needs("ray")
 pytestmark = pytest.mark.slow
 
 FUNCTIONS = """

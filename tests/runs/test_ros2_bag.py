@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.engines import needs
 
 import drake_diff as dd
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
@@ -11,7 +12,7 @@ from drake_diff.logs import read_mcap
 from drake_diff.runs import read_trace
 from drake_diff.runs.ros2 import export_ros2
 
-pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
+needs("rosbags")
 
 
 @pytest.fixture(scope="module")
