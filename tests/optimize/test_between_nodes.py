@@ -92,19 +92,3 @@ def test_a_plan_is_followed_under_feedback_as_in_closed_form():
     assert led == pytest.approx(0.3 * np.exp(-3 * times), abs=1e-9)
     assert motion.led_from(np.array([-2.0]), gains)[:, 0] == pytest.approx(-2 + times, abs=1e-12)
     assert motion.led_from(np.array([0.3]), None)[:, 0] == pytest.approx(0.3, abs=1e-15)
-
-
-def test_the_integration_of_another_motion_is_not_taken_over():
-    """By as little as the last bit of an input, or by its mesh or horizon; that of the very same one is."""
-    motion, other = at_rest(), np.zeros((21, 1))
-    expected = motion.gaps.copy()
-    assert expected == pytest.approx(0, abs=1e-15)
-    other[7] = np.finfo(float).tiny
-    bent = np.linspace(0, 1, 21) ** 1.1
-    for different in (at_rest(other), at_rest(horizon=1.1), at_rest(mesh=bent)):
-        different.measured_as(motion)
-        assert "_integrated" not in vars(different)
-    same = at_rest()
-    same.measured_as(motion)
-    assert "_integrated" in vars(same)
-    assert np.array_equal(same.gaps, expected)

@@ -210,21 +210,6 @@ def test_a_parameter_at_its_bound_stays_within_it():
     assert solution.bound_violation == 0
 
 
-def test_a_parameter_that_is_only_given_moves_the_collocated_plan():
-    """The same as a model whose file has that mass."""
-    asked = {"x0": [0, 0], "x_goal": [2, 0], "num_steps": 40, "running_cost": EFFORT}
-    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
-    given = dd.solve(dd.Problem(model, parameters={"pole.mass": 1.7}, **asked))
-    assert given.method == "collocation"
-    assert given.success, given.message
-    with applied(select(model, {"pole.mass": 1.7})):
-        assert dd.optimize.plant_dynamics(model, {"pole.mass": 1.7})([1, 0], [0]) == pytest.approx(
-            dd.optimize.plant_dynamics(model)([1, 0], [0])
-        )
-    other = dd.solve(dd.Problem(model, parameters={"pole.mass": 1.0}, **asked))
-    assert given.cost > 1.2 * other.cost
-
-
 # ------------------------------------------------------------------------------ the length of a step
 
 
@@ -294,29 +279,6 @@ def test_a_time_that_is_weighed_against_effort(method, tmp_path):
     assert solution.success, solution.message
     effort = 36 * mass**2 * way**2 / (1 - 1 / steps**2)
     assert solution.horizon == pytest.approx((effort / weight) ** 0.25, rel=1e-5)
-
-
-@pytest.mark.slow
-def test_mass_and_time_by_sweeps_through_discrete_steps(tmp_path):
-    """Both at once: for any T the best mass is that of the price, and the best T of it is where the slopes meet."""
-    price, heaviest, weight, steps, way = 8.0, 2.0, 3.0, 20, 1.0
-    problem = dd.Problem(
-        sliding(1.3, 100.0, tmp_path),
-        x0=[0, 0],
-        x_goal=[way, 0],
-        num_steps=steps,
-        horizon=(0.5, 10),
-        running_cost=lambda x, u: weight + u[0] ** 2,
-        optimize=BOTH,
-        parameters=("block.mass",),
-        parameter_cost=lambda p: price * (heaviest - p[0]) ** 2,
-    )
-    solution = dd.solve(problem, method="ilqr")
-    assert solution.success, solution.message
-    mass, time = solution.parameters[0], solution.horizon
-    effort = 12 * way**2 / (1 - 1 / steps**2)
-    assert weight == pytest.approx(3 * effort * mass**2 / time**4, rel=1e-4)
-    assert mass == pytest.approx(price * heaviest / (price + effort / time**3), rel=1e-4)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import pytest
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import GradientError, InputError, ShapeError
+from drake_diff.exceptions import GradientError, InputError
 from drake_diff.optimize.problem.constraint import Constraint
 
 
@@ -79,22 +79,6 @@ def test_a_lost_derivative_is_an_error():
     c = Constraint(lambda x: float(getattr(x[0], "value", lambda: x[0])()), upper=1).resolved(np.zeros(1), np.zeros(0))
     with pytest.raises(GradientError, match="lost its derivatives"):
         c.differentiate(np.zeros(1), np.zeros(0))
-
-
-def test_waypoints_and_horizon_are_checked():
-    limits = pendulum(waypoints={5: [0.5, np.nan]}).state_limits()
-    np.testing.assert_array_equal([side[5, 0] for side in limits], [0.5, 0.5])
-    np.testing.assert_array_equal([side[0] for side in limits], np.zeros((2, 2)))
-    np.testing.assert_array_equal([side[10] for side in limits], [[1, 0]] * 2)
-    assert np.isinf(limits[0][5, 1])
-    for knot in (0, 10, 1.0, -1):
-        with pytest.raises(InputError, match="from 1 to 9"):
-            pendulum(waypoints={knot: [0, 0]})
-    with pytest.raises(ShapeError):
-        pendulum(waypoints={3: [0]})
-    for horizon in (-1.0, (2, 1), (0, 1), (1,)):
-        with pytest.raises(InputError, match="horizon"):
-            pendulum(horizon=horizon)
 
 
 def test_the_excess_names_constraint_and_knot():

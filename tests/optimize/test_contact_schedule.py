@@ -251,26 +251,6 @@ def test_solo_lifts_a_foot(solo, lifted):
 
 
 @pytest.mark.slow
-def test_the_other_law_of_contact_decides_in_steps_that_are_fine_enough_for_it(solo, monkeypatch):
-    """Lagged contact in steps of 20 ms throws up a foot that lands hard; in 2.5 ms the same feedback holds it.
-
-    It lands hard where the guess unloads no foot: it then takes every phase for a quick one.
-    """
-    monkeypatch.setattr("drake_diff.optimize.scheduled.motion.FALLS", np.inf)
-    problem, guess = _lift(solo, 0)
-    solution = dd.solve(problem, method="ilqr", initial_guess=guess, tolerance=1e-4, max_iterations=20)
-    whole, fine = "with lagged contact", "with lagged contact in steps of 0.0025 s"
-    assert not any(r.holds for r in solution.replays if r.variant == whole)
-    assert [r.control for r in solution.replays if r.variant == fine and r.holds] == ["TVLQR"]
-
-
-@pytest.mark.slow
-def test_a_foot_that_is_unloaded_lands_softly_enough_for_the_other_law_of_contact(lifted):
-    _, solution = lifted
-    assert [r.control for r in solution.replays if r.variant == "with lagged contact" and r.holds] == ["TVLQR"]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("lifted", [0], indirect=True)
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 def test_a_lift_that_is_not_what_was_asked_is_refused(solo, lifted):

@@ -1,7 +1,6 @@
 """Through contact from a guess that does not touch: the stages, and what the true plant does in the end."""
 
 import math
-import signal
 
 import numpy as np
 import pytest
@@ -9,10 +8,9 @@ from helpers.problems import FREE, push
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError, ModelError
+from drake_diff.exceptions import InputError
 from drake_diff.optimize.continuation import default_schedule
-from drake_diff.optimize.ilqr import through_contact
-from drake_diff.optimize.ilqr.through_contact import restore_goal, where_it_jumps
+from drake_diff.optimize.ilqr.through_contact import restore_goal
 from drake_diff.optimize.solution import Status
 
 
@@ -45,22 +43,6 @@ def test_before_touching_the_push_is_the_closed_form_of_least_effort(two_spheres
     bend = np.diff(solution.us[:first, 0], 2)
     assert first > 10
     assert np.abs(bend).max() < 1e-4 * np.abs(solution.us).max()  # the gradient is met to 1e-8 of the cost's scale
-
-
-def test_the_stages_are_logged_and_the_last_is_the_true_plant(two_spheres):
-    lines = []
-    problem = push(two_spheres(damping=0), gap=0.4, goal=0.8)
-    given = [dd.model.SoftContact(0.15, 100.0), dd.model.SoftContact(0.05, 150.0)]
-    solution = dd.solve(problem, method="ilqr", continuation=given, max_iterations=100, progress=lines.append)
-    logs = solution.options["continuation"]
-    assert [log["number"] for log in logs] == [1, 2, 3]
-    assert [log["distance"] for log in logs] == [0.15, 0.05, None]
-    assert [log["stiffness"] for log in logs] == [100.0, 150.0, None]
-    assert logs[-1]["iterations"] == len(solution.iterations) - 1
-    assert logs[-1]["cost"] == pytest.approx(solution.cost, rel=1e-12)
-    assert logs[-1]["goal_error"] == pytest.approx(solution.goal_error, abs=1e-15)
-    assert sum(line.startswith("stage ") for line in lines) == 3
-    assert solution.defect == 0  # measured on the true plant
 
 
 def test_a_soft_final_cost_is_reached_too(two_spheres):
@@ -113,20 +95,6 @@ def test_the_time_limit_is_that_of_all_stages(two_spheres, monkeypatch):
     assert solution.defect == 0
 
 
-def test_ctrl_c_ends_all_stages(two_spheres):
-    before = signal.getsignal(signal.SIGINT)
-    problem = push(two_spheres(), gap=0.4, goal=1.0)
-
-    def interrupt_in_the_first_stage(line):
-        if line.startswith("iteration     1"):
-            signal.raise_signal(signal.SIGINT)
-
-    solution = dd.solve(problem, continuation="auto", progress=interrupt_in_the_first_stage)
-    assert solution.status is Status.INTERRUPTED
-    assert len(solution.options["continuation"]) == 1
-    assert signal.getsignal(signal.SIGINT) is before
-
-
 @each_row("wrong", ["soft", 0.1, [], [0.1], (dd.model.SoftContact(0.1, 1.0), None)])
 def test_a_schedule_that_is_none_is_refused(two_spheres, wrong):
     with pytest.raises(InputError, match="continuation"):
@@ -139,18 +107,6 @@ def test_only_ilqr_takes_a_continuation(two_spheres, load):
     pendulum = load("pendulum.urdf")
     with pytest.raises(InputError, match="may collide"):
         dd.solve(dd.Problem(pendulum, x0=[0, 0], num_steps=5, x_goal=[1, 0]), continuation="auto")
-
-
-def test_where_drake_knows_no_distance_the_message_says_so(two_spheres, monkeypatch):
-    def none(twin):
-        raise ModelError("of two such shapes")
-
-    problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
-    at = np.tile(problem.x0, (2, 1))
-    at[:, 1] = at[:, 0] + 0.2  # the spheres just touch
-    assert "just touching at knot 0" in where_it_jumps(problem, at)
-    monkeypatch.setattr(through_contact, "distances", none)
-    assert where_it_jumps(problem, at) == ", and where bodies just touch is not known: of two such shapes"
 
 
 def test_restoration_leaves_a_goal_that_nothing_moves(two_spheres):

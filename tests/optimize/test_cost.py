@@ -32,13 +32,6 @@ def test_a_quadratic_costs_gradient_is_that_of_autodiff_through_it():
     assert np.concatenate([by_x, by_u]) == pytest.approx(autodiff.derivatives(), rel=1e-12)
 
 
-def test_a_quadratic_cost_along_a_motion():
-    cost = dd.QuadraticCost(Q=[[3.0]], R=[[5.0]], x_ref=[1.0], u_ref=[7.0])
-    xs, us = np.array([[2.0], [1.0], [-1.0]]), np.array([[7.0], [8.0], [5.0]])
-    assert cost.along(xs, us) == pytest.approx([3.0, 5.0, 12.0 + 20.0], rel=1e-15)
-    assert dd.QuadraticCost().along(xs, us) == pytest.approx([0.0, 0.0, 0.0], abs=0)
-
-
 def test_a_cost_to_gos_derivatives_are_those_of_autodiff_through_it():
     random = np.random.default_rng(1)
     cost = CostToGo(random.random(3), random.standard_normal(3), random_weight(random, 3))
@@ -81,30 +74,6 @@ def test_an_indefinite_hessian_keeps_its_positive_part():
     """x0 x1 has the eigenvalues +1 along (1, 1) and -1 along (1, -1): what is left is [[1, 1], [1, 1]] / 2."""
     hessian = final_cost_hessian(lambda x: x[0] * x[1], np.array([0.3, -0.2]))
     assert hessian == pytest.approx(np.full((2, 2), 0.5), abs=1e-8)
-
-
-def test_a_final_quadratic_cost_leaves_the_input_out():
-    cost = dd.QuadraticCost(Q=[[3.0]], R=[[5.0]], x_ref=[1.0], u_ref=[7.0])
-    assert cost(np.array([3.0])) == 12.0
-    value, gradient = differentiate_final_cost(cost, np.array([3.0]))
-    assert (value, gradient.tolist()) == (12.0, [12.0])
-    assert final_cost_hessian(cost, np.array([3.0])).tolist() == [[6.0]]
-
-
-def test_a_quadratic_cost_of_nothing_is_zero_and_flat():
-    x, u = np.ones(2), np.ones(1)
-    value, by_x, by_u = differentiate_cost(dd.QuadraticCost(), x, u)
-    assert (value, by_x.tolist(), by_u.tolist()) == (0.0, [0.0, 0.0], [0.0])
-    assert not running_cost_hessian(dd.QuadraticCost(), x, u).any()
-
-
-def test_a_weight_is_a_read_only_copy():
-    weight = np.eye(2)
-    cost = dd.QuadraticCost(Q=weight)
-    weight[0, 0] = 9.0
-    assert cost.Q[0, 0] == 1.0
-    with pytest.raises(ValueError, match="read-only"):
-        cost.Q[0, 0] = 2.0
 
 
 def test_a_semidefinite_weight_is_allowed():

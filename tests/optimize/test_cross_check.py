@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.models import ball_on_ground
 from helpers.plants import pd_pendulum
-from helpers.problems import lqr, pendulum
+from helpers.problems import pendulum
 from helpers.table import each_row
 from typer.testing import CliRunner
 
@@ -75,20 +75,6 @@ def test_a_block_under_a_constant_force_ends_where_the_sums_say(write_urdf):
     assert (check.value, check.tolerance) == pytest.approx((0.1, 0.0525), rel=1e-6)
     assert check in found.checks
     assert "cross-checked in continuous time, TVLQR: slide_x ends 0.1 m from its goal" in repr(found)
-
-
-def test_its_own_gains_are_held_over_its_own_steps(write_urdf):
-    """The law in finer steps is the plan's own, of the first state of each of its steps."""
-    solution = dd.solve(lqr(0.1, 12, np.eye(2), 1.0, np.eye(2)), method="ilqr")
-    follower = Follower(solution.plan)
-    model = solution.problem.model
-    coarse, fine = follower._law(model, "TVLQR", 1), follower._law(model, "TVLQR", 4)
-    random = np.random.default_rng(0)
-    for k in range(12):
-        x = random.normal(size=2)
-        wanted = coarse(x, 0.1 * k)
-        for j in range(4):
-            assert fine(x if j == 0 else random.normal(size=2), 0.1 * k + 0.025 * j) == pytest.approx(wanted, abs=1e-12)
 
 
 def test_a_smooth_plan_holds_everywhere():

@@ -7,9 +7,8 @@ from pydrake.geometry import Box, Sphere
 
 import drake_diff as dd
 from drake_diff.exceptions import UnknownNameError
-from drake_diff.optimize.goal_markers import drawn_goals, meaning_of
+from drake_diff.optimize.goal_markers import drawn_goals
 from drake_diff.pages.scene import scene_of
-from drake_diff.runs.view import scene_of_run
 
 
 @pytest.fixture(scope="module")
@@ -57,30 +56,3 @@ def test_a_velocity_goes_with_its_body_and_does_not_turn_with_it(model):
 def test_an_unknown_frame_is_named(model):
     with pytest.raises(UnknownNameError, match="elbow"):
         drawn(model, dd.FrameVelocityGoal("elbow", velocity=[1, 0, 0]))
-
-
-def test_the_picture_has_room_for_its_goals(model):
-    times, xs = np.arange(2.0), np.array([[0.0, 0], [0.1, 0]])
-    far = drawn(model, dd.FrameGoal("pole", position=[3.0, 0, 0]))
-    _, high = scene_of(model, times, xs, marks=far).box
-    assert high[0] >= 3.0
-    assert scene_of(model, times, xs).box[1][0] < 1.0
-
-
-def test_a_run_has_its_goals_in_its_live_view_too(model, tmp_path):
-    goal = dd.FrameGoal("pole", point=[0, 0, -0.5], position=[0.2, None, None], tolerance=0.05)
-    us = np.zeros((4, 1))
-    problem = dd.Problem(model, x0=[0.1, 0], num_steps=4, goals=[goal], final_cost=dd.QuadraticCost(Q=np.eye(2)))
-    xs = np.array(dd.rollout(model, [0.1, 0], us).xs)
-    dd.save(dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", xs, us), tmp_path)
-    scene = scene_of_run(tmp_path)
-    np.testing.assert_allclose(scene.marks[0].pose.translation(), [0.2, 0, 0])
-    assert meaning_of([goal])[0][2] in (tmp_path / "report.html").read_text()
-
-
-def test_a_robot_is_seen_through_a_large_goal(model):
-    """A plane in the way of the camera; a small target and an obstacle are as they are."""
-    (plane,) = drawn(model, dd.FrameGoal("pole", position=[0.1, None, None]))
-    (small,) = drawn(model, dd.FrameGoal("pole", position=[0.1, 0.0, 0.3]))
-    (wall,) = drawn(model, dd.BoxObstacle([0, 0, 5], [4, 4, 0.1]))
-    assert plane.colour.a() <= 0.2 < 0.5 < min(small.colour.a(), wall.colour.a())

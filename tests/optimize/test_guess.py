@@ -38,14 +38,6 @@ def test_a_collocated_solution_as_drakes_trajectories_is_its_motion(scheme):
     np.testing.assert_allclose(held.vector_values(at).T, us, atol=1e-9)
 
 
-def test_an_input_between_the_knots_is_the_closed_forms():
-    """Least effort: x = 3 t^2 - 2 t^3 and u = 6 - 12 t, which a cubic and a parabola hold exactly."""
-    state, held = dd.solve(block(count=3)).trajectory()
-    for t in (0.1, 0.4, 0.77):
-        np.testing.assert_allclose(state.value(t).ravel(), [3 * t**2 - 2 * t**3, 6 * t - 6 * t**2], atol=1e-8)
-        np.testing.assert_allclose(held.value(t).ravel(), [6 - 12 * t], atol=1e-7)
-
-
 def test_a_discrete_solution_as_drakes_trajectories_holds_its_inputs(write_urdf):
     solution = dd.solve(plant(write_urdf), method="ilqr")
     state, held = solution.trajectory()
@@ -53,13 +45,6 @@ def test_a_discrete_solution_as_drakes_trajectories_holds_its_inputs(write_urdf)
     np.testing.assert_array_equal(held.value(0.05).ravel(), solution.us[0])
     np.testing.assert_array_equal(held.value(0.95).ravel(), solution.us[9])
     np.testing.assert_allclose(state.value(0.05).ravel(), (solution.xs[0] + solution.xs[1]) / 2, atol=1e-15)
-
-
-def test_a_refined_mesh_keeps_its_times():
-    solution = dd.solve(block(count=2, x_goal=[1, None]), refine=True, error_tolerance=1e-12)
-    state, held = solution.trajectory()
-    np.testing.assert_allclose(state.get_segment_times(), solution.times, atol=1e-15)
-    np.testing.assert_allclose(held.get_segment_times(), solution.times, atol=1e-15)
 
 
 def test_a_solution_that_is_not_finite_has_no_trajectory(write_urdf):
@@ -177,15 +162,6 @@ def test_a_swing_up_in_least_time_is_found_from_another_first_guess(limit, metho
         middle = x + h / 2 * np.array([x[1], u - 9.81 * np.sin(x[0]) - 0.1 * x[1]])
         x = x + h * np.array([middle[1], u - 9.81 * np.sin(middle[0]) - 0.1 * middle[1]])
     np.testing.assert_allclose(x, [np.pi, 0], atol=0.06)  # an upright pendulum makes 1e-6 grow e^(3 t)
-
-
-def test_the_same_seed_tries_the_same_guesses():
-    problem = limited_pendulum(3.0, horizon=(0.5, 10.0), running_cost=1.0)
-    a, b, c = (dd.solve(problem, seed=seed) for seed in (0, 0, 3))
-    np.testing.assert_array_equal(a.xs, b.xs)
-    assert a.success
-    assert c.success
-    assert a.options["initial_guess_sha256"] != c.options["initial_guess_sha256"]
 
 
 def test_what_no_guess_solves_says_how_many_were_tried():

@@ -1,10 +1,7 @@
 """iLQR against the Riccati recursion, its own quadratic case, and against what its optimum must satisfy."""
 
-import gc
 import itertools
 import signal
-import time
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -16,9 +13,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
-from drake_diff.optimize.ilqr.expansion import Motion, expand, jacobians_along
-from drake_diff.optimize.ilqr.ilqr import _Search, costs_to_go, solve_ilqr
+from drake_diff.optimize.ilqr.ilqr import costs_to_go, solve_ilqr
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic, minimize_in_box, solve_riccati
 from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.solution import Status
@@ -209,17 +204,6 @@ def test_a_step_of_size_a_leaves_the_rest_of_each_gap():
     assert np.abs(pendulum_gradient(solution.us)).max() < 1e-6
 
 
-@pytest.mark.parametrize("size", [0.25, 1.0])
-def test_a_roll_keeps_the_rest_of_the_gaps(size):
-    """The defects of the moved motion, measured by Drake's steps, against 1 - size of those before."""
-    problem, random = pendulum(), np.random.default_rng(0)
-    guess = random.standard_normal((101, 2)), random.standard_normal((100, 1))
-    search = _Search(problem, *guess, Limits(1, np.inf, 1e-8), None)
-    moved = search._roll(solve_riccati(search._expand(), 1e3), size)
-    steps = [dd.step(problem.model, x, u) for x, u in zip(moved.xs, moved.us, strict=False)]
-    assert np.array(steps) - moved.xs[1:] == pytest.approx((1 - size) * search.motion.gaps, abs=1e-12)
-
-
 def test_a_hard_goal_of_the_pendulum():
     """J = 8.826541704941 by an independent program, to 1e-8 of it since the goal is met to 1e-8."""
     solution = dd.solve(pendulum(x_goal=[np.pi, 0], running_cost=EFFORT, final_cost=None), method="ilqr")
@@ -242,26 +226,6 @@ def test_the_pendulum_of_drake_ddp():
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(0.225845385916, abs=1e-12)
     assert len(solution.iterations) < 40  # 199 without
-
-
-def test_the_pendulum_of_irs_lqr(tmp_path):
-    """Theirs: dw / dt = u - sin q, h = 0.05; 1856.154405579479 at u = 0.1 and 349.490454199 at the optimum."""
-    text = (MODELS / "pendulum.urdf").read_text()
-    length, mass = 9.81, 9.81**-2  # so that g / l = m l^2 = 1
-    for old, new in (("0 0 -0.5", f"0 0 {-length}"), ('mass value="1"', f'mass value="{mass}"'), ("0.1", "0")):
-        assert old in text
-        text = text.replace(old, new)
-    path = tmp_path / "pendulum.urdf"
-    path.write_text(text)
-    model = dd.load_model(path, time_step=0.05)
-    target = dd.QuadraticCost(Q=np.eye(2), x_ref=[np.pi, 0])
-    weights = dd.QuadraticCost(Q=np.eye(2) / 0.05, R=[[1 / 0.05]], x_ref=[np.pi, 0])
-    problem = dd.Problem(model, x0=[0, 0], num_steps=200, running_cost=weights, final_cost=target)
-    us = np.full((200, 1), 0.1)
-    solution = dd.solve(problem, method="ilqr", initial_guess=(dd.rollout(model, [0, 0], us).xs, us))
-    assert solution.iterations[0].objective == pytest.approx(1856.154405579479, rel=1e-12)
-    assert solution.success, solution.message
-    assert solution.cost == pytest.approx(349.490454199, rel=1e-10)
 
 
 @pytest.mark.parametrize(("count", "mass", "distance"), [(10, 1.0, 1.0), (100, 1.0, 1.0), (25, 2.5, -0.3)])
@@ -414,28 +378,6 @@ def test_a_goal_alone_needs_no_cost():
     assert solution.success, solution.message
 
 
-@pytest.mark.slow
-def test_swing_ups_from_random_inputs_reach_the_goal_or_say_that_they_do_not():
-    """20 guesses, normal inputs of size 1 under |u| <= 2.5; shooting's optimum is 10.98372."""
-    problem = pendulum(
-        x_goal=[np.pi, 0],
-        running_cost=EFFORT,
-        final_cost=None,
-        bounds=dd.Bounds(u_lower=[-2.5], u_upper=[2.5]),
-    )
-    reached = 0
-    for seed in range(20):
-        us = np.random.default_rng(seed).standard_normal((100, 1))
-        guess = dd.rollout(problem.model, problem.x0, us).xs, us
-        solution = dd.solve(problem, method="ilqr", initial_guess=guess)
-        end = dd.rollout(problem.model, problem.x0, solution.us).xs[-1]
-        arrived = np.abs(end - [np.pi, 0]).max() < 1e-5 and np.abs(solution.us).max() <= 2.5
-        assert arrived or not solution.success
-        reached += solution.success
-        assert not solution.success or solution.cost == pytest.approx(10.98372, abs=1e-5)
-    assert reached >= 18
-
-
 @each_row("seed", range(5))
 def test_the_box_newton_step_satisfies_the_conditions_of_an_optimum(seed):
     random = np.random.default_rng(seed)
@@ -448,105 +390,6 @@ def test_the_box_newton_step_satisfies_the_conditions_of_an_optimum(seed):
     assert np.all((slope[d == lower] >= 0) | free[d == lower])
     assert np.all((slope[d == upper] <= 0) | free[d == upper])
     assert np.all((lower <= d) & (d <= upper))
-
-
-def swing_up(**changes):
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
-    given = {"x0": np.zeros(4), "num_steps": 100, "running_cost": EFFORT, "x_goal": [1, np.pi, 0, 0]}
-    return dd.Problem(model, **(given | changes))
-
-
-@pytest.mark.slow
-def test_a_swing_up_converges_as_newtons_method_does():
-    """47 steps; more than 190 without the dynamics' curvature by differences."""
-    problem = swing_up()
-    solution = dd.solve(problem, method="ilqr")
-    assert solution.success, solution.message
-    assert len(solution.iterations) < 70
-    shooting = dd.solve(problem, method="shooting", initial_guess=solution)
-    assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("file", "goal"),
-    [
-        ("cart_pole.urdf", [0, np.pi, 0, 0]),
-        pytest.param("acrobot.xml", [np.pi, 0, 0, 0], marks=pytest.mark.slow),
-    ],
-)
-def test_a_step_takes_few_rollouts(file, goal, monkeypatch):
-    """At most 2.5 for each step that is taken, where full steps are too long: halving from 1 took 3.2."""
-    rolled, roll = [], _Search._roll
-
-    def counted(self, *args):
-        rolled.append(args)
-        return roll(self, *args)
-
-    monkeypatch.setattr(_Search, "_roll", counted)
-    model = dd.load_model(MODELS / file, time_step=0.02)
-    cost = dd.QuadraticCost(Q=100 * np.eye(4), x_ref=goal)
-    effort = dd.QuadraticCost(R=[[0.01]])
-    problem = dd.Problem(model, x0=np.zeros(4), num_steps=100, running_cost=effort, final_cost=cost)
-    us = np.full((100, 1), 0.1)
-    xs = dd.rollout(model, problem.x0, us).xs
-    result, _, _ = solve_ilqr(problem, xs, us, limits=Limits(60, 60.0, 1e-6), report=None)
-    steps = result.iterations[1:]
-    assert sum(row.step < 1 for row in steps) > 10
-    assert len(rolled) <= 2.5 * len(steps)
-    assert steps[-1].objective < 1e-2 * result.iterations[0].objective
-
-
-@each_row(
-    "limits", [{"x_upper": [np.inf, 1.2]}, {"x_upper": [2, 1.4], "x_lower": [-2, -0.2]}, {"x_lower": [-0.01, -0.01]}]
-)
-@each_row("goal", [(1, 0), (1, 0.5)])
-def test_a_linear_plant_within_limits_takes_one_step_for_each_update_of_the_multipliers(limits, goal, monkeypatch):
-    """Its augmented cost is quadratic but for the bends where bounds begin to push, and a policy knows of them."""
-    updated, update = [], AugmentedLagrangian.update
-
-    def counted(self, *args):
-        updated.append(args)
-        update(self, *args)
-
-    monkeypatch.setattr(AugmentedLagrangian, "update", counted)
-    problem = move(goal=goal, **limits)
-    xs, us = np.zeros((21, 2)), np.zeros((20, 1))
-    result, _, _ = solve_ilqr(problem, xs, us, limits=Limits(100, 60.0, 1e-8), report=None)
-    assert result.outcome is Outcome.SOLVED
-    steps = [row.step for row in result.iterations[1:]]
-    assert min(steps) == 1
-    assert len(steps) <= len(updated) + 1
-
-
-@each_row("seed", range(3))  # a limit of speed, a corridor, and both
-def test_limits_cost_few_steps(seed):
-    """Double pendulums below a speed, in a corridor of positions, or both: at most 60 steps, where cut at each bend
-    they took 31 to 156; and what is found is IPOPT's optimum or cheaper, to its 1e-8 of the bounds."""
-    random = np.random.default_rng([8, seed])
-    model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.04)
-    start, end = random.uniform(-0.6, 0.6, 2), random.uniform(-0.8, 0.8, 2)
-    lower, upper = np.full(4, -np.inf), np.full(4, np.inf)
-    if seed % 3 != 1:
-        fastest = np.argmax(np.abs(end - start))
-        upper[2 + fastest] = 1.5 * abs(end - start)[fastest] / (30 * 0.04)
-        lower[2 + fastest] = -upper[2 + fastest]
-    if seed % 3:
-        lower[:2], upper[:2] = np.minimum(start, end) - 0.05, np.maximum(start, end) + 0.05
-    problem = dd.Problem(
-        model,
-        x0=[*start, 0, 0],
-        x_goal=[*end, 0, 0],
-        num_steps=30,
-        running_cost=dd.QuadraticCost(R=np.eye(2)),
-        bounds=dd.Bounds(lower, upper, -25 * np.ones(2), 25 * np.ones(2)),
-    )
-    line = np.linspace(problem.x0, problem.x_goal, 31)
-    result, xs, us = solve_ilqr(problem, line, np.zeros((30, 2)), limits=Limits(100, 60.0, 1e-8), report=None)
-    assert result.outcome is Outcome.SOLVED
-    assert len(result.iterations) <= 61
-    assert np.max(np.maximum(xs - upper, lower - xs)[1:]) < 1e-8
-    shooting = dd.solve(problem, method="shooting", initial_guess=(xs, us))
-    assert problem.objective(xs, us) <= shooting.cost * (1 + 1e-6)
 
 
 def test_a_ridge_is_in_the_units_of_what_it_is_added_to():
@@ -578,71 +421,6 @@ def _around(scale):
         np.zeros(3),
         np.zeros(3),
     )
-
-
-def test_no_riccati_problem_is_solved_twice(monkeypatch):
-    seen = []
-
-    def noted(problem, regularization):
-        assert not any(problem is p and regularization == r for p, r in seen)
-        seen.append((problem, regularization))
-        return solve_riccati(problem, regularization)
-
-    monkeypatch.setattr("drake_diff.optimize.ilqr.ilqr.solve_riccati", noted)
-    solution = dd.solve(pendulum(num_steps=40), method="ilqr")
-    assert solution.success, solution.message
-    assert len(seen) >= len(solution.iterations) - 1
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_iterations():
-    """Of steps that regularization keeps short, 100 more leave no array: the motion of 40 knots alone is 1 kB.
-
-    What numpy holds is counted, and not every object of Python: what other threads and free lists of tuples hold is up
-    to what runs beside the test and ran before it.
-    """
-    problem = pendulum(num_steps=40)
-
-    def left(iterations):
-        search = _Search(problem, np.zeros((41, 2)), np.zeros((40, 1)), Limits(10**6, np.inf, 0.0), None)
-        gc.collect()
-        tracemalloc.start()
-        for _ in range(iterations):
-            search.regularization = 1e4
-            assert search._step(search._expand(), True) is None
-        gc.collect()
-        arrays = tracemalloc.DomainFilter(True, np.lib.tracemalloc_domain)
-        traces = tracemalloc.take_snapshot().filter_traces([arrays]).traces
-        tracemalloc.stop()
-        return sum(one.size for one in traces)
-
-    left(2)  # what is made once: certificates, caches
-    few, many = left(20), left(120)
-    assert few > 1000  # arrays are counted: it still has its motion
-    assert many - few < 1000
-
-
-def test_inputs_are_on_a_bound_that_rounding_alone_parts_them_from():
-    bounds = dd.Bounds(u_lower=[-3.0], u_upper=[np.inf])
-    problem = pendulum(num_steps=1, bounds=bounds)
-    search = _Search(problem, np.zeros((2, 2)), np.zeros((1, 1)), Limits(1, np.inf, 1e-8), None)
-    near = -3.0 * (1 - 1e-15)
-    assert near != -3.0
-    found = search._inside(np.array([[-4.0], [-3.0], [near], [-3.0 * (1 - 1e-13)], [1e300], [np.nan]]))
-    np.testing.assert_array_equal(found.ravel(), [-3.0, -3.0, -3.0, -3.0 * (1 - 1e-13), 1e300, np.nan])
-
-
-def test_a_sweep_takes_less_than_five_milliseconds():
-    problem = swing_up()
-    motion = Motion(np.zeros((101, 4)), np.zeros((100, 1)), np.zeros((100, 4)))
-    around = expand(problem, motion, jacobians_along(problem, motion), AugmentedLagrangian(problem))
-
-    def seconds():
-        start = time.perf_counter()
-        solve_riccati(around, 0.0)
-        return time.perf_counter() - start
-
-    assert min(seconds() for _ in range(10)) < 5e-3
 
 
 @pytest.mark.parametrize("side", [-1, 1])

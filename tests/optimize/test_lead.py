@@ -6,7 +6,7 @@ import pytest
 import drake_diff as dd
 from drake_diff.motion.dormand_prince import AT, DENSE, STAGES
 from drake_diff.optimize.transcription.collocation import collocated
-from drake_diff.optimize.transcription.lead import MOST_STEPS, Lead
+from drake_diff.optimize.transcription.lead import Lead
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 ACCURATE = 1e-3  # of a state's range: an oscillation takes at most 16 * 40 steps, each of which may be off by 1e-6
@@ -76,23 +76,6 @@ def test_what_leaves_all_numbers_is_no_number_from_there_on():
     before = t[:9]
     assert np.allclose(led[:90:10], 1 / (1 - before), rtol=1e-4)
     assert np.isnan(led[-1])
-
-
-def test_an_easy_interval_costs_six_evaluations():
-    count = 0
-
-    def f(x, u):
-        nonlocal count
-        count += 1
-        return [x[1], u[0]]
-
-    motion, _ = oscillator(1.0)
-    motion = motion_of(f, 2, motion.xs, motion.us, 4.0)
-    motion.led("TVLQR")
-    count = 0
-    motion.led("open loop")
-    assert count <= 6 * 40 + 1  # and never more than six of each of MOST_STEPS
-    assert MOST_STEPS == 16
 
 
 def test_within_a_step_the_weights_are_those_of_a_quartic():

@@ -67,11 +67,6 @@ def test_a_solver_that_stops_short_of_its_tolerance_is_inaccurate():
     assert result.outcome is Outcome.INACCURATE, result.message
 
 
-def test_the_iteration_limit_is_told():
-    result = run(program(rosenbrock), guess=(-1.2, 1.0), limits=Limits(3, math.inf, 1e-8))
-    assert result.outcome is Outcome.ITERATION_LIMIT
-
-
 def test_the_time_limit_ends_it_at_the_best_point_so_far():
     result = run(program(rosenbrock), guess=(-1.2, 1.0), limits=Limits(500, 1e-6, 1e-8))
     assert result.outcome is Outcome.TIME_LIMIT
@@ -93,26 +88,6 @@ def test_the_best_point_is_a_feasible_one_where_there_is_one(monkeypatch):
     assert result.outcome is Outcome.INTERRUPTED
     assert result.z @ result.z == pytest.approx(2, abs=1e-6)
     assert result.z.sum() <= math.sqrt(2) + 1e-6
-
-
-def test_ctrl_c_puts_the_former_handler_back(monkeypatch):
-    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
-
-    def mine(*_):
-        raise AssertionError("the former handler must not hear of it")
-
-    before = signal.signal(signal.SIGINT, mine)
-    try:
-        result = run(
-            program(rosenbrock),
-            guess=(-1.2, 1.0),
-            report=lambda line: signal.raise_signal(signal.SIGINT),
-        )
-        assert signal.getsignal(signal.SIGINT) is mine
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert result.outcome is Outcome.INTERRUPTED
-    assert np.all(np.isfinite(result.z))
 
 
 def test_a_solve_works_outside_the_main_thread():
@@ -170,10 +145,6 @@ def test_snopts_rows_are_read_where_their_columns_stand():
     assert [row.step for row in rows[1:]] == [0.05, 1.0]
 
 
-def test_text_without_a_table_gives_no_rows():
-    assert list(_snopt_rows(["", "EXIT: Optimal Solution Found.", "   12 constraints, 3 variables"])) == []
-
-
 def test_a_drake_without_snopt_is_named(monkeypatch):
     monkeypatch.setattr(SnoptSolver, "available", lambda self: False)
     with pytest.raises(MissingDependencyError, match="SNOPT is not in this Drake"):
@@ -193,10 +164,6 @@ def test_the_best_iterate_is_feasible_first_and_cheap_second():
     assert seen.best_of(np.array([9.0])).tolist() == [2.0]  # a copy: z itself went on
     seen.offer(np.array([7.0]), math.nan, 0.0)
     assert seen.best_of(np.array([9.0])).tolist() == [2.0]
-
-
-def test_without_an_iterate_the_guess_is_the_best():
-    assert watch().best_of(np.array([9.0])).tolist() == [9.0]
 
 
 def test_the_clock_and_ctrl_c_end_a_solve_and_the_end_is_reported(monkeypatch):

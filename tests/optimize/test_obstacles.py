@@ -90,15 +90,6 @@ def test_without_them_the_plan_goes_through(name):
     assert depth_by_drake(without.problem.model, finely(without), {"ball": BALL, "post": POST}[name]) > 0.05
 
 
-@pytest.mark.slow
-def test_shooting_keeps_clear_too():
-    problem = arm([dd.SphereObstacle([0.75, 0.0, -0.75], 0.08, name="ball")], x0=[0, 0, 0, 0], x_goal=[0.6, -0.6, 0, 0])
-    guess = dd.solve(problem, method="ilqr", max_iterations=150)
-    solution = dd.solve(problem, method="shooting", initial_guess=guess, max_iterations=60)
-    assert solution.constraint_violation <= 1e-6
-    assert depth_by_drake(problem.model, solution.xs, problem.goals[0], parts=50) < 0
-
-
 def test_where_a_plan_jumps_through_between_knots_the_mesh_is_refined(monkeypatch):
     problem = arm([BALL], num_steps=8, time_step=0.2)
     solution = dd.solve(problem, method="collocation", max_iterations=200)

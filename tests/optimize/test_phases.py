@@ -254,14 +254,6 @@ def test_what_cannot_be_is_told_as_infeasible():
     assert "from none of 9 first guesses" in solution.message
 
 
-def test_a_solution_is_its_own_guess(walked):
-    again = dd.solve(gait(), initial_guess=walked)
-    assert again.success
-    assert again.iterations[0].primal_infeasibility < 1e-7
-    parts = dd.solve(gait(), initial_guess=[walked.phases[0]])
-    assert parts.success
-
-
 def test_coarse_meshes_are_refined():
     problem = gait()
     coarse = replace(problem.phases[0], num_steps=3, us=None)

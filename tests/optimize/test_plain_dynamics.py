@@ -5,9 +5,8 @@ import types
 
 import numpy as np
 import pytest
-from helpers.models import MODELS
 from helpers.table import each_row
-from helpers.transcription import BLOCK, heavy_pendulum, own_derivatives, push
+from helpers.transcription import BLOCK, own_derivatives
 
 import drake_diff as dd
 from drake_diff.exceptions import ArtifactError, InputError, ModelError
@@ -113,18 +112,6 @@ def test_what_a_solver_would_leave_out_is_refused(load, changes, options, match)
     problem = dataclasses.replace(block_move(), **changes)
     with pytest.raises(InputError, match=match):
         dd.solve(problem, **{"method": "collocation"} | options)
-
-
-def test_what_does_not_hold_is_told_in_the_words_of_plain_dynamics():
-    """No time step that could be smaller, and no model: a finer mesh, and the dynamics."""
-    swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
-    asked = {"x0": [0, 0], "x_goal": [np.pi, 0], "num_steps": 4, "horizon": 2.0, "running_cost": EFFORT}
-    coarse = dd.solve(dd.Problem(swing, **asked), refine=False)
-    assert coarse.status is dd.Status.CONVERGED_NOT_VERIFIED
-    assert "pass refine=True, or take more steps (num_steps)" in coarse.message
-    assert "time step" not in coarse.message
-    moved = dataclasses.replace(coarse, xs=coarse.xs + 1.0)
-    assert "defect" in {c.what for c in moved.plan_checks.failing}
 
 
 def test_a_run_of_plain_dynamics_has_no_body_to_draw(tmp_path):
@@ -246,15 +233,6 @@ def test_a_midpoint_beyond_a_bound_or_constraint_is_measured():
     assert dataclasses.replace(solution, problem=kept).constraint_violation == pytest.approx(0.05, rel=1e-9)
 
 
-def test_a_solution_on_another_mesh_is_a_guess():
-    swing = {"x0": [0, 0], "x_goal": [np.pi, 0], "horizon": 2.0, "running_cost": EFFORT}
-    coarse = dd.solve(dd.Problem(heavy_pendulum(0.1), num_steps=20, **swing), scheme="trapezoid")
-    cold = dd.solve(dd.Problem(heavy_pendulum(0.1), num_steps=40, **swing))
-    warm = dd.solve(dd.Problem(heavy_pendulum(0.1), num_steps=40, **swing), initial_guess=coarse)
-    assert warm.cost == pytest.approx(cold.cost, rel=1e-8)
-    assert len(warm.iterations) <= len(cold.iterations)
-
-
 # ------------------------------------------------------------------------------ artifact
 
 
@@ -266,25 +244,6 @@ def test_a_failed_solve_of_plain_dynamics_leaves_an_artifact_that_fails(tmp_path
 
 
 # ------------------------------------------------------------------------------ what is printed
-
-
-def test_what_is_printed_fits_on_a_screen_and_is_escaped():
-    names = ["<b>place</b>", "speed"]
-    dynamics = dd.Dynamics(push, 2, 1, state_names=names)
-    limit = dd.Constraint(lambda x: x[1], upper=2, name="<i>slow</i>")
-    problem = dataclasses.replace(block_move(), system=dynamics, constraints=limit, waypoints={5: [0.5, np.nan]})
-    solution = dd.solve(problem)
-    for value in (problem, solution, dynamics, limit, EFFORT, dd.Bounds(u_upper=np.ones(40))):
-        assert 1 <= len(repr(value).splitlines()) <= 8
-        assert max(map(len, repr(value).splitlines())) < 160
-    assert repr(solution).startswith("Solution of plain dynamics by collocation (hermite_simpson, ipopt): converged")
-    assert str(solution) == f"plain dynamics by collocation: converged, cost {solution.cost:.6g}, defect " + (
-        f"{solution.defect:.2g}, goal error {solution.goal_error:.2g}"
-    )
-    assert "<i>" in repr(problem)
-    assert "<i>" not in problem._repr_html_()
-    assert "<b>" not in solution._repr_html_()
-    assert MODELS.name not in repr(problem)
 
 
 def test_the_shortest_way_of_a_car_that_begins_along_an_axis_is_found():

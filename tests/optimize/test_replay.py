@@ -6,20 +6,16 @@ import math
 import numpy as np
 import pytest
 from helpers.models import MODELS
-from helpers.plants import block as rail_block
 from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.model.parameters import select
 from drake_diff.motion import LQR
-from drake_diff.optimize.checks import check
-from drake_diff.optimize.messages import controls
 from drake_diff.optimize.replay import (
     FEEDBACK_TOLERANCE,
     STATE_TOLERANCE,
     Plan,
     broken_variants,
-    deciding,
     held,
     replays,
     track,
@@ -217,31 +213,6 @@ def test_a_plan_that_lives_from_one_law_of_contact_is_refused_in_the_other_in_fi
     assert found[-1].motion.xs[-1, 0] > 0.11  # 0.1 s to the ground, 0.03 s on its spring, and on the way up
 
 
-def test_where_the_other_law_fails_at_the_plans_own_step_the_message_says_so(write_urdf):
-    problem = block(write_urdf, final_cost=lambda x: x[0])
-    plan = plan_of(problem, np.zeros((COUNT, 1)))
-    own, other = f"in steps of {H:g} s", "with lagged contact"
-    known = by_name(replays(plan), own, "open loop")
-    finer, why = f"{other} in steps of {H / 8:g} s", "the foot is thrown up"
-    failed = (check("motion", why, math.inf, 0.0),)
-    rows = ((own, ()), (other, failed), (finer, ()))
-    found = [dataclasses.replace(known, variant=name, checks=checks) for name, checks in rows]
-    assert broken_variants(plan, found) == {}
-    said = controls(found, deciding(plan, found), finest=False)
-    assert said == f"on the plant open loop; open loop {other}, where steps are longer, not: {why}"
-    assert list(broken_variants(plan, found[:2])) == [other]
-
-
-def test_a_replay_prints_what_failed_and_not_its_arrays(write_urdf):
-    plan = plan_of(block(write_urdf, x_goal=[0.9, math.nan]), np.full((COUNT, 1), 2.0))
-    found = by_name(replays(plan), f"in steps of {H:g} s", "open loop")
-    assert repr(found) == f"Replay in steps of {H:g} s, open loop: {found.failures[0]}"
-    held_one = by_name(replays(plan_of(block(write_urdf, final_cost=lambda x: x[0]), np.zeros((COUNT, 1)))),
-                       f"in steps of {H:g} s", "open loop")  # fmt: skip
-    assert str(held_one) == f"in steps of {H:g} s, open loop: holds"
-    assert f">Replay {held_one}</pre>" in held_one._repr_html_()
-
-
 def test_inputs_that_cannot_be_stepped_are_missing_not_zero(write_urdf):
     problem = block(write_urdf, final_cost=lambda x: x[0])
     us = np.full((COUNT, 1), np.nan)
@@ -283,25 +254,6 @@ def test_a_frame_that_has_to_be_exact_is_replayed_in_steps_that_are_fine_enough_
     assert not broken_variants(plan, found)
 
 
-def test_a_check_has_how_far_the_plan_ends_from_its_goal_and_what_is_allowed(write_urdf):
-    """A block moved in steps of 0.05 s: held inputs in half the steps lead elsewhere by the closed form of the sums."""
-    problem = block(write_urdf, x_goal=[1, 0])
-    solution = dd.solve(problem, method="shooting")
-    assert solution.success, solution.message
-    us = np.repeat(solution.us[:, 0], 2)
-    vs = np.cumsum(us * H / 2)
-    off = abs(np.sum(vs) * H / 2 - 1)  # symplectic Euler by hand; the speed ends at 0 exactly
-    controlled = [r for r in solution.replays if r.variant == "in steps of 0.025 s"]
-    assert min(r.goal_error for r in controlled) <= off + 1e-9
-    assert controlled[0].goal_error == pytest.approx(off, abs=1e-9)
-    (ends,) = [c for c in controlled[0].checks if c.what == "goal"]
-    i = solution.problem.state_names.index(ends.where)  # both are off by rounding: the speeds sum to the same
-    assert ends.value == pytest.approx(off, abs=1e-9)
-    assert ends.tolerance == pytest.approx(0.05 * np.ptp(solution.xs[:, i]))
-    from_diagram = dd.solve(dd.Problem(rail_block(), x0=[0, 0], x_goal=[1, 0], num_steps=10), method="shooting")
-    assert {r.variant for r in from_diagram.replays} == {"in steps of 0.1 s"}  # it allows no other step
-
-
 def test_a_solve_whose_replay_fails_is_no_success(load):
     """A discrete swing-up in steps of 0.1 s is right at 0.1 s alone."""
     problem = dd.Problem(
@@ -315,12 +267,6 @@ def test_a_solve_whose_replay_fails_is_no_success(load):
     assert solution.defect == 0
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert "replayed in steps of 0.05 s it does not hold: open loop, " in solution.message
-
-
-def test_the_open_loop_motion_is_taken_once(write_urdf):
-    """The replay at the plan's own step is the plan's open-loop motion."""
-    plan = plan_of(block(write_urdf, x_goal=[1, 0]), np.full((COUNT, 1), 2.0))
-    assert by_name(replays(plan), f"in steps of {H:g} s", "open loop").motion is plan.open_loop
 
 
 def cart_pole_swing_up():

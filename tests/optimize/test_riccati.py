@@ -1,12 +1,9 @@
 """The Riccati recursion against a problem by hand, and the whole linear-quadratic problem as one linear system."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.table import each_row
 
-from drake_diff.optimize.ilqr import riccati_kernel
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic, follow, slope_along, solve_riccati
 
 
@@ -145,12 +142,3 @@ def test_without_a_minimum_there_is_no_policy_until_it_is_regularized(size):
     assert solve_riccati(p, 1e3) is not None
     p.hessians[3, 0, 0] = np.nan
     assert solve_riccati(p, 1e3) is None
-
-
-def test_a_sweep_is_compiled_for_one_kind_of_arguments():
-    """As of read-only arrays, or of those that are not contiguous: each takes seconds."""
-    p = problem()
-    p.F.setflags(write=False)
-    solve_riccati(p, 0.0)
-    solve_riccati(replace(p, F=np.asfortranarray(p.F), gaps=np.zeros((6, 3), dtype=int)), 1)
-    assert len(riccati_kernel.sweep.signatures) == 1

@@ -62,27 +62,6 @@ def test_by_the_mass_of_a_block(write_urdf):
     assert found.verdict == "agree"
 
 
-@pytest.mark.slow
-@each_row("limit", [np.inf, 10.0])
-def test_a_swing_up_is_what_whole_solves_differ_by(limit):
-    """Solved again from a straight line by `solve` itself, on both sides; 1e-4 of each column is asked."""
-    model = dd.example_model("cart_pole", time_step=0.02)
-    asked = {"num_steps": 100, "running_cost": EFFORT, "bounds": dd.Bounds(u_lower=[-limit], u_upper=[limit])}
-    problem = dd.Problem(model, x0=[0] * 4, x_goal=[1, np.pi, 0, 0], **asked)
-    solution = dd.solve(problem, method="collocation", tolerance=1e-10)
-    found = dd.sensitivity(solution, "goal")
-    assert found.verdict == "agree", found
-    assert (found.active > 0) == np.isfinite(limit)
-    for i, step in enumerate(np.diag([2e-4] * 4)):
-        ends = []
-        for side in (-1, 1):
-            moved = replace(problem, x_goal=problem.x_goal + side * step)
-            ends.append(dd.solve(moved, method="collocation", tolerance=1e-10))
-        us, cost = ((getattr(ends[1], name) - getattr(ends[0], name)) / 4e-4 for name in ("us", "cost"))
-        assert found.cost[i] == pytest.approx(cost, abs=1e-4 * np.abs(found.cost).max())
-        np.testing.assert_allclose(found.us[..., i], us, atol=1e-4 * np.abs(us).max())
-
-
 def test_a_limit_that_is_touched_without_force_is_a_corner():
     """u = 6 at both ends is just what the limit allows: a farther goal is held by it, a nearer one is not."""
     found = dd.sensitivity(dd.solve(block(6.0)), "goal")
@@ -227,25 +206,6 @@ def test_discrete_plans_keep_what_holds_them(write_urdf):
 
 
 @pytest.mark.slow
-def test_a_mass_that_the_plan_chooses_moves_with_the_goal(write_urdf):
-    """Effort k m^2 d^2: the least at the bound of m; with 20 / m besides it is inside, and d cost / dd = 2 k m^2 d."""
-    model = write_urdf(mass=1.0, time_step=0.1)
-    asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10, "running_cost": EFFORT}
-    chosen = {"optimize": ("controls", "parameters"), "parameters": ("block.mass",)}
-    for held, price in ((1, 0.0), (0, 20.0)):
-        bounds = {"block.mass": (0.7, 2.0)} if held else None
-        cost = {"parameter_cost": lambda p: 20.0 / p[0]} if price else {}
-        problem = dd.Problem(model, parameter_bounds=bounds, **asked, **chosen, **cost)
-        solution = dd.solve(problem, method="shooting")
-        found = dd.sensitivity(solution, "goal")
-        assert (found.verdict, found.active) == ("agree", held)
-        effort = solution.cost - price / solution.parameters[0]
-        assert found.cost[0] == pytest.approx(2 * effort, rel=1e-6)
-        with pytest.raises(InputError, match="does not choose itself"):
-            dd.sensitivity(solution, ["block.mass"])
-
-
-@pytest.mark.slow
 @each_row("method", ["ilqr", "shooting"])
 def test_the_length_of_steps_moves_with_the_goal(write_urdf, method):
     """Effort k d^2 / T^3 in N steps of any length, and T: T grows with the root of d, so that dT/dd = T / 2 d."""
@@ -281,16 +241,6 @@ def test_a_contact_that_is_about_to_begin_is_a_corner():
             assert "contact of ball/ball with pusher/pusher at knot 39" in found.weak
             assert any("the two sides of push_x differ" in told for told in found.weak)
     assert slopes[1e-4] > slopes[-2e-4] + 10  # both are right, and the corner is between them
-
-
-def test_a_wrong_derivative_of_a_discrete_plan_is_told(monkeypatch, write_urdf):
-    """Planted: the steps' Jacobians in the matrix are off by 0.1 %; re-solves have the honest ones."""
-    solution = dd.solve(regulated(write_urdf), method="ilqr")
-    honest = HeldPlan._hessian
-    monkeypatch.setattr(
-        HeldPlan, "_hessian", lambda self, y: honest(self, y) * (1 + 1e-3 * np.linspace(0, 1, len(self.z))[:, None])
-    )
-    assert dd.sensitivity(solution).verdict == "disagree"
 
 
 def test_a_plan_that_is_no_optimum_has_no_derivative(write_urdf):

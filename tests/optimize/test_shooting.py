@@ -162,24 +162,6 @@ def test_a_cart_pole_swings_up(limit):
     assert solution.goal_error < 1e-7
 
 
-def test_a_mass_is_chosen_together_with_the_inputs():
-    """The effort 12 m^2 / (1 - 1 / N^2) is least for the least mass allowed, 0.5 kg."""
-    problem = dd.Problem(
-        block(time_step=0.05),
-        x0=[0, 0],
-        x_goal=[1, 0],
-        num_steps=20,
-        running_cost=EFFORT,
-        optimize=("controls", "parameters"),
-        parameters=["block_0.mass"],
-        parameter_bounds={"block_0.mass": (0.5, 2)},
-    )
-    solution = shoot(problem)
-    assert solution.success, solution.message
-    assert solution.parameters == pytest.approx([0.5], abs=1e-7)
-    assert solution.cost == pytest.approx(12 * 0.25 / (1 - 1 / 400), rel=1e-6)
-
-
 def test_all_of_it_together_is_solved():
     solution = shoot(everything(x_goal=None))
     assert solution.success, solution.message

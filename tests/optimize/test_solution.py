@@ -11,14 +11,8 @@ from helpers.plants import block
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError
-from drake_diff.optimize.checks import check
-from drake_diff.optimize.messages import controls
-from drake_diff.optimize.replay import deciding, judged_replay
-from drake_diff.runs import measure
 
 METHODS = ("collocation", "shooting", "ilqr")
-OPEN, CLOSED = "open loop", "TVLQR"
 N, H = 10, 0.1
 MOVED = 1e-3
 
@@ -214,90 +208,6 @@ def test_the_integration_error_falls_by_the_fourth_order_of_hermite_simpson():
     assert 0 < errors[1] < errors[0] / 16
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_solutions_arrays_are_read_only(method):
-    with pytest.raises(ValueError, match="read-only"):
-        solved(method).xs[0, 0] = 1.0
-
-
 def test_only_converged_is_success():
     s = solved("shooting")
     assert [status for status in dd.Status if dataclasses.replace(s, status=status).success] == [dd.Status.CONVERGED]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_another_status_leaves_the_measures_as_they_were_taken(method):
-    """The status is told of the motion: nothing of the motion is measured again."""
-    s = dataclasses.replace(solved(method))
-    measured = {name: getattr(s, name) for name in ("cost", "defects", "plan", "replay", "replays", "transcribed")}
-    told = s.told(status=dd.Status.INFEASIBLE, message="m", options={"chain": []}, iterations=(), solver_message="w")
-    assert (told.status, told.message, told.options) == (dd.Status.INFEASIBLE, "m", {"chain": []})
-    assert (told.iterations, told.solver_message) == ((), "w")
-    assert all(getattr(told, name) is value for name, value in measured.items())
-    assert s.status is dd.Status.CONVERGED
-
-
-@each_row("name", ["xs", "us", "problem", "certificates", "cost"])
-def test_what_a_measure_may_depend_on_is_not_told(name):
-    with pytest.raises(InputError, match=f"expected one of cross_checks, iterations, .*, got '{name}'"):
-        solved("ilqr").told(**{name: None})
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_what_the_verdict_measured_is_not_measured_again(method):
-    assert {"cost", "defects", "plan", "replays"} <= vars(solved.__wrapped__(method)).keys()
-
-
-def of_replays(good):
-    """What is told of a discrete plan of which the replays in `good` (by control) hold."""
-    s = solved("ilqr")
-    found = []
-    for variant in ("in steps of 0.1 s", "in steps of 0.05 s"):
-        for control in (OPEN, CLOSED):
-            why = f"x ends far off {variant} by {control}"
-            checks = () if control in good else (check("motion", why, math.inf, 0.0),)
-            found.append(dataclasses.replace(s.replays[0], variant=variant, control=control, checks=checks))
-    return controls(found, deciding(s.plan, found), finest=False), judged_replay(s.plan, found)
-
-
-def test_a_plan_that_holds_under_every_control_says_so():
-    told, shown = of_replays({OPEN, CLOSED})
-    assert told == "on the plant open loop and under TVLQR"
-    assert shown.control == OPEN
-
-
-def test_where_nothing_holds_there_is_no_motion_that_was_judged():
-    assert of_replays(set())[1] is None
-
-
-@each_row("holding, failing", [(OPEN, CLOSED), (CLOSED, OPEN)])
-def test_the_control_that_does_not_hold_is_in_the_first_sentence_with_why(holding, failing):
-    words = {OPEN: "open loop", CLOSED: "under TVLQR"}
-    told, shown = of_replays({holding})
-    why = f"in steps of 0.1 s, x ends far off in steps of 0.1 s by {failing}"
-    assert told == f"on the plant {words[holding]}, not {words[failing]}: {why}"
-    assert shown.control == holding
-
-
-def test_a_success_that_only_feedback_holds_says_so_wherever_it_is_told(tmp_path):
-    """A cart-pole swung up: what half a step changes grows on the way up, and open loop ends elsewhere."""
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
-    effort = dd.QuadraticCost(R=[[1.0]])
-    problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=100, running_cost=effort)
-    solution = dd.solve(problem)
-    assert solution.success, solution.message
-    assert not any(r.holds for r in solution.replays if r.control == OPEN)
-    first = solution.message.split(";")[0]
-    held = "under TVLQR in steps of 0.01 s or less"
-    assert f"on the plant {held}, not open loop: in steps of 0.02 s, hinge_w ends" in first
-    assert "converged under TVLQR, not open loop" in str(solution)
-    assert "not open loop" in repr(solution)
-    record = dd.save(solution, tmp_path / "run")
-    assert record.sentence == solution.message
-    page = (tmp_path / "run" / "report.html").read_text()
-    assert "own motion, in steps of 0.01 s, while feedback (TVLQR) keeps it near the plan." in page
-    assert "Under the planned inputs alone it leaves the plan." in page
-    shown, control = measure(solution).shown
-    assert control == "TVLQR, in steps of 0.01 s"
-    assert shown is solution.judged_replay.motion
-    assert np.abs(shown.xs[-1] - [1, np.pi, 0, 0]).max() < 0.2  # the motion that is drawn is the one that arrives

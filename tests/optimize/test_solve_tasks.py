@@ -7,7 +7,6 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.derivatives.smooth_step import SmoothStep
-from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 SCHEMES = ("hermite_simpson", "trapezoid", "drake")
@@ -45,61 +44,6 @@ def test_auto_takes_collocation_where_the_horizon_is_free(load):
     assert 0.5 <= solution.horizon <= 2.0 + 1e-6  # IPOPT keeps a bound to its tolerance
     fixed = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT, horizon=(2.0, 2.0))
     assert solution.cost <= dd.solve(fixed).cost + 1e-6
-
-
-def test_a_waypoint_is_passed_at_the_cost_of_the_closed_form(write_urdf):
-    """Rest to rest over 1 m in 1 s through x(1/2) = a, v free: min int u^2 = 12 + 192 (a - 1/2)^2.
-
-    The cubic alone passes 1/2. A unit force-multiplier at the middle adds to x(1/2) the compliance 1/192, that of a
-    beam clamped at both ends.
-    """
-    problem = dd.Problem(
-        write_urdf(time_step=0.05),
-        x0=[0, 0],
-        x_goal=[1, 0],
-        num_steps=20,
-        running_cost=EFFORT,
-        waypoints={10: [0.6, math.nan]},
-    )
-    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson")
-    assert solution.success, solution.message
-    assert solution.xs[10, 0] == pytest.approx(0.6, abs=1e-8)
-    assert solution.cost == pytest.approx(12 + 192 * 0.01, rel=1e-8)
-    assert solution.constraint_excess["waypoint at knot 10"][0] < 1e-8
-
-
-@pytest.mark.parametrize("as_bound", [True, False])
-def test_a_speed_limit_costs_what_the_closed_form_says(write_urdf, as_bound):
-    """Rest to rest, 1 m in 1 s, v <= w: u = 2 w / s (1 - t / s) over s = 3/2 (1 - 1/w), then 0: J = 8 w^2 / (3 s).
-
-    The way is w (1 - 2 s / 3) = 1. With w = 9/8, s = 1/6 lies on a knot of 30.
-    """
-    w, s = 9 / 8, 1 / 6
-    limit = {"bounds": dd.Bounds(x_upper=[math.inf, w])} if as_bound else {}
-    if not as_bound:
-        limit = {"constraints": dd.Constraint(lambda x: x[1], upper=w, name="speed")}
-    problem = dd.Problem(
-        write_urdf(time_step=1 / 30), x0=[0, 0], x_goal=[1, 0], num_steps=30, running_cost=EFFORT, **limit
-    )
-    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson")
-    assert solution.status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED), solution.message
-    assert solution.cost == pytest.approx(8 * w**2 / (3 * s), rel=1e-6)
-    assert solution.xs[:, 1].max() <= w + 1e-8
-
-
-def test_a_broken_constraint_is_named_with_its_knot(write_urdf):
-    problem = dd.Problem(
-        write_urdf(time_step=0.1),
-        x0=[0, 0],
-        x_goal=[1, 0],
-        num_steps=10,
-        running_cost=EFFORT,
-        constraints=dd.Constraint(lambda x: x[1], upper=0.5, name="too slow"),
-    )
-    solution = dd.solve(problem, method="collocation")
-    assert not solution.success
-    assert solution.status is Status.INFEASIBLE
-    assert "too slow" in solution.message or "defect" in solution.message
 
 
 @pytest.mark.parametrize(("count", "holds"), [(4, False), (40, True)])

@@ -3,7 +3,6 @@
 The clock is ours: it stands still but where a test lets time pass.
 """
 
-import contextlib
 import signal
 import time
 
@@ -96,16 +95,6 @@ def test_what_is_found_in_time_and_not_certified_is_not_called_verified(monkeypa
     assert len(found.certificates) == 3  # those of the guess
 
 
-@each_row("method, solver", METHODS)
-def test_replays_that_the_limit_cuts_are_named(monkeypatch, method, solver):
-    clock = stopped(monkeypatch)
-    monkeypatch.setattr(run, "judged", late(clock, run.judged, from_call=1))
-    found = dd.solve(swing(), method=method, solver=solver, time_limit=10.0)
-    assert found.status is STATUS
-    assert "not made within the time limit: replays and other measures" in found.message
-    assert len(found.certificates) > 3
-
-
 @each_row(
     "method, place",
     [
@@ -196,29 +185,6 @@ def test_a_signal_in_the_middle_of_an_evaluation_ends_it(monkeypatch, method, so
     assert after <= 2 * found.problem.num_steps + 10
 
 
-@each_row("method", ["collocation", "shooting", "ilqr"])
-def test_a_signal_while_the_guess_is_certified_leaves_the_guess(monkeypatch, method):
-    plans, begun = [], []
-
-    def interrupted():
-        if not begun:
-            begun.append(signal.raise_signal(signal.SIGINT))
-        check_time()
-
-    def certify(*words, **more):
-        monkeypatch.setattr(twin, "check_time", interrupted)
-        return real(*words, **more)
-
-    name = "certify_equations" if method == "collocation" else "certify_steps"
-    real = getattr(run, name)
-    monkeypatch.setattr(run, name, certify)
-    found = dd.solve(swing(), method=method, on_plan=plans.append)
-    assert found.status is dd.Status.INTERRUPTED
-    assert "not made before that: certificates of the guess, the search" in found.message
-    assert [plan.status for plan in plans] == [dd.Status.INTERRUPTED]
-    assert np.array_equal(found.xs[0], [0, 0])
-
-
 def test_a_signal_ends_a_compilation_at_once():
     """Numba's own code is on the stack while it compiles, for seconds in which it looks at no flag."""
     numba_s = {"__name__": "numba.core.compiler", "signal": signal}
@@ -259,27 +225,3 @@ def test_what_numba_compiles_is_told_and_no_limit_counts_it(monkeypatch, method,
     found = dd.solve(problem, method=method, solver=solver, time_limit=10.0)
     assert found.status is STATUS
     assert found.message.endswith(lines[-1])
-
-
-class Destroyed:
-    """What a signal raises in a destructor, Python prints and forgets."""
-
-    def __del__(self):
-        signal.raise_signal(signal.SIGINT)
-
-
-def called_by_c(function):
-    """What it raises is lost, as in what LLVM calls."""
-    with contextlib.suppress(StoppedError):
-        function()
-
-
-@each_row("what", ["Destroyed()", "called_by_c(lambda: signal.raise_signal(signal.SIGINT))"])
-def test_a_signal_in_what_can_raise_nothing_ends_the_compilation_after_it(what):
-    numba_s = {"__name__": "numba.core.compiler", "signal": signal, "spent": time.process_time}
-    numba_s |= {"Destroyed": Destroyed, "called_by_c": called_by_c}
-    exec(f"def compile_it():\n    {what}\n    end = spent() + 20\n    while spent() < end: pass", numba_s)
-    with noted_interrupts() as flag, until_set(flag), pytest.raises(StoppedError):
-        numba_s["compile_it"]()
-    assert signal.getsignal(signal.SIGVTALRM) is signal.SIG_DFL
-    assert signal.getitimer(signal.ITIMER_VIRTUAL) == (0.0, 0.0)

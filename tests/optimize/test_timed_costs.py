@@ -53,17 +53,6 @@ def test_an_input_that_is_asked_for_in_time_is_given(write_urdf, method):
     np.testing.assert_allclose(solution.us[:, 0], np.sin(3 * at), atol=1e-6)
 
 
-@pytest.mark.slow
-@each_row("method", METHODS)
-def test_steps_of_many_segments_know_their_time(write_urdf, method):
-    """A waypoint in time without a waypoint: the cost is there in the second half alone."""
-    gate = [lambda x, u, t: 1e3 * (x[0] - 1) ** 2 * (1 + np.tanh(40 * (t - 0.75))) / 2, dd.QuadraticCost(R=[[1e-3]])]
-    solution = dd.solve(block(write_urdf, running_cost=gate), method=method)
-    late = solution.times > 0.8
-    np.testing.assert_allclose(solution.xs[late, 0], 1.0, atol=0.02)
-    assert abs(solution.xs[8, 0] - 1) > 0.1  # at 0.4 s nothing is asked
-
-
 @each_row("method", METHODS)
 @each_row("kind", ["arrays", "solution", "trajectory", "trajectories", "function"])
 def test_a_reference_is_followed_in_whatever_form_it_is_given(write_urdf, method, kind):

@@ -8,7 +8,6 @@ Optimization", SIAM Review 59(4), 2017; Betts, "Practical Methods for Optimal Co
 import dataclasses
 import itertools
 import math
-import time
 
 import casadi as ca
 import numpy as np
@@ -83,54 +82,6 @@ def test_the_cart_pole_from_its_file_swings_up(scheme, count, optimum):
     assert dynamics.bounds.u_upper == pytest.approx([20])
 
 
-def cart_poles_rates(z):
-    """Kelly's eq. 6.1 and 6.2 of z = [x, q, v, w, u] in CasADi."""
-    s, c, w, u = ca.sin(z[1]), ca.cos(z[1]), z[3], z[4]
-    cart = (0.15 * s * w**2 + u + 2.943 * c * s) / (1 + 0.3 * s**2)
-    return ca.vertcat(z[2], z[3], cart, -(0.15 * c * s * w**2 + u * c + 12.753 * s) / (0.5 + 0.15 * s**2))
-
-
-def by_radau(start, count):
-    """The least effort by Radau's collocation at three points of each interval, and inputs that are parabolas there."""
-    tau = [0.0, *ca.collocation_points(3, "radau")]
-    slopes, _, weights = ca.collocation_coeff(tau[1:])
-    h, x = 2.0 / count, ca.SX.sym("x", 4, 3 * count + 1)
-    u = ca.SX.sym("u", 1, 3 * count)
-    g, cost = [x[:, 0], x[:, -1] - ca.DM([1, np.pi, 0, 0])], 0
-    for k in range(count):
-        at = x[:, 3 * k : 3 * k + 4]
-        f = ca.horzcat(*[cart_poles_rates(ca.vertcat(at[:, j + 1], u[3 * k + j])) for j in range(3)])
-        g.append(ca.vec(at @ slopes - h * f))
-        cost += h * ca.dot(weights.T, ca.horzcat(*[u[3 * k + j] ** 2 for j in range(3)]))
-    z, free = ca.veccat(x, u), 4 * (3 * count + 1)
-    options = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "ipopt.tol": 1e-9}
-    solver = ca.nlpsol("radau", "ipopt", {"x": z, "f": cost, "g": ca.veccat(*g)}, options)
-    times = np.append(0.0, (np.arange(count)[:, None] + np.array(tau[1:])).ravel() / count)
-    bound = np.append(np.tile([2, np.inf, np.inf, np.inf], 3 * count + 1), np.full(3 * count, 20))
-    guess = np.append([start(t) for t in times], np.zeros(3 * count))
-    found = solver(x0=guess, lbx=-bound, ubx=bound, lbg=0, ubg=0)
-    return float(found["f"]), np.asarray(found["x"])[:free].reshape(-1, 4)
-
-
-@each_row("dip, optimum", [(0.0, 58.8077), (-1.5, 57.9448)])
-def test_the_cart_pole_has_two_swing_ups_within_all_bounds(dip, optimum):
-    """Which is found is the guess's doing: a straight line's is not the best. Another transcription agrees on both."""
-
-    def start(t):
-        aside = 0.5 * (dip != 0) * np.sin(np.pi * t)
-        return np.array([t + aside, np.pi * t + dip * np.sin(np.pi * t), 0, 0])
-
-    by_another, _ = by_radau(start, 40)
-    assert by_another == pytest.approx(optimum, abs=1e-3)
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
-    guess = np.array([start(t) for t in np.linspace(0, 1, 51)]), np.zeros((50, 1))
-    problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], running_cost=EFFORT, num_steps=50)
-    ours = dd.solve(problem, method="collocation", initial_guess=guess)
-    assert ours.success, ours.message
-    assert ours.cost == pytest.approx(optimum, abs=1e-3)
-    assert violation_between_nodes(ours.transcribed).worst == 0
-
-
 # ------------------------------------------------------------------------------ pendulums
 
 
@@ -173,11 +124,6 @@ def test_the_cost_converges_at_the_schemes_order(scheme, errors, orders):
         assert orders[0] < math.log2(coarse / fine) < orders[1]
 
 
-def test_the_inputs_of_the_least_effort():
-    motion = move(80, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0)
-    assert [motion.inputs_at_knots.min(), motion.inputs_at_knots.max()] == pytest.approx([-2.4700, 10.8685], abs=4e-3)
-
-
 def test_minimum_time():
     pendulum = heavy_pendulum(0.0, u_lower=[-5], u_upper=[5])
     motion = move(50, pendulum, x_goal=[np.pi, 0], horizon=(0.5, 6), running_cost=1.0)
@@ -200,20 +146,6 @@ def test_the_double_integrator_in_minimum_time(scheme, count):
     half = count // 2
     assert motion.inputs_at_knots[:half, 0] == pytest.approx(1, abs=1e-5)
     assert motion.inputs_at_knots[half + 1 :, 0] == pytest.approx(-1, abs=1e-5)
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_an_odd_number_of_intervals_is_slightly_slower(scheme):
-    motion = move(
-        9, x0=[-1, 0], x_goal=[0, 0], horizon=(0.1, 10), running_cost=1.0, bounds=unit_inputs(), scheme=scheme
-    )
-    assert 2 < motion.horizon < 2.03
-
-
-@pytest.mark.parametrize(("distance", "most"), [(9.0, 0.5), (0.04, 3.0)])
-def test_any_distance(distance, most):
-    motion = move(20, x_goal=[distance, 0], horizon=(0.01, 30), running_cost=1.0, bounds=unit_inputs(most))
-    assert motion.horizon == pytest.approx(2 * math.sqrt(distance / most / (1 - 2 / (3 * 20**2))), rel=1e-6)
 
 
 @pytest.mark.parametrize(("count", "rel"), [(10, 3e-7), (20, 2e-8)])
@@ -364,30 +296,6 @@ def test_van_der_pols_oscillator():
     assert motion.xs[:, 0].min() == pytest.approx(-0.25, abs=1e-6)
 
 
-def test_propts_variant():
-    dynamics = van_der_pol(u_lower=[-0.3], u_upper=[1])
-    motion = move(100, dynamics, x0=[0, 1], x_goal=None, horizon=5.0, running_cost=state_and_effort)
-    assert motion.cost == pytest.approx(2.86726, rel=5e-6)
-
-
-def test_rayleighs_oscillator():
-    dynamics = Dynamics(
-        lambda x, u: np.array([x[1], -x[0] + x[1] * (1.4 - 0.14 * x[1] ** 2) + 4 * u[0]]),
-        2,
-        1,
-        u_lower=[-10],
-        u_upper=[10],
-    )
-    options = {"x0": [-5, -5], "x_goal": None, "horizon": 4.5, "running_cost": lambda x, u: u[0] ** 2 + x[0] ** 2}
-    assert move(120, dynamics, **options).cost == pytest.approx(29.74893, rel=2e-5)
-
-
-def test_friction_with_a_push_of_both_signs():
-    motion = move(10, Dynamics(lambda x, u: np.array([x[1], u[0] - 4.0]), 2, 1))
-    assert motion.cost == pytest.approx(28, rel=1e-8)
-    assert motion.inputs_at_knots[:, 0] == pytest.approx(10 - 12 * motion.times, abs=1e-5)
-
-
 def test_friction_with_a_push_only():
     dynamics = Dynamics(lambda x, u: np.array([x[1], u[0] - 4.0]), 2, 1, u_lower=[0])
     motion = move(20, dynamics)  # a node lies at 3/4
@@ -457,22 +365,6 @@ def test_feedback_asks_for_no_more_than_the_bounds_allow():
         assert abs(dataclasses.replace(found, xs=xs).transcribed.led("TVLQR")[-1, 0] - 1) > 0.3
 
 
-def test_the_planar_quadrotors_side_step():
-    count, goal = 40, np.array([1.0, 0, 0, 0, 0, 0])
-    guess = np.linspace(np.zeros(6), goal, count + 1), np.full((count + 1, 2), HOVER)
-    motion = move(
-        count,
-        Dynamics(fly, 6, 2, u_lower=[0, 0], u_upper=[12, 12]),
-        x0=np.zeros(6),
-        x_goal=goal,
-        horizon=1.5,
-        running_cost=lambda x, u: (u[0] - HOVER) ** 2 + (u[1] - HOVER) ** 2,
-        initial_guess=guess,
-    )
-    assert motion.cost == pytest.approx(0.01673444, rel=1e-5)
-    assert [motion.inputs_at_knots.min(), motion.inputs_at_knots.max()] == pytest.approx([2.2453, 2.6248], abs=2e-3)
-
-
 HYPERSENSITIVE = 1.330806904943
 
 
@@ -499,13 +391,6 @@ def test_the_hypersensitive_problem_over_50_seconds():
     lengths = np.diff(motion.times)
     assert lengths[0] < lengths.max() / 4
     assert lengths[-1] < lengths.max() / 4
-
-
-@pytest.mark.slow
-def test_the_hypersensitive_problem_over_10000_seconds():
-    motion = hypersensitive(1e4, 50, error_tolerance=1e-5, max_num_steps=2000)
-    assert motion.cost == pytest.approx(HYPERSENSITIVE, rel=1e-4)
-    assert np.abs(motion.transcribed.at(np.linspace(100, 9900, 1000))[0]).max() < 1e-3
 
 
 # ------------------------------------------------------------------------------ measures, refinement
@@ -566,29 +451,10 @@ def test_the_motion_between_knots_goes_through_them(scheme):
         assert motion.us_mid is None
 
 
-def test_a_result_is_a_guess_for_another_mesh_and_scheme():
-    options = {"x_goal": [np.pi, 0], "horizon": 2.0}
-    coarse = move(20, heavy_pendulum(0.1), **options, scheme="trapezoid")
-    cold = move(40, heavy_pendulum(0.1), **options)
-    warm = move(40, heavy_pendulum(0.1), **options, initial_guess=coarse)
-    assert warm.cost == pytest.approx(cold.cost, rel=1e-9)
-    again = move(40, heavy_pendulum(0.1), **options, initial_guess=warm)
-    assert again.cost == pytest.approx(cold.cost, rel=1e-9)
-
-
 def test_the_same_problem_gives_the_same_bits():
     a, b = (move(20, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=(1, 2)) for _ in range(2))
     assert a.transcribed.nodes.tobytes() == b.transcribed.nodes.tobytes()
     assert a.horizon == b.horizon
-
-
-def test_limits_are_kept():
-    options = {"x0": [0, 0], "x_goal": [np.pi, 0], "num_steps": 20, "horizon": 2.0, "running_cost": effort}
-    motion = collocate(heavy_pendulum(0.1), **options, max_iterations=3, tolerance=1e-9)
-    assert motion.status is dd.Status.ITERATION_LIMIT
-    assert not motion.success
-    motion = collocate(heavy_pendulum(0.1), **options, max_iterations=500, time_limit=1e-3, tolerance=1e-9, refine=True)
-    assert motion.status is dd.Status.TIME_LIMIT
 
 
 def test_what_cannot_be_is_infeasible():
@@ -645,28 +511,6 @@ def test_the_programs_derivatives_are_differences(scheme, horizon, form):
 
         hessian = made["hess_lag"](z, [], sigma, weights).full()
         assert hessian == pytest.approx(np.triu(differences(slope)), abs=1e-6)
-
-
-def test_every_knot_is_evaluated_and_linearized_once_an_iterate():
-    valued, linearized = [], []
-
-    class Counting:
-        def values(self, knots):
-            valued.append(tuple(k.tobytes() for k in knots))
-            return np.column_stack([knots[:, 1], knots[:, 2]])
-
-        def linearize(self, knots):
-            linearized.append(tuple(k.tobytes() for k in knots))
-            rates = np.column_stack([knots[:, 1], knots[:, 2]])
-            return rates, np.tile([[0.0, 1, 0], [0, 0, 1]], (len(knots), 1, 1))
-
-    options = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 40, "horizon": 1.0, "running_cost": effort}
-    motion = collocate(Dynamics(Counting(), 2, 1), **options)
-    assert motion.success
-    linearized, valued = ([key for key in keys if len(key) == 81] for keys in (linearized, valued))  # by the solver
-    assert len(linearized) <= 1.1 * (len(motion.iterations) + 1)
-    assert len(valued) <= 1.5 * (len(motion.iterations) + 1)  # a line search tries more than one
-    assert len(linearized) <= 1.05 * len(set(linearized)) + 1
 
 
 @each_row("name", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "floating"])
@@ -798,24 +642,6 @@ def test_a_running_cost_without_derivatives_is_refused():
 
 
 # ------------------------------------------------------------------------------ times, printed
-
-
-def test_the_time_of_kellys_cart_pole(capsys):
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
-    problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], running_cost=EFFORT, num_steps=50)
-    options = {"x0": np.zeros(4), "x_goal": [1, np.pi, 0, 0], "horizon": 2.0, "running_cost": EFFORT}
-    start = time.perf_counter()
-    drake = dd.solve(problem, method="collocation", scheme="drake")
-    middle = time.perf_counter()
-    ours = move(50, plant_dynamics(model), max_iterations=500, tolerance=1e-8, **options)
-    end = time.perf_counter()
-    with capsys.disabled():
-        print(
-            f"\n50 intervals: Hermite-Simpson {end - middle:.2f} s (J {ours.cost:.6f}), dd.solve "
-            f"{middle - start:.2f} s (J {drake.cost:.6f}), ratio {(end - middle) / (middle - start):.2f}"
-        )
-    assert abs(ours.cost - 58.8077) < 1e-3 < abs(drake.cost - 58.8077)  # of this guess's own local optimum
-    assert ours.options["derivatives"] == "symbolic, exact Hessian"
 
 
 @each_row("end, error", [(1.0, 1 / 6), (2.0, 1 / 3)])

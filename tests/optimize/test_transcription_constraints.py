@@ -184,34 +184,6 @@ def test_an_interrupt_ends_with_the_best_iterate(monkeypatch):
     assert signal.getsignal(signal.SIGINT) is former
 
 
-def test_an_interrupt_within_a_called_function_too():
-    calls = []
-
-    def values(knots):
-        calls.append(len(knots))
-        if calls.count(len(knots)) == 6 and len(knots) == 41:
-            signal.raise_signal(signal.SIGINT)
-        return pendulum.values(knots)
-
-    pendulum = heavy_pendulum(0.1)
-    own = own_derivatives(pendulum)
-    own.values = values
-    motion = collocate(Dynamics(own, 2, 1), **SWING)
-    assert motion.status is dd.Status.INTERRUPTED
-
-
-def test_the_iteration_table_is_the_solvers():
-    motion = collocate(heavy_pendulum(0.1), **SWING, max_iterations=3, tolerance=1e-9)
-    assert motion.status is dd.Status.ITERATION_LIMIT
-    assert [row.iteration for row in motion.iterations] == [0, 1, 2, 3]
-    whole = collocate(heavy_pendulum(0.1), **SWING)
-    assert whole.success
-    assert whole.iterations[-1].objective == pytest.approx(whole.cost, rel=1e-9)
-    assert whole.iterations[-1].primal_infeasibility < 1e-9
-    assert whole.iterations[-1].dual_infeasibility < 1e-8
-    assert whole.iterations[1].step <= 1
-
-
 @each_row(
     "error, status",
     [(SimulationError, dd.Status.DIVERGED), (GradientError, dd.Status.NO_GRADIENT)],
@@ -233,28 +205,6 @@ def test_an_error_of_the_dynamics_ends_the_solve_and_is_told(monkeypatch, error,
     assert motion.status is status
     assert f"{error.__name__}: here it ends" in motion.message
     assert np.isfinite(motion.transcribed.nodes).all()
-
-
-def test_any_other_error_is_raised():
-    own, calls = own_derivatives(BLOCK), []
-
-    def failing(knots):
-        calls.append(len(knots))
-        raise ZeroDivisionError("mine")
-
-    own.values = failing
-    with pytest.raises(ZeroDivisionError, match="mine"):
-        collocate(Dynamics(own, 2, 1), **TASK)
-
-
-def test_an_error_of_the_report_is_raised(monkeypatch):
-    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
-
-    def report(line):
-        raise KeyError("yours")
-
-    with pytest.raises(KeyError, match="yours"):
-        collocate(BLOCK, **TASK, progress=report)
 
 
 def test_a_trial_point_out_of_the_domain_is_stepped_back_from():

@@ -104,26 +104,3 @@ def test_a_run_that_began_with_multipliers_comes_out_again(tmp_path):
     found = dd.verify(tmp_path / "run")
     assert found.holds, found
     assert "differ" not in found.sentence
-
-
-@pytest.mark.slow
-def test_ilqr_goes_on_from_its_multipliers():
-    """Its own optimum takes no more than a step, and a task that changed a little fewer than from the motion alone."""
-    model = dd.example_model("double_pendulum", time_step=0.02)
-    slow = dd.Constraint(lambda x: x[2], upper=0.9, name="slow")
-    cost = dd.QuadraticCost(R=np.eye(2))
-    asked = {"x_goal": [1, 0.5, 0, 0], "num_steps": 50, "running_cost": cost, "constraints": slow}
-    problem = dd.Problem(model, x0=[0.3, -0.4, 0, 0], **asked)
-    solution = dd.solve(problem, method="ilqr")
-    alone = replace(solution, multipliers=None)
-    again, without = (dd.solve(problem, method="ilqr", initial_guess=guess) for guess in (solution, alone))
-    assert steps(again) <= 1 < steps(without)
-    assert again.cost == pytest.approx(solution.cost, rel=1e-8)
-    other = dd.Problem(model, x0=[0.301, -0.399, 0, 0], **asked)
-    near, far = (dd.solve(other, method="ilqr", initial_guess=guess) for guess in (solution, alone))
-    assert near.success
-    assert steps(near) < steps(far)
-    assert near.cost == pytest.approx(far.cost, rel=1e-6)
-    wrong = Multipliers(np.zeros(0), solution.multipliers.rows[:-1])  # of another number of rows: none
-    ignored = dd.solve(problem, method="ilqr", initial_guess=replace(solution, multipliers=wrong))
-    assert steps(ignored) == steps(without)
