@@ -250,35 +250,6 @@ def test_what_stays_refused_is_said(shapes, kind):
     assert collision_names(plant) == ["box_shape"]
 
 
-def test_spheres_and_half_spaces_stay_and_nothing_is_said():
-    plant = Plant(0.005)
-    add_body(plant, Sphere(0.1))
-    plant.ground(contact_properties(1e4))
-    assert replaced(plant) == ()
-    assert sorted(collision_names(plant)) == ["box_shape", "ground"]
-
-
-def test_a_second_replacement_changes_nothing():
-    plant = Plant(0.005)
-    add_body(plant, Box(*SIZE))
-    replaced(plant)
-    before = collision_names(plant)
-    assert replaced(plant) == ()
-    assert collision_names(plant) == before
-
-
-def test_masses_and_what_is_drawn_stay():
-    plant = Plant(0.005)
-    body = add_body(plant, Box(*SIZE))
-    drawn = plant.plant.RegisterVisualGeometry(body, RigidTransform(), Box(*SIZE), "drawn", np.array([1, 0, 0, 1.0]))
-    before = body.default_spatial_inertia().CopyToFullMatrix6()
-    replaced(plant)
-    inspector = plant.scene_graph.model_inspector()
-    np.testing.assert_array_equal(body.default_spatial_inertia().CopyToFullMatrix6(), before)
-    assert inspector.GetAllGeometryIds(Role.kIllustration) == [drawn]
-    np.testing.assert_array_equal(inspector.GetShape(drawn).size(), SIZE)
-
-
 @pytest.mark.parametrize("excluded", [True, False])
 def test_a_collision_filter_of_the_original_holds_for_its_spheres(excluded):
     plant = Plant(0.005)
@@ -331,18 +302,6 @@ def test_hydroelastic_properties_of_its_own_stay():
     assert carried.GetProperty("hydroelastic", "resolution_hint") == 0.02
 
 
-def test_a_modulus_without_a_compliance_type_is_kept():
-    plant = Plant(0.005, contact_model="hydroelastic")
-    properties = contact_properties(1e4)
-    properties.AddProperty("hydroelastic", "hydroelastic_modulus", 3e6)
-    body = add_body(plant, Box(*SIZE), properties=properties)
-    (note,) = replaced(plant, "hydroelastic")
-    assert "modulus 3e+06 Pa" in note
-    carried = plant.scene_graph.model_inspector().GetProximityProperties(geometry_id(plant, body, "box_shape"))
-    assert carried.GetProperty("hydroelastic", "hydroelastic_modulus") == 3e6
-    assert carried.HasProperty("hydroelastic", "compliance_type")
-
-
 def test_hydroelastic_in_a_plant_with_point_contact_is_an_error():
     plant = Plant(0.005)
     add_body(plant, Box(*SIZE))
@@ -364,16 +323,6 @@ def test_a_finalized_plant_is_an_error():
     add_body(plant, Box(*SIZE))
     plant.plant.Finalize()
     with pytest.raises(ModelError, match="is finalized"):
-        replaced(plant)
-
-
-def test_a_name_that_is_taken_is_an_error():
-    plant = Plant(0.005)
-    body = add_body(plant, Box(*SIZE))
-    plant.plant.RegisterCollisionGeometry(
-        body, RigidTransform(), Sphere(0.1), "box_shape_corner_0", contact_properties(1e4)
-    )
-    with pytest.raises(ModelError, match="Drake refuses the route 'corner_spheres'"):
         replaced(plant)
 
 

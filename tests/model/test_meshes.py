@@ -1,7 +1,5 @@
 """Collision meshes of robot files as convex hulls or spheres: closed forms, what is told, and what is refused."""
 
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -250,22 +248,6 @@ def bodies_of(model):
     from drake_diff.model.plant import bodies
 
     return bodies(model.plant)
-
-
-def test_the_same_file_gives_the_same_bytes_in_another_process(tmp_path):
-    code = (
-        "import sys; from pathlib import Path; from drake_diff.model.triangles import *\n"
-        "from drake_diff.model.triangles import fit_spheres\n"
-        "h = hull_of_file(Path(sys.argv[1]), (1.0, 1.0, 1.0)); s = fit_spheres(h, 'x')\n"
-        "print(h.corners.tobytes().hex(), s.centres.tobytes().hex(), s.radius)"
-    )
-    mesh = shapes().icosphere(subdivisions=2, radius=0.1)
-    mesh.vertices *= [1, 2, 3]
-    mesh.export(tmp_path / "m.stl")
-    run = subprocess.run([sys.executable, "-c", code, tmp_path / "m.stl"], capture_output=True, text=True, check=True)
-    hull = triangles.hull_of_file(tmp_path / "m.stl", (1.0, 1.0, 1.0))
-    spheres = fit_spheres(hull, "x")
-    assert run.stdout.split() == [hull.corners.tobytes().hex(), spheres.centres.tobytes().hex(), str(spheres.radius)]
 
 
 @pytest.mark.slow

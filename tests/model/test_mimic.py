@@ -365,29 +365,6 @@ def panda(mimic, time_step=0.02, **options):
     return load(robot_file("panda.urdf"), mimic, time_step, base="weld", actuators="all", **options)
 
 
-@pytest.mark.slow
-@each_row("mimic, finger", [("reduce", [0.01, 0.03]), ("fix", None)])
-def test_the_panda_as_it_ships_goes_to_a_joint_goal(tmp_path, mimic, finger):
-    """Loaded with the documented arguments: certified, planned by collocation, saved, verified, and compared."""
-    model = panda(mimic)
-    start, goal = np.array(model.default_state), np.array(model.default_state)
-    start[[3, 5]] = goal[[3, 5]] = -1.5, 1.6
-    goal[:3] = 0.3, 0.2, -0.2
-    if finger:
-        start[7], goal[7] = finger
-        assert model.velocity_names[7] == "panda_finger_joint1_v"
-    assert dd.certify(model, start, np.zeros(model.nu)).verdict == "agree"
-    cost = dd.QuadraticCost(R=1e-3 * np.eye(model.nu))
-    problem = dd.Problem(model, x0=start, num_steps=30, running_cost=cost, x_goal=goal)
-    solution = dd.solve(problem, method="collocation")
-    assert solution.success, solution.message
-    dd.save(solution, tmp_path / "run")
-    assert dd.verify(tmp_path / "run", models="/").holds  # its meshes are not in the directory
-    free = panda(mimic, 1e-3, contact=False)
-    compared = dd.compare(free, engines=("pinocchio",), x0=start, us=np.zeros((20, free.nu)))
-    assert "pinocchio: the same simulation as Drake" in str(compared)
-
-
 @pytest.mark.parametrize("name", ["panda.urdf", pytest.param("talos_full_v2.urdf", marks=pytest.mark.slow)])
 def test_steps_of_reduced_robots_have_the_derivative_of_their_own_equation(name):
     """In flight, and on the ground in spheres: AutoDiffXd."""

@@ -197,13 +197,6 @@ def test_a_file_that_is_no_robot_is_refused_with_its_name_and_what_was_got(tmp_p
     assert str(refusal.value).startswith(str(tmp_path / name))
 
 
-@pytest.mark.parametrize("text", [urdf(), sdf(), mjcf()])
-def test_the_files_that_the_bad_ones_are_made_of_are_good(tmp_path, text):
-    name = {"<r": "a.urdf", "<s": "a.sdf", "<m": "a.xml"}[text[:2]]
-    (tmp_path / name).write_text(text)
-    assert dd.load_model(tmp_path / name, time_step=0.01).nv in (1, 6, 7)
-
-
 @each_row(
     "path, words",
     [

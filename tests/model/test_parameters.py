@@ -549,33 +549,6 @@ def test_the_stopping_distance_by_friction(count, mu, h):
 
 # ------------------------------------------------------------------------------------------------------------- names
 
-UNITS = {
-    "mass": "kg",
-    "center_of_mass": "m",
-    "inertia": "kg m^2",
-    "offset": "m",
-    "spring_rest_angle": "rad",
-    "spring_rest_length": "m",
-    "gear_ratio": "1",
-    "rotor_inertia": "kg m^2",
-    "friction": "1",
-    "dissipation": "s/m",
-    "relaxation_time": "s",
-    "hydroelastic_modulus": "Pa",
-    "radius": "m",
-    "gravity": "m/s^2",
-    "time_step": "s",
-}
-UNITS_BY_NAME = {
-    "hinge.damping": "N m s/rad",
-    "rail.damping": "N s/m",
-    "hinge.spring_stiffness": "N m/rad",
-    "rail.spring_stiffness": "N/m",
-    "ball.stiffness": "N/m",
-    "motor.kp": "N m/rad",
-    "motor.kd": "N m s/rad",
-}
-UNBOUNDED = ("center_of_mass", "inertia", "offset", "spring_rest_angle", "spring_rest_length", "gear_ratio", "gravity")
 BY_DIFFERENCES = ("time_step", "kp", "kd", "friction", "dissipation", "relaxation_time", "hydroelastic_modulus")
 BY_CHAIN_RULE = ("model.gravity", "rail.spring_stiffness", "rail.spring_rest_length")
 
@@ -588,46 +561,12 @@ def source_of(name):
     return "finite_difference" if quantity in differenced else "autodiff"
 
 
-@pytest.mark.parametrize(("make", "values"), [(arm, ARM), (ball, BALL)])
-def test_every_parameter_has_its_unit_bounds_value_and_source(make, values):
-    found = {p.name: p for p in dd.list_parameters(make())}
-    assert list(found) == sorted(found)
-    absent = {"ball.hydroelastic_modulus"} if make is ball else set()  # a ball of point contact has none of its own
-    for name, p in found.items():
-        quantity = name.rsplit(".", 1)[1]
-        unit = UNITS.get(quantity) or UNITS_BY_NAME.get(name)
-        if unit is not None:
-            assert p.unit == unit, name
-        assert p.lower == (-math.inf if quantity in UNBOUNDED else 0.0), name
-        assert p.upper == math.inf
-        assert p.derivative_source == source_of(name), name
-        assert p.label == name.rsplit(".", 1)[0]
-        assert not p.value.flags.writeable
-    for name, value in values.items():
-        if name not in absent and value is not None:
-            assert found[name].value == pytest.approx(np.atleast_1d(value), rel=1e-12), name
-
-
 def test_the_listed_inertia_is_the_central_one():
     """I_com = m G_o - m (|c|^2 1 - c c')."""
     found = {p.name: p.value for p in dd.list_parameters(arm())}
     c, m = np.array(ARM["pole.center_of_mass"]), ARM["pole.mass"]
     central = m * np.diag(UNIT_INERTIA) - m * (c @ c * np.eye(3) - np.outer(c, c))
     assert matrix(found["pole.inertia"]) == pytest.approx(central, rel=1e-12, abs=1e-15)
-
-
-@pytest.mark.parametrize("make", [arm, ball])
-def test_each_column_says_where_it_comes_from(make):
-    model = make()
-    u = np.zeros(model.nu)
-    names = [p.name for p in dd.list_parameters(model) if "/" not in p.name and np.all(p.value > p.lower)]
-    names = [name for name in names if not name.endswith("time_step")]
-    d = dd.differentiate_step(model, random_state(model, np.random.default_rng(0), 0.1), u, parameters=names)
-    assert d.C.shape == (model.nx, len(d.parameters)) == (model.nx, len(d.sources))
-    assert d.sources == tuple(source_of(name.split("[")[0]) for name in d.parameters)
-    x = random_state(model, np.random.default_rng(0), 0.1)
-    by_differences = dd.differentiate_step(model, x, u, parameters=names, method="finite_difference")
-    assert set(by_differences.sources) == {"finite_difference"}
 
 
 def test_a_frame_without_mass_has_no_inertia_to_list():
@@ -644,11 +583,6 @@ def test_a_frame_without_mass_has_no_inertia_to_list():
     assert "flange.inertia" not in found
     d = dd.differentiate_step(model, [0.0, 1.0], parameters=("flange.mass", "hand.mass", "hand.inertia"))
     assert np.all(d.C == 0)
-
-
-def test_a_model_from_a_diagram_has_no_time_step_to_change_and_one_from_a_file_has(load):
-    assert "model.time_step" not in {p.name for p in dd.list_parameters(arm())}
-    assert "model.time_step" in {p.name for p in dd.list_parameters(load("pendulum.urdf"))}
 
 
 def two_balls(stiffnesses=(1e4, 1e4), frictions=(0.5, 0.5)):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError
 from drake_diff.model.contact_geometry import inseparable_pairs
 from drake_diff.model.step import set_state
 
@@ -110,8 +109,3 @@ def test_audit_names_the_links_and_the_remedy(load):
     ]
     assert not [f for f in dd.audit(load(contact="separable")) if f.code == "never_apart"]
     assert not [f for f in dd.audit(load(contact=False)) if f.code == "never_apart"]
-
-
-def test_another_word_is_refused(load):
-    with pytest.raises(InputError, match='expected True, False, "ground" or "separable"'):
-        load(contact="apart")

@@ -176,27 +176,6 @@ def test_lagged_friction_step(u, v0):
     assert d.B[1, 0] == pytest.approx(h * d.B[3, 0], rel=1e-9)
 
 
-def test_results_do_not_depend_on_the_order_of_calls(load):
-    model, fresh = load("sliding_block.sdf"), load("sliding_block.sdf")
-    rest = model.default_state
-    rest[6] = 0.0495
-    fast = rest.copy()
-    fast[10] = 1.0
-    dd.differentiate_step(model, fast, parameters=("block.mass",))
-    dd.rollout(model, fast, num_steps=3)
-    dd.certify(model, fast)
-    assert np.array_equal(dd.step(model, rest), dd.step(fresh, rest))
-    assert np.array_equal(dd.differentiate_step(model, rest).A, dd.differentiate_step(fresh, rest).A)
-
-
-def test_the_step_is_a_copy(load):
-    model = load("pendulum.urdf")
-    first = dd.step(model, [0.1, 0.0], [0.0])
-    kept = first.copy()
-    dd.step(model, [2.0, 1.0], [0.0])
-    assert np.array_equal(first, kept)
-
-
 @each_row(
     "x, u, words",
     [

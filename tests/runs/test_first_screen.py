@@ -11,7 +11,7 @@ from helpers.models import MODELS
 import drake_diff as dd
 from drake_diff.runs import measure
 from drake_diff.runs.messages import asked_for
-from drake_diff.runs.page import _of_replays, alike, checks_of
+from drake_diff.runs.page import _of_replays, checks_of
 from drake_diff.runs.save import record_of
 
 CONTROLS = ("Inputs alone (open loop)", "With feedback (TVLQR)")
@@ -35,42 +35,6 @@ def test_the_end_is_named_with_its_units(cart_pole):
     )
     assert "rest" not in asked(cart_pole, x_goal={"slide_x": 1.0, "hinge_w": 0.5})
     assert "end with slide_x = 1 m and hinge_w = 0.5 rad/s" in asked(cart_pole, x_goal={"slide_x": 1.0, "hinge_w": 0.5})
-
-
-def test_goals_and_obstacles_are_what_the_robot_was_to_do(cart_pole):
-    told = asked(
-        cart_pole,
-        goals=[
-            dd.FrameGoal("pole", position=[0.3, None, None], knots=[25]),
-            dd.FrameVelocityGoal("cart"),
-            dd.JointGoal({"hinge": 1.0}),
-            dd.SphereObstacle([0, 0, 2], 0.1, name="lamp"),
-            dd.FrameGoal("pole", position=[9, 9, 9], weight=1.0),  # part of the cost: not asked for
-        ],
-        constraints=[dd.Constraint(lambda x: x[:1], [-1.0], [1.0], name="on the rail")],
-    )
-    for words in (
-        "bring pole to x = 0.3 m at 0.5 s",
-        "hold cart still",
-        "have hinge = 1",
-        "keep clear of obstacle 'lamp'",
-        "keep “on the rail”",
-    ):
-        assert words in told
-    assert "9" not in told.split(":")[1]
-
-
-def test_a_free_time_and_what_else_was_found_are_said(cart_pole):
-    fast = asked(cart_pole, x_goal={"slide_x": 1.0}, horizon=(0.5, 2.0), running_cost=1.0)
-    assert fast.endswith("as fast as it can: 1 s.")
-    fit = asked(
-        cart_pole,
-        optimize="parameters",
-        parameters=["cart.mass"],
-        trajectory_cost=lambda xs, us: xs[-1, 0] ** 2,
-        us=np.ones((50, 1)),
-    )
-    assert fit.endswith("Found: parameters; the inputs were given.")
 
 
 @pytest.fixture(scope="module")
@@ -130,23 +94,3 @@ def test_replays_that_hold_by_one_of_two_in_turn_are_red_only_where_the_plan_fai
     ]
     m = SimpleNamespace(solution=SimpleNamespace(judged_replay=None, success=success))
     assert [check.kind for check in _of_replays(m, replays)] == [kind, kind]
-
-
-def test_certificates_that_say_the_same_are_one_row():
-    def one(verdict="agree", power=1e-4, agree=6):
-        return {
-            "subject": "a",
-            "method": "m",
-            "verdict": verdict,
-            "entries": 6,
-            "power": power,
-            "counts": {"agree": agree},
-        }
-
-    rows = alike([one(), one(power=3e-4), one("disagree", agree=5), one()])
-    assert [(row["numbers"], row["count"], row["verdict"]) for row in rows] == [
-        ("0 to 1", 2, "agree"),
-        ("2", 1, "disagree"),
-        ("3", 1, "agree"),
-    ]
-    assert rows[0]["power"] == 3e-4  # what the weaker one would have noticed

@@ -213,32 +213,3 @@ def test_a_failed_run_is_saved_as_one(tmp_path):
     found = dd.verify(tmp_path / "run")
     assert found.verdict == "broken"
     assert 'a verdict "pass" with' in found.complaints[0]
-
-
-def test_the_command_line_runs_and_verifies_phases(tmp_path):
-    from typer.testing import CliRunner
-
-    from drake_diff.cli.main import app
-
-    script = tmp_path / "bounce.py"
-    script.write_text(
-        "import numpy as np\nimport drake_diff as dd\n"
-        "def problem():\n"
-        "    ball = dd.Dynamics(lambda x, u: [x[1], u[0] - 9.81], 2, 1, u_lower=[0], u_upper=[0])\n"
-        "    floor = dd.Constraint(lambda x: x[0], 0.0, 0.0, knots=-1, name='floor')\n"
-        "    kept = dict(num_steps=4, horizon=(0.01, 5.0))\n"
-        "    fall = dd.Problem(ball, x0=[1.0, 0.0], constraints=floor, **kept)\n"
-        "    rise = dd.Problem(ball, x0=[0.0, 2.0], x_goal=[np.nan, 0.0], **kept)\n"
-        "    return dd.optimize.PhasedProblem([fall, rise], resets=[np.diag([1.0, -0.8])])\n"
-    )
-
-    def ended(*arguments):
-        return CliRunner().invoke(app, list(arguments))
-
-    ran = ended("run", str(script), "--out", str(tmp_path / "run"))
-    assert ran.exit_code == 0, ran.output
-    assert "link 0 to 1" in ran.output
-    assert ended("verify", str(tmp_path / "run")).exit_code == 1  # undecided: it has user's functions
-    listed = ended("list", str(tmp_path))
-    assert listed.exit_code == 0
-    assert "phases" in listed.output

@@ -78,12 +78,6 @@ def test_a_cause_comes_out_again_in_a_process_of_its_own(saved):
     assert any("cause of lab: " in line and "hinge.damping is 0.2" in line for line in found.claimed)
 
 
-def test_beyond_its_limit_of_time_nothing_is_decided(saved, child_process):
-    found = dd.verify(saved, time_limit=0.01)
-    assert (found.verdict, found.complaints) == ("undecided", ())
-    assert "did not end within 0.01 s" in str(found)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_number_or_name_of_a_cause_is_planted_it_is_refused(saved, seed):
     """A hundredth of half the interval, or of a number that has none, is a lie; a thousandth of it is rounding."""

@@ -1,15 +1,10 @@
 """A run is written beside its directory and takes its place whole: nothing that was there is lost, whatever fails."""
 
-import errno
 import json
 import os
-import pickle
-import random
 import re
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +18,6 @@ from helpers.faults import (
     forked,
     goal_of,
     has_plan,
-    killed_after,
     quick_pages,
     tried,
     two_solutions,
@@ -34,12 +28,10 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff._base import files
 from drake_diff._base.clock import check_time
-from drake_diff.cli import main as cli
-from drake_diff.exceptions import ArtifactError, InputError, ModelError, WriteError
+from drake_diff.exceptions import ArtifactError, InputError, ModelError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.optimize import phased
 from drake_diff.optimize import run as optimize_run
-from drake_diff.optimize.solve import _best_of
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.panels import run_panel
 from drake_diff.runs import recover
@@ -246,32 +238,6 @@ def check(run, solutions, at, fault, *, exchanges=True):
     return now
 
 
-def test_the_trace_has_every_call_that_changes_the_disk(run, solutions):
-    """As the interpreter's own audit tells of them."""
-
-    def seen():
-        opened = []
-
-        def hear(event, words):
-            if event == "open" and not isinstance(words[0], int) and isinstance(words[2], int):
-                path = os.fsdecode(words[0])
-                if path.startswith(str(run.parent)) and words[2] & (os.O_WRONLY | os.O_RDWR):
-                    opened.append(path)
-            if event in ("os.mkdir", "os.rename") and str(words[0]).startswith(str(run.parent)):
-                opened.append(event)
-
-        sys.addaudithook(hear)
-        dd.save(solutions[1], run)
-        return [sum(name in ("os.mkdir", "os.rename") for name in opened), len(opened)]
-
-    calls = calls_of(run, solutions[1])
-    renames, heard = ended(*forked(seen))["found"]
-    kinds = [call.split()[0] for call in calls]
-    assert kinds.count("mkdir") + kinds.count("replace") == renames
-    assert kinds.count("create") == heard - renames
-    assert kinds.count("exchange") == 1
-
-
 def test_a_fault_in_any_call_loses_nothing(run, solutions, monkeypatch):
     """Every fourth call meets one fault, and each fault comes; the slow test has every call meet all."""
     quick_pages(monkeypatch)
@@ -291,20 +257,6 @@ def test_every_fault_in_any_call_loses_nothing(run, solutions, monkeypatch, exch
         for fault in FAULTS if exchanges else (*ERRORS[:1], KILLED):
             if check(run, solutions, at, fault, exchanges=exchanges) == NEW:
                 dd.save(solutions[0], run)
-
-
-@pytest.mark.slow
-def test_of_200_kills_at_random_moments_none_loses_a_run(run, solutions, monkeypatch):
-    quick_pages(monkeypatch)
-    rng, seen = random.Random(3), []
-    for _ in range(200):
-        killed_after(lambda: dd.save(solutions[1], run), rng.uniform(0, 0.3))
-        seen.append(goal_of(run))
-        for path in run.parent.glob("run.partial-*"):
-            shutil.rmtree(path)
-        if seen[-1] == NEW:
-            dd.save(solutions[0], run)
-    assert OLD in seen
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -369,14 +321,6 @@ def test_a_signal_as_a_search_ends_is_not_lost(solutions, monkeypatch, method):
     assert "then interrupted" in found.message
 
 
-def test_where_a_signal_ends_what_is_tried_after_the_best_plan_its_message_says_so(solutions):
-    best, later = solutions[1], solutions[0].told(status=dd.Status.INTERRUPTED)
-    assert _best_of([later, best]) is best
-    found = _best_of([best, later])
-    assert found.status is best.status
-    assert found.message.endswith("what was tried after it: the run was interrupted; this is the best motion so far")
-
-
 def test_a_signal_that_somebody_hears_or_that_is_ignored_is_left_to_them(solutions):
     heard, before = [], signal.signal(signal.SIGTERM, lambda *_: heard.append("own"))
     hup = signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -405,68 +349,6 @@ def test_a_signal_that_comes_while_a_plan_is_kept_waits_for_it(solutions, tmp_pa
         keep_plan(solutions[1], partial)
     assert has_plan(partial, solutions[1])
     assert dd.load_record(partial).solver.status == "converged"
-
-
-@pytest.mark.skipif(os.geteuid() != 0 or sys.platform != "linux", reason="only root mounts a small disk")
-def test_on_a_disk_that_is_full_the_plan_is_kept_on_another(solutions, tmp_path, monkeypatch):
-    disk, kept = tmp_path / "disk", tmp_path / "kept"
-    disk.mkdir()
-    kept.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(kept))
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", str(disk)], check=False).returncode:
-        pytest.skip("no disk can be mounted here")
-    try:
-        with pytest.raises(WriteError, match="No space left on device") as raised:
-            dd.save(solutions[1], disk / "run")
-        (left,) = disk.glob("run.partial-*")
-        assert str(left) in str(raised.value)
-        assert has_plan(left, solutions[1])
-        shutil.rmtree(left)
-        with pytest.raises(OSError, match="No space"):
-            (disk / "filled").write_bytes(bytes(2**17))
-        with pytest.raises(WriteError, match="the plan is in") as raised:
-            dd.save(solutions[1], disk / "run")
-        (elsewhere,) = kept.iterdir()
-        assert str(elsewhere) in str(raised.value)
-        assert has_plan(elsewhere, solutions[1])
-        assert recover(elsewhere, tmp_path / "out").verdict == "pass"
-        assert goal_of(tmp_path / "out") == NEW
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
-
-
-def test_the_command_tells_of_a_refusing_disk_in_a_sentence(tmp_path, monkeypatch, capsys):
-    task = f"""
-import drake_diff as dd
-
-def problem():
-    model = dd.load_model({str(MODELS / "pendulum.urdf")!r}, time_step=0.02)
-    return dd.Problem(model, x0=[0, 0], x_goal=[0.1, 0], num_steps=5, running_cost=dd.QuadraticCost(R=[[1.0]]))
-
-solve_options = {{"method": "shooting"}}
-"""
-    (tmp_path / "task.py").write_text(task)
-
-    def refused(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(files, "FileIO", refused)
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr(sys, "argv", ["drake-diff", "run", str(tmp_path / "task.py"), "--out", str(tmp_path / "out")])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    told = capsys.readouterr().err
-    assert end.value.code == cli.USAGE
-    assert told.startswith(f"drake-diff: WriteError: cannot write {tmp_path}/out.partial-")
-    assert "No space left on device" in told
-    assert "bug" not in told
-
-
-def test_the_error_of_a_disk_is_an_os_error_and_travels(tmp_path):
-    with pytest.raises(OSError, match=r"cannot write .*No such file") as raised:
-        files.write_whole(tmp_path / "missing" / "file", b"")
-    again = pickle.loads(pickle.dumps(raised.value))
-    assert (type(again), str(again)) == (WriteError, str(raised.value))
 
 
 def test_a_plan_that_was_kept_is_measured_as_it_would_have_been(run, solutions):

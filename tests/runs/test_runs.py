@@ -1,13 +1,11 @@
 """Runs side by side, and the commands verify, list and compare-runs: what they print and their exit status."""
 
-import dataclasses
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from helpers.models import MODELS, ROOT
 
@@ -184,13 +182,3 @@ solve_options = {{"method": "shooting"}}
     record = dd.load_record(left)
     assert (record.verdict, record.failures[0].code) == ("incomplete", "exception")
     assert "late" in record.sentence
-
-
-def test_a_motion_that_is_not_finite_is_saved_and_verified(tmp_path):
-    solution = solve()
-    xs = np.array(solution.xs)
-    xs[5] = np.nan
-    broken = dataclasses.replace(solution, xs=xs, status=dd.Status.DIVERGED)
-    assert dd.save(broken, tmp_path / "run").verdict == "fail"
-    found = dd.verify(tmp_path / "run")
-    assert found.complaints == ()
