@@ -7,8 +7,8 @@ from .problem.coupling import Periodic as Periodic
 from .problem.dwell import Dwell as Dwell
 from .problem.dynamics import DiscreteMap as DiscreteMap
 from .problem.dynamics import plant_dynamics as plant_dynamics
-from .problem.held import HeldContacts as HeldContacts
-from .problem.held import Impact as Impact
+from .problem.fixed_contacts import FixedContacts as FixedContacts
+from .problem.fixed_contacts import Impact as Impact
 from .problem.phases import PhasedProblem as PhasedProblem
 from .problem.schedule import ContactSchedule as ContactSchedule
 from .problem.terminal import TerminalSet as TerminalSet

@@ -23,7 +23,7 @@ from drake_diff.optimize.checks import Check, Checks, check
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.measure import INTEGRATION_TOLERANCE, derivative_check
 from drake_diff.optimize.messages import under
-from drake_diff.optimize.problem.held import Impact
+from drake_diff.optimize.problem.fixed_contacts import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report, heard
@@ -182,7 +182,7 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
         if impact is not None:
             late = _until_it_touches(motion, xs, gains[i], impact)
             if late is None:
-                return float("inf"), f"{', '.join(impact.held.rows)} do not touch at the end of {name}"
+                return float("inf"), f"{', '.join(impact.contacts.rows)} do not touch at the end of {name}"
             xs, wanted = late, np.vstack([wanted[: (len(late) - 2) // SUBSTEPS + 1], wanted[-1:]])
         beyond = np.max(np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)[1:], axis=0)
         at_knots = xs[::SUBSTEPS] if impact is None else np.vstack([xs[:-1:SUBSTEPS][: len(wanted) - 1], xs[-1:]])

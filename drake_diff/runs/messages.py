@@ -26,7 +26,7 @@ from drake_diff.runs.sections import COSTS, LIMITS
 STILL = 1e-3  # [rad/s or m/s] what is no faster is at rest
 FEW = 4  # so many goals, or coordinates of one, are named
 MOST = 8  # coordinates: of more the others are counted
-PARTS = ("held", "waypoints", "goals", "constraints", "couplings", *COSTS)  # of a problem, where it has them
+PARTS = ("fixed_contacts", "waypoints", "goals", "constraints", "couplings", *COSTS)  # of a problem, where it has them
 
 
 def claims_of(record: SealedRecord) -> tuple[str, ...]:

@@ -44,6 +44,7 @@ SECTIONS = {
 }  # fmt: skip
 DROPPED = ("evaluations", "elsewhere")  # a second measurement, which is a test now, and what replays say now
 RENAMED = {"panel": "conditions"}  # within the sections of a panel and of a trial
+FIXED_CONTACTS = {"HeldSpeeds": "FixedSpeeds", "HeldPlaces": "FixedPositions", "HeldForce": "FixedForce"}  # constraints
 
 
 def upgraded(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -56,7 +57,20 @@ def upgraded(fields: Mapping[str, Any]) -> dict[str, Any]:
         moved = {RENAMED.get(name, name): value for name, value in moved.items()}
     if names:
         result[str(kind)] = moved
+    problem = result.get("problem")
+    if isinstance(problem, Mapping) and "held" in problem:
+        result["problem"] = _with_fixed_contacts(problem)
     return {**result, "kind": KINDS_OF_2.get(str(kind), kind)}
+
+
+def _with_fixed_contacts(problem: Mapping[str, Any]) -> dict[str, Any]:
+    """The problem of a phase whose points the world held, by the names of version 3."""
+    constraints = [
+        {**c, "quantity": c["quantity"] and {FIXED_CONTACTS.get(kind, kind): v for kind, v in c["quantity"].items()}}
+        for c in problem["constraints"]
+    ]
+    others = {key: value for key, value in problem.items() if key != "held"}
+    return {**others, "constraints": constraints, "fixed_contacts": problem["held"]}
 
 
 KINDS: dict[str, type[SealedRecord]] = {kind.KIND: kind for kind in (PlanRecord, FitRecord, ComparisonRecord)}

@@ -20,7 +20,7 @@ from drake_diff._base.files import read_plain
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, ModelError
 from drake_diff.model.model import Model
 from drake_diff.optimize.phased import PhasedSolution
-from drake_diff.optimize.problem.held import HeldContacts, Impact
+from drake_diff.optimize.problem.fixed_contacts import FixedContacts, Impact
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Search, Solution, Status
@@ -416,10 +416,10 @@ def _phased_problem(section: PhasesSection, solutions: list[Solution]) -> Phased
         reset: dict[str, Any] = dict(link.reset or {})
         system = solutions[link.after].problem.system
         if "impact" in reset:
-            if not reset["impact"] and isinstance(system, HeldContacts):  # as records of 2.x tell that it stops them
+            if not reset["impact"] and isinstance(system, FixedContacts):  # as records of 2.x tell that it stops them
                 resets.append(system.impact)
                 continue
-            model: Any = system.model if isinstance(system, HeldContacts) else system
+            model: Any = system.model if isinstance(system, FixedContacts) else system
             try:
                 resets.append(Impact.from_dict(reset["impact"], model))
             except DrakeDiffError as error:

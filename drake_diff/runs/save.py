@@ -20,7 +20,7 @@ from drake_diff.exceptions import ArtifactError, InputError, WriteError
 from drake_diff.optimize.checks import Check
 from drake_diff.optimize.messages import under
 from drake_diff.optimize.phased import PhasedSolution
-from drake_diff.optimize.problem.held import Impact
+from drake_diff.optimize.problem.fixed_contacts import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE

@@ -22,15 +22,15 @@ from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost, SumOfCosts, TrackingCost
 from drake_diff.optimize.problem.coupling import Couples, InputRate, Jerk, Periodic
 from drake_diff.optimize.problem.dwell import Dwell
-from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
-from drake_diff.optimize.problem.held import (
+from drake_diff.optimize.problem.fixed_contacts import (
     IMPACT_QUANTITIES,
     QUANTITIES,
-    HeldContacts,
-    HeldQuantity,
-    held_quantity,
+    FixedContactQuantity,
+    FixedContacts,
+    fixed_contact_quantity,
     impact_quantity,
 )
+from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
 from drake_diff.optimize.problem.names import units_of
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
@@ -368,13 +368,13 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
         **{name: _cost(getattr(problem, name)) for name in COSTS},
         "initial_state_free": [bool(free) for free in problem.initial_state_mask],
         **({} if problem.motion == STEPS else {"motion": problem.motion}),
-        **({"held": problem.system.to_dict()} if isinstance(problem.system, HeldContacts) else {}),
+        **({"fixed_contacts": problem.system.to_dict()} if isinstance(problem.system, FixedContacts) else {}),
     }
 
 
 def _quantity(function: Any) -> dict[str, Any] | None:
     """What made a constraint's function; None of a user's own."""
-    return function.to_dict() if isinstance(function, HeldQuantity) else description_of(function)
+    return function.to_dict() if isinstance(function, FixedContactQuantity) else description_of(function)
 
 
 def finite_list(values: Any) -> list[float | None]:
@@ -430,7 +430,7 @@ def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array
     running, final = _rebuild_cost(p["running_cost"]), _rebuild_cost(p["final_cost"])
     goal = _numbers(p["x_goal"], np.nan)
     goals = [rebuild_goal(element) for element in p["goals"]]
-    system = HeldContacts(model, **p["held"]) if p.get("held") else model
+    system = FixedContacts(model, **p["fixed_contacts"]) if p.get("fixed_contacts") else model
     constraints = [_rebuild_constraint(c, system) for c in p["constraints"] if c["quantity"] is not None]
     couplings = [rebuild_coupling(element) for element in p.get("couplings", ()) if "Coupling" not in element]
     asked = goals or constraints or couplings or running is not None or final is not None
@@ -460,13 +460,13 @@ def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array
     )
 
 
-def _rebuild_constraint(c: dict[str, Any], system: Model | HeldContacts) -> Constraint:
+def _rebuild_constraint(c: dict[str, Any], system: Model | FixedContacts) -> Constraint:
     content, model = c["quantity"], system if isinstance(system, Model) else system.plant.model
     kind = next(iter(content))
     if kind in IMPACT_QUANTITIES:
         function: Any = impact_quantity(model, content)
-    elif kind in QUANTITIES and isinstance(system, HeldContacts):
-        function = held_quantity(system, content)
+    elif kind in QUANTITIES and isinstance(system, FixedContacts):
+        function = fixed_contact_quantity(system, content)
     else:
         function = made_from(model, content)
     lower, upper = (_numbers(c[side], gap) for side, gap in GAPS.items())

@@ -344,7 +344,7 @@ def leg_jumps(random):
     """A leg of two links stands, pushes off within its friction cone, and throws its body to a height."""
     path, foot = leg_file(), [0, 0, -0.3]
     model = dd.load_model(path, time_step=0.01)
-    stance = dd.optimize.HeldContacts(model, {"shin": foot})
+    stance = dd.optimize.FixedContacts(model, {"shin": foot})
     bend, height = random.uniform(0.5, 1.0), random.uniform(0.75, 0.95)
     x0 = np.array([0, 0.6 * np.cos(bend), bend, -2 * bend, 0, 0, 0, 0])
     effort = dd.QuadraticCost(R=1e-3 * np.eye(2))
@@ -368,7 +368,7 @@ def leg_jumps_and_lands(random):
     """The same leg jumps forward and lands: an impact, then it stands still."""
     path, foot = leg_file(), [0, 0, -0.3]
     model = dd.load_model(path, time_step=0.01)
-    stance = dd.optimize.HeldContacts(model, {"shin": foot})
+    stance = dd.optimize.FixedContacts(model, {"shin": foot})
     bend, way = random.uniform(0.6, 1.0), random.uniform(0.1, 0.4)
     x0 = np.array([0, 0.6 * np.cos(bend), bend, -2 * bend, 0, 0, 0, 0])
     effort = dd.QuadraticCost(R=1e-3 * np.eye(2))

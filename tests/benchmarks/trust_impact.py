@@ -15,7 +15,7 @@ from trust import Figure
 
 import drake_diff as dd
 from drake_diff.certificates.certificate import certify_jacobian
-from drake_diff.optimize import HeldContacts, Impact, PhasedProblem
+from drake_diff.optimize import FixedContacts, Impact, PhasedProblem
 from drake_diff.optimize.phased import judged_phases
 from drake_diff.optimize.program import NlpResult, Outcome
 
@@ -36,8 +36,8 @@ def struck(random):
     x = state_in_range(model, random, speed=10 ** random.uniform(-1, 0.5))
     floor = Floor(model.plant, ARMS[robot], at=at)
     e, slides = random.uniform(0.05, 0.9), random.uniform() < 0.5
-    held = HeldContacts(model, {ARMS[robot]: at}, axes="z" if slides else "xyz")
-    impact = Impact(held, restitution=0.0 if not slides else e, at=floor.terms(x)[2])
+    contacts = FixedContacts(model, {ARMS[robot]: at}, axes="z" if slides else "xyz")
+    impact = Impact(contacts, restitution=0.0 if not slides else e, at=floor.terms(x)[2])
     if (floor.terms(x)[1] @ x[model.nq :])[2] > 0:
         x[model.nq :] *= -1
     P = impact.impulses(x)
@@ -45,9 +45,9 @@ def struck(random):
         return None
     given = (impact.restitution, 0.0 if slides else 1e9)
     by_x = np.eye(model.nx)
-    by_x[model.nq :] += (1 + impact.restitution) * held.plant.jump.jacobian(np.concatenate([x, np.zeros(model.nu)]))[
-        :, : model.nx
-    ]
+    by_x[model.nq :] += (1 + impact.restitution) * contacts.plant.jump.jacobian(
+        np.concatenate([x, np.zeros(model.nu)])
+    )[:, : model.nx]
     return (lambda z: floor.after(z, *given)), x, by_x
 
 
@@ -103,13 +103,13 @@ def bounced(random):
     for axis in "xz":
         plant.plant.AddJointActuator(f"push_{axis}", plant.plant.GetJointByName(f"ball_{axis}"))
     model, e = plant.model(), random.uniform(0.3, 0.95)
-    held = HeldContacts(model, {"ball": [0, 0, -0.1]}, axes="z")
-    reset = Impact(held, restitution=e, at=0.0)
+    contacts = FixedContacts(model, {"ball": [0, 0, -0.1]}, axes="z")
+    reset = Impact(contacts, restitution=e, at=0.0)
     way = {"num_steps": 10, "horizon": (0.1, 1.5), "running_cost": dd.QuadraticCost(R=np.eye(2))}
     down = dd.Problem(model, x0=[0, random.uniform(0.5, 1.2), 0, 0], constraints=reset.kept(), **way)
     target = [random.uniform(0.5, 1.5), random.uniform(0.3, 1.0), np.nan, np.nan]
     up = dd.Problem(model, x0=[0.5, 0.1, 1, 1], x_goal=target, **way)
-    return dd.solve(PhasedProblem([down, up], resets=[reset])), held, e
+    return dd.solve(PhasedProblem([down, up], resets=[reset])), contacts, e
 
 
 def rejudged(solution, **fields):
@@ -121,14 +121,14 @@ def phases(random, count):
     """(accepted, planted, right plans refused, right plans)"""
     accepted = of = refused = right = 0
     for _ in range(count):
-        solution, held, e = bounced(random)
+        solution, contacts, e = bounced(random)
         if not solution.success:
             continue
         right += 1
         refused += not rejudged(solution)
         for _ in range(4):
             off = random.choice([-1, 1]) * 10 ** random.uniform(-3.5, -1)
-            other = Impact(held, restitution=float(np.clip(e + off, 0, 1)), at=0.0)
+            other = Impact(contacts, restitution=float(np.clip(e + off, 0, 1)), at=0.0)
             problem = PhasedProblem(solution.problem.phases, resets=[other])
             of += 1
             accepted += rejudged(solution, problem=problem)

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelWarning
-from drake_diff.optimize import HeldContacts, Impact, PhasedProblem
+from drake_diff.optimize import FixedContacts, Impact, PhasedProblem
 from drake_diff.optimize.phased import _across, judged_phases
 from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.runs.fields import canonical
@@ -31,7 +31,7 @@ def thrown():
     for axis in "xz":
         plant.plant.AddJointActuator(f"push_{axis}", plant.plant.GetJointByName(f"ball_{axis}"))
     model = plant.model()
-    reset = Impact(HeldContacts(model, {"ball": [0, 0, -0.1]}, axes="z"), restitution=RESTITUTION, at=0.0)
+    reset = Impact(FixedContacts(model, {"ball": [0, 0, -0.1]}, axes="z"), restitution=RESTITUTION, at=0.0)
     way = {"num_steps": 12, "horizon": (0.1, 1.5), "running_cost": dd.QuadraticCost(R=np.eye(2))}
     down = dd.Problem(model, x0=[0, 0.8, 0, 0], constraints=reset.kept(), **way)
     up = dd.Problem(model, x0=[0.5, 0.1, 1, 1], x_goal=[1.2, 0.9, np.nan, np.nan], **way)
@@ -44,7 +44,7 @@ def landed():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
-    stance, effort = HeldContacts(model, {"foot": FOOT}), dd.QuadraticCost(R=1e-2 * np.eye(2))
+    stance, effort = FixedContacts(model, {"foot": FOOT}), dd.QuadraticCost(R=1e-2 * np.eye(2))
     landing = Impact(stance, at=0.0, friction=0.8)
     x0, begins = np.array([0, 0.35, 0, 0, 0.4, 0, 0, 0]), np.array([0.1, 0.05, 0, 0, 0, 0, 0, 0])
     fly = dd.Problem(model, x0=x0, num_steps=15, horizon=(0.1, 0.8), running_cost=effort, constraints=landing.kept())
@@ -163,8 +163,8 @@ def test_a_plan_that_the_law_of_impact_does_not_have_is_refused(landed, seed):
     reset = problem.switches[0].reset
     P = HopperByHand(problem.phases[0].system).impact(landed.phases[0].xs[-1])[1]
     needed = abs(P[0]) / P[1]
-    less = Impact(reset.held, at=0.0, friction=needed * random.uniform(0.1, 0.9))
-    bouncy = Impact(reset.held, restitution=10 ** random.uniform(-4, -1), at=0.0, friction=0.8)
+    less = Impact(reset.contacts, at=0.0, friction=needed * random.uniform(0.1, 0.9))
+    bouncy = Impact(reset.contacts, restitution=10 ** random.uniform(-4, -1), at=0.0, friction=0.8)
     for impact, reason in ((less, "foot slides"), (bouncy, "is missed by")):
         other = PhasedProblem(problem.phases, resets=[impact], names=problem.names)
         again = rejudged(landed, problem=other)
@@ -194,7 +194,7 @@ def test_what_is_no_impact_is_refused_early(landed):
     ):
         with pytest.raises(InputError, match=message):
             Impact(stance, **wrong)
-    with pytest.raises(InputError, match="held: expected HeldContacts"):
+    with pytest.raises(InputError, match="contacts: expected FixedContacts"):
         Impact(stance.model)
 
 
@@ -203,7 +203,7 @@ def test_the_saltation_matrix_of_a_bounce():
     plant = Plant(0.01, "lagged")
     plant.ball("ball", 1.0, 0.1, contact_properties(2e4), "x", "z")
     plant.plant.AddJointActuator("push", plant.plant.GetJointByName("ball_x"))
-    impact = Impact(HeldContacts(plant.model(), {"ball": [0, 0, -0.1]}, axes="z"), restitution=0.8, at=0.0)
+    impact = Impact(FixedContacts(plant.model(), {"ball": [0, 0, -0.1]}, axes="z"), restitution=0.8, at=0.0)
     x = np.array([0, 0.1, 0, -3.0])
     np.testing.assert_allclose(impact(x), [0, 0.1, 0, 2.4], atol=1e-14)
     np.testing.assert_allclose(impact.by_drake(x), [0, 0.1, 0, 2.4], atol=1e-14)
@@ -222,10 +222,10 @@ def test_a_rod_that_strikes_with_its_end(angle):
     add_slide(plant.plant, "z", bodies[0].body_frame(), bodies[1], "z")
     plant.plant.AddJoint(RevoluteJoint("angle", bodies[1].body_frame(), rod.body_frame(), [0, 1, 0]))
     plant.plant.AddJointActuator("push", plant.plant.GetJointByName("angle"))
-    held = HeldContacts(plant.model(), {"rod": [length / 2, 0, 0]}, axes="z")
+    rod = FixedContacts(plant.model(), {"rod": [length / 2, 0, 0]}, axes="z")
     end = np.array([np.cos(angle), -np.sin(angle)]) * length / 2
     x = np.array([0.2, -end[1], angle, *v])
-    impact, inertia = Impact(held, restitution=e, at=0.0), m * length**2 / 12
+    impact, inertia = Impact(rod, restitution=e, at=0.0), m * length**2 / 12
     impulse = (1 + e) * -(v[1] - v[2] * end[0]) / (1 / m + end[0] ** 2 / inertia)
     np.testing.assert_allclose(impact.impulses(x), [impulse], rtol=1e-11)
     wanted = v + np.array([0, impulse / m, -end[0] * impulse / inertia])

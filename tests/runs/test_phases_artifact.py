@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarn
 def hopping():
     """A hopper that stands, then flies: models and their quantities alone, so that all of it can be made again."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
-    stance = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+    stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
     effort, x0 = dd.QuadraticCost(R=np.diag([0.1, 0.01])), np.array([0, 0.3, 0, 0.25, 0, 0, 0, 0])
     leg = {"leg_x": (0.1, 0.4), "swing_x": (-0.2, 0.2)}
     push = dd.Problem(
@@ -110,9 +110,11 @@ def test_a_stance_is_made_again(tmp_path):
     record = dd.save(dd.solve(hopping()), tmp_path / "run")
     assert record.verdict == "pass", record.sentence
     assert dd.verify(tmp_path / "run").verdict == "holds"
-    held = dd.load_record(tmp_path / "run" / "phase_0").problem["held"]
-    assert held == {"points": {"foot": [0.0, 0.0, -0.05]}, "axes": "xyz"}
-    found = forged(tmp_path / "run", lambda f: f["problem"].update(held={**held, "axes": "z"}), "phase_0/record.json")
+    contacts = dd.load_record(tmp_path / "run" / "phase_0").problem["fixed_contacts"]
+    assert contacts == {"points": {"foot": [0.0, 0.0, -0.05]}, "axes": "xyz"}
+    found = forged(
+        tmp_path / "run", lambda f: f["problem"].update(fixed_contacts={**contacts, "axes": "z"}), "phase_0/record.json"
+    )
     assert found.verdict == "broken"
 
 

@@ -14,6 +14,7 @@ from drake_diff.comparison import save_comparison
 from drake_diff.runs import certify_model, save_rollout
 from drake_diff.runs.fields import canonical
 from drake_diff.runs.provenance import embodiment_of
+from drake_diff.runs.read import upgraded
 from drake_diff.runs.sealed import SCHEMA_VERSION, own_sha256
 from drake_diff.trials import save_robustness
 
@@ -124,3 +125,18 @@ def test_a_lie_in_a_run_of_version_2_4_is_found(tmp_path):
     found = dd.verify(copy)
     assert found.verdict == "undecided"  # the version that wrote it is another
     assert any("metrics" in line for line in found.undecided)
+
+
+def test_the_held_points_of_version_2_are_fixed_contacts():
+    points = {"points": {"foot": [0.0, 0.0, -0.05]}, "axes": "xyz"}
+    constraints = [
+        {"quantity": {"HeldForce": {"row": 1}}},
+        {"quantity": {"ImpactPush": {"row": 0}}},
+        {"quantity": None},
+    ]
+    problem = {"num_steps": 3, "held": points, "constraints": constraints}
+    expected = [{"quantity": {"FixedForce": {"row": 1}}}, *constraints[1:]]
+    assert upgraded({"kind": "solve", "problem": problem}) == {
+        "kind": "plan",
+        "problem": {"num_steps": 3, "constraints": expected, "fixed_contacts": points},
+    }

@@ -17,7 +17,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.values import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
-from drake_diff.mechanics.held import HeldPlant
+from drake_diff.mechanics.fixed_contacts import FixedContactPlant
 from drake_diff.mechanics.symbol import Symbol, symbols
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.coupling import BoundCoupling
@@ -426,7 +426,7 @@ def _dynamics(task: OptimalControl) -> KnotFunction:
     function: Any = Refusal("an object with derivatives of its own")
     if isinstance(form, PlantKnots):
         function = symbolic_plant(form.model, dynamics.parameters, None if moved is None else moved.coordinates)
-    elif isinstance(form, HeldPlant):
+    elif isinstance(form, FixedContactPlant):
         function = form.rates.function
     elif isinstance(form, Pointwise):
         start = dynamics.parameters.values

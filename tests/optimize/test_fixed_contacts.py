@@ -72,24 +72,24 @@ CASES = [
 @pytest.mark.parametrize(("name", "frame", "point", "axes", "columns"), CASES)
 def test_motion_and_forces_are_those_of_drakes_matrices(name, frame, point, axes, columns):
     model = dd.load_model(MODELS / name, time_step=0.01, contact=False)
-    held = dd.optimize.HeldContacts(model, {frame: point}, axes=axes)
+    contacts = dd.optimize.FixedContacts(model, {frame: point}, axes=axes)
     random = np.random.default_rng(7)
     for _ in range(5):
         x, u = random.standard_normal(model.nx), 5 * random.standard_normal(model.nu)
         rates, forces = drake_says(MODELS / name, frame, np.array(point, dtype=float), columns, x, u)
-        np.testing.assert_allclose(held(x, u), rates, rtol=1e-9, atol=1e-9)  # rounding of a linear solve
-        np.testing.assert_allclose(held.forces(x, u), forces, rtol=1e-9, atol=1e-8)
+        np.testing.assert_allclose(contacts(x, u), rates, rtol=1e-9, atol=1e-9)  # rounding of a linear solve
+        np.testing.assert_allclose(contacts.forces(x, u), forces, rtol=1e-9, atol=1e-8)
         knot = np.concatenate([x, u])[None]
         h, every = 1e-6, np.eye(model.nx + model.nu)
-        differences = [(held.values(knot + h * e)[0] - held.values(knot - h * e)[0]) / (2 * h) for e in every]
+        differences = [(contacts.values(knot + h * e)[0] - contacts.values(knot - h * e)[0]) / (2 * h) for e in every]
         scale = max(1.0, np.abs(differences).max())
-        np.testing.assert_allclose(held.linearize(knot)[1][0] / scale, np.array(differences).T / scale, atol=1e-7)
+        np.testing.assert_allclose(contacts.linearize(knot)[1][0] / scale, np.array(differences).T / scale, atol=1e-7)
 
 
 def test_a_leg_of_two_links_is_held(leg_file):
     model = dd.load_model(leg_file, time_step=0.01, actuators={"hip_j": 60, "knee": 60})
-    held = dd.optimize.HeldContacts(model, {"shin": [0, 0, -0.3]})
-    assert held.rows == ("shin x", "shin z")
+    contacts = dd.optimize.FixedContacts(model, {"shin": [0, 0, -0.3]})
+    assert contacts.rows == ("shin x", "shin z")
     random = np.random.default_rng(1)
     actuation = np.zeros((5, 2))
     actuation[3, 0] = actuation[4, 1] = 1
@@ -100,7 +100,7 @@ def test_a_leg_of_two_links_is_held(leg_file):
         plant.Finalize()
         context, world = plant.CreateDefaultContext(), plant.world_frame()
         plant.SetPositionsAndVelocities(context, x)
-        rates, forces = held(x, u), held.forces(x, u)
+        rates, forces = contacts(x, u), contacts.forces(x, u)
         shin, tip = plant.GetBodyByName("shin").body_frame(), np.array([0, 0, -0.3])
         J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, shin, tip, world, world)[[0, 2]]
         bias = plant.CalcBiasTranslationalAcceleration(context, JacobianWrtVariable.kV, shin, tip, world, world)
@@ -113,23 +113,23 @@ def test_a_leg_of_two_links_is_held(leg_file):
 
 def test_an_impact_stops_the_foot_and_keeps_the_momentum_of_the_rest():
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
-    held = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+    contacts = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
     x = np.array([0.1, 0.5, 0.0, 0.3, 0.5, -2.0, 0.1, 0.0])
-    after = held.impact(x)
+    after = contacts.impact(x)
     np.testing.assert_allclose(after[:4], x[:4])
-    np.testing.assert_allclose(held.speeds(after), 0, atol=1e-12)
+    np.testing.assert_allclose(contacts.speeds(after), 0, atol=1e-12)
     # The leg slides freely along z: a massless motor passes no impulse on, so that the body keeps its speed.
     assert after[5] == pytest.approx(-2.0, abs=1e-9)
-    np.testing.assert_allclose(held.impact(after), after, atol=1e-12)  # what stands is not hit again
+    np.testing.assert_allclose(contacts.impact(after), after, atol=1e-12)  # what stands is not hit again
     locked = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.01)
-    rod = dd.optimize.HeldContacts(locked, {"pole": [0, 0, -0.5]}, axes="x")
+    rod = dd.optimize.FixedContacts(locked, {"pole": [0, 0, -0.5]}, axes="x")
     hit = rod.impact([0.0, 0.4, 1.0, 0.0])
     assert rod.speeds(hit) == pytest.approx([0.0], abs=1e-12)
 
 
 def test_a_hopper_jumps_to_its_height():
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
-    stance = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+    stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
     leg, effort = {"leg_x": (0.1, 0.4), "swing_x": (-0.2, 0.2)}, dd.QuadraticCost(R=np.diag([0.1, 0.01]))
     x0 = np.array([0, 0.3, 0, 0.25, 0, 0, 0, 0])
     push = dd.Problem(
@@ -164,7 +164,7 @@ def test_a_hopper_jumps_to_its_height():
 def test_a_start_that_slides_or_a_place_that_is_missed_is_refused(seed):
     """By its own equations the motion is right in both: only what a stance keeps says that the foot does not stand."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
-    stance = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+    stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
     random = np.random.default_rng(seed)
     off = random.choice([-1, 1]) * 10 ** random.uniform(-2.5, -1)
     x0 = np.array([0, 0.3, 0, 0.25, 0, 0, 0, 0.0])
@@ -180,7 +180,7 @@ def test_a_start_that_slides_or_a_place_that_is_missed_is_refused(seed):
 def test_a_force_that_leaves_its_cone_is_refused():
     """A hopper that is pushed sideways on ice: the plan of a rough ground breaks the smooth one's cone."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
-    stance = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+    stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
     x0 = np.array([0, 0.3, 0, 0.25, 0, 0, 0, 0.0])
     goal = {"x": 0.08, "x_v": 0.0, "z": 0.3, "z_v": 0.0}
     parts = {"x0": x0, "x_goal": goal, "num_steps": 12, "horizon": 0.5, "running_cost": dd.QuadraticCost(R=np.eye(2))}
@@ -197,28 +197,28 @@ def test_a_force_that_leaves_its_cone_is_refused():
 
 def test_the_friction_cone_of_three_axes_is_round():
     model = dd.example_model("panda")
-    held = dd.optimize.HeldContacts(model, "panda_hand")
-    (cone,) = [c for c in held.kept(friction=0.5) if "slide" in c.label]
+    contacts = dd.optimize.FixedContacts(model, "panda_hand")
+    (cone,) = [c for c in contacts.kept(friction=0.5) if "slide" in c.label]
     random = np.random.default_rng(0)
     x, u = np.concatenate([model.default_state[: model.nq], np.zeros(model.nv)]), random.standard_normal(model.nu)
-    f = held.forces(x, u)
+    f = contacts.forces(x, u)
     assert cone(x, u)[0] == pytest.approx((0.5 * f[2]) ** 2 - f[0] ** 2 - f[1] ** 2, rel=1e-12)
 
 
 def test_what_cannot_be_held_is_named():
     model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.01)
     with pytest.raises(ModelError, match="depend on each other"):
-        dd.optimize.HeldContacts(model, {"lower": [0, 0, -0.5], "upper": [0, 0, -0.5]})
+        dd.optimize.FixedContacts(model, {"lower": [0, 0, -0.5], "upper": [0, 0, -0.5]})
     with pytest.raises(ModelError, match="no joint moves"):
-        dd.optimize.HeldContacts(model, "lower", axes="y")
+        dd.optimize.FixedContacts(model, "lower", axes="y")
     with pytest.raises(UnknownNameError):
-        dd.optimize.HeldContacts(model, "foot")
+        dd.optimize.FixedContacts(model, "foot")
     with pytest.raises(InputError, match="axes"):
-        dd.optimize.HeldContacts(model, "lower", axes="xw")
+        dd.optimize.FixedContacts(model, "lower", axes="xw")
     with pytest.raises(ModelError, match="quaternion_floating"):
-        dd.optimize.HeldContacts(dd.load_model(MODELS / "quadrotor.urdf", time_step=0.01), "body")
-    held = dd.optimize.HeldContacts(model, "lower", axes="x")
+        dd.optimize.FixedContacts(dd.load_model(MODELS / "quadrotor.urdf", time_step=0.01), "body")
+    contacts = dd.optimize.FixedContacts(model, "lower", axes="x")
     with pytest.raises(InputError, match="friction"):
-        held.kept(friction=0.5)
+        contacts.kept(friction=0.5)
     with pytest.raises(InputError, match="at"):
-        held.kept(at=[1.0, 2.0])
+        contacts.kept(at=[1.0, 2.0])

@@ -21,7 +21,7 @@ STAYS = 1e-3  # [m] how far a held point may drift from its place
 STAYS_CLOSED = 1e-5  # [m, N s] of the gap and the impulses of an impact, as of every constraint of a plan
 
 
-class HeldContacts(Dynamics):
+class FixedContacts(Dynamics):
     """The equations of motion of a model with points that are held in place, as the system of a `Problem`.
 
     The forces that hold them are part of the motion: see `forces`, and `kept` for what a foot asks of them. The
@@ -40,7 +40,7 @@ class HeldContacts(Dynamics):
 
     Example:
         >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
-        >>> stance = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+        >>> stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
         >>> stance.rows  # the hopper is planar
         ('foot x', 'foot z')
         >>> hold = [0.0, 1.001 * 9.81]  # the leg's motor carries the body, and the ground the foot of 0.2 kg as well
@@ -49,7 +49,7 @@ class HeldContacts(Dynamics):
     """
 
     def __init__(self, model: Model, points: str | Mapping[str, Any], *, axes: str = AXES):
-        from drake_diff.mechanics.held import held_plant  # loads CasADi
+        from drake_diff.mechanics.fixed_contacts import fixed_contact_plant  # loads CasADi
 
         if not isinstance(model, Model):
             raise InputError("model", got=type(model).__name__, expected="a Model")
@@ -62,9 +62,9 @@ class HeldContacts(Dynamics):
         self.points = {name: finite_array(f"point of {name}", point, (3,)) for name, point in given.items()}
         places = _Stacked([frame_position(model, name, point) for name, point in self.points.items()], self._columns)
         speeds = _Stacked([frame_velocity(model, name, point) for name, point in self.points.items()], self._columns)
-        plant = held_plant(model, places, speeds)
+        plant = fixed_contact_plant(model, places, speeds)
         if isinstance(plant, Refusal):
-            raise ModelError(f"held contacts: {plant}")
+            raise ModelError(f"fixed contacts: {plant}")
         self.plant = plant
         every = [f"{name} {axis}" for name in self.points for axis in self.axes]
         self.rows = tuple(every[i] for i in plant.rows)
@@ -74,7 +74,7 @@ class HeldContacts(Dynamics):
         self.model, self.default_state = model, frozen(model.default_state)
 
     def __repr__(self) -> str:
-        return f"HeldContacts of {self.plant.model.name}: {', '.join(self.rows)} held"
+        return f"FixedContacts of {self.plant.model.name}: {', '.join(self.rows)} fixed"
 
     @property
     def _columns(self) -> list[int]:
@@ -89,7 +89,7 @@ class HeldContacts(Dynamics):
         return self.plant.forces(np.concatenate([np.asarray(x), np.asarray(u)]))
 
     def places(self, x: Any) -> Any:
-        """(m,) [m] the coordinates that are held."""
+        """(m,) [m] the coordinates that are fixed."""
         return np.asarray(self.plant.places(x))[self.plant.rows]
 
     def speeds(self, x: Any) -> Any:
@@ -119,18 +119,20 @@ class HeldContacts(Dynamics):
 
         Example:
             >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
-            >>> stance = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+            >>> stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
             >>> [constraint.label for constraint in stance.kept(at=0.0, friction=0.8)]
-            ['held points at rest', 'held points in place', 'foot pushes', 'foot does not slide']
+            ['fixed points at rest', 'fixed points in place', 'foot pushes', 'foot does not slide']
         """
         reach = positive_float("tolerance [m]", tolerance)
         zero = np.zeros(len(self.rows))
-        constraints = [Constraint(HeldSpeeds(self), zero, zero, knots=0, name="held points at rest")]
+        constraints = [Constraint(FixedSpeeds(self), zero, zero, knots=0, name="fixed points at rest")]
         where = self._where(at)
         if not np.all(np.isnan(where)):
             given = np.flatnonzero(~np.isnan(where))
             lower, upper = where[given] - reach, where[given] + reach
-            constraints.append(Constraint(HeldPlaces(self, given.tolist()), lower, upper, name="held points in place"))
+            constraints.append(
+                Constraint(FixedPositions(self, given.tolist()), lower, upper, name="fixed points in place")
+            )
         if friction is not None:
             constraints += self._pushing(positive_float("friction", friction))
         return constraints
@@ -147,7 +149,7 @@ class HeldContacts(Dynamics):
 
     def _pushing(self, friction: float) -> Iterator[Constraint]:
         for name, z, along in self.normals():
-            yield Constraint(HeldForce(self, z), lower=0.0, name=f"{name} pushes")
+            yield Constraint(FixedForce(self, z), lower=0.0, name=f"{name} pushes")
             if along:
                 cone = FrictionCone(self, z, along, friction)
                 yield Constraint(cone, lower=cone_limits(along), name=f"{name} does not slide")
@@ -157,7 +159,7 @@ class HeldContacts(Dynamics):
         for name in self.points:
             rows = {row[-1]: i for i, row in enumerate(self.rows) if row[:-2] == name}
             if "z" not in rows:
-                raise InputError("friction", got=f"{name}, which is not held along z", expected="points held along z")
+                raise InputError("friction", got=f"{name}, which is free along z", expected="points fixed along z")
             yield name, rows["z"], [rows[axis] for axis in "xy" if axis in rows]
 
 
@@ -178,16 +180,16 @@ class Impact:
         [M  -J'] [v+]   [M v-    ]
         [J   0 ] [P ] = [-e J v- ]
 
-    With J v the velocities of the held coordinates and e the restitution. All of these coordinates are in the impact:
+    With J v the velocities of the fixed coordinates and e the restitution. All of these coordinates are in the impact:
     with axes="z" a point slides without friction, with all axes it sticks. Given `at`, the impact comes where the gap
     closes, also in the chain of all phases, and its feedback is led back through the saltation matrix
     dR/dx + (f+ - dR/dx f-) g' / (g' f-), with R the reset, f the rates, and g the gap.
 
     Args:
-        held: The points.
+        contacts: The points.
         restitution: e, from 0 (the points stop) to 1.
-        at: Where the points meet the world: the height z of all, or (m,) places of `held.rows`, NaN where there is no
-            gap. None where the plan alone says when the impact comes.
+        at: Where the points meet the world: the height z of all, or (m,) places of `contacts.rows`, NaN where there is
+            no gap. None where the plan alone says when the impact comes.
         friction: The coefficient within which the impulses have to stay; None asks nothing of them.
 
     Raises:
@@ -195,25 +197,27 @@ class Impact:
 
     Example:
         >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
-        >>> foot = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+        >>> foot = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
         >>> landing = dd.optimize.Impact(foot, at=0.0, friction=0.8)
         >>> landing
         Impact of foot x, foot z: restitution 0
     """
 
-    def __init__(self, held: HeldContacts, *, restitution: float = 0.0, at: Any = None, friction: float | None = None):
-        if not isinstance(held, HeldContacts):
-            raise InputError("held", got=type(held).__name__, expected="HeldContacts")
-        self.held, self.restitution = held, float(finite_array("restitution", restitution, ()))
+    def __init__(
+        self, contacts: FixedContacts, *, restitution: float = 0.0, at: Any = None, friction: float | None = None
+    ):
+        if not isinstance(contacts, FixedContacts):
+            raise InputError("contacts", got=type(contacts).__name__, expected="FixedContacts")
+        self.contacts, self.restitution = contacts, float(finite_array("restitution", restitution, ()))
         if not 0 <= self.restitution <= 1:
             raise InputError("restitution", got=restitution, expected="a number from 0 to 1")
-        self.where = held._where(at)
+        self.where = contacts._where(at)
         self.gap_rows = np.flatnonzero(~np.isnan(self.where))
         self.friction = None if friction is None else positive_float("friction", friction)
-        self.__qualname__ = f"the impact of {', '.join(held.rows)}"  # by which a problem in phases tells it
+        self.__qualname__ = f"the impact of {', '.join(contacts.rows)}"  # by which a problem in phases tells it
 
     def __repr__(self) -> str:
-        return f"Impact of {', '.join(self.held.rows)}: restitution {self.restitution:g}"
+        return f"Impact of {', '.join(self.contacts.rows)}: restitution {self.restitution:g}"
 
     @property
     def has_gap(self) -> bool:
@@ -222,18 +226,18 @@ class Impact:
 
     def __call__(self, x: Any) -> Any:
         """(nx,) the state after the impact, from the state `x` (nx,) before, in any arithmetic."""
-        x, nq = np.asarray(x), self.held.plant.model.nq
-        jump = self.held.plant.jump(np.concatenate([x, np.zeros(self.held.nu)]))
+        x, nq = np.asarray(x), self.contacts.plant.model.nq
+        jump = self.contacts.plant.jump(np.concatenate([x, np.zeros(self.contacts.nu)]))
         return np.concatenate([x[:nq], x[nq:] + (1 + self.restitution) * jump])
 
     def impulses(self, x: Any) -> Any:
-        """(m,) [N s] on the points, one for each of `held.rows`, in any arithmetic."""
-        impulses = self.held.plant.impulses(np.concatenate([np.asarray(x), np.zeros(self.held.nu)]))
+        """(m,) [N s] on the points, one for each of `contacts.rows`, in any arithmetic."""
+        impulses = self.contacts.plant.impulses(np.concatenate([np.asarray(x), np.zeros(self.contacts.nu)]))
         return (1 + self.restitution) * impulses
 
     def gaps(self, x: Any) -> Any:
         """[m] how far the points are from where they meet the world, in any arithmetic."""
-        return self.held.places(x)[self.gap_rows] - self.where[self.gap_rows]
+        return self.contacts.places(x)[self.gap_rows] - self.where[self.gap_rows]
 
     def first_gap(self, x: Array) -> float:
         """[m] the smallest of the gaps."""
@@ -241,22 +245,22 @@ class Impact:
 
     def by_drake(self, x: Array) -> Array:
         """(nx,) the state after, by Drake's mass matrix and velocities."""
-        jump, _ = self.held.plant.jump_at(np.asarray(x, dtype=float))
+        jump, _ = self.contacts.plant.jump_at(np.asarray(x, dtype=float))
         after = np.array(x, dtype=float)
-        after[self.held.plant.model.nq :] += (1 + self.restitution) * jump
+        after[self.contacts.plant.model.nq :] += (1 + self.restitution) * jump
         return after
 
     def broken_rules(self, x: Array) -> list[str]:
         """What of the impact at `x` (nx,) the world does not do: a gap that is open, a pull, a slide."""
         faults = [
-            f"{self.held.rows[i]} is {gap:.3g} m apart"
+            f"{self.contacts.rows[i]} is {gap:.3g} m apart"
             for i, gap in zip(self.gap_rows, self.gaps(x), strict=True)
             if not abs(gap) <= STAYS_CLOSED
         ]
         if self.friction is None:
             return faults
-        values = (1 + self.restitution) * self.held.plant.jump_at(np.asarray(x, dtype=float))[1]
-        for name, z, along in self.held.normals():
+        values = (1 + self.restitution) * self.contacts.plant.jump_at(np.asarray(x, dtype=float))[1]
+        for name, z, along in self.contacts.normals():
             most, slide = self.friction * values[z], float(np.linalg.norm(values[along]))
             if values[z] < -STAYS_CLOSED:
                 faults.append(f"the ground pulls at {name} by {-values[z]:.3g} N s")
@@ -266,9 +270,9 @@ class Impact:
 
     def saltation(self, x: Array, rates: Array, rates_after: Array) -> Array:
         """(nx, nx) of the rates (nx,) before and after; the reset's own derivative where no single gap closes."""
-        nx, nq = self.held.nx, self.held.plant.model.nq
+        nx, nq = self.contacts.nx, self.contacts.plant.model.nq
         reset = np.eye(nx)
-        slopes = self.held.plant.jump.jacobian(np.concatenate([x, np.zeros(self.held.nu)]))[:, :nx]
+        slopes = self.contacts.plant.jump.jacobian(np.concatenate([x, np.zeros(self.contacts.nu)]))[:, :nx]
         reset[nq:] += (1 + self.restitution) * slopes
         if len(self.gap_rows) != 1:
             return reset
@@ -286,16 +290,16 @@ class Impact:
 
         Example:
             >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
-            >>> foot = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+            >>> foot = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
             >>> [constraint.label for constraint in dd.optimize.Impact(foot, at=0.0, friction=0.8).kept()]
             ['foot z touches', 'foot is pushed', 'foot does not slide in the impact']
         """
         constraints, zero = [], np.zeros(len(self.gap_rows))
         if self.has_gap:
-            names = " and ".join(self.held.rows[i] for i in self.gap_rows)
+            names = " and ".join(self.contacts.rows[i] for i in self.gap_rows)
             constraints.append(Constraint(ImpactGaps(self), zero, zero, knots=-1, name=f"{names} touches"))
         if self.friction is not None:
-            for name, z, along in self.held.normals():
+            for name, z, along in self.contacts.normals():
                 constraints.append(Constraint(ImpactPush(self, z), lower=0.0, knots=-1, name=f"{name} is pushed"))
                 if along:
                     cone = ImpactCone(self, z, along, self.friction)
@@ -306,71 +310,71 @@ class Impact:
     def to_dict(self) -> dict[str, Any]:
         """What a record tells of it."""
         positions = [None if np.isnan(position) else float(position) for position in self.where]
-        return self.held.to_dict() | {"restitution": self.restitution, "at": positions, "friction": self.friction}
+        return self.contacts.to_dict() | {"restitution": self.restitution, "at": positions, "friction": self.friction}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any], model: Model) -> "Impact":
         """The same again; InputError where `values` are none."""
         try:
-            held = HeldContacts(model, values["points"], axes=values["axes"])
+            contacts = FixedContacts(model, values["points"], axes=values["axes"])
             positions = [np.nan if position is None else position for position in values["at"]]
-            return cls(held, restitution=values["restitution"], at=positions, friction=values["friction"])
+            return cls(contacts, restitution=values["restitution"], at=positions, friction=values["friction"])
         except (KeyError, TypeError) as error:
             raise InputError("impact", got=repr(values)[:80], expected="what Impact.to_dict tells") from error
 
 
-class HeldQuantity:
+class FixedContactQuantity:
     """The base of the functions that a stance's constraints are of; a record tells them by `to_dict`."""
 
     def to_dict(self) -> dict[str, Any]:
         """The kind and its values."""
-        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "held"}  # type: ignore[arg-type]
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "contacts"}  # type: ignore[arg-type]
         return {type(self).__name__: values}
 
 
 @dataclass(frozen=True, eq=False)
-class HeldSpeeds(HeldQuantity):
-    """The velocities of the held coordinates."""
+class FixedSpeeds(FixedContactQuantity):
+    """The velocities of the fixed coordinates."""
 
-    held: HeldContacts
+    contacts: FixedContacts
 
     def __call__(self, x: Any) -> Any:
-        return self.held.speeds(x)
+        return self.contacts.speeds(x)
 
 
 @dataclass(frozen=True, eq=False)
-class HeldPlaces(HeldQuantity):
-    """Some of the held coordinates."""
+class FixedPositions(FixedContactQuantity):
+    """Some of the fixed coordinates."""
 
-    held: HeldContacts
+    contacts: FixedContacts
     rows: list[int]
 
     def __call__(self, x: Any) -> Any:
-        return self.held.places(x)[self.rows]
+        return self.contacts.places(x)[self.rows]
 
 
 @dataclass(frozen=True, eq=False)
-class HeldForce(HeldQuantity):
+class FixedForce(FixedContactQuantity):
     """One of the forces."""
 
-    held: HeldContacts
+    contacts: FixedContacts
     row: int
 
     def __call__(self, x: Any, u: Any) -> Any:
-        return self.held.forces(x, u)[self.row]
+        return self.contacts.forces(x, u)[self.row]
 
 
 @dataclass(frozen=True, eq=False)
-class FrictionCone(HeldQuantity):
+class FrictionCone(FixedContactQuantity):
     """friction f_z - f_t and friction f_z + f_t, or of two directions friction^2 f_z^2 - f_x^2 - f_y^2."""
 
-    held: HeldContacts
+    contacts: FixedContacts
     z: int
     along: list[int]
     friction: float
 
     def __call__(self, x: Any, u: Any) -> Any:
-        return _within_cone(self.held.forces(x, u), self.z, self.along, self.friction)
+        return _within_cone(self.contacts.forces(x, u), self.z, self.along, self.friction)
 
 
 def _within_cone(f: Any, z: int, along: list[int], friction: float) -> Any:
@@ -385,7 +389,7 @@ def cone_limits(along: list[int]) -> Any:
     return np.zeros(2) if len(along) == 1 else 0.0
 
 
-class ImpactQuantity(HeldQuantity):
+class ImpactQuantity(FixedContactQuantity):
     """The base of the functions that an impact's constraints are of, each of the state before it."""
 
     impact: Impact
@@ -430,7 +434,7 @@ class ImpactCone(ImpactQuantity):
         return _within_cone(self.impact.impulses(x), self.z, self.along, self.friction)
 
 
-QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (HeldSpeeds, HeldPlaces, HeldForce, FrictionCone)}
+QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (FixedSpeeds, FixedPositions, FixedForce, FrictionCone)}
 IMPACT_QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (ImpactGaps, ImpactPush, ImpactCone)}
 
 
@@ -444,10 +448,10 @@ def impact_quantity(model: Model, record: dict[str, Any]) -> ImpactQuantity:
     return quantity
 
 
-def held_quantity(held: HeldContacts, record: dict[str, Any]) -> HeldQuantity:
-    """The function that `HeldQuantity.to_dict` told of, of `held`; InputError where that is none."""
+def fixed_contact_quantity(contacts: FixedContacts, record: dict[str, Any]) -> FixedContactQuantity:
+    """The function that `FixedContactQuantity.to_dict` told of, of `contacts`; InputError where that is none."""
     if not (len(record) == 1 and next(iter(record)) in QUANTITIES):
         raise InputError("quantity", got=repr(record)[:80], expected=f"one of {', '.join(QUANTITIES)} with its values")
     ((kind, values),) = record.items()
-    quantity: HeldQuantity = QUANTITIES[kind](held, **values)
+    quantity: FixedContactQuantity = QUANTITIES[kind](contacts, **values)
     return quantity

@@ -35,7 +35,7 @@ class _Expression:
     """An SX function of a knot, in any arithmetic."""
 
     def __init__(self, symbol: Any, value: Any):
-        self.function = ca.Function("held", [symbol], [ca.densify(value)])
+        self.function = ca.Function("value", [symbol], [ca.densify(value)])
         self._jacobian = ca.Function("slopes", [symbol], [ca.densify(ca.jacobian(value, symbol))])
 
     def __call__(self, knot: Any) -> Any:
@@ -46,8 +46,8 @@ class _Expression:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldPlant:
-    """What the equations come to for the `rows` of all points' coordinates that are held; see `held_plant`."""
+class FixedContactPlant:
+    """What the equations come to for the `rows` of all points' coordinates that are held; see `fixed_contact_plant`."""
 
     model: Model
     places: Callable[[Any], Any]  # x -> (P,) all coordinates of the points
@@ -135,7 +135,9 @@ class HeldPlant:
         return _Expression(*self._symbolic["impulses"])
 
 
-def held_plant(model: Model, places: Callable[[Any], Any], speeds: Callable[[Any], Any]) -> HeldPlant | Refusal:
+def fixed_contact_plant(
+    model: Model, places: Callable[[Any], Any], speeds: Callable[[Any], Any]
+) -> FixedContactPlant | Refusal:
     """The equations with the points at `places` held, whose velocities are `speeds`; why there are none.
 
     What no joint moves is not held: the y of a planar leg. Both functions take the state in any arithmetic.
@@ -164,7 +166,7 @@ def held_plant(model: Model, places: Callable[[Any], Any], speeds: Callable[[Any
             f"the {len(rows)} coordinates that are held depend on each other, so that their forces are not unique: "
             "hold fewer axes of some points"
         )
-    plant = HeldPlant(model, places, speeds, rows, EquationsOfMotion(model), tree)
+    plant = FixedContactPlant(model, places, speeds, rows, EquationsOfMotion(model), tree)
     probe = np.hstack([states, random.standard_normal((TRIED, model.nu))])
     same = agrees(plant.rates.function, probe, plant.values(probe), SAME_PLANT)
     wanted = np.array([plant.forces_at(knot) for knot in probe])
