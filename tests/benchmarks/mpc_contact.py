@@ -32,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 import numpy as np  # noqa: E402
 from helpers.models import MODELS, strike  # noqa: E402
 from helpers.robots import FOOT, example_robot  # noqa: E402
+from pages import write_page  # noqa: E402
 from pydrake.multibody.parsing import Parser  # noqa: E402
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant  # noqa: E402
 from pydrake.multibody.tree import BodyIndex  # noqa: E402
@@ -475,7 +476,7 @@ def main():
         told = "\n\n".join(__doc__.strip().split("\n\n")[2:])
         page = options.markdown.read_text().split(HEAD.split("\n")[1])[0].rstrip("\n") + "\n"
         page += HEAD.format(seed=options.seed, count=options.count, told=told)
-        options.markdown.write_text(page + "\n".join(rows) + "\n")
+        write_page(options.markdown, page + "\n".join(rows) + "\n")
 
 
 if __name__ == "__main__":

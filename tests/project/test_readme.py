@@ -158,7 +158,6 @@ CONSTANTS = {
         "3": "drake_diff.optimize.replay:FEEDBACK_TOLERANCE",
         "5": "drake_diff.optimize.replay:STATE_TOLERANCE",
     },
-    "docs/glossary.md": {"1": "drake_diff.certificates.certificate:VerdictOptions.power"},
     "docs/logs.md": {
         "1e-6": "drake_diff.runs.differences:RELATIVE",
         "1e-9": "drake_diff.runs.differences:ABSOLUTE",
