@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.bounces import RADIUS, Bounce
 from helpers.models import MODELS, Plant, contact_properties
-from helpers.table import each_row, slow_after
+from helpers.table import each_row
 from pydrake.geometry import Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import PdControllerGains, SpatialInertia
@@ -44,13 +44,6 @@ def test_through_a_bounce_the_gradient_does_not_converge_and_is_called_that(boun
     assert "not converged: do not optimize with this" in str(certificate)
     with pytest.raises(CertificateError, match="not converged: do not optimize with this"):
         certificate.require()
-
-
-@pytest.mark.slow
-def test_without_the_second_layer_the_same_gradient_agrees(bouncer):
-    certificate = dd.certify_rollout(bouncer(1e4, 1 / 480), [1.003, -2.0], None, height, num_steps=480)
-    assert certificate.verdict in {"agree", "undecided"}  # with differences, which are as wrong
-    assert abs(certificate.entries[0].derivative + 1) > 1
 
 
 @pytest.mark.slow
@@ -220,32 +213,6 @@ def test_a_gradient_of_one_is_compared_with_the_slopes(secant, continuous, sprea
     assert found.converged.all() == (not disagree)
 
 
-@pytest.mark.slow
-def test_stiffening_a_bounce_does_not_converge_at_a_fixed_step(bouncer):
-    certificate = dd.certify_rollout(
-        bouncer(1e3, 1 / 480), [1.003, -2.0], None, height, num_steps=480, refine_stiffness=True
-    )
-    assert certificate.refinements[0].by == "stiffness, times"
-    assert certificate.refinements[0].levels == (1.0, 4.0, 16.0)
-    assert certificate.verdict == "not_converged"
-
-
-def test_stiffening_needs_a_stated_stiffness(load):
-    with pytest.raises(InputError, match="states no point stiffness"):
-        dd.certify_rollout(load("pendulum.urdf"), [0.1, 0], [[0.0]], height, refine_stiffness=True)
-
-
-@pytest.mark.parametrize(("h", "count"), slow_after(1, [(0.02, 37), (0.01, 100)]))
-def test_the_gradient_of_a_projectile_is_the_same_at_every_step_size(load, h, count):
-    """In free fall d z / d v0 = T for every h."""
-    model = load("projectile.sdf", time_step=h)
-    x0 = model.default_state
-    x0[6], x0[10:] = 1.0, [2.0, 1.0, 5.0]
-    certificate = dd.certify_rollout(model, x0, None, lambda x: x[6], num_steps=count, refine=True).require()
-    j = certificate.columns.index("ball_vz[0]") if "ball_vz[0]" in certificate.columns else -1
-    assert certificate.refinements[0].values[:, j] == pytest.approx([h * count] * 3, rel=1e-9)
-
-
 @pytest.mark.parametrize("h", [0.01, pytest.param(0.005, marks=pytest.mark.slow)])
 def test_the_gradient_of_a_spring_tends_to_the_continuous_one(load, h):
     """x(T) of m x'' + c x' + k x = 0 by x(0): e^(-a T) (cos w T + a / w sin w T), a = c / 2 m; and by v(0)."""
@@ -373,11 +340,3 @@ def test_horizon_diagnostics_of_a_vanishing_gradient():
     gradient = dd.differentiate_rollout(plant.model(), x0, None, lambda x: x[2], num_steps=60)
     assert gradient.vanishes_at is not None
     assert gradient.explodes_at is None
-
-
-def test_a_neutral_motion_neither_grows_nor_vanishes(load):
-    gradient = dd.differentiate_rollout(load("projectile.sdf"), load("projectile.sdf").default_state, None,
-                                        lambda x: x[6], num_steps=10)  # fmt: skip
-    assert gradient.growth_rate == pytest.approx(1.0, abs=1e-3)
-    assert gradient.explodes_at is None
-    assert gradient.vanishes_at is None

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from helpers.contracts import different
-from helpers.engines import G, assert_free_steps_agree, engine_of, needs
+from helpers.engines import assert_free_steps_agree, engine_of, needs
 from helpers.models import Plant, robot
 from helpers.table import each_row
 from pydrake.geometry import Role
@@ -91,13 +91,6 @@ def test_casadi_is_the_hand_calculation(load, file, form):
     assert one.method == "casadi"
 
 
-def test_gravity_is_drakes_and_not_adams_own(load):
-    model = load("projectile.sdf")
-    x = np.zeros(13)
-    x[0] = 1.0
-    assert engine_of("casadi", model).step(x, [])[12] == pytest.approx(-G * 0.01, rel=1e-14)
-
-
 @pytest.mark.parametrize("wrong", [lambda real, q: real(q[[3, 0, 1, 2]]), lambda real, q: real(q).T])
 def test_a_swapped_quaternion_or_a_transposed_rotation_is_found(monkeypatch, wrong):
     from drake_diff.engines import casadi as casadi_engine
@@ -159,23 +152,6 @@ def read_back(model, tmp_path):
 def test_drake_reads_the_same_model_from_the_urdf(load, tmp_path, file):
     found = different(*(dd.engines.load_engine("drake", m) for m in (load(file), read_back(load(file), tmp_path))))
     assert all(quantity == "effort limits" and "1e+10" in detail for quantity, detail in found.items())
-
-
-@pytest.mark.parametrize("name", ["ur5_robot.urdf", "solo12.urdf"])
-def test_drake_reads_the_same_robot_from_the_urdf(tmp_path, name):
-    model = robot(name, tmp_path)
-    assert not different(
-        dd.engines.load_engine("drake", model), dd.engines.load_engine("drake", read_back(model, tmp_path))
-    )
-
-
-def test_drake_reads_turned_frames_from_the_urdf(tmp_path):
-    model = turned(free=False)
-    found = different(
-        dd.engines.load_engine("drake", model), dd.engines.load_engine("drake", read_back(model, tmp_path))
-    )
-    assert found.keys() == {"position limits"}  # a slide without limits has them, far away
-    assert "1e+10" in found["position limits"]
 
 
 def test_pinocchio_reads_the_same_model_from_the_urdf(tmp_path):

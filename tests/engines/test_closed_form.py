@@ -209,12 +209,6 @@ def test_the_record_has_the_functions_name_hash_and_parameters_and_verify_says_w
     assert any("mine: a user's function (cart_pole)" in told for told in checked.unchecked)
 
 
-def test_a_function_without_source_has_no_hash(model):
-    scope = {"f": cart_pole}
-    exec("g = lambda q, v, u, p: f(q, v, u, p)", scope)
-    assert mine(model, scope["g"]).function.sha256 is None
-
-
 def test_without_contact_equations_are_another_model_once_something_touches(load):
     model = load("sphere_on_ground.sdf", time_step=0.005)
     x0 = np.array(model.default_state)

@@ -161,11 +161,6 @@ def test_what_is_disabled_is_refused_by_name(ball, tmp_path, flag):
         own(tmp_path, ball, (r'warmstart="disable"', f'{flag}="disable"'))
 
 
-def test_what_overrides_all_contacts_is_refused_by_name(ball, tmp_path):
-    with pytest.raises(ModelError, match=r"enabled options \(override\)"):
-        own(tmp_path, ball, (r'warmstart="disable"', 'override="enable"'))
-
-
 @each_row("option, said", [
     ('cone="pyramidal"', "pyramidal"), ('cone="elliptic" noslip_iterations="3"', "noslip"),
     ('cone="elliptic" solver="PGS"', "PGS"),

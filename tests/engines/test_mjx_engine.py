@@ -13,7 +13,7 @@ from helpers.engines import (
     on_tangent,
 )
 from helpers.forward_formula import free_box
-from helpers.models import MODELS, Plant, contact_properties, random_state
+from helpers.models import Plant, contact_properties, random_state
 from helpers.plants import block_on_rails
 from pydrake.geometry import Box, Cylinder
 from pydrake.math import RigidTransform
@@ -129,23 +129,6 @@ def test_sliding_and_sticking_have_the_steps_jacobian_and_not_slipping_at_all_ha
         engine.differentiate_step(x, [])
 
 
-def test_pyramidal_cones_have_the_derivative_at_rest(tmp_path):
-    model, x = block_on_rails()
-    engine = own_mjcf(tmp_path, model, ('cone="elliptic"', 'cone="pyramidal"'))
-    assert "pyramidal" in engine.contract.contact_law
-    # Pyramids are piecewise linear: a larger step stays right, and the solver's 1e-13 is seen less.
-    assert_jacobian_is_that_of_the_step(engine, model, x, [], step=1e-5)
-
-
-def test_a_pair_that_is_apart_takes_the_derivative_of_one_that_slides(load):
-    model = load("sliding_block.sdf", time_step=0.005)
-    engine, x = engine_of("mjx", model), model.default_state
-    x[6], x[10] = 0.05 - 2 * G / 4e4, 1.0  # four corners slide, four are apart
-    np.testing.assert_allclose(engine.step(x, []), engine_of("mujoco", model).step(x, []), rtol=0, atol=1e-12)
-    with pytest.raises(GradientError, match="not finite"):
-        engine.differentiate_step(x, [])
-
-
 def test_a_solver_that_stops_early_is_said(tmp_path):
     model, x = block_on_rails()
     x[2] = 0.03  # between sliding and sticking: no step of Newton's is exact
@@ -207,14 +190,3 @@ def test_a_pair_that_mjx_has_no_collision_for_is_refused_by_name():
         plant.shape(body, shape, contact_properties(1e4), RigidTransform())
     with pytest.raises(ModelError, match=r"CYLINDER.*BOX"):
         engine_of("mjx", plant.model())
-
-
-def test_other_friction_and_stiffness_are_found(tmp_path):
-    needed = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
-    path = tmp_path / "ball.sdf"
-    text = (MODELS / "sphere_on_ground.sdf").read_text()
-    path.write_text(text.replace("mu_dynamic>0.5", "mu_dynamic>0.4", 1))
-    found = different(dd.engines.load_engine("drake", needed), engine_of("mjx", dd.load_model(path, time_step=0.01)))
-    assert "0.444" in found["friction"]
-    same = different(dd.engines.load_engine("drake", needed), engine_of("mjx", needed))
-    assert same.keys() == {"contact law", "solver tolerance", "integrator"}

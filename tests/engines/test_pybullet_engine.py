@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.contracts import CHANGES, arms, different
+from helpers.contracts import different
 from helpers.engines import needs
 from helpers.forward_formula import formula, free_box
 from helpers.models import Plant, contact_properties
@@ -20,8 +20,6 @@ from drake_diff.mechanics.description import Geometry, describe, rigid_links
 
 needs("pybullet")
 G = 9.81
-# What no engine but Drake has as Drake has it, and Bullet's damping, which is explicit.
-OWN = {"limit law", "solver tolerance", "integrator", "derivative convention"}
 
 
 def bullet(model):
@@ -48,15 +46,6 @@ def test_what_is_beyond_a_limit_comes_back_by_a_fifth_of_it_each_step(load):
 
 
 # ---- the contract ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("change", ["armature", "gear"])
-def test_armature_is_what_bullet_has_not(tmp_path, change):
-    model = arms(tmp_path, **CHANGES[change][0])
-    found = different(dd.engines.load_engine("drake", model), bullet(model))
-    assert found.keys() - OWN == {"armature", "M(q)"}
-    assert "Bullet has no rotor inertia" in found["armature"]
-    assert "left_joint_2" in found["armature"]
 
 
 @pytest.mark.parametrize("wrong", ["quaternion order", "velocity frame", "none"])

@@ -10,7 +10,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_diff.exceptions import ModelError, SimulationError
-from drake_diff.model.equations import ContinuousSystem, EquationsOfMotion
+from drake_diff.model.equations import EquationsOfMotion
 
 
 def test_kellys_cart_pole(load):
@@ -64,15 +64,6 @@ def test_values_and_derivatives_are_those_of_drakes_continuous_plant(load, name)
         ours = f.autodiff(z[: model.nx], z[model.nx :])
         assert f(x, u) == pytest.approx(ExtractValue(drake).ravel(), rel=1e-11, abs=1e-11)
         assert ExtractGradient(ours) == pytest.approx(ExtractGradient(drake), rel=1e-9, abs=1e-9)
-
-
-def test_it_is_a_drake_system_with_an_autodiff_twin(load):
-    system = ContinuousSystem(EquationsOfMotion(load("cart_pole.urdf")))
-    context = system.CreateDefaultContext()
-    context.SetContinuousState([0.1, 0.7, -0.3, 1.1])
-    system.get_input_port().FixValue(context, [2.0])
-    assert system.EvalTimeDerivatives(context).CopyToVector()[2] == pytest.approx(3.172075726216, abs=1e-11)
-    assert system.ToAutoDiffXd() is not None
 
 
 def test_pd_control_has_no_continuous_form():

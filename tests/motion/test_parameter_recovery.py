@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from helpers.models import Plant, add_slide, contact_properties
-from pydrake.geometry import HalfSpace, Sphere
+from helpers.models import Plant, contact_properties
+from pydrake.geometry import HalfSpace
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import RevoluteJoint, RotationalInertia, SpatialInertia
 
@@ -82,21 +82,6 @@ def test_a_hidden_mass(load, name, parameter, size):
     all_recovered(outcomes)
 
 
-@pytest.mark.slow
-def test_the_hidden_mass_of_a_cart_poles_bob(load):
-    model = load("cart_pole.urdf", time_step=0.02)
-    free = dd.Bounds(x_lower=[-np.inf] * 4, x_upper=[np.inf] * 4)
-    outcomes = {}
-    for seed in SEEDS:
-        random = np.random.default_rng(seed)
-        truth = {"pole.mass": 0.3 * within_a_factor_of_two(random)}
-        start = {"pole.mass": truth["pole.mass"] * within_a_factor_of_two(random)}
-        us = 4 * np.sin(0.3 * np.arange(40) + random.uniform(0, 6))[:, None]
-        x0 = np.concatenate([random.uniform(-0.3, 0.3, 1), random.uniform(-2, 2, 1), random.uniform(-0.5, 0.5, 2)])
-        outcomes[seed] = (*recover(model, x0, us, truth, start, bounds=free), truth)
-    all_recovered(outcomes)
-
-
 def sliding_ball(approximation):
     """On a rail along the ground; free in z too where friction is lagged, else held where its weight holds it.
 
@@ -132,67 +117,6 @@ def test_a_hidden_friction(approximation):
     all_recovered(outcomes, certified=False)
 
 
-@pytest.mark.slow
-def test_a_hidden_link_length(load):
-    """The elbow's place on the upper rod; along the hinges, axis y, it has no effect and stays where it started."""
-    model, outcomes = load("double_pendulum.urdf", time_step=0.01), {}
-    for seed in SEEDS:
-        random = np.random.default_rng(seed)
-        length = 0.8 * within_a_factor_of_two(random)
-        truth = {"elbow.offset": np.array([random.uniform(-0.2, 0.2), 0.0, -length])}
-        start = {"elbow.offset": [0.0, 0.0, -length * within_a_factor_of_two(random)]}
-        us = np.sin(0.15 * np.arange(60)[:, None] + random.uniform(0, 6, 2))
-        x0 = random.uniform(-1, 1, 4)
-        outcomes[seed] = (*recover(model, x0, us, truth, start), truth)
-        assert outcomes[seed][1]["elbow.offset"][1] == 0.0
-    all_recovered(outcomes)
-
-
-def pushed_ball(approximation):
-    """A driven ball on a rail that pushes another one, which nothing else moves."""
-    made = Plant(0.01, approximation)
-    properties = contact_properties(4e3, dissipation=2.0, friction=0.0, relaxation_time=0.02)
-    pusher = made.plant.AddRigidBody("pusher", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
-    pushed = made.plant.AddRigidBody("pushed", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
-    for body in (pusher, pushed):
-        rail = add_slide(made.plant, f"{body.name()}_rail", made.plant.world_frame(), body, "x")
-        made.shape(body, Sphere(0.1), properties, RigidTransform())
-        if body is pusher:
-            made.plant.AddJointActuator("push", rail)
-    return made.model()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("approximation", ["lagged", "sap", "similar"])
-def test_a_hidden_mass_through_contact(approximation):
-    """Known only by how it is pushed, and thrown off where the push ends."""
-    model, outcomes = pushed_ball(approximation), {}
-    for seed in SEEDS:
-        random = np.random.default_rng(seed)
-        truth = {"pushed.mass": within_a_factor_of_two(random)}
-        start = {"pushed.mass": truth["pushed.mass"] * within_a_factor_of_two(random)}
-        us = 8 * (1 + 0.5 * np.sin(0.3 * np.arange(40) + random.uniform(0, 6)))[:, None]
-        us[30:] = 0.0
-        x0 = [0.0, 0.2 + random.uniform(-0.002, 0.02), random.uniform(0.2, 0.6), 0.0]
-        outcomes[seed] = (*recover(model, x0, us, truth, start), truth)
-        contacts = dd.rollout(model, x0, us, parameters=truth).contacts
-        assert sum(bool(c) for c in contacts) > 5
-    all_recovered(outcomes, certified=False)
-
-
-@pytest.mark.slow
-def test_a_hidden_stiffness_of_contact():
-    model, outcomes = pushed_ball("lagged"), {}
-    for seed in SEEDS:
-        random = np.random.default_rng(seed)
-        truth = {"pushed.stiffness": 4e3 * within_a_factor_of_two(random)}
-        start = {"pushed.stiffness": truth["pushed.stiffness"] * within_a_factor_of_two(random)}
-        us = 8 * (1 + 0.5 * np.sin(0.3 * np.arange(15) + random.uniform(0, 6)))[:, None]
-        x0 = [0.0, 0.2 + random.uniform(-0.002, 0.002), random.uniform(0.2, 0.6), 0.0]
-        outcomes[seed] = (*recover(model, x0, us, truth, start), truth)
-    all_recovered(outcomes, certified=False)
-
-
 def gimbal():
     """A body in three driven hinges about x, y and z, all through its centre of mass."""
     made = Plant(0.02)
@@ -222,20 +146,6 @@ def test_a_hidden_inertia():
         x0 = np.concatenate([random.uniform(-0.5, 0.5, 3), random.uniform(-1, 1, 3)])
         outcomes[seed] = (*recover(model, x0, us, truth, start), truth)
         assert room_of_inertia(outcomes[seed][1]["c.inertia"]) > 0
-    all_recovered(outcomes)
-
-
-@pytest.mark.slow
-def test_several_hidden_parameters_at_once(load):
-    """Mass, damping, rest length and stiffness of a driven block, whose motion tells them apart."""
-    model, outcomes = load("mass_spring_damper.sdf", time_step=0.02), {}
-    size = {"block.mass": 2.0, "slide.damping": 1.5, "slide.spring_stiffness": 50.0, "slide.spring_rest_length": 0.1}
-    for seed in SEEDS:
-        random = np.random.default_rng(seed)
-        truth = {name: value * within_a_factor_of_two(random) for name, value in size.items()}
-        start = {name: value * within_a_factor_of_two(random) for name, value in truth.items()}
-        us = 10 * random.standard_normal((50, 1))
-        outcomes[seed] = (*recover(model, random.uniform(-1, 1, 2), us, truth, start), truth)
     all_recovered(outcomes)
 
 

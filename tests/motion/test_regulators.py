@@ -9,7 +9,6 @@ import functools
 
 import numpy as np
 import pytest
-from helpers.loops import tracking
 from helpers.models import MODELS
 from helpers.table import slow_after
 from pydrake.multibody.parsing import Parser
@@ -22,11 +21,10 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import drake_diff as dd
 from drake_diff.motion import TVLQR
-from drake_diff.optimize.replay import goal_check, regulator_weights
+from drake_diff.optimize.replay import regulator_weights
 
 NAMES = ("cart_pole", "acrobot")
 FILES = {"cart_pole": "cart_pole.urdf", "acrobot": "acrobot.xml"}
-LEVELS = (0.1, 0.2, 0.4, 0.8)  # standard deviation of each initial angle [rad], place [m] and rate [per s]
 
 
 @functools.cache
@@ -89,18 +87,6 @@ def reference(solution):
     return controller
 
 
-def survivors(solution, controller, level, trials):
-    """How many of the perturbed starts, the same for every controller, end at the goal, as the package judges it."""
-    problem, count = solution.problem, 0
-    for seed in range(trials):
-        x0 = problem.x0 + level * np.random.default_rng([seed, 7]).standard_normal(4)
-        with np.errstate(all="ignore"):  # a motion that is lost may leave every number: it is not counted
-            found = dd.loop.closed_loop(problem.model, controller, x0, problem.num_steps)
-            error = problem.goal_error(found.motion.xs[-1])
-        count += not found.ended and goal_check(solution.plan, error).passes
-    return count
-
-
 @pytest.mark.parametrize("name", slow_after(1, NAMES))
 def test_our_gains_are_drakes_on_the_discrete_plant(name):
     """1e-9 of the largest; what is asked is 1e-6. 80 to 100 steps of rounding in two Riccati recursions."""
@@ -120,26 +106,3 @@ def test_in_continuous_time_drakes_gains_are_others(name):
     ours = TVLQR(solution.problem.model, solution.xs, solution.us, *regulator_weights(solution.plan, solution.us))
     apart = np.abs(continuous_gains(solution) - ours.gains).max(axis=(1, 2))
     assert np.median(apart) > 0.1 * np.median(np.abs(ours.gains).max(axis=(1, 2)))
-
-
-def compare(name, trials):
-    """Ours survives where Drake's does, by counts within 3 binomial errors of their difference."""
-    solution = swing_up(name)
-    ours, drakes = tracking(solution), reference(solution)
-    for level in LEVELS:
-        a, b = (survivors(solution, controller, level, trials) for controller in (ours, drakes))
-        print(name, level, a, b)
-        error = np.sqrt((a * (trials - a) + b * (trials - b)) / trials)
-        assert a >= b - 3 * error, f"{name} at {level}: {a} of {trials} under ours, {b} under Drake's"
-        assert a >= 0.95 * trials or b < 0.95 * trials, f"{name} at {level}: {a} of {trials} under ours, {b}"
-
-
-@pytest.mark.parametrize("name", slow_after(1, NAMES))
-def test_a_few_starts_survive_under_ours_as_under_drakes(name):
-    compare(name, 10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_200_starts_a_level_survive_under_ours_as_under_drakes(name):
-    compare(name, 200)

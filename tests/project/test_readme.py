@@ -7,7 +7,6 @@ import subprocess
 import sys
 from itertools import product
 from operator import attrgetter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -98,31 +97,6 @@ def test_the_table_of_a_bounce_and_a_toss():
     ]
     for row, values in zip(printed, found, strict=True):
         assert row == [f"{value:.4g}" for value in values]
-
-
-def test_every_module_that_contributing_names_is_there():
-    text = (ROOT / "CONTRIBUTING.md").read_text()
-    package = ROOT / "drake_diff"
-    modules = re.findall(r"`(\w+(?:/\w+)*\.py)`", text)
-    rooms = {name for row in re.findall(r"^\| (`.*?) \|", text, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
-    assert modules
-    assert not [name for name in modules if not ((package / name).is_file() or (ROOT / name).is_file())]
-    assert rooms == {path.stem for path in package.iterdir() if path.is_dir() or path.stem == "exceptions"} - {
-        "__pycache__",
-        *("assets", "models", "schema"),
-    }
-
-
-def test_the_panel_in_the_documents_runs(tmp_path):
-    text = (ROOT / "docs" / "panels.md").read_text()
-    panel, code = re.search(r"```toml\n(.*?)```.*?```python\n(.*?)```", text, re.DOTALL).groups()
-    (tmp_path / "panel.toml").write_text(panel.replace("seeds = 50", "seeds = 1"))
-    (tmp_path / "swing.py").write_text(code)
-    (tmp_path / "pendulum.urdf").symlink_to(ROOT / "models" / "pendulum.urdf")
-    command = [sys.executable, "-m", "drake_diff.cli.main", "panel", "panel.toml", "--out", "out"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert len(Path(tmp_path, "out", "table.csv").read_text().splitlines()) == 7  # a header and six cells
 
 
 # Of each document the numbers that are a constant of the package, as "module:name"; of 5 % also as a part.

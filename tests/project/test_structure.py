@@ -3,8 +3,6 @@
 import ast
 from pathlib import Path
 
-from helpers.table import each_row
-
 TESTS = Path(__file__).parents[1]
 BENCHMARKS = TESTS / "benchmarks"
 PROGRAMS = {path.stem for path in BENCHMARKS.glob("*.py")} - {"__main__"}
@@ -51,27 +49,3 @@ def test_no_test_imports_a_benchmark():
     found = {path.name: imported_benchmarks(path.read_text()) - PENDING.get(path.name, set()) for path in paths}
     assert len(PROGRAMS) > 3
     assert not {path: names for path, names in found.items() if names}
-
-
-@each_row(
-    "line", ["import conftest", "from test_a import b", "from . import test_a", "def f():\n    import test_a as c"]
-)
-def test_an_import_of_a_test_is_noticed(line):
-    assert imported_tests(line)
-
-
-@each_row(
-    "line",
-    [
-        "from benchmarks import acceptance",
-        "import benchmarks.acceptance",
-        "from .benchmarks.acceptance import main",
-        "from tests.benchmarks import acceptance",
-        "def f():\n    from acceptance import main",
-        "import acceptance as other",
-        "other = pytest.importorskip('acceptance')",
-    ],
-)
-def test_an_import_of_a_benchmark_is_noticed(line):
-    assert imported_benchmarks(line)
-    assert not imported_benchmarks("import json\nfrom helpers.models import MODELS")

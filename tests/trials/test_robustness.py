@@ -14,7 +14,7 @@ from drake_diff._base.statistics import margin, success_rate
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.parameters import list_parameters
 from drake_diff.optimize.replay import track
-from drake_diff.trials.perturbation import PERTURBATIONS, Setup, parameters_of, perturbed
+from drake_diff.trials.perturbation import Setup, parameters_of, perturbed
 from drake_diff.trials.run import TOLD, Sensitivity, levels_named, trial_seed
 from drake_diff.trials.trial import Task, run_trial
 
@@ -49,30 +49,6 @@ def test_intervals_are_the_published_ones():
         (1, 29): (0.0061, 0.1718),
     }.items():
         np.testing.assert_allclose(success_rate(successes, trials)[2:], interval, atol=5.1e-5)
-
-
-def test_the_edges_are_where_the_score_test_is_significant():
-    """(k/n - p)^2 = z^2 p (1 - p) / n at both, exactly."""
-    for k, n in ((3, 10), (19, 20), (50, 100)):
-        rate = success_rate(k, n)
-        for p in (rate.lower, rate.upper):
-            assert (k / n - p) ** 2 == pytest.approx(1.959963984540054**2 * p * (1 - p) / n, rel=1e-12)
-    assert success_rate(20, 20).upper == 1.0
-    for k, n in ((21, 20), (-1, 20), (0, 0)):
-        with pytest.raises(InputError, match="successes"):
-            success_rate(k, n)
-
-
-def test_the_interval_covers_what_it_says():
-    """By SciPy's binomial: averaged over p it covers 95 %, as Brown, Cai and DasGupta (2001) find, within 1 %."""
-    binom = pytest.importorskip("scipy.stats").binom
-    n = 50
-    rates = [success_rate(k, n) for k in range(n + 1)]
-    p = np.linspace(0.01, 0.99, 197)
-    inside = np.array([[r.lower <= q <= r.upper for r in rates] for q in p])
-    coverage = (inside * binom.pmf(np.arange(n + 1), n, p[:, None])).sum(axis=1)
-    assert abs(coverage.mean() - 0.95) < 0.01
-    assert coverage.min() > 0.85
 
 
 @each_row("rates, found", [([100, 95, 94], 0.2), ([94, 100, 100], 0.0), ([100, 90, 100], 0.1), ([100, 99, 95], 0.3)])
@@ -165,13 +141,6 @@ def test_contact_is_another_approximation():
     plain = Setup(model, model.default_state, dd.loop.Loop(), 1.0, {})
     found = [s.model.contract.contact.approximation for s in draws(plain, "contact_approximation", 1, 8)]
     assert set(found) == {"similar", "lagged"}
-
-
-def test_what_feeds_no_input_is_not_tried():
-    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=H)
-    tried = {name for name, kind in PERTURBATIONS.items() if kind.is_of(model)}
-    plant = {"mass", "inertia", "friction", "stiffness", "gravity", "time_step", "contact_approximation"}
-    assert tried == {"initial_state", "push", *plant}
 
 
 def test_what_is_around_the_controller_changes(setup):
@@ -377,32 +346,6 @@ def test_a_sensor_or_estimator_that_raises_fails_its_trial_and_the_others_go_on(
     assert {e.reason.split("; ")[-1] for e in found.cells[0].endings} == {f"the {part} itself failed"}
 
 
-def test_trials_whose_controller_raises_are_control_errors_and_the_others_go_on(cart):
-    """A mass m (1 + U) ends at 2 / (1 + U) m: beyond 2.2 m where U < -1/11, and there the controller raises."""
-    found = dd.robustness(pushed_and_stopped(cart), {"mass": [0.2, 0.02]}, trials=40, controller=raising(2.2))
-    small, large = found.cells
-    factors = [perturbed(found.task.setup, {"mass": 0.2}, e.seed).parameters["cart.mass"].item() / MASS
-               for e in large.endings]  # fmt: skip
-    raised = [factor < 1 / 1.1 for factor in factors]
-    assert 0 < sum(raised) < 40
-    assert small.rate.successes == 40
-    assert large.controller_errors == {"KeyError: 'no gain so far out'": sum(raised)}
-    for ending, it_raised in zip(large.endings, raised, strict=True):
-        assert ("KeyError: 'no gain so far out'; the controller itself failed" in ending.reason) == it_raised
-        assert not it_raised or ending.label == "control_error"
-    told = (
-        f"In {sum(raised)} of them the controller itself failed, in {sum(raised)} with KeyError: 'no gain so far out'"
-    )
-    assert told in found.sentence
-
-
-def test_a_controller_that_raises_without_any_perturbation_fails_every_trial(cart):
-    found = dd.robustness(pushed_and_stopped(cart), {"mass": [0.1]}, trials=3, controller=raising(1.0))  # at step 20
-    assert not found.success
-    assert found.cells[0].labels == {"control_error": 3}
-    assert found.sentence.startswith("Unperturbed it fails: at t = 0.2 s: the controller failed: KeyError")
-
-
 def test_a_controller_that_raises_beside_the_motion_has_no_gradient(cart):
     """At rest at 0 and never beyond in the unperturbed run: differences look there, and it raises."""
     task = Task(plan(cart, np.zeros((10, 1)), [0.0, 0.0]).plan, raising(1e-9))
@@ -436,11 +379,6 @@ def test_a_goal_error_that_is_not_finite_cannot_be_judged(cart):
                 labels.append(run_trial(task, {"push": 1.7e308}, seed).label)
     assert labels
     assert set(labels) == {"evaluation_error"}
-
-
-def test_a_success_has_no_label(cart):
-    trial = run_trial(Task(pushed_and_stopped(cart).plan, "tvlqr"), {"mass": 0.01}, 0)
-    assert (trial.label, trial.reason, trial.outcome.failures) == (None, "", ())
 
 
 # ---- what gradients predict
@@ -538,18 +476,6 @@ def test_nothing_is_predicted_of_what_no_gradient_tells(regulator):
 
 
 # ---- the whole of it
-
-
-def test_the_same_seed_gives_the_same_trials(cart):
-    solution = pushed_and_stopped(cart)
-
-    def ends(seed):
-        result = dd.robustness(solution, {"mass": [0.1], "sensor_noise": [0.1]}, trials=4, seed=seed)
-        return [e.last.tobytes() for c in result.cells for e in c.endings]
-
-    assert ends(1) == ends(1)
-    assert not set(ends(1)) & set(ends(2))
-    assert len({trial_seed(0, k) for k in range(1000)}) == 1000
 
 
 def test_rates_margins_and_the_worst_are_of_the_trials(cart):

@@ -1,10 +1,8 @@
 """What trials leave on disk: every number, worst trials that can be run again, and nothing that lies."""
 
-import csv
 import json
 import re
 import shutil
-from dataclasses import replace
 from hashlib import sha256
 
 import numpy as np
@@ -16,7 +14,6 @@ from helpers.table import each_row, slow_after
 from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff._base.statistics import success_rate
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 from drake_diff.logs import read_mcap
@@ -25,7 +22,7 @@ from drake_diff.runs.sealed import own_sha256
 from drake_diff.runs.verify import recalled
 from drake_diff.trials import files as robustness_page
 from drake_diff.trials import save_robustness
-from drake_diff.trials.files import record_of, robustness_data
+from drake_diff.trials.files import robustness_data
 from drake_diff.trials.trial import evaluate
 
 LEVELS = {"mass": [0.02, 0.4], "actuator_delay": [1, 8], "time_step": [2], "sensor_bias": [0.01]}
@@ -122,15 +119,6 @@ def test_a_worst_trial_is_run_again_from_its_file_alone(result, saved):
     assert fields["plant_time_step_s"] == 0.02
 
 
-def test_it_is_the_worst_at_the_lowest_level_that_fails(result):
-    for name, level in (("mass", 0.4), ("actuator_delay", 1)):
-        cell = result.worst(name)
-        assert cell.level == level
-        failed = [e.goal_error for e in cell.endings if e.label is not None]
-        assert cell.worst.outcome.goal_error == max(failed)
-        assert all(c.rate.successes == 6 for c in result.of(name) if c.level < level)
-
-
 def test_the_trace_has_all_that_the_loop_saw_and_did(result, saved):
     trial = result.worst("actuator_delay").worst
     log, found = read_mcap(saved[0] / "worst/actuator_delay_1/trace.mcap"), trial.outcome.run
@@ -150,54 +138,6 @@ def test_the_trace_has_all_that_the_loop_saw_and_did(result, saved):
     assert [m.failure_label for _, m in log.messages["/events"]] == ["control_error"]
     latencies = json.loads((saved[0] / "worst/actuator_delay_1/latencies.json").read_text())
     assert latencies["latencies_s"] == found.latencies.tolist()
-
-
-def test_the_table_has_a_row_for_each_trial(result, saved):
-    rows = list(csv.DictReader((saved[0] / "trials.csv").open()))
-    assert len(rows) == 6 * len(result.cells)
-    for c in result.cells:
-        mine = [r for r in rows if (r["perturbation"], float(r["level"])) == (c.perturbation, c.level)]
-        assert sum(int(r["success"]) for r in mine) == c.rate.successes
-        assert [float(r["last hinge_q"]) for r in mine] == [e.last[0] for e in c.endings]
-
-
-def test_what_a_controller_raises_stands_in_record_and_table(run, tmp_path):
-    with recalled(run) as solution:
-        found = dd.robustness(solution, {"mass": [0.02]}, trials=2, controller=lambda *_: lambda x, t: 1 / 0)
-        record = save_robustness(found, tmp_path / "out", run)
-    assert record.verdict == "fail"
-    assert record.robustness.perturbations[0].cells[0].controller_errors == {"ZeroDivisionError: division by zero": 2}
-    rows = list(csv.DictReader((tmp_path / "out" / "trials.csv").open()))
-    assert [row["label"] for row in rows] == ["control_error"] * 2
-    assert all("the controller failed: ZeroDivisionError: division by zero" in row["reason"] for row in rows)
-
-
-def test_the_page_says_and_plots_it_and_needs_no_network(result, saved):
-    folder = saved[0]
-    page, plots = (folder / "robustness.html").read_text(), robustness_data(result)["plots"]
-    assert "Content-Security-Policy" in page
-    assert not re.search(r'(src|href)="https?:', page)
-    for target in re.findall(r'<a href="([^"]+)"', page):
-        assert (folder / target).is_file()
-    assert len(re.findall(r'<a href="', page)) == len(LEVELS)
-    for name in LEVELS:
-        success, moved, last = (p for p in plots if p["place"] == name)
-        cells = result.of(name)
-        assert success["x"] == [c.level for c in cells]
-        assert success["series"][0]["y"] == pytest.approx([c.rate.value for c in cells])
-        assert success["series"][1]["y"] == pytest.approx([c.rate.lower for c in cells])
-        assert moved["series"][0]["y"] == pytest.approx([c.displacement for c in cells])
-        points = [[y for y in s["y"] if y is not None] for s in last["series"]]
-        assert [len(p) for p in points] == [6] * len(cells) + [1]
-        assert sorted(points[0]) == pytest.approx(sorted(e.last[1] for e in cells[0].endings), rel=1e-7)
-        assert f'id="{name}" class="plots"' in page
-    trial = result.worst(result.weakest).worst
-    angle = next(p for p in plots if p["title"] == "hinge_q")
-    assert [s["name"] for s in angle["series"]] == ["true", "observed", "estimated", "plan"]
-    assert angle["series"][0]["y"] == pytest.approx(trial.outcome.run.motion.xs[:, 0], rel=1e-7)
-    assert all(len(s["y"]) == len(p["x"]) for p in plots for s in p["series"])
-    assert "Nothing is drawn" in page
-    assert "Budget: 20 ms, the controller&#39;s period" in page
 
 
 @browsing
@@ -224,40 +164,6 @@ def test_the_page_opens_without_a_network_and_without_an_error(saved, browser, t
     assert errors(browser) == []
 
 
-def doctored(result, rates, **changes):
-    """`result` with other successes of 100 by perturbation and level."""
-    cells = [
-        replace(c, rate=success_rate(rates[c.perturbation][i], 100), labels={"state_error": 1}, **changes)
-        for name in result.names
-        for i, c in enumerate(result.of(name))
-    ]
-    return replace(result, cells=tuple(cells))
-
-
-def test_the_words_name_the_weakest_point_and_who_is_to_blame(result):
-    rates = {"mass": [100, 100], "actuator_delay": [100, 90], "time_step": [100], "sensor_bias": [100]}
-    # Margins, as parts of the largest usual levels: 0.4 / 0.4, 1 / 8, 2 / 4, 0.01 / 0.1.
-    assert doctored(result, rates).weakest == "sensor_bias"
-    rates["actuator_delay"] = [94, 90]
-    told = doctored(result, rates)
-    assert told.weakest == "actuator_delay"
-    assert "Weakest point: actuator_delay, with no margin: at 1 steps 94 of 100 succeed" in told.sentence
-    assert "Of 6 failed trials: 6 state errors." in told.sentence
-    assert "they say nothing about actuator_delay" in told.sentence
-
-
-def test_the_words_say_whether_gradients_knew(result):
-    rates = {"mass": [100, 50], "actuator_delay": [100, 100], "time_step": [100], "sensor_bias": [100]}
-    all_of, none_of = "in 6 of the 6 cells that they cover; of mass in 2 of 2.", "in 0 of the 6 cells"
-    for factor, told in ((1.9, all_of), (2.1, none_of), (0.51, all_of), (0.49, none_of)):
-        assert told in doctored(result, rates, displacement=factor, predicted=1.0).sentence
-    assert "Gradients predict none of it" in doctored(result, rates, predicted=None).sentence
-    perfect = doctored(result, {name: [100] * 2 for name in LEVELS})
-    assert "No trial fails" in perfect.sentence
-    assert record_of(perfect, "x").verdict == "pass"
-    assert record_of(doctored(result, {name: [94] * 2 for name in LEVELS}), "x").verdict == "fail"
-
-
 def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(result, tmp_path, monkeypatch):
     before = save_robustness(result, tmp_path / "out")
 
@@ -279,23 +185,6 @@ def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(result, tmp_p
     with pytest.raises(InputError, match="which holds 'mine'"):
         save_robustness(result, tmp_path / "out")
     assert (other / "notes.txt").read_text() == "keep"
-
-
-def test_a_loop_of_ones_own_is_not_said_to_run_again(cart, run, tmp_path):
-    result = dd.robustness(
-        pushed_and_stopped(cart),
-        {"mass": [0.4]},
-        trials=2,
-        loop=dd.loop.Loop(sensor=dd.loop.Sensor(noise=0.01), latency_budget=1),
-    )
-    record = save_robustness(result, tmp_path, run)
-    trial = json.loads((tmp_path / record.robustness.perturbations[0].worst / "trial.json").read_text())
-    assert trial["run"] is None
-    assert record.robustness.loop.sensor["noise"] == 0.01
-    assert (record.robustness.loop.latency_budget_s, record.robustness.loop.latency_budget_is) == (1.0, "stated")
-    assert record.robustness.loop.actuator["upper"] is None
-    with pytest.raises(InputError, match="trial: run"):
-        evaluate(trial)
 
 
 def test_a_run_that_breaks_off_at_once_and_one_with_a_fallback_are_kept(cart, tmp_path):
@@ -417,12 +306,6 @@ def test_the_command_fails_where_the_plan_does_not_survive(run, tmp_path):
     assert found.exit_code == 1
     assert "Weakest point: actuator_delay, with no margin: at 1 steps 0 of 2 succeed" in found.output
     assert "2 control" in found.output
-
-
-def test_the_command_takes_mpc(run, tmp_path):
-    found = call(run, "--trials", 1, "--perturbations", "mass", "--controller", "mpc", "--out", tmp_path / "out")
-    assert found.exit_code == 0, found.output
-    assert json.loads((tmp_path / "out" / "record.json").read_text())["robustness"]["loop"]["controller"] == "mpc"
 
 
 def test_the_command_refuses_what_it_cannot_try(run, tmp_path):
