@@ -3,12 +3,78 @@
 Each try is a process of its own, forked from one that has the solution to be saved.
 """
 
+import errno
 import json
 import os
 import signal
+from pathlib import Path
+
+import numpy as np
 
 import drake_diff as dd
+from drake_diff._base import files
+from drake_diff.runs import page, save
+from drake_diff.runs.sealed import files_below
 from helpers.forks import fork, status_of
+
+ERRORS = ("ENOSPC", "EIO", "EACCES")
+FULL = "full"  # a disk that is full from then on: what writes fails, what removes and renames does not
+KILLED, KILLED_AFTER = "killed", "killed after"
+FAULTS = (*ERRORS, FULL, KILLED, KILLED_AFTER)
+WRITES = ("create", "write", "mkdir", "fsync")
+
+
+class Disk:
+    """What is called below `root`; the `at`-th call meets `fault`. It patches the process that it is made in."""
+
+    def __init__(self, root, at=None, fault=""):
+        self.root, self.at, self.fault = str(Path(root).resolve()), at, fault
+        self.calls = []
+        for name in ("replace", "rename", "mkdir", "rmdir", "unlink", "chmod", "open", "fsync"):
+            setattr(os, name, self._watched(name, getattr(os, name)))
+        disk = self
+
+        class Watched(files.FileIO):
+            def __init__(self, path, mode):
+                disk.meet("create", path, lambda: super(Watched, self).__init__(path, mode))
+
+            def write(self, data):
+                return disk.meet("write", self.name, lambda: super(Watched, self).write(data))
+
+        files.FileIO = Watched
+        exchange = files._renameat2()
+        if exchange is not None:
+            files._renameat2 = lambda: lambda *words: disk.meet("exchange", words[3], lambda: exchange(*words))
+
+    def _watched(self, name, call):
+        def watched(path, *words, dir_fd=None, **more):
+            if dir_fd is not None:
+                more["dir_fd"] = dir_fd
+            if name == "open" and not words[0] & (os.O_WRONLY | os.O_RDWR | os.O_DIRECTORY):
+                return call(path, *words, **more)  # to be read
+            told = "create" if name == "open" and words[0] & os.O_CREAT else name
+            return self.meet(told, path, lambda: call(path, *words, **more), dir_fd)
+
+        return watched
+
+    def meet(self, name, path, call, dir_fd=None):
+        where = os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else os.fsdecode(path)
+        if dir_fd is not None:
+            where = os.path.join(os.readlink(f"/proc/self/fd/{dir_fd}"), where)
+        if not os.path.abspath(where).startswith(self.root):
+            return call()
+        number = len(self.calls)
+        self.calls.append(f"{name} {os.path.relpath(where, self.root)}")
+        if self.fault == FULL and number >= self.at and name in WRITES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if number != self.at or self.fault == FULL:
+            return call()
+        if self.fault in ERRORS:
+            raise OSError(getattr(errno, self.fault), os.strerror(getattr(errno, self.fault)))
+        if self.fault == KILLED_AFTER:
+            call()
+        os.kill(os.getpid(), signal.SIGKILL)
+        return None
 
 
 def forked(action):
@@ -39,3 +105,48 @@ def ended(child, reading):
     status = status_of(child)
     assert status in (0, -signal.SIGKILL), f"a forked process ended with status {status}, and told {told!r}"
     return json.loads(told) if status == 0 else {"ended": "killed"}
+
+
+def tried(action, root, at=None, fault="", *, exchanges=True):
+    """What becomes of `action()` where the `at`-th call below `root` meets `fault`; without, all calls."""
+
+    def act():
+        if not exchanges:
+            files._renameat2 = lambda: None
+        disk = Disk(root, at, fault)
+        action()
+        return disk.calls
+
+    return ended(*forked(act))
+
+
+def two_solutions():
+    """A plan that was saved, and one to be saved where it is, both of a pendulum."""
+    model = dd.load_model("models/pendulum.urdf", time_step=0.02)
+    asked = {"x0": [0, 0], "num_steps": 10, "running_cost": dd.QuadraticCost(R=[[1.0]])}
+    return [dd.solve(dd.Problem(model, x_goal=[goal, 0], **asked), method="shooting") for goal in (0.2, 0.3)]
+
+
+def quick_pages(monkeypatch):
+    """Pages of a word each, and versions that are looked up once: what is written is as much, what is computed less."""
+    monkeypatch.setattr(page, "write_pages", lambda *words: [files.write_whole(path, b"a page") for path in words[:2]])
+    known = save.provenance_of()
+    monkeypatch.setattr(save, "provenance_of", lambda: known)
+
+
+def goal_of(directory):
+    """The goal of the run that is whole in `directory`, an AssertionError where it is not."""
+    record = dd.load_record(directory)
+    assert record.state == "complete"
+    assert record.sealed() == record
+    assert files_below(Path(directory), record.FILE) == record.files
+    return record.problem["x_goal"][0]
+
+
+def has_plan(directory, solution):
+    """Whether the plan of `solution` can be read in `directory`."""
+    try:
+        with np.load(Path(directory) / "plan.npz") as plan:
+            return np.array_equal(plan["xs"], solution.xs) and np.array_equal(plan["us"], solution.us)
+    except (OSError, ValueError):
+        return False
