@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from helpers.contact_forms import SlidingBlock, SphereOnGround
 from helpers.contracts import CHANGES, FOLLOWS, PLAIN, arms, different
 from helpers.engines import (
     HAND,
@@ -45,8 +46,6 @@ from drake_diff.engines.closed_form import (
     NumpyEngine,
     Pendulum,
     Projectile,
-    SlidingBlock,
-    SphereOnGround,
 )
 from drake_diff.exceptions import (
     ModelError,
