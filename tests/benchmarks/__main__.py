@@ -10,23 +10,20 @@ start (of processes: imports and --help).
 """
 
 import argparse
-import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
+import _one_thread  # noqa: F401 (before NumPy)
+import compare
+from cases import CASES
+from peers import QUANTITIES
+from solves import QUICK_SOLVES, SOLVES, solved
+from starts import started
+from suite import QUICK_MODELS, Missing, Row, measured
+from table import document, machine, save, show
 
-import compare  # noqa: E402
-from cases import CASES  # noqa: E402
-from peers import QUANTITIES  # noqa: E402
-from solves import QUICK_SOLVES, SOLVES, solved  # noqa: E402
-from starts import started  # noqa: E402
-from suite import QUICK_MODELS, Missing, Row, measured  # noqa: E402
-from table import document, machine, save, show  # noqa: E402
-
-from drake_diff.exceptions import InputError, UnknownNameError  # noqa: E402
+from drake_diff.exceptions import InputError, UnknownNameError
 
 KINDS = (*QUANTITIES, "solve", "start")
 

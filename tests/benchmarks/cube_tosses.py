@@ -12,23 +12,20 @@ eight corner spheres, and pads on the faces with a friction of their own.
 """
 
 import argparse
-import os
 import sys
 import tempfile
 import time
 from itertools import product
 from pathlib import Path
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")
+import _one_thread  # noqa: F401 (before NumPy)
+import numpy as np
+from cube_tosses_axes import axes_of, rotations, turned
 
-import numpy as np  # noqa: E402
-from cube_tosses_axes import axes_of, rotations, turned  # noqa: E402
-
-import drake_diff as dd  # noqa: E402
-from drake_diff._base.arrays import Array  # noqa: E402
-from drake_diff.identification import ContactIdentification, first_state, identify_contact  # noqa: E402
-from drake_diff.identification.impacts import flights_of  # noqa: E402
+import drake_diff as dd
+from drake_diff._base.arrays import Array
+from drake_diff.identification import ContactIdentification, first_state, identify_contact
+from drake_diff.identification.impacts import flights_of
 
 RATE, WIDTH, MASS, INERTIA = 148.0, 0.1048, 0.37, 0.00081  # [Hz, m, kg, kg m^2] as published with the tosses
 INSET = 0.0024  # [m] by hand, radius of a corner sphere: its centre is so far inside of three faces

@@ -30,22 +30,22 @@ from collections import Counter
 from hashlib import sha256
 from pathlib import Path
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")
+import _one_thread  # noqa: F401 (before NumPy)
+
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
-import numpy as np  # noqa: E402
-from helpers.models import MODELS  # noqa: E402
-from helpers.strange import FILES, broken  # noqa: E402
-from mcap.reader import NonSeekingReader  # noqa: E402
-from mcap.writer import Writer  # noqa: E402
-from trust_verify import leaves, rewrite, seal  # noqa: E402
+import numpy as np
+from helpers.models import MODELS
+from helpers.strange import FILES, broken
+from mcap.reader import NonSeekingReader
+from mcap.writer import Writer
+from trust_verify import leaves, rewrite, seal
 
-import drake_diff as dd  # noqa: E402
-from drake_diff.cli import main as cli  # noqa: E402
-from drake_diff.exceptions import DrakeDiffError  # noqa: E402
-from drake_diff.runs.verify import recalled  # noqa: E402
-from drake_diff.runs.view import scene_of_run  # noqa: E402
+import drake_diff as dd
+from drake_diff.cli import main as cli
+from drake_diff.exceptions import DrakeDiffError
+from drake_diff.runs.verify import recalled
+from drake_diff.runs.view import scene_of_run
 
 HANG = 90.0  # [s] the limit of the process apart is 60, and this machine may be busy
 OPENED, ACCESSED = 0x20, 0x1  # of inotify

@@ -13,7 +13,6 @@ model has not.
 import argparse
 import copy
 import json
-import os
 import sys
 import tempfile
 import time
@@ -22,18 +21,17 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
+import _one_thread  # noqa: F401 (before NumPy)
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from helpers.models import robot_file  # noqa: E402
-from pydrake.multibody.tree import MultibodyForces  # noqa: E402
-from rates import success_rate  # noqa: E402
+import mujoco
+import numpy as np
+from helpers.models import robot_file
+from pydrake.multibody.tree import MultibodyForces
+from rates import success_rate
 
-import drake_diff as dd  # noqa: E402
+import drake_diff as dd
 
 ROBOTS = ("ur5_robot.urdf", "z1.urdf", "so100.urdf")
 PERIOD, SAMPLES, STEP, NOISE = 0.01, 200, 2.5e-4, 2e-4  # [s], and [rad]

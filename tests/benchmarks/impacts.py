@@ -13,7 +13,6 @@ import argparse
 import hashlib
 import json
 import logging
-import os
 import statistics
 import sys
 import time
@@ -21,18 +20,16 @@ import warnings
 from dataclasses import asdict
 from pathlib import Path
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
+import _one_thread  # noqa: F401 (before NumPy)
+import numpy as np
+from impact_cases import FAMILIES, Case, case
+from impact_truth import Slopes, truth
+from rates import success_rate
 
-import numpy as np  # noqa: E402
-from impact_cases import FAMILIES, Case, case  # noqa: E402
-from impact_truth import Slopes, truth  # noqa: E402
-from rates import success_rate  # noqa: E402
-
-from drake_diff import differentiate_rollout  # noqa: E402
-from drake_diff.exceptions import DrakeDiffError, GradientWarning  # noqa: E402
-from drake_diff.model.parameters import select  # noqa: E402
-from drake_diff.motion.flow.steps import FlowSteps  # noqa: E402
+from drake_diff import differentiate_rollout
+from drake_diff.exceptions import DrakeDiffError, GradientWarning
+from drake_diff.model.parameters import select
+from drake_diff.motion.flow.steps import FlowSteps
 
 HERE = Path(__file__).parent
 RIGHT = 0.01  # part of the truth

@@ -12,7 +12,6 @@ goes beyond a limit, as a jump of a speed may, it counts too.
 """
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -21,20 +20,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")
+import _one_thread  # noqa: F401 (before NumPy)
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
-import numpy as np  # noqa: E402
-from helpers.models import MODELS, strike  # noqa: E402
-from pydrake.multibody.parsing import Parser  # noqa: E402
-from pydrake.multibody.plant import MultibodyPlant  # noqa: E402
-from pydrake.systems.analysis import Simulator  # noqa: E402
-from task_cases import ARM, HOVER, MOMENT_RATIO, MOST, PANDA, QUADROTOR, ball_distance, flying, places  # noqa: E402
+import numpy as np
+from helpers.models import MODELS, strike
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import Simulator
+from task_cases import ARM, HOVER, MOMENT_RATIO, MOST, PANDA, QUADROTOR, ball_distance, flying, places
 
-import drake_diff as dd  # noqa: E402
-from drake_diff.model import BodyForce  # noqa: E402
+import drake_diff as dd
+from drake_diff.model import BodyForce
 
 FINE = 1e-3  # [s] the referee's step
 PUSHES = 3

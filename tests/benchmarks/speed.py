@@ -9,7 +9,6 @@ the table into a file, between <!-- speed --> and <!-- end of speed -->.
 
 import argparse
 import gc
-import os
 import platform
 import statistics
 import sys
@@ -19,25 +18,23 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")  # read when NumPy is imported
-
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from panda_arm import panda_arm, state  # noqa: E402
-from pydrake.multibody.tree import BodyIndex  # noqa: E402
+import _one_thread  # noqa: F401 (before NumPy)
+import mujoco
+import numpy as np
+from panda_arm import panda_arm, state
+from pydrake.multibody.tree import BodyIndex
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from helpers.robots import FOOT, example_robot  # noqa: E402
+from helpers.robots import FOOT, example_robot
 
-import drake_diff as dd  # noqa: E402
-from drake_diff.derivatives.steps import known_steps  # noqa: E402
-from drake_diff.engines.mujoco import MujocoEngine  # noqa: E402
-from drake_diff.exceptions import ModelWarning  # noqa: E402
-from drake_diff.model.parameters import select  # noqa: E402
-from drake_diff.model.step import advance  # noqa: E402
-from drake_diff.optimize.ilqr.riccati import LinearQuadratic, solve_riccati  # noqa: E402
+import drake_diff as dd
+from drake_diff.derivatives.steps import known_steps
+from drake_diff.engines.mujoco import MujocoEngine
+from drake_diff.exceptions import ModelWarning
+from drake_diff.model.parameters import select
+from drake_diff.model.step import advance
+from drake_diff.optimize.ilqr.riccati import LinearQuadratic, solve_riccati
 
 KNOTS, ROUNDS, QUICK_ROUNDS = 50, 15, 5
 LEG = (0.0, 0.8, -1.6)  # [rad] hip, thigh and calf of the standing Go2

@@ -17,7 +17,6 @@ import argparse
 import fnmatch
 import json
 import logging
-import os
 import statistics
 import subprocess
 import sys
@@ -27,21 +26,21 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
+import _one_thread  # noqa: F401 (before NumPy)
+
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
-import numpy as np  # noqa: E402
-from pages import write_page  # noqa: E402
-from rates import success_rate  # noqa: E402
-from referee import judge, judge_phases  # noqa: E402
-from task_cases import FAMILIES, NOT_EXPRESSED, Case  # noqa: E402
-from task_cases_more import MORE  # noqa: E402
-from task_phases import PHASES, PhasedCase  # noqa: E402
-from trust_solve import NAMED, plan_of  # noqa: E402
+import numpy as np
+from pages import write_page
+from rates import success_rate
+from referee import judge, judge_phases
+from task_cases import FAMILIES, NOT_EXPRESSED, Case
+from task_cases_more import MORE
+from task_phases import PHASES, PhasedCase
+from trust_solve import NAMED, plan_of
 
-import drake_diff as dd  # noqa: E402
-from drake_diff.exceptions import DrakeDiffError, ModelWarning  # noqa: E402
+import drake_diff as dd
+from drake_diff.exceptions import DrakeDiffError, ModelWarning
 
 TIME_LIMIT, AIM = 60.0, 0.95
 EVERY = {family: [*FAMILIES.get(family, []), *MORE.get(family, [])] for family in dict.fromkeys([*FAMILIES, *MORE])}

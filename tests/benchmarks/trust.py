@@ -11,7 +11,6 @@ import argparse
 import importlib
 import json
 import logging
-import os
 import platform
 import sys
 import time
@@ -19,12 +18,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
+import _one_thread  # noqa: F401 (before NumPy)
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
-from rates import success_rate  # noqa: E402
+from rates import success_rate
 
 # Each is a module trust_NAME beside this file, with `measure(seed, count)` and its usual COUNT.
 PARTS = (
