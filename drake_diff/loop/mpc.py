@@ -22,11 +22,12 @@ from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import LQR
 from drake_diff.motion.rollout import STEPS
+from drake_diff.optimize.ilqr.expansion import Motion
 from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.realtime.rolling import Rolling, Staying
-from drake_diff.optimize.realtime.step import Motion, Step, Stretch, roll, take_step
+from drake_diff.optimize.realtime.step import Step, Stretch, roll, take_step
 from drake_diff.optimize.replay import Plan, held, regulator_weights
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
@@ -174,7 +175,7 @@ class MPC:
         count = self._rolling.count(k, self.horizon)
         xs = np.array([self._row(i, 0) for i in range(k, k + count + 1)])
         us = np.array([self._row(i, 1) for i in range(k, k + count)])
-        motion = Motion(xs, us, xs[1:])
+        motion = Motion(xs, us, np.zeros_like(xs[1:]))
         self.status = OK
         try:
             x = self._same_sign(finite_array("x", x, (self._problem.nx,)), xs[0])
@@ -203,7 +204,7 @@ class MPC:
         known = range(self._begin + (k == self._begin), self._begin + len(last.us))
         ends = [last.ends[k + j - self._begin] if j and k + j in known else advance(twin, xs[j], us[j])
                 for j in range(len(us))]  # fmt: skip
-        return Motion(xs, us, np.array(ends))
+        return Motion.with_ends(xs, us, np.array(ends))
 
     def _followed(self, x: Array, k: int, xs: Array, us: Array, stretch: Stretch) -> Motion:
         """The plant's own motion from x under the last gains; under those of the first plan where it costs less.
@@ -218,7 +219,7 @@ class MPC:
             rows = step.feedback[np.clip(steps - begin, 0, len(step.feedback) - 1)]
             try:
                 motion = roll(stretch, x, xs, us, rows)
-                paid = stretch.paid(motion)
+                paid = stretch.paid(motion, stretch.limits)
             except SimulationError:
                 continue
             if np.isfinite(paid):
@@ -258,7 +259,9 @@ class MPC:
         for count in counts:
             xs, us = self._reference.xs[-count - 1 :], self._reference.us[-count:]
             if len(us) == count:
-                take_step(self._rolling.stretch(self._problem.num_steps - count, count), Motion(xs, us, xs[1:]))
+                take_step(
+                    self._rolling.stretch(self._problem.num_steps - count, count), Motion(xs, us, np.zeros_like(xs[1:]))
+                )
             else:
                 self._rolling.stretch(0, count)
 
@@ -277,7 +280,7 @@ class MPC:
         stretch, paid = rolling.stretch(0, problem.num_steps), np.inf
         xs, us = np.array(xs), np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
         xs[0] = problem.x0
-        motion, ranges = Motion(xs, us, stretch.ends(xs[:-1], us)), problem.ranges(xs)
+        motion, ranges = stretch.motion(xs, us), problem.ranges(xs)
         efforts = np.maximum(np.ptp(us, axis=0), SMALLEST_RANGE)
         if np.max(np.abs(motion.gaps) / ranges) > GAP and problem.model.contract.contact.collision_pairs:
             stretch = replace(stretch, rolls=True)  # what is no motion says nothing of what touches

@@ -101,13 +101,13 @@ def _sweep(motion: Motion) -> Callable[[], object]:
     model, xs, us = motion
     A, B, _ = dd.linearize(model, xs[:-1], us, x_next=xs[1:])
     n, m = model.nx, model.nu
+    gradients, hessians = np.full((KNOTS + 1, n + m), 1e-2), np.tile(0.1 * np.eye(n + m), (KNOTS + 1, 1, 1))
+    gradients[-1, n:], hessians[-1] = 0.0, np.diag([1.0] * n + [0.0] * m)
     problem = LinearQuadratic(
         F=np.concatenate([A, B], axis=2),
         gaps=np.zeros((KNOTS, n)),
-        gradients=np.full((KNOTS, n + m), 1e-2),
-        hessians=np.tile(0.1 * np.eye(n + m), (KNOTS, 1, 1)),
-        final_gradient=np.full(n, 1e-2),
-        final_hessian=np.eye(n),
+        gradients=gradients,
+        hessians=hessians,
         lower=-100.0 - us,
         upper=100.0 - us,
         start_lower=np.zeros(n),

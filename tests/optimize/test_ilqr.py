@@ -405,8 +405,9 @@ def test_a_ridge_is_in_the_units_of_what_it_is_added_to():
 def _around(scale):
     """A linear-quadratic problem of three states, whose two inputs are in units of `scale`."""
     random = np.random.default_rng(4)
-    F, g = random.standard_normal((5, 3, 5)), random.standard_normal((5, 5))
-    H = np.tile(np.eye(5), (5, 1, 1))
+    F, g = random.standard_normal((5, 3, 5)), random.standard_normal((6, 5))
+    H = np.tile(np.eye(5), (6, 1, 1))
+    g[-1], H[-1] = [1, 1, 1, 0, 0], np.diag([1, 1, 1, 0, 0])
     into = np.diag(np.concatenate([np.ones(3), scale]))
     one = np.full((5, 2), np.inf)
     return LinearQuadratic(
@@ -414,8 +415,6 @@ def _around(scale):
         np.zeros((5, 3)),
         g @ into,
         into @ H @ into,
-        np.ones(3),
-        np.eye(3),
         -one,
         one,
         np.zeros(3),

@@ -10,15 +10,14 @@ from drake_diff.optimize.ilqr.riccati import LinearQuadratic, follow, slope_alon
 def problem(seed=0, count=6, n=3, m=2, *, gaps=1.0, free=0.0, bound=np.inf):
     """Random and convex; x_0 within +-`free`, inputs within +-`bound`."""
     random = np.random.default_rng(seed)
-    roots = random.standard_normal((count, n + m, n + m))
-    final = random.standard_normal((n, n))
+    roots = random.standard_normal((count + 1, n + m, n + m))
+    gradients, hessians = random.standard_normal((count + 1, n + m)), roots @ roots.swapaxes(1, 2) + 0.1 * np.eye(n + m)
+    gradients[-1, n:], hessians[-1, n:], hessians[-1, :, n:] = 0.0, 0.0, 0.0
     return LinearQuadratic(
         F=random.standard_normal((count, n, n + m)) / np.sqrt(n),
         gaps=gaps * random.standard_normal((count, n)),
-        gradients=random.standard_normal((count, n + m)),
-        hessians=roots @ roots.swapaxes(1, 2) + 0.1 * np.eye(n + m),
-        final_gradient=random.standard_normal(n),
-        final_hessian=final @ final.T,
+        gradients=gradients,
+        hessians=hessians,
         lower=np.full((count, m), -bound),
         upper=np.full((count, m), bound),
         start_lower=np.full(n, -free),
@@ -62,7 +61,7 @@ def followed(p, policy, start):
 
 def value(p, xs, us):
     zs = np.hstack([xs[:-1], us])
-    own = np.sum(p.gradients * zs) + np.einsum("ki,kij,kj->", zs, p.hessians, zs) / 2
+    own = np.sum(p.gradients[:-1] * zs) + np.einsum("ki,kij,kj->", zs, p.hessians[:-1], zs) / 2
     return own + p.final_gradient @ xs[-1] + xs[-1] @ p.final_hessian @ xs[-1] / 2
 
 
@@ -72,10 +71,8 @@ def one_step(bound=np.inf):
     return LinearQuadratic(
         F=np.ones((1, 1, 2)),
         gaps=0 * one,
-        gradients=np.array([[0.0, 3.0]]),
-        hessians=np.eye(2)[None],
-        final_gradient=np.array([2.0]),
-        final_hessian=one,
+        gradients=np.array([[0.0, 3.0], [2.0, 0.0]]),
+        hessians=np.array([np.eye(2), np.diag([1.0, 0.0])]),
         lower=-bound * one,
         upper=bound * one,
         start_lower=np.zeros(1),

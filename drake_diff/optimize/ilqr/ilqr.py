@@ -31,9 +31,11 @@ from drake_diff.optimize.ilqr.expansion import (
     with_active,
 )
 from drake_diff.optimize.ilqr.riccati import (
+    ROUNDING_OF_CURVATURE,
     AffinePolicy,
     LinearQuadratic,
     follow,
+    least_regularized,
     slope_along,
     solve_riccati,
 )
@@ -52,7 +54,6 @@ from drake_diff.optimize.program import (
 
 # Regularization, of the inputs' own curvature: the least at all, the first that is tried, and the last.
 SMALLEST_REGULARIZATION, FIRST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-4, 1e-3, 1e8
-ROUNDING_OF_CURVATURE = 1e-8  # of the inputs' curvature: what makes one that is only just not positive definite so
 HARDER = 8.0  # the factor between two regularizations
 SUFFICIENT_DECREASE = 1e-4
 TRIALS = 5  # sizes along one policy; then a shorter policy is asked for
@@ -133,7 +134,7 @@ def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
     Raises GradientError if a derivative is refused, InputError if the cost has no minimum.
     """
     search = _Search(problem, xs, us, Limits(1, math.inf, 1.0), None)
-    policy = _least_regularized(solve_riccati, search._expand())
+    policy = least_regularized(search._expand())
     if policy is None:
         raise InputError("running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum")
     nx = problem.nx
@@ -142,15 +143,11 @@ def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
     return tuple(CostToGo(*row) for row in parts)
 
 
-def _least_regularized(solve: _Solve, model: LinearQuadratic) -> AffinePolicy | None:
-    return solve(model, 0.0) or solve(model, ROUNDING_OF_CURVATURE)
-
-
 def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: float) -> bool:
     """Whether no model, regularized as little as it allows, promises more than `limit`, and one of them that much."""
     promises = False
     for model in models:
-        policy = _least_regularized(solve, model)
+        policy = solve(model, 0.0) or solve(model, ROUNDING_OF_CURVATURE)
         if policy is not None and not abs(policy.expected) <= limit:
             return False
         promises = promises or policy is not None
@@ -303,7 +300,7 @@ class _Search:
             estimate = curvature_along(self.problem, new, model.multipliers())
             if estimate is not None:
                 curvature, known = estimate
-                self.curvature.M[known] = curvature
+                self.curvature.M[:-1][known] = curvature
         self.expanded = new
         return model
 

@@ -6,7 +6,7 @@ the boxes those of Tassa, Mansard and Todorov, "Control-limited differential dyn
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from drake_diff.optimize.ilqr import riccati_kernel
 
 BOX_ITERATIONS = 30
 HALVINGS = np.asarray(0.5 ** np.arange(20), dtype=np.float64)
+ROUNDING_OF_CURVATURE = 1e-8  # of the inputs' curvature: makes one that is only just not positive definite so
 LEAST_SCALE = 1e-12  # of the largest diagonal entry: an input of no effect has a ridge too
 
 
@@ -25,10 +26,8 @@ class LinearQuadratic:
 
     F: Array  # (N, n, n + m)
     gaps: Array  # (N, n)
-    gradients: Array  # (N, n + m)
-    hessians: Array  # (N, n + m, n + m)
-    final_gradient: Array  # (n,)
-    final_hessian: Array  # (n, n)
+    gradients: Array  # (N+1, n + m), whose last entries are those of x_N and zeros
+    hessians: Array  # (N+1, n + m, n + m)
     lower: Array  # (N, m)
     upper: Array  # (N, m)
     start_lower: Array  # (n,)
@@ -36,7 +35,22 @@ class LinearQuadratic:
 
     @property
     def num_states(self) -> int:
-        return len(self.final_gradient)
+        return self.gaps.shape[1]
+
+    @property
+    def final_gradient(self) -> Array:
+        """(n,)"""
+        return self.gradients[-1, : self.num_states]
+
+    @property
+    def final_hessian(self) -> Array:
+        """(n, n)"""
+        return self.hessians[-1, : self.num_states, : self.num_states]
+
+    def unbounded(self) -> "LinearQuadratic":
+        """The same without bounds of the inputs."""
+        wide = np.full_like(self.lower, np.inf)
+        return replace(self, lower=-wide, upper=wide)
 
     def multipliers(self) -> Array:
         """(N, n): v_k = d cost / d x_(k+1), all inputs as they are and all gaps kept."""
@@ -150,20 +164,26 @@ def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array)
     return d, free
 
 
-def follow(problem: LinearQuadratic, policy: AffinePolicy) -> tuple[Array, Array]:
-    """(dxs (N+1, n), dus (N, m)) of the full linear step, which closes the gaps."""
+def least_regularized(problem: LinearQuadratic) -> AffinePolicy | None:
+    """The best policy; None where the inputs' Hessian is not positive definite by more than rounding."""
+    return solve_riccati(problem, 0.0) or solve_riccati(problem, ROUNDING_OF_CURVATURE)
+
+
+def follow(problem: LinearQuadratic, policy: AffinePolicy, *, clipped: bool = False) -> tuple[Array, Array]:
+    """(dxs (N+1, n), dus (N, m)) of the full linear step, which closes the gaps; its inputs may be `clipped`."""
     n, (count, m) = problem.num_states, problem.lower.shape
-    zs, dx = np.empty((count, n + m)), policy.start
-    for z, F, f, d, K in zip(zs, problem.F, problem.gaps, policy.feedforward, policy.feedback, strict=True):
-        z[:n] = dx
-        z[n:] = d + K.dot(dx)
-        dx = F.dot(z) + f
-    return np.vstack([zs[:, :n], dx]), zs[:, n:]
+    dxs, dus = np.empty((count + 1, n)), np.empty((count, m))
+    dxs[0] = policy.start
+    for k, (F, f, d, K) in enumerate(zip(problem.F, problem.gaps, policy.feedforward, policy.feedback, strict=True)):
+        dus[k] = d + K.dot(dxs[k])
+        if clipped:
+            dus[k] = np.clip(dus[k], problem.lower[k], problem.upper[k])
+        dxs[k + 1] = F[:, :n].dot(dxs[k]) + F[:, n:].dot(dus[k]) + f
+    return dxs, dus
 
 
 def slope_along(problem: LinearQuadratic, dxs: Array, dus: Array) -> tuple[float, float]:
     """(slope, curvature) of the cost along a step (N+1, n), (N, m)."""
-    zs, dx = np.hstack([dxs[:-1], dus]), dxs[-1]
-    slope = float(np.sum(problem.gradients * zs) + problem.final_gradient @ dx)
+    zs = np.hstack([dxs, np.vstack([dus, np.zeros((1, dus.shape[1]))])])
     bent = (problem.hessians @ zs[:, :, None])[:, :, 0]
-    return slope, float(np.sum(bent * zs) + dx @ problem.final_hessian @ dx)
+    return float(np.sum(problem.gradients * zs)), float(np.sum(bent * zs))

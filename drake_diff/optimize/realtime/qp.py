@@ -19,7 +19,9 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.steps import Flags
+from drake_diff.exceptions import GradientError
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
+from drake_diff.optimize.knots import KnotFunction
 
 ACCURATE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 50}
 # The second is slower and solves what the first may not, whose numbers differ widely.
@@ -30,35 +32,49 @@ DEAREST = 1e4  # price: dearer ones cost PIQP its digits, so that the cost is ta
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """Limits of one function of a knot, at the knots first ... last."""
+class Limits:
+    """Rows lower <= f(z) <= upper at the K knots from `first` on, infinite where there is no limit."""
 
+    labels: tuple[str, ...]  # (m,)
+    function: KnotFunction
     first: int
-    last: int
-    columns: Indices  # of z = [x, u] that it depends on
-    has_lower: Flags  # (m,) whether there is ever such a limit
+    lower: Array  # (K, m)
+    upper: Array
+    has_lower: Flags  # (m,) whether there is such a limit at any knot of the problem
     has_upper: Flags
+    prices: Array  # (m,) per unit that a limit is passed by
+    ranges: Array  # (m,) how far f ranges; a limit on both sides that is far narrower is one to be met
 
     @property
-    def size(self) -> int:
-        """m"""
-        return len(self.has_lower)
+    def knots(self) -> slice:
+        return slice(self.first, self.first + len(self.lower))
 
-    @property
-    def count(self) -> int:
-        """The number of knots."""
-        return self.last - self.first + 1
+    def select(self, xs: Array, us: Array) -> Array:
+        """(K, nx + nu) the knots of a motion where they hold."""
+        return np.hstack([xs, np.vstack([us, np.zeros((1, us.shape[1]))])])[self.knots]
+
+    def beyond(self, xs: Array, us: Array) -> Array:
+        """(K, m) how far a motion is beyond a limit."""
+        values = self.function.values(self.select(xs, us))
+        return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
+
+    def linearize(self, xs: Array, us: Array) -> "Limited":
+        """Around a motion; GradientError where something is not finite."""
+        values, jacobians = self.function.linearize(self.select(xs, us))
+        if not (np.all(np.isfinite(values)) and np.all(np.isfinite(jacobians))):
+            raise GradientError(f"{self.labels[0]} or its derivative is not finite along the motion")
+        return Limited(self, jacobians, self.lower - values, self.upper - values, self.prices)
 
 
 @dataclass(frozen=True, eq=False)
 class Limited:
-    """What `Rows` are at a point: Jacobians (K, m, nx + nu), and how far the limits are from the values (K, m)."""
+    """`Limits` around a motion: Jacobians (K, m, nx + nu), and how far the limits are from the values (K, m)."""
 
+    limits: Limits
     jacobians: Array
     lower: Array
     upper: Array
     prices: Array  # (m,)
-    ranges: Array  # (m,) of the values
 
     @property
     def beyond(self) -> Array:
@@ -81,20 +97,19 @@ class Moves:
 class SoftProgram:
     """The program for `count` steps; its structure never changes, and is set up once."""
 
-    def __init__(self, nx: int, nu: int, count: int, rows: Sequence[Rows]):
-        self.nx, self.nu, self.count, self.rows = nx, nu, count, tuple(rows)
+    def __init__(self, nx: int, nu: int, count: int, rows: Sequence[Limits]):
+        self.nx, self.nu, self.count = nx, nu, count
         n, moves = nx + nu, count * (nx + nu)
-        self.slack_at = np.cumsum([moves, *(r.count * r.size for r in self.rows)])
+        self.slack_at = np.cumsum([moves, *(r.lower.size for r in rows)])
         self.size = int(self.slack_at[-1])
         places, sides = [self._dynamics()], count * nx
-        self.sides: list[tuple[int, Indices, Indices]] = []  # (+1 upper or -1 lower, index of the rows, bounded (m,))
-        for i, r in enumerate(self.rows):
+        self.sides: list[tuple[int, int, Indices]] = []  # (+1 upper or -1 lower, which of the rows, bounded (m,))
+        for i, r in enumerate(rows):
             for sign, has in ((1, r.has_upper), (-1, r.has_lower)):
                 bounded = np.flatnonzero(has)
-                self.sides.append((sign, np.array([i]), bounded))
-                places.append(self._soft(i, bounded, sides))
-                sides += r.count * len(bounded)
-        self.height = sides
+                self.sides.append((sign, i, bounded))
+                places.append(self._soft(i, r, bounded, sides))
+                sides += len(r.lower) * len(bounded)
         entries = np.concatenate([np.stack(pair) for pair in places], axis=1)
         self._inside = entries[1] >= 0  # what depends on the first state, which is given, has no column
         self._order = np.lexsort((entries[0][self._inside], entries[1][self._inside]))
@@ -119,14 +134,14 @@ class SoftProgram:
         positions = np.where(j < self.nx, (k - 1) * n + self.nu + j, k * n + j - self.nx)
         return np.where((k == 0) & (j < self.nx), -1, positions)
 
-    def _soft(self, i: int, bounded: Indices, first: int) -> tuple[Indices, Indices]:
+    def _soft(self, i: int, r: Limits, bounded: Indices, first: int) -> tuple[Indices, Indices]:
         """(rows, columns) of one side's Jacobian, then of its slacks."""
-        r = self.rows[i]
-        k, a = _all(r.count, len(bounded))
-        steps, entries, j = _all(r.count, len(bounded), len(r.columns))
+        count, m = r.lower.shape
+        k, a = _all(count, len(bounded))
+        steps, entries, j = _all(count, len(bounded), len(r.function.columns))
         rows = np.concatenate([steps * len(bounded) + entries, k * len(bounded) + a])
-        slacks = self.slack_at[i] + k * r.size + bounded[a]
-        return first + rows, np.concatenate([self._column(steps + r.first, r.columns[j]), slacks])
+        slacks = self.slack_at[i] + k * m + bounded[a]
+        return first + rows, np.concatenate([self._column(steps + r.first, r.function.columns[j]), slacks])
 
     def _set_hessian(self, n: int) -> ca.Sparsity:
         k, i, j = _all(self.count + 1, n, n)
@@ -140,31 +155,22 @@ class SoftProgram:
     def solve(self, model: LinearQuadratic, limited: Sequence[Limited]) -> Moves | Refusal:
         """A Refusal where PIQP finds no solution, as of numbers that are not finite or far too large."""
         n, nx, nu, count = self.nx + self.nu, self.nx, self.nu, self.count
-        dearest = max((float(np.max(linearized.prices, initial=0.0)) for linearized in limited), default=0.0)
+        dearest = max((float(np.max(rows.prices, initial=0.0)) for rows in limited), default=0.0)
         unit = DEAREST / dearest if dearest > DEAREST else 1.0  # of the cost
         data = [np.ones(count * nx), -model.F.ravel()]
         lower, upper = [model.gaps.ravel()], [model.gaps.ravel()]
-        for sign, (i,), bounded in self.sides:
-            r, linearized = self.rows[i], limited[i]
-            data += [
-                linearized.jacobians[:, bounded][:, :, r.columns].ravel(),
-                np.full(r.count * len(bounded), -float(sign)),
-            ]
-            side, far = (
-                (linearized.upper if sign > 0 else linearized.lower)[:, bounded],
-                FAR * linearized.ranges[bounded],
-            )
+        for sign, i, bounded in self.sides:
+            rows = limited[i]
+            side, far = (rows.upper if sign > 0 else rows.lower)[:, bounded], FAR * rows.limits.ranges[bounded]
+            columns = rows.limits.function.columns
+            data += [rows.jacobians[:, bounded][:, :, columns].ravel(), np.full(side.size, -float(sign))]
             side = np.clip(side, -far, far).ravel()  # PIQP complains of rows without a limit
             lower.append(side if sign < 0 else np.full(side.size, -np.inf))
             upper.append(side if sign > 0 else np.full(side.size, np.inf))
         a = np.concatenate(data)[self._inside][self._order]
-        hessians = np.zeros((count + 1, n, n))
-        hessians[:-1], hessians[-1, :nx, :nx] = model.hessians, model.final_hessian
-        h = hessians.ravel()[self._curved][self._hessian_order]
-        g = np.zeros(self.size)
-        g[: count * n] = np.append(model.gradients.ravel()[nx:], model.final_gradient)
-        for start, r, linearized in zip(self.slack_at[:-1], self.rows, limited, strict=True):
-            g[start : start + r.count * r.size] = np.tile(linearized.prices, r.count)
+        h = model.hessians.ravel()[self._curved][self._hessian_order]
+        of_slacks = [np.tile(rows.prices, len(rows.lower)) for rows in limited]
+        g = np.concatenate([model.gradients.ravel()[nx : nx + count * n], *of_slacks])
         least, most = np.full((count, n), -np.inf), np.full((count, n), np.inf)
         least[:, :nu], most[:, :nu] = model.lower, model.upper
         sides = {"lba": np.concatenate(lower), "uba": np.concatenate(upper)}
@@ -177,24 +183,21 @@ class SoftProgram:
                 break
         else:
             return Refusal(f"PIQP: {stats['return_status']}")
-        return self._unpacked(z, *(np.asarray(solution[name]).ravel() / unit for name in ("lam_a", "lam_x")))
-
-    def _unpacked(self, z: Array, by_row: Array, by_variable: Array) -> Moves:
-        count, nx, nu = self.count, self.nx, self.nu
-        moves = z[: count * (nx + nu)].reshape(count, nx + nu)
-        multipliers = [np.zeros((r.count, r.size)) for r in self.rows]
-        first = count * nx
-        for _, (i,), bounded in self.sides:
-            size = self.rows[i].count * len(bounded)
-            multipliers[i][:, bounded] += by_row[first : first + size].reshape(self.rows[i].count, len(bounded))
+        by_row, by_variable = (np.asarray(solution[name]).ravel() / unit for name in ("lam_a", "lam_x"))
+        moves, first = z[: count * n].reshape(count, n), count * nx
+        multipliers = [np.zeros(rows.lower.shape) for rows in limited]
+        for _, i, bounded in self.sides:
+            shape = len(limited[i].lower), len(bounded)
+            size = shape[0] * shape[1]
+            multipliers[i][:, bounded] += by_row[first : first + size].reshape(shape)
             first += size
-        places = zip(self.slack_at[:-1], self.rows, strict=True)
+        slacks = zip(np.split(z, self.slack_at[:-1])[1:], limited, strict=True)
         return Moves(
             dxs=np.concatenate([np.zeros((1, nx)), moves[:, nu:]]),
             dus=moves[:, :nu],
-            slacks=tuple(z[start : start + r.count * r.size].reshape(r.count, r.size) for start, r in places),
+            slacks=tuple(part.reshape(rows.lower.shape) for part, rows in slacks),
             multipliers=tuple(multipliers),
-            bounds=by_variable[: count * (nx + nu)].reshape(count, nx + nu)[:, :nu],
+            bounds=by_variable[: count * n].reshape(count, n)[:, :nu],
             dynamics=-by_row[: count * nx].reshape(count, nx),
         )
 

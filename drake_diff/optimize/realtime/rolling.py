@@ -1,19 +1,21 @@
 """A problem as stretches that begin at any of its steps and may reach beyond its end."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import InputError
+from drake_diff.optimize.ilqr.riccati import least_regularized
+from drake_diff.optimize.knots import Costs, KnotFunction, Selected, Stage, knot_cost, knot_function
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST, GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.realtime.knots import KnotFunction, Selected, knot_cost, knot_function
-from drake_diff.optimize.realtime.qp import Rows, SoftProgram
-from drake_diff.optimize.realtime.step import DEAR, NO_SLOPE, Limits, Motion, Stage, Stretch, expand, free_policy
+from drake_diff.optimize.realtime.qp import Limits, SoftProgram
+from drake_diff.optimize.realtime.step import DEAR, NO_SLOPE, Stretch, expand
 
 # A price above a limit's multiplier keeps it wherever it can be kept. Where an end is stayed at, prices are this many
 # costs of the plan for a whole range of what is limited: ten times what staying costs that is off by as much. Elsewhere
@@ -60,8 +62,9 @@ class Rolling:
         middle = len(us) // 2
         probe = np.array([np.concatenate([xs[k], us[k]]) for k in (0, middle, len(us) - 1)])
         states = probe[:, : self.nx]
-        self._running = knot_cost(problem.total_running_cost, self.nx, self.nu, probe)
-        self._final = knot_cost(problem.total_final_cost, self.nx, 0, states)
+        running, final = problem.total_running_cost, problem.total_final_cost
+        self._running = knot_cost(running, self.nx, self.nu, probe, gauss_newton=True)
+        self._final = knot_cost(final, self.nx, 0, states, gauss_newton=True)
         if staying is not None:
             self._stay = knot_cost(staying.running, self.nx, self.nu, probe)
             self._stayed = knot_cost(staying.final, self.nx, 0, states)
@@ -74,32 +77,28 @@ class Rolling:
         """The steps `begin` ... `begin` + `count`."""
         limits = tuple(self._limits(group, begin, count) for group in self.groups)
         if count not in self._programs:
-            self._programs[count] = SoftProgram(self.nx, self.nu, count, [limit.rows for limit in limits])
-        running, final = self._costs(begin, count)
-        return Stretch(self.problem.model, self.problem.bounds, running, final, limits, self._programs[count])
+            self._programs[count] = SoftProgram(self.nx, self.nu, count, limits)
+        costs = Costs(tuple(self._stages(begin, count)))
+        return Stretch(self.problem.model, self.problem.bounds, costs, limits, self._programs[count])
 
     def count(self, begin: int, horizon: int) -> int:
         """How many steps are planned at most from step `begin` on."""
         left = self.problem.num_steps - begin
         return min(horizon, left) if self.staying is None and left > 0 else horizon
 
-    def _costs(self, begin: int, count: int) -> tuple[list[Stage], list[Stage]]:
+    def _stages(self, begin: int, count: int) -> Iterator[Stage]:
         h, end, last = self.problem.model.time_step, begin + count, self.problem.num_steps
         times: Array = h * np.arange(begin, end + 1, dtype=float)
         planned = count if self.staying is None else int(np.clip(last - begin, 0, count))
-        running, final = [Stage(self._running, slice(0, planned), times[:planned], h)], []
+        yield Stage(self._running, slice(0, planned), times[:planned], h)
         if planned < count:
-            running.append(Stage(self._stay, slice(planned, count), times[planned:count], h))
-        at_end = slice(count, count + 1), times[count:], 1.0
+            yield Stage(self._stay, slice(planned, count), times[planned:count], h)
+        final = self._final if self.staying is None else self._stayed
         if end < last:
-            final.append(Stage(knot_cost(self.tails[end], self.nx, 0, np.empty((0, self.nx))), *at_end))
-            return running, final
-        if self.staying is None:
-            return running, [Stage(self._final, *at_end)]
-        if begin < last:
-            final.append(Stage(self._final, slice(last - begin, last - begin + 1), times[last - begin :][:1], 1.0))
-        final.append(Stage(self._stayed, *at_end))
-        return running, final
+            final = knot_cost(self.tails[end], self.nx, 0, np.empty((0, self.nx)))
+        elif self.staying is not None and begin < last:
+            yield Stage(self._final, slice(last - begin, last - begin + 1), times[last - begin :][:1], 1.0, final=True)
+        yield Stage(final, slice(count, count + 1), times[count:], 1.0, final=True)
 
     def _groups(self, probe: Array) -> list[_Group]:
         problem, b = self.problem, self.problem.bounds
@@ -138,15 +137,17 @@ class Rolling:
         met = np.zeros(m, dtype=bool)
         for wanted in group.special.values():
             met |= ~np.isnan(wanted)
-        rows = Rows(first, last, group.function.columns, np.isfinite(group.lower) | met, np.isfinite(group.upper) | met)
-        return Limits(group.labels, group.function, rows, lower, upper, group.prices, group.ranges)
+        has_lower, has_upper = np.isfinite(group.lower) | met, np.isfinite(group.upper) | met
+        return Limits(
+            group.labels, group.function, first, lower, upper, has_lower, has_upper, group.prices, group.ranges
+        )
 
     def _set_prices(self, xs: Array, us: Array) -> None:
         """Prices by what a unit of each state and input is worth along the plan, and by the slopes of the rows."""
         problem, b = self.problem, self.problem.bounds
         whole = replace(self.stretch(0, problem.num_steps), limits=())
-        expansion = expand(whole, Motion(xs, us, whole.ends(xs[:-1], us)))
-        policy = free_policy(expansion.quadratic)
+        quadratic = expand(whole, whole.motion(xs, us)).quadratic
+        policy = least_regularized(quadratic.unbounded())
         if policy is None:
             raise InputError(
                 "running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum"
@@ -159,9 +160,9 @@ class Rolling:
         efforts = np.where(np.isfinite(wide), wide, 1.0 + np.ptp(us, axis=0))
         P = np.max(np.diagonal(policy.value_hessians, axis1=1, axis2=2), axis=0)
         worth = np.max(np.abs(policy.value_gradients), axis=0) + P * ranges
-        B = expansion.quadratic.F[:, :, self.nx :]
+        B = quadratic.F[:, :, self.nx :]
         curved = np.einsum("kij,kil,klj->kj", B, policy.value_hessians[1:], B)
-        curved = curved + np.diagonal(expansion.quadratic.hessians, axis1=1, axis2=2)[:, self.nx :]
+        curved = curved + np.diagonal(quadratic.hessians[:-1], axis1=1, axis2=2)[:, self.nx :]
         worth = np.concatenate([worth, np.max(curved, axis=0) * efforts])
         spans, random = np.concatenate([ranges, efforts]), np.random.default_rng(0)
         knots = np.hstack([xs[:-1], us])

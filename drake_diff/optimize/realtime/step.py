@@ -9,7 +9,6 @@ the feedback of the quadratic program, and there are no gaps. Tassa, Erez and To
 complex behaviors through online trajectory optimization", 2012.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,20 +18,27 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.step import linearize
-from drake_diff.exceptions import GradientError, SimulationError
+from drake_diff.exceptions import SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.step import advance, set_state
-from drake_diff.optimize.ilqr.riccati import AffinePolicy, LinearQuadratic, solve_riccati
+from drake_diff.optimize.ilqr.expansion import Motion, off_bounds
+from drake_diff.optimize.ilqr.riccati import (
+    AffinePolicy,
+    LinearQuadratic,
+    follow,
+    least_regularized,
+    slope_along,
+    solve_riccati,
+)
+from drake_diff.optimize.knots import Costs
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import CostToGo
-from drake_diff.optimize.realtime.knots import KnotCost, KnotFunction
-from drake_diff.optimize.realtime.qp import Limited, Moves, Rows, SoftProgram
+from drake_diff.optimize.realtime.qp import Limited, Limits, Moves, SoftProgram
 
 STEP_SIZES = (1.0, 0.5, 0.25, 0.125, 1 / 16, 1 / 32)
 ROLLED_SIZES = (1.0, 0.4, 0.1)  # each costs a rollout
 SUFFICIENT_DECREASE = 1e-4
 GAP_PRICE = 2.0  # over the largest multiplier of the dynamics
-SMALLEST_REGULARIZATION = 1e-8
 ROUNDING = 1e-12  # of the merit: a change below this is lost in the sum
 SOLVED_TO = 1e-9  # the same of a quadratic program with limits that push
 # Of what a step moves the plant by: an error above it is looked at over a part of the step, where it has to shrink.
@@ -47,46 +53,12 @@ STIFF = 1e4  # over a row's price, per its scale: the curvature of a row that ho
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
-    """Rows lower <= f(z) <= upper at each knot of a stretch, infinite where there is none; `prices` (m,) per unit."""
-
-    labels: tuple[str, ...]  # (m,)
-    function: KnotFunction
-    rows: Rows
-    lower: Array  # (K, m)
-    upper: Array
-    prices: Array
-    ranges: Array  # (m,) how far f ranges; a limit on both sides that is far narrower is one to be met
-
-    def at(self, xs: Array, us: Array) -> Array:
-        """(K, nx + nu) the knots of a motion where they hold."""
-        knots = np.concatenate([xs, np.zeros((len(xs), us.shape[1]))], axis=1)
-        knots[:-1, xs.shape[1] :] = us
-        return knots[self.rows.first : self.rows.last + 1]
-
-    def beyond(self, values: Array) -> Array:
-        """(K, m) how far `values` are beyond a limit."""
-        return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """A cost at some knots of a stretch: `weight` times that of knots (K, n) at their times (K,) [s]."""
-
-    cost: KnotCost
-    at: slice  # of the knots 0 ... N
-    times: Array
-    weight: float
-
-
-@dataclass(frozen=True, eq=False)
 class Stretch:
-    """What is minimized over some steps. Costs of `running` are of [x, u], those of `final` of x alone."""
+    """What is minimized over some steps: costs, and limits, whose prices are paid where they are passed."""
 
     model: Model
     bounds: Bounds
-    running: Sequence[Stage]
-    final: Sequence[Stage]
+    costs: Costs
     limits: Sequence[Limits]
     program: SoftProgram
     rolls: bool = False  # whether each motion is rolled out on the plant, see `along`
@@ -104,44 +76,22 @@ class Stretch:
 
     def cost(self, xs: Array, us: Array) -> float:
         """That of a motion xs (N+1, nx), us (N, nu)."""
-        knots = np.hstack([xs[:-1], us])
-        parts = [(s, knots) for s in self.running] + [(s, xs) for s in self.final]
-        return float(sum(s.weight * np.sum(s.cost.values(z[s.at], s.times)) for s, z in parts))
+        return float(np.sum(self.costs.values(xs, us)))
 
-    def beyond(self, xs: Array, us: Array) -> list[Array]:
-        """How far each limit is passed, (K, m) each."""
-        return [limit.beyond(limit.function.values(limit.at(xs, us))) for limit in self.limits]
-
-    def paid(self, motion: "Motion") -> float:
-        """The cost of the plant's own motion, and the prices of what is beyond limits."""
+    def paid(self, motion: Motion, rows: Sequence[Limits | Limited]) -> float:
+        """The cost of a motion, and what it pays for what is beyond limits at the prices of `rows`."""
         with np.errstate(all="ignore"):
-            far = zip(self.limits, self.beyond(motion.xs, motion.us), strict=True)
-            return self.cost(motion.xs, motion.us) + sum(
-                float(np.sum(linearized.prices * beyond)) for linearized, beyond in far
-            )
+            beyond = (limit.beyond(*motion.point) for limit in self.limits)
+            prices = (float(np.sum(row.prices * far)) for row, far in zip(rows, beyond, strict=True))
+            return self.cost(*motion.point) + sum(prices)
 
     def ends(self, xs: Array, us: Array) -> Array:
         """(N, nx) where the plant's steps from xs (N, nx) under us (N, nu) lead."""
         return np.array([advance(self.model.double, x, u) for x, u in zip(xs, us, strict=True)])
 
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """xs (N+1, nx) and us (N, nu), and where each step leads: `ends` (N, nx)."""
-
-    xs: Array
-    us: Array
-    ends: Array
-
-    @property
-    def gaps(self) -> Array:
-        """(N, nx)"""
-        return self.ends - self.xs[1:]
-
-    @property
-    def is_rollout(self) -> bool:
-        """Whether there are no gaps."""
-        return bool(np.all(self.ends == self.xs[1:]))
+    def motion(self, xs: Array, us: Array) -> Motion:
+        """xs (N+1, nx) under us (N, nu), with the gaps that the plant leaves."""
+        return Motion.with_ends(xs, us, self.ends(xs[:-1], us))
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +127,7 @@ class Step:
 
         Rows and bounds that hold the solution go on to hold it, and those that give way give way.
         """
-        return _solved(_held(self.expansion, self.moves, self.stretch, one_sided=True))
+        return least_regularized(_held(self.expansion, self.moves, one_sided=True))
 
     @cached_property
     def feedback(self) -> Array:
@@ -190,7 +140,7 @@ class Step:
     @cached_property
     def tails(self) -> tuple[CostToGo, ...] | None:
         """What remains to be paid from each knot on, for motions that may also leave the limits to the inside."""
-        policy = _solved(_held(self.expansion, self.moves, self.stretch, one_sided=False))
+        policy = least_regularized(_held(self.expansion, self.moves, one_sided=False))
         if policy is None:
             return None
         parts = zip(self.motion.xs, policy.value_gradients, policy.value_hessians, strict=True)
@@ -205,14 +155,13 @@ class Step:
     def given_way(self) -> tuple[str, float, int] | None:
         """(label, how far, knot) of the limit that the solution passes at the highest price, if it passes one."""
         worst, passed = 0.0, None
-        prices = [linearized.prices for linearized in self.expansion.limited]
-        rows = zip(self.stretch.limits, prices, self.moves.slacks, self.moves.multipliers, strict=True)
-        for limit, price, slack, force in rows:
-            gives = (np.abs(force) >= GIVES * price) & (slack > SLIGHT * limit.ranges)
-            paid = np.where(gives, slack * price, 0.0)
+        for rows, slack, force in zip(self.expansion.limited, self.moves.slacks, self.moves.multipliers, strict=True):
+            limits = rows.limits
+            gives = (np.abs(force) >= GIVES * rows.prices) & (slack > SLIGHT * limits.ranges)
+            paid = np.where(gives, slack * rows.prices, 0.0)
             if np.max(paid, initial=0.0) > worst:
                 k, i = np.unravel_index(int(np.argmax(paid)), paid.shape)
-                worst, passed = float(paid[k, i]), (limit.labels[i], float(slack[k, i]), int(k) + limit.rows.first)
+                worst, passed = float(paid[k, i]), (limits.labels[i], float(slack[k, i]), int(k) + limits.first)
         return passed
 
 
@@ -225,19 +174,19 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
     """
     expansion = expand(stretch, motion)
     if damping is not None:
-        expansion = replace(expansion, quadratic=_damped(expansion.quadratic, damping))
+        quadratic, added = expansion.quadratic, np.tile(np.diag(damping), (len(motion.xs), 1, 1))
+        added[-1, :, len(motion.xs[0]) :] = 0.0
+        expansion = replace(expansion, quadratic=replace(quadratic, hessians=quadratic.hessians + added))
     solved = _solve(stretch, expansion)
     if isinstance(solved, Refusal):
         return solved
     expansion, moves = solved.expansion, solved.moves
     gap_prices = GAP_PRICE * np.max(np.abs(moves.dynamics), axis=0)
     before = merit(stretch, expansion, motion, gap_prices)
-    saved = [
-        linearized.prices * (linearized.beyond - slack)
-        for linearized, slack in zip(expansion.limited, moves.slacks, strict=True)
-    ]
-    slope, curvature = _along(expansion.quadratic, moves)
-    slope -= sum(float(np.sum(saving)) for saving in saved) + float(np.sum(gap_prices * np.abs(motion.gaps)))
+    slope, curvature = slope_along(expansion.quadratic, moves.dxs, moves.dus)
+    slope -= float(np.sum(gap_prices * np.abs(motion.gaps)))
+    for rows, slack in zip(expansion.limited, moves.slacks, strict=True):
+        slope -= float(np.sum(rows.prices * (rows.beyond - slack)))
     promised = -(slope + curvature / 2)
     rounding = ROUNDING * (1 + abs(before))
     step = Step(stretch, motion, 0.0, promised, before, expansion, moves, solved.whole, True, solved.feedback)
@@ -258,12 +207,7 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
 
 def merit(stretch: Stretch, expansion: Expansion, motion: Motion, gap_prices: Array) -> float:
     """What a motion costs, with the prices of what is beyond limits and of gaps, `gap_prices` (nx,)."""
-    with np.errstate(all="ignore"):
-        paid = sum(
-            float(np.sum(linearized.prices * beyond))
-            for linearized, beyond in zip(expansion.limited, stretch.beyond(motion.xs, motion.us), strict=True)
-        )
-        return stretch.cost(motion.xs, motion.us) + paid + float(np.sum(gap_prices * np.abs(motion.gaps)))
+    return stretch.paid(motion, expansion.limited) + float(np.sum(gap_prices * np.abs(motion.gaps)))
 
 
 def _moved(step: Step, size: float) -> Motion:
@@ -272,8 +216,7 @@ def _moved(step: Step, size: float) -> Motion:
     xs, us = motion.xs + size * step.moves.dxs, motion.us + size * step.moves.dus
     if stretch.rolls:
         return roll(stretch, motion.xs[0], xs, us, step.feedback)
-    us = np.clip(us, stretch.bounds.u_lower, stretch.bounds.u_upper)
-    return Motion(xs, us, stretch.ends(xs[:-1], us))
+    return stretch.motion(xs, np.clip(us, stretch.bounds.u_lower, stretch.bounds.u_upper))
 
 
 def roll(stretch: Stretch, x: Array, xs: Array, us: Array, feedback: Array) -> Motion:
@@ -284,7 +227,7 @@ def roll(stretch: Stretch, x: Array, xs: Array, us: Array, feedback: Array) -> M
     for k, u in enumerate(us):
         inputs[k] = np.clip(u + feedback[k].dot(states[k] - xs[k]), bounds.u_lower, bounds.u_upper)
         states[k + 1] = advance(twin, states[k], inputs[k])
-    return Motion(states, inputs, states[1:])
+    return Motion(states, inputs, np.zeros_like(states[1:]))
 
 
 def _first_rollout(step: Step) -> Step:
@@ -316,26 +259,21 @@ class _Solved:
 def _solve(stretch: Stretch, expansion: Expansion) -> _Solved | Refusal:
     """The quadratic program; where motions are rolled out and bounds of inputs alone push, by Riccati's sweep."""
     quadratic = expansion.quadratic
-    nothing = tuple(np.zeros_like(linearized.lower) for linearized in expansion.limited)
-    free, policy = _swept(_unbounded(quadratic)), None
+    nothing = tuple(np.zeros_like(rows.lower) for rows in expansion.limited)
+    free = _swept(quadratic.unbounded())
     if free is not None:
         moves, policy = free
         within = _within_bounds(quadratic, moves)
-        if within and _is_kept(stretch, expansion, moves):
+        if within and _is_kept(expansion, moves):
             return _Solved(expansion, replace(moves, slacks=nothing, multipliers=nothing), True, policy.feedback)
         if stretch.rolls and not within:
             boxed = _swept(quadratic)
-            if boxed is not None and _is_kept(stretch, expansion, boxed[0]):
+            if boxed is not None and _is_kept(expansion, boxed[0]):
                 boxed_moves = replace(boxed[0], slacks=nothing, multipliers=nothing)
                 return _Solved(expansion, boxed_moves, False, boxed[1].feedback)
         expansion = replace(expansion, limited=_dear_enough(expansion.limited, moves.dynamics))
-    found_by_piqp = stretch.program.solve(quadratic, expansion.limited)
-    return found_by_piqp if isinstance(found_by_piqp, Refusal) else _Solved(expansion, found_by_piqp, False, None)
-
-
-def _damped(quadratic: LinearQuadratic, damping: Array) -> LinearQuadratic:
-    final = quadratic.final_hessian + np.diag(damping[: quadratic.num_states])
-    return replace(quadratic, hessians=quadratic.hessians + np.diag(damping), final_hessian=final)
+    priced = stretch.program.solve(quadratic, expansion.limited)
+    return priced if isinstance(priced, Refusal) else _Solved(expansion, priced, False, None)
 
 
 def _is_doubtful(step: Step, before: Motion) -> bool:
@@ -353,54 +291,27 @@ def _is_doubtful(step: Step, before: Motion) -> bool:
     large = error(step.motion, 1.0)
     if large <= max(SUSPECT * change, UNSEEN * (1 + float(np.max(np.abs(before.ends))))):
         return False
-    xs, us = before.xs + SHORT_PART * dxs, before.us + SHORT_PART * dus
-    return error(Motion(xs, us, step.stretch.ends(xs[:-1], us)), SHORT_PART) > STILL * SHORT_PART * large
+    short = step.stretch.motion(before.xs + SHORT_PART * dxs, before.us + SHORT_PART * dus)
+    return error(short, SHORT_PART) > STILL * SHORT_PART * large
 
 
 def expand(stretch: Stretch, motion: Motion) -> Expansion:
     """The quadratic program around `motion`. Raises GradientError or SimulationError."""
-    model, xs, us, bounds = stretch.model, motion.xs, motion.us, stretch.bounds
-    inside = np.where(us == bounds.u_upper, np.nextafter(us, bounds.u_lower), us)
-    inside = np.where(us == bounds.u_lower, np.nextafter(us, bounds.u_upper), inside)
-    A, B, _ = linearize(model, xs, inside, x_next=motion.ends)
-    nx, n = model.nx, model.nx + model.nu
-    gradients, hessians = np.zeros((len(us), n)), np.zeros((len(us), n, n))
-    final_gradient, final_hessian = np.zeros(nx), np.zeros((nx, nx))
-    knots = np.hstack([xs[:-1], us])
-    for s in stretch.running:
-        gradient, hessian = s.cost.expand(knots[s.at], s.times)
-        gradients[s.at] += s.weight * gradient
-        hessians[s.at] += s.weight * hessian
-    for s in stretch.final:
-        gradient, hessian = s.cost.expand(xs[s.at], s.times)
-        for k, g, h in zip(range(*s.at.indices(len(xs))), gradient, hessian, strict=True):
-            if k < len(us):
-                gradients[k, :nx] += s.weight * g
-                hessians[k, :nx, :nx] += s.weight * h
-            else:
-                final_gradient, final_hessian = final_gradient + s.weight * g, final_hessian + s.weight * h
-    if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(hessians)) and np.all(np.isfinite(final_gradient))):
-        raise GradientError("the cost's derivative is not finite along the motion")
+    xs, us, bounds = motion.xs, motion.us, stretch.bounds
+    A, B, _ = linearize(stretch.model, xs, off_bounds(bounds, us), x_next=motion.ends)
+    gradients, hessians = stretch.costs.expand(xs, us)
+    given = np.zeros(len(xs[0]))
     quadratic = LinearQuadratic(
         F=np.concatenate([A, B], axis=2),
         gaps=motion.gaps,
         gradients=gradients,
         hessians=hessians,
-        final_gradient=final_gradient,
-        final_hessian=final_hessian,
         lower=bounds.u_lower - us,
         upper=bounds.u_upper - us,
-        start_lower=np.zeros(nx),
-        start_upper=np.zeros(nx),
+        start_lower=given,
+        start_upper=given,
     )
-    return Expansion(quadratic, tuple(_limited(limit, xs, us) for limit in stretch.limits))
-
-
-def _limited(limit: Limits, xs: Array, us: Array) -> Limited:
-    values, jacobians = limit.function.linearize(limit.at(xs, us))
-    if not (np.all(np.isfinite(values)) and np.all(np.isfinite(jacobians))):
-        raise GradientError(f"{limit.labels[0]} or its derivative is not finite along the motion")
-    return Limited(jacobians, limit.lower - values, limit.upper - values, limit.prices, limit.ranges)
+    return Expansion(quadratic, tuple(limit.linearize(xs, us) for limit in stretch.limits))
 
 
 def _swept(quadratic: LinearQuadratic) -> tuple[Moves, AffinePolicy] | None:
@@ -408,9 +319,10 @@ def _swept(quadratic: LinearQuadratic) -> tuple[Moves, AffinePolicy] | None:
     policy = solve_riccati(quadratic, 0.0)
     if policy is None:
         return None
-    dxs, dus = _roll(quadratic, policy)
+    dxs, dus = follow(quadratic, policy, clipped=True)
     dynamics = policy.value_gradients[1:] + np.einsum("kij,kj->ki", policy.value_hessians[1:], dxs[1:])
-    by_input = quadratic.gradients + np.einsum("kij,kj->ki", quadratic.hessians, np.hstack([dxs[:-1], dus]))
+    moved = np.hstack([dxs[:-1], dus])
+    by_input = quadratic.gradients[:-1] + np.einsum("kij,kj->ki", quadratic.hessians[:-1], moved)
     by_input += np.einsum("kij,ki->kj", quadratic.F, dynamics)
     bounds = -by_input[:, quadratic.num_states :]
     return Moves(dxs, dus, (), (), bounds, dynamics), policy
@@ -420,11 +332,11 @@ def _within_bounds(quadratic: LinearQuadratic, moves: Moves) -> bool:
     return not (np.any(moves.dus < quadratic.lower) or np.any(moves.dus > quadratic.upper))
 
 
-def _is_kept(stretch: Stretch, expansion: Expansion, moves: Moves) -> bool:
+def _is_kept(expansion: Expansion, moves: Moves) -> bool:
     """Whether moves leave no limit of states."""
-    for limit, linearized in zip(stretch.limits, expansion.limited, strict=True):
-        moved = np.einsum("kri,ki->kr", linearized.jacobians, limit.at(moves.dxs, moves.dus))
-        if np.any(moved < linearized.lower) or np.any(moved > linearized.upper):
+    for rows in expansion.limited:
+        moved = np.einsum("kri,ki->kr", rows.jacobians, rows.limits.select(moves.dxs, moves.dus))
+        if np.any(moved < rows.lower) or np.any(moved > rows.upper):
             return False
     return True
 
@@ -435,80 +347,38 @@ def _dear_enough(limited: Sequence[Limited], forces: Array) -> tuple[Limited, ..
     `forces` (N, nx) are its multipliers: far from the plan they are larger than the plan's own.
     """
     worth, factor = np.max(np.abs(forces), axis=0), 1.0
-    for linearized in limited:
-        slopes = np.abs(linearized.jacobians[:, :, : len(worth)])
+    for rows in limited:
+        slopes = np.abs(rows.jacobians[:, :, : len(worth)])
         squared = np.sum(slopes**2, axis=2)
         seen = squared > NO_SLOPE
         wanted = DEAR * (slopes @ worth) / np.where(seen, squared, 1.0)
-        factor = max(factor, float(np.max(np.where(seen, wanted / linearized.prices, 0.0), initial=0.0)))
-    return tuple(replace(linearized, prices=factor * linearized.prices) for linearized in limited)
+        factor = max(factor, float(np.max(np.where(seen, wanted / rows.prices, 0.0), initial=0.0)))
+    return tuple(replace(rows, prices=factor * rows.prices) for rows in limited)
 
 
-def free_policy(quadratic: LinearQuadratic) -> AffinePolicy | None:
-    """The best policy without limits; None where the cost has no minimum."""
-    return _solved(_unbounded(quadratic))
-
-
-def _unbounded(quadratic: LinearQuadratic) -> LinearQuadratic:
-    wide = np.full_like(quadratic.lower, np.inf)
-    return replace(quadratic, lower=-wide, upper=wide)
-
-
-def _roll(quadratic: LinearQuadratic, policy: AffinePolicy) -> tuple[Array, Array]:
-    dxs, dus = np.zeros((len(quadratic.gaps) + 1, quadratic.num_states)), np.empty_like(policy.feedforward)
-    for k, F in enumerate(quadratic.F):
-        wanted = policy.feedforward[k] + policy.feedback[k].dot(dxs[k])
-        dus[k] = np.clip(wanted, quadratic.lower[k], quadratic.upper[k])
-        dxs[k + 1] = F.dot(np.concatenate([dxs[k], dus[k]])) + quadratic.gaps[k]
-    return dxs, dus
-
-
-def _along(quadratic: LinearQuadratic, moves: Moves) -> tuple[float, float]:
-    """The cost's slope and curvature along the whole step."""
-    d, last = np.hstack([moves.dxs[:-1], moves.dus]), moves.dxs[-1]
-    slope = float(np.sum(quadratic.gradients * d) + quadratic.final_gradient @ last)
-    curved = np.einsum("ki,kij,kj->", d, quadratic.hessians, d) + last @ quadratic.final_hessian @ last
-    return slope, float(curved)
-
-
-def _solved(quadratic: LinearQuadratic) -> AffinePolicy | None:
-    return solve_riccati(quadratic, 0.0) or solve_riccati(quadratic, SMALLEST_REGULARIZATION)
-
-
-def _held(expansion: Expansion, moves: Moves, stretch: Stretch, *, one_sided: bool) -> LinearQuadratic:
+def _held(expansion: Expansion, moves: Moves, *, one_sided: bool) -> LinearQuadratic:
     """The program around its own solution, with what holds it as curvature, and held inputs at rest.
 
     Where not `one_sided`, that is of rows alone that are to be met from both sides, and as stiff as they are dear.
     """
     q = expansion.quadratic
-    nx, n, count = q.num_states, q.F.shape[2], len(q.F)
-    d = np.hstack([moves.dxs[:-1], moves.dus])
-    gradients = q.gradients + np.einsum("kij,kj->ki", q.hessians, d)
-    final_gradient = q.final_gradient + q.final_hessian @ moves.dxs[-1]
-    gradients, hessians = np.vstack([gradients, np.zeros((1, n))]), np.zeros((count + 1, n, n))
-    gradients[-1, :nx] = final_gradient
-    hessians[:-1], hessians[-1, :nx, :nx] = q.hessians, q.final_hessian
-    for limit, linearized, forces in zip(stretch.limits, expansion.limited, moves.multipliers, strict=True):
-        knots = slice(limit.rows.first, limit.rows.last + 1)
-        ratios = np.abs(forces) / linearized.prices
-        holds = (ratios > HOLDS) & (ratios < GIVES)
+    nx, d = q.num_states, np.hstack([moves.dxs, np.vstack([moves.dus, np.zeros((1, moves.dus.shape[1]))])])
+    gradients, hessians = q.gradients + np.einsum("kij,kj->ki", q.hessians, d), np.array(q.hessians)
+    for rows, forces in zip(expansion.limited, moves.multipliers, strict=True):
+        limits, ratios = rows.limits, np.abs(forces) / rows.prices
         if one_sided:
-            stiff = np.where(holds, STIFF * linearized.prices, 0.0)
+            stiff = np.where((ratios > HOLDS) & (ratios < GIVES), STIFF * rows.prices, 0.0)
         else:
-            met = limit.upper - limit.lower < NARROW * limit.ranges
-            stiff = np.where(met, linearized.prices / limit.ranges, 0.0)
-        gradients[knots] += np.einsum("kr,kri->ki", forces, linearized.jacobians)
-        hessians[knots] += np.einsum("kri,kr,krj->kij", linearized.jacobians, stiff, linearized.jacobians)
-    F, on_bound = np.array(q.F), _on_bound(q, moves)
-    for k, i in np.argwhere(on_bound):
+            met = limits.upper - limits.lower < NARROW * limits.ranges
+            stiff = np.where(met, rows.prices / limits.ranges, 0.0)
+        gradients[limits.knots] += np.einsum("kr,kri->ki", forces, rows.jacobians)
+        hessians[limits.knots] += np.einsum("kri,kr,krj->kij", rows.jacobians, stiff, rows.jacobians)
+    F = np.array(q.F)
+    for k, i in np.argwhere(_on_bound(q, moves)):
         F[k, :, nx + i] = 0.0
         hessians[k, nx + i, :] = hessians[k, :, nx + i] = 0.0
         hessians[k, nx + i, nx + i], gradients[k, nx + i] = 1.0, 0.0
-    nothing = np.full_like(q.lower, math.inf)
-    return replace(
-        q, F=F, gaps=np.zeros_like(q.gaps), gradients=gradients[:-1], hessians=hessians[:-1],
-        final_gradient=gradients[-1, :nx], final_hessian=hessians[-1, :nx, :nx], lower=-nothing, upper=nothing,
-    )  # fmt: skip
+    return replace(q, F=F, gaps=np.zeros_like(q.gaps), gradients=gradients, hessians=hessians).unbounded()
 
 
 def _on_bound(q: LinearQuadratic, moves: Moves) -> Array:

@@ -16,9 +16,9 @@ import numpy as np
 from drake_diff._base.arrays import Array, skew
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
-from drake_diff.optimize.ilqr.expansion import Motion, expand
+from drake_diff.optimize.ilqr.expansion import Motion, expand_costs
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.relaxed.plant import Forces, RelaxedPlant, Softness
+from drake_diff.optimize.relaxed.plant import RelaxedPlant, Softness
 
 PENALTY, GROWTH, LARGEST_PENALTY = 1.0, 5.0, 1e8
 SUFFICIENT = 1e-3  # of the decrease that the model promises
@@ -266,9 +266,7 @@ class RelaxedSearch:
         nv, n, N, h = self.nv, self.problem.model.nq, self.count, self.h
         q, v = motion.q, motion.xs[:, n:]
         forces = self.plant.forces(q[:-1], v[:-1], v[1:], soft, slopes=True)
-        gaps = np.zeros((N, self.problem.nx))
-        model = expand(self.problem, Motion(motion.xs, motion.us, gaps), np.empty(0), self.constraints)
-        g, H = self._of_knots(motion, model, forces)  # by [dq_k, v_k, tau_k]
+        g, H = self._of_knots(motion)  # by [dq_k, v_k, tau_k]
         first, second = slopes_of(self.plant.coordinates, q[:-1], q[1:])
         first, second = first / h, second / h
         # Z_k = d [dq_k, v_k, tau_k] / d [dq_(k-1), dq_k, dq_(k+1)]
@@ -295,7 +293,7 @@ class RelaxedSearch:
         keep = slice(2, N + 2)  # q_1 ... q_N; that of index 0 is before the first, 1 is the first
         return gradient[keep].ravel(), Band(diagonal[keep], below[keep], beneath[keep])
 
-    def _of_knots(self, motion: RelaxedMotion, model: Any, forces: Forces) -> tuple[Array, Array]:
+    def _of_knots(self, motion: RelaxedMotion) -> tuple[Array, Array]:
         """The gradients (N+1, 3 nv) and Hessians (N+1, 3 nv, 3 nv) of the augmented cost by [dq, v, tau]."""
         nv, nq, nx, N = self.nv, self.problem.model.nq, self.problem.nx, self.count
         rate = self.plant.coordinates.rate(motion.q)
@@ -303,9 +301,8 @@ class RelaxedSearch:
         T[:, :nq, :nv] = rate
         T[:, nq:nx, nv : 2 * nv] = np.eye(nv)
         T[:, nx:, 2 * nv :] = self.plant.inverse_actuation
-        gradients, hessians = np.zeros((N + 1, T.shape[1])), np.zeros((N + 1, T.shape[1], T.shape[1]))
-        gradients[:-1], hessians[:-1] = model.gradients, model.hessians
-        gradients[-1, :nx], hessians[-1, :nx, :nx] = model.final_gradient, model.final_hessian
+        rollout = Motion(motion.xs, motion.us, np.zeros((N, nx)))
+        gradients, hessians = expand_costs(self.problem, rollout, self.constraints)
         pushes = self._input_pushes(motion)
         gradients[:-1, nx:] += self.input_scale * pushes
         inputs = np.arange(nx, T.shape[1])

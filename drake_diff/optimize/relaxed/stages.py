@@ -150,10 +150,8 @@ def _feedback(problem: Problem, xs: Array, us: Array, ends: Array, weight: float
     model = LinearQuadratic(
         F=F,
         gaps=np.zeros((N, nx)),
-        gradients=np.zeros((N, nx + nu)),
-        hessians=np.repeat(np.diag(np.concatenate([Q, R]))[None], N, axis=0),
-        final_gradient=np.zeros(nx),
-        final_hessian=np.diag(Q),
+        gradients=np.zeros((N + 1, nx + nu)),
+        hessians=np.repeat(np.diag(np.concatenate([Q, R]))[None], N + 1, axis=0),
         lower=np.full((N, nu), -np.inf),
         upper=np.full((N, nu), np.inf),
         start_lower=np.zeros(nx),

@@ -16,35 +16,13 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.values import Refusal
-from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
+from drake_diff.mechanics.casadi_tree import PlantFunctions, symbolic_plant
 from drake_diff.mechanics.fixed_contacts import FixedContactPlant
-from drake_diff.mechanics.symbol import Symbol, symbols
+from drake_diff.optimize.knots import trace
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.coupling import BoundCoupling
 from drake_diff.optimize.problem.dynamics import DiscreteMap, PlantKnots, Pointwise
 from drake_diff.optimize.transcription.task import OptimalControl, TimedRate
-
-SAME_VALUES = 1e-10  # of the largest value at a knot: the same operations, rounded in another order
-
-
-def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) -> Any | Refusal:
-    """The function (x, u) -> (m,) as an SX function of a knot [x, u], or why there is none.
-
-    It must give the values `wanted` (P, m) at the knots `probe` (P, nx + nu).
-    """
-    knot = ca.SX.sym("knot", probe.shape[1])
-    entries = symbols(knot)
-    try:
-        with np.errstate(all="ignore"):
-            result = np.asarray(f(entries[:nx], entries[nx:])).ravel()
-            expressions = [entry.sx if isinstance(entry, Symbol) else float(entry) for entry in result]
-    except Exception as error:  # whatever it is that f cannot do with symbols: it need not
-        return Refusal(f"{type(error).__name__}: {str(error).splitlines()[0][:100] if str(error) else ''}")
-    function = ca.Function("traced", [knot], [ca.vertcat(*expressions)])
-    if not agrees(function, probe, wanted, SAME_VALUES):
-        return Refusal("its symbolic form gives other values")
-    return function
-
 
 THREAD_WORTH = 500_000  # instructions of 1 to 5 ns; to start a thread costs 50 us
 Values = Callable[[Array], Array]  # knots (K, nx + nu) -> (K, m)
@@ -406,11 +384,10 @@ def constraint_function(c: Constraint, nx: int, probe: Array) -> KnotFunction:
     """That of a constraint's values, tried at the knots `probe` (P, nx + nu)."""
 
     def values(knots: Array) -> Array:
-        return np.array([c(knot[:nx], knot[nx:]) for knot in knots])
+        return c.along(knots[:, :nx], knots[:, nx:])
 
     def linearize(knots: Array) -> tuple[Array, Array]:
-        pairs = [c.differentiate(knot[:nx], knot[nx:]) for knot in knots]
-        return np.array([value for value, _ in pairs]), np.array([rows for _, rows in pairs])
+        return values(knots), c.slopes(knots[:, :nx], knots[:, nx:])
 
     with np.errstate(all="ignore"):
         function = trace(c.function if c.takes_input else lambda x, u: c.function(x), nx, probe, values(probe))

@@ -23,9 +23,10 @@ from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.parameters import ParameterVector
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.loss import differentiate_loss
-from drake_diff.optimize.ilqr.expansion import Motion, curvature_along, expand_running_cost
+from drake_diff.optimize.ilqr.expansion import Motion, curvature_along
+from drake_diff.optimize.knots import costs_of
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.cost import differentiate_final_cost, final_cost_hessian
+from drake_diff.optimize.problem.cost import differentiate_final_cost
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iterate, Iteration, Limits, Multipliers, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.program import solve_ipopt
@@ -288,24 +289,16 @@ class StepProgram:
 
     def _gradient(self, z: Array, _: Array) -> list[Any]:
         xs, us, h = self._read(z)
-        gradient, coordinates, final, paid = (
-            np.zeros(self.size),
-            z[self.parameters_at],
-            self.problem.total_final_cost,
-            0.0,
-        )
-        by_nodes = expand_running_cost(self.problem, xs, us, h)[0]
-        gradient[np.hstack([self.states_at[:-1], self.inputs_at])] = by_nodes
-        if final is not None:
-            paid, by_end = differentiate_final_cost(final, xs[-1])
-            gradient[self.states_at[-1]] += by_end
+        gradient, coordinates, nx = np.zeros(self.size), z[self.parameters_at], self.problem.nx
+        costs = costs_of(self.problem, xs, us, h)
+        by_nodes, running = costs.expand(xs, us)[0], costs.values(xs, us)[:-1]
+        gradient[self.states_at], gradient[self.inputs_at] = by_nodes[:, :nx], by_nodes[:-1, nx:]
         if self.problem.trajectory_cost is not None:
-            value, by_xs, by_us, _method = differentiate_loss(self.problem.trajectory_cost, xs, us)
+            _, by_xs, by_us, _method = differentiate_loss(self.problem.trajectory_cost, xs, us)
             gradient[self.states_at] += by_xs
             gradient[self.inputs_at] += by_us
-            paid += value
-        rates = (self.problem.objective(xs, us, h) - paid) / h  # of a running cost, whose steps are all of one length
-        gradient[self.parameters_at] = self._by_coordinates(coordinates) + rates * self._by_step(coordinates)
+        paid = float(np.sum(running)) / h  # of a running cost, whose steps are all of one length
+        gradient[self.parameters_at] = self._by_coordinates(coordinates) + paid * self._by_step(coordinates)
         return [self._cost(z), gradient]
 
     def _by_coordinates(self, coordinates: Array) -> Array:
@@ -336,11 +329,11 @@ class StepProgram:
         blocks.append(np.zeros((nx, nx)))
         coordinates, width = z[self.parameters_at], nx + nu
         by_step = self._by_step(coordinates)
-        for block, slope, cost in zip(blocks, *expand_running_cost(self.problem, xs, us, h), strict=False):
+        slopes, costs = costs_of(self.problem, xs, us, h).expand(xs, us)
+        for block, slope, cost in zip(blocks[:-1], slopes, costs, strict=False):
             block[:width, :width] += sigma[0] * cost
             block[:width, width:] += sigma[0] * np.outer(slope / h, by_step)
-        if self.problem.total_final_cost is not None:
-            blocks[-1] += sigma[0] * final_cost_hessian(self.problem.total_final_cost, xs[-1])
+        blocks[-1] += sigma[0] * costs[-1, :nx, :nx]
         for j, step in enumerate(np.diag(DIFFERENCE * np.maximum(1.0, np.abs(coordinates)))):
             apart = self._by_coordinates(coordinates + step) - self._by_coordinates(coordinates - step)
             blocks[0][width:, width + j] += sigma[0] * apart / (2 * step[j])
