@@ -2,7 +2,8 @@
 
 What does not touch has no gradient. So `solve_continuation` first solves the same problem with contact at a distance:
 on the plant with a force added (`soft_contact`), or by inverse dynamics (`relaxed`), of a shorter reach in each stage.
-A stage only warms up the next: the schedule goes on if it fails.
+A stage only warms up the next: the schedule goes on if it fails. Of relaxed stages the true plant follows each under
+feedback: the one that it follows best is where the search on the true plant begins.
 """
 
 import math
@@ -14,11 +15,16 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.clock import noted_interrupts, now, until_set
-from drake_diff.exceptions import GradientError, InputError, SimulationError
+from drake_diff._base.clock import TimeIsUpError, noted_interrupts, now, until_set
+from drake_diff._base.values import Refusal
+from drake_diff.exceptions import GradientError, InputError, NonFiniteError, SimulationError
 from drake_diff.model.contact import SoftContact, distances, separations, softened, thinnest_geometry
-from drake_diff.model.step import set_state
+from drake_diff.model.plant import bodies
+from drake_diff.model.step import advance, set_state
+from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import roll_states
+from drake_diff.optimize.ilqr.expansion import off_bounds
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import (
     PATIENCE,
@@ -30,19 +36,44 @@ from drake_diff.optimize.ilqr.through_contact import (
 )
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
-from drake_diff.optimize.relaxed.plant import RelaxedPlant, Softness
-from drake_diff.optimize.relaxed.search import Found
-from drake_diff.optimize.relaxed.stages import describe, solve_relaxed
+from drake_diff.optimize.relaxed.plant import RelaxedPlant, Softness, relaxed_plant
+from drake_diff.optimize.relaxed.search import RelaxedSearch
 
-STAGE_ITERATIONS, STAGE_TOLERANCE = 30, 1e-4  # a stage is a guess for the next: no more than that is asked of it
-REACH = 3.0  # the first distance is this part of the gap, where the force is e^-3 = 5 % of that at touching
-SHORTER = 3.0  # each distance is this part of the one before
-# No distance is shorter than what crosses the gap L at 4 L / T moves in a step: it would be met only by chance.
-FASTEST = 4.0
-# h^2 k / m of the stiffest stage: at 4 the explicit force is unstable; where it is weak, true contact, which jumps,
-# does the work, and the stage is as rough as the true plant.
-LARGEST_STIFFNESS = 0.4
-NUDGE = 10.0  # how many gaps the force at x0 alone would move what it acts on, were it to last
+
+@dataclass(frozen=True)
+class SoftOptions:
+    """Stages on the plant with a force at a distance."""
+
+    iterations: int = 30  # of a stage
+    tolerance: float = 1e-4  # of a stage, which is a guess for the next
+    reach: float = 3.0  # the first distance is this part of the gap, where the force is e^-3 = 5 % of that at touching
+    shorter: float = 3.0  # each distance is this part of the one before
+    # No distance is shorter than what crosses the gap L at 4 L / T moves in a step: it would be met only by chance.
+    fastest: float = 4.0
+    # h^2 k / m of the stiffest stage: at 4 the explicit force is unstable; where it is weak, true contact, which jumps,
+    # does the work, and the stage is as rough as the true plant.
+    largest_stiffness: float = 0.4
+    nudge: float = 10.0  # how many gaps the force at x0 alone would move what it acts on, were it to last
+
+
+@dataclass(frozen=True)
+class RelaxedOptions:
+    """Stages by inverse dynamics with relaxed contact."""
+
+    stages: int = 5  # each reach is half of the one before
+    iterations: int = 60  # of a stage
+    reach: tuple[float, float] = (0.01, 0.1)  # [m] the smallest and the largest of the first stage
+    nearest: float = 6.0  # where nothing touches, the first reach is this part of the nearest gap
+    slip: float = 0.1  # [m/s] in the first stage
+    least_slip: float = 0.02  # [m/s] in any
+    rebound: float = 0.1  # [m/s] contact that parts faster than twice that does not push
+    share: float = 1 / 3  # of its weight that pushes a body which just touches
+    without_gravity: float = 1.0  # [m/s^2]
+    # What the whole range of an input is worth to the regulator, where that of a state is 1; at the last it rests.
+    weights: tuple[float, ...] = (0.1, 10.0, 1e9)
+
+
+SOFT, RELAXED = SoftOptions(), RelaxedOptions()
 FORMS = 'None, "auto", "relaxed" or SoftContacts, one a stage'
 Stages = tuple[SoftContact, ...] | RelaxedPlant
 
@@ -116,15 +147,14 @@ class _Stages:
 
     def log(self, *entries: Any, kind: str = "true plant") -> None:
         self.logs.append(StageLog(kind, len(self.logs) + 1, *entries))
-        if self.report:
-            self.report.say(str(self.logs[-1]))
+        self._say(str(self.logs[-1]))
 
     def soften(self, us: Array, stages: Sequence[SoftContact]) -> None:
         """By iLQR on the plant with a force at a distance beside its contact."""
         problem, limits, x0 = self.problem, self.limits, np.array(self.problem.x0)
         for contact in stages:
             softer = replace(problem, system=softened(problem.model, contact))
-            iterations, tolerance = min(STAGE_ITERATIONS, limits.max_iterations), max(STAGE_TOLERANCE, limits.tolerance)
+            iterations, tolerance = min(SOFT.iterations, limits.max_iterations), max(SOFT.tolerance, limits.tolerance)
             short = Limits(iterations, self.deadline - now(), tolerance)
             record: tuple[Any, ...]
             try:
@@ -140,26 +170,51 @@ class _Stages:
         self.xs, self.us = roll_states(problem.model, x0, us), us
 
     def relax(self, xs: Array, us: Array, plant: RelaxedPlant) -> None:
-        """By inverse dynamics with relaxed contact, and where the true plant gets that follows what they find."""
-        problem = self.problem
-
-        def tell(line: str) -> None:
-            if self.report:
-                self.report.say(line)
-
-        def log(soft: Softness, result: Found) -> None:
-            miss = float(np.abs(problem.goal_error(result.motion.xs[-1])).max())
-            stiffness = float(np.max(soft.force)) / (soft.reach * math.log(2))
-            self.log(soft.reach, stiffness, result.ended, result.iterations, result.cost, miss, None, kind="relaxed")
-
+        """By inverse dynamics with relaxed contact from xs (N+1, nx); then the true plant follows a stage."""
+        problem, followed = self.problem, list[tuple[float, Array, Array]]()
         try:
             with until_set(self.interrupted):
-                self.xs, self.us = solve_relaxed(problem, plant, xs, is_over=self.is_over, log=log, tell=tell)
-        except SimulationError as error:
-            self.log(None, None, f"refused: {error}", 0, None, None, None, kind="relaxed")
+                self._relax(xs, plant, followed)
+        except TimeIsUpError:
+            self._say("the true plant follows no more relaxed stages")
+        if followed:
+            _, self.xs, self.us = min(followed, key=lambda start: start[0])
+        else:
+            refusal = "refused: the true plant can follow none of the relaxed stages"
+            self.log(None, None, refusal, 0, None, None, None, kind="relaxed")
             self.xs, self.us = roll_states(problem.model, problem.x0, us), us
         if self.is_over():
             self.ended = Outcome.INTERRUPTED if self.interrupted.is_set() else Outcome.TIME_LIMIT
+
+    def _relax(self, xs: Array, plant: RelaxedPlant, followed: list[tuple[float, Array, Array]]) -> None:
+        """Add to `followed` (how far it is from the stage, xs, us) of each motion of the true plant that follows it."""
+        problem, nq = self.problem, self.problem.model.nq
+        search, closed = RelaxedSearch(problem, plant), None
+        q = np.array(xs[:, :nq])
+        q[0] = problem.x0[:nq]
+        for i, _ in plant.coordinates.free:
+            q[:, i : i + 4] /= np.linalg.norm(q[:, i : i + 4], axis=1, keepdims=True)
+        for softness in relaxed_schedule(problem, plant):
+            result = search.run(q, softness, RELAXED.iterations, self.is_over, self._say)
+            q, states = result.motion.q, result.motion.xs
+            stiffness = float(np.max(softness.force)) / (softness.reach * math.log(2))
+            numbers = result.ended, result.iterations, result.cost, miss_of(problem, states), None
+            self.log(softness.reach, stiffness, *numbers, kind="relaxed")
+            for weight in RELAXED.weights:
+                motion = follow(problem, states, result.motion.us, weight)
+                if motion is not None:
+                    off = np.mean(((motion[0] - states) / problem.ranges(states)) ** 2)
+                    followed.append((float(off) + result.gap + result.violation, *motion))
+            if self.is_over():
+                break
+            if result.ended != "inaccurate":
+                closed = q, search.learned
+            elif closed is not None:  # the next one begins where the last that closed ended
+                q, search.learned = closed
+
+    def _say(self, line: str) -> None:
+        if self.report:
+            self.report.say(line)
 
     def on_the_true_plant(self) -> NlpResult:
         """The stage whose result is told; what is found is `xs`, `us`."""
@@ -179,8 +234,8 @@ class _Stages:
             if outcome is Outcome.INFEASIBLE and miss_of(problem, xs) <= limits.tolerance:
                 outcome = Outcome.INACCURATE  # state bounds are measured again by the verdict
             result = replace(result, z=us.ravel(), outcome=outcome, message=message)
-            if done and self.report:
-                self.report.say(done.removeprefix("; "))
+            if done:
+                self._say(done.removeprefix("; "))
         self.xs, self.us = xs, us
         return result
 
@@ -190,7 +245,7 @@ def check_schedule(problem: Problem, continuation: Any) -> Stages:
     if isinstance(continuation, str) and continuation == "auto":
         return default_schedule(problem)
     if isinstance(continuation, str) and continuation == "relaxed":
-        return describe(problem)
+        return read_relaxed_plant(problem)
     given = tuple(continuation) if isinstance(continuation, Sequence) else ()
     if not given or not all(isinstance(stage, SoftContact) for stage in given):
         raise InputError("continuation", got=repr(continuation), expected=FORMS)
@@ -213,15 +268,84 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
     if not math.isfinite(mass):
         raise InputError("x0", got="nothing that may collide can approach", expected="a pair that can")
     reach = max(*distances(model.double).values(), thinnest_geometry(model)[0] / 2)
-    duration, stiffest = problem.num_steps * model.time_step, LARGEST_STIFFNESS * mass / model.time_step**2
+    duration, stiffest = problem.num_steps * model.time_step, SOFT.largest_stiffness * mass / model.time_step**2
     stages: list[SoftContact] = []
-    sigma = reach / REACH
-    while not stages or sigma >= FASTEST * reach / problem.num_steps:
+    sigma = reach / SOFT.reach
+    while not stages or sigma >= SOFT.fastest * reach / problem.num_steps:
         unit = SoftContact(float(sigma), 1.0)
-        nudge = NUDGE * 2 * mass * reach / duration**2 / unit.normal_force(reach)
+        nudge = SOFT.nudge * 2 * mass * reach / duration**2 / unit.normal_force(reach)
         stages.append(replace(unit, stiffness=float(min(stiffest, nudge))))
-        sigma /= SHORTER
+        sigma /= SOFT.shorter
     return tuple(stages)
+
+
+def read_relaxed_plant(problem: Problem) -> RelaxedPlant:
+    """What the stages need to know of the model; InputError where a problem or a model is none of theirs."""
+    if not problem.initial_state_is_given:
+        raise InputError("continuation", got="'relaxed' with a free initial state", expected="one that is given")
+    plant = problem.model.cache("relaxed plant", lambda: relaxed_plant(problem.model))
+    if isinstance(plant, Refusal):
+        raise InputError("continuation", got=f"'relaxed': {plant.reason}", expected="another model, or 'auto'")
+    if not plant.pairs.ids:
+        raise InputError("continuation", got="'relaxed': no sphere may touch anything", expected="a pair that may")
+    return plant
+
+
+def relaxed_schedule(problem: Problem, plant: RelaxedPlant) -> tuple[Softness, ...]:
+    """The stages, from the model's sizes and masses: reaches from half of the thinnest shape or a sixth of the gap.
+
+    What just touches pushes with a third of the lighter one's weight, and no contact is stiffer than the model's own.
+    """
+    model = problem.model
+    gap = float(np.min(plant.distances(problem.x0[None, : model.nq])))
+    first = float(np.clip(max(thinnest_geometry(model)[0] / 2, gap / RELAXED.nearest), *RELAXED.reach))
+    weight, stiffest, schedule = _weights(problem, plant) * RELAXED.share, plant.material.stiffness * np.log(2), []
+    for number in range(RELAXED.stages):
+        reach = first / 2**number
+        force, slip = np.minimum(weight, stiffest * reach), max(RELAXED.least_slip, RELAXED.slip / 2**number)
+        schedule.append(Softness(reach, force, slip, RELAXED.rebound))
+    return tuple(schedule)
+
+
+def _weights(problem: Problem, plant: RelaxedPlant) -> Array:
+    """(P,) [N] the weight of the lighter of the two trees that each pair is of, or what moves it in the time given."""
+    drake, mass = problem.model.plant, dict[int, float]()  # by the tree's first degree of freedom
+
+    def tree(body: Any) -> int | None:
+        moving = np.flatnonzero(plant.moving(body))
+        return int(moving[0]) if len(moving) else None
+
+    for body in bodies(drake):
+        first = tree(body)
+        if first is not None:
+            mass[first] = mass.get(first, 0.0) + float(body.default_mass())
+    acceleration = float(np.linalg.norm(drake.gravity_field().gravity_vector())) or RELAXED.without_gravity
+    trees = [tree(body) for body in plant.pairs.bodies]
+    pairs = zip(plant.pairs.sphere_body, plant.pairs.other_body, strict=True)
+    lighter = [min(mass[first] for i in pair if (first := trees[i]) is not None) for pair in pairs]
+    return np.array(lighter) * acceleration
+
+
+def follow(problem: Problem, xs: Array, us: Array, weight: float) -> tuple[Array, Array] | None:
+    """The true plant as it follows xs (N+1, nx), us (N, nu) under feedback; None where it cannot be stepped along.
+
+    The feedback weighs states by their ranges along xs, and inputs by theirs and `weight`.
+    """
+    bounds, model = problem.bounds, problem.model
+    us = np.clip(us, bounds.u_lower, bounds.u_upper)
+    limit = np.minimum(np.abs(bounds.u_lower), np.abs(bounds.u_upper))
+    size = np.where(np.isfinite(limit), limit, np.maximum(np.max(np.abs(us), axis=0), 1.0))
+    Q, R = np.diag(1 / tangent_space(model).scale(problem.ranges(xs)) ** 2), np.diag(weight / size**2)
+    try:
+        regulator = TVLQR(model, xs, off_bounds(bounds, us), Q, R)
+        states, inputs = np.array(xs), np.array(us)
+        states[0] = problem.x0
+        for k in range(len(us)):
+            inputs[k] = np.clip(regulator(states[k], k * model.time_step), bounds.u_lower, bounds.u_upper)
+            states[k + 1] = advance(model.double, states[k], inputs[k])
+    except (GradientError, SimulationError, NonFiniteError):
+        return None
+    return (states, inputs) if np.all(np.isfinite(states)) else None
 
 
 def _told(

@@ -13,7 +13,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.optimize.ilqr.ilqr import costs_to_go, solve_ilqr
+from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic, minimize_in_box, solve_riccati
 from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.solution import Status
@@ -439,28 +439,6 @@ def test_an_effort_limit_is_a_bound_like_any_other(write_urdf, side):
         found.append(us)
     assert found[0][0] == -side
     np.testing.assert_allclose(found[0], found[1], atol=1e-7)
-
-
-def test_costs_to_go_are_what_the_best_inputs_from_there_cost():
-    """Of the double integrator, about a motion that is not the optimum's: V_k(x) - V_k(y) = x' P_k x - y' P_k y."""
-    h, count, Q, R, Qf = DOUBLE_INTEGRATOR
-    random = np.random.default_rng(3)
-    us = random.standard_normal((count, 1))
-    problem = lqr(*DOUBLE_INTEGRATOR)
-    found = costs_to_go(problem, dd.rollout(problem.model, problem.x0, us).xs, us)
-    assert len(found) == count + 1
-    for k, cost in enumerate(found):
-        P = riccati(h, count - k, Q, R, Qf)[0]
-        x, y = random.standard_normal((2, 2))
-        assert cost(x) - cost(y) == pytest.approx(x @ P @ x - y @ P @ y, rel=1e-9, abs=1e-9)
-
-
-def test_a_cost_without_a_best_input_has_no_cost_to_go():
-    """-1e4 u^2, which no QuadraticCost and no difference of gradients lets through: put in below those."""
-    problem = lqr(*DOUBLE_INTEGRATOR)
-    object.__setattr__(problem.running_cost, "R", np.array([[-1e4]]))
-    with pytest.raises(InputError, match="curvature"):
-        costs_to_go(problem, np.zeros((21, 2)), np.zeros((20, 1)))
 
 
 def without_derivatives(monkeypatch, refuses, error=GradientError):

@@ -12,9 +12,9 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.model.tangent import tangent_space
+from drake_diff.optimize.continuation import follow, read_relaxed_plant, relaxed_schedule
 from drake_diff.optimize.relaxed.plant import Softness, relaxed_plant
 from drake_diff.optimize.relaxed.search import Band, RelaxedSearch, between, slopes_of
-from drake_diff.optimize.relaxed.stages import describe, follow, relaxed_schedule
 
 
 def softness(plant, reach=0.02, force=20.0):
@@ -150,7 +150,7 @@ def test_least_effort_far_from_contact_is_the_closed_form(two_spheres):
     goal = np.full(4, np.nan)
     goal[0] = distance
     problem = push(two_spheres(damping=0), gap=1.0, goal=1.0, num_steps=N, x_goal=goal)
-    plant = describe(problem)
+    plant = read_relaxed_plant(problem)
     search = RelaxedSearch(problem, plant)
     q = np.tile(problem.x0[:2], (N + 1, 1))
     found = search.run(q, softness(plant, reach=0.01), 50, lambda: False, lambda line: None)
@@ -246,6 +246,6 @@ def test_what_has_no_relaxed_contact_is_refused_by_name(load, two_spheres):
 def test_the_schedule_is_read_off_the_model(two_spheres):
     """Of two balls of radius 0.1 m: from that on, each reach half of the last; a third of the weight of 0.5 kg."""
     problem = push(two_spheres(), gap=0.3, goal=1.0)
-    stages = relaxed_schedule(problem, describe(problem))
+    stages = relaxed_schedule(problem, read_relaxed_plant(problem))
     assert [stage.reach for stage in stages] == pytest.approx(0.1 / 2.0 ** np.arange(5), rel=1e-9)
     assert stages[0].force == pytest.approx([0.5 * 9.81 / 3], rel=1e-9)

@@ -10,7 +10,7 @@ motion converges slowly (`expansion`).
 import math
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -35,11 +35,9 @@ from drake_diff.optimize.ilqr.riccati import (
     AffinePolicy,
     LinearQuadratic,
     follow,
-    least_regularized,
     slope_along,
     solve_riccati,
 )
-from drake_diff.optimize.problem.cost import CostToGo
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,
@@ -52,26 +50,36 @@ from drake_diff.optimize.program import (
     Report,
 )
 
-# Regularization, of the inputs' own curvature: the least at all, the first that is tried, and the last.
-SMALLEST_REGULARIZATION, FIRST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-4, 1e-3, 1e8
-HARDER = 8.0  # the factor between two regularizations
-SUFFICIENT_DECREASE = 1e-4
-TRIALS = 5  # sizes along one policy; then a shorter policy is asked for
-LONGER = 2.0  # times a step that had been cut back: the first size that is tried after it
-MOST_CUT, LEAST_CUT = 0.1, 0.5  # of a size that was too long: the parabola's minimum is kept between
-LONG, TINY = 1 / 2, 1 / 100  # from a step that long on less regularization will do; below that it takes more
-SHORT, LITTLE = 1 / 32, 1e-2  # several steps cut back to that, each of which gains so little of the cost: it crawls
-# Of the cost: a promise below this is lost in the rounding of the cost's sum.
-ROUNDING = 1e-13
-# Of what the next update of the multipliers changes in the augmented cost: what a minimization before it may leave.
-LEFT_OVER = 3e-2
-BESIDE = 1e-14  # of a bound: an input that is no further from it is on it
-# Of what a step gained: where the next one gains more, the search converges slowly, for want of the right curvature.
-SLOW = 1 / 2
-SAME_MOTION = 1e-9  # of the largest state: what rounding of two forms of a step may come to under feedback
-SETTLE = 12  # sweeps for one policy, until it leads to the bounds that it was made for
-PARTS = 0.5 ** np.arange(6)  # of such a sweep's step
 
+@dataclass(frozen=True)
+class IlqrOptions:
+    """What tunes the search."""
+
+    # Regularization, of the inputs' own curvature: the least at all, the first that is tried, the last, and the factor
+    # between two.
+    smallest_regularization: float = 1e-4
+    first_regularization: float = 1e-3
+    largest_regularization: float = 1e8
+    harder: float = 8.0
+    sufficient_decrease: float = 1e-4
+    trials: int = 5  # sizes along one policy; then a shorter policy is asked for
+    longer: float = 2.0  # times a step that had been cut back: the first size that is tried after it
+    most_cut: float = 0.1  # of a size that was too long: the parabola's minimum is kept between this
+    least_cut: float = 0.5  # and this
+    long: float = 1 / 2  # from a step that long on less regularization will do
+    tiny: float = 1 / 100  # below that it takes more
+    short: float = 1 / 32  # several steps cut back to that,
+    little: float = 1e-2  # each of which gains so little of the cost: it crawls
+    rounding: float = 1e-13  # of the cost: a promise below this is lost in the rounding of the cost's sum
+    left_over: float = 3e-2  # of what the next update of the multipliers changes: what a minimization may leave
+    beside: float = 1e-14  # of a bound: an input that is no further from it is on it
+    slow: float = 1 / 2  # of what a step gained: where the next one gains more, the curvature is not the right one
+    same_motion: float = 1e-9  # of the largest state: what rounding of two forms of a step may come to under feedback
+    settle: int = 12  # sweeps for one policy, until it leads to the bounds that it was made for
+    parts: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125)  # of such a sweep's step
+
+
+OPTIONS = IlqrOptions()
 _Solve = Callable[[LinearQuadratic, float], AffinePolicy | None]
 
 
@@ -107,12 +115,11 @@ def solve_ilqr(
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
 
-    After `patience` steps that had to be cut back to less than SHORT and gain LITTLE, with no better between them, the
-    search ends as inaccurate: it crawls along a jump. `least_penalty` is what constraints
-    weigh from the start, `values` (np,) are those of the problem's `design` to begin with, its own where None;
-    `begun` are the multipliers of a search like this one. A motion
-    on the way that cannot be stepped or differentiated is a step that is too long, which the message counts; raises
-    GradientError or SimulationError if the guess is such a motion.
+    After `patience` short steps in a row that gain little, with no better between them, the search ends as inaccurate:
+    it crawls along a jump. `least_penalty` is what constraints weigh from the start, `values` (np,) are those of the
+    problem's `design` to begin with, its own where None; `begun` are the multipliers of a search like this one. A
+    motion on the way that cannot be stepped or differentiated is a step that is too long, which the message counts;
+    raises GradientError or SimulationError if the guess is such a motion.
     """
     search = _Search(problem, xs, us, limits, report, patience, values)
     search.constraints.penalty = max(search.constraints.penalty, least_penalty)
@@ -125,22 +132,6 @@ def solve_ilqr(
     result = NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows), parameters=parameters)
     multipliers = Multipliers(np.zeros(0), search.constraints.forces)
     return replace(result, multipliers=multipliers), motion.xs, motion.us
-
-
-def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
-    """What remains to be paid of `problem` from each state of xs (N+1, nx) on, under the best inputs near us (N, nu).
-
-    To second order in the distance from xs, without the dynamics' second derivatives; an input on a bound stays there.
-    Raises GradientError if a derivative is refused, InputError if the cost has no minimum.
-    """
-    search = _Search(problem, xs, us, Limits(1, math.inf, 1.0), None)
-    policy = least_regularized(search._expand())
-    if policy is None:
-        raise InputError("running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum")
-    nx = problem.nx
-    gradients, hessians = policy.value_gradients[:, :nx], policy.value_hessians[:, :nx, :nx]
-    parts = zip(search.motion.xs, gradients, hessians, strict=True)
-    return tuple(CostToGo(*row) for row in parts)
 
 
 def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: float) -> bool:
@@ -180,8 +171,8 @@ class _Bends:
     def lower_between(self, old: tuple[Array, Array], new: tuple[Array, Array]) -> tuple[Array, Array]:
         """The first step on the way back from `new` to `old` that is lower than `old`."""
         before, step = self(old)[1], new
-        for fraction in PARTS:
-            step = tuple(a + fraction * (b - a) for a, b in zip(old, new, strict=True))
+        for fraction in OPTIONS.parts:
+            step = old[0] + fraction * (new[0] - old[0]), old[1] + fraction * (new[1] - old[1])
             if self(step)[1] < before:
                 break
         return step
@@ -201,7 +192,7 @@ class _Search:
         self.problem, self.limits, self.report, self.patience = problem, limits, report, patience
         self.constraints = AugmentedLagrangian(problem)
         lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
-        self.inner = lower * (1 + BESIDE * np.sign(lower)), upper * (1 - BESIDE * np.sign(upper))
+        self.inner = lower * (1 + OPTIONS.beside * np.sign(lower)), upper * (1 - OPTIONS.beside * np.sign(upper))
         self.start, self.design = now(), problem.design
         begin = self.design.start if values is None else self.design.of_values(values)
         self.motion = self._take_in(xs, us, np.clip(begin, *self.design.limits))
@@ -213,7 +204,7 @@ class _Search:
         self.jacobians: Array | None = None
         self.gap_weight = 0.0
         self.regularization, self.ahead = 0.0, 1.0  # how far is tried first, as a part of a step not regularized
-        self.crawled = 0  # steps cut back to less than SHORT that gained LITTLE, since the last better one
+        self.crawled = 0  # short steps that gained little, since the last better one
         self.gains = math.inf, math.inf  # of the merit, by the last two steps of this minimization
         self.stalled = False
         self.refusals, self.refusal = 0, ""  # trial motions that could not be differentiated, and why the last
@@ -238,7 +229,8 @@ class _Search:
             motion = self._roll(self.policy, 0.0)
         except SimulationError:
             motion = self.guess
-        same = np.abs(motion.xs - self.motion.xs).max() <= SAME_MOTION * max(1.0, float(np.abs(motion.xs).max()))
+        rounding = OPTIONS.same_motion * max(1.0, float(np.abs(motion.xs).max()))
+        same = np.abs(motion.xs - self.motion.xs).max() <= rounding
         self.motion, self.cost = motion, self._objective(motion)
         self.rows[-1] = replace(self.rows[-1], objective=self.cost, primal_infeasibility=self._infeasibility())
         if same:
@@ -296,7 +288,7 @@ class _Search:
         model = expand(self.problem, new, self.jacobians, self.constraints)
         moved = np.tile(new.c - old.c, (len(new.us), 1))
         self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], moved, new.us - old.us]))
-        if new.is_rollout and self.gains[1] > SLOW * self.gains[0]:  # steps with gaps are short for these
+        if new.is_rollout and self.gains[1] > OPTIONS.slow * self.gains[0]:  # steps with gaps are short for these
             estimate = curvature_along(self.problem, new, model.multipliers())
             if estimate is not None:
                 curvature, known = estimate
@@ -310,7 +302,7 @@ class _Search:
         scale = 1 + abs(merit)
         left_over = self.limits.tolerance**2 * scale
         if not final:
-            left_over = max(left_over, LEFT_OVER * self.constraints.unrest(*self.motion.point))
+            left_over = max(left_over, OPTIONS.left_over * self.constraints.unrest(*self.motion.point))
         curved = (replace(model, hessians=model.hessians + self.curvature.M),) if self.curvature.M.any() else ()
         models = (*curved, model)
         solve = cache(solve_riccati)  # no policy is sought twice
@@ -323,15 +315,15 @@ class _Search:
         if len(self.rows) > self.limits.max_iterations:
             return Outcome.ITERATION_LIMIT
         refusals = self.refusals
-        while self.regularization <= LARGEST_REGULARIZATION:
+        while self.regularization <= OPTIONS.largest_regularization:
             with np.errstate(all="ignore"):  # a policy that leads to infinity promises nothing
                 policies = (self._settled(candidate, solve(candidate, self.regularization)) for candidate in models)
                 policy = next((p for p in policies if p is not None and p.expected >= 0), None)
             if policy is not None and self._search_along(model, policy):
                 return None
-            if is_reached(ROUNDING * scale):
+            if is_reached(OPTIONS.rounding * scale):
                 return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
-            if self.motion.is_rollout and policy is not None and policy.expected <= ROUNDING * scale:
+            if self.motion.is_rollout and policy is not None and policy.expected <= OPTIONS.rounding * scale:
                 break  # no step that can be told from none: the cost has a kink or a jump here, as contact makes them
             self.regularization = self._tightened()
         self.regularization = 0.0
@@ -352,7 +344,7 @@ class _Search:
         smooth = with_active(self.problem, self.motion, model, rows, here, (none, none))
         bends = _Bends(smooth, rows, point)
         active, step, best, least = here, bends.still, policy, math.inf
-        for _ in range(SETTLE):
+        for _ in range(OPTIONS.settle):
             led = follow(model, policy)
             ahead, change = bends(led)
             if change < least:
@@ -370,7 +362,7 @@ class _Search:
         return best
 
     def _tightened(self) -> float:
-        return max(HARDER * self.regularization, FIRST_REGULARIZATION)
+        return max(OPTIONS.harder * self.regularization, OPTIONS.first_regularization)
 
     def _search_along(self, model: LinearQuadratic, policy: AffinePolicy) -> bool:
         """Take a step along `policy` that lowers the merit enough, if a few sizes find one.
@@ -384,22 +376,22 @@ class _Search:
             self.gap_weight = max(self.gap_weight, 2 * (slope + max(curvature, 0) / 2) / distance)
             slope -= self.gap_weight * distance
         merit, size = self._merit(self.motion, self.cost), min(1.0, self.ahead * (1 + self.regularization))
-        for trial in range(TRIALS):
+        for trial in range(OPTIONS.trials):
             trial_merit = self._try(policy, size, merit, slope)
             if trial_merit is None:
-                self.ahead = LONGER * size / (1 + self.regularization) if trial else 1.0
-                crawls = size < SHORT and self.gains[1] < LITTLE * abs(merit)
+                self.ahead = OPTIONS.longer * size / (1 + self.regularization) if trial else 1.0
+                crawls = size < OPTIONS.short and self.gains[1] < OPTIONS.little * abs(merit)
                 self.crawled = self.crawled + (trial > 0) if crawls else 0
                 is_smooth = math.isinf(self.patience)  # else the model may reach too far again: contact jumps
-                if is_smooth or size >= LONG:
-                    relaxed = self.regularization / HARDER
-                    self.regularization = relaxed if relaxed > SMALLEST_REGULARIZATION else 0.0
-                elif size < TINY and trial:
+                if is_smooth or size >= OPTIONS.long:
+                    relaxed = self.regularization / OPTIONS.harder
+                    self.regularization = relaxed if relaxed > OPTIONS.smallest_regularization else 0.0
+                elif size < OPTIONS.tiny and trial:
                     self.regularization = self._tightened()
                 return True
             excess = trial_merit - merit - slope * size
             least = -slope * size**2 / (2 * excess) if excess > 0 else 0.0  # 0 where what was found is infinite
-            size = min(max(least, MOST_CUT * size), LEAST_CUT * size)
+            size = min(max(least, OPTIONS.most_cut * size), OPTIONS.least_cut * size)
         self.ahead = 1.0  # the next policy is shorter itself
         return False
 
@@ -412,7 +404,7 @@ class _Search:
         with np.errstate(all="ignore"):  # a merit that is not finite is no decrease
             cost = self._objective(motion)
             trial_merit = self._merit(motion, cost)
-        if not trial_merit <= merit + SUFFICIENT_DECREASE * size * slope:
+        if not trial_merit <= merit + OPTIONS.sufficient_decrease * size * slope:
             return trial_merit if math.isfinite(trial_merit) else math.inf
         try:
             jacobians = jacobians_along(self.problem, motion)

@@ -291,13 +291,13 @@ class StepProgram:
         xs, us, h = self._read(z)
         gradient, coordinates, nx = np.zeros(self.size), z[self.parameters_at], self.problem.nx
         costs = costs_of(self.problem, xs, us, h)
-        by_nodes, running = costs.expand(xs, us)[0], costs.values(xs, us)[:-1]
+        by_nodes = costs.expand(xs, us)[0]
         gradient[self.states_at], gradient[self.inputs_at] = by_nodes[:, :nx], by_nodes[:-1, nx:]
         if self.problem.trajectory_cost is not None:
             _, by_xs, by_us, _method = differentiate_loss(self.problem.trajectory_cost, xs, us)
             gradient[self.states_at] += by_xs
             gradient[self.inputs_at] += by_us
-        paid = float(np.sum(running)) / h  # of a running cost, whose steps are all of one length
+        paid = float(np.sum(costs.values(xs, us)[:-1])) / h  # of a running cost, whose steps are all of one length
         gradient[self.parameters_at] = self._by_coordinates(coordinates) + paid * self._by_step(coordinates)
         return [self._cost(z), gradient]
 
