@@ -294,7 +294,7 @@ class StepProgram:
         by_nodes = costs.expand(xs, us)[0]
         gradient[self.states_at], gradient[self.inputs_at] = by_nodes[:, :nx], by_nodes[:-1, nx:]
         if self.problem.trajectory_cost is not None:
-            _, by_xs, by_us, _method = differentiate_loss(self.problem.trajectory_cost, xs, us)
+            _paid, by_xs, by_us, _method = differentiate_loss(self.problem.trajectory_cost, xs, us)
             gradient[self.states_at] += by_xs
             gradient[self.inputs_at] += by_us
         paid = float(np.sum(costs.values(xs, us)[:-1])) / h  # of a running cost, whose steps are all of one length
