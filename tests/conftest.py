@@ -27,6 +27,12 @@ for public in dd.__all__:  # a module that is first loaded while a test has patc
     getattr(dd, public)
 
 
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if not (item.get_closest_marker("solve") or item.get_closest_marker("slow")):
+            item.add_marker("unit")
+
+
 @pytest.fixture(autouse=True)
 def verify_in_this_process(request, monkeypatch):
     """A child process imports Drake for two seconds: tests that ask for `child_process` use one."""

@@ -82,6 +82,7 @@ def block(limit=np.inf, gains=None, start=0.0):
 FOUND = {"quadruped.urdf": {"default_decides"}, "jumper.sdf": {"mimic_joint"}}
 
 
+@pytest.mark.slow
 @each_row("name", sorted(p.name for p in MODELS.iterdir()))
 def test_the_models_of_this_repository_are_clean(load, name):
     model, ground = load(name), FOUND.get(name, set())
@@ -233,6 +234,7 @@ def test_an_identity_frame_is_told_and_another_is_not():
 HYDROELASTIC = {"compliance": ("compliant", "compliant"), "contact_model": "hydroelastic_with_fallback"}
 
 
+@pytest.mark.solve
 @each_row(
     "upper, lower, height",
     [
@@ -293,6 +295,7 @@ def slope_by_height_is_right(model, x):
     return dd.differentiate_step(model, x, method="autodiff").A[-1, 6] == pytest.approx(slope, rel=2e-2)
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("lower", [Cylinder(0.2, 0.2), Box(1, 1, 0.2)])
 def test_a_sphere_over_a_flat_mesh_is_aligned_only_in_its_planes_of_symmetry(lower):
     """The meshes' edges lie on each other there: certify says the same."""
@@ -337,6 +340,7 @@ def test_a_sphere_beside_the_axis_is_only_told():
 # 6. Efforts at their limits
 
 
+@pytest.mark.slow
 def test_an_effort_at_its_limit_is_an_error():
     model = block(limit=20.0).model()
     assert "saturated_effort" not in codes(audit(model, u=[19.99]))

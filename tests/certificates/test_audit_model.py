@@ -10,6 +10,8 @@ from helpers.table import each_row
 
 import drake_diff as dd
 
+pytestmark = pytest.mark.solve
+
 CODES = [
     "no_actuator",
     "undriven",
@@ -423,6 +425,7 @@ TRAPS += [
 ]
 
 
+@pytest.mark.slow
 @each_row("code, severity, text, options, words, mended", TRAPS)
 def test_a_trap_is_named_and_its_remedy_mends_it(tmp_path, code, severity, text, options, words, mended):
     finding = audited(tmp_path, text, **options)[code]
@@ -475,6 +478,7 @@ def test_a_block_falls_out_of_corner_spheres_and_stays_between_boxes(tmp_path):
     assert heights["corner_spheres"] == pytest.approx(0.5 - 9.81 * 0.2 * 0.205 / 2, abs=1e-9)  # free fall in 40 steps
 
 
+@pytest.mark.slow
 @each_row("name", sorted(p.name for p in MODELS.iterdir()))
 def test_the_models_of_this_repository_have_none(load, name):
     model = load(name)

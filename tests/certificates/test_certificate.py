@@ -19,6 +19,8 @@ from drake_diff.derivatives.refine_step import RefinedSteps
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError, UnknownNameError
 from drake_diff.model.plant import joints
 
+pytestmark = pytest.mark.solve
+
 
 def smooth(n, seed=0):
     """A smooth function R^n -> R^n and its Jacobian."""
@@ -167,6 +169,7 @@ def test_nothing_but_agree_passes_require():
 SMOOTH = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf")
 
 
+@pytest.mark.slow
 @each_row("name", [*SMOOTH, "projectile.sdf"])
 def test_every_smooth_model_is_certified_at_random_states(load, name):
     model, random = load(name), np.random.default_rng(3)
@@ -174,6 +177,7 @@ def test_every_smooth_model_is_certified_at_random_states(load, name):
         dd.certify(model, random_state(model, random), random.standard_normal(model.nu)).require()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
 def test_a_ball_in_contact_is_certified_at_random_states(load, approximation):
     model, random = load("sphere_on_ground.sdf", contact_approximation=approximation), np.random.default_rng(4)
@@ -320,6 +324,7 @@ def sliding(approximation, gains=None):
     return plant.model()
 
 
+@pytest.mark.slow
 @each_row(
     "approximation, gains",
     [("lagged", None), ("sap", None), ("similar", None), ("sap", (10.0, 1.0)), ("lagged", (1e3, 10.0))],
@@ -350,6 +355,7 @@ def test_the_same_differences_judge_another_derivative():
         first.of(wrong[:2])
 
 
+@pytest.mark.slow
 @each_row("name", ["z1.urdf", "panda.urdf", "go2.urdf"])
 def test_1_percent_near_a_joint_limit_and_under_pd_control_is_found_and_named(name):
     random = np.random.default_rng(3)
@@ -391,6 +397,7 @@ def test_differences_that_are_certified_by_differences_are_said_to_share_the_met
     assert "the two share a method" not in str(dd.certify(load("pendulum.urdf"), [0.5, 0.1], [0.1]))
 
 
+@pytest.mark.slow
 def test_motors_in_the_air_are_not_called_discontinuous():
     """A third of these states was, by differences of 1e-12 between values that are all rounding."""
     model, random = example_robot("solo12.urdf"), np.random.default_rng(0)

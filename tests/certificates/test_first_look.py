@@ -90,6 +90,7 @@ def test_a_wide_bend_and_a_far_corner_are_no_doubt():
     assert doubt(lambda x: np.hstack([x[:, 1:] ** 2, x]), [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) == ""  # a bowl
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("name", ["go2.urdf", "solo12.urdf"])
 @pytest.mark.parametrize("approximation", ["sap", "lagged", "similar"])
 def test_robots_on_their_feet_pass_at_once_and_a_wrong_entry_is_named(name, approximation):
@@ -162,6 +163,7 @@ def test_a_nearer_look_meets_what_is_at_the_point_and_not_what_is_beside_it():
     assert doubts(lambda x: np.floor(x / 1e-3 + 0.5) * 1e-3) == [True, True]
 
 
+@pytest.mark.solve
 def test_a_ball_that_has_just_touched_passes_nearer_to_the_point_where_every_entry_agrees():
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
     x = model.default_state

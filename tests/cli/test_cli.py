@@ -25,6 +25,8 @@ from drake_diff.runs import directory as directories
 from drake_diff.runs.compare import list_runs
 from drake_diff.runs.save import recover
 
+pytestmark = pytest.mark.solve
+
 PENDULUM = f"""
 import numpy as np
 import drake_diff as dd
@@ -83,6 +85,7 @@ def test_out_names_the_run_directory(tmp_path, monkeypatch):
     assert not (tmp_path / "artifacts").exists()
 
 
+@pytest.mark.slow
 def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tmp_path):
     """0.1 N m cannot lift 1 kg at 0.5 m, which weighs 4.9 N m, to the top within 0.8 s."""
     done = drake_diff("run", script(tmp_path, limit=0.1), cwd=tmp_path)
@@ -151,6 +154,7 @@ def test_a_bug_in_the_script_exits_with_4_and_its_traceback(tmp_path, monkeypatc
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_run_with_the_best_motion_so_far(tmp_path):
     options = {"method": "shooting", "tolerance": 1e-14, "max_iterations": 100000}
     running = start(script(tmp_path, num_steps=400, options=options), tmp_path)
@@ -372,6 +376,7 @@ def test_what_the_audit_tells_can_be_typed_until_nothing_is_left_to_mend(tmp_pat
     assert exit_of(monkeypatch, "certify", "arm.urdf", "--states", "2", *typed) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 @each_row(
     "words, kept",

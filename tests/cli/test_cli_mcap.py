@@ -17,6 +17,8 @@ from drake_diff.optimize.solution import Solution
 from drake_diff.runs import measure
 from drake_diff.runs.trace import write_trace
 
+pytestmark = pytest.mark.solve
+
 STATE = TYPES["State"]
 
 

@@ -62,6 +62,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @each_row("change", CHANGES)
 @each_row("name", ["drake", "mujoco", "pinocchio"])
 def test_the_term_that_was_changed_is_found(tmp_path, name, change):

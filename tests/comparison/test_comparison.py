@@ -22,6 +22,8 @@ from drake_diff.exceptions import (
 )
 from drake_diff.model.tangent import tangent_space
 
+pytestmark = pytest.mark.solve
+
 G = 9.81
 
 
@@ -66,6 +68,7 @@ def test_the_motion_is_the_closed_form_of_a_throw(load):
         np.testing.assert_allclose(e.rollout_jacobian[row, column], 0.4, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_contact_laws_are_told_apart_and_the_free_part_is_not(load):
     needs("mujoco")
     needs("pinocchio")
@@ -223,6 +226,7 @@ def test_a_float32_engine_has_its_own_tolerance(load):
         assert by_name(dd.compare(model, (other,), num_steps=5))["single"].verdict == verdict
 
 
+@pytest.mark.slow
 @each_row("name, verdict", [("pinocchio", "other model"), ("mujoco", "other law")])
 def test_another_jacobian_in_contact_is_not_unexplained(load, name, verdict):
     """The motion never touches; at the sampled contact state Pinocchio has no contact, and MuJoCo another law of it."""

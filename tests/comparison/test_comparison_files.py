@@ -19,6 +19,8 @@ from drake_diff.logs import read_mcap
 from drake_diff.runs import ComparisonRecord
 from drake_diff.runs.sealed import own_sha256
 
+pytestmark = pytest.mark.solve
+
 
 @pytest.fixture(scope="module")
 def ball():

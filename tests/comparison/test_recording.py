@@ -21,6 +21,8 @@ from drake_diff.engines.formats import mjcf
 from drake_diff.exceptions import ArtifactError, InputError, ShapeError
 from drake_diff.logs import read_mcap
 
+pytestmark = pytest.mark.solve
+
 H = 0.01
 INPUTS = 2 * np.sin(np.arange(40))[:, None]
 
@@ -114,6 +116,7 @@ def explicit_damping(model, tmp_path):
     return engine_of("mujoco", model, path=path)
 
 
+@pytest.mark.slow
 @each_row(
     "change, as_if, term, verdict",
     [

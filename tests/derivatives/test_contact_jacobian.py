@@ -18,6 +18,8 @@ from drake_diff.model import contact_modes
 from drake_diff.model.parameters import select
 from drake_diff.model.step import set_state
 
+pytestmark = pytest.mark.solve
+
 MATERIAL = (
     "<drake:proximity_properties><drake:point_contact_stiffness>{k}</drake:point_contact_stiffness>"
     "<drake:relaxation_time>{tau}</drake:relaxation_time>"
@@ -202,6 +204,7 @@ MEETINGS = [
 ]
 
 
+@pytest.mark.slow
 @each_row("mine, other", MEETINGS)
 def test_other_shapes_meet_as_drake_lets_them(tmp_path, mine, other):
     """Two free bodies, or one on the ground, turned anyhow: differences of the step solved to rounding."""

@@ -31,6 +31,8 @@ from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.derivatives.sources import METHODS
 from drake_diff.exceptions import ModelError, ModelWarning, SimulationError, UnknownNameError
 
+pytestmark = pytest.mark.solve
+
 NAMES = sorted(path.name for path in MODELS.iterdir())
 BESIDE = 0.1  # [rad] or [m] inside joint limits: a step of 10 ms at 1 rad/s covers a tenth of it
 SAME = 1e-10  # two exact derivatives of one smooth step differ by rounding
@@ -64,6 +66,7 @@ def same_by_both(model, x, u=(), parameters=None, expected="implicit"):
     return found["implicit"]
 
 
+@pytest.mark.slow
 @each_row("name", NAMES)
 @each_row("seed", range(3))
 def test_every_model_of_this_repository(load, name, seed):

@@ -26,6 +26,8 @@ from drake_diff.mechanics.tree import ForwardDynamics
 from drake_diff.model.parameters import applied, select
 from drake_diff.motion import TVLQR
 
+pytestmark = pytest.mark.solve
+
 NAMES = sorted(path.name for path in MODELS.iterdir())
 SAME = 1e-9  # of the largest entry, as the gate has it: one derivative in two orders of operations
 
@@ -72,6 +74,7 @@ def test_a_thrown_body(load):
 # ---- AutoDiffXd ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @each_row("name", NAMES)
 def test_every_model_of_this_repository(load, name):
     model, random = load(name), np.random.default_rng(5)

@@ -240,6 +240,7 @@ def on_four_feet(approximation, random, stiffness=1e5, **options):
     return model, state
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("approximation", ["lagged", "similar", "sap"])
 def test_the_differences_on_four_feet_are_autodiffs(approximation):
     random = np.random.default_rng(3)
@@ -261,6 +262,7 @@ def test_the_differences_on_four_feet_are_autodiffs(approximation):
     assert np.all(found.left <= 1e-6)
 
 
+@pytest.mark.slow
 def test_a_box_in_point_contact_which_autodiff_does_not_have():
     made = Plant(H, "lagged")
     body = made.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.3, 0.3, 0.2, 0.1))
@@ -439,6 +441,7 @@ def test_a_robot_in_the_air_with_controllers():
 # ---- many robots -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "approximation", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("lagged", "similar")), "sap"]
 )

@@ -111,6 +111,7 @@ def test_what_is_not_known_goes_to_autodiff():
         differentiate_loss(lambda xs, us: np.sqrt((us * us).sum()), xs, us)
 
 
+@pytest.mark.solve
 def test_a_long_motions_loss_is_differentiated_in_time_that_grows_with_it(load):
     """By AutoDiffXd the 20,000 numbers of this motion would take minutes."""
     model, count = load("pendulum.urdf"), 10_000

@@ -72,6 +72,7 @@ def test_the_same_sphere_beside_the_axis_is_certified():
     dd.certify(model, x, method="autodiff").require()
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize(
     ("upper", "lower", "height"),
     slow_after(
@@ -144,6 +145,7 @@ def test_parameter_columns_have_their_closed_form(load):
     assert d.C[0] == pytest.approx([h * by_damping, h * by_mass], rel=1e-9)
 
 
+@pytest.mark.solve
 def test_every_listed_parameter_is_certified_at_a_good_state():
     model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.005)
     names = [p.name for p in dd.list_parameters(model)]

@@ -24,6 +24,8 @@ from drake_diff.engines.formats import inertial_urdf, urdf
 from drake_diff.exceptions import ModelError, ModelWarning
 from drake_diff.mechanics.description import describe
 
+pytestmark = pytest.mark.solve
+
 TURN = RigidTransform(RollPitchYaw(0.3, -0.4, 0.5), [0.1, -0.2, 0.3])
 BOX = SpatialInertia.SolidBoxWithMass(1.3, 0.1, 0.2, 0.3)
 

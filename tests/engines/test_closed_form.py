@@ -16,6 +16,8 @@ from drake_diff.engines import ClosedForm
 from drake_diff.engines.contract import UNKNOWN, is_another_model
 from drake_diff.exceptions import InputError, NonFiniteError, ShapeError, UnknownNameError
 
+pytestmark = pytest.mark.solve
+
 TRUE = {"cart": 1.0, "bob": 0.3, "length": 0.5, "g": 9.81, "coriolis": 1.0, "gain": 1.0}
 
 
@@ -90,6 +92,7 @@ WRONG = {  # what is wrong: parameters, the only part that is different, how it 
 }
 
 
+@pytest.mark.slow
 @each_row("what", WRONG)
 def test_a_wrong_term_is_found_and_named(load, what):
     model = load("cart_pole.urdf")
@@ -198,6 +201,7 @@ def test_the_record_has_the_functions_name_hash_and_parameters_and_verify_says_w
     assert any("mine: a user's function (cart_pole)" in told for told in checked.unchecked)
 
 
+@pytest.mark.slow
 def test_without_contact_equations_are_another_model_once_something_touches(load):
     model = load("sphere_on_ground.sdf", time_step=0.005)
     x0 = np.array(model.default_state)

@@ -16,6 +16,8 @@ from drake_diff.exceptions import ModelError
 from drake_diff.export.export import export_model, written
 from drake_diff.mechanics.description import describe
 
+pytestmark = pytest.mark.solve
+
 G, H = 9.81, 0.005
 
 
@@ -77,6 +79,7 @@ def test_a_changed_contact_is_another_model_and_its_line_says_so(ball, tmp_path,
     assert word in e.sentence
 
 
+@pytest.mark.slow
 def test_the_same_contact_holds_under_another_law_and_by_other_names(ball, tmp_path):
     names = (r'name="ground::ground#0"', 'name="floor"'), (r'name="sphere::ball#1"', 'name="my ball"')
     pair = (r'geom1="[^"]*" geom2="[^"]*"', 'geom1="floor" geom2="my ball"')
@@ -172,6 +175,7 @@ def test_the_form_of_the_law_is_named(ball, tmp_path, option, said):
     assert ("stiffness" in told) == ("pyramidal" in option)  # a pyramid's edges share the force
 
 
+@pytest.mark.slow
 def test_another_plant_in_drake_is_another_model(ball, tmp_path):
     text = (MODELS / "sphere_on_ground.sdf").read_text()
     for old, new, quantity in (

@@ -20,6 +20,7 @@ MJX = pytest.param("mjx", marks=pytest.mark.slow)  # JAX compiles for seconds
 ENGINES = ["drake", "mujoco", MJX, "pinocchio", "casadi"]
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("name", ENGINES)
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_change_is_found_and_named(tmp_path, name, change):
@@ -55,6 +56,7 @@ HAND = {
 }  # fmt: skip
 
 
+@pytest.mark.solve
 @each_row("change", HAND)
 def test_a_change_of_a_hand_calculation_is_found_and_named(load, change):
     file, form, quantities = HAND[change]

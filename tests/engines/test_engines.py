@@ -57,6 +57,8 @@ from drake_diff.exceptions import (
 )
 from drake_diff.model.tangent import tangent_space
 
+pytestmark = pytest.mark.solve
+
 # ---- hand calculations -------------------------------------------------------------------------------------------
 
 
@@ -612,6 +614,7 @@ def test_a_model_that_other_engines_would_simulate_otherwise_is_refused(name, ki
         engine_of(name, model)
 
 
+@pytest.mark.slow
 @each_row("name, module, extra", [(name, m, extra) for name, (modules, extra) in NEEDED.items() for m in modules])
 def test_a_missing_engine_is_named_with_its_extra(name, module, extra):
     needs(name)

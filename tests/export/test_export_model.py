@@ -25,6 +25,8 @@ from drake_diff.export.export import complaints, export_model, written
 from drake_diff.mechanics.description import describe, describe_whole
 from drake_diff.model.tangent import sample_states
 
+pytestmark = pytest.mark.solve
+
 FILES = {"contract.json", "initial_states.csv", "inputs.csv", "README.md"}
 MODEL_FILE = {
     "gazebo": "model.sdf", "isaaclab": "model.urdf", "urdf": "model.urdf", "sdf": "model.sdf", "mjcf": "model.xml",
@@ -117,6 +119,7 @@ def test_shapes_come_back_where_they_were(load, tmp_path, form):
             assert theirs.contract.contacts[0].friction == 0.5
 
 
+@pytest.mark.slow
 @each_row(
     "form, element, named",
     [

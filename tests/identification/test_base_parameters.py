@@ -12,6 +12,7 @@ from drake_diff.identification.base import NAMES
 from drake_diff.identification.tree import ten_numbers, tree_for_identification
 
 
+@pytest.mark.slow
 def test_two_rods_have_the_textbooks_sums(load):
     """Rods of 1 kg and 0.8 m, 0.7 kg and 0.5 m: I1 + l1^2 m2, m1 c1 + l1 m2, I2, m2 c2; none weighs sideways."""
     found = {next(iter(b.parts)): b for b in base_parameters(load("double_pendulum.urdf"))}

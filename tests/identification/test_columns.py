@@ -9,6 +9,8 @@ import pytest
 import drake_diff as dd
 from drake_diff.identification.columns import side_by_side
 
+pytestmark = pytest.mark.solve
+
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 PERIOD = 0.01
 
@@ -36,6 +38,7 @@ def swung(load):
     return model, recorded(model, [0.5, -0.3], us, velocities=True), us
 
 
+@pytest.mark.slow
 def test_exchanged_and_mirrored_columns_and_degrees_are_named(swung):
     model, xs, us = swung
     q, v, u = (*model.position_names,), (*model.velocity_names,), (*model.input_names,)
@@ -54,6 +57,7 @@ def test_exchanged_and_mirrored_columns_and_degrees_are_named(swung):
         assert w.sentence == f"{words}: this explains the recording."
 
 
+@pytest.mark.slow
 def test_right_columns_are_not_named(swung):
     assert said(*swung).sentence == "Nothing: the model explains it."
 
@@ -70,25 +74,6 @@ def test_what_a_mirror_does_not_change_is_told_as_it_is(load):
         (f"column {name} has the other sign",) for name in (model.position_names[0], model.input_names[0])
     }
     assert w.sentence.endswith("the recording cannot tell.")
-
-
-@pytest.mark.slow
-def test_mistaken_columns_of_an_arm_that_another_engine_moved_are_named():
-    """MuJoCo with an encoder's noise, by the benchmark of causes."""
-    pytest.importorskip("mujoco")
-    import identify
-
-    model, log, _ = identify.recorded("ur5_robot", (), 41)
-    q, u = model.position_names, model.input_names
-    swapped, mirrored, inputs = log.xs.copy(), log.xs.copy(), log.us.copy()
-    swapped[:, [1, 2]], mirrored[:, 3], inputs[:, [0, 1]] = log.xs[:, [2, 1]], -log.xs[:, 3], log.us[:, [1, 0]]
-    for xs, us, words in (
-        (swapped, log.us, f"columns {q[1]} and {q[2]} are exchanged"),
-        (mirrored, log.us, f"column {q[3]} has the other sign"),
-        (log.xs, inputs, f"columns {u[0]} and {u[1]} are exchanged"),
-        (np.degrees(log.xs), log.us, f"6 columns of angles, {q[0]} to {q[5]}, have degrees, not radians"),
-    ):
-        assert said(model, xs, us).names == (words,)
 
 
 def test_a_mistake_whose_motion_cannot_be_computed_leaves_the_others_theirs():

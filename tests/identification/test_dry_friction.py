@@ -19,6 +19,8 @@ from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 
+pytestmark = pytest.mark.solve
+
 MASS, FRICTION = 2.0, 0.3 * 2.0 * 9.81  # [kg], [N] of a block on a floor
 H, N = 0.01, 180  # [s] between samples
 NOISE = 1e-4  # [m]
@@ -82,6 +84,7 @@ def test_a_block_that_comes_to_rest_and_stays_has_its_friction(write_urdf, tmp_p
     assert dd.verify(tmp_path / "run").holds  # which fits again
 
 
+@pytest.mark.slow
 def test_friction_that_creeps_is_not_sold_as_dry_friction(write_urdf):
     """By c tanh(v / 0.05 m/s) the block creeps where dry friction would hold it."""
     us, at = pushes(9.0), H * np.arange(N + 1)
@@ -124,6 +127,7 @@ def test_the_friction_of_a_joint_that_follows_another_holds_both(tmp_path):
     assert low < FRICTION / 0.4 < high < low + 0.02 * FRICTION / 0.4
 
 
+@pytest.mark.slow
 def test_friction_that_holds_is_named_where_a_joint_follows_another(tmp_path):
     """Of either joint: 1 N of the one and 1/0.4 N of the other do the same."""
     us = pushes(9.0)
@@ -250,6 +254,7 @@ def fit_of(model, law, unknowns, us, xs, times, seed):
     return fit, xs[fit.segments.first].copy()
 
 
+@pytest.mark.slow
 def test_a_fit_of_which_least_is_left_at_a_kink_ends_there(load):
     """A joint stops just when its input changes: a little later or earlier it goes on otherwise, and noise wants both.
 
@@ -337,6 +342,7 @@ def test_a_fit_by_steps_frozen_halfway_ends_where_one_by_their_own_derivatives_d
         assert abs(off[0]) < 0.01  # [standard deviations]: least squares end within 1e-5 of |r|^2, which is 0.003
 
 
+@pytest.mark.slow
 def test_a_held_joint_that_is_taken_for_moving_at_first_is_found_at_rest_in_a_few_steps(load):
     """Its way to the stop is as v^2, which says ever less of v: plain steps take up to 15 here."""
     model, count = load("double_pendulum.urdf"), 100

@@ -13,6 +13,8 @@ from drake_diff.comparison import read_recording
 from drake_diff.exceptions import DrakeDiffError, InputError, UnknownNameError
 from drake_diff.identification import excite
 
+pytestmark = pytest.mark.solve
+
 
 def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motion_gives(write_urdf):
     """x = x0 + v0 t + s (double integral of u / m): linear in x0, v0 and the strength s; the mass is one over it."""

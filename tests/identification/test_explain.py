@@ -27,6 +27,8 @@ from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknown
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.runs.read import load_record
 
+pytestmark = pytest.mark.solve
+
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 
@@ -256,6 +258,7 @@ def test_a_delay_and_a_limit_of_inputs_are_named(pendulum):
     assert w.values["motor.limit"] == pytest.approx(2.5, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_of_a_right_model_nothing_is_said(pendulum, seed):
     for log in (swing(seed=seed), driven(seed=seed)):
@@ -281,31 +284,6 @@ def test_chance_names_a_change_of_a_right_arm_in_less_than_0_3_percent():
 
 
 @pytest.mark.slow
-def test_of_an_arm_that_another_engine_moved_a_right_model_is_silent_and_an_error_is_named():
-    """MuJoCo with an encoder's noise, by the benchmark: nothing is changed, or a joint's damping is."""
-    pytest.importorskip("mujoco")
-    import identify
-
-    assert identify.measure("ur5_robot", (), 41)["verdict"] == "right"
-    assert identify.measure("ur5_robot", ("damping",), 42)["verdict"] == "named"
-    assert identify.measure("panda", ("mass",), 105)["verdict"] == "named"
-    for robot, kind, seed in (  # of which fits were once stuck, and a second change was named too
-        ("hextilt_flying_arm_5", "input_delay", 870018),
-        ("quadruped", "damping", 930133),
-        ("a1", "coulomb_friction", 930139),
-        ("so101", "damping", 1000014),  # which makes its gripper too stiff for the steps that the model needs
-    ):
-        assert identify.measure(robot, (kind,), seed)["verdict"] == "named", robot
-    two = identify.measure("double_pendulum_simple", ("damping", "input_delay"), 230017)
-    assert two["verdict"] == "named", two
-    arm = identify.measure("kinova", ("input_delay", "strength"), 330004)
-    assert arm["verdict"] == "named", arm
-    gives = identify.measure("double_pendulum_simple", ("coulomb_friction",), 210037, soft=True)
-    assert gives["verdict"] == "named", gives
-    assert "gives way" in gives["said"]
-
-
-@pytest.mark.slow
 def test_what_moves_within_less_than_the_time_between_samples_is_found():
     """A light leg with more damping, of which steps of 10 ms have no motion: MuJoCo's, by the benchmark."""
     pytest.importorskip("mujoco")
@@ -319,6 +297,7 @@ def test_what_moves_within_less_than_the_time_between_samples_is_found():
     assert set(dd.explain(model, recording, motion="continuous").names) == set(truth.changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("step", "names"), [pytest.param(0.005, (), marks=pytest.mark.slow), (0.0025, ("model.time_step",))]
 )
@@ -339,6 +318,7 @@ def test_the_length_of_a_simulators_steps_is_named(load, step, names):
         assert w.values["model.time_step"] == pytest.approx(step)
 
 
+@pytest.mark.slow
 def test_a_comparison_with_a_recording_names_the_cause(pendulum, tmp_path):
     """In the terminal, in the record and on the page; where nothing can be looked for, why."""
     log = swing(damping=0.2, velocities=True)
@@ -360,6 +340,7 @@ def test_a_comparison_with_a_recording_names_the_cause(pendulum, tmp_path):
         assert each["lab"].sentence in text
 
 
+@pytest.mark.slow
 def test_a_law_that_no_parameter_has_is_not_explained(pendulum):
     """A wall that stops the measured angle."""
     log = swing(noise=1e-4)

@@ -19,6 +19,8 @@ from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.runs.sealed import own_sha256
 
+pytestmark = pytest.mark.solve
+
 
 def write_swing(path, *, damping=0.15, seed=0, friction=0.0):
     """A CSV file of a pendulum of 1 kg at 0.5 m by its equation of motion: positions with noise of 1 mrad."""

@@ -20,6 +20,8 @@ from drake_diff.identification.tree import Dynamics, tree_for_identification
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
 from drake_diff.model.step import set_state
 
+pytestmark = pytest.mark.solve
+
 
 @pytest.fixture
 def pendulum(load):

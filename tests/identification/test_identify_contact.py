@@ -13,6 +13,8 @@ from drake_diff.identification.impacts import shrink_to, start_of
 from drake_diff.identification.recordings import Chart, read_pieces
 from drake_diff.mechanics.description import coordinates_of
 
+pytestmark = pytest.mark.solve
+
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 
@@ -126,6 +128,7 @@ def noisy(ball, friction, seed):
     return found
 
 
+@pytest.mark.slow
 def test_identify_goes_through_impacts_and_says_whether_they_are_explained(ball):
     def fit(friction, **more):
         logs = noisy(ball, friction, 1)
@@ -177,28 +180,3 @@ def test_the_spread_of_a_first_state_is_that_of_first_states_by_other_noise(ball
     # Of 20 flights, the root of chi^2 / 19 is within 0.55 and 1.55 for 12 numbers together, 1 in 100 times not.
     ratio = scattered / np.sqrt(np.mean(np.square(told), axis=0))
     assert np.all((ratio > 0.55) & (ratio < 1.55)), ratio
-
-
-@pytest.mark.slow
-def test_a_cubes_half_width_and_friction_are_found_from_tosses_by_the_same_steps():
-    import cube_tosses as tosses
-
-    true = tosses.model_of(1, np.zeros(3), half_width=0.0534)
-    truth = {"cube.friction": 0.11, "cube.stiffness": 3e4, "cube.relaxation_time": 0.008}
-    rng, recordings = np.random.default_rng(0), []
-    for k in range(8):
-        turn = rng.standard_normal(4)
-        x0 = np.concatenate([turn / np.linalg.norm(turn), [0, 0, 0.16], rng.uniform(-3, 3, 3), [1.0, 0.3, -0.2]])
-        xs = dd.rollout(true, x0, np.zeros((100, 0)), parameters=truth).xs.copy()
-        xs[:, 6] -= 0.001  # the ground is 1 mm lower
-        recordings.append(tosses.recording(f"toss {k}", xs))
-    names = ["cube_z.bias", "cube.friction", "cube.stiffness", "cube.relaxation_time"]
-
-    def build(half_width):
-        return tosses.model_of(1, np.zeros(3), half_width=half_width)
-
-    found = identify_contact(build, recordings, names, lengths={"half_width": 0.0524})
-    # The half width to 0.5 %, half of what is asked of the real tosses.
-    assert found.values["half_width"] == pytest.approx(0.0534, rel=5e-3)
-    assert found.values["cube_z.bias"] == pytest.approx(-0.001, abs=3e-4)
-    assert found.values["cube.friction"] == pytest.approx(0.11, rel=0.03)

@@ -17,6 +17,8 @@ from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 
+pytestmark = pytest.mark.solve
+
 
 def pushed(t, us, period, delay, mass):
     """Where a block is that inputs push, each held for a period, `delay` later than recorded: the double integral."""
@@ -38,6 +40,7 @@ def rail(model, delay, mass=2.0, noise=1e-3, n=150):
     return dd.Recording("rail", "1", t, np.column_stack([x, np.full(n + 1, np.nan)]), us[:, None])
 
 
+@pytest.mark.slow
 def test_a_delay_is_found_to_a_part_of_a_sample(write_urdf):
     model = write_urdf(mass=2.0)
     for delay in (0.013, 0.06):

@@ -19,6 +19,8 @@ from drake_diff.identification.tree import Dynamics, Numbers, tree_for_identific
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.step import set_state
 
+pytestmark = pytest.mark.solve
+
 POSE = (0.1, -0.05, 0.2, 0.3, -0.4, 0.5)
 
 

@@ -100,6 +100,7 @@ def test_an_sdf_file_takes_springs_too(load, tmp_path):
     same(model, path, {**values, "block.inertia": inertia * 1.25})
 
 
+@pytest.mark.solve
 @each_row("seed", range(12))
 def test_random_bodies_come_out_as_they_were_found(arm, tmp_path, seed):
     rng = np.random.default_rng(seed)

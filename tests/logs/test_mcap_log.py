@@ -21,6 +21,8 @@ from drake_diff.logs import mcap_file
 from drake_diff.logs.channels import MESSAGES, TYPES
 from drake_diff.logs.mcap_file import CHUNK_SIZE, Channel, read_mcap, recover_mcap, write_mcap
 
+pytestmark = pytest.mark.solve
+
 STATE = TYPES["State"].cls
 
 
@@ -194,6 +196,7 @@ def test_an_attachment_whose_checksum_is_wrong_is_refused_though_every_other_hol
         read_mcap(path)
 
 
+@pytest.mark.slow
 def test_a_long_log_is_streamed_not_gathered(tmp_path):
     """40,000 messages are over 10 MB as Python objects; a few chunks and their indexes are far less."""
     messages = ((k, STATE(time=k, q=[k] * 10)) for k in range(40_000))

@@ -16,6 +16,8 @@ from drake_diff.loop.run import Loop, Push, closed_loop
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion import LQR
 
+pytestmark = pytest.mark.solve
+
 
 def gain(kp, kd):
     return lambda x, t: np.array([-kp * x[0] - kd * x[1]])

@@ -15,6 +15,8 @@ from drake_diff.model.step import advance
 from drake_diff.motion import TVLQR
 from drake_diff.optimize.replay import goal_check, regulator_weights
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
@@ -98,6 +100,7 @@ def test_the_pushed_cart_pole_ends_upright(swung):
     assert runs["mpc"].ended == ""
 
 
+@pytest.mark.slow
 def test_the_same_calls_give_the_same_bytes_and_start_forgets(swung):
     def run(mpc):
         loop = dd.loop.Loop(pushes=[dd.loop.Push("pole", [1.0, 0, 0], 0.1)])

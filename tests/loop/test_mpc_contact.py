@@ -11,6 +11,8 @@ import drake_diff as dd
 from drake_diff.model.step import advance
 from drake_diff.optimize.realtime import step as realtime
 
+pytestmark = pytest.mark.solve
+
 G, FRICTION = 9.81, 0.5
 
 

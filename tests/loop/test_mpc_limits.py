@@ -15,6 +15,8 @@ from drake_diff.exceptions import InputError
 from drake_diff.loop import MPC, Loop, Push, closed_loop
 from drake_diff.optimize.realtime import step as realtime_step
 
+pytestmark = pytest.mark.solve
+
 H, COUNT, Q, R, QF = DOUBLE_INTEGRATOR
 A, B = np.array([[1, H], [0, 1]]), np.array([[H**2], [H]])
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -122,6 +124,7 @@ def test_a_limit_that_the_motion_need_not_pass_is_never_traded_for_its_cost():
     assert mpc.status == "ok"
 
 
+@pytest.mark.slow
 @each_row("horizon", [6, 40])
 def test_a_waypoint_is_met_at_the_problems_own_knot(horizon):
     problem = dd.Problem(
@@ -248,6 +251,7 @@ def test_another_iteration_that_would_be_late_is_not_begun():
     assert mpc.missed == 0
 
 
+@pytest.mark.slow
 @each_row("wrong", ["sign", "half", "transposed"])
 def test_wrong_derivatives_are_seen(wrong):
     """B of the other sign, of half its size, or A transposed: the plant does not do what they promise."""

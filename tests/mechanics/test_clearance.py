@@ -48,6 +48,8 @@ from drake_diff.mechanics.placing import placing_of
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import any_state
 
+pytestmark = pytest.mark.solve
+
 ROBOTS = ("ur5_robot.urdf", "panda.urdf", "a1.urdf")  # hinges; hinges and slides; a free base
 CLOSED = 1e-9  # [m] of metres: closed forms on both sides
 # [m] For a pair of capsules Drake has no closed form: its library searches, and stops above the least distance. Ours is

@@ -52,6 +52,7 @@ def test_steps_with_impulses_are_autodiffs(approximation, time_step):
     assert seen >= 3
 
 
+@pytest.mark.solve
 @each_row("table", ["mass", "center", "moves"])
 def test_a_wrong_number_in_the_tables_is_found_out(table, monkeypatch):
     """By Drake's solution, which does not solve such a step, or by AutoDiffXd's Jacobian."""

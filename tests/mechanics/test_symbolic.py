@@ -25,6 +25,8 @@ from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.optimize.transcription.expressions import SymbolicPlant, trace
 from drake_diff.optimize.transcription.program import TranscribedProgram
 
+pytestmark = pytest.mark.solve
+
 EXACT = "symbolic, exact Hessian"
 FORMS = {
     "ordinary": lambda x, u: np.array([-(x[1] ** 2) / u[0] + 3, 2.0 - x[0] * np.float64(2.0) ** x[1]]),

@@ -43,6 +43,7 @@ def by_drake(model, x, a):
     return ExtractValue(tau).ravel(), ExtractGradient(tau), model.plant.CalcMassMatrix(model.double.context)
 
 
+@pytest.mark.solve
 @each_row("seed", range(12))
 def test_a_random_tree_is_drakes_entry_by_entry(seed):
     model, random = random_tree(seed), np.random.default_rng(100 + seed)
@@ -159,6 +160,7 @@ def test_a_tree_that_is_not_drakes_is_not_used(monkeypatch):
     assert pytest.approx(b.A, abs=1e-10) == a.A
 
 
+@pytest.mark.solve
 @each_row("name", ["cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf", "double_pendulum.urdf"])
 def test_a_whole_rollout_in_one_call_is_the_one_by_autodiff(load, name):
     model = load(name)

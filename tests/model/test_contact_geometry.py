@@ -359,6 +359,7 @@ def hydroelastic(shape, half_space):
     return properties
 
 
+@pytest.mark.slow
 @each_row("contact_model", ["point", "hydroelastic", "hydroelastic_with_fallback"])
 @each_row("a, b", list(combinations_with_replacement(SHAPES, 2)))
 def test_autodiff_throws_where_the_table_says_so_and_nowhere_else(shapes, a, b, contact_model):

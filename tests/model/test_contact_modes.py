@@ -83,6 +83,7 @@ def test_a_change_of_mode_beside_the_step_is_named_with_the_entries_it_touches()
     assert "touches d(ball_z_x, ball_z_v)/dball_z_x" in str(changes[0])
 
 
+@pytest.mark.slow
 def test_at_the_edge_of_friction_the_push_changes_the_mode():
     """sap: at 0.3 N short of mu m g no change within 1e-4 N, at the limit one."""
     model, x = pushed_ball("sap"), [0.0, REST, 0.0, 0.0]
@@ -93,6 +94,7 @@ def test_at_the_edge_of_friction_the_push_changes_the_mode():
     assert not dd.certify(model, x, [limit - 0.3]).mode_changes
 
 
+@pytest.mark.solve
 @each_row("z, vx, vz", [(0.3, 1.0, -1.0), (REST, 1.0, 0.0), (0.097, 0.5, -0.5), (0.0985, 0, 0.3)])
 @each_row("approximation", ["sap", "similar", "lagged"])
 def test_no_good_contact_state_is_flagged(z, vx, vz, approximation):

@@ -490,6 +490,7 @@ def lander(time_step):
     return dd.load_model(MODELS / "quadrotor.urdf", time_step=time_step, body_forces=[engine])
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize(
     ("method", "steps", "close"),
     [

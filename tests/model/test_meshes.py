@@ -188,6 +188,7 @@ def test_spheres_are_inside_and_their_gaps_are_true():
         assert np.max(apart) <= spheres.open_gap + 1e-9
 
 
+@pytest.mark.solve
 @each_row("treatment", ["convex", "spheres"])
 def test_a_foot_rests_at_its_height(tmp_path, treatment):
     shapes().box(EDGES).export(tmp_path / "box.stl")
@@ -229,6 +230,7 @@ def test_all_spheres_have_what_the_file_gives_to_the_mesh(tmp_path):
     assert {friction.static_friction() for friction in frictions} == {0.3}
 
 
+@pytest.mark.solve
 def test_what_the_file_says_of_mass_stays():
     path = robot_file("panda.urdf")
     models = [load_quietly(path, meshes) for meshes in ("skip", "convex", "spheres")]

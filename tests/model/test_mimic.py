@@ -16,6 +16,8 @@ from drake_diff.mechanics.description import describe
 from drake_diff.model.plant import actuators
 from drake_diff.model.plant import joints as joints_of
 
+pytestmark = pytest.mark.solve
+
 H = 0.01
 ROUNDING = 1e-11  # of v' of size 1 to 10: sums of a few products, and a linear system of one to eight unknowns
 LINK = (

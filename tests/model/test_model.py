@@ -20,6 +20,7 @@ from drake_diff.model.parameters import applied, select
 NAMES = sorted(p.name for p in MODELS.iterdir())
 
 
+@pytest.mark.solve
 @each_row("name", NAMES)
 def test_every_model_loads_without_a_warning_and_steps_and_differentiates(load, name):
     with warnings.catch_warnings():
@@ -187,6 +188,7 @@ BAD_FILES = {
 }
 
 
+@pytest.mark.solve
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 @each_row("name", BAD_FILES)
 def test_a_file_that_is_no_robot_is_refused_with_its_name_and_what_was_got(tmp_path, name):

@@ -37,6 +37,8 @@ from drake_diff.model.parameters import (
     to_log_cholesky,
 )
 
+pytestmark = pytest.mark.solve
+
 G = 9.81
 SMOOTH = 1e-9  # autodiff and the chain rule, through one step that nothing iterates on
 CONTACT = 1e-6  # SAP solves a step to 1e-6, and its Jacobian and differences are as accurate
@@ -701,6 +703,7 @@ def test_an_arm_with_all_values_given_is_the_arm_built_with_them():
     same_motion(arm(), values, arm(**ARM_CHANGES), np.array(x), np.tile(u, (8, 1)))
 
 
+@pytest.mark.slow
 @each_row("approximation", ["lagged", "sap", "similar"])
 @each_row("name", [name for name in BALL_CHANGES if "modulus" not in name])
 def test_a_ball_with_a_value_given_is_the_ball_built_with_it(name, approximation):
@@ -712,6 +715,7 @@ def test_a_ball_with_a_value_given_is_the_ball_built_with_it(name, approximation
     same_motion(model, {name: BALL_CHANGES[name]}, built, ball_state(model), np.zeros((8, 0)))
 
 
+@pytest.mark.slow
 @each_row("name", ["ball.hydroelastic_modulus", "ball.friction"])
 def test_a_hydroelastic_ball_with_a_value_given_is_the_ball_built_with_it(name):
     made = [ball("lagged", "hydroelastic", **change) for change in ({}, {name: BALL_CHANGES[name]})]

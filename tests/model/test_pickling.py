@@ -15,6 +15,8 @@ from drake_diff import exceptions
 from drake_diff.exceptions import InputError, ModelError, NonFiniteError, ShapeError, UnknownNameError
 from drake_diff.model.contact import SoftContact, softened
 
+pytestmark = pytest.mark.solve
+
 SECONDS = 120  # a pool that waits for ever fails here
 GIVEN = {
     InputError: [

@@ -132,6 +132,7 @@ MJCF = (
 )
 
 
+@pytest.mark.solve
 @each_row("name, text", [("m.sdf", SDF.format(0)), ("m.xml", MJCF), ("m.dmd.yaml", "")])
 def test_the_repairs_are_the_same_in_every_format(tmp_path, name, text):
     if name == "m.dmd.yaml":

@@ -15,6 +15,8 @@ from drake_diff.exceptions import InputError
 from drake_diff.model.contact import separations
 from drake_diff.model.step import set_state
 
+pytestmark = pytest.mark.solve
+
 SOFT = dd.model.SoftContact(0.05, 200.0)
 
 

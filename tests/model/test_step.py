@@ -126,6 +126,7 @@ def test_sap_contact_step(h, k, tau, depth, v):
     assert d.A[1] == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
+@pytest.mark.slow
 @each_row("approximation", APPROXIMATIONS)
 @each_row("k_ball, k_ground", [(1e4, 1e4), (2000.0, 6000.0)])
 def test_static_penetration_is_weight_over_stiffness(approximation, k_ball, k_ground):

@@ -7,12 +7,14 @@ import sys
 
 import pytest
 from helpers.strange import DIRECTIVES, FILES, MJCF, URDF, broken, ends, put
-from helpers.table import each_row, slow_after
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.sandbox import crash_of
 from drake_diff.cli import main as cli
 from drake_diff.exceptions import ModelError
+
+pytestmark = pytest.mark.solve
 
 ENDINGS = tuple(FILES)
 
@@ -36,7 +38,7 @@ def test_the_whole_files_load(tmp_path, ending):
     assert end == "'ok'"
 
 
-@pytest.mark.parametrize(("seed", "count"), slow_after(1, [(0, 50), (1, 400)]))
+@pytest.mark.parametrize(("seed", "count"), [(0, 50)])
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_broken_files_end_in_an_error_that_names_the_file(tmp_path, ending, seed, count):
     check(tmp_path, ending, seed, count)
@@ -92,6 +94,7 @@ def ends_a_process(path):
     return subprocess.run([sys.executable, "-c", read, str(path)], capture_output=True, check=False).returncode < 0
 
 
+@pytest.mark.slow
 @each_row(
     "command, ending",
     [("audit", "obj"), ("certify", "vtk"), ("plan", "vtk")],

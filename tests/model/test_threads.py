@@ -11,6 +11,8 @@ import drake_diff as dd
 from drake_diff.exceptions import ModelError
 from drake_diff.model.step import advance
 
+pytestmark = pytest.mark.solve
+
 SOLVES = (("collocation", None), ("shooting", None), ("ilqr", None))
 
 

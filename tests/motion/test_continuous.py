@@ -46,6 +46,7 @@ def test_the_damped_pendulum(load, q, w, u):
 NAMES = ("cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf", "projectile.sdf")
 
 
+@pytest.mark.solve
 @each_row("name", NAMES)
 def test_values_and_derivatives_are_those_of_drakes_continuous_plant(load, name):
     model, random = load(name), np.random.default_rng(0)

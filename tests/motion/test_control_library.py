@@ -22,6 +22,7 @@ def linearized(engine, model):
     return engine.differentiate_step(x, np.zeros(model.nu))
 
 
+@pytest.mark.solve
 @each_row("name", ENGINES)
 def test_the_poles_of_a_mass_on_a_spring(load, control, name):
     """M v' = M v - h (k q + d v'), q' = q + h v': poles of det (z^2 (1 + h d/m) - z (2 + h d/m - h^2 k/m) + 1) = 0."""

@@ -26,6 +26,8 @@ from drake_diff.motion.flow.integrate import Integrator, pushing_of
 from drake_diff.motion.flow.plant import flow_plant, material_of, numbers_of
 from drake_diff.motion.flow.steps import FlowSteps
 
+pytestmark = pytest.mark.solve
+
 
 def ball_on_rails(*, stiffness, dissipation=0.0, friction=0.0, gravity=0.0, approximation="lagged", relaxation=0.0):
     """1 kg, radius 0.1 m, on rails along x and z above the ground; `stiffness` is that of the pair."""

@@ -13,6 +13,8 @@ import drake_diff as dd
 from drake_diff.model.parameters import from_log_cholesky, room_of_inertia, to_log_cholesky
 from drake_diff.optimize.solution import Status
 
+pytestmark = pytest.mark.solve
+
 G = 9.81
 SEEDS = range(6)
 RECOVERED = 1e-4  # relative
@@ -61,6 +63,7 @@ def all_recovered(outcomes, *, certified=True):
     assert {seed: s.message for seed, (s, _, _) in outcomes.items() if s.status not in accepted} == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "parameter", "size"),
     [
@@ -193,6 +196,7 @@ def test_controls_initial_state_and_parameters_together_at_a_known_optimum(write
     assert solution.cost == pytest.approx(best @ (best / inverse), rel=1e-7)
 
 
+@pytest.mark.slow
 def test_no_difference_of_the_objective_leads_down_from_a_joint_optimum(load):
     """A sprung block that is to swing along: all of inputs, start, stiffness and rest length are at their best."""
     model, count = load("mass_spring_damper.sdf", time_step=0.05), 40

@@ -281,6 +281,7 @@ def test_the_gradient_through_tvlqr_is_that_of_rollouts(load):
     check_gradients(model, tvlqr, [0.3, -0.2], 10, ("pole.mass",))
 
 
+@pytest.mark.solve
 def test_the_gradient_through_a_neural_network_is_that_of_rollouts(load):
     model, random = load("cart_pole.urdf", time_step=0.02), np.random.default_rng(5)
     policy = ParametricPolicy(network, 0.5 * random.standard_normal(97))
@@ -383,6 +384,7 @@ def test_a_policy_cannot_change_the_state_it_is_given():
     assert x[0] == 0.3
 
 
+@pytest.mark.solve
 def test_a_long_tvlqr_is_differentiated_by_the_gains_that_act(write_urdf):
     """5000 steps: only two of the 10000 parameters carry derivatives at a time."""
     model, count = write_urdf(), 5000

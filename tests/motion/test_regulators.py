@@ -23,6 +23,8 @@ import drake_diff as dd
 from drake_diff.motion import TVLQR
 from drake_diff.optimize.replay import regulator_weights
 
+pytestmark = pytest.mark.solve
+
 NAMES = ("cart_pole", "acrobot")
 FILES = {"cart_pole": "cart_pole.urdf", "acrobot": "acrobot.xml"}
 

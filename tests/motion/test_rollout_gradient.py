@@ -65,6 +65,7 @@ def test_the_projectiles_jacobian_is_exact(load):
         assert g.by_x0[10:] == pytest.approx(np.eye(3)[i], abs=1e-12)
 
 
+@pytest.mark.solve
 @each_row("masses", [(1.0, 1.0), (1.0, 2.0)])
 @each_row("approximation", ["lagged", "sap"])
 def test_momentum_invariants_of_a_collision(masses, approximation):
@@ -110,6 +111,7 @@ def bouncing_ball(k):
     return plant.model()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("k", "at_least"), slow_after(1, [(1e3, 0.05), (1e4, 0.5)]))
 def test_a_compliant_bounce_does_not_have_the_rigid_gradient(k, at_least):
     """A bounce off the ground without loss has dy/dy0 = dy/dv0 = -1. That of Drake's discrete contact is

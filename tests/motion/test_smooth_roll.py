@@ -13,7 +13,7 @@ from drake_diff.motion.smooth_roll import SmoothRoll, smooth_roll_of
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.program import Limits, Outcome
 
-pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning"), pytest.mark.solve]
 
 
 def arm(file, time_step=0.01):

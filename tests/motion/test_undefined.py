@@ -4,7 +4,6 @@ import warnings
 
 import numpy as np
 import pytest
-from helpers.bounces import RADIUS, Bounce
 from helpers.models import Plant, contact_properties
 from pydrake.geometry import Sphere
 
@@ -38,6 +37,7 @@ def gradient(model, x0, loss, steps, **more):
     return g, [one.column for one in g.undefined]
 
 
+@pytest.mark.solve
 def test_a_clean_bounce_and_a_pendulum_are_defined():
     g, undefined = gradient(ball(), [0, 1.0, 0, -2.0], lambda x: x[1], 100)
     assert undefined == []
@@ -120,6 +120,7 @@ def test_where_a_motion_a_little_away_has_no_end_is_told():
     assert "slide_x[0]" in [one.column for one in g.undefined]
 
 
+@pytest.mark.solve
 def test_a_derivative_that_is_not_the_slope_that_there_is_is_not_called_undefined(monkeypatch):
     """Steps that are too long for the derivative: taken again at a hundredth of the tolerance; then it is named."""
     model, x0 = ball(gravity=9.81), [0, 0.5, 0.3, 0]
@@ -177,40 +178,3 @@ def test_where_no_width_has_a_slope_there_is_no_number():
         g.undefined[0].smooth(30)
     with pytest.raises(InputError, match="at least 4"):
         g.undefined[0].smooth(3)
-
-
-def smoothed_truth(ball, approximation, start, column, width, duration):
-    """E[f(x + w) w] / width^2 of the last rate, by the trapezoid rule on motions event by event."""
-    nodes = np.linspace(-6, 6, 801)
-    moved = [np.array(start) + width * z * np.eye(2)[column] for z in nodes]
-    ends = np.array([ball.end(approximation, one, duration)[1] for one in moved])
-    return np.trapezoid(ends * nodes * np.exp(-(nodes**2) / 2) / np.sqrt(2 * np.pi), nodes) / width
-
-
-@pytest.mark.slow
-def test_intervals_of_smoothed_slopes_cover_those_of_an_integration_event_by_event(tmp_path):
-    """By seed, both laws: a ball that touches the ground at the end, or not. That 3 of 10 miss has a chance of 1 %."""
-    random, inside, of, duration = np.random.default_rng(5), 0, 0, 0.3
-    for i in range(10):
-        approximation = ("lagged", "sap")[i % 2]
-        ball = Bounce(
-            10 ** random.uniform(3, 4),
-            relaxation_time=random.uniform(0, 5e-3) if approximation == "sap" else 0.0,
-            dissipation=random.uniform(0, 0.5) if approximation == "lagged" else 0.0,
-        )
-        v = random.uniform(-1, 0.5)
-        gap = random.choice([-1, 1]) * 10 ** random.uniform(-5, -2.5)
-        start = [RADIUS + gap - v * duration + 9.81 * duration**2 / 2, v]
-        model = ball.model(tmp_path / "ball.sdf", approximation, 0.01)
-        g, _ = gradient(model, start, lambda x: x[1], 30)
-        for one in g.undefined[:1]:
-            try:
-                found = one.smooth(60, seed=i)
-            except GradientError:
-                continue
-            column = [f"{name}[0]" for name in model.state_names].index(one.column)
-            exact = smoothed_truth(ball, approximation, start, column, float(found.noise.sigma), duration)
-            inside += abs(found.jacobian.item() - exact) <= 1.96 * np.sqrt(found.variance.item())
-            of += 1
-    assert of >= 6
-    assert inside >= of - 2

@@ -9,6 +9,8 @@ from helpers.table import each_row
 
 import drake_diff as dd
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
@@ -48,6 +50,7 @@ def test_a_tolerance_that_no_solver_reaches_is_judged_by_our_own_measures(method
     assert solution.cost == pytest.approx(exact.cost, rel=1e-6)
 
 
+@pytest.mark.slow
 @each_row("outcome", ["INFEASIBLE", "FAILED", "ITERATION_LIMIT", "INACCURATE", "NO_GRADIENT"])
 def test_what_a_solver_says_of_an_optimum_is_measured_again(outcome):
     """The words are false of an optimum; a plan that keeps all, and is the optimum of another cost, is none."""

@@ -6,6 +6,8 @@ import pytest
 import drake_diff as dd
 from drake_diff.optimize.run import kept_apart
 
+pytestmark = pytest.mark.solve
+
 BALL = """<link name="{name}"><inertial><mass value="1"/><inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0"
 iyz="0"/></inertial><collision><geometry><sphere radius="0.2"/></geometry></collision></link>
 <joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{name}"/><axis xyz="{axis}"/>

@@ -26,6 +26,7 @@ def wall(random):
     return dd.Constraint(function, lower=lower, name="wall"), half
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("seed", range(16))
 def test_a_wall_between_start_and_goal_is_not_crossed_between_two_nodes(seed):
     random = np.random.default_rng(seed)

@@ -18,6 +18,8 @@ from drake_diff.optimize.problem.dynamics import Moved, plant_dynamics
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.optimize.transcription.program import TranscribedProgram
 
+pytestmark = pytest.mark.solve
+
 BOTH = ("controls", "parameters")
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -331,6 +333,7 @@ def test_a_plan_with_a_free_step_is_in_its_record(tmp_path):
 # ------------------------------------------------------------------------------ refusals
 
 
+@pytest.mark.slow
 @each_row("wrong", ["negated", "one percent", "swapped"])
 def test_a_column_of_a_parameter_that_is_wrong_is_refused(wrong, monkeypatch):
     from drake_diff.optimize.transcription import expressions
@@ -405,6 +408,7 @@ def test_parameters_of_dynamics_that_are_not_asked_for_keep_their_values():
 # ------------------------------------------------------------------------------ the artifact
 
 
+@pytest.mark.slow
 def test_a_record_has_the_parameters_and_a_forged_value_is_refused(tmp_path):
     problem = dd.Problem(
         dd.load_model(MODELS / "pendulum.urdf", time_step=0.05),

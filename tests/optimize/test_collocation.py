@@ -12,6 +12,8 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
@@ -31,6 +33,7 @@ def collocate(problem, **options):
     return dd.solve(problem, method="collocation", scheme="drake", **options)
 
 
+@pytest.mark.slow
 @each_row("count", [2, 4, 10, 20])
 @each_row("solver", ["ipopt", "snopt"])
 def test_the_block_moves_by_the_transcriptions_own_optimum(count, solver):
@@ -101,6 +104,7 @@ def test_nothing_to_control_is_refused():
         collocate(problem)
 
 
+@pytest.mark.slow
 @each_row("row, column", [(2, 1), (2, 3), (3, 1), (3, 3), (2, 4), (3, 4)])
 def test_a_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
     """Every entry of [A B] of the accelerations that is not zero by itself, the guess being a moving one."""

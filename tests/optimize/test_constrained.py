@@ -76,6 +76,7 @@ def test_a_speed_limit_as_a_constraint_is_the_same_as_a_bound(method):
     assert as_constraint.us[:, 0] == pytest.approx(us, abs=1e-5)
 
 
+@pytest.mark.solve
 @by_each_method
 @pytest.mark.parametrize("unit", [1e3, 1e-3])
 def test_the_unit_of_a_constraint_does_not_matter(method, unit):
@@ -90,6 +91,7 @@ def test_the_unit_of_a_constraint_does_not_matter(method, unit):
         assert len(other.iterations) <= 1.5 * len(plain.iterations)
 
 
+@pytest.mark.slow
 @by_each_method
 def test_a_force_and_a_power_are_limited(method):
     """|u| <= 5 N as a constraint of (x, u), and |u v| <= 3.3 W, where 3.46 W and 6 N would be best."""
@@ -125,6 +127,7 @@ def test_a_pendulums_tip_reaches_a_height(method):
     assert solution.cost == pytest.approx(dd.solve(goal, method="ilqr").cost, rel=1e-6)
 
 
+@pytest.mark.solve
 @by_each_method
 def test_a_point_goes_around_a_disc(method):
     """From (-1, 0.1) to (1, 0) around a disc of 0.5 m: it touches at some knot, enters at none, and passes above."""

@@ -11,6 +11,8 @@ from drake_diff.model.step import set_state
 from drake_diff.optimize.ilqr.through_contact import MARGIN, beginnings, restore_goal
 from drake_diff.optimize.shooting import ShootingVariables
 
+pytestmark = pytest.mark.solve
+
 
 def separation(model, x):
     set_state(model.double, x)

@@ -13,6 +13,8 @@ from drake_diff.optimize.continuation import default_schedule
 from drake_diff.optimize.ilqr.through_contact import restore_goal
 from drake_diff.optimize.solution import Status
 
+pytestmark = pytest.mark.solve
+
 
 def test_a_push_from_a_distance_arrives_and_keeps_momentum(two_spheres):
     """Without damping the momentum of both is what the motor gave: sum of h u, all on Drake's own plant.

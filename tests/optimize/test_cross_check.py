@@ -24,6 +24,8 @@ from drake_diff.runs.cross_check import Follower, replays_in
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.verify import verify_own
 
+pytestmark = pytest.mark.solve
+
 FREE = math.nan
 G, MU, STIFF = 9.81, 0.4, 2e4
 PLANTS = "continuous time", "mujoco"
@@ -233,6 +235,7 @@ def test_a_record_has_it_and_verify_measures_it_again(pushed, tmp_path):
     assert dd.verify(tmp_path / "run").require().verdict == "holds"
 
 
+@pytest.mark.slow
 def test_a_record_that_lies_of_it_is_found(pushed, tmp_path, monkeypatch):
     honest = evidence.record_of
 
@@ -249,6 +252,7 @@ def test_a_record_that_lies_of_it_is_found(pushed, tmp_path, monkeypatch):
     assert any("goal_error: recorded 0" in complaint for complaint in found.complaints), found.complaints
 
 
+@pytest.mark.slow
 @each_row(
     "there, words", [(True, "mujoco, which is not installed here"), (False, "mujoco, which was not installed where")]
 )

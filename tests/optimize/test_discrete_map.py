@@ -115,6 +115,7 @@ def test_what_a_map_cannot_be_asked():
         dd.solve(driven, method="collocation", scheme="map")
 
 
+@pytest.mark.solve
 def test_a_map_is_warm_started_and_its_sensitivity_is_that_of_re_solves():
     problem = kicked_problem()
     first = dd.solve(problem)

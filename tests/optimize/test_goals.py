@@ -27,6 +27,8 @@ from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
 from drake_diff.optimize.problem.goals import AIMED
 from drake_diff.optimize.transcription.expressions import Symbolic, trace
 
+pytestmark = pytest.mark.solve
+
 UPPER, LOWER = 0.8, 0.5  # [m] of double_pendulum.urdf
 EFFORT = dd.QuadraticCost(R=np.eye(2))
 
@@ -183,6 +185,7 @@ def test_a_hand_that_replays_miss_is_no_success(arm):
     assert any(c.tolerance == 1e-6 and c.where == "lower position" for c in solution.checks.failing)
 
 
+@pytest.mark.slow
 def test_a_goal_out_of_reach_is_named(arm):
     far = dd.solve(reach(arm, goals=tip(position=[-2.0, None, 0.0])), method="collocation", progress=False)
     assert not far.success
@@ -417,6 +420,7 @@ def test_verify_binds_the_goals_again_and_holds(run):
     assert any("goal" in line and "FrameGoal" in line for line in found.claimed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lie",
     slow_after(

@@ -12,6 +12,8 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ShapeError
 from drake_diff.optimize.guess import another_guess, first_guess
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
@@ -55,6 +57,7 @@ def test_a_solution_that_is_not_finite_has_no_trajectory(write_urdf):
         broken.trajectory()
 
 
+@pytest.mark.slow
 @each_row("method", ["collocation", "ilqr", "shooting"])
 @each_row("count", [7, 10, 25])
 def test_a_solution_of_any_method_and_length_is_a_guess(write_urdf, method, count):
@@ -144,6 +147,7 @@ def limited_pendulum(limit, **asked):
     return dd.Problem(swing, **ends | asked)
 
 
+@pytest.mark.slow
 @each_row("limit", [3.9, 2.5])
 @each_row("method", ["auto", "collocation"])
 def test_a_swing_up_in_least_time_is_found_from_another_first_guess(limit, method):

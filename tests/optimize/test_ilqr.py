@@ -18,6 +18,8 @@ from drake_diff.optimize.ilqr.riccati import LinearQuadratic, minimize_in_box, s
 from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.solution import Status
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 

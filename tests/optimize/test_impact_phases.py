@@ -117,6 +117,7 @@ class HopperByHand:
         return np.concatenate([x[:4], x[4:] + pushed @ P]), P
 
 
+@pytest.mark.solve
 def test_a_hopper_lands_where_another_simulation_lands(landed):
     assert landed.success, landed.message
     hopper = HopperByHand(landed.problem.phases[0].system)

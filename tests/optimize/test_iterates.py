@@ -8,6 +8,8 @@ from pydrake.math import RotationMatrix
 
 import drake_diff as dd
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 

@@ -20,6 +20,8 @@ from drake_diff.optimize.problem.obstacles import along_steps
 from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.optimize.verification import judged
 
+pytestmark = pytest.mark.solve
+
 BALL = dd.SphereObstacle([0.0, 0.0, -1.2], 0.1, name="ball")
 POST = dd.BoxObstacle([0.0, 0.0, -1.25], [0.1, 0.4, 0.2], name="post")
 SMOOTH = dd.QuadraticCost(Q=np.diag([0, 0, 1.0, 1.0]), R=1e-2 * np.eye(2))

@@ -11,6 +11,8 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff._base.values import Refusal
 
+pytestmark = pytest.mark.solve
+
 H, N = 0.1, 10
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 

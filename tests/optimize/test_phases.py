@@ -244,6 +244,7 @@ def test_a_wrong_derivative_of_a_reset_is_found(bounced):
     assert "certificate" in again.message
 
 
+@pytest.mark.solve
 def test_what_cannot_be_is_told_as_infeasible():
     """A ball cannot rise above where it was dropped."""
     problem = bouncing(1.0, 0.8, 1)

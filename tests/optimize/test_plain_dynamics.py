@@ -15,6 +15,8 @@ from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.runs import read_trace
 from drake_diff.runs.view import scene_of_run
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 

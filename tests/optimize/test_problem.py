@@ -61,6 +61,7 @@ def test_a_nan_goal_is_free(load):
     assert problem.goal_error(np.array([9.0, 3.0, 9.0, 0.5])) == pytest.approx([0, 3 - np.pi, 0, 0.5])
 
 
+@pytest.mark.solve
 @each_row(
     "changes, words",
     [

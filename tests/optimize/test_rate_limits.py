@@ -14,6 +14,8 @@ from drake_diff.optimize import InputRate, Jerk
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.optimize.transcription.program import TranscribedProgram
 
+pytestmark = pytest.mark.solve
+
 BLOCK = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 ENDS = dd.Constraint(lambda x, u: u, 0.0, 0.0, knots=(0, -1), name="no force at the ends")
@@ -37,6 +39,7 @@ def test_the_least_time_from_rest_to_rest_is_that_of_the_s_curve(way, limit):
     assert solution.horizon > wanted * (1 - 1e-6)
 
 
+@pytest.mark.slow
 @each_row("scheme", ["hermite_simpson", "trapezoid", "drake"])
 @each_row("horizon", [None, (0.3, 2.0)])
 def test_rows_of_rates_have_the_derivatives_of_differences(scheme, horizon):
@@ -64,6 +67,7 @@ def test_rows_of_rates_have_the_derivatives_of_differences(scheme, horizon):
         assert np.max(np.abs(found - wanted)) < 1e-8 * np.max(np.abs(wanted))  # of central differences
 
 
+@pytest.mark.slow
 @each_row("method", ["collocation", "shooting"])
 def test_a_pendulum_swings_up_with_a_slow_motor(method):
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
@@ -78,6 +82,7 @@ def test_a_pendulum_swings_up_with_a_slow_motor(method):
         assert np.max(np.abs(np.diff(replay.motion.us[:, 0]))) <= 10 * 0.05 * 1.05
 
 
+@pytest.mark.slow
 def test_steps_of_another_length_have_their_own_rates():
     """A horizon of 2 s in 40 steps of a model of 0.02 s: inputs change from one 0.05 s to the next."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)

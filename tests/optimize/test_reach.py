@@ -12,6 +12,8 @@ import drake_diff as dd
 from drake_diff.optimize.optimality import out_of_reach
 from drake_diff.optimize.shooting import ShootingVariables
 
+pytestmark = pytest.mark.solve
+
 H, N = 0.02, 40
 EFFORT = dd.QuadraticCost(R=[[1e-3]])
 

@@ -169,6 +169,7 @@ def test_the_true_plant_follows_what_was_rolled_out(two_spheres):
     assert inputs == pytest.approx(us, abs=1e-12)
 
 
+@pytest.mark.solve
 def test_a_push_from_a_distance_arrives_and_keeps_momentum(two_spheres):
     """As by soft contact; the stages are told, and the last is the true plant's."""
     problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)

@@ -22,6 +22,8 @@ from drake_diff.optimize.replay import (
 )
 from drake_diff.optimize.solution import Status
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 H, COUNT = 0.05, 20
 

@@ -11,6 +11,8 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.optimize.optima import distinct
 
+pytestmark = pytest.mark.solve
+
 
 def around(size=0.5, **asked):
     """A point at constant speed past a disk that lies on its way: to the left, or to the right and longer."""

@@ -12,6 +12,8 @@ import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, UnknownNameError
 from drake_diff.optimize.transcription.kkt import HeldPlan
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
@@ -161,6 +163,7 @@ def test_a_linear_regulator_has_the_gains_of_its_riccati_equation(write_urdf, me
     assert "Jacobians" in found.derivatives
 
 
+@pytest.mark.slow
 def test_a_discrete_plan_between_two_states_is_a_least_norm(write_urdf):
     """u = S' (S S')^-1 (goal - free motion), S from inputs to the last state; u and cost scale with the mass."""
     h, m, count = 0.1, 1.5, 10

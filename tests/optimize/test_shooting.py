@@ -21,6 +21,8 @@ from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 from drake_diff.optimize.solution import Status
 from drake_diff.optimize.transcription import steps
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 

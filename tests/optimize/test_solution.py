@@ -196,6 +196,7 @@ def test_the_integration_error_of_a_cubic_motion_is_rounding():
     assert solved("collocation").integration_error < 1e-9
 
 
+@pytest.mark.solve
 def test_the_integration_error_falls_by_the_fourth_order_of_hermite_simpson():
     """Per interval it is O(h^5): halving h divides it by about 32 on a smooth motion, by 16 at the very least."""
     errors = []

@@ -8,6 +8,8 @@ import pytest
 import drake_diff as dd
 from drake_diff.derivatives.smooth_step import SmoothStep
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 SCHEMES = ("hermite_simpson", "trapezoid", "drake")
 

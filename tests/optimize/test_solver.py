@@ -17,6 +17,8 @@ from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.optimize.run import Run
 from drake_diff.optimize.solution import Status
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 

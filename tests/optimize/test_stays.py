@@ -14,6 +14,8 @@ from drake_diff.motion import LQR
 from drake_diff.optimize import Dwell, TerminalSet
 from drake_diff.runs.messages import asked_for
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 METHODS = ["collocation", "shooting", "ilqr"]
 
@@ -36,6 +38,7 @@ def swung_up(path="pendulum.urdf", goal=(np.pi, 0.0), limit=3.0, **more):
     )
 
 
+@pytest.mark.slow
 @each_row("method", METHODS)
 def test_a_crane_stays_where_it_was_sent(method):
     solution = dd.solve(crane(goals=[stay()]), method=method)
@@ -199,6 +202,7 @@ def test_a_set_is_one_of_the_model_as_it_is():
         dd.sensitivity(solution, ["pole.mass"])
 
 
+@pytest.mark.slow
 def test_records_of_both_are_verified(tmp_path):
     for name, problem in (("stay", crane(goals=[stay()])), ("set", swung_up())):
         solution = dd.solve(problem)

@@ -8,6 +8,8 @@ from helpers.plants import box_on_the_ground
 
 import drake_diff as dd
 
+pytestmark = pytest.mark.solve
+
 FAR = dd.Bounds(np.full(12, -50), np.full(12, 50))  # the URDF's limits of speed would act
 METHODS = (
     {"method": "ilqr"},

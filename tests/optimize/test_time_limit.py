@@ -197,6 +197,7 @@ def test_a_signal_ends_a_compilation_at_once():
         assert flag.is_set()
 
 
+@pytest.mark.solve
 @each_row("method, solver", METHODS)
 def test_what_numba_compiles_is_told_and_no_limit_counts_it(monkeypatch, method, solver):
     """A year by the clock, of which the limit of 10 s leaves all to the search."""

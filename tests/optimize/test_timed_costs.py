@@ -33,6 +33,7 @@ def branching(x, u, t):
     return (1 + t) * u[0] ** 2 if t >= 0 else 0.0
 
 
+@pytest.mark.solve
 @each_row("cost", [lambda x, u, t: (1 + t) * u[0] ** 2, branching])
 def test_a_weight_that_grows_in_time_has_the_closed_forms_optimum(cost):
     """min of int (1 + t) u^2 with int u = 1: u = 1 / ((1 + t) ln 2), at a cost of 1 / ln 2."""
@@ -43,6 +44,7 @@ def test_a_weight_that_grows_in_time_has_the_closed_forms_optimum(cost):
     assert solution.cost == pytest.approx(1 / np.log(2), rel=1e-7)
 
 
+@pytest.mark.slow
 @each_row("method", METHODS)
 def test_an_input_that_is_asked_for_in_time_is_given(write_urdf, method):
     """(u - sin 3 t)^2 is 0 where u is that; discrete methods ask at the beginning of each step."""
@@ -53,6 +55,7 @@ def test_an_input_that_is_asked_for_in_time_is_given(write_urdf, method):
     np.testing.assert_allclose(solution.us[:, 0], np.sin(3 * at), atol=1e-6)
 
 
+@pytest.mark.slow
 @each_row("method", METHODS)
 @each_row("kind", ["arrays", "solution", "trajectory", "trajectories", "function"])
 def test_a_reference_is_followed_in_whatever_form_it_is_given(write_urdf, method, kind):
@@ -88,6 +91,7 @@ def test_the_cost_of_a_reference_is_the_sum_over_its_steps(write_urdf):
     assert problem.objective(at, held) == pytest.approx(wanted, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_sum_of_costs_is_one_cost(write_urdf):
     t = np.linspace(0, 1, 5)
     follow = TrackingCost((t, np.column_stack([np.sin(t), np.cos(t)])), Q=np.eye(2))
@@ -127,6 +131,7 @@ def test_mpc_follows_a_reference_that_moves_on():
     np.testing.assert_allclose(motion.xs[20:60, 0], wave[20:60, 0], atol=0.05)
 
 
+@pytest.mark.solve
 def test_a_run_that_follows_a_reference_verifies(write_urdf, tmp_path):
     t = np.linspace(0, 1, 21)
     follow = TrackingCost((t, np.column_stack([t**2 / 2, t])), Q=np.eye(2))

@@ -29,6 +29,8 @@ from drake_diff.optimize.transcription.expressions import knot_functions
 from drake_diff.optimize.transcription.program import TranscribedProgram
 from drake_diff.optimize.transcription.task import SCHEMES as SCHEMES_OF
 
+pytestmark = pytest.mark.solve
+
 SCHEMES = ("trapezoid", "hermite_simpson")
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 

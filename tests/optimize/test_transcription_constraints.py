@@ -22,6 +22,7 @@ SWING = TASK | {"x_goal": [np.pi, 0], "num_steps": 20, "horizon": 2.0}
 # ------------------------------------------------------------------------------ waypoints
 
 
+@pytest.mark.solve
 @each_row("dynamics", [BLOCK, CALLED])
 @each_row("place", [0.5, 0.7, -0.2])
 def test_a_place_half_way(dynamics, place):
@@ -128,6 +129,7 @@ def test_bad_constraints_are_named(constraint, message):
 # ------------------------------------------------------------------------------ what is no success
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("dynamics", [BLOCK, CALLED])
 def test_a_constraint_that_cannot_be_kept_is_no_success(dynamics):
     motion = collocate(

@@ -9,6 +9,8 @@ from helpers.table import each_row, slow_after
 import drake_diff as dd
 from drake_diff.optimize.program import Multipliers
 
+pytestmark = pytest.mark.solve
+
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 

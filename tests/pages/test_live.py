@@ -32,6 +32,8 @@ from drake_diff.pages.meshcat import STILLS, Stills, stills_of
 from drake_diff.pages.scene import Scene, scene_of
 from drake_diff.pages.shapes import Drawn
 
+pytestmark = pytest.mark.solve
+
 HOSTILE = "<img src=x onerror=alert(1)>"
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -317,6 +319,7 @@ def connected(browser):
     browser.execute_cdp_cmd("Network.emulateNetworkConditions", {"offline": True, **told})
 
 
+@pytest.mark.slow
 @browsing
 def test_a_browser_shows_rows_names_as_text_and_the_end(swing, connected):
     """In one tab that is open before the search ends: no script of a name runs, and the viewer is in its frame."""

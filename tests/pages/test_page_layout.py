@@ -29,6 +29,8 @@ from drake_diff.pages.html import MOST_ENTRIES, MOST_POINTS, Line, Plot, page_da
 from drake_diff.pages.meshcat import MOST_POSES, frames_of
 from drake_diff.runs.compare import write_runs_page
 
+pytestmark = pytest.mark.solve
+
 PHONE, DESK = (390, 844), (1280, 800)
 EVIL = "</script><img src=x onerror=\"document.title = 'evil'\">"
 
@@ -103,6 +105,7 @@ def test_a_report_of_thirty_joints_is_below_5_mb(humanoid):
     assert len(data["xs"]) < 5  # the times stand once, not with each of 100 plots
 
 
+@pytest.mark.slow
 @browsing
 def test_a_group_of_plots_is_shown_at_a_time_under_one_legend(humanoid, browser):
     open_page(browser, humanoid / "report.html", size=DESK)
@@ -125,6 +128,7 @@ def test_a_group_of_plots_is_shown_at_a_time_under_one_legend(humanoid, browser)
     assert errors(browser) == []
 
 
+@pytest.mark.slow
 @browsing
 def test_inputs_are_drawn_as_percent_of_their_limit_and_told_in_their_unit(humanoid, browser):
     """Held at 0.2 N m of 0.5 N m: 40 %."""
@@ -178,6 +182,7 @@ def open_all(browser):
     wait_for_frame(browser)
 
 
+@pytest.mark.slow
 @browsing
 @pytest.mark.parametrize(
     ("size", "scheme"), slow_after(1, [(PHONE, "dark"), (DESK, "light")]), ids=["phone", "desktop"]
@@ -196,6 +201,7 @@ def test_every_text_can_be_read_and_every_control_has_a_name(humanoid, browser, 
     assert all("lowest" in label or "no value" in label for label in plots)
 
 
+@pytest.mark.slow
 @browsing
 def test_what_cannot_be_read_is_found(two, browser):
     """What the test above looks for, planted."""
@@ -213,6 +219,7 @@ def test_what_cannot_be_read_is_found(two, browser):
     assert {kind for kind, *_ in badly_laid(browser)} == {"beyond the page", "cut", "overlap"}
 
 
+@pytest.mark.slow
 @browsing
 def test_the_replay_is_moved_by_the_keyboard(two, browser):
     """The arrow keys move it by a hundredth, the space bar plays and pauses, and types a space in a field."""

@@ -93,6 +93,7 @@ def is_harmless(page):
     return len(scripts) == 4 and not pictures and not any(a.startswith("on") for _, x in found for a in x)
 
 
+@pytest.mark.solve
 @each_row("name", PAGES)
 def test_no_text_becomes_an_element(pages, name):
     page = pages[name].read_text()
@@ -111,6 +112,7 @@ def test_an_element_that_got_into_a_page_is_noticed(pages):
     assert not is_harmless(page.replace("<header>", "<header onclick='1'>"))
 
 
+@pytest.mark.slow
 @browsing
 @pytest.mark.parametrize("name", slow_after(3, PAGES))
 def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
@@ -127,6 +129,7 @@ def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
     assert browser.execute_script("return document.querySelectorAll('.plot canvas').length") > 0
 
 
+@pytest.mark.slow
 @browsing
 @pytest.mark.parametrize("name", slow_after(3, PAGES))
 def test_a_script_that_was_put_into_a_page_is_refused(pages, browser, tmp_path, name):

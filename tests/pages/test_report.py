@@ -22,6 +22,8 @@ from drake_diff.runs import measure
 from drake_diff.runs.page import plots_of
 from drake_diff.runs.view import scene_of_run, serve
 
+pytestmark = pytest.mark.solve
+
 HOSTILE = "<script>alert(1)</script>"
 
 
@@ -152,6 +154,7 @@ def test_an_arrow_is_as_long_as_its_force(runs, browser, thrown):
     assert browser.execute_script(f"return {find}") == pytest.approx(expected, rel=1e-2)  # between two frames
 
 
+@pytest.mark.slow
 @browsing
 def test_hostile_names_do_no_harm_in_a_browser(hostile, browser):
     for page in ("report.html", "replay.html"):

@@ -138,6 +138,7 @@ def test_loading_reads_no_mesh_and_a_page_does(tmp_path, monkeypatch):
     assert len(read) == 1
 
 
+@pytest.mark.solve
 def test_a_page_is_the_same_when_it_is_made_again(tmp_path):
     pages = []
     for name in ("a.html", "b.html"):

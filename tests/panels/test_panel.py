@@ -30,6 +30,8 @@ from drake_diff.runs import list_runs
 from drake_diff.runs.fields import canonical as sealed_canonical
 from drake_diff.runs.sealed import own_sha256
 
+pytestmark = pytest.mark.solve
+
 FUNCTIONS = """
 import os, random, time
 import numpy as np
@@ -157,14 +159,6 @@ def thousand(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [2, 4])
-def test_a_thousand_trials_give_the_same_bytes_whatever_the_number_of_workers(thousand, workers):
-    out = thousand.parent / f"with_{workers}"
-    run_panel(thousand, out=out, workers=workers)
-    assert files(out) == files(thousand.parent / "one")
-
-
-@pytest.mark.slow
 def test_a_thousand_trials_killed_three_times_at_random_give_the_same_bytes(thousand):
     out, journal = thousand.parent / "killed", thousand.parent / "killed" / "trials.jsonl"
     names = {trial.id: f"{trial.cell['method']} {trial.cell['level']} {trial.fields['repeat']}" for trial in
@@ -220,11 +214,13 @@ def test_global_generators_start_from_the_trials_own_seed():
 # --- what dies --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_trial_whose_worker_dies_is_evaluated_once_more(write, tmp_path):
     table = run_panel(write("dies_once"), out=tmp_path / "out", workers=2)
     assert [row["cost"] for row in table.rows] == [0.5, 1, 2, 4, 8]
 
 
+@pytest.mark.slow
 def test_a_trial_whose_worker_dies_twice_is_a_row_that_says_so(write, tmp_path):
     table = run_panel(write("dies"), out=tmp_path / "out", workers=1)
     assert table.errors == 1
@@ -241,6 +237,7 @@ def test_a_trial_that_calls_exit_ends_itself_alone(write, tmp_path):
     assert [row.get("error") for row in table.rows] == [None, None, "SystemExit: enough", None, None]
 
 
+@pytest.mark.slow
 def test_workers_end_with_their_parent_in_the_middle_of_a_trial(write, tmp_path):
     path = write("cheap", seconds=60)
     process = start(path, tmp_path / "out", "--workers", 2)
@@ -251,6 +248,7 @@ def test_workers_end_with_their_parent_in_the_middle_of_a_trial(write, tmp_path)
     wait_for(lambda: no_worker_lives(path), seconds=5)
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
     path, out = write("cheap", seeds=100, seconds=0.02), tmp_path / "out"
     process = start(path, out, "--workers", 2)
@@ -277,6 +275,7 @@ def test_a_script_needs_no_guard_around_its_panel(write, tmp_path):
 # --- the journal ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_torn_last_line_is_dropped_and_its_trial_evaluated_again(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
     run_panel(path, out=out, workers=1)
@@ -293,6 +292,7 @@ def test_a_torn_last_line_is_dropped_and_its_trial_evaluated_again(write, tmp_pa
     assert files(out) == before
 
 
+@pytest.mark.slow
 def test_a_changed_byte_in_any_line_is_refused(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
     run_panel(path, out=out, workers=1)
@@ -308,6 +308,7 @@ def test_a_changed_byte_in_any_line_is_refused(write, tmp_path):
         assert (out / "trials.jsonl").read_bytes() == changed
 
 
+@pytest.mark.slow
 def test_another_panels_journal_is_refused_and_so_is_one_of_its_lines(write, tmp_path):
     run_panel(write("cheap"), out=tmp_path / "out", workers=1)
     run_panel(write("cheap", methods='["other"]'), out=tmp_path / "other", workers=1)
@@ -320,6 +321,7 @@ def test_another_panels_journal_is_refused_and_so_is_one_of_its_lines(write, tmp
         run_panel(write("cheap"), out=tmp_path / "out", workers=1)
 
 
+@pytest.mark.slow
 def test_a_comment_changes_no_panel_but_another_function_does(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
     run_panel(path, out=out, workers=1)
@@ -331,6 +333,7 @@ def test_a_comment_changes_no_panel_but_another_function_does(write, tmp_path):
         run_panel(path, out=out, workers=1)
 
 
+@pytest.mark.slow
 def test_two_at_once_on_one_directory_are_refused(write, tmp_path):
     path, out = write("cheap", seconds=60), tmp_path / "out"
     process = start(path, out, "--workers", 1)
@@ -344,6 +347,7 @@ def test_two_at_once_on_one_directory_are_refused(write, tmp_path):
 # --- rows and their summary -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_exception_is_a_row_and_exit_status_1(write, tmp_path):
     process = start(write("fails"), tmp_path / "out", "--workers", 1)
     output = process.communicate(timeout=60)[0]
@@ -465,6 +469,7 @@ def test_without_ray_its_extra_is_named(write, tmp_path, monkeypatch):
         run_panel(write(), out=tmp_path / "out", engine="ray")
 
 
+@pytest.mark.slow
 def test_every_trial_has_a_record_that_is_the_same_for_any_number_of_workers(write, tmp_path):
     path = write("fails")
     found = [run_panel(path, out=tmp_path / f"out_{n}", workers=n) for n in (1, 2)]
@@ -482,6 +487,7 @@ def test_every_trial_has_a_record_that_is_the_same_for_any_number_of_workers(wri
         assert own_sha256(record) == record["record_sha256"]
 
 
+@pytest.mark.slow
 def test_a_panel_and_its_trials_are_records(write, tmp_path):
     done = run_panel(write("fails"), out=tmp_path / "runs" / "mine", workers=1)
     record = dd.load_record(done.directory)
@@ -522,6 +528,7 @@ def files_again(directory):
     dd.load_record(directory).write(directory)
 
 
+@pytest.mark.slow
 def test_a_panel_whose_files_do_not_follow_from_its_journal_is_broken(write, tmp_path):
     made = run_panel(write("fails"), out=tmp_path / "panel", workers=1).directory
     trial = min((made / "trials").iterdir())

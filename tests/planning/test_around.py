@@ -16,6 +16,8 @@ from drake_diff.planning.around import Line, Space, lines
 from drake_diff.planning.robot import load_robot
 from drake_diff.runs import read_trace
 
+pytestmark = pytest.mark.solve
+
 LONG, THICK = 0.5, 0.03  # [m] of each link, and its radius
 ROD = """<link name="{name}"><inertial><origin xyz="0 0 -0.25"/><mass value="1"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
@@ -102,6 +104,7 @@ def test_the_same_seed_finds_the_same_lines(arm):
     assert [a.tolist() for a in one] == [b.tolist() for b in other]
 
 
+@pytest.mark.slow
 def test_a_hand_goes_around_a_ball_and_the_plan_is_clear_by_the_closed_form(arm, tmp_path):
     angle = 0.5
     center = -0.95 * np.array([np.sin(angle), 0, np.cos(angle)])
@@ -114,6 +117,7 @@ def test_a_hand_goes_around_a_ball_and_the_plan_is_clear_by_the_closed_form(arm,
     assert "SphereObstacle" in done.lines[3]
 
 
+@pytest.mark.slow
 @each_row(
     "avoid, message",
     [

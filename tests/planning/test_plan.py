@@ -18,6 +18,8 @@ from drake_diff.planning.motion import along
 from drake_diff.planning.robot import load_robot
 from drake_diff.runs import read_trace
 
+pytestmark = pytest.mark.solve
+
 
 def command(*words, cwd):
     return subprocess.run(

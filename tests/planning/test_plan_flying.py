@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from helpers.models import MODELS, robot_file
+from helpers.models import robot_file
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.planning import plan
 from drake_diff.planning.robot import load_robot
+
+pytestmark = pytest.mark.solve
 
 BOX = """<sdf version="1.9"><model name="scene">
 <link name="ground"><collision name="skin"><pose>0 0 -0.5 0 0 0</pose><geometry><box><size>9 9 1</size></box></geometry>
@@ -48,19 +50,12 @@ def test_a_box_is_lifted_out_of_the_ground_and_flown(box, tmp_path):
     assert dd.verify(tmp_path / "out").holds
 
 
-@pytest.mark.slow
-def test_a_drone_goes_where_it_is_asked_to(tmp_path):
-    done = plan(MODELS / "quadrotor.urdf", goals={"body": [1.0, -0.5, 2.0]}, out=tmp_path / "out")
-    assert done.success, done.lines
-    assert done.solution.xs[-1][4:7] == pytest.approx([1.0, -0.5, 2.0], abs=1e-6)
-    assert done.solution.xs[-1][7:] == pytest.approx(np.zeros(6), abs=1e-6)
-
-
 def test_a_goal_of_what_does_not_fly_is_refused(box, tmp_path):
     with pytest.raises(InputError, match="box"):
         plan(box, goals={"ground": [0.0, 0.0, 1.0]}, out=tmp_path / "out")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["quadrotor_base.urdf", pytest.param("iris_simple.urdf", marks=pytest.mark.slow)])
 def test_drones_of_strangers_hover(name, tmp_path):
     done = plan(robot_file(name), out=tmp_path / "out", seed=2)

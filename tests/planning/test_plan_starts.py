@@ -13,6 +13,8 @@ from drake_diff.planning.robot import load_robot
 from drake_diff.planning.task import Task, postures
 from drake_diff.runs.fields import Failure
 
+pytestmark = pytest.mark.solve
+
 G = 9.81
 INERTIA = '<inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/>'
 

@@ -19,7 +19,7 @@ from drake_diff.planning.feet import find_feet
 from drake_diff.planning.robot import GROUND, ON_FEET, load_robot, ranges
 from drake_diff.planning.standing import Legged, hold, stand, standing_posture
 
-pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning"), pytest.mark.solve]
 G = 9.81
 HIPS = {"fl": (0.2, 0.1), "fr": (0.2, -0.1), "hl": (-0.2, 0.1), "hr": (-0.2, -0.1)}
 

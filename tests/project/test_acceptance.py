@@ -92,6 +92,7 @@ def test_what_may_not_be_lost_fails(before, write, change):
     assert call("compare", before, changed(before, write, change)).returncode == 1
 
 
+@pytest.mark.solve
 def test_an_incomplete_second_run_fails_and_an_item_removed_on_purpose_does_not(before, write):
     assert call("compare", before, changed(before, write, {}, complete=False)).returncode == 1
     gone = changed(before, write, {"trust/solve/0": {"outcomes": {}, "status": "error", "seconds": 9.0}})

@@ -10,6 +10,8 @@ from helpers.models import ROOT, script
 from hypothesis import given
 from hypothesis import strategies as st
 
+pytestmark = pytest.mark.solve
+
 TABLE = script("examples/studies/contact_table.py")
 CASES, Case = TABLE.CASES, TABLE.Case
 G = 9.81

@@ -13,6 +13,8 @@ from helpers.models import ROOT
 import drake_diff as dd
 from drake_diff import quantities
 
+pytestmark = pytest.mark.solve
+
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 ROOMS = [path.parent.name for path in sorted(Path(dd.__file__).parent.glob("*/__init__.pyi"))]
 OF_QUANTITIES = ["center_of_mass", "contact_force", "frame_position", "frame_rotation_error", "frame_velocity"]

@@ -13,6 +13,8 @@ from helpers.table import each_row, slow_after
 import drake_diff as dd
 from drake_diff.exceptions import GradientWarning, ModelWarning
 
+pytestmark = pytest.mark.solve
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
@@ -39,6 +41,7 @@ def test_the_cart_pole_swings_up_near_the_continuous_optimum():
     assert np.abs(solution.replay.xs[-1] - [1, np.pi, 0, 0]).max() < 1e-8  # the simulator itself arrives
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vx", slow_after(1, [3.7, 0.3]))  # short of the target and beyond
 def test_the_projectiles_three_gradients_agree(vx):
     """By hand d loss / d vx = (x_T - 6) * 3.0 with x_T = 3 vx."""
@@ -102,6 +105,7 @@ def test_the_network_learns_to_balance():
     assert after < 0.1 * before
 
 
+@pytest.mark.slow
 def test_the_hidden_parameters_are_found():
     """The motion has no noise, so the only limit is the solver's tolerance."""
     module = example("hidden_parameters")

@@ -7,6 +7,8 @@ import pytest
 from helpers.models import script
 from helpers.table import each_row, slow_after
 
+pytestmark = pytest.mark.solve
+
 PANEL = script("examples/studies/gradient_panel.py")
 
 
@@ -42,6 +44,7 @@ def test_over_the_wall_only_zeroth_order_finds_the_way():
     assert sum(PANEL.descend(case, "zeroth", seed) for seed in range(10)) > 8
 
 
+@pytest.mark.slow
 def test_a_doubled_derivative_is_biased_and_the_derivative_itself_is_not():
     case = PANEL.double_integrator()
     wrong = replace(case, derivative=lambda x: 2 * case.derivative(x))

@@ -10,6 +10,8 @@ import pytest
 
 import drake_diff
 
+pytestmark = pytest.mark.solve
+
 PACKAGE = Path(drake_diff.__file__).parent
 ROOMS = """
 certificates comparison engines export identification logs loop model motion optimize panels runs trials
@@ -114,6 +116,7 @@ for name in again().__all__:
     assert sorted(fresh(AGAIN + code).split()) == sorted([*PUBLIC, *MODULES])
 
 
+@pytest.mark.slow
 def test_threads_that_race_for_names_all_get_them():
     code = """
 import threading

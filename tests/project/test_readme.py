@@ -19,6 +19,8 @@ from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
 
+pytestmark = pytest.mark.solve
+
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -159,6 +161,7 @@ def test_a_number_of_a_document_is_the_constant_of_the_package(document):
         assert any(math.isclose(float(number), each, rel_tol=1e-12) for each in values), constant
 
 
+@pytest.mark.slow
 def test_what_is_not_installed_exits_with_3(tmp_path):
     script = "import sys; sys.modules['mujoco'] = None\nfrom drake_diff.cli.main import main\nmain()"
     command = [sys.executable, "-c", script, "export-model", str(ROOT / "models" / "hopper.sdf"), "--to", "mjcf"]

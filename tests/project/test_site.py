@@ -22,6 +22,7 @@ PAGES = [
 ]
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("page", PAGES)
 def test_the_code_of_a_page_runs_and_prints_what_stands_below_it(page, tmp_path, monkeypatch, capsys):
     """All blocks of a page in one go, in a folder with the models of the package and a recording."""

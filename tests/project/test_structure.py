@@ -3,6 +3,10 @@
 import ast
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.solve
+
 TESTS = Path(__file__).parents[1]
 BENCHMARKS = TESTS / "benchmarks"
 PROGRAMS = {path.stem for path in BENCHMARKS.glob("*.py")} - {"__main__"}
@@ -44,6 +48,7 @@ def test_no_module_imports_a_test_module_or_conftest():
     assert not {path: names for path, names in found.items() if names}
 
 
+@pytest.mark.slow
 def test_no_test_imports_a_benchmark():
     paths = [path for path in TESTS.rglob("*.py") if BENCHMARKS not in path.parents]
     found = {path.name: imported_benchmarks(path.read_text()) - PENDING.get(path.name, set()) for path in paths}

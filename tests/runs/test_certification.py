@@ -50,6 +50,7 @@ def test_every_other_state_touches_and_the_rest_are_free(load, name):
         assert (depth == 0.0) if state.kind == "free" else (1e-4 <= depth <= 1e-3)
 
 
+@pytest.mark.slow
 @each_row("name", NAMES)
 def test_states_are_seeded_and_within_limits(load, name):
     model = load(name)
@@ -119,6 +120,7 @@ def test_the_record_is_written_and_says_incomplete_until_it_is_not(load, tmp_pat
     assert written.verdict == "pass"
 
 
+@pytest.mark.solve
 def test_the_command_prints_a_table_writes_the_artifact_and_exits_with_0(tmp_path):
     result = CliRunner().invoke(
         app, ["certify", str(MODELS / "sliding_block.sdf"), "--states", "4", "--out", str(tmp_path / "run")]
@@ -129,6 +131,7 @@ def test_the_command_prints_a_table_writes_the_artifact_and_exits_with_0(tmp_pat
     assert (tmp_path / "run" / "record.json").is_file()
 
 
+@pytest.mark.solve
 def test_the_command_exits_with_1_where_a_state_fails(tmp_path, monkeypatch):
     monkeypatch.setattr("drake_diff.derivatives.step.MAGNITUDE_BOUND", 1e-3)
     result = CliRunner().invoke(

@@ -53,6 +53,7 @@ def test_the_embodiment_is_what_the_file_says(tmp_path):
     assert told.touching == ["base", "tool"]
 
 
+@pytest.mark.solve
 def test_a_robot_that_is_held_and_one_of_equations_alone_say_so(record):
     assert record.embodiment.base == "held to the world: pole by hinge"
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -104,6 +105,7 @@ def test_the_panel_is_that_of_the_replays_and_its_hash_is_its_own(record):
         PlanRecord.model_validate(told)
 
 
+@pytest.mark.solve
 def test_a_record_of_the_schema_before_is_read_with_what_it_lacks_empty(record, tmp_path):
     """2.1 had no embodiment, data and panel: as in the reference run of that time."""
     old = record.model_dump(mode="json") | {"schema_version": "2.1.0", "kind": "solve"}

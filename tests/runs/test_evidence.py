@@ -14,6 +14,8 @@ from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.runs.save import begin
 from drake_diff.runs.trace import read_trace
 
+pytestmark = pytest.mark.solve
+
 
 @pytest.fixture(scope="module")
 def swing_up():

@@ -12,7 +12,7 @@ import drake_diff as dd
 from drake_diff.runs.fields import canonical
 from drake_diff.runs.sealed import own_sha256
 
-pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning"), pytest.mark.solve]
 
 
 def hopping():
@@ -96,6 +96,7 @@ def forged(folder, change, name="record.json"):
     return dd.verify(folder)
 
 
+@pytest.mark.slow
 def test_a_run_in_phases_is_made_again(swung):
     found = dd.verify(swung)
     assert found.verdict == "holds", repr(found)

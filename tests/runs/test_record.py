@@ -27,6 +27,8 @@ from drake_diff.runs.read import KINDS, parse_record
 from drake_diff.runs.sealed import SCHEMA_VERSION, own_sha256
 from drake_diff.runs.sections import describe_problem, rebuild_problem
 
+pytestmark = pytest.mark.solve
+
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**60), 2**60) | NUMBERS | st.text(max_size=8),
@@ -234,6 +236,7 @@ def test_inputs_at_their_bounds_begin_and_end_in_the_events(tmp_path):
     assert record.events[0].kind == "solver_started"
 
 
+@pytest.mark.slow
 def test_momentum_energy_and_the_friction_cone_of_a_falling_ball(thrown, tmp_path):
     """In flight momentum changes by m g t to rounding; semi-implicit Euler loses m g^2 h t / 2 of energy."""
     found = {m.name: m for m in measure(thrown).invariants}
@@ -344,6 +347,7 @@ COLLOCATION_METRICS = ["integration error", "state excess between nodes", "input
 COLLOCATION_METRICS += ["constraint excess between nodes", "excess between nodes"]
 
 
+@pytest.mark.slow
 @each_row("coordinate", range(13))
 def test_one_coordinate_of_the_last_state_that_is_off_is_the_end_error(thrown, coordinate):
     xs = np.array(thrown.replay.xs)

@@ -18,6 +18,8 @@ from drake_diff.runs.read import upgraded
 from drake_diff.runs.sealed import SCHEMA_VERSION, own_sha256
 from drake_diff.trials import save_robustness
 
+pytestmark = pytest.mark.solve
+
 H = 0.02
 OLD = ROOT / "tests" / "data" / "pendulum_2_4"
 

@@ -23,6 +23,8 @@ from drake_diff.runs.read import load_record
 from drake_diff.runs.sealed import own_sha256
 from drake_diff.runs.verify import verify_own
 
+pytestmark = pytest.mark.solve
+
 TIMES = np.linspace(0, 0.6, 61)
 
 
@@ -70,6 +72,7 @@ def forge(folder, **changes):
     return verify_own(folder)
 
 
+@pytest.mark.slow
 def test_a_cause_comes_out_again_in_a_process_of_its_own(saved):
     found = dd.verify(saved, time_limit=300.0)
     assert (found.verdict, found.complaints, found.rounded) == ("intact", (), ()), found.lines

@@ -66,6 +66,7 @@ def test_frames_inputs_and_diagnostics_are_the_trace_s(run, bag):
         assert float({v.key: v.value for v in m.status[0].values}["energy_total [J]"]) == energy
 
 
+@pytest.mark.solve
 def test_contacts_and_events_are_the_trace_s(load, tmp_path):
     """Of a hopper that stands on its foot."""
     from drake_diff.runs import measure

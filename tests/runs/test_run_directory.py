@@ -41,6 +41,8 @@ from drake_diff.runs.fields import canonical
 from drake_diff.runs.save import begin, keep_plan
 from drake_diff.runs.sealed import own_sha256
 
+pytestmark = pytest.mark.solve
+
 OLD, NEW = 0.2, 0.3  # the goals of the two runs
 SEARCHES = {
     "collocation": (Transcription, "solve"),
@@ -238,6 +240,7 @@ def check(run, solutions, at, fault, *, exchanges=True):
     return now
 
 
+@pytest.mark.slow
 def test_a_fault_in_any_call_loses_nothing(run, solutions, monkeypatch):
     """Every fourth call meets one fault, and each fault comes; the slow test has every call meet all."""
     quick_pages(monkeypatch)
@@ -275,6 +278,7 @@ def test_each_signal_ends_a_search_with_its_best_plan(solutions, tmp_path, numbe
     assert has_plan(tmp_path / "run.partial-1-0123abcd", plan)
 
 
+@pytest.mark.slow
 @each_row("early", ["as the record is begun", "as expressions are built"])
 @each_row("method", ["collocation", "ilqr", "in phases"])
 def test_a_signal_before_the_search_leaves_the_guess_as_a_plan(solutions, tmp_path, monkeypatch, early, method):
@@ -351,6 +355,7 @@ def test_a_signal_that_comes_while_a_plan_is_kept_waits_for_it(solutions, tmp_pa
     assert dd.load_record(partial).solver.status == "converged"
 
 
+@pytest.mark.slow
 def test_a_plan_that_was_kept_is_measured_as_it_would_have_been(run, solutions):
     expected = dd.save(solutions[1], run.parent / "expected")
     shutil.rmtree(run)

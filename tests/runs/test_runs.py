@@ -16,6 +16,8 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.runs.compare import compare_runs, list_runs
 from drake_diff.runs.save import begin, begin_failure
 
+pytestmark = pytest.mark.solve
+
 FAILED, OPEN = "failed.partial-1-0123abcd", "open.partial-22-0123abcd"
 
 
@@ -111,6 +113,7 @@ def test_text_of_a_record_changes_nothing_on_a_terminal():
     assert plain("[red]no[/]\x1b[31m\u202e\n").plain == "[red]no[/]\ufffd[31m\ufffd\ufffd"
 
 
+@pytest.mark.slow
 def test_the_commands_print_and_exit_as_they_should(runs, tmp_path, monkeypatch, capsys):
     """The first in a process of its own, as a shell starts it."""
     done = drake_diff("verify", runs / "a", cwd=tmp_path)
@@ -152,6 +155,7 @@ def test_the_commands_print_and_exit_as_they_should(runs, tmp_path, monkeypatch,
     assert "wrote new/both.html" in shown
 
 
+@pytest.mark.slow
 def test_an_exception_in_the_solve_leaves_a_labelled_record_and_exits_with_4(tmp_path):
     (tmp_path / "task.py").write_text(
         f"""

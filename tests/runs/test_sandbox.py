@@ -18,7 +18,7 @@ from drake_diff.exceptions import InputError
 
 FUZZ = ROOT / "tests" / "benchmarks" / "fuzz_directories.py"
 
-pytestmark = pytest.mark.usefixtures("child_process")
+pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.solve]
 
 
 def give(value):
@@ -55,6 +55,7 @@ def ask(function, monkeypatch, seconds=20.0, **arguments):
     return call(f"test_sandbox:{function.__name__}", arguments, seconds)
 
 
+@pytest.mark.slow
 @each_row(
     "function, kind, sentence",
     [
@@ -97,6 +98,7 @@ def test_a_model_that_ends_drake_breaks_the_run(run, monkeypatch):
     assert "the model cannot be read or run: the process that did so ended by SIGABRT" in found.sentence
 
 
+@pytest.mark.slow
 @each_row("limit", [{"time_limit": 0.05}, {"memory_limit": 0.05}])
 def test_a_limit_makes_a_run_undecided_and_is_named(run, limit):
     found = dd.verify(run, **limit)

@@ -9,6 +9,8 @@ from pydrake.multibody.tree import JointIndex
 import drake_diff as dd
 from drake_diff.runs import measure
 
+pytestmark = pytest.mark.solve
+
 
 def by_hand(model, random, x0=None, steps=8, off=0.01):
     """A plan that is not quite a motion of the model, and misses all that was asked by some hundredths."""

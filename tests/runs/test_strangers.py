@@ -26,6 +26,8 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.mcap_file import read_mcap, recover_mcap
 from drake_diff.runs import list_runs
 
+pytestmark = pytest.mark.solve
+
 RUN = ROOT / "artifacts" / "pendulum_swing_up"
 MIB = 2**20
 HEADER = "{'descr': '<f8', 'fortran_order': False, 'shape': %s, }"

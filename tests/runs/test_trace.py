@@ -107,6 +107,7 @@ def test_parameters_that_were_found_come_back_and_move_the_frames(tmp_path, load
 NUMBERS = st.floats(-10, 10) | st.sampled_from([np.nan, np.inf, -np.inf, -0.0, 5e-324, 1e6])
 
 
+@pytest.mark.solve
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_any_plan_round_trips_whatever_its_numbers(tmp_path_factory, data):

@@ -34,6 +34,8 @@ from drake_diff.runs.sealed import reproducible
 from drake_diff.runs.trace import write_trace
 from drake_diff.trials import save_robustness
 
+pytestmark = pytest.mark.solve
+
 FILES = ("plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap")
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 EVIL = """<robot name="&lt;script&gt;alert(1)&lt;/script&gt;"><link name="[red]a[/]"><inertial><mass value="1"/>
@@ -318,6 +320,7 @@ def test_another_version_of_drake_is_a_reason_for_doubt_not_a_lie(run, copy):
     assert any("metrics[cost].value: recorded 1, again" in line for line in found.undecided)
 
 
+@pytest.mark.slow
 def test_a_search_that_a_time_limit_or_the_user_ended_cannot_be_found_again(solution, tmp_path):
     for status in (dd.Status.TIME_LIMIT, dd.Status.INTERRUPTED):
         dd.save(solution.told(status=status), tmp_path / status.value)
@@ -487,6 +490,7 @@ def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):
     assert "not run again: the system is a user's own diagram" in str(found)
 
 
+@pytest.mark.slow
 def test_a_users_constraint_or_cost_is_undecided_and_what_rests_on_it_is_told(tmp_path):
     def slow(x):
         return x[1]

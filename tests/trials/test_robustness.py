@@ -18,6 +18,8 @@ from drake_diff.trials.perturbation import Setup, parameters_of, perturbed
 from drake_diff.trials.run import TOLD, Sensitivity, levels_named, trial_seed
 from drake_diff.trials.trial import Task, run_trial
 
+pytestmark = pytest.mark.solve
+
 A, B = np.array([[1.0, H], [0.0, 1.0]]), np.array([[H * H], [H]]) / MASS  # v+ = v + h u / m, x+ = x + h v+
 K = np.array([[-300.0, -40.0]])  # u = K x
 PHI = A + B @ K
@@ -411,6 +413,7 @@ def test_predictions_are_the_closed_form(regulator):
         assert sensitivity.predicted(name, 0.03) == pytest.approx(0.03 * value, rel=1e-9), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "level"),
     [

@@ -25,6 +25,8 @@ from drake_diff.trials import save_robustness
 from drake_diff.trials.files import robustness_data
 from drake_diff.trials.trial import evaluate
 
+pytestmark = pytest.mark.solve
+
 LEVELS = {"mass": [0.02, 0.4], "actuator_delay": [1, 8], "time_step": [2], "sensor_bias": [0.01]}
 WORST = ["mass_0.4", "actuator_delay_1", "time_step_2", "sensor_bias_0.01"]
 TRIAL_FILES = {"trial.json", "trace.mcap", "replay.html", "latencies.json"}
@@ -140,6 +142,7 @@ def test_the_trace_has_all_that_the_loop_saw_and_did(result, saved):
     assert latencies["latencies_s"] == found.latencies.tolist()
 
 
+@pytest.mark.slow
 @browsing
 @pytest.mark.parametrize(
     ("size", "scheme"), slow_after(1, [((1440, 900), "light"), ((390, 844), "dark")]), ids=["laptop", "phone"]
@@ -164,6 +167,7 @@ def test_the_page_opens_without_a_network_and_without_an_error(saved, browser, t
     assert errors(browser) == []
 
 
+@pytest.mark.slow
 def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(result, tmp_path, monkeypatch):
     before = save_robustness(result, tmp_path / "out")
 
