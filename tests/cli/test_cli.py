@@ -17,7 +17,6 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.cli import main as cli
-from drake_diff.cli.text import as_options
 from drake_diff.derivatives import METHODS
 from drake_diff.exceptions import ArtifactError
 from drake_diff.optimize import solve as solving
@@ -138,12 +137,6 @@ def test_bad_input_exits_with_2_a_named_error_and_no_artifact(tmp_path, monkeypa
     assert "Error: " in shown
     assert "Traceback" not in shown
     assert not (tmp_path / "artifacts").exists()
-
-
-def test_a_missing_script_exits_with_2(tmp_path):
-    done = drake_diff("run", tmp_path / "nothing.py", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "nothing.py" in done.stderr
 
 
 def test_a_bug_in_the_script_exits_with_4_and_its_traceback(tmp_path, monkeypatch, capsys):
@@ -408,22 +401,8 @@ def test_the_options_are_those_of_load_model(tmp_path, monkeypatch, capsys, word
         assert seen[0].options | kept == seen[0].options
 
 
-def test_arguments_are_typed_as_options():
-    arguments = {"fix_joints": ["a b", "c"], "ground": True, "contact": False, "mimic": "reduce"}
-    assert as_options(arguments) == "--fix-joints 'a b,c' --ground true --no-contact --mimic reduce"
-
-
 def test_the_version_is_that_of_the_installation(tmp_path):
     done = drake_diff("--version", cwd=tmp_path)
     version, computes = done.stdout.splitlines()
     assert (done.returncode, version) == (0, f"drake-diff {metadata.version('drake-diff')}")
     assert computes.startswith("Steps are differentiated by compiled functions (Numba ")
-
-
-def test_without_an_installation_there_is_no_version(monkeypatch, capsys):
-    def unknown(name):
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(metadata, "version", unknown)
-    assert exit_of(monkeypatch, "--version") == cli.MISSING
-    assert "MissingDependencyError: drake-diff runs from a folder" in capsys.readouterr().err

@@ -77,12 +77,6 @@ def test_the_term_that_was_changed_is_found(tmp_path, name, change):
     assert next(iter(found.effects.values())) == max(found.effects.values())
 
 
-def test_equal_steps_are_nobodys_doing(tmp_path):
-    drake = engine_of("drake", arms(tmp_path))
-    found = of(drake, engine_of("drake", arms(tmp_path)), *arm_state(drake.model))
-    assert (found.gap, found.responsible) == (0.0, "")
-
-
 @pytest.mark.parametrize(
     ("options", "told"),
     [

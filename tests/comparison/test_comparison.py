@@ -10,7 +10,6 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE
-from drake_diff.comparison.side_by_side import default_engines
 from drake_diff.engines.load import load_spec
 from drake_diff.exceptions import (
     InputError,
@@ -180,30 +179,6 @@ def test_missing_and_impossible_engines_are_listed_with_the_reason(load, monkeyp
     assert not found.holds  # nothing was compared
 
 
-def test_the_same_seed_gives_the_same_motion(load):
-    model = load("double_pendulum.urdf")
-    a, b, c = (dd.compare(model, (), num_steps=10, seed=seed) for seed in (3, 3, 4))
-    assert np.array_equal(a.reference.motion.xs, b.reference.motion.xs)
-    assert not np.array_equal(a.reference.motion.xs, c.reference.motion.xs)
-
-
-def test_tools_that_are_no_engines_are_told_of_and_not_pretended(load):
-    found = dd.compare(load("pendulum.urdf"), ("opencv", "gtsam", "isaaclab", "control"), num_steps=2)
-    told = {r.engine: r.reason for r in found.refused}
-    assert len(found.engines) == 1
-    assert "has no dynamics" in told["opencv"]
-    assert "has no dynamics" in told["gtsam"]
-    assert "export-model" in told["isaaclab"]
-    with pytest.raises(MissingDependencyError, match="poles and LQR"):
-        dd.engines.load_engine("control", load("pendulum.urdf"))
-
-
-def test_by_default_every_engine_is_asked(load):
-    assert default_engines(load("pendulum.urdf"))[:1] == ("numpy",)
-    contact = default_engines(load("sphere_on_ground.sdf"))
-    assert {"drake:similar", "drake:lagged", "mujoco", "pinocchio", "numpy"} <= set(contact)
-
-
 def test_bad_input_is_named(load):
     model = load("pendulum.urdf")
     with pytest.raises(UnknownNameError, match="mujoco"):
@@ -240,22 +215,6 @@ def test_another_jacobian_in_contact_is_not_unexplained(load, name, verdict):
     of_states = {e.jacobians[i].state: e.laws[i] for i in e.other_states}
     # MuJoCo turns by the exponential.
     assert of_states == {"contact": "contact law"} | ({} if name == "pinocchio" else {"free": "integrator"})
-
-
-def test_another_jacobian_in_contact_that_no_contract_tells_of_is_unexplained(load):
-    model = load("sphere_on_ground.sdf")
-    x0 = np.array(model.default_state)
-    x0[6] = 3.0
-    drake = engine_of("drake", model)
-
-    def softer(x, u):
-        found = drake.differentiate_step(x, u)
-        return found._replace(A=found.A * (0.9 if drake.contact_depth(x) else 1.0))
-
-    e = by_name(
-        dd.compare(model, (Doctored(drake, name="soft", differentiate_step=softer),), x0=x0, num_steps=5, seed=4)
-    )
-    assert e["soft"].verdict == "unexplained"
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1.0, "its own step's"), (1.05, "undecided")])

@@ -5,21 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.contracts import arms
 from helpers.engines import engine_of, needs
 from helpers.models import MODELS
 from helpers.table import each_row
 from helpers.two_bases import two_bases
 from pydrake.math import RollPitchYaw
-from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff.cli.main import app
 from drake_diff.comparison import read_recording
 from drake_diff.comparison.attribution import move
 from drake_diff.engines.formats import mjcf
 from drake_diff.exceptions import ArtifactError, InputError, ShapeError
-from drake_diff.logs import read_mcap
 
 pytestmark = pytest.mark.solve
 
@@ -78,29 +74,6 @@ def test_the_reference_takes_as_many_steps_as_lie_between_samples(load):
         compared(model, dropped)
 
 
-@pytest.mark.slow
-def test_the_command_compares_recordings_and_saves_them(load, tmp_path):
-    """One as it was, one sampled every fifth step and by another time step: exit status 1, and named."""
-    model = load("cart_pole.urdf")
-    header = ["time", *model.state_names, *model.input_names]
-    fast, slow = engine_of("drake", model), engine_of("drake", model.at_time_step(H / 2))
-    for name, engine, every, h in (("same", fast, 1, H), ("other", slow, 10, 5 * H)):
-        r = record(engine, [0, 0.7, 0, 0], np.ones((8, 1)), every=every, h=h)
-        rows = [[*map(repr, map(float, (t, *x))), "1.0"] for t, x in zip(r.times, r.xs, strict=True)]
-        write_csv(tmp_path / f"{name}.csv", header, rows)
-    command = ["compare", str(model.source), "--engines", "numpy", "--out", str(tmp_path / "out")]
-    for name, status in (("same", 0), ("other", 1)):
-        command += ["--recording", str(tmp_path / f"{name}.csv")]
-        done = CliRunner().invoke(app, command)
-        assert done.exit_code == status, done.output
-    assert "as if the time step were half" in done.output
-    log = read_mcap(next((tmp_path / "out").glob("*.mcap")))
-    np.testing.assert_allclose(log.arrays("/3_other/state")["time"], 5 * H * np.arange(9))
-    frames = {t.child_frame_id.split("/")[0] for _, m in log.messages["/tf"] for t in m.transforms}
-    assert "2_same" in frames
-    assert "3_other" not in frames  # it has no state at most of the times
-
-
 def damped_cart_pole(tmp_path, damping):
     text = (MODELS / "cart_pole.urdf").read_text()
     path = tmp_path / f"cart_pole_{damping}.urdf"
@@ -144,17 +117,6 @@ def test_the_one_setting_that_is_another_is_named(tmp_path, change, as_if, term,
     assert (e.verdict, e.first.as_if, e.largest.as_if) == (verdict, as_if, as_if)
     assert (e.first.responsible, e.largest.responsible) == (term, term)
     assert as_if in e.sentence
-
-
-def test_a_dropped_armature_is_named(tmp_path):
-    model = arms(tmp_path)
-    bare = engine_of("drake", arms(tmp_path, gear=0))  # of one of four joints: not the change, and not said to be
-    assert compared(model, record(bare, np.full(8, 0.1), np.ones((5, 4)), h=0.002)).largest.as_if == ""
-    text = model.source.read_text().replace('rotor_inertia value="0.0001"', 'rotor_inertia value="0"')
-    (tmp_path / "bare.urdf").write_text(text)
-    bare = engine_of("drake", dd.load_model(tmp_path / "bare.urdf", time_step=0.002))
-    e = compared(model, record(bare, np.full(8, 0.1), np.ones((5, 4)), h=0.002))
-    assert (e.verdict, e.largest.as_if, e.largest.responsible) == ("other model", "as if armature were 0", "inertia")
 
 
 def test_mujoco_s_turn_of_a_free_body_is_named(load):
@@ -476,21 +438,6 @@ def test_a_recording_of_two_free_bodies_is_compared_and_the_wrong_mass_is_seen(t
     assert e.step_gaps.max() > 1e-4  # 30 % of an arm's mass, where the turn's law makes 1e-7
 
 
-@pytest.mark.slow
-def test_a_mass_on_the_second_of_two_free_bodies_is_identified(tmp_path):
-    """MuJoCo in steps of 0.2 ms is the hidden truth, with noise of 1 mm, 1 mrad, 1 mm/s: 0.65 kg, not 0.5."""
-    needs("mujoco")
-    model, truth = two_bases(tmp_path), two_in_mujoco(two_bases(tmp_path, 0.65), fine=50, count=60)
-    noisy = truth.xs + 1e-3 * np.random.default_rng(1).standard_normal(truth.xs.shape)
-    for i in (0, 8):
-        noisy[:, i : i + 4] /= np.linalg.norm(noisy[:, i : i + 4], axis=1)[:, None]
-    log = csv_of(tmp_path / "log.csv", model, dd.Recording("mujoco", "1", truth.times, noisy, truth.us))
-    found = dd.identify(model, log, ["left_arm.mass", "right_arm.mass"])
-    assert found.values["right_arm.mass"] == pytest.approx(0.65, rel=0.01)  # of 30 %; the step's own error is 0.1 %
-    assert found.values["left_arm.mass"] == pytest.approx(0.5, rel=0.01)
-    assert found.explained, found.reason
-
-
 def two_bag(path, model, xs, names):
     """Joint states, and each body's odometry in the topic and with the child frame that `names` says."""
     rows = []
@@ -553,26 +500,6 @@ def test_a_body_that_is_missing_at_one_time_is_named(tmp_path):
         read_recording(bag_of(tmp_path / "bag", rows), model)
 
 
-def test_the_exported_bag_of_two_free_bodies_is_a_recording(tmp_path):
-    pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
-    from drake_diff.runs import measure
-    from drake_diff.runs.ros2 import export_ros2
-    from drake_diff.runs.trace import write_trace
-
-    model = two_bases(tmp_path)
-    x0 = np.array(model.default_state)
-    x0[16:] = 0.3
-    problem = dd.Problem(model, x0=x0, num_steps=5, final_cost=lambda x: x[4] ** 2)
-    motion = dd.rollout(model, x0, np.tile([0.3, -0.4], (5, 1)))
-    solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
-    write_trace(tmp_path / "trace.mcap", measure(solution), {})
-    counts = export_ros2(tmp_path, tmp_path / "bag")
-    assert counts["/odometry/left_body"] == counts["/odometry/right_body"] == 6
-    found = read_recording(tmp_path / "bag", model)
-    np.testing.assert_allclose(found.xs, motion.xs, atol=1e-15)  # the twist is turned there and back
-    np.testing.assert_array_equal(found.us, motion.us)
-
-
 def test_a_follower_is_left_out_of_a_bag_s_state(tmp_path):
     """`a` is in the state, `b` follows it; a reader of this bag has both."""
     from helpers.followers import followed
@@ -619,9 +546,3 @@ def test_a_bag_without_what_the_model_has_is_refused(load, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ArtifactError, match="not a ROS 2 bag"):
         read_recording(Path(tmp_path / "empty"), load("projectile.sdf"))
-
-
-def test_a_recording_shows_in_jupyter_with_its_name_escaped():
-    shown = dd.Recording("<script>", "1", np.array([0.0, 0.1]), np.zeros((2, 2)), np.zeros((1, 1)))._repr_html_()
-    assert "&lt;script&gt; 1: 2 samples over 0.1 s" in shown
-    assert "<script>" not in shown

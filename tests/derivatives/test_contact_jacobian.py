@@ -152,14 +152,6 @@ def test_many_steps_in_one_call_are_the_same(tmp_path):
         np.testing.assert_allclose(B[k], one.B, rtol=0, atol=1e-9 * size)
 
 
-def test_one_step_of_many_that_touches_is_placed_where_it_is(tmp_path):
-    model = _puck(tmp_path)
-    xs = np.array([[0.0, 0.4, 1.0, 0.0], [0.3, 0.099, 0.5, -0.1], [0.0, 0.6, 1.0, 0.0]])
-    A, _, methods = dd.linearize(model, xs, np.zeros((3, 0)))
-    assert methods == ("analytic",) * 3
-    np.testing.assert_allclose(A[1], dd.differentiate_step(model, xs[1], method="autodiff").A, atol=1e-9)
-
-
 def test_what_rests_on_a_fixed_sphere(tmp_path):
     """The sphere's side may be the one that does not move."""
     post = _sphere("post", "0 0 0.2", 0.2)
@@ -366,15 +358,6 @@ def test_what_is_taken_for_a_single_step_with_contact_follows_the_models_size(tm
     large = _walker(tmp_path)
     ((x, u),) = _touching_states(large, 1, seed=3)
     assert dd.differentiate_step(large, x, u).method == "analytic"
-
-
-def test_given_values_are_not_kept(tmp_path):
-    x, given = [0.0, 0.1 - 1e-3, 1.0, -0.02], {"z.friction": 0.9}
-    first = _puck(tmp_path)
-    dd.differentiate_step(first, x, parameters=given)
-    found, other = (dd.differentiate_step(m, x, method="analytic") for m in (first, _puck(tmp_path)))
-    assert found.method == "analytic"
-    np.testing.assert_array_equal(found.A, other.A)
 
 
 def _laws(count, seed):

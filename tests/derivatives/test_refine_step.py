@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.models import Plant, add_slide, contact_properties, robot_file
 from helpers.plants import block, constrained, limited_pendulum, pair, springs_and_motors
-from helpers.robots import FOOT, ROBOTS, example_robot, state_in_contact, state_in_range
+from helpers.robots import FOOT, ROBOTS, example_robot, state_in_contact
 from helpers.table import each_row
 from pydrake.geometry import Box, Sphere
 from pydrake.math import RigidTransform
@@ -161,13 +161,6 @@ def test_a_joint_at_its_limit(q, v, u, held):
     assert (exact != free) == bool(held)
 
 
-def test_a_step_that_ends_at_rest_beside_a_limit():
-    """v' = v + h (u - 3 v) / A is 0 to rounding, as at the end of a plan: nothing is left to compare rounding with."""
-    model, A = slide(limits=(-1.0, 1.0), damping=3.0), 2.1 + 3.0 * H
-    v = 0.3
-    assert refined(model, [-0.999, v], [3.0 * v - A * v / H])[1] == pytest.approx(0.0, abs=1e-15)
-
-
 @each_row("gains", [(300.0, 20.0), (1e9, 1e6)])
 @each_row("u", [0.0, 1e4])
 def test_a_pd_controller_within_its_effort_at_its_limit_and_too_stiff_for_the_step(gains, u):
@@ -206,14 +199,6 @@ def test_couplers_of_light_fingers_of_a_robot_that_falls(time_step):
     np.testing.assert_allclose(ratios[:, -2:], 1.0, rtol=1e-9)
     assert not ratios[:, :-2].any()
     np.testing.assert_allclose(found.offset, 0.0, atol=1e-9)
-
-
-def test_a_hand_whose_fingers_are_coupled_and_controlled():
-    model, random = example_robot("panda.urdf", gains=(100.0, 3.0)), np.random.default_rng(1)
-    xs = np.array([state_in_range(model, random) for _ in range(10)])
-    found = refine_steps(model, select(model, ()), xs, random.standard_normal((10, model.nu)))
-    assert {str(why) for why in found.refused.values()} <= {"hydroelastic contact acts"}
-    assert np.nanmax(np.abs(found.x_next - found.drake)) < 1e-6
 
 
 # ---- AutoDiffXd ------------------------------------------------------------------------------------------------------
@@ -428,14 +413,6 @@ def test_what_is_not_known_is_named():
     locked = springs_and_motors()
     locked.plant.GetJointByName("hinge0").Lock(locked.double.context)
     assert why_not(locked, np.zeros(6), np.zeros(3)) == "a joint is locked"
-
-
-def test_a_robot_in_the_air_with_controllers():
-    model, random = example_robot("ur5_robot.urdf", gains=(400.0, 30.0)), np.random.default_rng(0)
-    xs = np.array([state_in_range(model, random) for _ in range(20)])
-    found = refine_steps(model, select(model, ()), xs, random.standard_normal((20, model.nu)))
-    assert not found.refused
-    assert np.abs(found.x_next - found.drake).max() < 1e-9  # without limits the problem is quadratic: one step
 
 
 # ---- many robots -----------------------------------------------------------------------------------------------------

@@ -145,23 +145,6 @@ def test_friction_softness_limits_and_damping_come_back_and_one_that_is_off_is_n
     assert any(f", {named}: " in told for told in complaints(form, model, wrong)), (form, element)
 
 
-def test_mujoco_s_own_urdf_reader_has_the_same_mass_matrix(tmp_path):
-    mujoco = pytest.importorskip("mujoco", reason="no MuJoCo (the extra `engines`)")
-    model = arms(tmp_path)
-    description = describe(model)
-    theirs = mujoco.MjModel.from_xml_string(urdf(description))
-    data = mujoco.MjData(theirs)
-    drake = engine_of("drake", model)
-    armature = np.diag(description.by_velocity("armature"))  # which MuJoCo's reader of URDF leaves out
-    for seed in range(3):
-        data.qpos[:] = q = np.random.default_rng(seed).standard_normal(4)
-        mujoco.mj_forward(theirs, data)
-        M = np.zeros((4, 4))
-        for column, unit in zip(M, np.eye(4), strict=True):
-            mujoco.mj_mulM(theirs, data, column, unit)
-        np.testing.assert_allclose(M, drake.mass_matrix(q) - armature, atol=1e-12)
-
-
 # ---- joints that follow others ----------------------------------------------------------------------------------
 
 
@@ -236,13 +219,6 @@ def test_bad_input_is_named(load, tmp_path):
         export_model(model, tmp_path, target="sdf")
     with pytest.raises(InputError, match="states"):
         export_model(model, tmp_path / "out", target="sdf", states=0)
-
-
-def test_what_is_left_out_is_told(load, tmp_path):
-    export_model(load("sphere_on_ground.sdf"), tmp_path / "lab", target="isaaclab", states=2)
-    assert "to be added by hand: ground::ground#0." in (tmp_path / "lab" / "README.md").read_text()
-    export_model(load("sphere_on_ground.sdf"), tmp_path / "gazebo", target="gazebo", states=2)
-    assert "to be added by hand: none." in (tmp_path / "gazebo" / "README.md").read_text()
 
 
 def test_the_command_exports(load, tmp_path):

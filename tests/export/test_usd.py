@@ -57,14 +57,6 @@ def test_newton_finds_the_free_ball_and_the_box(load, tmp_path):
     assert pusher[0] == pytest.approx(0.05, rel=1e-6)  # the radius
 
 
-def test_the_armature_is_there(tmp_path):
-    from drake_diff.export.usd import usd
-
-    text = usd(describe(arms(tmp_path)))
-    assert text.count("float physxJoint:armature = 0.04") == 4
-    assert 'prepend apiSchemas = ["PhysicsDriveAPI:angular", "PhysxJointAPI"]' in text
-
-
 def test_what_usd_cannot_say_is_told_and_not_written(load, tmp_path):
     from drake_diff.export.usd import usd
 
@@ -155,22 +147,6 @@ def test_usd_has_no_hinge_that_follows_a_slide(tmp_path):
     export_model(followed(tmp_path, ("prismatic", "revolute")), tmp_path / "out", target="isaaclab", states=2)
     assert not (tmp_path / "out" / "model.usda").exists()
     assert "No USD is written: b follows a: in USD a hinge cannot" in (tmp_path / "out" / "README.md").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
-def test_newton_finds_the_follower(tmp_path, kind):
-    _, builder = newton_of(followed(tmp_path, (kind, kind)), tmp_path)
-    assert [label.split("/")[-1] for label in builder.joint_label] == ["a", "b"]
-    assert list(builder.joint_mimic_joint) == [-1, 0]
-    np.testing.assert_allclose(builder.joint_mimic_coeffs[1], [0.3, 1.7], rtol=1e-6)  # of float32, in rad or m
-
-
-def test_what_is_lost_is_told_by_name(load):
-    from drake_diff.export.usd import lost
-
-    assert any("dissipation" in told for told in lost(describe(load("sphere_on_ground.sdf"))))
-    assert lost(describe(load("cart_pole.urdf"))) == ("effort limits of force",)
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.identification import contact
 from drake_diff.identification.contact import Fitted, Point, WholeMotions
-from drake_diff.identification.messages import NO_CHANGE, Explanation, also_touching
 from drake_diff.identification.recordings import Chart, read_pieces
 from drake_diff.identification.unknowns import Unknown, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
@@ -129,23 +128,3 @@ def test_a_change_that_is_none_blames_no_model(other, names):
     w = contact._Search.said(search, base, fitted, tried)
     assert w.explained
     assert w.names == names
-
-
-def test_what_neither_search_explains_is_said_of_both():
-    in_air = Explanation((), {}, {}, (), False, "Not explained: this; with a, more is left.", {})
-    touching = Explanation((), {}, {}, (), False, f"{NO_CHANGE}; with b, what is left of x is twice the noise.", {})
-    w = also_touching(in_air, touching)
-    assert not w.explained
-    assert w.sentence == (
-        "Not explained: this; with a, more is left. Where bodies touch, none that was tried explains it either; "
-        "with b, what is left of x is twice the noise."
-    )
-
-
-@pytest.mark.slow
-def test_a_change_that_is_not_tried_is_not_explained_by_another(ball, contact_alone, monkeypatch):
-    monkeypatch.setattr(contact, "OF_CONTACT", ("friction",))
-    w = dd.explain(ball, thrown(ball, ball__stiffness=13000.0))
-    assert w.names == ()
-    assert not w.explained
-    assert w.sentence.startswith("Not explained: no change that was tried")

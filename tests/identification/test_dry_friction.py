@@ -127,18 +127,6 @@ def test_the_friction_of_a_joint_that_follows_another_holds_both(tmp_path):
     assert low < FRICTION / 0.4 < high < low + 0.02 * FRICTION / 0.4
 
 
-@pytest.mark.slow
-def test_friction_that_holds_is_named_where_a_joint_follows_another(tmp_path):
-    """Of either joint: 1 N of the one and 1/0.4 N of the other do the same."""
-    us = pushes(9.0)
-    xs = sticks_and_slips(us, mass=2 + 0.4**2 * 3)
-    w = dd.explain(sliders(tmp_path), measured(xs, us))
-    assert w.names in [("a.coulomb_friction",), ("b.coulomb_friction",)]
-    true = FRICTION if w.names == ("a.coulomb_friction",) else FRICTION / 0.4
-    low, high = w.intervals[w.names[0]]
-    assert low < true < high < low + 0.02 * true
-
-
 def test_derivatives_go_through_a_stop_that_lets_another_joint_go(load):
     """Random steps of two joints, whose stops, turns and releases follow each other: as by differences."""
     model, random, count = load("double_pendulum.urdf"), np.random.default_rng(0), 300
@@ -287,19 +275,6 @@ def test_a_fit_of_which_least_is_left_at_a_kink_ends_there(load):
     assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 12)  # of standard normal numbers
 
 
-def test_shorter_steps_are_half_of_those_that_there_are(load):
-    """Where samples are 10 ms apart, steps of at most 20 ms are 10 ms long: halves of these tell whether they do."""
-    model, count = load("double_pendulum.urdf"), 40
-    tree = tree_for_identification(model)
-    unknowns = choose_unknowns(model, tree, ["shoulder.damping"])
-    law = ContinuousMotion(model, tree, unknowns, 0.02)
-    times, us = H * np.arange(count + 1), np.zeros((count, 2))
-    xs = law.run(unknowns.start, np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), H), us[None])[0]
-    fit, _ = fit_of(model, law, unknowns, us, xs, times, 0)
-    assert law.cut(H) == (H,)
-    assert fit.shorter.cut(H) == (H / 2, H / 2)
-
-
 def test_a_least_squares_mixed_with_itself_is_the_same(load):
     model, count = load("double_pendulum.urdf"), 40
     tree = tree_for_identification(model)
@@ -318,43 +293,3 @@ def test_a_least_squares_mixed_with_itself_is_the_same(load):
         for dz in np.eye(2):  # the rows of a triangle have either sign
             one, two = (np.sum((each.b - each.R @ dz) ** 2) for each in (mixed, same))
             assert one == pytest.approx(two, rel=1e-9)
-
-
-def test_a_fit_by_steps_frozen_halfway_ends_where_one_by_their_own_derivatives_does(load):
-    """Steps of 0.1 s are differentiated so badly when frozen that no part of a step leads on."""
-    model, count, h = load("double_pendulum.urdf"), 40, 0.1
-    tree = tree_for_identification(model)
-    unknowns = choose_unknowns(model, tree, ["shoulder_motor.strength"])
-    laws = [ContinuousMotion(model, tree, unknowns, h, frozen=frozen) for frozen in (True, False)]
-    assert not laws[0].exact().frozen
-    assert laws[1].exact() is None
-    times = h * np.arange(count + 1)
-    us = np.column_stack([6 * np.sin(4.4 * times[:-1]), 0.6 * np.sin(8.2 * times[:-1])])
-    z = unknowns.z_start
-    xs = laws[1].run(unknowns.values(z), np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), h), us[None])[0]
-    for seed in range(4):
-        ended = []
-        for law in laws:
-            fit, starts = fit_of(model, law, unknowns, us, xs, times, seed)
-            ended.append(fit.solve(z, starts, 12))
-        assert all(one.converged for one in ended), [one.why for one in ended]
-        off = (ended[0].z - ended[1].z) * np.abs(ended[1].reduced.R[0, 0])
-        assert abs(off[0]) < 0.01  # [standard deviations]: least squares end within 1e-5 of |r|^2, which is 0.003
-
-
-@pytest.mark.slow
-def test_a_held_joint_that_is_taken_for_moving_at_first_is_found_at_rest_in_a_few_steps(load):
-    """Its way to the stop is as v^2, which says ever less of v: plain steps take up to 15 here."""
-    model, count = load("double_pendulum.urdf"), 100
-    tree = tree_for_identification(model)
-    unknowns = choose_unknowns(model, tree, ["shoulder.coulomb_friction"])
-    law = ContinuousMotion(model, tree, unknowns, H)
-    times, true = H * np.arange(count + 1), np.array([4.0])
-    us = np.column_stack([6 * np.sin(4.4 * times[:-1]), 0.6 * np.sin(8.2 * times[:-1])])
-    xs = law.run(true, np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), H), us[None])[0]
-    assert np.all(xs[:15, 2] == 0)
-    for seed in range(12):
-        fit, starts = fit_of(model, law, unknowns, us, xs, times, seed)
-        starts[0, 2:] = [0.05, -0.09]  # [rad/s]
-        solved = fit.solve(true, starts, 12)
-        assert solved.converged, (seed, solved.why)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.models import MODELS, robot_file
+from helpers.models import MODELS
 from helpers.table import each_row
 from scipy import stats
 from typer.testing import CliRunner
@@ -51,25 +51,6 @@ def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motio
     # The motion is the double integral of inputs that are held.
     v = np.concatenate([[0.0], np.cumsum(best.us[:, 0]) * 0.02 / 2.0])
     np.testing.assert_allclose(best.xs[:, 1], v, atol=1e-9)
-
-
-def test_what_no_motion_tells_stays_open(load):
-    model, names = load("pendulum.urdf"), ["hinge.damping", "pole.center_of_mass"]
-    e = excite(model, names, duration=1.0, limits={"hinge_q": 1.0}, max_iterations=0)
-    assert e.unidentifiable == ("pole.center_of_mass[1]: a change of it leaves the motion as it is",)
-    assert np.isinf(e.deviations["pole.center_of_mass"][1])
-    assert np.isfinite(e.deviations["hinge.damping"])
-    assert "Open: pole.center_of_mass[1]" in e.sentence
-
-
-def test_a_default_state_at_a_limit_of_a_joint_is_moved_to_the_middle():
-    """As of an arm whose zero is where a joint ends."""
-    model = dd.load_model(robot_file("so100.urdf"), time_step=0.01, base="weld", actuators="all")
-    lower, upper = model.position_limits
-    i = model.position_names.index("shoulder_lift_q")
-    assert model.default_state[i] == lower[i] == 0
-    e = excite(model, ["elbow_flex.damping"], duration=1.0, max_iterations=0)
-    assert e.xs[0, i] == pytest.approx(upper[i] / 2)
 
 
 def test_what_is_promised_of_friction_is_what_its_sign_does(write_urdf):

@@ -18,12 +18,12 @@ from typer.testing import CliRunner
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ModelError, UnknownNameError
-from drake_diff.identification.candidates import Candidates, Inputs
+from drake_diff.identification.candidates import Candidates
 from drake_diff.identification.motion import ContinuousMotion, exponential
 from drake_diff.identification.ranking import FALSE_NAME
 from drake_diff.identification.recordings import Chart, given_noise, read_pieces
 from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
+from drake_diff.identification.unknowns import Unknowns, choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.runs.read import load_record
 
@@ -83,14 +83,6 @@ def test_a_single_change_of_a_pendulum_is_named(pendulum, changes, name, truth):
     assert low < truth < high, w
 
 
-def test_gravity_is_named(pendulum):
-    w = dd.explain(pendulum, driven(gravity=9.0))
-    assert among(w, "model.gravity"), w
-    assert w.values["model.gravity"][2] == pytest.approx(-9.0, abs=0.05)
-    assert "model.gravity[1] cannot be known" in w.sentence  # it is along the hinge
-    assert "inf" not in w.sentence
-
-
 def test_what_cannot_be_told_apart_is_named_together(pendulum):
     """A pendulum that nothing drives shows only the quotient of damping and mass."""
     w = dd.explain(pendulum, swing(damping=0.15))
@@ -122,20 +114,6 @@ def test_a_centre_of_mass_moves_as_in_a_file(tmp_path):
     np.testing.assert_allclose(numbers.inertial, changed.numbers.inertial, atol=1e-12)
     other = set_numbers(models[0], tree, Unknowns(one), np.array([0.1, 0.0, -0.4]))
     assert np.max(np.abs(other.inertial - changed.numbers.inertial)) > 0.05  # [kg m^2]
-
-
-def test_a_mass_promises_what_it_does_with_its_inertia():
-    """As in a file. UR5's first link turns about its own axis, so that nothing but its inertia acts."""
-    model = example_robot("ur5_robot.urdf")
-    tree, _chart = tree_for_identification(model), Chart(coordinates_of(model))
-    each = choose_unknowns(model, tree, ["shoulder_link.mass", "shoulder_link.inertia"]).each
-    both, alone = Unknowns(each, as_in_files=True), Unknowns(each[:1], as_in_files=True)
-    starts, us = 0.3 * np.random.default_rng(1).standard_normal((4, model.nx)), np.full((4, 1, model.nu), 5.0)
-    law, hs = ContinuousMotion(model, tree, alone, 0.01), np.full((4, 1), 0.01)
-    before, xs, after = (law.run(np.exp(alone.z_start + s), starts, hs, us) for s in (-1e-3, 0, 1e-3))
-    _, by_z = Inputs(ContinuousMotion(model, tree, both, 0.01), both, []).slopes(both.z_start, xs, hs, us)
-    true = (after - before)[:, -1] / 2e-3
-    np.testing.assert_allclose(by_z[:, 0, :, 0], true, atol=1e-5 * np.max(np.abs(true)))
 
 
 def test_beside_a_mass_the_motion_is_that_of_the_mass_with_its_inertia():
@@ -197,31 +175,6 @@ def test_dry_friction_stops_and_holds_and_lets_go(load):
     assert np.all(xs[9:21, 1] == 0)
 
 
-def test_dry_friction_can_give_way_where_it_holds(load):
-    """Of 0.5 N m on a hinge of 0.25 kg m^2, as by 2.25 kg m^2 and 25 N m s/rad more.
-
-    It slides by -2 rad/s^2 until 0.2 rad/s, and from there its speed decays by 10 a second; under 0.4 N m it creeps.
-    """
-    model = load("pendulum.urdf")
-    tree, _chart = tree_for_identification(model), Chart(coordinates_of(model))
-    tree = replace(tree, numbers=replace(tree.numbers, gravity=np.zeros(3), damping=np.zeros(1)))
-    by = {"hinge.held_inertia": 2.25, "hinge.held_damping": 25.0}
-    held = [Unknown(name, "", np.array([value]), 0.0, value) for name, value in by.items()]
-    unknowns = Unknowns((*choose_unknowns(model, tree, ["hinge.coulomb_friction"]).each, *held))
-    law = ContinuousMotion(model, tree, unknowns, 0.04)
-    z, starts, hs = unknowns.z_start + np.array([0.5, 0, 0]), np.array([[0.1, 0.7], [0.1, 0.0]]), np.full((2, 20), 0.04)
-    us = np.repeat([0.0, 0.4], 20).reshape(2, 20, 1)
-    xs, t = law.run(unknowns.values(z), starts, hs, us), 0.04 * np.arange(21)
-    slides, after, decays = np.minimum(t, 0.25), np.maximum(t - 0.25, 0), 0.4 / 25 * (1 - np.exp(-10 * t))
-    stops = 0.1 + 0.7 * slides - slides**2 + 0.02 * (1 - np.exp(-10 * after))
-    np.testing.assert_allclose(xs[0, :, 0], stops, atol=1e-8)
-    np.testing.assert_allclose(xs[1, :, 0], 0.1 + 0.4 / 25 * t - decays / 10, atol=1e-8)
-    _, by_z = law.slopes(z, xs[:, 6:8], hs[:, 6:7], us[:, 6:7])  # the step in which it is caught
-    for i, step in enumerate(1e-6 * np.eye(3)):
-        ends = [law.run(unknowns.values(z + s * step), xs[:, 6], hs[:, 6:7], us[:, 6:7])[:, -1] for s in (1, -1)]
-        np.testing.assert_allclose(by_z[:, 0, :, i], (ends[0] - ends[1]) / 2e-6, atol=1e-8)
-
-
 @pytest.mark.parametrize("names", [["elbow.coulomb_friction"], ["shoulder.coulomb_friction", "elbow.coulomb_friction"]])
 def test_derivatives_go_through_stops_and_reversals(load, names):
     model = load("double_pendulum.urdf")
@@ -281,20 +234,6 @@ def test_chance_names_a_change_of_a_right_arm_in_less_than_0_3_percent():
     named, by_bic = chance_of_a_name(model, log, 50_000)
     assert named < FALSE_NAME + 4 * np.sqrt(FALSE_NAME / 50_000)  # four standard deviations of the draws
     assert by_bic > 0.01
-
-
-@pytest.mark.slow
-def test_what_moves_within_less_than_the_time_between_samples_is_found():
-    """A light leg with more damping, of which steps of 10 ms have no motion: MuJoCo's, by the benchmark."""
-    pytest.importorskip("mujoco")
-    import identify
-
-    model, recording, truth = identify.recorded("solo", ("mass", "damping"), 940067)
-    found = dd.identify(model, recording, list(truth.changes))
-    assert found.explained, found.reason
-    for name, value in truth.changes.items():
-        assert found.values[name] == pytest.approx(value, rel=2e-3)  # half an interval is 5e-4 of the damping
-    assert set(dd.explain(model, recording, motion="continuous").names) == set(truth.changes)
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from helpers.models import MODELS
-from helpers.mujoco_arm import MuJoCoArm, bare_arm, drakes, shaken
 from helpers.pendulum import swing
 from typer.testing import CliRunner
 
@@ -170,25 +169,3 @@ def test_priors_and_bounds_are_kept_and_come_out_again(tmp_path):
     assert dd.verify(tmp_path / "run").holds
     refused = CliRunner().invoke(app, [*words, "--prior", "pole.mass=1"])
     assert isinstance(refused.exception, InputError)
-
-
-@pytest.mark.slow
-def test_the_delay_of_an_arm_in_another_simulator_is_found_beside_a_mass(tmp_path):
-    """A UR5 in MuJoCo whose torques act 7 ms late, with a heavier forearm; encoders of 0.2 mrad at 100 Hz."""
-    mujoco = pytest.importorskip("mujoco")
-    path = bare_arm(tmp_path)
-    model, random = drakes(path), np.random.default_rng(0)
-    q0 = np.array([0.3, -1.2, 1.0, -0.5, 0.4, 0.2])
-    us = shaken(model, q0, 150, 0.01, random)
-    arm = MuJoCoArm(mujoco, path)
-    q, v, _ = arm.move(q0, us, 0.01, delay=0.007, masses={"forearm_link": 1.2})
-    xs = np.hstack([q + 2e-4 * random.standard_normal(q.shape), np.full_like(v, np.nan)])
-    log = dd.Recording("MuJoCo", mujoco.__version__, 0.01 * np.arange(151), xs, us)
-    start = next(p.value[0] for p in dd.list_parameters(model) if p.name == "forearm_link.mass")
-    names = ["forearm_link.mass", "model.input_delay"]
-    e = dd.identify(model, log, names, priors={names[0]: (start, 1.0)}, motion="continuous")  # no limits there either
-    assert e.explained, e.reason
-    # Intervals of 95 % twice as wide, in which the truth is but once in 10,000 times not.
-    for name, truth, width in (("model.input_delay", 0.007, 1e-4), ("forearm_link.mass", 1.2 * start, 1e-2)):
-        low, high = e.intervals[name]
-        assert abs(e.values[name] - truth) < high - low < width, name

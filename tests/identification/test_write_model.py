@@ -160,12 +160,6 @@ def test_what_a_file_cannot_carry_is_named(arm, tmp_path, name, words):
     assert not (tmp_path / "right.urdf").exists()
 
 
-def test_an_offset_in_sdf_is_refused(load, tmp_path):
-    model = load("sliding_block.sdf")
-    with pytest.raises(InputError, match="SDF has no place for it"):
-        write_model(saying(model, {"slide.offset": np.array([0.0, 0.0, 1.0])}), tmp_path / "right.sdf")
-
-
 def test_other_kinds_of_files_are_refused(arm, load, tmp_path):
     acrobot = load("acrobot.xml")
     with pytest.raises(ModelError, match="one URDF or SDF file"):
@@ -240,12 +234,6 @@ def test_a_name_that_the_file_has_twice_is_refused(tmp_path):
     model = dd.load_model(path, time_step=0.01)
     with pytest.raises(InputError, match="elements link of this name"):
         write_model(saying(model, {"one::a.mass": 2.0}), tmp_path / "right.sdf")
-
-
-def test_parameters_without_a_change_leave_the_text(arm, tmp_path):
-    path = write_model(saying(arm, {"arm.mass": 2.0}), tmp_path / "right.urdf")
-    lines = path.read_text().splitlines()
-    assert [line for line in lines if not line.startswith("<!-- Explained")] == ARM.splitlines()
 
 
 def test_names_cannot_end_the_comment(arm, tmp_path):

@@ -60,13 +60,6 @@ def test_every_double_comes_back_bit_for_bit(tmp_path_factory, values):
     assert found.tobytes() == np.array(values).tobytes()
 
 
-def test_the_same_content_gives_the_same_bytes(tmp_path):
-    paths = [tmp_path / name for name in ("a.mcap", "b.mcap")]
-    for path in paths:
-        write(path, states(), status="converged")
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-
-
 def test_a_cut_file_is_refused(tmp_path):
     path = tmp_path / "a.mcap"
     write(path, states())
@@ -149,11 +142,6 @@ def test_arrays_of_lists_of_different_lengths_texts_and_flags(tmp_path):
     assert (found["variant"], found["failures"], found["holds"].tolist()) == (["x"], [["y", "z"]], [True])
     with pytest.raises(UnknownNameError, match="one of /contacts, /replays"):
         log.arrays("/contact")
-
-
-def test_an_empty_channel_gives_arrays_as_wide_as_its_names(tmp_path):
-    write_mcap(tmp_path / "a.mcap", [Channel("/state", STATE, [], {"names": {"q": ["a", "b"]}})], {}, {})
-    assert read_mcap(tmp_path / "a.mcap").arrays("/state")["q"].shape == (0, 2)
 
 
 def test_channels_are_merged_in_time_and_a_time_that_decreases_is_refused(tmp_path):

@@ -43,15 +43,6 @@ def test_a_delayed_sensor_is_the_delayed_recursion(cart, delay):
     assert set(found.controller_status) == {"ok"}
 
 
-def test_without_a_loop_around_it_a_controller_is_a_policy(cart):
-    found = closed_loop(cart, gain(30, 8), [1.0, 0.5], 50)
-    plain = dd.rollout(cart, [1.0, 0.5], policy=gain(30, 8), num_steps=50)
-    assert np.array_equal(found.motion.xs, plain.xs)
-    assert np.array_equal(found.motion.energy, plain.energy)
-    assert np.array_equal(found.observations, plain.xs[:-1])
-    assert np.array_equal(found.commands, found.applied)
-
-
 @pytest.mark.parametrize("delay", [1, 2, 4])
 def test_the_stability_limit_of_the_double_integrator_under_a_delay(cart, delay):
     """z^d (z - 1)^2 + (h^2 kp z + h kd (z - 1)) / m = 0. Without kp what remains is z^d (z - 1) + h kd / m = 0, an
@@ -263,13 +254,6 @@ def test_ctrl_c_in_a_controller_is_no_failure_of_it(cart):
 
     with pytest.raises(KeyboardInterrupt):
         closed_loop(cart, interrupted, [0.0, 0.0], 20)
-
-
-def test_a_loop_is_shown_in_a_few_lines(cart):
-    shown = repr(closed_loop(cart, Stubborn("call"), [0.0, 0.0], 500))
-    assert shown.splitlines()[0] == "closed loop: 6 steps of the controller, 6 of the plant"
-    assert "broke off at t = 0.06 s: the controller failed" in shown
-    assert len(shown.splitlines()) == 4
 
 
 def test_a_late_answer_is_not_used_and_the_last_command_is_held(cart):

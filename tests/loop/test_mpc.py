@@ -13,7 +13,7 @@ import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.step import advance
 from drake_diff.motion import TVLQR
-from drake_diff.optimize.replay import goal_check, regulator_weights
+from drake_diff.optimize.replay import regulator_weights
 
 pytestmark = pytest.mark.solve
 
@@ -100,17 +100,6 @@ def test_the_pushed_cart_pole_ends_upright(swung):
     assert runs["mpc"].ended == ""
 
 
-@pytest.mark.slow
-def test_the_same_calls_give_the_same_bytes_and_start_forgets(swung):
-    def run(mpc):
-        loop = dd.loop.Loop(pushes=[dd.loop.Push("pole", [1.0, 0, 0], 0.1)])
-        return dd.loop.closed_loop(mpc._problem.model, mpc, np.zeros(4), 8, loop).commands.tobytes()
-
-    first = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
-    other = dd.loop.MPC(swing_up(), horizon=30, plan=swung)
-    assert run(first) == run(first) == run(other)
-
-
 def test_between_two_plans_the_first_ones_inputs_are_given(swung):
     """Only steps 0, 3 and 6 look at the state, and there it is as planned: 1e-4 of 3 N is what two minima of a cost of
     59 can differ by that both leave 1e-16 of it."""
@@ -189,15 +178,6 @@ def test_what_it_cannot_do_is_refused_at_once(changes, options, said):
         dd.loop.MPC(problem, **{"horizon": 5, "plan": straight(problem), **options})
 
 
-def test_an_open_loop_holds_its_last_input():
-    controller = dd.loop.OpenLoop([[1.0], [2.0], [3.0]], 0.1)
-    assert [controller(None, t)[0] for t in (0.0, 0.1, 0.1999, 0.2, 9.0)] == [1, 2, 3, 3, 3]
-    with pytest.raises(InputError, match="0 steps"):
-        dd.loop.OpenLoop(np.zeros((0, 1)), 0.1)
-    with pytest.raises(InputError, match="time_step"):
-        dd.loop.OpenLoop([[1.0]], 0.0)
-
-
 def test_tracking_is_the_regulator_of_the_replays_within_bounds(swung):
     controller = tracking(swung)
     xs, us = swung.plan.sample(1)
@@ -205,11 +185,3 @@ def test_tracking_is_the_regulator_of_the_replays_within_bounds(swung):
     d = np.array([0.01, -0.02, 0.0, 0.01])
     assert controller(xs[40] + d, 0.8) == pytest.approx(us[40] - gains[40] @ d, abs=1e-12)
     assert controller(xs[40] + 1e6, 0.8)[0] in (-20, 20)
-
-
-@pytest.mark.parametrize(("parts", "arrives"), [(1, False), (4, True)])
-def test_a_collocated_plan_is_tracked_where_the_steps_are_short_enough(swung, parts, arrives):
-    """Arrival as the package judges it: within 5 % of each state's range."""
-    model = swung.plan.model_at(parts)
-    end = dd.loop.closed_loop(model, tracking(swung, parts), swung.xs[0], 100 * parts).motion.xs[-1]
-    assert goal_check(swung.plan, swung.problem.goal_error(end)).passes == arrives

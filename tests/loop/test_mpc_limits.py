@@ -171,16 +171,6 @@ def test_a_goal_is_stayed_at_past_an_obstacle():
     assert np.max(clear.lacking(run.motion.xs)) < 0.02  # the margin may be used, the ball is not entered
 
 
-class Clock:
-    """Each reading is the next of `times`, the last for ever."""
-
-    def __init__(self, *times):
-        self.times = list(times)
-
-    def __call__(self):
-        return self.times.pop(0) if len(self.times) > 1 else self.times[0]
-
-
 def test_a_late_answer_is_not_used_and_the_last_plan_goes_on():
     problem = limited()
 
@@ -219,36 +209,6 @@ def test_a_late_answer_is_not_used_and_the_last_plan_goes_on():
     mpc.start(x)
     assert mpc.missed == 0
     assert len(mpc.latencies) == 0
-
-
-def test_without_a_budget_no_clock_changes_anything():
-    problem = limited()
-    given = []
-    for times in ((0.0,), tuple(np.cumsum(np.full(400, 3.0)))):
-        mpc = MPC(problem, horizon=10, plan=straight(problem), iterations=3, clock=Clock(*times))
-        given.append(closed_loop(problem.model, mpc, [1.0, 0.0], 20).commands.tobytes())
-    assert given[0] == given[1]
-
-
-def test_another_iteration_that_would_be_late_is_not_begun():
-    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
-    problem = dd.Problem(model, x0=[0, 0], x_goal=[2.0, 0], num_steps=50, running_cost=EFFORT)
-    solution = dd.solve(problem)
-    calls = []
-    with pytest.MonkeyPatch.context() as patch:
-        now = [0.0]
-        take = realtime_step.take_step
-
-        def counted(*given):
-            calls.append(now[0])
-            now[0] += 0.4
-            return take(*given)
-
-        mpc = MPC(problem, horizon=20, plan=solution, iterations=10, budget=1.0, clock=lambda: now[0])
-        patch.setattr("drake_diff.loop.mpc.take_step", counted)
-        mpc([0.5, 1.0], 0.1)
-    assert len(calls) == 2
-    assert mpc.missed == 0
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from helpers.robots import example_robot, state_in_contact, state_in_range
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff._base.compiled import compiled, report_compilation
+from drake_diff._base.compiled import compiled
 from drake_diff.derivatives.contact import jacobian as of_contact
 from drake_diff.mechanics import compiled_tree as of_trees
 from drake_diff.mechanics import tree_kernel
@@ -111,9 +111,3 @@ def test_a_function_without_a_folder_for_its_cache_is_compiled_all_the_same(monk
     monkeypatch.syspath_prepend(str(tmp_path))
     double = compiled(importlib.import_module("kernel_without_cache").double)
     assert (double(1.5), double.stats.cache_path) == (3.0, None)
-
-
-def test_a_compilation_is_logged_with_its_time(caplog):
-    report_compilation("sweep", 0.2)
-    report_compilation("sweep", 6.34)
-    assert [record.getMessage() for record in caplog.records] == ["Numba compiled sweep in 6.3 s, once on this machine"]

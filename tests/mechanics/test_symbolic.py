@@ -10,7 +10,7 @@ import pytest
 from helpers.models import MODELS, random_state, robot_file
 from helpers.plants import floating, random_tree
 from helpers.table import each_row
-from helpers.transcription import BLOCK, collocate, move, own_derivatives, solved
+from helpers.transcription import move, own_derivatives, solved
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.tree import QuaternionFloatingJoint
 
@@ -185,13 +185,6 @@ def test_a_model_that_is_no_tree_of_hinges_and_slides_has_none():
     assert "quaternion_floating" in why.reason
 
 
-def test_the_context_is_left_as_it_was():
-    model = model_named("acrobot.xml")
-    model.plant.SetPositionsAndVelocities(model.double.context, [0.1, 0.2, 0.3, 0.4])
-    symbolic_plant(model)
-    assert list(model.plant.GetPositionsAndVelocities(model.double.context)) == [0.1, 0.2, 0.3, 0.4]
-
-
 # ------------------------------------------------------------------------------ two routes, one result
 
 
@@ -258,10 +251,3 @@ def test_a_hessian_that_is_not_finite_is_left_and_that_is_told():
     )
     assert 12 < motion.cost < 13
     assert motion.xs[-1] == pytest.approx([1, 0], abs=1e-9)
-
-
-def test_the_block_is_exact_in_one_step():
-    """A quadratic program: an exact Hessian needs one step, IPOPT's table has the start and it."""
-    motion = collocate(BLOCK, x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=1.0, running_cost=lambda x, u: u[0] ** 2)
-    assert len(motion.iterations) == 2
-    assert motion.iterations[-1].objective == pytest.approx(12, rel=1e-9)

@@ -85,18 +85,6 @@ def test_a_double_pendulum_of_rods_has_its_mass_matrix_and_bias(load):
     assert d.tau[0] == pytest.approx(np.add(bias, weight), rel=1e-12)
 
 
-def test_many_states_at_once_are_the_same_states_one_by_one():
-    model, random = random_tree(3), np.random.default_rng(0)
-    n = model.nv
-    q, v, a = (random.standard_normal((7, n)) for _ in range(3))
-    together = at(model, q, v, a)
-    for k in range(7):
-        alone = at(model, q[k], v[k], a[k])
-        assert together.tau[k] == pytest.approx(alone.tau[0], abs=1e-12)
-        assert together.by_q[k] == pytest.approx(alone.by_q[0], abs=1e-12)
-        assert together.by_v[k] == pytest.approx(alone.by_v[0], abs=1e-12)
-
-
 def floating():
     made = Plant(0.01)
     made.plant.AddRigidBody("free", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
@@ -185,17 +173,6 @@ def test_in_a_rollout_through_a_joint_limit_the_steps_at_it_are_autodiffs():
     assert {d.method for d in ours} == {"implicit", "autodiff"}
     for a, b in zip(ours, drakes, strict=True):
         assert pytest.approx(b.A, abs=1e-8 * np.abs(b.A).max()) == a.A
-
-
-def test_states_that_are_no_rollout_are_each_their_own(load):
-    model, random = load("acrobot.xml"), np.random.default_rng(2)
-    xs, us = random.standard_normal((6, 4)), random.standard_normal((6, 1))
-    for method in ("implicit", "autodiff"):
-        found = derivatives_along(model, xs[0], us, method=method, xs=xs)
-        for d, x, u in zip(found, xs, us, strict=True):
-            alone = dd.differentiate_step(model, x, u, method="autodiff")
-            assert pytest.approx(alone.A, abs=1e-10) == d.A
-            assert np.array_equal(d.x_next, alone.x_next)
 
 
 def test_pd_control_and_clipped_inputs_in_one_call_too():

@@ -14,7 +14,6 @@ from helpers.browser import (
     move_slider,
     nameless,
     open_page,
-    set_screen,
     view_of,
     wait_for_frame,
 )
@@ -24,9 +23,7 @@ from helpers.table import each_row, slow_after
 
 import drake_diff as dd
 from drake_diff.certificates.certificate import certify_jacobian
-from drake_diff.exceptions import ArtifactError
-from drake_diff.pages.html import MOST_ENTRIES, MOST_POINTS, Line, Plot, page_data, write_page
-from drake_diff.pages.meshcat import MOST_POSES, frames_of
+from drake_diff.pages.html import MOST_POINTS, Line, Plot, page_data, write_page
 from drake_diff.runs.compare import write_runs_page
 
 pytestmark = pytest.mark.solve
@@ -128,21 +125,6 @@ def test_a_group_of_plots_is_shown_at_a_time_under_one_legend(humanoid, browser)
     assert errors(browser) == []
 
 
-@pytest.mark.slow
-@browsing
-def test_inputs_are_drawn_as_percent_of_their_limit_and_told_in_their_unit(humanoid, browser):
-    """Held at 0.2 N m of 0.5 N m: 40 %."""
-    open_page(browser, humanoid / "report.html", size=DESK)
-    press(browser, ".choices button", "Inputs")
-    values = texts(browser, ".panel:not([hidden]) .values")
-    assert all(v.strip().startswith("40 % (0.2 N") for v in values), values[:3]
-    rows = saved_by(browser, ".panel:not([hidden]) .legend .csv")
-    assert len(rows) == 1 + 41
-    assert len(rows[0]) == 1 + 29
-    assert rows[0][1].endswith("[N m]")
-    assert float(rows[3][4]) == 0.2  # absolute
-
-
 @browsing
 @pytest.mark.parametrize("size", slow_after(1, [(PHONE,), (DESK,)]), ids=["phone", "desktop"])
 def test_the_replay_stays_in_view_beside_its_plots(humanoid, browser, size):
@@ -160,19 +142,6 @@ def test_the_replay_stays_in_view_beside_its_plots(humanoid, browser, size):
         press(browser, "#fold")
         assert not browser.execute_script("return document.getElementById('view').offsetParent")
     assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
-
-
-@pytest.mark.slow
-@browsing
-def test_tables_scroll_in_their_own_box(humanoid, browser):
-    open_page(browser, humanoid / "report.html", size=PHONE)
-    browser.execute_script("document.querySelectorAll('details').forEach(d => d.open = true)")
-    boxes = browser.execute_script(
-        "return [...document.querySelectorAll('.wide')].map(b => [b.clientHeight, b.scrollHeight, b.scrollWidth])"
-    )
-    assert max(box[0] for box in boxes) <= 0.61 * PHONE[1]
-    assert any(box[1] > 2 * box[0] for box in boxes)
-    assert browser.execute_script("return document.documentElement.scrollWidth") <= PHONE[0]
 
 
 def open_all(browser):
@@ -203,24 +172,6 @@ def test_every_text_can_be_read_and_every_control_has_a_name(humanoid, browser, 
 
 @pytest.mark.slow
 @browsing
-def test_what_cannot_be_read_is_found(two, browser):
-    """What the test above looks for, planted."""
-    open_page(browser, two / "short" / "report.html", size=PHONE)
-    assert faint_texts(browser) == nameless(browser) == badly_laid(browser) == []
-    browser.execute_script(
-        "document.querySelector('.facts').style.cssText = 'color: #bbb; margin-top: -40px';"
-        "document.querySelector('.sentence').style.width = '900px';"
-        "document.querySelector('.checks li').style.cssText = 'overflow: hidden; white-space: nowrap; width: 60px';"
-        "document.getElementById('play').removeAttribute('aria-label');"
-        "document.getElementById('play').removeAttribute('title'); document.getElementById('play').textContent = ''"
-    )
-    assert [tag for _, tag, _ in faint_texts(browser)] == ["P"]
-    assert len(nameless(browser)) == 1
-    assert {kind for kind, *_ in badly_laid(browser)} == {"beyond the page", "cut", "overlap"}
-
-
-@pytest.mark.slow
-@browsing
 def test_the_replay_is_moved_by_the_keyboard(two, browser):
     """The arrow keys move it by a hundredth, the space bar plays and pauses, and types a space in a field."""
     from selenium.webdriver.common.action_chains import ActionChains
@@ -238,33 +189,6 @@ def test_the_replay_is_moved_by_the_keyboard(two, browser):
     assert browser.execute_script("return scrollY") == 0
     ActionChains(browser).send_keys(" ").perform()
     assert not browser.execute_script(is_playing)
-
-
-@browsing
-def test_the_speed_of_the_replay_is_chosen(two, browser):
-    """The clock of the page is replaced: a tenth of a second at half the speed moves the slider by 0.05 s."""
-    open_page(browser, two / "short" / "report.html")
-    browser.execute_script(
-        "window.calls = []; window.requestAnimationFrame = (f) => calls.push(f);"
-        "document.getElementById('speed').value = '0.5'; document.getElementById('play').click();"
-        "calls.shift()(1000); calls.shift()(1100)"
-    )
-    assert browser.execute_script("return Number(document.getElementById('time').value)") == pytest.approx(0.05)
-    assert browser.execute_script("return document.getElementById('play').getAttribute('aria-label')") == "pause"
-
-
-@pytest.mark.slow
-@browsing
-def test_the_picture_is_dark_where_the_screen_is(two, browser):
-    corner = {}
-    for page in ("report.html", "replay.html"):
-        open_page(browser, two / "short" / page)
-        for scheme in ("light", "dark"):
-            set_screen(browser, DESK, scheme)
-            wait_for_frame(browser)
-            corner[scheme, page] = view_of(browser)[5, 5].mean()
-    assert min(corner["light", page] for page in ("report.html", "replay.html")) > 0.8
-    assert max(corner["dark", page] for page in ("report.html", "replay.html")) < 0.3
 
 
 @pytest.mark.slow
@@ -289,18 +213,6 @@ def test_two_runs_share_a_replay_and_plots(two, browser, tmp_path):
     assert texts(browser, ".values")[1].strip().endswith("-0.2")  # 0.3 less 0.5 rad
     assert told != texts(browser, ".values")[1]
     assert errors(browser) == []
-
-
-def test_a_page_of_two_runs_says_where_they_are_furthest_apart(two, tmp_path):
-    page = tmp_path / "new" / "both.html"
-    write_runs_page(page, two / "short", two / "long")
-    text = page.read_text()
-    assert "short and long: the plans are furthest apart in" in text
-    assert "problem.num_steps" in text
-    write_runs_page(page, two / "short", two / "short")
-    assert "have the same plan" in page.read_text()
-    with pytest.raises(ArtifactError):
-        write_runs_page(page, two / "short", tmp_path)
 
 
 @pytest.mark.slow
@@ -358,17 +270,6 @@ def certificate(rows, columns, wrong=()):
     return certify_jacobian(lambda x: matrix @ x, np.ones(columns), given, columns=[EVIL, *"c" * (columns - 1)])
 
 
-def test_of_a_large_certificate_the_entries_nearest_to_failing_have_numbers():
-    (small, large) = page_data(0.0, (), [certificate(3, 4), certificate(40, 50, wrong=[(7, 9), (39, 49)])])[
-        "certificates"
-    ]
-    assert small["told"] == list(range(12))
-    assert len(large["told"]) == MOST_ENTRIES
-    assert {7 * 50 + 9, 39 * 50 + 49} == set(large["told"][:2])
-    assert large["codes"].count("0") == 1998
-    assert len(large["derivative"]) == MOST_ENTRIES
-
-
 def test_of_a_long_series_the_extremes_are_kept():
     y = np.sin(np.linspace(0, 30, 20_001))
     y[7_777] = 5.0  # a peak of one step
@@ -386,13 +287,6 @@ def test_of_a_long_series_the_extremes_are_kept():
         for t, v in zip(plot["x"], plot["series"][0]["y"], strict=True)
         if v is not None
     )
-
-
-def test_a_replay_of_many_bodies_has_fewer_frames():
-    times = np.linspace(0, 10, 1001)
-    assert len(frames_of(times)) == 641  # 64 in each second
-    assert len(frames_of(times, MOST_POSES // 60)) == 101
-    assert frames_of(times, 100)[-1] == (10.0, 1000)
 
 
 def write_plots(path, data):

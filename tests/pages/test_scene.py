@@ -36,11 +36,6 @@ def test_the_force_of_an_input_is_drawn_where_it_pushes():
             np.testing.assert_allclose(one.force, force * R @ along, atol=1e-12)
 
 
-def test_motors_are_not_forces_on_bodies():
-    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
-    assert scene_of(model, np.array([0, 0.01]), np.zeros((2, 2)), us=np.ones((1, 1))).thrusts == ()
-
-
 @pytest.mark.parametrize("seed", range(8))
 def test_all_of_a_motion_is_in_view_and_fills_the_picture(seed):
     """By a pinhole camera, which knows of the balls alone: none beyond FILLED, and one at least at its edge."""

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 import drake_diff as dd
 from drake_diff._base.statistics import success_rate
 from drake_diff.cli.main import app
-from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
+from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.panels import run_panel
 from drake_diff.panels.panel import row_of
 from drake_diff.panels.panel_file import expand, load_panel
@@ -215,12 +215,6 @@ def test_global_generators_start_from_the_trials_own_seed():
 
 
 @pytest.mark.slow
-def test_a_trial_whose_worker_dies_is_evaluated_once_more(write, tmp_path):
-    table = run_panel(write("dies_once"), out=tmp_path / "out", workers=2)
-    assert [row["cost"] for row in table.rows] == [0.5, 1, 2, 4, 8]
-
-
-@pytest.mark.slow
 def test_a_trial_whose_worker_dies_twice_is_a_row_that_says_so(write, tmp_path):
     table = run_panel(write("dies"), out=tmp_path / "out", workers=1)
     assert table.errors == 1
@@ -260,16 +254,6 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
     assert "Traceback" not in output
     assert no_worker_lives(path)
     assert 3 <= len(finished(out / "trials.jsonl")) < 500
-
-
-@pytest.mark.slow
-def test_a_script_needs_no_guard_around_its_panel(write, tmp_path):
-    """Workers do not import the script that started them: without `if __name__ == "__main__"` it would start again."""
-    script = tmp_path / "script.py"
-    call = f"run_panel({str(write())!r}, out='out', workers=1)"
-    script.write_text(f"from drake_diff.panels import run_panel\nprint({call})\n")
-    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert done.stdout.splitlines()[0] == "5 trials in 5 cells, 1 errors, in out", done.stderr
 
 
 # --- the journal ------------------------------------------------------------------------------------------------------
@@ -319,18 +303,6 @@ def test_another_panels_journal_is_refused_and_so_is_one_of_its_lines(write, tmp
         file.write(foreign)
     with pytest.raises(ArtifactError, match="line 7 is damaged or another panel's"):
         run_panel(write("cheap"), out=tmp_path / "out", workers=1)
-
-
-@pytest.mark.slow
-def test_a_comment_changes_no_panel_but_another_function_does(write, tmp_path):
-    path, out = write("cheap"), tmp_path / "out"
-    run_panel(path, out=out, workers=1)
-    path.write_text("# said in passing\n" + path.read_text())
-    run_panel(path, out=out, workers=1)
-    with open(tmp_path / "trials.py", "a") as file:
-        file.write("# changed\n")
-    with pytest.raises(ArtifactError, match="another panel: function_sha256"):
-        run_panel(path, out=out, workers=1)
 
 
 @pytest.mark.slow
@@ -385,34 +357,7 @@ def test_the_summary_of_a_cell_by_hand(tmp_path):
     assert (cell["success"]["count"], cell["success"]["rate"]) == (2, 2 / 3)
 
 
-def test_wilsons_interval_solves_its_equation():
-    """Its ends are the rates p that are z standard deviations, sqrt(p (1 - p) / n), from the rate that was seen."""
-    for successes, count in [(0, 5), (3, 10), (10, 10), (500, 1000)]:
-        low, high = success_rate(successes, count)[2:]
-        assert (low == 0) == (successes == 0)
-        assert (high == 1) == (successes == count)
-        for p in {low, high} - {0, 1}:
-            deviations = abs(successes / count - p) / math.sqrt(p * (1 - p) / count)
-            assert deviations == pytest.approx(1.959963984540054, rel=1e-9)  # rounding, of a difference of rates
-
-
 # --- the file ---------------------------------------------------------------------------------------------------------
-
-
-def test_another_value_on_an_axis_changes_no_other_trial(write):
-    few = expand(load_panel(write(seeds=3, methods='["a"]')))
-    more = expand(load_panel(write(seeds=4, methods='["b", "a"]')))
-    assert {trial.id: trial.fields for trial in few}.items() <= {trial.id: trial.fields for trial in more}.items()
-    assert len({trial.fields["seed"] for trial in more}) == len(more) == 40
-    assert more[1].name == "method=b level=0.5 repeat=1"
-
-
-def test_cells_stand_beside_the_axes(tmp_path):
-    path = tmp_path / "p.toml"
-    path.write_text('evaluate = "a:b"\n[axes]\nx = [1, 2]\ny = [3, 4]\n[[cells]]\nx = 9\n')
-    assert [trial.cell for trial in expand(load_panel(path))] == [
-        {"x": 1, "y": 3}, {"x": 1, "y": 4}, {"x": 2, "y": 3}, {"x": 2, "y": 4}, {"x": 9}
-    ]  # fmt: skip
 
 
 @each_row(
@@ -461,30 +406,6 @@ def test_bad_options_are_refused(write, tmp_path):
     ]:
         with pytest.raises(InputError, match=message):
             run_panel(write(), out=tmp_path / "out", **options)
-
-
-def test_without_ray_its_extra_is_named(write, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'drake-diff\[cluster\]'"):
-        run_panel(write(), out=tmp_path / "out", engine="ray")
-
-
-@pytest.mark.slow
-def test_every_trial_has_a_record_that_is_the_same_for_any_number_of_workers(write, tmp_path):
-    path = write("fails")
-    found = [run_panel(path, out=tmp_path / f"out_{n}", workers=n) for n in (1, 2)]
-    one, two = ({p.name: p.read_bytes() for p in (f.directory / "trials").iterdir()} for f in found)
-    assert one == two
-    assert set(one) == {f"{row['id']}.json" for row in found[0].rows}
-    told = {record["trial"]["id"]: record for record in map(json.loads, one.values())}
-    for row in found[0].rows:
-        record = told[row["id"]]
-        assert record["trial"]["inputs"]["seed"] == row["seed"]
-        assert record["trial"]["cell"] == {"method": "a", "level": row["level"]}
-        assert record["verdict"] == ("fail" if row["level"] == 2 else "pass")
-        assert ("error" in record["trial"]["result"]) == (row["level"] == 2)
-        assert record["trial"]["conditions"]["evaluate"] == "trials.py:fails"
-        assert own_sha256(record) == record["record_sha256"]
 
 
 @pytest.mark.slow

@@ -51,10 +51,6 @@ def test_a_plan_starts_where_the_motors_hold_the_robot(tmp_path):
     assert plan(outstretched(tmp_path, 1.0), out=tmp_path / "out").success
 
 
-def test_a_start_that_is_held_is_left_where_the_file_puts_it(tmp_path):
-    assert load_robot(outstretched(tmp_path, 10.0), 0).q == pytest.approx([0.0])
-
-
 def test_a_joint_that_no_posture_relieves_is_fixed_and_told(tmp_path):
     """A vertical slide carries 9.81 N wherever it is, and its motor has 5 N."""
     slide = joint(

@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 import drake_diff as dd
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError
-from drake_diff.model.contact import contacts_of_the_step, deepest_overlap, thinnest_geometry
+from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion import TVLQR
@@ -187,20 +187,6 @@ def test_the_law_of_contact_can_be_told_where_the_file_does_not(tmp_path):
     for wrong in ({"near_rigid": 0}, {"relaxation_time": -1.0}):
         with pytest.raises(InputError, match="above 0"):
             dd.load_model(path, time_step=0.01, **wrong)
-
-
-def test_an_overlap_is_judged_by_what_overlaps(on_feet):
-    """Feet of 4 cm, 1 mm in the ground, and a trunk whose shape, 0.2 mm thick, is in the air."""
-    model = on_feet(bottom=1e-4)
-    x = model.default_state
-    x[6] = 0.42 - 1e-3
-    advance(model.double, x, np.zeros(model.nu))
-    depth, thickness, _ = deepest_overlap(model)
-    assert (depth, thickness) == pytest.approx((1e-3, 0.04), rel=1e-9)
-    assert thinnest_geometry(model)[0] == pytest.approx(2e-4)
-    x[6] = 5.0
-    advance(model.double, x, np.zeros(model.nu))
-    assert deepest_overlap(model)[2] == "nothing"
 
 
 def test_a_range_of_a_quaternion_is_that_of_the_turn(on_feet):
