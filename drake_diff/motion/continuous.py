@@ -12,8 +12,10 @@ these formulas: of Drake it takes the mass matrix, the forces without contact an
 of a discrete step.
 
 In the air steps are explicit. What touches is stiff, as friction that holds is a damper of mu f / v_s: steps there are
-linearly implicit, of `rosenbrock`. Where two geometries touch or let go the force has a corner, and that of Kelvin and
+linearly implicit, of Rodas5P. Where two geometries touch or let go the force has a corner, and that of Kelvin and
 Voigt jumps by k tau x': a step ends there, and no pair pushes within a step that did not at its start.
+
+It shares no equation with the flow that plans in continuous time are made by, so that they are replayed by it.
 """
 
 import time
@@ -26,13 +28,22 @@ import numpy as np
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, MultibodyForces
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff.exceptions import ModelError, SimulationError
+from drake_diff.model.contact import ContactPoint, body_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, proximity_property
 from drake_diff.model.step import set_state
-from drake_diff.motion import rosenbrock
-from drake_diff.motion.dormand_prince import ERROR, LEAST, STAGES, factor
+from drake_diff.motion.rollout import Policy, Rollout, continuous_rollout
+from drake_diff.motion.tableaus import (
+    ERROR,
+    LEAST,
+    ROSENBROCK_COUPLINGS,
+    ROSENBROCK_GAMMA,
+    ROSENBROCK_STAGES,
+    STAGES,
+    factor,
+)
 
 TOLERANCE = 1e-9  # of each step, relative to max(1, |x|)
 EVALUATIONS = 1_000_000  # of the equations of motion at most, about half a minute
@@ -66,6 +77,20 @@ class _Touch:
     bodies: tuple[tuple[float, int, Any], ...]  # +1 for A and -1 for B, its index, itself; the world left out
 
 
+@dataclass(frozen=True, slots=True)
+class _Contact:
+    """Two geometries A and B that overlap; A's point moves `relative` to B's, and the `normal` is out of B."""
+
+    pair: tuple[Any, Any]
+    touch: _Touch
+    depth: float  # [m]
+    point: tuple[float, ...]  # where the force acts, in world
+    normal: list[float]
+    relative: tuple[float, ...]
+    force: list[float]  # [N] on A
+    push: float  # [N] of it along the normal
+
+
 class ContinuousMotion:
     """The continuous motion of a model, as it is now: parameters that are applied act.
 
@@ -93,7 +118,7 @@ class ContinuousMotion:
         self.still = np.zeros(model.nv)
         self.lower, self.upper = model.position_limits
         self.forces = MultibodyForces(plant)
-        self._found: dict[Any, _Touch] = {}
+        self._touches: dict[Any, _Touch] = {}
 
     def states(self, x0: Array, us: Array) -> Array:
         """(N+1, nx) at the ends of the model's steps, over which us (N, nu) is held; raises as `roll`."""
@@ -133,15 +158,24 @@ class ContinuousMotion:
         if not self.touches:
             return frozenset()
         set_state(self.twin, x)
-        return self._contacts(None)[1]
+        return frozenset(contact.pair for contact in self._contacts(None) if contact.push > 0)
 
     def contact_force(self, only: Pairs | None = None) -> Array:
         """(nv,) of all contacts in the context's state, or of some pairs `only`."""
         plant, context = self.twin.plant, self.twin.context
+        wrenches: dict[int, list[float]] = {}  # on each body about the world's origin
+        for contact in self._contacts(only):
+            (x, y, z), (fx, fy, fz) = contact.point, contact.force
+            wrench = y * fz - z * fy, z * fx - x * fz, x * fy - y * fx, fx, fy, fz
+            for sign, i, _ in contact.touch.bodies:
+                total = wrenches.setdefault(i, [0.0] * 6)
+                for n, value in enumerate(wrench):
+                    total[n] += sign * value
         self.forces.SetZero()
-        for i, wrench in self._contacts(only)[0].items():
-            force = SpatialForce(np.array(wrench))
-            plant.get_body(BodyIndex(i)).AddInForceInWorld(context, force, self.forces)
+        for i, total in wrenches.items():
+            body = plant.get_body(BodyIndex(i))
+            force = SpatialForce(np.array(total)).Shift(plant.EvalBodyPoseInWorld(context, body).translation())
+            body.AddInForceInWorld(context, force, self.forces)
         return np.asarray(self.twin.own_force(plant.CalcGeneralizedForces(context, self.forces)))
 
     def touches_at(self, x: Array) -> Iterator[tuple[str, float, float, Array]]:
@@ -153,7 +187,7 @@ class ContinuousMotion:
         inspector, pairs = self._penetrations()
         world, mass = plant.world_frame(), self.twin.mass_matrix()
         for pair in pairs:
-            touch = self._found.get((pair.id_A, pair.id_B)) or self._touch(inspector, pair.id_A, pair.id_B)
+            touch = self._touches.get((pair.id_A, pair.id_B)) or self._touch(inspector, pair.id_A, pair.id_B)
             point = touch.part * np.asarray(pair.p_WCa) + (1 - touch.part) * np.asarray(pair.p_WCb)
             jacobian = np.zeros((3, self.model.nv))
             for sign, _, body in touch.bodies:
@@ -163,45 +197,31 @@ class ContinuousMotion:
             names = " and ".join(inspector.GetName(geometry) for geometry in (pair.id_A, pair.id_B))
             yield names, touch.stiffness, touch.damping, jacobian @ np.linalg.solve(mass, jacobian.T)
 
-    def _contacts(self, only: Pairs | None) -> tuple[dict[int, list[float]], Pairs]:
-        """(the wrench on each body about its origin, the pairs that push) in the context's state."""
+    def _contacts(self, only: Pairs | None) -> "Iterator[_Contact]":
+        """The pairs that overlap in the context's state, or some of them `only`."""
         plant, context = self.twin.plant, self.twin.context
         inspector, pairs = self._penetrations()
-        motions: dict[int, list[float]] = {}  # of each body's origin: where it is, how it turns, how it moves
-        wrenches: dict[int, list[float]] = {}
-        pushing = []
+        twists: dict[int, list[float]] = {}  # of each body: how it turns, and how its point at the world's origin moves
         for pair in pairs:
             key = pair.id_A, pair.id_B
             if only is not None and key not in only:
                 continue
-            touch = self._found.get(key) or self._touch(inspector, *key)
+            touch = self._touches.get(key) or self._touch(inspector, *key)
             a, b = touch.part, 1 - touch.part
             x, y, z = (a * p + b * q for p, q in zip(pair.p_WCa.tolist(), pair.p_WCb.tolist(), strict=True))
             ux = uy = uz = 0.0
             for sign, i, body in touch.bodies:
-                if i not in motions:
-                    place = plant.EvalBodyPoseInWorld(context, body).translation().tolist()
-                    motions[i] = place + plant.EvalBodySpatialVelocityInWorld(context, body).get_coeffs().tolist()
-                    wrenches[i] = [0.0] * 6
-                px, py, pz, wx, wy, wz, vx, vy, vz = motions[i]
-                rx, ry, rz = x - px, y - py, z - pz
-                ux += sign * (vx + wy * rz - wz * ry)
-                uy += sign * (vy + wz * rx - wx * rz)
-                uz += sign * (vz + wx * ry - wy * rx)
-            fx, fy, fz, push = self._force(touch, pair.depth, pair.nhat_BA_W.tolist(), (ux, uy, uz))
-            if push > 0:
-                pushing.append(key)
-            for sign, i, _ in touch.bodies:
-                px, py, pz, *_ = motions[i]
-                rx, ry, rz = x - px, y - py, z - pz
-                w = wrenches[i]
-                w[0] += sign * (ry * fz - rz * fy)
-                w[1] += sign * (rz * fx - rx * fz)
-                w[2] += sign * (rx * fy - ry * fx)
-                w[3] += sign * fx
-                w[4] += sign * fy
-                w[5] += sign * fz
-        return wrenches, frozenset(pushing)
+                if i not in twists:
+                    twist = plant.EvalBodySpatialVelocityInWorld(context, body)
+                    origin = plant.EvalBodyPoseInWorld(context, body).translation()
+                    twists[i] = twist.Shift(-origin).get_coeffs().tolist()
+                wx, wy, wz, vx, vy, vz = twists[i]
+                ux += sign * (vx + wy * z - wz * y)
+                uy += sign * (vy + wz * x - wx * z)
+                uz += sign * (vz + wx * y - wy * x)
+            normal, relative = pair.nhat_BA_W.tolist(), (ux, uy, uz)
+            *force, push = self._force(touch, pair.depth, normal, relative)
+            yield _Contact(key, touch, pair.depth, (x, y, z), normal, relative, force, push)
 
     def _force(self, touch: _Touch, depth: float, normal: Any, relative: Any) -> tuple[float, ...]:
         """[N] on A, and how much of it is along the normal. A's point moves `relative` to B's; `normal` is out of B."""
@@ -243,8 +263,8 @@ class ContinuousMotion:
         both = d_a + d_b if self.law == KELVIN_VOIGT else (1 - part) * d_a + part * d_b
         friction, stiffness = 2 * mu_a * mu_b / (mu_a + mu_b or 1.0), k_a * k_b / (k_a + k_b)
         place = part if self.law == own_law(self.model) else 0.5  # Drake's continuous plant pushes in the middle
-        self._found[a, b] = _Touch(friction, stiffness, both, place, tuple(bodies))
-        return self._found[a, b]
+        self._touches[a, b] = _Touch(friction, stiffness, both, place, tuple(bodies))
+        return self._touches[a, b]
 
     def _advance(
         self, rates: Callable[..., Array], x: Array, dt: float, tolerance: float, deadline: float
@@ -339,9 +359,9 @@ class ImplicitSteps:
 
     def take(self, h: float) -> tuple[Array, Array]:
         """The state after a step of `h` [s], and its error."""
-        inverse = np.linalg.inv(np.eye(len(self.x)) / (rosenbrock.GAMMA * h) - self.slopes)
-        stages, at = np.empty((len(rosenbrock.STAGES), len(self.x))), self.x
-        for i, (weights, couplings) in enumerate(zip(rosenbrock.STAGES, rosenbrock.COUPLINGS, strict=True)):
+        inverse = np.linalg.inv(np.eye(len(self.x)) / (ROSENBROCK_GAMMA * h) - self.slopes)
+        stages, at = np.empty((len(ROSENBROCK_STAGES), len(self.x))), self.x
+        for i, (weights, couplings) in enumerate(zip(ROSENBROCK_STAGES, ROSENBROCK_COUPLINGS, strict=True)):
             at = self.x + weights @ stages[:i]
             value = self.first if i == 0 else self.rates(at)
             stages[i] = inverse @ (value + couplings @ stages[:i] / h)
@@ -354,3 +374,89 @@ def _ratio(x: Array, ahead: Array, error: Array, tolerance: float) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         ratio = float(np.sqrt(np.mean((error / size) ** 2)))
     return ratio if np.isfinite(ratio) else float("inf")
+
+
+def replayed(
+    model: Model,
+    x0: Array,
+    inputs: Array | Policy,
+    count: int,
+    *,
+    tolerance: float = TOLERANCE,
+    evaluations: int | None = None,
+) -> Rollout:
+    """The motion over `count` of the model's steps under us (N, nu) or a policy; raises what `ContinuousMotion` does.
+
+    It is too stiff where it takes more than `evaluations` of the equations of motion to the `tolerance` of each step.
+    The states have work with them while they are integrated: of actuators, of what damping took, and of contact [J].
+    """
+    motion, nx, h = _WithWork(model, tolerance), model.nx, model.time_step
+    motion.most = evaluations or motion.most
+    states, us = np.zeros((count + 1, nx + 3)), np.empty((count, model.nu))
+    states[0, :nx] = x0
+    deepest, contacts, dt = np.zeros(count + 1), list[tuple[ContactPoint, ...]](), h
+    for k in range(count):
+        x = states[k, :nx].copy()
+        us[k] = finite_array("u", inputs(x, k * h), (model.nu,)) if callable(inputs) else inputs[k]
+        states[k + 1], dt = motion.follow(states[k], us[k], dt)
+        pushed = motion.deepest()
+        contacts.append(tuple(point for _, point in sorted(pushed.items())))
+        deepest[k + 1] = max((point.depth for point in pushed.values()), default=0.0)
+    efforts = np.clip(us, -motion.limits, motion.limits)
+    return continuous_rollout(model, states[:, :nx], us, efforts, states[:, nx:], deepest, tuple(contacts))
+
+
+class _WithWork(ContinuousMotion):
+    """Of states (nx + 3,), the last three being work."""
+
+    def __init__(self, model: Model, tolerance: float):
+        super().__init__(model)
+        self.tolerance = tolerance
+        self.damping, self.push, self.seen = model.double.damping(), np.zeros(model.nv), list[Array]()
+
+    def follow(self, state: Array, u: Array, dt: float) -> tuple[Array, float]:
+        """The state one of the model's steps later, and a length of step [s] that would do next."""
+        self.twin.set_input(u)
+        self.seen = [state]
+        force = self.actuation @ np.clip(u, -self.limits, self.limits)
+        return self._advance(partial(self.rates, force), state, dt, self.tolerance, np.inf)
+
+    def rates(self, force: Array, x: Array, only: Pairs | None = None) -> Array:
+        self.push, v = self.still, x[self.model.nq : self.model.nx]
+        found = super().rates(force, x[: self.model.nx], only)
+        return np.concatenate([found, [v @ force, v @ (self.damping * v), v @ self.push]])
+
+    def contact_force(self, only: Pairs | None = None) -> Array:
+        self.push = super().contact_force(only)
+        return self.push
+
+    def pushing(self, x: Array) -> Pairs:
+        return super().pushing(x[: self.model.nx])
+
+    def _until_change(self, *given: Any) -> tuple[float, Array, Pairs]:
+        found = super()._until_change(*given)
+        self.seen.append(found[1])
+        return found
+
+    def deepest(self) -> dict[tuple[str, str], ContactPoint]:
+        """Of each two bodies that pushed each other since `follow` was called, where they were deepest."""
+        found: dict[tuple[str, str], ContactPoint] = {}
+        for state in self.seen if self.touches else ():
+            for point in self._points(state[: self.model.nx]):
+                names = point.body_a, point.body_b
+                if names not in found or point.depth > found[names].depth:
+                    found[names] = point
+        return found
+
+    def _points(self, x: Array) -> Iterator[ContactPoint]:
+        """Of the pairs that push at `x` (nx,)."""
+        set_state(self.twin, x)
+        for contact in self._contacts(None):
+            if contact.push > 0:
+                (a, b), sign = (body_of(self.model, geometry) for geometry in contact.pair), 1.0
+                if self.twin.plant.IsAnchored(a):  # the force is the one on what can move
+                    a, b, sign = b, a, -1.0
+                normal, relative = np.array(contact.normal), np.array(contact.relative)
+                slip = float(np.linalg.norm(relative - (relative @ normal) * normal))
+                where = frozen(contact.point), frozen(sign * normal), frozen(sign * np.array(contact.force))
+                yield ContactPoint(a.name(), b.name(), *where, float(contact.depth), slip)

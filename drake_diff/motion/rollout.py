@@ -164,32 +164,48 @@ def _in_continuous_time(
     model: Model, vector: ParameterVector, x0: Array, inputs: Array | Policy, count: int
 ) -> Rollout:
     """`rollout` of a model, to which the vector is applied, by its flow."""
-    from drake_diff.motion.flow.measured import measured_flow  # loads CasADi
-
-    h, meter = model.time_step, Meter(model)
+    from drake_diff.motion.flow.steps import measured_flow  # loads CasADi
 
     def choose(x: Array, k: int) -> Array:
-        return finite_array("u", inputs(x.copy(), k * h), (model.nu,)) if callable(inputs) else inputs[k]
+        return finite_array("u", inputs(x.copy(), k * model.time_step), (model.nu,)) if callable(inputs) else inputs[k]
 
-    found = measured_flow(model, vector, x0, choose, count)
-    for x in found.xs:
+    return continuous_rollout(model, *measured_flow(model, vector, x0, choose, count))
+
+
+def continuous_rollout(
+    model: Model,
+    xs: Array,
+    us: Array,
+    efforts: Array,
+    work: Array,
+    penetration: Array,
+    contacts: tuple[tuple[ContactPoint, ...], ...],
+) -> Rollout:
+    """A motion in continuous time at the ends of N intervals.
+
+    `work` (N+1, 3) [J] is that of actuators, damping and contact since the start, `penetration` (N+1,) [m] the largest
+    since the end before.
+    """
+    meter = Meter(model)
+    for x in xs:
         set_state(model.double, x)
         meter.measure_state(x)
     _, kinetic, potential, at_ends = (np.array(column) for column in zip(*meter.states, strict=True))
+    deepest = np.maximum(np.maximum(at_ends, penetration), np.append(0.0, at_ends[:-1]))
     return Rollout(
-        times=frozen(h * np.arange(count + 1)),
-        xs=frozen(found.xs),
-        us=frozen(found.us),
-        efforts=frozen(found.efforts),
+        times=frozen(model.time_step * np.arange(len(xs))),
+        xs=frozen(xs),
+        us=frozen(us),
+        efforts=frozen(efforts),
         kinetic_energy=frozen(kinetic),
         potential_energy=frozen(potential),
-        work=frozen(found.work),
-        dissipation=frozen(found.dissipation),
-        contact_work=frozen(found.contact_work),
-        limit_work=frozen(np.zeros(count + 1)),  # a motion that reaches one is refused
-        penetration=frozen(np.maximum(at_ends, found.penetration)),
-        constraint_violation=frozen(meter.violations(found.xs[:, : model.nq])),
-        contacts=found.contacts,
+        work=frozen(work[:, 0]),
+        dissipation=frozen(work[:, 1]),
+        contact_work=frozen(work[:, 2]),
+        limit_work=frozen(np.zeros(len(xs))),  # a motion that reaches one is refused
+        penetration=frozen(deepest),
+        constraint_violation=frozen(meter.violations(xs[:, : model.nq])),
+        contacts=contacts,
     )
 
 

@@ -28,9 +28,9 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.continuous import replayed
 from drake_diff.motion.intervals import intervals_of
 from drake_diff.motion.policy import TVLQR
-from drake_diff.motion.replayed import replayed
 from drake_diff.motion.rollout import CONTINUOUS, Policy, Rollout, rollout
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.goals import GoalConstraint

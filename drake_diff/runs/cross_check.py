@@ -20,7 +20,7 @@ from drake_diff.model.contact import penetration
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.step import set_state
-from drake_diff.motion.replayed import replayed
+from drake_diff.motion.continuous import replayed
 from drake_diff.motion.rollout import CONTINUOUS, Policy, rollout
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.names import units_of

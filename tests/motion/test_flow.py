@@ -20,11 +20,11 @@ import drake_diff as dd
 from drake_diff.exceptions import GradientError, GradientWarning, ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import select
-from drake_diff.motion import rosenbrock
 from drake_diff.motion.continuous import ContinuousMotion
 from drake_diff.motion.flow.integrate import Integrator, pushing_of
 from drake_diff.motion.flow.plant import flow_plant, material_of, numbers_of
 from drake_diff.motion.flow.steps import FlowSteps
+from drake_diff.motion.tableaus import ROSENBROCK_COUPLINGS, ROSENBROCK_GAMMA, ROSENBROCK_STAGES
 
 pytestmark = pytest.mark.solve
 
@@ -250,10 +250,10 @@ def test_the_rosenbrock_method_has_order_5():
         x, h = np.array([1.0, 0.5]), 1 / count
         for _ in range(count):
             slope = np.array([[0, 1], [-3 * np.cos(x[0]), -0.6 * x[1] ** 2]])
-            W, changes = np.eye(2) / (h * rosenbrock.GAMMA) - slope, np.zeros((8, 2))
-            for i, (a, c) in enumerate(zip(rosenbrock.STAGES, rosenbrock.COUPLINGS, strict=True)):
+            W, changes = np.eye(2) / (h * ROSENBROCK_GAMMA) - slope, np.zeros((8, 2))
+            for i, (a, c) in enumerate(zip(ROSENBROCK_STAGES, ROSENBROCK_COUPLINGS, strict=True)):
                 changes[i] = np.linalg.solve(W, rates(x + a @ changes[:i]) + c @ changes[:i] / h)
-            x = x + rosenbrock.STAGES[7] @ changes[:7] + changes[7]
+            x = x + ROSENBROCK_STAGES[7] @ changes[:7] + changes[7]
         return x
 
     exact = solve_ivp(lambda _, x: rates(x), (0, 1), [1, 0.5], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]

@@ -9,7 +9,7 @@ from helpers.robots import example_robot, state_in_contact
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.motion.replayed import replayed
+from drake_diff.motion.continuous import replayed
 from drake_diff.optimize import optimality
 
 pytestmark = pytest.mark.solve

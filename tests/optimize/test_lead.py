@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.motion.dormand_prince import AT, DENSE, STAGES
+from drake_diff.motion.tableaus import AT, DENSE, STAGES
 from drake_diff.optimize.transcription.collocation import collocated
 from drake_diff.optimize.transcription.lead import Lead
 

@@ -21,8 +21,8 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.values import Refusal
-from drake_diff.derivatives.contact.active_contacts import read_pairs
+from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.contact.active_contacts import ContactPairs, read_pairs
 from drake_diff.derivatives.contact.laws import QUANTITIES, Material, MaterialChange, combine
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.mechanics.casadi_tree import SymbolicTree
@@ -31,13 +31,75 @@ from drake_diff.mechanics.tree import tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import proximity_property
 from drake_diff.model.step import set_state
-from drake_diff.motion.dormand_prince import ERROR, STAGES
-from drake_diff.motion.flow.shapes import distance_of, edges_of
+from drake_diff.motion.tableaus import ERROR, STAGES
+
+TINY_LENGTH = 1e-30  # [m^2] keeps the distance from a point or an axis differentiable on it
+
+
+def distance_of(pairs: ContactPairs, i: int, local: Any) -> tuple[Any, Any]:
+    """Of `local` (3,), in the frame of the other shape of pair `i`, from that shape: (distance, its gradient)."""
+    lower, upper = pairs.lower[i], pairs.upper[i]
+    if np.isinf(lower).any():  # a half space, below 0
+        return local[2] - float(upper[2]), ca.DM([0, 0, 1])
+    if pairs.is_round[i]:
+        distance, gradient = _from_cylinder(local, float(upper[0]), float(upper[2]))
+    elif np.all(lower == upper):
+        distance = ca.sqrt(ca.sumsqr(local - ca.DM(upper)) + TINY_LENGTH)
+        gradient = (local - ca.DM(upper)) / distance
+    else:
+        distance, gradient = _from_box(local, lower, upper)
+    return distance - pairs.rounding[i], gradient
+
+
+def edges_of(pairs: ContactPairs, i: int, local: Any) -> list[Any]:
+    """Where the nearest point of the other shape goes from one of its faces to the next, how the normal turns jumps.
+
+    Each is above 0 beyond a face, at `local` (3,) as in `distance_of`.
+    """
+    lower, upper = pairs.lower[i], pairs.upper[i]
+    if np.isinf(lower).any():
+        return []
+    if pairs.is_round[i]:
+        half = float(upper[2])
+        return [ca.sqrt(ca.sumsqr(local[:2]) + TINY_LENGTH) - float(upper[0]), local[2] - half, -half - local[2]]
+    wide = np.flatnonzero(upper > lower).tolist()
+    return [side for j in wide for side in (local[j] - float(upper[j]), float(lower[j]) - local[j])]
+
+
+def _from_box(local: Any, lower: Array, upper: Array) -> tuple[Any, Any]:
+    outside = local - ca.fmin(ca.fmax(local, ca.DM(lower)), ca.DM(upper))
+    ways = ca.vertcat(ca.DM(upper) - local, local - ca.DM(lower))
+    return _from_faces(outside, ways, ca.DM(np.hstack([np.eye(3), -np.eye(3)])))
+
+
+def _from_cylinder(local: Any, radius: float, half: float) -> tuple[Any, Any]:
+    """Its axis is z."""
+    away = ca.sqrt(ca.sumsqr(local[:2]) + TINY_LENGTH)
+    beside = ca.if_else(away > radius, 1 - radius / away, 0.0)
+    outside = ca.vertcat(beside * local[:2], local[2] - ca.fmin(ca.fmax(local[2], -half), half))
+    ways = ca.vertcat(radius - away, half - local[2], local[2] + half)
+    side, up = ca.vertcat(local[:2] / away, 0), ca.DM([0, 0, 1])
+    return _from_faces(outside, ways, ca.horzcat(side, up, -up))
+
+
+def _from_faces(outside: Any, ways: Any, normals: Any) -> tuple[Any, Any]:
+    """By the way from the shape's nearest point, `outside` (3,), or within it by the shortest of the ways out."""
+    square = ca.sumsqr(outside)
+    beyond = square > 0
+    length = ca.sqrt(ca.if_else(beyond, square, 1.0))
+    least = ca.mmin(ways)
+    face, found = ca.SX.zeros(3), ca.SX(0)
+    for j in range(ways.numel()):
+        nearest = ca.logic_and(ways[j] <= least, found < 0.5)
+        face += ca.if_else(nearest, normals[:, j], ca.DM.zeros(3))
+        found += ca.if_else(nearest, 1.0, 0.0)
+    return ca.if_else(beyond, length, -least), ca.if_else(beyond, outside / length, face)
+
 
 STICTION_SPEED = 1e-3  # v_s [m/s], Drake's default in continuous time
 MOST_PARTS = 200  # sets of contacts whose equations are kept
 SAME_WAY = 0.5  # the cosine of a normal's turn within a step: a step's error keeps it near 1 where it does not jump
-TINY = 1e-24  # [m^2/s^2] keeps the length of a slip of 0 differentiable
+TINY_SLIP = 1e-24  # [m^2/s^2] keeps the length of a slip of 0 differentiable
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +175,7 @@ class FlowPlant:
         velocity = J @ tree.v
         rate = -ca.dot(normal, velocity)
         slip = velocity + rate * normal
-        speed = ca.sqrt(ca.sumsqr(slip) + TINY)
+        speed = ca.sqrt(ca.sumsqr(slip) + TINY_SLIP)
         r = ca.fmin(speed / STICTION_SPEED, 1.0)
         drag = mu * r**3 * (10 - 15 * r + 6 * r**2) / speed
         bracket = -phi + damping * rate if self.is_sap else 1 + damping * rate

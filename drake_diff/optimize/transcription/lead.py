@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.motion.dormand_prince import AT, DENSE, ERROR, STAGES
+from drake_diff.motion.tableaus import AT, DENSE, ERROR, STAGES
 from drake_diff.optimize.transcription.task import OptimalControl
 
 TOLERANCE = 1e-6  # of a state's range along the motion, in a step: a ten-thousandth of how far it may be off at all
