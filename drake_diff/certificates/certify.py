@@ -13,8 +13,8 @@ from drake_diff._base.differences import one_by_one
 from drake_diff.certificates.certificate import JITTER, Certificate, ModeChange, certificate_of, jitter
 from drake_diff.certificates.differences import Neighbourhood, is_broken, look_around
 from drake_diff.certificates.directions import FirstLook, LookAt, certificate_by
-from drake_diff.derivatives.implicit import form_of
 from drake_diff.derivatives.refine_step import refine_steps
+from drake_diff.derivatives.smooth_step import form_of
 from drake_diff.derivatives.sources import check_method, step_at
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along, step_jacobians
 from drake_diff.exceptions import SimulationError

@@ -17,14 +17,19 @@ from drake_diff._base.values import Refusal
 from drake_diff.derivatives.contact.active_contacts import JOINT_LIMITS, is_iterated
 from drake_diff.derivatives.contact.jacobian import contact_form, contact_jacobians, material_of
 from drake_diff.derivatives.contact.laws import QUANTITIES, material_change
-from drake_diff.derivatives.implicit import RESIDUAL_TOLERANCE, differentiate_equation, form_of
 from drake_diff.derivatives.refine_step import refine_steps
-from drake_diff.derivatives.smooth_step import SmoothStep, build_analytic
+from drake_diff.derivatives.smooth_step import (
+    RESIDUAL_TOLERANCE,
+    SmoothStep,
+    build_analytic,
+    differentiate_equation,
+    form_of,
+)
 from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, Steps, take_steps
 from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
-from drake_diff.mechanics.compiled_tree import CompiledTree, compiled_tree
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
+from drake_diff.mechanics.tree import CompiledTree, compiled_tree
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select, write_autodiff
 from drake_diff.model.repairs import Coupling

@@ -31,7 +31,6 @@ from drake_diff._base.arrays import Array, Indices, cross
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.contact.active_contacts import weigh
 from drake_diff.derivatives.contact.laws import QUANTITIES, ContactLaw, combine
-from drake_diff.derivatives.implicit import Form, form_of
 from drake_diff.derivatives.joint_impulses import (
     Controllers,
     Couplers,
@@ -41,6 +40,7 @@ from drake_diff.derivatives.joint_impulses import (
     limit_impulses,
     single_joints,
 )
+from drake_diff.derivatives.smooth_step import Form, form_of
 from drake_diff.model.contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied

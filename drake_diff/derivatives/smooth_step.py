@@ -1,6 +1,20 @@
-"""Smooth steps by the derivatives of a tree's accelerations.
+"""The Jacobians of smooth steps from their own equation, without differentiating Drake's solver.
 
-Where nothing touches and no limit acts, Drake's step of a tree is (see `implicit`)
+Where no contact, joint limit or constraint carries a force, Drake's discrete step solves, for the velocities v',
+
+    r(v'; q, v, u) = ID(q, v, (v' - v) / h) - f(q, v) + D (v' - v) + P (q + h v') - P q - ... = 0
+
+ID being the inverse dynamics M a + bias, f gravity, springs and joint damping -D v, all explicit in (q, v). Joint
+damping D and the PD controllers are implicit. With the inputs clipped at their effort limits,
+
+    input_i = clip(u_i - kp_i (q_i + h v'_i - q_ref_i) - kd_i (v'_i - v_ref_i)),
+
+so dv' = -(dr/dv')^-1 dr with dr/dv' = M / h + D + B (kd + h kp) B' for the inputs that are not clipped, and
+q' = q + h N(q) v'. By the time step dr = (B kp v' - M (v' - v) / h^2) dh. Only r is differentiated, at Drake's own v',
+by AutoDiffXd (`Implicit`).
+r(v') = 0 is checked: where it does not hold, something else acts, or the AutoDiffXd plant is not the double one.
+
+Of a tree it is, by the derivatives of the tree's accelerations (`SmoothStep`),
 
     (M + h D) a = B u + c - K q - D v - bias(q, v),   v' = v + h a,   q' = q + h N(q) v'
 
@@ -12,19 +26,197 @@ which is not this one then.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array
-from drake_diff.derivatives.implicit import Form, form_of
-from drake_diff.derivatives.steps import Steps
-from drake_diff.exceptions import ModelError
-from drake_diff.mechanics.compiled_tree import compiled_tree
-from drake_diff.mechanics.coordinates import Coordinates
+from drake_diff._base.autodiff import gradient_rows
+from drake_diff._base.values import Refusal
+from drake_diff.derivatives.steps import Jacobians, NotSmoothError, Steps
+from drake_diff.exceptions import DrakeDiffError, ModelError
+from drake_diff.mechanics.coordinates import Coordinates, euler_jacobian, euler_step
 from drake_diff.mechanics.description import describe_tree
-from drake_diff.mechanics.tree import ForwardDynamics
+from drake_diff.mechanics.tree import ForwardDynamics, compiled_tree
 from drake_diff.model.model import Model
+from drake_diff.model.parameters import write_autodiff
+from drake_diff.model.plant import actuators, joints
+from drake_diff.model.step import set_state
+
+# Rounding of the forces that balance, relative to the largest of them. What a solver leaves is larger.
+RESIDUAL_TOLERANCE = 1e-9
+
+
+class Implicit:
+    """The Jacobians of smooth steps from their own equation; parameters that are differenced have zeros.
+
+    But for the time step, which is in the equation.
+    """
+
+    name = "implicit"
+
+    def differentiate(self, steps: Steps) -> Jacobians | Refusal:
+        """Step by step."""
+        form, values = form_of(steps.model), np.empty((len(steps), steps.model.nx, steps.width))
+        if form.excluded:
+            return Refusal(form.excluded)
+        refused: dict[int, DrakeDiffError] = {}
+        for k, touches in enumerate(steps.touching.tolist()):
+            if touches:
+                refused[k] = NotSmoothError("geometries touch")
+                continue
+            missing = differentiate_equation(form, steps, k, values[k])
+            if not missing <= RESIDUAL_TOLERANCE:
+                why = f"contact, a joint limit or a constraint acts: {missing:.3g} of the forces are not accounted for"
+                refused[k] = NotSmoothError(why)
+        return Jacobians(values, refused, timed=True)
+
+
+def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) -> float:
+    """Step k's derivative into `jacobian` (nx, nx + nu + np); returns the force that is not accounted for.
+
+    Where some is missing nothing is written: the equation is not the step's.
+    """
+    model, vector = steps.model, steps.vector
+    x, u, v_next = steps.xs[k], steps.us[k], steps.x_next[k, model.nq :]
+    steps.stand_at(k)
+    twin, nq, nx, h = model.double, model.nq, model.nx, model.time_step
+    change, damping = v_next - x[nq:], twin.damping()
+    effort, free, (kp, kd) = form.effort(x[:nq], v_next, u, h)
+    applied = form.actuation @ np.minimum(np.maximum(effort, -form.limit), form.limit)  # clip() takes thrice as long
+
+    variables = InitializeAutoDiff(np.concatenate([x, vector.values])).ravel()
+    write_autodiff(vector, model, variables[nx:])
+    set_state(model.autodiff, variables[:nx])
+    needed = model.autodiff.inverse_dynamics(np.array([AutoDiffXd(a) for a in change / h])).reshape(-1, 1)
+    force, rest = ExtractValue(needed).ravel(), damping * change - applied
+    missing = float(np.abs(force + rest).max() / max(1.0, np.abs(force).max(), np.abs(rest).max()))
+    if not missing <= RESIDUAL_TOLERANCE:
+        return missing
+    rows = gradient_rows(needed, len(variables))
+    if vector.parameters:
+        rows = rows + gradient_rows(model.autodiff.damping() * change, len(variables))
+    pressed = form.actuation * free  # (nv, nu) what an input that is not at its limit does
+    by_point = np.concatenate([rows[:, :nx], -pressed, rows[:, nx:]], axis=1)
+    by_next = model.double.mass_matrix() / h
+    by_next[form.diagonal] += damping
+    by_point[:, nq:nx] -= by_next  # through (v' - v) / h and D (v' - v)
+    if form.pd:
+        by_point[:, form.position] += pressed * kp
+        by_next += (pressed * (kd + h * kp)) @ form.actuation.T
+    step = None if vector.step_entry is None else nx + model.nu + vector.step_entry
+    if step is not None:
+        by_point[:, step] = -(model.double.mass_matrix() @ change) / h**2
+        if form.pd:
+            by_point[:, step] += (pressed * kp) @ v_next[form.velocity]
+    velocities = -np.linalg.solve(by_next, by_point)
+    jacobian[:nq] = _positions(model, form, v_next, velocities, len(vector.values))
+    jacobian[nq:] = velocities
+    if step is not None:
+        jacobian[:nq, step] += np.asarray(twin.rates(v_next))
+    return missing
+
+
+def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, num_parameters: int) -> Array:
+    """(nq, nx + nu + np) the derivative of q' = q + h N(q) v'; the AutoDiffXd twin stands at the step's state."""
+    if form.q_dot_is_v:
+        moved = model.time_step * velocities
+        moved[form.diagonal] += 1.0
+        return np.asarray(moved)
+    moved_positions = np.eye(model.nq, velocities.shape[1])
+    twin = model.autodiff
+    q_dot = twin.rates(np.array([AutoDiffXd(v) for v in v_next]))
+    moved_positions[:, : model.nx] += model.time_step * gradient_rows(q_dot, model.nx + num_parameters)[:, : model.nx]
+    n = np.array([model.double.rates(e) for e in np.eye(model.nv)]).T
+    return np.asarray(moved_positions + model.time_step * n @ velocities)
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """What of a model does not change from step to step."""
+
+    excluded: str  # why the form describes no step of the model; empty where it may
+    driven: str  # the same, but for constraints and what the diagram's systems exert
+    actuators: list[Any]
+    velocity: NDArray[np.int64]  # (nu,) the index in v of the joint that an input drives, and in q; 0 of other inputs
+    position: NDArray[np.int64]
+    actuation: Array  # (nv, nu)
+    limit: Array
+    cut: Array  # (nu,) beyond what Drake cuts off an input itself: infinite under PD control, whose sum it cuts off
+    reference: Array  # (2, nu) the positions and velocities that PD control holds
+    diagonal: tuple[Any, ...]  # the indices of that of (nv, nv)
+    pd: bool
+    q_dot_is_v: bool
+
+    def effort(self, q: Array, v_next: Array, u: Array, h: float) -> tuple[Array, NDArray[np.bool_], Any]:
+        """(..., nu) what the inputs are before they are clipped, whether they are not beyond their limits, and kp, kd.
+
+        Exactly at a limit the derivative is that of the inside, as AutoDiffXd's is: there plans end up, and stay.
+        """
+        kp, kd = self.gains()
+        effort = u
+        if self.pd:
+            moved = q[..., self.position] + h * v_next[..., self.velocity] - self.reference[0]
+            effort = u - kp * moved - kd * (v_next[..., self.velocity] - self.reference[1])
+        return effort, np.abs(effort) <= self.limit, (kp, kd)
+
+    def gains(self) -> tuple[Array, Array]:
+        """kp (nu,) and kd (nu,), zero where there is no controller; they may change as parameters do."""
+        if not self.pd:
+            return np.zeros(len(self.limit)), np.zeros(len(self.limit))
+        gains = [a.get_controller_gains() if a.has_controller() else None for a in self.actuators]
+        return np.array([g.p if g else 0.0 for g in gains]), np.array([g.d if g else 0.0 for g in gains])
+
+
+def form_of(model: Model) -> Form:
+    """Read once: nothing in it changes with parameters."""
+    return model.cache("implicit form", lambda: _read_form(model), of_structure=True)
+
+
+def _read_form(model: Model) -> Form:
+    plant_actuators, inputs = actuators(model.plant), model.inputs
+    joined = [(a.joint().velocity_start(), a.joint().position_start(), a.effort_limit()) for a in plant_actuators]
+    starts_and_limits = inputs.of_actuators(np.reshape(joined, (len(plant_actuators), 3)))
+    velocity, position = starts_and_limits[:, 0].astype(int), starts_and_limits[:, 1].astype(int)
+    controlled = inputs.of_actuators([a.has_controller() for a in plant_actuators]).astype(bool)
+    if model.coupling is not None:  # of inputs with PD control only, which such a model has not
+        velocity, position = model.coupling.of_v[velocity], model.coupling.of_q[position]
+    references = np.zeros((2, len(plant_actuators)))
+    for instance, target in model.pd_targets.items():
+        driven = [i for i, a in enumerate(plant_actuators) if a.model_instance() == instance]
+        references[:, driven] = np.asarray(target).reshape(2, len(driven))
+    why = _why_driven(model)
+    return Form(
+        excluded="constraints act at every step" if model.num_constraints else why or model.systems_act,
+        driven=why,
+        actuators=plant_actuators,
+        velocity=velocity,
+        position=position,
+        actuation=model.actuation,
+        limit=np.where(inputs.actuator >= 0, starts_and_limits[:, 2], np.inf),
+        cut=np.where((inputs.actuator >= 0) & ~controlled, starts_and_limits[:, 2], np.inf),
+        reference=references,
+        diagonal=np.diag_indices(model.nv),
+        pd=any(a.has_controller() for a in plant_actuators),
+        q_dot_is_v=bool(model.plant.IsVelocityEqualToQDot()),
+    )
+
+
+def _why_driven(model: Model) -> str:
+    """What acts on the model, beside constraints, that the form leaves out wherever it is; empty where nothing does."""
+    plant = model.plant
+    if any(joint.is_locked(model.double.context) for joint in joints(plant)):
+        return "a joint is locked"
+    controlled = [a for a in actuators(plant) if a.has_controller()]
+    if model.coupling is not None and controlled:
+        return "PD control acts on reduced coordinates"
+    if controlled and not model.inputs.plain:
+        return "PD controllers act beside the diagram's own inputs"
+    targets = {a.model_instance(): plant.get_desired_state_input_port(a.model_instance()) for a in controlled}
+    return "the diagram feeds PD targets" if any(model.feeds(port) for port in targets.values()) else ""
+
 
 # What a limit or a controller at its limit changes in x' is larger; x' known to rounding alone, as x + gap, is not.
 STEP_TOLERANCE = 1e-10
@@ -57,34 +249,12 @@ class SmoothStep:
     def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
         """(N, nx, nx + nu) and x' (N, nx) of the steps from xs (N, nx) under us (N, nu), were they smooth."""
         c, h = self.coordinates, self.time_step
-        if not c.free:
-            return self._fixed(xs, us)
         q, v = xs[:, : c.nq], xs[:, c.nq :]
         force, clipped = self.force_of(q, v, us)
         by_q, by_v, inverse, a = self.dynamics.accelerate(q, v, force)
         parts = by_q - inverse * self.stiffness, by_v - inverse * self.damping, self._by_input(inverse, clipped)
-        velocities = h * np.concatenate(parts, axis=2)
-        velocities[:, :, c.nv : 2 * c.nv] += np.eye(c.nv)
-        return self.assemble(q, velocities, v + h * a)
-
-    def _fixed(self, xs: Array, us: Array) -> tuple[Array, Array]:
-        """Of hinges and slides, where N(q) = 1."""
-        n, h = self.coordinates.nv, self.time_step
-        nx, nu = 2 * n, us.shape[1]
-        q, v = xs[:, :n], xs[:, n:]
-        force, clipped = self.force_of(q, v, us)
-        by_q, by_v, inverse, a = self.dynamics.accelerate(q, v, force)
-        jacobians = np.empty((len(xs), nx, nx + nu))
-        upper, lower = jacobians[:, :n], jacobians[:, n:]
-        np.multiply(by_q - inverse * self.stiffness if self.sprung else by_q, h, out=lower[:, :, :n])
-        np.multiply(by_v - inverse * self.damping, h, out=lower[:, :, n:nx])
-        np.multiply(self._by_input(inverse, clipped), h, out=lower[:, :, nx:])
-        diagonal = jacobians.reshape(len(xs), -1)[:, :: nx + nu + 1]  # of the first nx columns; a view
-        diagonal[:, n:] += 1.0
-        np.multiply(lower, h, out=upper)
-        diagonal[:, :n] += 1.0
-        v_next = v + h * a
-        return jacobians, np.concatenate([q + h * v_next, v_next], axis=1)
+        x_next = euler_step(c, h, xs, a)
+        return euler_jacobian(c, h, xs, x_next, np.concatenate(parts, axis=2)), x_next
 
     def single(self, x: Array, u: Array, x_next: Array) -> Array | None:
         """(nx, nx + nu) of the step from x (nx,) under u (nu,) to x_next (nx,), in a third of the time of `__call__`.
@@ -161,16 +331,6 @@ class SmoothStep:
         """(N, nv, nu) M^-1 B, 0 for clipped inputs."""
         columns = inverse.take(self.form.velocity, axis=2)
         return columns if clipped is None else columns * ~clipped[:, None]
-
-    def assemble(self, q: Array, velocities: Array, v_next: Array) -> tuple[Array, Array]:
-        """(N, nx, nx + nu) and x' (N, nx), from the derivative of v' by small motion, v and u, and v'."""
-        c, h = self.coordinates, self.time_step
-        lower = np.concatenate([velocities[:, :, : c.nv] @ c.motion(q), velocities[:, :, c.nv :]], axis=2)
-        N = c.rate(q)
-        upper = h * N @ lower
-        upper[:, :, : c.nq] += np.eye(c.nq) + h * c.rate_by_position(v_next)
-        q_next = q + h * (N @ v_next[..., None])[..., 0]
-        return np.concatenate([upper, lower], axis=1), np.concatenate([q_next, v_next], axis=1)
 
 
 def build_analytic(model: Model) -> SmoothStep:

@@ -25,8 +25,8 @@ from drake_diff._base.differences import Many, plateau, sweep_of
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives import METHODS
 from drake_diff.derivatives.analytic import Analytic
-from drake_diff.derivatives.implicit import Implicit, form_of
 from drake_diff.derivatives.refine_step import refine_steps, solves_the_step
+from drake_diff.derivatives.smooth_step import Implicit, form_of
 from drake_diff.derivatives.steps import Jacobians, Source, Steps, take_step, take_steps
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.model import Model

@@ -189,7 +189,7 @@ class EulerEngine(Arguments):
         x, u = self._point(x, u)
         acceleration, by = self._acceleration_derivative(x, u)
         x_next = euler_step(self.coordinates, self.time_step, x, acceleration)
-        jacobian = euler_jacobian(self.coordinates, self.time_step, x, x_next, by)
+        jacobian = euler_jacobian(self.coordinates, self.time_step, x[None], x_next[None], np.asarray(by)[None])[0]
         return StepJacobian(frozen(jacobian[:, : len(x)]), frozen(jacobian[:, len(x) :]), self.method)
 
     def contact_depth(self, x: ArrayLike) -> float:

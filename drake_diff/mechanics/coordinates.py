@@ -16,8 +16,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from drake_diff._base.arrays import Array, cross, skew
+from drake_diff._base.arrays import Array, cross, own_array, skew
+from drake_diff.mechanics import tree_kernel
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,12 @@ class Coordinates:
     @cached_property
     def nv(self) -> int:
         return 6 * len(self.free) + len(self.single)
+
+    @cached_property
+    def starts(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(bodies, 2) and (joints, 2): `free` and `single` as arrays."""
+        free, single = (np.array(pairs, dtype=np.int64).reshape(-1, 2) for pairs in (self.free, self.single))
+        return free, single
 
     @cached_property
     def moves_as_is(self) -> Array:
@@ -89,21 +97,22 @@ def euler_acceleration(M: Array, D: Array, h: float, v: Array, force: Array) -> 
 
 
 def euler_step(coordinates: Coordinates, h: float, x: Array, acceleration: Array) -> Array:
-    """(nx,) the state that the acceleration leads to."""
-    q, v = x[: coordinates.nq], x[coordinates.nq :]
-    v_next = v + h * acceleration
-    return np.concatenate([q + h * coordinates.rate(q) @ v_next, v_next])
+    """(..., nx) the states that accelerations (..., nv) lead to from x (..., nx)."""
+    q, v_next = x[..., : coordinates.nq], x[..., coordinates.nq :] + h * acceleration
+    q_dot = (
+        (coordinates.rate(q) @ v_next[..., None])[..., 0] if coordinates.free else v_next @ coordinates.moves_as_is.T
+    )
+    return np.concatenate([q + h * q_dot, v_next], axis=-1)
 
 
 def euler_jacobian(coordinates: Coordinates, h: float, x: Array, x_next: Array, by: Array) -> Array:
-    """(nx, nx + nu) of `euler_step`, from `by` (nv, 2 nv + nu): the acceleration by small motion, by v and by u."""
+    """(N, nx, nx + nu) of `euler_step`, from `by` (N, nv, 2 nv + nu): the acceleration by small motion, v and u."""
     nq, nv = coordinates.nq, coordinates.nv
-    q, v_next = x[:nq], x_next[nq:]
-    lower = h * np.hstack([by[:, :nv] @ coordinates.motion(q), by[:, nv:]])
-    lower[:, nq : nq + nv] += np.eye(nv)
-    upper = h * coordinates.rate(q) @ lower
-    upper[:, :nq] += np.eye(nq) + h * coordinates.rate_by_position(v_next)
-    return np.vstack([upper, lower])
+    velocities, jacobians = h * by, np.empty((len(x), nq + nv, nq - nv + by.shape[2]))
+    velocities[:, :, nv : 2 * nv] += np.eye(nv)
+    q, v_next = own_array(x[:, :nq]), own_array(x_next[:, nq:])
+    tree_kernel.assemble_steps(h, *coordinates.starts, q, v_next, velocities, jacobians)
+    return jacobians
 
 
 def exponential_turn(quaternion: Array, angle: Array) -> Array:

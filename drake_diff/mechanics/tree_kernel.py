@@ -381,26 +381,86 @@ def _factor(M: Array) -> bool:
 
 
 @compiled
-def _back_substitute(M: Array, a: Array) -> None:
-    """a = (L D L')^-1 a of what `_factor` left in M."""
-    n = len(a)
+def substitute(M: Array, B: Array) -> None:
+    """B (n, m) = (L D L')^-1 B of what `_factor` left in M, row by row as they lie in memory."""
+    n, m = B.shape
     for i in range(n):
         for k in range(i):
-            a[i] -= M[i, k] * a[k]
-    for i in range(n):
-        a[i] /= M[i, i]
+            factor = M[i, k]
+            for j in range(m):
+                B[i, j] -= factor * B[k, j]
     for i in range(n - 1, -1, -1):
+        inverse = 1.0 / M[i, i]
+        for j in range(m):
+            B[i, j] *= inverse
         for k in range(i + 1, n):
-            a[i] -= M[k, i] * a[k]
+            factor = M[k, i]
+            for j in range(m):
+                B[i, j] -= factor * B[k, j]
 
 
 @compiled
-def solve(M: Array, a: Array) -> bool:
-    """a = M^-1 a by L D L', which takes M's place; False if it is not positive definite."""
-    if not _factor(M):
-        return False
-    _back_substitute(M, a)
-    return True
+def assemble_step(h: float, free: Whole, single: Whole, q: Array, v_next: Array, by: Array, out: Array) -> None:
+    """out (nx, nx + nu + np) from the derivative (nv, 2 nv + nu + np) of v' by small motion, v, u and parameters."""
+    nq, nv, width = len(q), len(v_next), by.shape[1]
+    shift = nq - nv
+    out[:] = 0.0
+    for i in range(nv):
+        row = nq + i
+        for b in range(len(single)):
+            out[row, single[b, 0]] = by[i, single[b, 1]]
+        for b in range(len(free)):
+            s, d = free[b, 0], free[b, 1]
+            w, x, y, z = q[s], q[s + 1], q[s + 2], q[s + 3]
+            f = 2.0 / (w * w + x * x + y * y + z * z)
+            b0, b1, b2 = f * by[i, d], f * by[i, d + 1], f * by[i, d + 2]
+            out[row, s] = -(b0 * x + b1 * y + b2 * z)
+            out[row, s + 1] = b0 * w + b1 * z - b2 * y
+            out[row, s + 2] = -b0 * z + b1 * w + b2 * x
+            out[row, s + 3] = b0 * y - b1 * x + b2 * w
+            for a in range(3):
+                out[row, s + 4 + a] = by[i, d + 3 + a]
+        for j in range(nv, width):
+            out[row, shift + j] = by[i, j]
+    total = out.shape[1]
+    for b in range(len(single)):
+        s, row = single[b, 0], nq + single[b, 1]
+        for j in range(total):
+            out[s, j] = h * out[row, j]
+        out[s, s] += 1.0
+    for b in range(len(free)):
+        s, d = free[b, 0], free[b, 1]
+        w, x, y, z = q[s], q[s + 1], q[s + 2], q[s + 3]
+        for j in range(total):
+            r0, r1, r2 = out[nq + d, j], out[nq + d + 1, j], out[nq + d + 2, j]
+            out[s, j] = -0.5 * h * (x * r0 + y * r1 + z * r2)
+            out[s + 1, j] = 0.5 * h * (w * r0 + z * r1 - y * r2)
+            out[s + 2, j] = 0.5 * h * (-z * r0 + w * r1 + x * r2)
+            out[s + 3, j] = 0.5 * h * (y * r0 - x * r1 + w * r2)
+            for a in range(3):
+                out[s + 4 + a, j] = h * out[nq + d + 3 + a, j]
+        for a in range(7):
+            out[s + a, s + a] += 1.0
+        w0, w1, w2 = 0.5 * h * v_next[d], 0.5 * h * v_next[d + 1], 0.5 * h * v_next[d + 2]
+        out[s, s + 1] -= w0
+        out[s, s + 2] -= w1
+        out[s, s + 3] -= w2
+        out[s + 1, s] += w0
+        out[s + 1, s + 2] -= w2
+        out[s + 1, s + 3] += w1
+        out[s + 2, s] += w1
+        out[s + 2, s + 1] += w2
+        out[s + 2, s + 3] -= w0
+        out[s + 3, s] += w2
+        out[s + 3, s + 1] -= w1
+        out[s + 3, s + 2] += w0
+
+
+@compiled
+def assemble_steps(h: float, free: Whole, single: Whole, q: Array, v_next: Array, by: Array, out: Array) -> None:
+    """`assemble_step` of N steps."""
+    for k in range(len(q)):
+        assemble_step(h, free, single, q[k], v_next[k], by[k], out[k])
 
 
 @compiled
@@ -423,20 +483,18 @@ def differentiate_acceleration(
     n, L = v.shape[1], len(t.kind)
     poses, S, tau = np.empty((1, L, 3, 4)), np.empty((1, n, 6)), np.empty((1, n))
     mass, slope, tau_q, tau_v = np.empty((1, n, n)), np.empty((1, n, n)), np.empty((1, n, n)), np.empty((1, n, n))
-    a, column = np.empty((1, n)), np.empty(n)
+    a = np.empty((1, n))
     for k in range(len(q)):
         a[0] = 0.0
         differentiate_tree(t, q[k : k + 1], v[k : k + 1], a, False, poses, S, mass, slope, tau, tau_q, tau_v)
         for i in range(n):
             mass[0, i, i] += armature[i]
-        definite = _factor(mass[0])
-        for j in range(n):
-            for i in range(n):
-                column[i] = 0.0
-            column[j] = 1.0
-            _back_substitute(mass[0], column)
-            for i in range(n):
-                inverse[k, i, j] = column[i] if definite else np.nan
+        inverse[k] = 0.0
+        for i in range(n):
+            inverse[k, i, i] = 1.0
+        if not _factor(mass[0]):
+            inverse[k] = np.nan
+        substitute(mass[0], inverse[k])
         for i in range(n):
             total = 0.0
             for j in range(n):
@@ -475,7 +533,7 @@ def roll(
     parent, first = tree.parent, tree.first
     poses, S, own = np.empty((len(tree.kind), 3, 4)), np.empty((n, 6)), np.empty((J, 10))
     V, A, F, momentum = np.empty((J + 1, 6)), np.empty((J + 1, 6)), np.empty((J, 6)), np.empty((1, 6))
-    M, a = np.zeros((n, n)), np.empty(n)
+    M, a = np.zeros((n, n)), np.empty((n, 1))
     V[J], A[J] = 0.0, 0.0  # the world's
     for i in range(3):
         A[J, 3 + i] = -tree.gravity[i]
@@ -508,7 +566,7 @@ def roll(
             total = forces.rest[s] - forces.damping[s] * x[n + s] - forces.stiffness[s] * x[s] - _dot(S, s, F, j)
             for i in range(nu):
                 total += forces.actuation[s, i] * min(max(us[k, i], -forces.limit[i]), forces.limit[i])
-            a[s] = total
+            a[s, 0] = total
             _times(own, j, S, s, momentum, 0)
             M[s, s] = _dot(momentum, 0, S, s) + forces.armature[s]
             above = up
@@ -521,10 +579,11 @@ def roll(
                     own[up, i] += own[j, i]
                 for i in range(6):
                     F[up, i] += F[j, i]
-        if not solve(M, a):
+        if not _factor(M):
             return False
+        substitute(M, a)
         for s in range(n):
-            v = x[n + s] + h * a[s]
+            v = x[n + s] + h * a[s, 0]
             xs[k + 1, n + s] = v - gaps[k, n + s]
             xs[k + 1, s] = x[s] + h * v - gaps[k, s]
         for r in range(n):

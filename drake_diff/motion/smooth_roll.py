@@ -15,8 +15,8 @@ from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics import tree_kernel
-from drake_diff.mechanics.compiled_tree import compiled_tree
 from drake_diff.mechanics.description import describe_tree
+from drake_diff.mechanics.tree import compiled_tree
 from drake_diff.model.model import Model
 from drake_diff.model.step import stepped
 

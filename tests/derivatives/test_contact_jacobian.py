@@ -9,7 +9,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.derivatives import analytic
-from drake_diff.derivatives.contact import law_kernel, laws, nearest_points
+from drake_diff.derivatives.contact import laws, nearest_points
 from drake_diff.derivatives.contact.active_contacts import read_pairs
 from drake_diff.derivatives.contact.laws import ContactLaw
 from drake_diff.derivatives.steps import take_step
@@ -387,7 +387,7 @@ def _solved(law, velocity):
     """(M, 23) of each contact the impulse, and which branch of the law it is on: (M, 3) flags."""
     found, constants = np.zeros((len(velocity), 23)), (1e-3, 1e-7, 1e-4)
     for m, at in enumerate(found):
-        law_kernel.solve_law(
+        laws.solve_law(
             laws.LAWS[law.approximation], law.time_step, law.near_rigid, constants, law.normal[m], law.phi[m],
             law.friction[m], law.stiffness[m], law.time[m], law.dissipation[m], law.weight[m], velocity[m],
             law.before[m], at,
@@ -404,7 +404,7 @@ def _changed(law, velocity, solved, name, change):
             for names in (("phi", "weight", "before"), ("friction", "stiffness", "time", "dissipation"))
         )
         of_velocity, of_normal = (change[m] if name == one else zero for one in ("velocity", "normal"))
-        law_kernel.change_law(
+        laws.change_law(
             laws.LAWS[law.approximation], law.time_step, 1e-3, law.normal[m], law.phi[m], law.friction[m],
             law.stiffness[m], law.dissipation[m], law.weight[m], velocity[m], solved[m], of_velocity, of_normal,
             of_state, of_material, found[m],

@@ -40,10 +40,19 @@ import drake_diff as dd
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.mechanics import placing
-from drake_diff.mechanics.clearance import FromBall, FromBox, OfPairs, Swept, balls_of
+from drake_diff.mechanics.clearance import (
+    FromBall,
+    FromBox,
+    OfPairs,
+    Swept,
+    along_segment,
+    along_segments,
+    balls_of,
+    length,
+    to_box,
+)
 from drake_diff.mechanics.cover import Piece, around_mesh, cover_of, pieces_around, sides_of
 from drake_diff.mechanics.description import read_links
-from drake_diff.mechanics.distance import along_segment, along_segments, length, to_box
 from drake_diff.mechanics.placing import placing_of
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import any_state

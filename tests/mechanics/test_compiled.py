@@ -10,11 +10,11 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.compiled import compiled
-from drake_diff.derivatives.contact import jacobian as of_contact
-from drake_diff.mechanics import compiled_tree as of_trees
+from drake_diff.derivatives.contact import kernel
+from drake_diff.mechanics import tree as of_trees
 from drake_diff.mechanics import tree_kernel
-from drake_diff.mechanics.compiled_tree import compiled_tree
 from drake_diff.mechanics.description import describe_tree
+from drake_diff.mechanics.tree import compiled_tree
 
 
 def _largest(a, b):
@@ -64,13 +64,8 @@ def test_a_wrong_number_in_the_tables_is_found_out(table, monkeypatch):
             of_trees, "compile_links", lambda *a: replace(right(*a), tables=_off(right(*a).tables, table))
         )
     else:
-        module = of_contact.kernel(of_contact.KERNEL)
-
-        class Patched:
-            def __getattr__(self, name):
-                return (lambda *a: _off(module.Plant(*a), table)) if name == "Plant" else getattr(module, name)
-
-        monkeypatch.setattr(of_contact, "kernel", lambda name: Patched())
+        right_plant = kernel.Plant
+        monkeypatch.setattr(kernel, "Plant", lambda *a: _off(right_plant(*a), table))
     assert dd.differentiate_step(model, x, u).method != "analytic"
 
 
@@ -85,8 +80,7 @@ def test_nothing_is_compiled_for_more_than_one_kind_of_arguments():
     model, random = example_robot("solo12.urdf", feet=True), np.random.default_rng(6)
     xs = np.array([state_in_contact(model, random) for _ in range(3)])
     us = np.zeros((3, model.nu))
-    of_steps = of_contact.kernel(of_contact.KERNEL)
-    functions = of_steps.overlapping, of_steps.touch, of_steps.step_jacobians, tree_kernel.differentiate_tree
+    functions = kernel.overlapping, kernel.touch, kernel.step_jacobians, tree_kernel.differentiate_tree
     dd.linearize(model, xs, us)
     compiled = [len(function.signatures) for function in functions]  # other kernels call the last one as well
     assert min(compiled) > 0

@@ -23,13 +23,11 @@ from numpy.typing import NDArray
 from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
 
 from drake_diff._base.arrays import Array, Indices, cross, own_array, skew
-from drake_diff._base.compiled import kernel
+from drake_diff.derivatives.contact import kernel
 from drake_diff.derivatives.contact.nearest_points import NearestPointPairs, move_apart, read_nearest_point_pairs
 from drake_diff.derivatives.steps import Steps
 from drake_diff.mechanics.description import Description
 from drake_diff.model.model import Model
-
-KERNEL = "drake_diff.derivatives.contact.kernel"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,22 +74,22 @@ class ContactPairs:
 
     def overlapping(self, of_pairs: Any, poses: Array) -> Any:
         """The kernel.Touching of those that overlap where the bodies are at `poses` (N, bodies, 3, 4)."""
-        compiled, N = kernel(KERNEL), len(poses)
+        N = len(poses)
         shapes = self.center, self.radius, self.rotation, self.position, self.lower, self.upper, self.rounding
-        spheres, first = compiled.Spheres(*map(own_array, shapes)), np.empty(N + 1, dtype=np.int64)
+        spheres, first = kernel.Spheres(*map(own_array, shapes)), np.empty(N + 1, dtype=np.int64)
         pair = np.empty(N * len(self.radius), dtype=np.int64)
-        M = compiled.overlapping(spheres, of_pairs.sides, poses, first, pair)
-        contacts = compiled.Touching(
+        M = kernel.overlapping(spheres, of_pairs.sides, poses, first, pair)
+        contacts = kernel.Touching(
             first, pair[:M], np.empty((M, 3)), np.empty((M, 3)), np.empty(M), np.empty((M, 7, 6))
         )
-        compiled.touch(spheres, of_pairs, poses, contacts)
+        kernel.touch(spheres, of_pairs, poses, contacts)
         return contacts
 
     def touching(self, poses: Array) -> Touches:
         """The pairs that overlap where the bodies are at `poses` (N, bodies, 3, 4)."""
         count, sides = len(self.ids), np.stack([self.sphere_body, self.other_body], axis=1)
         none, halves = np.zeros(count), np.full(count, 0.5)  # half of the overlap on each side: the middle
-        of_pairs = kernel(KERNEL).Pairs(
+        of_pairs = kernel.Pairs(
             sides, np.zeros((len(self.bodies), 0)), none, none, none, none, halves, np.zeros((5, count, 0))
         )
         contacts = self.overlapping(of_pairs, own_array(poses))

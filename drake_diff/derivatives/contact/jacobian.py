@@ -8,7 +8,7 @@ whose inverse dynamics are differentiated; what the impulses change is solved fo
     (A + sum_c J_c' G_c J_c) dv' = A dv'|_g + sum_c d(J_c' g_c)|_v',   G_c = -dg_c / d(J_c v').
 
 That v' solves the equation is checked, in the norm and to the tolerance of Drake's solver. What is left out here, as a
-shape that is not known, shows there. `kernel` and `law_kernel` do the arithmetic.
+shape that is not known, shows there. `kernel` does the arithmetic.
 """
 
 from dataclasses import dataclass
@@ -18,21 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, cross, own_array
-from drake_diff._base.compiled import kernel
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives import joint_impulses
-from drake_diff.derivatives.contact import laws
+from drake_diff.derivatives.contact import kernel, laws
 from drake_diff.derivatives.contact.active_contacts import AllPairs, Placed, read_all_pairs, topology_of
 from drake_diff.derivatives.contact.laws import Material, MaterialChange, read_material
 from drake_diff.derivatives.joint_impulses import couplers_of
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.derivatives.steps import Flags, Steps
-from drake_diff.mechanics.compiled_tree import CompiledTree, compiled_tree
 from drake_diff.mechanics.description import describe_tree
+from drake_diff.mechanics.tree import CompiledTree, compiled_tree
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 
-KERNEL = "drake_diff.derivatives.contact.kernel"
 # Of the momentum: Drake's solver ends at 1e-6 of it, in the same norm.
 OPTIMALITY = 2e-6
 ROUNDING = 1e-12
@@ -45,7 +43,7 @@ class ContactForm:
     pairs: AllPairs
     unknown: str  # why no contact of the model is known here; empty where some is
     tree: CompiledTree
-    plant: tuple[object, ...]  # of kernel.Plant
+    plant: tuple[Any, ...]  # of kernel.Plant
     sides: NDArray[np.int64]  # (P, 2) of the pairs in the bodies
     by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
     carriers: NDArray[np.intp]  # (bodies,) the link of each body of the pairs, -1 of the world
@@ -91,13 +89,9 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
         unknown = f"the contact model is {contact.model}, not point"
     elif not pairs.ids:
         unknown = "nothing of it may touch"
-    topology, coordinates = topology_of(description), smooth.coordinates
+    topology = topology_of(description)
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
     names = [labels.get(body.index(), "world") for body in pairs.bodies]
-    starts = (
-        np.array(pairs_of_starts, dtype=np.int64).reshape(-1, 2)
-        for pairs_of_starts in (coordinates.free, coordinates.single)
-    )
     plant = (
         model.time_step,
         laws.LAWS[contact.approximation],
@@ -113,7 +107,7 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
         smooth.limits,
         couplers.direction,
         couplers.offset,
-        *starts,
+        *smooth.coordinates.starts,
     )
     return ContactForm(
         pairs=pairs,
@@ -147,21 +141,21 @@ def contact_jacobians(
 
     Where nothing is said of one that is not, its equation is not Drake's.
     """
-    nq, compiled, N = smooth.coordinates.nq, kernel(KERNEL), len(steps)
+    nq, N = smooth.coordinates.nq, len(steps)
     parts = steps.xs[:, :nq], steps.xs[:, nq:], steps.x_next[:, nq:]
     q, v, v_next = (own_array(array) for array in parts)
     moved = form.tree(q, v, (v_next - v) / smooth.time_step)
     placed = form.pairs.locate(steps, form.poses(moved.poses))
     count = 0 if change is None else change.friction.shape[1]
-    changes = np.zeros((5, len(form.sides), 0)) if change is None else own_array(change.stacked)
-    of_pairs = compiled.Pairs(form.sides, form.by_body, *map(own_array, material.of_pairs), changes)
+    changes = np.zeros((5, len(form.sides), 0)) if change is None else change.stacked
+    of_pairs = kernel.Pairs(form.sides, form.by_body, *map(own_array, (*material.of_pairs, changes)))
     contacts, unknown = form.contacts(of_pairs, placed, moved.S, material)
     force, clipped = smooth.force_of(q, v, steps.us)
     if clipped is None:
         clipped = np.zeros(steps.us.shape, dtype=bool)
     jacobians, sizes = np.empty((N, steps.model.nx, steps.model.nx + steps.model.nu + count)), np.empty((N, 3))
-    compiled.step_jacobians(
-        compiled.Plant(*form.plant),
+    kernel.step_jacobians(
+        kernel.Plant(*form.plant),
         of_pairs,
         contacts,
         q,

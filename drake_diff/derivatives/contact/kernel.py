@@ -1,6 +1,6 @@
 """What contacts, joint limits and couplers change of a step's Jacobian, state by state: compiled.
 
-`jacobian` has the equation, `kinematics` the motion of contacts, `laws` and `joint_impulses` the impulses.
+`jacobian` has the equation, `laws` and `joint_impulses` the impulses.
 """
 
 from typing import NamedTuple
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.compiled import compiled
-from drake_diff.derivatives.contact.law_kernel import SAME_MATERIAL, SAME_STATE, SAP, change_law, solve_law
+from drake_diff.derivatives.contact.laws import SAME_MATERIAL, SAME_STATE, SAP, change_law, solve_law
+from drake_diff.mechanics.tree_kernel import _factor, assemble_step, substitute
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
@@ -416,97 +417,6 @@ def _add_joint(
 
 
 @compiled
-def _factor(A: Array, L: Array) -> None:
-    """L L' = A, of which the lower half is read; NaN where A is not positive definite."""
-    n = len(A)
-    for i in range(n):
-        for j in range(i + 1):
-            total = A[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
-
-
-@compiled
-def _solve(L: Array, B: Array) -> None:
-    """B (n, m) becomes (L L')^-1 B, row by row as they lie in memory."""
-    n, m = B.shape
-    for i in range(n):
-        for k in range(i):
-            factor = L[i, k]
-            for j in range(m):
-                B[i, j] -= factor * B[k, j]
-        inverse = 1.0 / L[i, i]
-        for j in range(m):
-            B[i, j] *= inverse
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            factor = L[k, i]
-            for j in range(m):
-                B[i, j] -= factor * B[k, j]
-        inverse = 1.0 / L[i, i]
-        for j in range(m):
-            B[i, j] *= inverse
-
-
-@compiled
-def _assemble(p: Plant, q: Array, v_next: Array, by: Array, nq: int, out: Array) -> None:
-    """out (nx, nx + nu + np) from the derivative (nv, 2 nv + nu + np) of v' by small motion, v, u and parameters."""
-    nv, width, h = len(v_next), by.shape[1], p.time_step
-    shift = nq - nv
-    out[:] = 0.0
-    for i in range(nv):
-        row = nq + i
-        for b in range(len(p.single)):
-            out[row, p.single[b, 0]] = by[i, p.single[b, 1]]
-        for b in range(len(p.free)):
-            s, d = p.free[b, 0], p.free[b, 1]
-            w, x, y, z = q[s], q[s + 1], q[s + 2], q[s + 3]
-            f = 2.0 / (w * w + x * x + y * y + z * z)
-            b0, b1, b2 = f * by[i, d], f * by[i, d + 1], f * by[i, d + 2]
-            out[row, s] = -(b0 * x + b1 * y + b2 * z)
-            out[row, s + 1] = b0 * w + b1 * z - b2 * y
-            out[row, s + 2] = -b0 * z + b1 * w + b2 * x
-            out[row, s + 3] = b0 * y - b1 * x + b2 * w
-            for a in range(3):
-                out[row, s + 4 + a] = by[i, d + 3 + a]
-        for j in range(nv, width):
-            out[row, shift + j] = by[i, j]
-    total = out.shape[1]
-    for b in range(len(p.single)):
-        s, row = p.single[b, 0], nq + p.single[b, 1]
-        for j in range(total):
-            out[s, j] = h * out[row, j]
-        out[s, s] += 1.0
-    for b in range(len(p.free)):
-        s, d = p.free[b, 0], p.free[b, 1]
-        w, x, y, z = q[s], q[s + 1], q[s + 2], q[s + 3]
-        for j in range(total):
-            r0, r1, r2 = out[nq + d, j], out[nq + d + 1, j], out[nq + d + 2, j]
-            out[s, j] = -0.5 * h * (x * r0 + y * r1 + z * r2)
-            out[s + 1, j] = 0.5 * h * (w * r0 + z * r1 - y * r2)
-            out[s + 2, j] = 0.5 * h * (-z * r0 + w * r1 + x * r2)
-            out[s + 3, j] = 0.5 * h * (y * r0 - x * r1 + w * r2)
-            for a in range(3):
-                out[s + 4 + a, j] = h * out[nq + d + 3 + a, j]
-        for a in range(7):
-            out[s + a, s + a] += 1.0
-        w0, w1, w2 = 0.5 * h * v_next[d], 0.5 * h * v_next[d + 1], 0.5 * h * v_next[d + 2]
-        out[s, s + 1] -= w0
-        out[s, s + 2] -= w1
-        out[s, s + 3] -= w2
-        out[s + 1, s] += w0
-        out[s + 1, s + 2] -= w2
-        out[s + 1, s + 3] += w1
-        out[s + 2, s] += w1
-        out[s + 2, s + 1] += w2
-        out[s + 2, s + 3] -= w0
-        out[s + 3, s] += w2
-        out[s + 3, s + 1] -= w1
-        out[s + 3, s + 2] += w0
-
-
-@compiled
 def step_jacobians(
     p: Plant,
     pairs: Pairs,
@@ -532,9 +442,9 @@ def step_jacobians(
     the momentum that the impulses do not account for, that which v' has, and the impulses', each in Drake's norm.
     """
     N, nv = v.shape
-    nq, nu, h = q.shape[1], p.actuation.shape[1], p.time_step
+    nu, h = p.actuation.shape[1], p.time_step
     right, left = np.empty((nv, 2 * nv + nu + pairs.changes.shape[2])), np.empty((nv, nv))
-    factor = np.zeros((nv, nv))
+    factor = np.empty((nv, nv))
     A, diagonal, push, gained = np.empty((nv, nv)), np.empty(nv), np.empty(nv), np.empty((nv, 1))
     free, j = np.empty((nv, 1)), np.zeros(nv)
     L, point, across, y = np.empty((nv, 3)), np.empty((nv, 7)), np.empty((nv, 3)), np.empty((nv, 7))
@@ -558,8 +468,10 @@ def step_jacobians(
             right[i, 2 * nv + nu :] = 0.0
             gained[i, 0] = h * (tau[n, i] - force[n, i]) + p.armature[i] * (v_next[n, i] - v[n, i])
             free[i, 0] = gained[i, 0]
-        _factor(A, factor)
-        _solve(factor, free)
+        factor[:] = A
+        if not _factor(factor):
+            free[:] = np.nan
+        substitute(factor, free)
         for m in range(c.first[n], c.first[n + 1]):
             _add_contact(
                 p, pairs, c, m, S[n], diagonal, slope[n], v[n], v_next[n], right, left, push, L, point, across, y
@@ -592,6 +504,7 @@ def step_jacobians(
             had += momentum * momentum / diagonal[i]
             given += push[i] * push[i] / diagonal[i]
         sizes[n, 0], sizes[n, 1], sizes[n, 2] = np.sqrt(missing), np.sqrt(had), np.sqrt(given)
-        _factor(left, factor)
-        _solve(factor, right)
-        _assemble(p, q[n], v_next[n], right, nq, out[n])
+        if not _factor(left):
+            right[:] = np.nan
+        substitute(left, right)
+        assemble_step(h, p.free, p.single, q[n], v_next[n], right, out[n])

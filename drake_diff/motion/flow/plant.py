@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.refusal import Refusal
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.contact.active_contacts import ContactPairs, read_pairs
 from drake_diff.derivatives.contact.laws import QUANTITIES, Material, MaterialChange, combine
 from drake_diff.exceptions import GradientError, ModelError, SimulationError

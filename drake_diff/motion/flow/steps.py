@@ -32,9 +32,9 @@ from drake_diff.derivatives.contact.laws import QUANTITIES, material_change
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.contact import ContactPoint
-from drake_diff.model.counted import stepped
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector
+from drake_diff.model.step import stepped
 from drake_diff.motion.flow.integrate import TOLERANCE, Flow, FlowEvent, Integrator, on_arrays, pushing_of
 from drake_diff.motion.flow.plant import FlowPart, FlowPlant, flow_plant, material_of, numbers_of
 

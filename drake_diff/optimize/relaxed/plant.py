@@ -32,7 +32,7 @@ from drake_diff.derivatives.contact.active_contacts import (
     topology_of,
 )
 from drake_diff.derivatives.contact.laws import Material, read_material
-from drake_diff.derivatives.implicit import form_of
+from drake_diff.derivatives.smooth_step import form_of
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
 from drake_diff.mechanics.tree import Tree, tree_of
