@@ -12,7 +12,7 @@ from .derivatives.step import differentiate_step as differentiate_step
 from .derivatives.step import linearize as linearize
 from .identification.explain import explain as explain
 from .identification.identify import identify as identify
-from .model import quantities as quantities
+from .mechanics import quantities as quantities
 from .model.example import example_model as example_model
 from .model.model import Model as Model
 from .model.model import load_model as load_model

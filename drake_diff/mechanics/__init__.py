@@ -1,1 +1,5 @@
-"""The same tree of bodies written out without Drake: in NumPy, Pinocchio and CasADi."""
+"""The tree of bodies written out without Drake: kinematics, dynamics and their derivatives, distances."""
+
+from drake_diff._base import attach_stub as _attach_stub
+
+__getattr__, __dir__, __all__ = _attach_stub(__name__, __file__)

@@ -18,10 +18,10 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import InputError
 from drake_diff.mechanics.cover import Piece
-from drake_diff.mechanics.placing import Placing
+from drake_diff.mechanics.forward_kinematics import ForwardKinematics
+from drake_diff.mechanics.quantities import PLACE
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
-from drake_diff.model.quantities import PLACE
 
 TINY = 1e-24  # [m^2] keeps the slope of a length of 0 a number; it adds 1e-12 m at most
 PARALLEL = 1e-12  # of the squared sine of two segments' angle: less is 0
@@ -124,23 +124,23 @@ def in_rows(pieces: Sequence[Piece]) -> Pieces:
 class Clearance:
     """Signed distances [m] of a robot's pieces; `labels` (m,) tell what each row is of."""
 
-    def __init__(self, model: Model, placing: Placing, labels: Sequence[str]):
-        self.model, self.placing, self.labels = model, placing, tuple(labels)
+    def __init__(self, model: Model, kinematics: ForwardKinematics, labels: Sequence[str]):
+        self.model, self.kinematics, self.labels = model, kinematics, tuple(labels)
 
     def __call__(self, x: Any) -> Any:
         """(m,) [m] at x (nx,)."""
         for quantity in sorted(self.model.other_quantities & PLACE):
             raise InputError("parameters", got=quantity, expected="only such as distances do not depend on")
-        return self._distances(self.placing(np.asarray(x)[: self.model.nq]))
+        return self._distances(self.kinematics(np.asarray(x)[: self.model.nq]))
 
     def values(self, xs: Array) -> Array:
         """(K, m) [m] at xs (K, nx)."""
-        return np.asarray(self._distances(self.placing(xs[:, : self.model.nq])), dtype=float)
+        return np.asarray(self._distances(self.kinematics(xs[:, : self.model.nq])), dtype=float)
 
     def linearize(self, xs: Array) -> tuple[Array, Array]:
         """(K, m) [m], and their derivatives by the state (K, m, nx), at xs (K, nx)."""
         q = xs[:, : self.model.nq]
-        frames = self.placing(q)
+        frames = self.kinematics(q)
         return np.asarray(self._distances(frames)), self._slopes(q, frames)
 
     def moved(self, xs: Array) -> Array:
@@ -148,7 +148,7 @@ class Clearance:
 
         That is the longest of the straight ways of its points.
         """
-        return np.asarray(self._ways(self.placing(xs[:, : self.model.nq])))
+        return np.asarray(self._ways(self.kinematics(xs[:, : self.model.nq])))
 
     def _distances(self, frames: tuple[Any, Any]) -> Any:
         raise NotImplementedError
@@ -163,8 +163,10 @@ class Clearance:
 class FromBall(Clearance):
     """Of capsules from a ball at `center` (3,) of a `radius` [m]."""
 
-    def __init__(self, model: Model, placing: Placing, pieces: Sequence[Piece], center: Array, radius: float):
-        super().__init__(model, placing, [p.body for p in pieces])
+    def __init__(
+        self, model: Model, kinematics: ForwardKinematics, pieces: Sequence[Piece], center: Array, radius: float
+    ):
+        super().__init__(model, kinematics, [p.body for p in pieces])
         self.pieces, self.center, self.radius = in_rows(pieces), center, radius
 
     def _nearest(self, frames: tuple[Any, Any]) -> Any:
@@ -181,7 +183,7 @@ class FromBall(Clearance):
     def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
         points = self._nearest(frames)
         apart = points - self.center
-        return self.placing.pushes(q, frames, self.pieces.at, points, apart / length(apart)[..., None])
+        return self.kinematics.pushes(q, frames, self.pieces.at, points, apart / length(apart)[..., None])
 
 
 class FromBox(Clearance):
@@ -191,10 +193,16 @@ class FromBox(Clearance):
     """
 
     def __init__(
-        self, model: Model, placing: Placing, pieces: Sequence[Piece], center: Array, rotation: Array, half: Array
+        self,
+        model: Model,
+        kinematics: ForwardKinematics,
+        pieces: Sequence[Piece],
+        center: Array,
+        rotation: Array,
+        half: Array,
     ):
         balls = [ball for piece in pieces for ball in balls_of(piece)]
-        super().__init__(model, placing, [p.body for p in balls])
+        super().__init__(model, kinematics, [p.body for p in balls])
         self.pieces, self.center, self.rotation, self.half = in_rows(balls), center, rotation, half
 
     def _within(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -210,14 +218,16 @@ class FromBox(Clearance):
 
     def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
         points, local = self._within(frames)
-        return self.placing.pushes(q, frames, self.pieces.at, points, away_from_box(local, self.half) @ self.rotation.T)
+        return self.kinematics.pushes(
+            q, frames, self.pieces.at, points, away_from_box(local, self.half) @ self.rotation.T
+        )
 
 
 class OfPairs(Clearance):
     """Of two capsules from each other, a row for each pair."""
 
-    def __init__(self, model: Model, placing: Placing, pairs: Sequence[tuple[Piece, Piece]]):
-        super().__init__(model, placing, [f"{a.body} and {b.body}" for a, b in pairs])
+    def __init__(self, model: Model, kinematics: ForwardKinematics, pairs: Sequence[tuple[Piece, Piece]]):
+        super().__init__(model, kinematics, [f"{a.body} and {b.body}" for a, b in pairs])
         self.first, self.second = in_rows([a for a, _ in pairs]), in_rows([b for _, b in pairs])
 
     def _nearest(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -235,8 +245,8 @@ class OfPairs(Clearance):
     def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
         a, b = self._nearest(frames)
         way = (a - b) / length(a - b)[..., None]
-        first = self.placing.pushes(q, frames, self.first.at, a, way)
-        return first - self.placing.pushes(q, frames, self.second.at, b, way)
+        first = self.kinematics.pushes(q, frames, self.first.at, a, way)
+        return first - self.kinematics.pushes(q, frames, self.second.at, b, way)
 
 
 class Swept(Clearance):
@@ -246,7 +256,7 @@ class Swept(Clearance):
     """
 
     def __init__(self, other: Clearance, before: Array):
-        super().__init__(other.model, other.placing, other.labels * len(before))
+        super().__init__(other.model, other.kinematics, other.labels * len(before))
         self.other, self.before = other, before
         self.moves = np.zeros((other.model.nx, other.model.nx))  # the rates of the positions that are velocities
         for joint in joints(other.model.plant):

@@ -123,9 +123,9 @@ def exponential_turn(quaternion: Array, angle: Array) -> Array:
 
 
 def rotation(quaternion: Array) -> Array:
-    """(..., 3, 3) of a quaternion (w, x, y, z) (..., 4) of any norm."""
+    """(..., 3, 3) of a quaternion (w, x, y, z) (..., 4) of any norm but 0, in ordinary arithmetic."""
     vector = skew(quaternion[..., 1:])
-    scale = 2 / (quaternion * quaternion).sum(axis=-1)[..., None, None]
+    scale = 2 / (quaternion * quaternion).sum(axis=-1, keepdims=True)[..., None]
     return np.asarray(_ONE + scale * (quaternion[..., :1, None] * vector + vector @ vector))
 
 

@@ -17,7 +17,7 @@ from pydrake.math import RigidTransform
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import ModelError
-from drake_diff.mechanics.placing import Placing
+from drake_diff.mechanics.forward_kinematics import ForwardKinematics
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
 from drake_diff.model.triangles import read_mesh, scaled
@@ -41,7 +41,7 @@ class Piece:
     """A capsule of a `radius` [m] around the segment from `start` to `end` (3,) [m]; a sphere where they are one."""
 
     body: str
-    link: int  # its place among the links of a Placing, -1 for the world
+    link: int  # its place among the links of its ForwardKinematics, -1 for the world
     start: Array  # in the link's frame
     end: Array
     radius: float
@@ -63,21 +63,21 @@ class Cover:
     doubts: tuple[str, ...]
 
 
-def cover_of(model: Model, placing: Placing) -> Cover:
+def cover_of(model: Model, kinematics: ForwardKinematics) -> Cover:
     """The cover of the shapes that `model` has."""
-    return model.cache("cover", lambda: _cover(model, placing))
+    return model.cache("cover", lambda: _cover(model, kinematics))
 
 
-def _cover(model: Model, placing: Placing) -> Cover:
+def _cover(model: Model, kinematics: ForwardKinematics) -> Cover:
     whole, pieces, bare, unread = _with_whole_shapes(model), list[Piece](), list[str](), list[str]()
     inspector = whole.double.inspector
     for label, body in labelled(bodies(whole.plant)).items():
-        link, pose = placing.on[label]
+        link, pose = kinematics.on[label]
         found = [] if inspector is None else list(_of_shapes(whole, inspector, body, unread))
         found = found or list(_skeleton(whole, body))
         pieces += [replace(p, body=label, link=link, start=pose @ p.start, end=pose @ p.end) for p in found]
-    for place, rigid in enumerate(placing.links):
-        if place not in placing.between and all(p.link != place for p in pieces):
+    for place, rigid in enumerate(kinematics.links):
+        if place not in kinematics.between and all(p.link != place for p in pieces):
             bare.append(rigid.joint.body)
     return Cover(tuple(pieces), tuple(bare), (*unread, *_doubts(pieces, bare)))
 

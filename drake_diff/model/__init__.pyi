@@ -1,4 +1,3 @@
-from . import quantities as quantities
 from .contact import SoftContact as SoftContact
 from .contact import contact_modes as contact_modes
 from .contact import softened as softened

@@ -6,8 +6,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import InputError
+from drake_diff.mechanics.quantities import frame_position
 from drake_diff.model.model import Model
-from drake_diff.model.quantities import frame_position
 from drake_diff.model.step import advance
 from drake_diff.planning.motion import LONGEST, PEAK, SHORTEST, STEPS, Guess, smooth
 from drake_diff.planning.posture import TOUCHING, shares

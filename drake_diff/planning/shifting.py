@@ -9,7 +9,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError, SimulationError
-from drake_diff.model.quantities import frame_position
+from drake_diff.mechanics.quantities import frame_position
 from drake_diff.model.step import advance, set_state
 from drake_diff.motion.policy import TVLQR
 from drake_diff.planning.feet import center_of_mass

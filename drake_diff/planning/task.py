@@ -8,8 +8,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.mechanics.quantities import frame_position
 from drake_diff.model.model import Model
-from drake_diff.model.quantities import frame_position
 from drake_diff.optimize.problem.obstacles import Obstacle
 from drake_diff.planning.around import Space
 from drake_diff.planning.motion import PEAK, speed_limits

@@ -13,10 +13,10 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError
+from drake_diff.mechanics.quantities import description_of, made_from
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select
 from drake_diff.model.plant import FLOATING, joints
-from drake_diff.model.quantities import description_of, made_from
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost, SumOfCosts, TrackingCost

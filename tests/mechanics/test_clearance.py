@@ -39,7 +39,7 @@ from scipy.spatial import ConvexHull
 import drake_diff as dd
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError
-from drake_diff.mechanics import placing
+from drake_diff.mechanics import forward_kinematics as module
 from drake_diff.mechanics.clearance import (
     FromBall,
     FromBox,
@@ -53,7 +53,7 @@ from drake_diff.mechanics.clearance import (
 )
 from drake_diff.mechanics.cover import Piece, around_mesh, cover_of, pieces_around, sides_of
 from drake_diff.mechanics.description import read_links
-from drake_diff.mechanics.placing import placing_of
+from drake_diff.mechanics.forward_kinematics import forward_kinematics
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import any_state
 
@@ -156,7 +156,7 @@ def test_two_segments_are_as_near_as_a_search_over_both_finds():
 @pytest.mark.parametrize("robot", slow_after(1, ROBOTS))
 def test_distances_of_a_robot_have_exact_derivatives(robot):
     model, random = example_robot(robot, 0.02), np.random.default_rng(4)
-    links = placing_of(model)
+    links = forward_kinematics(model)
     pieces = cover_of(model, links).pieces
     turned = RollPitchYaw(0.3, -0.5, 0.7).ToRotationMatrix().matrix()
     pairs = [(a, b) for a, b in itertools.combinations(pieces, 2) if a.link != b.link][:40]
@@ -186,8 +186,8 @@ def test_where_links_are_is_refused_where_the_tree_is_another(monkeypatch):
         hinge.axis[:] = -hinge.axis
         return links
 
-    monkeypatch.setattr(placing, "read_links", one_axis_turned_around)
-    found = placing_of(model)
+    monkeypatch.setattr(module, "read_links", one_axis_turned_around)
+    found = forward_kinematics(model)
     assert isinstance(found, Refusal)
     assert "not where Drake has them" in str(found)
 
@@ -260,7 +260,7 @@ def test_balls_of_a_capsule_contain_it():
 
 def test_a_robot_without_readable_shapes_is_a_skeleton_and_says_so():
     model = without_shapes()
-    cover = cover_of(model, placing_of(model))
+    cover = cover_of(model, forward_kinematics(model))
     assert {p.source for p in cover.pieces} == {"skeleton"}
     assert "no shape that could be read" in cover.doubts[0]
     assert "upper, lower" in cover.doubts[0]
@@ -281,7 +281,7 @@ def without_shapes():
 def test_collision_meshes_are_contained_though_the_step_skips_them(robot):
     """Every corner of every mesh, as trimesh reads the file's own, is in a capsule of its link."""
     model = dd.load_model(robot_file(robot), time_step=0.02, base="weld")
-    links = placing_of(model)
+    links = forward_kinematics(model)
     cover = cover_of(model, links)
     root, checked = ET.parse(robot_file(robot)).getroot(), 0
     folder = robot_file(robot).parents[[p.name for p in robot_file(robot).parents].index("example-robot-data")]
@@ -312,14 +312,14 @@ def test_what_a_step_touches_with_is_not_what_is_kept_clear(options):
     """Spheres in its corners leave most of a box open: the cover is that of the box that the file gives."""
     model = dd.load_model(MODELS / "box_push.sdf", time_step=0.01, **options)
     whole = dd.load_model(MODELS / "box_push.sdf", time_step=0.01)
-    found, wanted = ([p for p in cover_of(m, placing_of(m)).pieces if p.link >= 0] for m in (model, whole))
+    found, wanted = ([p for p in cover_of(m, forward_kinematics(m)).pieces if p.link >= 0] for m in (model, whole))
     assert [(p.body, p.radius, p.source) for p in found] == [(p.body, p.radius, p.source) for p in wanted]
     assert any(p.source == "around a box" for p in found)
 
 
 def test_parameters_that_move_links_are_refused():
     model = dd.load_model("models/double_pendulum.urdf", time_step=0.01)
-    links = placing_of(model)
+    links = forward_kinematics(model)
     clearance = FromBall(model, links, cover_of(model, links).pieces, np.zeros(3), 0.1)
     names = [p.name for p in dd.list_parameters(model) if p.name.endswith(".offset")]
     with applied(select(model, names)) as other, pytest.raises(InputError, match="offset"):
@@ -356,7 +356,7 @@ def chain(*kinds):
 )
 def test_joints_of_several_coordinates_are_chains_of_hinges_and_slides(kinds):
     model, random = chain(*kinds), np.random.default_rng(2)
-    links = placing_of(model)
+    links = forward_kinematics(model)
     assert not isinstance(links, Refusal), links
     cover = cover_of(model, links)
     assert (len(cover.pieces), cover.bare) == (len(kinds), ())
@@ -381,7 +381,7 @@ def test_joints_of_several_coordinates_are_chains_of_hinges_and_slides(kinds):
 def test_the_way_of_a_step_is_along_the_rates_of_positions(kinds):
     """A little earlier the positions were those at now's rates, but for what turns freely."""
     model, random = chain(*kinds), np.random.default_rng(3)
-    links = placing_of(model)
+    links = forward_kinematics(model)
     clearance = FromBall(model, links, cover_of(model, links).pieces, np.array([0.4, 0.1, 0.5]), 0.1)
     x, dt = random.uniform(-0.5, 0.5, model.nx), 0.02
     context = model.plant.CreateDefaultContext()
@@ -397,7 +397,7 @@ def test_the_way_of_a_step_is_along_the_rates_of_positions(kinds):
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 def test_the_way_of_a_step_with_joints_that_follow_others_is_theirs_too():
     model = dd.load_model(robot_file("panda.urdf"), time_step=0.02, base="weld", actuators="all", mimic="reduce")
-    links, random = placing_of(model), np.random.default_rng(3)
+    links, random = forward_kinematics(model), np.random.default_rng(3)
     clearance = FromBall(model, links, cover_of(model, links).pieces, np.array([0.6, 0.3, 0.6]), 0.05)
     x, dt = any_state(model, random), 0.02
     earlier = np.concatenate([x[: model.nq] - dt * x[model.nq :], x[model.nq :]])

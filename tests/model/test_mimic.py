@@ -145,7 +145,7 @@ def test_a_chain_of_followers_has_one_coordinate(tmp_path):
     assert model.state_names == ("a_x", "a_v")
     v = 0.5 + H * 6.0 / (1 + 9 + 36)
     np.testing.assert_allclose(dd.step(model, [0.1, 0.5], [6.0]), [0.1 + H * v, v], rtol=ROUNDING)
-    x = dd.model.quantities.frame_position(model, "c_link")([0.1, 0.0])[0]
+    x = dd.quantities.frame_position(model, "c_link")([0.1, 0.0])[0]
     assert x == pytest.approx(-6 * 0.1 + 0.5, abs=1e-15)
 
 
@@ -191,7 +191,7 @@ def test_both_elements_of_sdf_are_read(tmp_path, inside, beside, world):
     model = load(path)
     assert model.state_names == ("a_x", "a_v")
     assert model.plant.num_constraints() == 1
-    place = dd.model.quantities.frame_position(model, "b_link")
+    place = dd.quantities.frame_position(model, "b_link")
     assert place([0.1, 0.0])[0] == pytest.approx(0.47, abs=1e-15)
 
 
@@ -207,9 +207,9 @@ def test_fixed_joints_are_where_they_start(tmp_path):
     assert (model.state_names, model.input_names) == (("c_q", "c_w"), ("motor_c",))
     assert model.plant.num_constraints() == 0
     assert "a at 0.25, b at 1.5" in model.notes[-1]
-    positions = [dd.model.quantities.frame_position(model, f"{name}_link") for name in "ab"]
+    positions = [dd.quantities.frame_position(model, f"{name}_link") for name in "ab"]
     np.testing.assert_allclose(positions[0]([0.0, 0.0]), [0.25, 0, 0], atol=1e-15)
-    end = dd.model.quantities.frame_position(model, "b_link", [1, 0, 0])([0.0, 0.0])
+    end = dd.quantities.frame_position(model, "b_link", [1, 0, 0])([0.0, 0.0])
     np.testing.assert_allclose(end, [np.cos(1.5), np.sin(1.5), 0], atol=1e-15)
     assert model.changed(mimic="reduce").nv == 2
 

@@ -11,8 +11,8 @@ from drake_diff._base.arrays import Array, finite_array, frozen, positive_float
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError
+from drake_diff.mechanics.quantities import frame_position, frame_velocity
 from drake_diff.model.model import Model
-from drake_diff.model.quantities import frame_position, frame_velocity
 from drake_diff.optimize.problem.constraint import Constraint, plant_limits
 from drake_diff.optimize.problem.dynamics import Dynamics
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, array_with_gaps, finite_array, positive_float
 from drake_diff.exceptions import InputError
-from drake_diff.model.model import Model
-from drake_diff.model.quantities import (
+from drake_diff.mechanics.quantities import (
     UP,
     center_of_mass,
     frame_angular_velocity,
@@ -26,6 +25,7 @@ from drake_diff.model.quantities import (
     frame_tilt,
     frame_velocity,
 )
+from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.names import coordinates
 

@@ -18,7 +18,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.mechanics.clearance import Clearance, FromBall, FromBox, OfPairs, Swept
 from drake_diff.mechanics.cover import Piece, cover_of
-from drake_diff.mechanics.placing import Placing, placing_of
+from drake_diff.mechanics.forward_kinematics import ForwardKinematics, forward_kinematics
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 from drake_diff.model.tangent import any_state
@@ -211,9 +211,9 @@ class SphereObstacle(Obstacle):
         return _called(self.name, "sphere", self.center)
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        placing, center = _placing(model), np.array(self.center)
-        pieces = _near(placing, _pieces(model, placing, self.links), center, self.radius + self.margin)
-        clearance = FromBall(model, placing, pieces, center, self.radius)
+        kinematics, center = _kinematics(model), np.array(self.center)
+        pieces = _near(kinematics, _pieces(model, kinematics, self.links), center, self.radius + self.margin)
+        clearance = FromBall(model, kinematics, pieces, center, self.radius)
         return self.constraints(clearance, self.margin, f"clear of {self.label}", f"obstacle {self.label}")
 
     def marks(self) -> tuple[Mark, ...]:
@@ -273,10 +273,10 @@ class BoxObstacle(Obstacle):
         return _called(self.name, "box", self.center)
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        placing, center, half = _placing(model), np.array(self.center), np.array(self.size) / 2
+        kinematics, center, half = _kinematics(model), np.array(self.center), np.array(self.size) / 2
         reach = float(np.linalg.norm(half)) + self.margin
-        pieces = _near(placing, _pieces(model, placing, self.links), center, reach)
-        clearance = FromBox(model, placing, pieces, center, np.array(self.rotation), half)
+        pieces = _near(kinematics, _pieces(model, kinematics, self.links), center, reach)
+        clearance = FromBox(model, kinematics, pieces, center, np.array(self.rotation), half)
         return self.constraints(clearance, self.margin, f"clear of {self.label}", f"obstacle {self.label}")
 
     def marks(self) -> tuple[Mark, ...]:
@@ -320,20 +320,20 @@ class SelfCollision(Obstacle):
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
         pairs, touching = self._pairs(model)
         free_pairs = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
-        return self.constraints(OfPairs(model, _placing(model), free_pairs), self.margin, "clear of itself", "")
+        return self.constraints(OfPairs(model, _kinematics(model), free_pairs), self.margin, "clear of itself", "")
 
     def apart_but_at(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
         """What keeps all pairs of `model` apart but those that are nearer than the margin at one of xs (K, nx).
 
         What stands for a link contains its shapes and sticks out of some: what is near there need not touch.
         """
-        placing, (pairs, _) = _placing(model), self._pairs(model)
+        kinematics, (pairs, _) = _kinematics(model), self._pairs(model)
         if not pairs:
             return ()
-        near = np.any(OfPairs(model, placing, pairs).values(xs) < self.margin, axis=0)
+        near = np.any(OfPairs(model, kinematics, pairs).values(xs) < self.margin, axis=0)
         touching = {frozenset((a.body, b.body)) for (a, b), close in zip(pairs, near, strict=True) if close}
         free_pairs = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
-        return self.constraints(OfPairs(model, placing, free_pairs), self.margin, "clear of itself", "")
+        return self.constraints(OfPairs(model, kinematics, free_pairs), self.margin, "clear of itself", "")
 
     def left_out(self, model: Model) -> tuple[str, ...]:
         """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b"."""
@@ -341,21 +341,21 @@ class SelfCollision(Obstacle):
 
     def _pairs(self, model: Model) -> tuple[list[tuple[Piece, Piece]], set[frozenset[str]]]:
         """The pairs of pieces that may touch, and the pairs of bodies among them that always do."""
-        placing = _placing(model)
+        kinematics = _kinematics(model)
         known = labelled(bodies(model.plant))
         for name in (body for pair in self.ignore for body in pair):
             if name not in known:
                 raise UnknownNameError("SelfCollision.ignore", got=name, known=known)
-        pieces, left = _pieces(model, placing, self.links, fixed=True), {frozenset(pair) for pair in self.ignore}
+        pieces, left = _pieces(model, kinematics, self.links, fixed=True), {frozenset(pair) for pair in self.ignore}
         pairs = [
             (a, b)
             for a, b in combinations(pieces, 2)
-            if not _are_neighbours(placing, a, b) and frozenset((a.body, b.body)) not in left
+            if not _are_neighbours(kinematics, a, b) and frozenset((a.body, b.body)) not in left
         ]
-        return pairs, _touching(model, placing, pairs)
+        return pairs, _touching(model, kinematics, pairs)
 
 
-def _touching(model: Model, placing: Placing, pairs: Sequence[tuple[Piece, Piece]]) -> set[frozenset[str]]:
+def _touching(model: Model, kinematics: ForwardKinematics, pairs: Sequence[tuple[Piece, Piece]]) -> set[frozenset[str]]:
     """The pairs of bodies of which some pieces overlap in the default posture, or in all of many random ones."""
     if not pairs:
         return set()
@@ -364,7 +364,7 @@ def _touching(model: Model, placing: Placing, pairs: Sequence[tuple[Piece, Piece
     def found() -> set[frozenset[str]]:
         random = np.random.default_rng(0)
         xs = np.array([model.default_state, *(any_state(model, random) for _ in range(LOOKED_AT))])
-        overlaps = OfPairs(model, placing, pairs).values(xs) < 0
+        overlaps = OfPairs(model, kinematics, pairs).values(xs) < 0
         names = np.array([" ".join(sorted((a.body, b.body))) for a, b in pairs])
         touching = set()
         for name in dict.fromkeys(names.tolist()):
@@ -376,26 +376,28 @@ def _touching(model: Model, placing: Placing, pairs: Sequence[tuple[Piece, Piece
     return model.cache(key, found)
 
 
-def _are_neighbours(placing: Placing, a: Piece, b: Piece) -> bool:
+def _are_neighbours(kinematics: ForwardKinematics, a: Piece, b: Piece) -> bool:
     """Whether two pieces are on one link, or one of their links carries the other."""
-    carriers = [-2 if piece.link < 0 else placing.carrier(piece.link) for piece in (a, b)]
+    carriers = [-2 if piece.link < 0 else kinematics.carrier(piece.link) for piece in (a, b)]
     return a.link == b.link or carriers[0] == b.link or carriers[1] == a.link
 
 
-def _placing(model: Model) -> Placing:
-    placing = placing_of(model)
-    if isinstance(placing, Refusal):
-        raise ModelError(f"obstacles: {placing}")
-    return placing
+def _kinematics(model: Model) -> ForwardKinematics:
+    kinematics = forward_kinematics(model)
+    if isinstance(kinematics, Refusal):
+        raise ModelError(f"obstacles: {kinematics}")
+    return kinematics
 
 
-def _pieces(model: Model, placing: Placing, links: Sequence[str] | None, *, fixed: bool = False) -> list[Piece]:
+def _pieces(
+    model: Model, kinematics: ForwardKinematics, links: Sequence[str] | None, *, fixed: bool = False
+) -> list[Piece]:
     """Those of the named bodies, or of all; without those that are `fixed` to the world, or with them."""
     known = labelled(bodies(model.plant))
     for name in links or ():
         if name not in known:
             raise UnknownNameError("links", got=name, known=known)
-    cover = cover_of(model, placing)
+    cover = cover_of(model, kinematics)
     chosen = [p for p in cover.pieces if (links is None or p.body in links) and (fixed or p.link >= 0)]
     for name in links or ():
         if all(p.body != name for p in cover.pieces):
@@ -403,14 +405,14 @@ def _pieces(model: Model, placing: Placing, links: Sequence[str] | None, *, fixe
     return chosen
 
 
-def _near(placing: Placing, pieces: Sequence[Piece], center: Array, reach: float) -> list[Piece]:
+def _near(kinematics: ForwardKinematics, pieces: Sequence[Piece], center: Array, reach: float) -> list[Piece]:
     """Without the pieces that no state brings within `reach` [m] of `center`.
 
     A link is never further from where its root is held than all offsets and slides between them together.
     """
     roots: list[Array] = []
     lengths: list[float] = []
-    for link in placing.links:
+    for link in kinematics.links:
         slide = float(np.max(np.abs([link.joint.lower, link.joint.upper]))) if link.joint.kind == "prismatic" else 0.0
         offset = np.asarray(link.on_parent.translation())
         roots.append(offset if link.parent < 0 else roots[link.parent])
@@ -485,7 +487,7 @@ def swept(constraints: Sequence[Constraint], time_step: float, parts: int) -> tu
 def doubts_of(goals: Sequence[Goal], model: Model) -> Iterator[str]:
     """What a model may not keep clear, where one of `goals` asks for it."""
     if any(isinstance(goal, Obstacle) for goal in goals):
-        yield from cover_of(model, _placing(model)).doubts
+        yield from cover_of(model, _kinematics(model)).doubts
     for goal in goals:
         if isinstance(goal, SelfCollision) and (left := goal.left_out(model)):
             yield (

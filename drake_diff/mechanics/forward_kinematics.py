@@ -1,4 +1,7 @@
-"""Where the links of a tree are, in ordinary arithmetic: for floats, many states at once, AutoDiffXd and symbols.
+"""Where the links of a tree are and how they move, in ordinary arithmetic.
+
+It serves floats, many states at once, AutoDiffXd and symbols. A collocation traces functions of the state with symbols,
+to have their exact second derivatives; what is traced is compared with Drake's own numbers before it is used.
 
     R = R_parent R_F exp(axis q),  p = p_parent + R_parent p_F        of a hinge
     R = R_parent R_F,              p = p_parent + R_parent (p_F + R_F axis q)   of a slide
@@ -9,21 +12,24 @@ several other coordinates is a chain of hinges and slides, with links between th
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_diff._base.arrays import Array, Indices, cross, skew
 from drake_diff._base.values import Refusal
-from drake_diff.mechanics.description import Link, RigidLink, read_links, without_welds
+from drake_diff.mechanics.coordinates import rotation
+from drake_diff.mechanics.description import Link, RigidLink, names_of, read_links, without_welds
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
 from drake_diff.model.repairs import Coupling
 from drake_diff.model.step import set_state
 
 X, Y, Z = np.eye(3)
+ROUNDED = 1e-15  # of the frames' entries (sines of pi): zeros that would keep products of symbols alive
 TURNS = (("revolute", Z, 2), ("revolute", Y, 1), ("revolute", X, 0))  # roll, pitch and yaw
 CHAINS: dict[str, tuple[tuple[str, Array, int], ...]] = {  # the kind, axis and coordinate of each link
     "planar": (("prismatic", X, 0), ("prismatic", Y, 1), ("revolute", Z, 2)),
@@ -31,20 +37,46 @@ CHAINS: dict[str, tuple[tuple[str, Array, int], ...]] = {  # the kind, axis and 
     "ball_rpy": TURNS,
     "rpy_floating": (("prismatic", X, 3), ("prismatic", Y, 4), ("prismatic", Z, 5), *TURNS),
 }
-PLACED = ("weld", "revolute", "prismatic", "quaternion_floating", *CHAINS)
+RPY = "ball_rpy", "rpy_floating"
+KNOWN = ("weld", "revolute", "prismatic", "quaternion_floating", *CHAINS)
 SAME_PLACE = 1e-11  # [m, and of a rotation's entries] rounding, relative to the largest
 
 
+@dataclass(frozen=True)
+class Moving:
+    """A frame in the world: rotation (3, 3), origin (3,) [m], angular velocity (3,) and its origin's (3,) [m/s]."""
+
+    R: Any
+    p: Any
+    w: Any
+    v: Any
+
+    def shifted(self, R: Array, p: Array) -> "Moving":
+        """The frame that lies at rotation R (3, 3), origin p (3,) in this one."""
+        arm = self.R @ p
+        return Moving(self.R @ R, self.p + arm, self.w, self.v + cross(self.w, arm))
+
+
 @dataclass(frozen=True, eq=False)
-class Placing:
+class ForwardKinematics:
     """The links of a tree, every parent before its children; `on` is where each body went, -1 for the world."""
 
     links: tuple[RigidLink, ...]
     on: dict[str, tuple[int, Any]]  # body -> (place among the links, pose on it)
     between: frozenset[int]  # the links that are no bodies
     carried: NDArray[np.bool_]  # (L, L): whether link j carries link i, or is i
-    nx: int
-    coupling: Coupling | None  # where q has the independent coordinates alone
+    spins: frozenset[int]  # the hinges whose three velocities are the angular velocity in the joint's frame
+    labels: dict[int, str]  # of the bodies by their indices
+    model: Model
+
+    @property
+    def nx(self) -> int:
+        return self.model.nx
+
+    @property
+    def coupling(self) -> Coupling | None:
+        """Where q has the independent coordinates alone."""
+        return self.model.coupling
 
     def carrier(self, link: int) -> int:
         """The next link below that is a body, -1 for the world."""
@@ -60,11 +92,10 @@ class Placing:
         places: list[Any] = []
         for link in self.links:
             R, p = (world, origin) if link.parent < 0 else (turns[link.parent], places[link.parent])
-            F, start = link.on_parent, link.joint.q_start
-            A, b = F.rotation().matrix(), F.translation()
+            start, (A, b) = link.joint.q_start, _without_rounding(link.on_parent)
             if link.free:
                 places.append(p + _times(R, b + _times(A, q[..., start + 4 : start + 7])))
-                turns.append(R @ (A @ _rotation(q[..., start : start + 4])))
+                turns.append(R @ (A @ rotation(q[..., start : start + 4])))
                 continue
             angle = q[..., start, None]
             if link.joint.kind == "revolute":
@@ -107,6 +138,74 @@ class Placing:
             own[:, :, k] += ratio * found[:, :, i]
         return own
 
+    def frame(self, x: Any, frame: Any, *, speeds: bool = False) -> Moving:
+        """A `frame` of the plant at the state x (nx,); without `speeds` as if at rest, which is less to trace."""
+        x = np.asarray(x)
+        turns, places = self(x[: self.model.nq])
+        link, pose = self._on(frame)
+        still = Moving(turns[link], places[link], np.zeros(3), np.zeros(3))
+        return (self._moving(x, turns, places, link) if speeds else still).shifted(*pose)
+
+    def _on(self, frame: Any) -> tuple[int, tuple[Array, Array]]:
+        """The link that carries a frame, and the frame's rotation and origin on it."""
+        link, pose = self.on[self.labels[int(frame.body().index())]]
+        return link, _without_rounding(pose @ frame.GetFixedPoseInBodyFrame())
+
+    def _moving(self, x: Any, turns: Any, places: Any, link: int) -> Moving:
+        v = x[self.model.nq :]
+        v, origin = v if self.coupling is None else self.coupling.velocities(v), places[link]
+        angular, linear = np.zeros(3), np.zeros(3)
+        for j in np.flatnonzero(self.carried[link]) if link >= 0 else ():
+            carrier, i, arm = self.links[j], self.links[j].joint.v_start, origin - places[j]
+            if i < 0:
+                continue
+            if carrier.free or j in self.spins:
+                before = turns[carrier.parent] @ _without_rounding(carrier.on_parent)[0]  # -1 is the world, the last
+                spin = before @ v[i : i + 3]
+                angular, linear = angular + spin, linear + cross(spin, arm)
+                if carrier.free:
+                    linear = linear + before @ v[i + 3 : i + 6]
+                continue
+            axis = (turns[j] @ carrier.axis) * v[i]
+            if carrier.joint.kind == "revolute":
+                angular, linear = angular + axis, linear + cross(axis, arm)
+            else:
+                linear = linear + axis
+        return Moving(turns[link], origin, angular, linear)
+
+    def quaternion(self, x: Any, frame: Any) -> Any:
+        """(4,) w, x, y, z of the rotation of `frame` in the world, of either sign, at the state x (nx,)."""
+        q = self._all(np.asarray(x)[: self.model.nq])
+        link, (R, _) = self._on(frame)
+        turned = _quaternion_of(R)
+        while link >= 0:
+            carrier, start = self.links[link], self.links[link].joint.q_start
+            if carrier.free:
+                own = q[start : start + 4]
+                turned = product(own / np.sqrt(own.dot(own)), turned)
+            elif carrier.joint.kind == "revolute":
+                turned = product(np.array([np.cos(q[start] / 2), *(carrier.axis * np.sin(q[start] / 2))]), turned)
+            turned = product(_quaternion_of(_without_rounding(carrier.on_parent)[0]), turned)
+            link = carrier.parent
+        return turned
+
+    def center_of_mass(self, x: Any) -> Any:
+        """(3,) [m] of all bodies but the world, at the state x (nx,)."""
+        total, moment, (turns, places) = 0.0, np.zeros(3), self(np.asarray(x)[: self.model.nq])
+        for link, mass, center in self._masses:
+            total, moment = total + mass, moment + mass * (places[link] + turns[link] @ center)
+        return moment / total
+
+    @cached_property
+    def _masses(self) -> list[tuple[int, float, Array]]:
+        """(link, mass [kg], centre of mass (3,) in it [m]) of the bodies."""
+        context, masses = self.model.plant.CreateDefaultContext(), []
+        for label, body in labelled(bodies(self.model.plant)).items():
+            mass, (link, pose) = float(body.get_mass(context)), self.on[label]
+            if mass > 0:
+                masses.append((link, mass, _rounded(pose @ body.CalcCenterOfMassInBodyFrame(context))))
+        return masses
+
     def _all(self, q: Any) -> Any:
         """The positions (..., n) of all joints."""
         return q if self.coupling is None else self.coupling.positions(q)
@@ -116,18 +215,6 @@ def _times(matrix: Any, vector: Any) -> Any:
     return (matrix @ vector[..., None])[..., 0]
 
 
-def _rotation(quaternion: Any) -> Any:
-    """(..., 3, 3) of w x y z (..., 4) of any length but 0."""
-    w, x, y, z = (quaternion[..., i] for i in range(4))
-    two = 2 / (w * w + x * x + y * y + z * z)
-    rows = [
-        [1 - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)],
-        [two * (x * y + w * z), 1 - two * (x * x + z * z), two * (y * z - w * x)],
-        [two * (x * z - w * y), two * (y * z + w * x), 1 - two * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def _turning(quaternion: Array) -> Array:
     """(K, 3, 4): the angular velocity of a change of w x y z (K, 4), 2 vec(dq q*) / |q|^2."""
     w, v = quaternion[:, 0], quaternion[:, 1:]
@@ -135,19 +222,38 @@ def _turning(quaternion: Array) -> Array:
     return np.asarray(np.concatenate(parts, axis=2) * (2 / np.sum(quaternion**2, axis=1))[:, None, None])
 
 
-def placing_of(model: Model) -> Placing | Refusal:
+def product(a: Any, b: Any) -> Any:
+    """(4,) the quaternion a b."""
+    return np.array([a[0] * b[0] - a[1:].dot(b[1:]), *(a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:]))])
+
+
+def _quaternion_of(R: Array) -> Array:
+    return _rounded(RotationMatrix(R).ToQuaternion().wxyz())
+
+
+def _without_rounding(pose: RigidTransform) -> tuple[Array, Array]:
+    return _rounded(pose.rotation().matrix()), _rounded(pose.translation())
+
+
+def _rounded(values: Any) -> Array:
+    return np.where(np.abs(values) < ROUNDED, 0.0, values)
+
+
+def forward_kinematics(model: Model) -> ForwardKinematics | Refusal:
     """The tree of `model`, compared with Drake's at two states; a Refusal names the joint that has no formula here."""
 
-    def compared() -> Placing | Refusal:
+    def compared() -> ForwardKinematics | Refusal:
         if not model.nq:
             return Refusal("nothing in it can move")
         for joint in joints(model.plant):
-            if joint.type_name() not in PLACED:
+            if joint.type_name() not in KNOWN:
                 return Refusal(
                     f"joint {joint.name()} is a {joint.type_name()} joint, and where that leads is not written out: "
                     "replace it by hinges and slides"
                 )
-        single = [part for link in read_links(model.plant, {}) for part in _chain(link)]
+        whole = read_links(model.plant, {})
+        rpy = {link.joint for link in whole if link.kind in RPY}
+        single = [part for link in whole for part in _chain(link)]
         links, on, _ = without_welds(single)
         known = {"world", *labelled(bodies(model.plant))}
         between = frozenset(i for i, link in enumerate(links) if link.joint.body not in known)
@@ -156,13 +262,16 @@ def placing_of(model: Model) -> Placing | Refusal:
         for i, link in enumerate(links):
             if link.parent >= 0:
                 carried[i] |= carried[link.parent]
-        placing = Placing(tuple(links), on, between, carried, model.nx, model.coupling)
+        turning = {part.body for part in single if part.joint in rpy and part.v_start >= 0 and part.kind == "revolute"}
+        spins = frozenset(i for i, link in enumerate(links) if link.joint.body in turning)
+        labels = {int(index): label for index, label in names_of(model.plant)[0].items()}
+        kinematics = ForwardKinematics(tuple(links), on, between, carried, spins, labels, model)
         here, random = model.double.state(), np.random.default_rng(0)
-        same = all(_is_same(model, placing, random.standard_normal(model.nq)) for _ in range(2))
+        same = all(_is_same(model, kinematics, random.standard_normal(model.nq)) for _ in range(2))
         set_state(model.double, here)
-        return placing if same else Refusal("its links are not where Drake has them")
+        return kinematics if same else Refusal("its links are not where Drake has them")
 
-    return model.cache("placing", compared)
+    return model.cache("forward kinematics", compared)
 
 
 def _chain(link: Link) -> Iterator[Link]:
@@ -176,16 +285,17 @@ def _chain(link: Link) -> Iterator[Link]:
         last = i == len(chain) - 1
         own: dict[str, Any] = {} if last else {"mass": 0.0, "inertia": np.zeros((3, 3)), "on_child": RigidTransform()}
         body = link.body if last else f"{link.body} behind {i + 1} of {len(chain)} coordinates"
-        yield replace(
-            link, body=body, parent=parent, kind=kind, axis=axis, q_start=link.q_start + k, on_parent=pose, **own
-        )
+        starts: dict[str, Any] = {"q_start": link.q_start + k, "v_start": link.v_start + k}
+        if link.kind in RPY and kind == "revolute":  # the first has all of the angular velocity
+            starts["v_start"] = link.v_start if axis is Z else -1
+        yield replace(link, body=body, parent=parent, kind=kind, axis=axis, on_parent=pose, **starts, **own)
         parent, pose = body, RigidTransform()
 
 
-def _is_same(model: Model, placing: Placing, q: Array) -> bool:
-    turns, places = placing(q)
+def _is_same(model: Model, kinematics: ForwardKinematics, q: Array) -> bool:
+    turns, places = kinematics(q)
     set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
-    for label, (place, pose) in placing.on.items():
+    for label, (place, pose) in kinematics.on.items():
         body = model.plant.world_body() if label == "world" else model.double.body(label)
         wanted = model.plant.EvalBodyPoseInWorld(model.double.context, body).GetAsMatrix34()
         R = turns[place] @ pose.rotation().matrix()

@@ -27,9 +27,10 @@ from pydrake.multibody.tree import FrameIndex
 
 from drake_diff._base.arrays import finite_array
 from drake_diff._base.autodiff import plain
+from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
+from drake_diff.mechanics.forward_kinematics import ForwardKinematics, forward_kinematics, product
 from drake_diff.model.contact import body_of, contact_forces
-from drake_diff.model.kinematics import Kinematics, kinematics_of, product
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 from drake_diff.model.step import advance, set_state
@@ -368,10 +369,13 @@ def _is_symbolic(x: Any) -> bool:
     return array.dtype == object and not all(isinstance(entry, known) for entry in array.ravel())
 
 
-def _tree_of(model: Model, depends_on: frozenset[str]) -> Kinematics:
+def _tree_of(model: Model, depends_on: frozenset[str]) -> ForwardKinematics:
     """What places frames for other scalars than Drake's."""
     _check_parameters(model, depends_on)
-    return kinematics_of(model)
+    kinematics = forward_kinematics(model)
+    if isinstance(kinematics, Refusal):
+        raise ModelError(str(kinematics))
+    return kinematics
 
 
 def _conjugate(q: Any) -> Any:
