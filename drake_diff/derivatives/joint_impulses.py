@@ -42,35 +42,37 @@ LIMIT_WINDOW = 2.0  # of how far a joint moves in a step: where Drake looks for 
 
 @dataclass(frozen=True, eq=False)
 class JointImpulses:
-    """S of them, each in one of N problems."""
+    """S of them in each of N problems; one whose bounds are both 0 does not act."""
 
-    problem: NDArray[np.intp]  # (S,)
     direction: Array  # (S, nv) j
-    target: Array  # (S,) v_hat [m/s or rad/s]
-    compliance: Array  # (S,) R [1/kg or 1/(kg m^2)]
-    lower: Array  # (S,) [N s or N m s]
+    target: Array  # (N, S) v_hat [m/s or rad/s]
+    compliance: Array  # (N, S) R [1/kg or 1/(kg m^2)]
+    lower: Array  # (N, S) [N s or N m s]
     upper: Array
 
-    def subset(self, which: NDArray[np.intp], position: NDArray[np.intp]) -> "JointImpulses":
-        """Some of them, in the problems that `position` says."""
-        target, compliance = self.target[which], self.compliance[which]
-        bounds = self.lower[which], self.upper[which]
-        return JointImpulses(position, self.direction[which], target, compliance, *bounds)
+    def subset(self, which: Indices) -> "JointImpulses":
+        """Those of some of the problems."""
+        return JointImpulses(self.direction, *(array[which] for array in self._of_problems))
+
+    @property
+    def _of_problems(self) -> tuple[Array, ...]:
+        return self.target, self.compliance, self.lower, self.upper
+
+    def reach(self) -> NDArray[np.bool_]:
+        """(N, nv) which degrees of freedom they may move."""
+        return np.asarray((self.lower < self.upper) @ (self.direction != 0))
 
     def evaluate(self, v: Array) -> tuple[Array, Array]:
-        """The impulses (S,) at the velocities v (N, nv), and their derivatives (S,) by -j . v', none at a bound."""
-        wanted = (self.target - (self.direction * v[self.problem]).sum(axis=1)) / self.compliance
+        """The impulses (N, S) at the velocities v (N, nv), and their derivatives (N, S) by -j . v', none at a bound."""
+        wanted = (self.target - (self.direction @ v[..., None])[..., 0]) / self.compliance
         free = (wanted > self.lower) & (wanted < self.upper)
         return np.clip(wanted, self.lower, self.upper), np.where(free, 1 / self.compliance, 0.0)
 
 
-def gather(parts: Sequence[JointImpulses], nv: int) -> JointImpulses:
+def gather(parts: Sequence[JointImpulses]) -> JointImpulses:
     """All of some parts as one."""
-    if not parts:
-        none = np.zeros(0)
-        return JointImpulses(np.zeros(0, dtype=np.intp), np.zeros((0, nv)), none, none, none, none)
-    names = ("problem", "direction", "target", "compliance", "lower", "upper")
-    return JointImpulses(*(np.concatenate([getattr(impulses, name) for impulses in parts]) for name in names))
+    of_problems = zip(*(impulses._of_problems for impulses in parts), strict=True)
+    return JointImpulses(np.vstack([impulses.direction for impulses in parts]), *map(np.hstack, of_problems))
 
 
 def limit_impulses(limits: Array, q: Array, v: Array, free: Array, diagonal: Array, h: float) -> list[JointImpulses]:
@@ -79,21 +81,14 @@ def limit_impulses(limits: Array, q: Array, v: Array, free: Array, diagonal: Arr
     `limits` (2, nv) are infinite where there are none, `diagonal` (N, nv) is that of A.
     """
     window = LIMIT_WINDOW * h * np.maximum(np.abs(v), np.abs(free))
-    impulses = []
+    impulses, stiffest = [], 1 / (2 * h * h * LIMIT_STIFFNESS)
     for sign, limit in ((1.0, limits[0]), (-1.0, limits[1])):
-        with np.errstate(invalid="ignore"):
-            distance = sign * (q - limit)  # infinite where there is no limit
-            problem, dof = np.nonzero(distance <= window)
-        if not len(problem):
-            continue
-        w = 1 / diagonal[problem, dof]
-        direction = np.zeros((len(problem), q.shape[1]))
-        direction[np.arange(len(problem)), dof] = sign
-        stiffest = 1 / (2 * h * h * LIMIT_STIFFNESS)
-        compliance = np.maximum(NEAR_RIGID * w, stiffest)
-        none, all_ = np.zeros(len(problem)), np.full(len(problem), np.inf)
-        target = -distance[problem, dof] / (2 * h)
-        impulses.append(JointImpulses(problem, direction, target, compliance, none, all_))
+        limited = np.flatnonzero(np.isfinite(limit))
+        distance = sign * (q - limit)[:, limited]
+        compliance = np.maximum(NEAR_RIGID / diagonal[:, limited], stiffest)
+        upper = np.where(distance <= window[:, limited], np.inf, 0.0)
+        direction = sign * np.eye(q.shape[1])[limited]
+        impulses.append(JointImpulses(direction, -distance / (2 * h), compliance, np.zeros_like(upper), upper))
     return impulses
 
 
@@ -109,16 +104,13 @@ class Controllers:
 
     def impulses(self, q: Array, us: Array, diagonal: Array, h: float) -> JointImpulses:
         """q and `diagonal` (N, nv) are as for limits, us (N, C) the inputs of the controllers' actuators."""
-        problem, which = (index.ravel() for index in np.indices(us.shape))
-        dof = self.velocity[which]
-        kp, kd, softest = self.kp.ravel(), self.kd.ravel(), NEAR_RIGID / diagonal[problem, dof]
-        lowered = np.minimum(1.0, 1 / (h * (h * kp + kd) * softest))
-        kp, kd = lowered * kp, lowered * kd
-        direction = np.zeros((len(problem), q.shape[1]))
-        direction[np.arange(len(problem)), dof] = 1.0
-        effort = us.ravel() - kp * (q[problem, dof] - self.reference[0, which]) + kd * self.reference[1, which]
-        total, bound = h * kp + kd, h * self.limit[which]
-        return JointImpulses(problem, direction, effort / total, 1 / (h * total), -bound, bound)
+        softest = NEAR_RIGID / diagonal[:, self.velocity]
+        lowered = np.minimum(1.0, 1 / (h * (h * self.kp + self.kd) * softest))
+        kp, kd = lowered * self.kp, lowered * self.kd
+        effort = us - kp * (q[:, self.velocity] - self.reference[0]) + kd * self.reference[1]
+        total, bound = h * kp + kd, np.broadcast_to(h * self.limit, us.shape)
+        direction = np.eye(q.shape[1])[self.velocity]
+        return JointImpulses(direction, effort / total, 1 / (h * total), -bound, bound)
 
 
 PROBES = 3  # two to read, one more to check
@@ -134,13 +126,9 @@ class Couplers:
 
     def impulses(self, q: Array, diagonal: Array, h: float) -> JointImpulses:
         """Of N states: q (N, nv) of each degree of freedom, `diagonal` (N, nv) that of A."""
-        count, (rows, nv) = len(q), self.direction.shape
-        off = (q @ self.direction.T - self.offset).ravel()
-        w = (1 / diagonal @ (self.direction**2).T).ravel()
-        infinite = np.full(count * rows, np.inf)
-        direction = np.broadcast_to(self.direction, (count, rows, nv)).reshape(-1, nv)
-        problem = np.repeat(np.arange(count), rows)
-        return JointImpulses(problem, direction, -off / (2 * h), NEAR_RIGID * w, -infinite, infinite)
+        off, w = q @ self.direction.T - self.offset, 1 / diagonal @ (self.direction**2).T
+        infinite = np.full(off.shape, np.inf)
+        return JointImpulses(self.direction, -off / (2 * h), NEAR_RIGID * w, -infinite, infinite)
 
 
 def couplers_of(model: Model) -> Couplers | Refusal:

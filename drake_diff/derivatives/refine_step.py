@@ -55,46 +55,22 @@ BISECTIONS = 30
 
 @dataclass(frozen=True, eq=False)
 class ContactImpulses:
-    """M contacts, each in one of N problems."""
+    """C contacts in each of N problems; where a problem has fewer, the Jacobians of the others are 0."""
 
-    problem: Indices  # (M,)
-    jacobian: Array  # (M, nv, 3) J'
-    law: ContactLaw
+    jacobian: Array  # (N, C, nv, 3) J'
+    law: ContactLaw  # of N C contacts
 
-    def subset(self, which: Indices, position: Indices) -> "ContactImpulses":
-        """Some of them, in the problems that `position` says."""
-        return ContactImpulses(position, self.jacobian[which], self.law.subset(which))
+    def subset(self, which: Indices) -> "ContactImpulses":
+        """Those of some of the problems."""
+        count = self.jacobian.shape[1]
+        rows = (which[:, None] * count + np.arange(count)).ravel()
+        return ContactImpulses(self.jacobian[which], self.law.subset(rows))
 
     def evaluate(self, v: Array) -> tuple[Array, Array]:
-        """The impulses (M, 3) at the velocities v (N, nv), and their derivatives (M, 3, 3) by -J v'."""
-        impulse, slope = self.law.impulses((v[self.problem][:, None, :] @ self.jacobian)[:, 0])
-        return impulse, -slope
-
-
-def _add(total: Array, where: Indices, parts: Array) -> None:
-    """Add each of parts (M, ...) to the entry of `total` that `where` (M,) says: np.add.at, many times as fast."""
-    if len(where):
-        order, begins, rows = _grouped(where)
-        total[rows] += np.add.reduceat(parts[order], begins, axis=0)
-
-
-def _add_squares(total: Array, where: Indices, size: Array, vectors: Array) -> None:
-    """Add size w w' of each of vectors (M, n) to the entry of `total` (N, n, n) that `where` (M,) says."""
-    if not len(where):
-        return
-    order, begins, rows = _grouped(where)
-    counts = np.diff(begins, append=len(where))
-    index = np.repeat(np.arange(len(rows)), counts), np.arange(len(where)) - np.repeat(begins, counts)
-    stacked = np.zeros((2, len(rows), int(np.max(counts)), vectors.shape[1]))
-    stacked[0][index], stacked[1][index] = vectors[order], (size[:, None] * vectors)[order]
-    total[rows] += stacked[0].swapaxes(1, 2) @ stacked[1]
-
-
-def _grouped(where: Indices) -> tuple[Indices, Indices, Indices]:
-    """The order by group, where each group begins in it, and the groups."""
-    order = np.argsort(where, kind="stable")
-    begins = np.flatnonzero(np.diff(where[order], prepend=-1))
-    return order, begins, where[order][begins]
+        """The impulses (N, C, 3) at the velocities v (N, nv), and their derivatives (N, C, 3, 3) by -J v'."""
+        shape = self.jacobian.shape[:2]
+        impulse, slope = self.law.impulses((v[:, None, None, :] @ self.jacobian)[:, :, 0].reshape(-1, 3))
+        return impulse.reshape(*shape, 3), -slope.reshape(*shape, 3, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,34 +94,25 @@ class ConvexSteps:
 
     def subset(self, which: Indices) -> "ConvexSteps":
         """Some of the problems."""
-        position = np.full(len(self.A), -1, dtype=np.intp)
-        position[which] = np.arange(len(which))
-        contacts, joints = self.contacts, self.joints
-        acting = np.flatnonzero(position[joints.problem] >= 0)
-        joints = joints.subset(acting, position[joints.problem[acting]])
-        if contacts is not None:
-            acting = np.flatnonzero(position[contacts.problem] >= 0)
-            contacts = contacts.subset(acting, position[contacts.problem[acting]])
-        return ConvexSteps(self.A[which], self.momentum[which], contacts, joints, self.same_tree)
+        contacts = None if self.contacts is None else self.contacts.subset(which)
+        return ConvexSteps(self.A[which], self.momentum[which], contacts, self.joints.subset(which), self.same_tree)
 
     def taking_part(self) -> NDArray[np.bool_]:
         """(N, nv) the degrees of freedom of the trees that an impulse may reach, which Drake solves for."""
-        reached = np.zeros(self.momentum.shape, dtype=bool)
+        reached = self.joints.reach()
         if self.contacts is not None:
-            np.logical_or.at(reached, self.contacts.problem, (self.contacts.jacobian != 0).any(axis=2))
-        np.logical_or.at(reached, self.joints.problem, self.joints.direction != 0)
+            reached = reached | (self.contacts.jacobian != 0).any(axis=(1, 3))
         return np.asarray(reached @ self.same_tree)
 
     def evaluate(self, v: Array) -> Balance:
         """The balance at v (N, nv)."""
-        given, curvature = np.zeros_like(v), np.array(self.A)
-        if self.contacts is not None:
-            J, (impulse, slope) = self.contacts.jacobian, self.contacts.evaluate(v)
-            _add(given, self.contacts.problem, (J @ impulse[..., None])[..., 0])
-            _add(curvature, self.contacts.problem, J @ slope @ J.swapaxes(-1, -2))
         j, (pull, stiffness) = self.joints.direction, self.joints.evaluate(v)
-        _add(given, self.joints.problem, j * pull[:, None])
-        _add_squares(curvature, self.joints.problem, stiffness, j)
+        given = (j.T @ pull[..., None])[..., 0]
+        curvature = self.A + j.T @ (stiffness[..., None] * j)
+        if self.contacts is not None:  # sums over the contacts one by one, however many there are of other problems
+            J, (impulse, slope) = self.contacts.jacobian, self.contacts.evaluate(v)
+            given += (J @ impulse[..., None])[..., 0].sum(axis=1)
+            curvature += (J @ slope @ J.swapaxes(-1, -2)).sum(axis=1)
         had = (self.A @ v[..., None])[..., 0]
         return Balance(had - self.momentum - given, given, curvature)
 
@@ -222,15 +189,6 @@ class RefinedSteps:
     left: Array  # (N,) what Drake's own leaves of the momentum, which is to be at most 1e-6; NaN where not known
     missing: Array  # (N, nv) that, as a momentum, of the whole plant
     refused: Mapping[int, Refusal]
-
-
-def refine_step(model: Model, vector: ParameterVector, x: Array, u: Array) -> Array | Refusal:
-    """(nx,) the step from x (nx,) under u (nu,) to rounding, `vector` being applied; or why it is not had.
-
-    Raises SimulationError where Drake cannot take the step.
-    """
-    refined = refine_steps(model, vector, x[None], u[None])
-    return refined.refused.get(0, refined.x_next[0])
 
 
 def refine_steps(
@@ -475,9 +433,7 @@ def _problems(
         parts.append(pd.impulses(q, us[:, which], weights, h))
     if isinstance(couplers, Couplers) and len(couplers.offset):
         parts.append(couplers.impulses(q, weights, h))
-    return ConvexSteps(
-        A, momentum, _contact_impulses(model, read, v, weights), gather(parts, model.nv), _same_tree(model)
-    )
+    return ConvexSteps(A, momentum, _contact_impulses(model, read, v, weights), gather(parts), _same_tree(model))
 
 
 def _same_tree(model: Model) -> NDArray[np.bool_]:
@@ -498,38 +454,43 @@ def _same_tree(model: Model) -> NDArray[np.bool_]:
 
 
 def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array) -> ContactImpulses | None:
-    contacts = [(i, *contact) for i, r in enumerate(read) for contact in r.contacts]
-    if not contacts:
+    columns = [[contact[i] for r in read for contact in r.contacts] for i in range(8)]
+    if not columns[0]:
         return None
-    numbers, *columns = zip(*contacts, strict=True)
     moves_a, origin_a, moves_b, origin_b, point, normal, phi, sides = (np.array(column) for column in columns)
-    J = _at_point(moves_a, point - origin_a) - _at_point(moves_b, point - origin_b)
-    moving = (J != 0).any(axis=(1, 2))  # two parts of one body may overlap: Drake leaves them to no motion
+    counts = [len(r.contacts) for r in read]
+    problem = np.repeat(np.arange(len(read)), counts)
+    at_points = _at_point(moves_a, point - origin_a) - _at_point(moves_b, point - origin_b)
+    moving = (at_points != 0).any(axis=(1, 2))  # two parts of one body may overlap: Drake leaves them to no motion
     if not moving.any():
         return None
-    problem, J, normal, phi, sides = (
-        np.array(numbers, dtype=np.intp)[moving],
-        J[moving],
-        normal[moving],
-        phi[moving],
-        sides[moving],
-    )
-    material = combine(sides)
-    contact = model.contract.contact
+    slot = problem, np.concatenate([np.arange(count) for count in counts])
+    shape = len(read), max(counts)
+    J = np.zeros((*shape, v.shape[1], 3))
+    J[slot] = at_points
+    material, contact = combine(sides), model.contract.contact
+
+    def placed(values: Array, empty: float) -> Array:
+        """(N C, ...) values of contacts, `empty` where a problem has no more of them, and where nothing moves."""
+        array = np.full((*shape, *values.shape[1:]), empty)
+        array[problem[moving], slot[1][moving]] = values[moving]
+        return array.reshape(-1, *values.shape[1:])
+
+    weight = weigh(at_points, weights[problem])
     law = ContactLaw(
         approximation=contact.approximation,
         time_step=model.time_step,
         near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
-        before=((v[problem][:, None, :] @ J)[:, 0] * normal).sum(axis=1),
-        normal=normal,
-        phi=phi,
-        weight=weigh(J, weights[problem]),
-        friction=material.friction,
-        stiffness=material.stiffness,
-        time=material.time,
-        dissipation=material.dissipation,
+        before=placed(((v[problem][:, None, :] @ at_points)[:, 0] * normal).sum(axis=1), 0.0),
+        normal=placed(normal, 0.0),
+        phi=placed(phi, 0.0),
+        weight=placed(weight, 1.0),
+        friction=placed(material.friction, 0.0),
+        stiffness=placed(material.stiffness, 1.0),
+        time=placed(material.time, 0.0),
+        dissipation=placed(material.dissipation, 0.0),
     )
-    return ContactImpulses(problem, J, law)
+    return ContactImpulses(J, law)
 
 
 def _at_point(motions: Array, from_origin: Array) -> Array:

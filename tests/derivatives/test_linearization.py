@@ -19,7 +19,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.derivatives import analytic
 from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified
 from drake_diff.derivatives.joint_impulses import NEAR_RIGID
-from drake_diff.derivatives.refine_step import refine_step
+from drake_diff.derivatives.refine_step import refine_steps
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.mechanics.tree import ForwardDynamics
@@ -329,8 +329,8 @@ def test_auto_serves_wherever_autodiff_does_and_every_step_is_had_to_rounding():
     served = []
     for model, x, u in example_robots():
         served.append(same_where_autodiff_works(model, x, u))
-        solved = refine_step(model, select(model, ()), x, u)
-        assert not isinstance(solved, Refusal), f"{model.name}: {solved}"
+        solved = refine_steps(model, select(model, ()), x[None], u[None])
+        assert not solved.refused, f"{model.name}: {solved.refused}"
     assert served.count(True) >= 30
 
 

@@ -19,7 +19,7 @@ from drake_diff.derivatives import joint_impulses, sources
 from drake_diff.derivatives import refine_step as refining
 from drake_diff.derivatives.contact import laws
 from drake_diff.derivatives.joint_impulses import couplers_of
-from drake_diff.derivatives.refine_step import refine_step, refine_steps
+from drake_diff.derivatives.refine_step import refine_steps
 from drake_diff.exceptions import GradientError
 from drake_diff.model import contact_modes
 from drake_diff.model.parameters import applied, select
@@ -29,15 +29,14 @@ NEAR_RIGID = 0.01 / (4 * np.pi**2)  # Drake's, of limits, controllers and couple
 
 
 def refined(model, x, u=(), parameters=()):
-    found = refine_step(model, select(model, parameters), np.array(x, dtype=float), np.array(u, dtype=float))
-    assert not isinstance(found, Refusal), found
-    return found
+    found = refine_steps(model, select(model, parameters), *(np.array([row], dtype=float) for row in (x, u)))
+    assert not found.refused, found.refused
+    return found.x_next[0]
 
 
 def why_not(model, x, u=()):
-    found = refine_step(model, select(model, ()), np.array(x, dtype=float), np.array(u, dtype=float))
-    assert isinstance(found, Refusal)
-    return str(found)
+    found = refine_steps(model, select(model, ()), *(np.array([row], dtype=float) for row in (x, u)))
+    return str(found.refused[0])
 
 
 def slope(f, at, step):
