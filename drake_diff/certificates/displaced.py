@@ -10,13 +10,16 @@ The function alone can be asked far from the motion at next to no cost, along on
 times the scale.
 """
 
-import types
+import pickle
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from io import BytesIO
+from types import CellType, FunctionType, MethodType
 from typing import Any
 
+import cloudpickle
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, finite_array
@@ -215,65 +218,51 @@ def _check_solved(refined: RefinedSteps) -> None:
 
 
 SHARED = ("pydrake.", "drake_diff.model.")  # packages whose objects a copy shares with the original: models and plants
+REMEMBERING = (FunctionType, MethodType, CellType, partial, dict, list, tuple, set, deque, np.ndarray)
 STEPS = (1e-4, 1e-6)  # of the differences of a policy; a derivative must miss both
 MISSED = 1e-3  # of the row's largest entry
 LEAST = 1e-6  # of the input: a smaller derivative is not told from rounding
 ASKED = 5  # times along the motion at which the derivative is compared
 
 
-def fresh(policy: Any) -> Any:
-    """A copy of `policy` with a memory of its own: containers and arrays are copied, however deep they stand.
+class _Copier(cloudpickle.Pickler):  # type: ignore[misc]  # cloudpickle has no types
+    """Pickles what can remember: containers, arrays, closures and objects of classes written in Python.
 
-    Models are shared, as are objects that are not made in Python; a memory among the globals of a module is, too.
+    All else is shared: `shared` has it by the number that stands for it.
     """
-    return _copied(policy, {})
+
+    def __init__(self, file: BytesIO):
+        super().__init__(file, protocol=4)  # a later one would share the buffers of arrays
+        self.shared: list[Any] = []
+
+    def persistent_id(self, thing: Any) -> int | None:
+        made_by: Any = type(thing).__new__
+        can_remember = isinstance(thing, REMEMBERING) or made_by is object.__new__
+        if can_remember and not type(thing).__module__.startswith(SHARED):
+            return None
+        self.shared.append(thing)
+        return len(self.shared) - 1
 
 
-def _copied(thing: Any, known: dict[int, Any]) -> Any:
-    """`thing`, or a copy where it can remember; `known` are the copies that there are, by the originals' id."""
-    if id(thing) in known or type(thing).__module__.startswith(SHARED):
-        return known.get(id(thing), thing)
-    if isinstance(thing, types.FunctionType):
-        return _copied_function(thing, known)
-    if isinstance(thing, types.MethodType):
-        return types.MethodType(thing.__func__, _copied(thing.__self__, known))
-    if isinstance(thing, partial):
-        arguments = (_copied(argument, known) for argument in thing.args)
-        return partial(_copied(thing.func, known), *arguments, **_copied(thing.keywords, known))
-    if isinstance(thing, dict | list | deque | set | np.ndarray):
-        return _copied_container(thing, known)
-    made_by: Any = type(thing).__new__
-    if made_by is object.__new__ and hasattr(thing, "__dict__"):  # of a class written in Python
-        known[id(thing)] = copy = object.__new__(type(thing))
-        copy.__dict__.update({name: _copied(value, known) for name, value in vars(thing).items()})
-    return known.get(id(thing), thing)
+class _Restorer(pickle.Unpickler):
+    def __init__(self, file: BytesIO, shared: list[Any]):
+        super().__init__(file)
+        self.shared = shared
+
+    def persistent_load(self, number: Any) -> Any:
+        return self.shared[number]
 
 
-def _copied_container(thing: Any, known: dict[int, Any]) -> Any:
-    known[id(thing)] = copy = thing.copy()
-    if isinstance(thing, np.ndarray):
-        copy.flags.writeable = thing.flags.writeable
-    elif not isinstance(thing, set):
-        for key in thing if isinstance(thing, dict) else range(len(thing)):
-            copy[key] = _copied(thing[key], known)
-    return copy
+def fresh(policy: Any) -> Any:
+    """A copy of `policy` with a memory of its own: containers, arrays and closures are copied, however deep they stand.
 
-
-def _copied_function(function: types.FunctionType, known: dict[int, Any]) -> types.FunctionType:
-    """With cells of its own, as a closure's memory stands there, or in its attributes or default arguments."""
-    cells = function.__closure__ or ()
-    copies = tuple(types.CellType() for _ in cells)
-    code, names = function.__code__, function.__globals__
-    copy = types.FunctionType(code, names, function.__name__, None, copies if cells else None)
-    known[id(function)] = copy  # before its cells, one of which may hold it
-    copy.__defaults__, copy.__kwdefaults__ = (
-        _copied(some, known) for some in (function.__defaults__, function.__kwdefaults__)
-    )
-    copy.__dict__.update({name: _copied(value, known) for name, value in vars(function).items()})
-    for empty, cell in zip(copies, cells, strict=True):
-        if cell != types.CellType():  # a name that the function closes over and that is not bound yet
-            empty.cell_contents = _copied(cell.cell_contents, known)
-    return copy
+    Models are shared, as are objects that are not made in Python, and the globals of a module that can be imported.
+    """
+    file = BytesIO()
+    copier = _Copier(file)
+    copier.dump(policy)
+    file.seek(0)
+    return _Restorer(file, copier.shared).load()
 
 
 def with_parameters(policy: Any, parameters: Array) -> Any:

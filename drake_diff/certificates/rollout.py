@@ -26,8 +26,14 @@ from drake_diff.certificates.displaced import (
     stairs_of_policy,
     wrong_derivative,
 )
-from drake_diff.certificates.refinement import Refinement, refine_by_stiffness, refine_by_time_step
-from drake_diff.certificates.truth import SECONDS, Truth, by_truth, truth_of
+from drake_diff.certificates.truth import (
+    SECONDS,
+    Refinement,
+    Truth,
+    by_truth,
+    refine_by_time_step,
+    truth_of,
+)
 from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import CertificateError, GradientWarning, InputError, ModelError, SimulationError
 from drake_diff.model.model import Model
@@ -215,7 +221,6 @@ def certify_rollout(
     parameters: Parameters = (),
     num_steps: int | None = None,
     refine: bool = False,
-    refine_stiffness: bool = False,
     seconds: float = SECONDS,
     method: str = "auto",
     gradient: RolloutGradient | None = None,
@@ -236,11 +241,10 @@ def certify_rollout(
         parameters: names, or values by name, of the parameters to differentiate by too.
         num_steps: N, where `us` is None.
         refine: take the gradient again at h/2 and h/4, under the same inputs, and compare it with the slopes of the
-            loss over the way of many steps and of the motion in continuous time, along each state, each input by as
-            much at all times, and each parameter. The latter is the certificate's `truth`.
+            motion in continuous time, along each state, each input by as much at all times, and each parameter: the
+            certificate's `truth`. Where something touches and they are not known, nothing converges.
         seconds: of this thread's work at most for the motion in continuous time [s]; columns that are not measured by
             then say so.
-        refine_stiffness: take it again at 4 and 16 times every contact stiffness that the model states.
         method: as in `differentiate_step`; or "continuous": the gradient of the motion in continuous time, beside the
             slopes of another integration of it. A column has no slope where those do not settle, which is
             "discontinuous", and is "undecided" where they were not measured in time.
@@ -256,7 +260,7 @@ def certify_rollout(
 
     Raises:
         InputError: both `us` and `policy` are given; what is sampled, or under a policy, is to be refined; the time
-            step or a stiffness is refined and a parameter at once, or no stiffness is stated.
+            step is refined and a parameter at once.
         ModelError: the motion in continuous time is asked for and there is none; `refine` of a model from a diagram,
             which has but one time step, where that is so.
         GradientError: the rollout has no gradient, or the policy remembers what it was asked before.
@@ -272,7 +276,7 @@ def certify_rollout(
         ('agree', ('hinge_q[0]', 'hinge_w[0]', 'motor[0]', 'motor[1]'))
     """
     is_continuous = method == CONTINUOUS or (gradient is not None and CONTINUOUS in gradient.methods)
-    _check_arguments(us, policy, refine, refine_stiffness, sampled, is_continuous)
+    _check_arguments(us, policy, refine, sampled, is_continuous)
     if not is_continuous:
         check_method(method)
     x0, vector = finite_array("x0", x0, (model.nx,)), select(model, parameters)
@@ -292,15 +296,10 @@ def certify_rollout(
     stairs = _checked(moved, gradient)
     if sampled:
         return _sampled(moved, gradient, stairs, seed, subject)
-    flat, (truth, no_truth) = moved.flat(gradient), (None, "")
-    if refine:
-        truth, no_truth = _truth(moved, gradient, seconds)
+    truth, no_truth = _truth(moved, gradient, seconds) if refine else (None, "")
     refinements = []
     if refine and (model.can_rebuild or truth is None):
-        refinement = refine_by_time_step(moved, flat, truth, no_truth)
-        refinements.append(refinement)
-    if refine_stiffness:
-        refinements.append(refine_by_stiffness(moved, flat))
+        refinements.append(refine_by_time_step(moved, gradient, truth))
     method = " + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources)))
     certificate = _certified(moved, gradient, beside, method, subject)
     return RolloutCertificate(
@@ -317,16 +316,15 @@ def _check_arguments(
     us: ArrayLike | None,
     policy: Policy | None,
     refine: bool,
-    refine_stiffness: bool,
     sampled: bool,
     is_continuous: bool,
 ) -> None:
     """Raise InputError where two of them do not go together."""
     if us is not None and policy is not None:
         raise InputError("certify_rollout", got="us and policy", expected="one of them")
-    if is_continuous and (sampled or refine or refine_stiffness):
+    if is_continuous and (sampled or refine):
         raise InputError("certify_rollout", got="refinement or a sample in continuous time", expected="neither there")
-    if (policy is not None or sampled) and (refine or refine_stiffness):
+    if (policy is not None or sampled) and refine:
         raise InputError("refine", got="refinement of a closed loop or of a sample", expected="it of given inputs")
 
 

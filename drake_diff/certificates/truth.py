@@ -1,5 +1,9 @@
 """What a rollout's gradient is beside the truth: the motion in continuous time that the discrete steps stand for.
 
+Both AutoDiffXd and difference quotients can be wrong about the physics: through a compliant bounce the gradient of the
+discrete motion can be 10 to 400 times that of the motion it stands for. So a rollout's gradient may also be taken at h,
+h/2 and h/4. That it converges does not make it right (see `beside_truth`): it is compared with slopes of the motion.
+
 The motion is integrated with error control from the contact law itself (`motion.continuous`), which shares nothing with
 the steps nor with `differentiate_rollout(method="continuous")`. A slope is measured by central differences over three
 widths, 1e-2, 1e-3 and 1e-4 of a column's scale (a tenth of that where nothing touches), each with an integration as
@@ -17,18 +21,20 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.certificates.certificate import VERDICTS
 from drake_diff.certificates.differences import TINY
 from drake_diff.certificates.displaced import Displaced, Line
-from drake_diff.exceptions import DrakeDiffError
+from drake_diff.exceptions import DrakeDiffError, InputError
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import applied
+from drake_diff.model.parameters import TIME_STEP, applied
+from drake_diff.model.step import set_state
 from drake_diff.motion.continuous import HUNT_CROSSLEY, KELVIN_VOIGT, ContinuousMotion
-from drake_diff.motion.gradient import CONTINUOUS, RolloutGradient
-from drake_diff.motion.loss import evaluate_loss
+from drake_diff.motion.gradient import CONTINUOUS, RolloutGradient, differentiate_rollout
+from drake_diff.motion.loss import evaluate_loss, takes_one_argument
 
 
 @dataclass(frozen=True)
@@ -359,3 +365,140 @@ def by_truth(truth: Truth, subject: str) -> dict[str, Any]:
         "reasons": reasons, "method": CONTINUOUS, "subject": subject, "around": None, "stopped": 0.0, "second": None,
         "scale": frozen(np.ones(len(slopes))), "told": "differences are of another integration of the same motion",
     }  # fmt: skip
+
+
+REFINEMENTS = (1, 2, 4)  # parts of a time step
+CONTRACTION = 0.75  # halfway between 1/2, which first order promises, and 1, no convergence
+TRUSTED = 0.1  # how far from its limit a gradient may be, relative to it
+STILL = 1e-2  # changes below this part tell no rate
+NEGLIGIBLE = 1e-3  # entries below this part of the largest are judged by its measure
+SPREAD = 0.05  # how uncertain the slope of the motion in continuous time may be, relative to its size
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """A gradient (n,) at three time steps [s], and its limit.
+
+    `apart` names the directions in which the gradient is not the slope of the motion in continuous time.
+    """
+
+    levels: tuple[float, ...]
+    columns: tuple[str, ...]
+    values: Array  # (3, n)
+    limit: Array  # (n,)
+    scale: Array  # (n,) what the errors of each entry are parts of
+    converged: NDArray[np.bool_]  # (n,)
+    apart: tuple[str, ...] = ()
+
+    @property
+    def worst(self) -> int:
+        """The column whose first value is furthest from its limit, those that have converged last."""
+        distance = np.abs(self.values[0] - self.limit) / np.maximum(self.scale, 1e-300)
+        return int(np.argmax(distance + 1e6 * ~self.converged))
+
+    def __str__(self) -> str:
+        j = self.worst
+        levels = ", ".join(f"{level:.4g}" for level in self.levels)
+        if self.converged.all():
+            text = f"converges with the time step ({levels}): by {self.columns[j]} {_row(self.values[:, j])}, "
+            parts = [f"{text}limit {self.limit[j]:.4g}"]
+        else:
+            count = int((~self.converged).sum())
+            parts = [
+                f"not converged: do not optimize with this; with the time step ({levels}) the gradient by "
+                f"{self.columns[j]} is {_row(self.values[:, j])}"
+                + (f" ({count} of {len(self.columns)} entries)" if count > 1 else "")
+            ]
+        if self.apart:
+            more = f" and {len(self.apart) - 1} more" if len(self.apart) > 1 else ""
+            parts.append(f"it is not known to be the slope of the motion in continuous time by {self.apart[0]}{more}")
+        return "; ".join(parts)
+
+
+def _row(values: Array) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)
+
+
+def at_finer_steps(moved: Displaced) -> Iterator[Array]:
+    """The gradient at h/2 and h/4 under the same inputs, the loss seeing the states at the same times."""
+    if TIME_STEP in {p.name for p in moved.vector.parameters}:
+        raise InputError("parameters", got=TIME_STEP, expected="others, as refine=True changes the time step")
+    model, loss, (count, nu) = moved.model, moved.loss, moved.us.shape
+    options: dict[str, Any] = {"parameters": moved.vector.to_dict(), "method": moved.method}
+    for m in REFINEMENTS[1:]:
+        finer, held = model.at_time_step(model.time_step / m), np.repeat(moved.us, m, axis=0)
+        coarse = loss if takes_one_argument(loss) else lambda xs, us, m=m: loss(xs[::m], us[::m])
+        g = differentiate_rollout(finer, moved.x0, held, coarse, **options)
+        yield moved.flat(replace(g, by_us=g.by_us.reshape(count, m, nu).sum(axis=1)))
+
+
+def kinds_of(moved: Displaced) -> list[str]:
+    """(n,) the kind of each column of a gradient: what is of one kind has one unit."""
+    contract, space = moved.model.contract, moved.space
+    units = [f"position [{term.unit}]" for term in contract.positions]
+    units += [f"velocity [{term.unit}]" for term in contract.velocities]
+    kinds = [unit for i, unit in enumerate(units) if i not in space.quaternions]
+    return kinds + len(moved.us) * [f"input [{term.unit}]" for term in contract.inputs] + list(moved.vector.names)
+
+
+def judge_levels(levels: tuple[float, ...], columns: Sequence[str], values: Array, kinds: Sequence[str]) -> Refinement:
+    """Which columns of `values` (3, n) converge.
+
+    An error of first order makes the changes d1 and d2 halve, and the limit is g3 + d2. An entry has converged if
+    |d2| <= 0.75 |d1| and its first value is within 10 % of the limit, or if both changes are below 1 %: of the largest
+    of its own values, or of the root mean square of all entries of its kind, as the others matter more than it then.
+    """
+    d1, d2 = np.diff(values, axis=0)
+    limit = values[2] + d2
+    size = np.maximum(np.abs(values).max(axis=0), np.abs(limit))
+    scale = np.maximum(size, NEGLIGIBLE * float(size.max(initial=0.0)))
+    for kind in set(kinds):
+        alike = np.array(kinds) == kind
+        scale[alike] = np.maximum(scale[alike], np.sqrt((size[alike] ** 2).mean()))
+    contracts = np.abs(d2) <= CONTRACTION * np.abs(d1)
+    still = np.maximum(np.abs(d1), np.abs(d2)) <= STILL * scale
+    near = np.abs(values[0] - limit) <= TRUSTED * scale
+    converged = ((contracts & near) | still) & np.all(np.isfinite(values), axis=0)
+    return Refinement(levels, tuple(columns), frozen(values), frozen(limit), frozen(scale), converged)
+
+
+def refine_by_time_step(moved: Displaced, gradient: RolloutGradient, truth: Truth | None) -> Refinement:
+    """The `gradient` at h, at h/2 and h/4, beside the slopes of the motion in continuous time."""
+    values = np.array([moved.flat(gradient), *at_finer_steps(moved)])
+    levels = tuple(moved.model.time_step / m for m in REFINEMENTS)
+    refinement = judge_levels(levels, moved.columns, values, kinds_of(moved))
+    return beside_truth(refinement, moved.lines, truth, touches=_overlaps(moved.model, gradient.xs))
+
+
+def _overlaps(model: Model, xs: Array) -> bool:
+    """Whether geometries that may collide overlap in one of the states `xs` (N + 1, nx)."""
+    if not model.contract.contact.collision_pairs:
+        return False
+    for x in xs:
+        set_state(model.double, x)
+        if model.double.overlaps():
+            return True
+    return False
+
+
+def beside_truth(refinement: Refinement, lines: Sequence[Line], truth: Truth | None, *, touches: bool) -> Refinement:
+    """`refinement`, in which only what is the slope of the motion in continuous time, to 10 %, converges.
+
+    Contact begins at the first step that overlaps, with a force that is not small (k tau v in `sap`): what is lost of
+    it grows along a step and starts again at the next, and the loss is a sawtooth of the start, whose teeth shrink with
+    h and keep their slope. So a gradient that `touches` something and cannot be compared does not converge either. Of
+    inputs at all times the size of a slope is the sum of their sizes.
+    """
+    converged, apart = refinement.converged.copy(), []
+    for line in lines:
+        slope = None if truth is None else truth.slope(line.name)
+        if slope is None or slope.exists is None:
+            is_truth = not touches
+        else:
+            size = max(float(refinement.scale[line.columns].sum()), abs(slope.value))
+            gap = abs(float(refinement.values[0, line.columns].sum()) - slope.value)
+            is_truth = slope.exists and gap <= TRUSTED * size and slope.error <= SPREAD * size
+        if not is_truth:
+            converged[line.columns] = False
+            apart.append(line.name)
+    return replace(refinement, converged=converged, apart=tuple(apart))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.bounces import RADIUS, Bounce
+from helpers.bounces import Bounce
 from helpers.models import MODELS, Plant, contact_properties
 from helpers.table import each_row
 from pydrake.geometry import Sphere
@@ -11,10 +11,9 @@ from pydrake.multibody.tree import PdControllerGains, SpatialInertia
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 import drake_diff as dd
-from drake_diff.certificates.displaced import Displaced, Line
-from drake_diff.certificates.refinement import REFINEMENTS, Motions, Slope, beside_slopes, judge_levels
+from drake_diff.certificates.displaced import Line
+from drake_diff.certificates.truth import TrueSlope, Truth, beside_truth, judge_levels
 from drake_diff.exceptions import CertificateError, InputError, ModelError, SimulationError
-from drake_diff.model.parameters import select
 from drake_diff.motion import continuous
 from drake_diff.motion.continuous import ContinuousMotion
 
@@ -64,24 +63,8 @@ def test_a_gradient_that_converges_to_the_slope_of_the_teeth_is_refused(tmp_path
     assert np.ptp(refinement.values[:, 0]) < 0.08 * abs(refinement.values[0, 0])  # it converges, to something else
     assert abs(refinement.values[2, 0] - truth[0]) > 3
     assert certificate.verdict == "not_converged"
-    for along, exact in zip(refinement.compared, truth, strict=True):
-        # 8 teeth to each side leave a part of the difference of 4 between a tooth's slope and the mean one.
-        assert along.slope.secant == pytest.approx(exact, abs=0.25)
-        assert along.slope.continuous == pytest.approx(exact, abs=1e-3)
-        assert along.disagree == ("the slope over many steps' way", "the continuous motion's")
-    assert "the gradient is not the slope over many steps' way and not the continuous motion's" in str(certificate)
-
-
-def test_the_line_through_the_loss_is_as_wide_as_the_way_of_eight_steps(tmp_path):
-    """A touch is a step later where the start is v h higher, or v h / t faster upwards, after a fall of t."""
-    h, parts = 1e-3, REFINEMENTS[-1]
-    model = Bounce(1e4).model(tmp_path / "bouncer.sdf", "sap", h)
-    moved = Displaced(model, np.array(DROP), np.zeros((400, 0)), height, None, select(model, ()), "auto")
-    motions = Motions(moved, parts, None)
-    by_z, by_v = (motions.slope(line).width for line in moved.lines)
-    fall = np.sqrt(2 * (DROP[0] - RADIUS) / 9.81)
-    assert by_z == pytest.approx(8 * 9.81 * fall * h / parts, rel=2e-3)  # the touch is seen at the end of a step
-    assert by_v == pytest.approx(by_z / fall, rel=2e-3)
+    assert [slope.value for slope in certificate.truth.slopes] == pytest.approx(truth, abs=1e-3)
+    assert refinement.apart == ("slide_x[0]", "slide_v[0]")
 
 
 @pytest.mark.parametrize("approximation", ["sap", "lagged"])
@@ -137,17 +120,16 @@ def tossed_cube(h):
     return plant
 
 
-def test_a_smooth_motion_has_all_three_slopes_and_says_them(load):
+def test_a_smooth_motion_converges_to_the_slopes_of_the_motion_itself(load):
     certificate = dd.certify_rollout(
         load("pendulum.urdf"), [0.5, 0.3], np.full((30, 1), 0.2), height, refine=True, parameters=("pole.mass",)
     ).require()
-    along = certificate.refinements[0].compared
-    assert [c.slope.line.name for c in along] == ["hinge_q[0]", "hinge_w[0]", "motor at all times", "pole.mass"]
-    for c in along:  # an error of first order in h / 4 = 2.5 ms, at 4.4 rad/s
-        assert c.slope.secant == pytest.approx(c.slope.continuous, rel=0.02)
-        assert c.disagree == ()
-    assert "the loss itself rises by" in str(certificate)
-    assert "the continuous motion's slope is" in str(certificate)
+    slopes = certificate.truth.slopes
+    assert [slope.column for slope in slopes] == ["hinge_q[0]", "hinge_w[0]", "motor at all times", "pole.mass"]
+    limit = certificate.refinements[0].limit
+    for slope in slopes:  # what extrapolation leaves is of second order in h = 10 ms, at 4.4 rad/s
+        assert limit[list(slope.columns)].sum() == pytest.approx(slope.value, rel=0.01)
+    assert certificate.refinements[0].apart == ()
 
 
 @pytest.mark.slow
@@ -157,10 +139,9 @@ def test_where_there_is_no_continuous_motion_it_is_said_why(tmp_path):
     held = tmp_path / "held.urdf"
     held.write_text(text.replace("<robot ", '<robot xmlns:drake="http://drake.mit.edu" '))
     model = dd.load_model(held, time_step=0.01)
-    refinement = dd.certify_rollout(model, [0.5, 0.3], np.zeros((30, 1)), height, refine=True).refinements[0]
-    assert all(np.isnan(c.slope.continuous) and np.isfinite(c.slope.secant) for c in refinement.compared)
-    assert "no slope of the continuous motion: PD controllers have none" in str(refinement)
-    assert refinement.converged.all()
+    certificate = dd.certify_rollout(model, [0.5, 0.3], np.zeros((30, 1)), height, refine=True).require()
+    assert "PD controllers have none" in certificate.no_truth
+    assert certificate.refinements[0].converged.all()  # nothing touches: no tooth can be taken for a slope
 
 
 def test_a_motion_that_is_too_stiff_for_error_control_says_so(tmp_path, monkeypatch):
@@ -174,31 +155,34 @@ def test_a_motion_that_is_too_stiff_for_error_control_says_so(tmp_path, monkeypa
 def test_an_entry_is_judged_by_the_size_of_those_of_its_kind(kind, converges):
     """0.02, 0.01 and 0.005 are an error of first order that matters little beside ones, and all of it alone."""
     values = np.array([[1.0, 0.02], [1.0, 0.01], [1.0, 0.005]])
-    found = judge_levels("time step", (1.0, 0.5, 0.25), ["a", "b"], values, ["position [rad]", kind])
+    found = judge_levels((1.0, 0.5, 0.25), ["a", "b"], values, ["position [rad]", kind])
     assert found.converged.tolist() == [True, converges]
 
 
-@each_row(
-    "secant, continuous, spread, disagree",
-    [
-        (1.0, 1.0, 0.0, ()),
-        (1.05, 0.95, 0.01, ()),
-        (np.nan, 1.0, 0.0, ()),
-        (1.0, np.nan, np.nan, ()),
-        (0.85, 1.0, 0.0, ("the slope over many steps' way",)),
-        (1.0, 1.2, 0.0, ("the continuous motion's",)),
-        (-1.0, -1.0, 0.0, ("the slope over many steps' way", "the continuous motion's")),
-        (1.0, 1.0, 0.2, ("compared with a continuous motion, which has no slope here",)),
-        (np.nan, np.nan, np.nan, ("compared with anything",)),
-    ],
-)
-def test_a_gradient_of_one_is_compared_with_the_slopes(secant, continuous, spread, disagree):
-    levels = judge_levels("time step", (1.0, 0.5, 0.25), ["z"], np.ones((3, 1)), ["position [m]"])
+SLOPES = {  # value and error of the slope in continuous time, whether something touches, and whether 1 converges
+    "the same": ((1.0, 0.0), True, True),
+    "9 % off": ((0.92, 0.01), True, True),
+    "12 % off": ((0.88, 0.0), False, False),
+    "another sign": ((-1.0, 0.0), False, False),
+    "known to 20 %": ((1.0, 0.2), False, False),
+    "none": (None, False, False),
+    "unknown, and nothing touches": ((), False, True),
+    "unknown, and something touches": ((), True, False),
+}
+
+
+@each_row("case", SLOPES)
+def test_a_gradient_of_one_is_compared_with_the_slope_of_the_motion(case):
+    slope, touches, converges = SLOPES[case]
+    levels = judge_levels((1.0, 0.5, 0.25), ["z"], np.ones((3, 1)), ["position [m]"])
     assert levels.converged.all()
-    slope = Slope(Line("z", np.array([0]), 1.0, np.ones(1), 1.0), secant, 0.1, continuous, spread, ())
-    found = beside_slopes(levels, [slope])
-    assert found.compared[0].disagree == disagree
-    assert found.converged.all() == (not disagree)
+    known = {"value": slope[0], "error": slope[1]} if slope else {}
+    exists = None if slope == () else slope is not None
+    truth = Truth("Kelvin-Voigt", 0.0, 0.0, 0.0, (TrueSlope("z", (0,), 1.0, exists=exists, **known),), 1.0, touches)
+    line = Line("z", np.array([0]), 1.0, np.ones(1), 1.0)
+    found = beside_truth(levels, [line], truth, touches=touches)
+    assert found.converged.all() == converges
+    assert found.apart == (() if converges else ("z",))
 
 
 @pytest.mark.slow
