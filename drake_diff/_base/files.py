@@ -230,11 +230,11 @@ def plain_file(path: Path, most: int = MOST_FILE, *, links: bool = False) -> Ite
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
         raise ArtifactError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     with os.fdopen(number, "rb") as file:
-        found = os.fstat(number)
-        if not stat.S_ISREG(found.st_mode):  # exchanged since it was looked at
-            raise ArtifactError(f"{path}: expected a plain file, got {_kind(found.st_mode)}")
-        if found.st_size > most:
-            raise ArtifactError(f"{path}: expected at most {most} bytes, got {found.st_size}")
+        state = os.fstat(number)
+        if not stat.S_ISREG(state.st_mode):  # exchanged since it was looked at
+            raise ArtifactError(f"{path}: expected a plain file, got {_kind(state.st_mode)}")
+        if state.st_size > most:
+            raise ArtifactError(f"{path}: expected at most {most} bytes, got {state.st_size}")
         yield file
 
 
@@ -255,14 +255,14 @@ def read_plain(path: Path, most: int = MOST_FILE, *, links: bool = False) -> byt
 
 def sha256_of(path: Path, most: int = MOST_FILE) -> tuple[int, str]:
     """How many bytes a plain file has, and their hash; never more than a piece of it in memory."""
-    found, count = sha256(), 0
+    digest, count = sha256(), 0
     with plain_file(path, most) as file:
         while piece := file.read(MIB):
-            found.update(piece)
+            digest.update(piece)
             count += len(piece)
             if count > most:
                 raise ArtifactError(f"{path}: expected at most {most} bytes, got more")
-    return count, found.hexdigest()
+    return count, digest.hexdigest()
 
 
 def files_in(folder: Path) -> dict[str, os.DirEntry[str]]:
@@ -270,12 +270,12 @@ def files_in(folder: Path) -> dict[str, os.DirEntry[str]]:
 
     ArtifactError where there are more than `MOST_FILES`, or a folder cannot be read.
     """
-    found: dict[str, os.DirEntry[str]] = {}
+    entries_by_path: dict[str, os.DirEntry[str]] = {}
     waiting, seen = [(folder, "")], 0
     while waiting:
-        place, before = waiting.pop()
+        location, before = waiting.pop()
         try:
-            with os.scandir(place) as entries:
+            with os.scandir(location) as entries:
                 for entry in entries:
                     seen += 1
                     if seen > MOST_FILES:
@@ -283,10 +283,10 @@ def files_in(folder: Path) -> dict[str, os.DirEntry[str]]:
                     if entry.is_dir(follow_symlinks=False):
                         waiting.append((Path(entry.path), f"{before}{entry.name}/"))
                     else:
-                        found[before + entry.name] = entry
+                        entries_by_path[before + entry.name] = entry
         except OSError as error:
-            raise ArtifactError(f"{place}: cannot be read: {error.strerror}") from error
-    return found
+            raise ArtifactError(f"{location}: cannot be read: {error.strerror}") from error
+    return entries_by_path
 
 
 def json_of(data: bytes) -> Any:
@@ -295,10 +295,10 @@ def json_of(data: bytes) -> Any:
     if values > MOST_VALUES:
         raise ValueError(f"expected at most {MOST_VALUES} values, got more")
     try:
-        found = json.loads(data.decode("utf-8"), parse_constant=_refuse, parse_float=_finite)
+        document = json.loads(data.decode("utf-8"), parse_constant=_refuse, parse_float=_finite)
     except RecursionError as error:
         raise ValueError(f"expected at most {DEEPEST} lists and objects inside one another") from error
-    level = [found]
+    level = [document]
     for _ in range(DEEPEST):
         inner: list[Any] = []
         for value in level:
@@ -310,7 +310,7 @@ def json_of(data: bytes) -> Any:
             elif isinstance(value, str) and SURROGATE.search(value):
                 raise ValueError("a text in it is no Unicode: half of a surrogate pair")
         if not inner:
-            return found
+            return document
         level = inner
     raise ValueError(f"expected at most {DEEPEST} lists and objects inside one another")
 

@@ -380,10 +380,10 @@ def _certified(
     """The certificate by rollouts whose steps are solved to rounding, else by Drake's own."""
     derivative, tolerance = moved.flat(gradient)[None] * moved.scale, moved.solver_tolerance(gradient)
 
-    def by(losses: Many, told: str, unsolved: float, stopped: float) -> Certificate:
+    def by(losses: Many, statement: str, unsolved: float, stopped: float) -> Certificate:
         return certify_displacement(
             losses, derivative, rows=("loss",), columns=moved.columns, scale=moved.scale, beside=beside,
-            unsolved=unsolved, stopped=stopped, told=told, method=method, subject=subject,
+            unsolved=unsolved, stopped=stopped, told=statement, method=method, subject=subject,
         )  # fmt: skip
 
     if not tolerance:

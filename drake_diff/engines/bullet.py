@@ -82,9 +82,9 @@ class PybulletEngine(RigidEngine):
             self.owners[geometry.name] = (self.bullet.createMultiBody(0, shape, -1, *pose), -1)
         self._set_contacts()
         bodies = {x.joint.v_start: self.places[i] for i, x in enumerate(self.tree.links) if x.free}
-        found = [self.bullet.getDynamicsInfo(*bodies[v]) for _, v in self.coordinates.free]
-        self.centers = Centers(self.coordinates, tuple(np.array(info[3]) for info in found))
-        axes = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in found]
+        moving_dofs = [self.bullet.getDynamicsInfo(*bodies[v]) for _, v in self.coordinates.free]
+        self.centers = Centers(self.coordinates, tuple(np.array(info[3]) for info in moving_dofs))
+        axes = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in moving_dofs]
         bases = [bodies[v][0] for _, v in self.coordinates.free]
         # Of each free body its places in q and v, and what Bullet has: its base, centre of mass and principal axes.
         self.free = tuple(zip(self.coordinates.free, bases, self.centers.centers, axes, strict=True))
@@ -95,14 +95,14 @@ class PybulletEngine(RigidEngine):
         x, u = self._point(x, u)
         self._set(x)
         force = self._effort(u) - self.stiffness * self._stretch(x[: self.nq])
-        for place, link in self.joints:
-            self.bullet.setJointMotorControl2(*place, p.TORQUE_CONTROL, force=float(force[link.joint.v_start]))
+        for owner, link in self.joints:
+            self.bullet.setJointMotorControl2(*owner, p.TORQUE_CONTROL, force=float(force[link.joint.v_start]))
         islands = self.bullet.stepSimulation()
         used = max([0, *(island["numIterationsUsed"] for island in islands or ())])
         room = int(self.bullet.getPhysicsEngineParameters()["numSolverIterations"])
         q, v = np.zeros(self.nq), np.zeros(self.nv)
-        for place, link in self.joints:
-            q[link.joint.q_start], v[link.joint.v_start] = self.bullet.getJointState(*place)[:2]
+        for owner, link in self.joints:
+            q[link.joint.q_start], v[link.joint.v_start] = self.bullet.getJointState(*owner)[:2]
         for (i, j), base, center, turned in self.free:
             position, turn = self.bullet.getBasePositionAndOrientation(base)
             R = rotation(np.array(turn)[[3, 0, 1, 2]]) @ turned.T
@@ -110,9 +110,9 @@ class PybulletEngine(RigidEngine):
             q[i : i + 4] *= np.sign(q[i : i + 4] @ x[i : i + 4])  # of the two, that which x goes on to
             q[i + 4 : i + 7] = np.array(position) - R @ center
             v[j + 3 : j + 6], v[j : j + 3] = self.bullet.getBaseVelocity(base)
-        found = self._found("Bullet", q, v, x, u)
+        x_next = self._found("Bullet", q, v, x, u)
         self.status = "ok" if used < room else f"the solver used all of its {room} iterations"
-        return found
+        return x_next
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         raise NotOfferedError("Bullet has no derivatives of its step")
@@ -121,7 +121,7 @@ class PybulletEngine(RigidEngine):
         x, q, v = self._state(x)
         kinetic = float(v @ self.mass_matrix(q) @ v) / 2
         self._set(x)
-        parts = [_read_part(self.bullet, place) for place in self.places.values()]
+        parts = [_read_part(self.bullet, owner) for owner in self.places.values()]
         fallen = sum(mass * float(self.description.gravity @ center) for mass, center, _, _ in parts)
         return kinetic - fallen + self._spring_energy(q) + self.tree.anchored_energy
 
@@ -134,8 +134,8 @@ class PybulletEngine(RigidEngine):
         q = self._positions(q)
         M, T = np.zeros((self.nv, self.nv)), self.centers.turn(q)
         for tree in self.tree.trees:
-            at, body, joints = self._dofs(tree), self.places[tree.start][0], self._joint_positions(tree, q)
-            M[np.ix_(at, at)] = self.bullet.calculateMassMatrix(body, joints or [0.0])  # it takes no empty list
+            owner, body, joints = self._dofs(tree), self.places[tree.start][0], self._joint_positions(tree, q)
+            M[np.ix_(owner, owner)] = self.bullet.calculateMassMatrix(body, joints or [0.0])  # it takes no empty list
         for (i, j), _, _, turned in self.free:
             into = np.kron(np.eye(2), (rotation(q[i : i + 4]) @ turned).T)
             T[j : j + 6] = into @ T[j : j + 6]
@@ -148,9 +148,9 @@ class PybulletEngine(RigidEngine):
             raise NotOfferedError(NO_BIAS)
         needed = self.stiffness * self._stretch(q)
         for tree in self.tree.trees:
-            at = self._dofs(tree)
-            given = (self._joint_positions(tree, q), [float(v[j]) for j in at], [0.0] * len(at))
-            needed[at] += self.bullet.calculateInverseDynamics(self.places[tree.start][0], *given)
+            owner = self._dofs(tree)
+            given = (self._joint_positions(tree, q), [float(v[j]) for j in owner], [0.0] * len(owner))
+            needed[owner] += self.bullet.calculateInverseDynamics(self.places[tree.start][0], *given)
         return np.asarray(needed)
 
     @property
@@ -187,21 +187,21 @@ class PybulletEngine(RigidEngine):
             },
         )  # fmt: skip
 
-    def _build(self, part: range) -> None:
-        links = [(i, self.tree.links[i]) for i in part]
+    def _build(self, members: range) -> None:
+        links = [(i, self.tree.links[i]) for i in members]
         flags = p.URDF_USE_INERTIA_FROM_FILE | p.URDF_USE_SELF_COLLISION | p.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
         with NamedTemporaryFile("w", suffix=".urdf") as file:
             file.write(bullet_urdf(links, self.tree.geometries))
             file.flush()
             body = self.bullet.loadURDF(file.name, useFixedBase=not links[0][1].free, flags=flags)
-        numbers = {"link_-1": -1, f"link_{part.start}": -1}
+        numbers = {"link_-1": -1, f"link_{members.start}": -1}
         for k in range(self.bullet.getNumJoints(body)):
             numbers[self.bullet.getJointInfo(body, k)[12].decode()] = k
             self.bullet.setJointMotorControl2(body, k, p.VELOCITY_CONTROL, force=0)
-        for i in part:
+        for i in members:
             self.places[i] = (body, numbers[f"link_{i}"])
             self.bullet.changeDynamics(*self.places[i], **INERT)
-        self.owners |= {g.name: self.places[i] for i, g in self.tree.geometries if i in part}
+        self.owners |= {g.name: self.places[i] for i, g in self.tree.geometries if i in members}
 
     def _set_contacts(self) -> None:
         """Where pairs disagree, friction and stiffness of links are by least squares; the contract shows them."""
@@ -228,30 +228,30 @@ class PybulletEngine(RigidEngine):
     def _read_pairs(self) -> tuple[PairContract, ...]:
         """Every pair of geometries whose links touch each other in Bullet: Drake's, then what comes with them."""
         owners, links = self.owners, {self._owners_of(pair) for pair in self.tree.pairs}
-        found = [pair.names for pair in self.tree.pairs]
+        pairs = [pair.names for pair in self.tree.pairs]
         for a in owners:
             for b in owners:
                 both = a < b and tuple(sorted((owners[a], owners[b]))) in links
-                if both and (a, b) not in found and (b, a) not in found:
-                    found.append((a, b))
+                if both and (a, b) not in pairs and (b, a) not in pairs:
+                    pairs.append((a, b))
         contracts = []
-        for names in found:
-            one, two = (self.bullet.getDynamicsInfo(*owners[name]) for name in names)
-            k_one, k_two = float(one[9]), float(two[9])
+        for names in pairs:
+            body, two = (self.bullet.getDynamicsInfo(*owners[name]) for name in names)
+            k_one, k_two = float(body[9]), float(two[9])
             stiffness = k_one * k_two / (k_one + k_two) if min(k_one, k_two) > 0 else None
-            contracts.append(PairContract(names, float(one[1] * two[1]), stiffness))
+            contracts.append(PairContract(names, float(body[1] * two[1]), stiffness))
         return tuple(contracts)
 
-    def _dofs(self, part: range) -> list[int]:
+    def _dofs(self, members: range) -> list[int]:
         """Drake's places in v of a tree's velocities in Bullet's order."""
-        found: list[int] = []
-        for i in sorted(part, key=lambda i: self.places[i][1]):
+        dofs: list[int] = []
+        for i in sorted(members, key=lambda i: self.places[i][1]):
             start = self.tree.links[i].joint.v_start
-            found += range(start, start + 6) if self.tree.links[i].free else [start]
-        return found
+            dofs += range(start, start + 6) if self.tree.links[i].free else [start]
+        return dofs
 
-    def _joint_positions(self, part: range, q: Array) -> list[float]:
-        order = sorted(part, key=lambda i: self.places[i][1])
+    def _joint_positions(self, members: range, q: Array) -> list[float]:
+        order = sorted(members, key=lambda i: self.places[i][1])
         return [float(q[self.tree.links[i].joint.q_start]) for i in order if not self.tree.links[i].free]
 
     def _set(self, x: Array) -> None:
@@ -262,27 +262,27 @@ class PybulletEngine(RigidEngine):
             position = list(q[i + 4 : i + 7] + R @ center)
             self.bullet.resetBasePositionAndOrientation(base, position, list(_turn(R @ turned)))
             self.bullet.resetBaseVelocity(base, list(v[j + 3 : j + 6]), list(v[j : j + 3]))
-        for place, link in self.joints:
-            self.bullet.resetJointState(*place, float(q[link.joint.q_start]), float(v[link.joint.v_start]))
+        for owner, link in self.joints:
+            self.bullet.resetJointState(*owner, float(q[link.joint.q_start]), float(v[link.joint.v_start]))
 
 
-def _read_part(bullet: Any, place: Owner) -> tuple[float, Array, Array, Array]:
+def _read_part(bullet: Any, owner: Owner) -> tuple[float, Array, Array, Array]:
     """Mass, centre of mass (3,), inertia (3, 3) about it and principal axes (3, 3) of a link, in world."""
-    info = bullet.getDynamicsInfo(*place)
-    state = bullet.getBasePositionAndOrientation(place[0]) if place[1] < 0 else bullet.getLinkState(*place, 0, 1)
+    info = bullet.getDynamicsInfo(*owner)
+    state = bullet.getBasePositionAndOrientation(owner[0]) if owner[1] < 0 else bullet.getLinkState(*owner, 0, 1)
     R = rotation(np.array(state[1])[[3, 0, 1, 2]])
     return float(info[0]), np.array(state[0]), R @ np.diag(info[2]) @ R.T, R
 
 
-def _read_joint(bullet: Any, place: Owner, link: RigidLink) -> JointContract:
+def _read_joint(bullet: Any, owner: Owner, link: RigidLink) -> JointContract:
     """Where Bullet is at Drake's q = 0; springs are those of the engine."""
-    mass, center, inertia, R = _read_part(bullet, place)
+    mass, center, inertia, R = _read_part(bullet, owner)
     name, carried = link.joint.joint, [(mass, center, inertia)]
-    if place[1] < 0:
+    if owner[1] < 0:
         free = "quaternion_floating"
         return joint_contract(name=name, kind=free, axis=np.zeros(3), anchor=center, carried=carried)
-    info = bullet.getJointInfo(*place)
-    _, above, _, turned = _read_part(bullet, (place[0], info[16]))
+    info = bullet.getJointInfo(*owner)
+    _, above, _, turned = _read_part(bullet, (owner[0], info[16]))
     lower, upper = (limit(side) for side in info[8:10]) if info[8] <= info[9] else (-np.inf, np.inf)
     return joint_contract(
         name=name, kind=KINDS[info[2]], axis=R @ info[13], anchor=above + turned @ info[14], carried=carried,

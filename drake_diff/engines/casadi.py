@@ -47,11 +47,11 @@ class CasadiEngine(EulerEngine, PlantEngine):
         self.trees = [_Tree(self.description, base) for base in bases]
         q, v, a = (ca.SX.sym(name, n) for name, n in (("q", self.nq), ("v", self.nv), ("a", self.nv)))
         M, bias, potential = ca.SX(self.nv, self.nv), ca.SX(self.nv, 1), ca.SX(0)
-        for part in self.trees:
-            potential += part.potential(q, self.gravity)
-            if len(part.dofs):
-                own_M, own_bias = part.dynamics(q, v, self.gravity)
-                M[part.dofs, part.dofs], bias[part.dofs] = own_M, own_bias
+        for tree in self.trees:
+            potential += tree.potential(q, self.gravity)
+            if len(tree.dofs):
+                own_M, own_bias = tree.dynamics(q, v, self.gravity)
+                M[tree.dofs, tree.dofs], bias[tree.dofs] = own_M, own_bias
         for link in self.description.moving:
             if link.kind != "quaternion_floating":
                 stretch = q[link.q_start] - link.rest
@@ -89,7 +89,7 @@ class CasadiEngine(EulerEngine, PlantEngine):
 
     @property
     def contract(self) -> EngineContract:
-        joints = {joint.name: joint for part in self.trees for joint in part.joints()}
+        joints = {joint.name: joint for tree in self.trees for joint in tree.joints()}
         return EngineContract(
             engine=self.name, joints=tuple(joints[link.joint] for link in self.description.moving),
             native_order=tuple(joints),
@@ -163,8 +163,8 @@ class _Tree:
         poses = {self.root: self._base_pose(q)}
         for node in list(self.model.tree)[1:]:
             joint = node.parent_arc
-            at = CasadiLike(q[self.links[joint.name].q_start] if joint.name in self.links else ca.SX(0))
-            poses[node.name] = ca.mtimes(poses[joint.parent], joint.homogeneous(q=at).array)
+            motion = CasadiLike(q[self.links[joint.name].q_start] if joint.name in self.links else ca.SX(0))
+            poses[node.name] = ca.mtimes(poses[joint.parent], joint.homogeneous(q=motion).array)
         return poses
 
     def joints(self) -> tuple[JointContract, ...]:
@@ -182,21 +182,21 @@ class _Tree:
             inertial = self.model.links[node.name].inertial
             H = poses[node.name] @ np.array(ca.evalf(self.model.links[node.name].homogeneous().array))
             R, inertia = H[:3, :3], np.array(ca.evalf(inertial.inertia.get_matrix().array))
-            part = (float(inertial.mass.array), H[:3, 3], R @ inertia @ R.T)
-            carried.setdefault(carrier[node.name], []).append(part)
-        found = []
+            inertia_of_part = (float(inertial.mass.array), H[:3, 3], R @ inertia @ R.T)
+            carried.setdefault(carrier[node.name], []).append(inertia_of_part)
+        contracts = []
         if self.base:
             free, name, origin = "quaternion_floating", self.base.joint, np.zeros(3)
-            found.append(joint_contract(name=name, kind=free, axis=origin, anchor=origin, carried=carried[name]))
+            contracts.append(joint_contract(name=name, kind=free, axis=origin, anchor=origin, carried=carried[name]))
         for name in self.model.actuated_joints:
             joint, link = self.model.joints[name], self.links[name]
             H, kind = poses[joint.child], "prismatic" if joint.type == "prismatic" else "revolute"
             limits = (-np.inf, np.inf) if joint.type == "continuous" else (joint.limit.lower, joint.limit.upper)
-            own = {k: getattr(link, k) for k in ("damping", "armature", "stiffness", "rest")}
-            own |= {"axis": H[:3, :3] @ np.array(ca.evalf(joint.axis.array)).ravel(), "anchor": H[:3, 3]}
-            own |= {"lower": limit(limits[0]), "upper": limit(limits[1])}
-            found.append(joint_contract(name=name, kind=kind, carried=carried[name], **own))
-        return tuple(found)
+            numbers = {k: getattr(link, k) for k in ("damping", "armature", "stiffness", "rest")}
+            numbers |= {"axis": H[:3, :3] @ np.array(ca.evalf(joint.axis.array)).ravel(), "anchor": H[:3, 3]}
+            numbers |= {"lower": limit(limits[0]), "upper": limit(limits[1])}
+            contracts.append(joint_contract(name=name, kind=kind, carried=carried[name], **numbers))
+        return tuple(contracts)
 
 
 class _Joint(StdJoint):  # type: ignore[misc]  # adam has no types

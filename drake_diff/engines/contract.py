@@ -81,8 +81,8 @@ class Match:
     def different(self, quantity: str, what: str) -> ContractLine:
         """With the reason of the engine that has one."""
         reason = self.one.reasons.get(quantity) or self.two.reasons.get(quantity) or ""
-        told = reason if reason in UNKNOWN else "; ".join(part for part in (what, reason) if part)
-        return ContractLine(quantity, "different", told, reason)
+        detail = reason if reason in UNKNOWN else "; ".join(text for text in (what, reason) if text)
+        return ContractLine(quantity, "different", detail, reason)
 
     def text(self, quantity: str, a: str, b: str) -> ContractLine:
         return ContractLine(quantity, "equal", a) if a == b else self.different(quantity, self.both(a, b))
@@ -191,8 +191,8 @@ class Match:
     def solver_tolerance(self) -> ContractLine:
         if not self.limited and not any(c.contacts for c in self.contracts):
             return ContractLine("solver tolerance", "equal", "nothing to solve: neither contact nor limits")
-        told = ("none" if c.solver_tolerance is None else f"{c.solver_tolerance:g}" for c in self.contracts)
-        return self.text("solver tolerance", *told)
+        tolerances = ("none" if c.solver_tolerance is None else f"{c.solver_tolerance:g}" for c in self.contracts)
+        return self.text("solver tolerance", *tolerances)
 
     def scalar_type(self) -> ContractLine:
         a, b = (contract.precision for contract in self.contracts)
@@ -201,12 +201,12 @@ class Match:
         return ContractLine("scalar type", "different", self.both(a, b), f"its arithmetic is {self.precision}")
 
     def derivatives(self) -> ContractLine:
-        quantity, told = "derivative convention", [contract.derivatives for contract in self.contracts]
-        if told[0] == told[1]:
-            return ContractLine(quantity, "equal", told[0])
-        if "none" in told:
-            return ContractLine(quantity, "different", self.both(*told), "it offers no derivatives")
-        return ContractLine(quantity, "mapped", self.both(*told))
+        quantity, conventions = "derivative convention", [contract.derivatives for contract in self.contracts]
+        if conventions[0] == conventions[1]:
+            return ContractLine(quantity, "equal", conventions[0])
+        if "none" in conventions:
+            return ContractLine(quantity, "different", self.both(*conventions), "it offers no derivatives")
+        return ContractLine(quantity, "mapped", self.both(*conventions))
 
 
 def values_told(values: tuple[Any, ...]) -> str:
@@ -249,22 +249,22 @@ def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
         []
     """
     match = Match(a, b)
-    one, two = match.one, match.two
+    first, two = match.one, match.two
     return (
         match.order(),
         *(match.joints(quantity, read) for quantity, read in JOINT_NUMBERS.items()),
-        match.numbers("gravity", one.gravity, two.gravity, "[m/s^2]"),
+        match.numbers("gravity", first.gravity, two.gravity, "[m/s^2]"),
         match.actuation(),
         match.effort_limits(),
         *match.dynamics(),
-        match.numbers("time step", (one.time_step,), (two.time_step,), "[s]"),
-        match.text("integrator", one.integrator, two.integrator),
+        match.numbers("time step", (first.time_step,), (two.time_step,), "[s]"),
+        match.text("integrator", first.integrator, two.integrator),
         match.state(),
         match.limit_law(),
-        match.text("contact law", one.contact_law, two.contact_law),
+        match.text("contact law", first.contact_law, two.contact_law),
         *contact_lines(match),
         match.solver_tolerance(),
-        match.text("reset", one.reset, two.reset),
+        match.text("reset", first.reset, two.reset),
         match.scalar_type(),
         match.derivatives(),
     )
@@ -281,8 +281,8 @@ def _random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array,
     """q and v of joints of these kinds, in Drake's coordinates, quaternions of norm 1."""
     free = [kind == "quaternion_floating" for kind in kinds]
     parts = [random.standard_normal(7 if floats else 1) for floats in free]
-    for part in (part for part, floats in zip(parts, free, strict=True) if floats):
-        part[:4] /= np.linalg.norm(part[:4])
+    for coordinates in (coordinates for coordinates, floats in zip(parts, free, strict=True) if floats):
+        coordinates[:4] /= np.linalg.norm(coordinates[:4])
     return np.concatenate(parts), random.standard_normal(len(kinds) + 5 * sum(free))
 
 
@@ -295,9 +295,9 @@ def contact_lines(match: Match) -> tuple[ContractLine, ...]:
 
     A number that differs has no reason: it is another model. What an engine has no number for has its reason.
     """
-    one, two = match.contracts
+    first, two = match.contracts
     same = same_geometries(match)
-    a = {frozenset(same.get(name, name) for name in pair.names): pair for pair in one.contacts}
+    a = {frozenset(same.get(name, name) for name in pair.names): pair for pair in first.contacts}
     b = {frozenset(pair.names): pair for pair in two.contacts}
     shared = [(a[names], b[names]) for names in a if names in b]
     return (
@@ -317,21 +317,21 @@ def same_geometries(match: Match) -> dict[str, str]:
     A name is taken without what Drake puts around it: model::name#number.
     """
     a, b = (list(c.geometries) for c in match.contracts)
-    found: dict[str, str] = {}
+    same: dict[str, str] = {}
     touching = _touching(match.one) | _touching(match.two)
 
     def take(rule: Callable[[GeometryContract, GeometryContract], bool]) -> None:
-        for x in [x for x in a if x.name not in found]:
-            free = [y for y in b if y.name not in found.values() and rule(x, y)]
+        for x in [x for x in a if x.name not in same]:
+            free = [y for y in b if y.name not in same.values() and rule(x, y)]
             if free:
-                found[x.name] = min(free, key=lambda y: float(np.linalg.norm(np.subtract(x.position, y.position)))).name
+                same[x.name] = min(free, key=lambda y: float(np.linalg.norm(np.subtract(x.position, y.position)))).name
 
     take(lambda x, y: x.name == y.name)
     take(lambda x, y: _plain(x.name) == _plain(y.name) and x.carrier == y.carrier)
     a, b = ([g for g in side if g.name in touching] for side in (a, b))
     take(lambda x, y: _same_shape(match, x, y) and _same_pose(match, x, y))
     take(lambda x, y: x.kind == y.kind and x.carrier == y.carrier)
-    return found
+    return same
 
 
 def _plain(name: str) -> str:
@@ -362,8 +362,8 @@ def _geometries(match: Match, same: Mapping[str, str]) -> tuple[ContractLine, Co
             shapes.append(f"{x.name}: {match.both(*(f'{g.kind} {values_told(g.sizes)}' for g in (x, y)))} [m]")
         if not _same_pose(match, x, y):
             poses.append(f"{x.name}: {match.both(*map(_place, (x, y)))}")
-    told = f"of {len(both)} geometries" if both else "nothing can touch"
-    return _line(match, "shapes", shapes, told), _line(match, "poses", poses, told)
+    details = f"of {len(both)} geometries" if both else "nothing can touch"
+    return _line(match, "shapes", shapes, details), _line(match, "poses", poses, details)
 
 
 def _place(g: GeometryContract) -> str:
@@ -371,10 +371,10 @@ def _place(g: GeometryContract) -> str:
     return f"on {g.carrier} at {values_told(g.position)} [m]{along}"
 
 
-def _line(match: Match, quantity: str, wrong: list[str], told: str) -> ContractLine:
+def _line(match: Match, quantity: str, wrong: list[str], detail: str) -> ContractLine:
     """What is wrong without a reason to excuse it; the engine's own word on it is told all the same."""
     if not wrong:
-        return ContractLine(quantity, "equal", told)
+        return ContractLine(quantity, "equal", detail)
     remark = match.one.reasons.get(quantity) or match.two.reasons.get(quantity)
     return ContractLine(quantity, "different", "; ".join([_some(wrong), *([remark] if remark else [])]))
 
@@ -392,8 +392,8 @@ def _pairs(
     sides = ((match.one.engine, a, b), (match.two.engine, b, a))
     only = [
         f"only in {engine}: {_some(missing)}"
-        for engine, own, others in sides
-        if (missing := sorted(" with ".join(own[names].names) for names in own.keys() - others.keys()))
+        for engine, own_names, others in sides
+        if (missing := sorted(" with ".join(own_names[names].names) for names in own_names.keys() - others.keys()))
     ]
     return match.different(quantity, "; ".join([match.both(len(a), len(b)), *only]))
 
@@ -406,16 +406,16 @@ def _numbers(
     for x, y in shared:
         p, q = read(x), read(y)
         seen.add(p)
-        told = f"{' with '.join(x.names)}: {match.both(p, q)} {unit}"
+        details = f"{' with '.join(x.names)}: {match.both(p, q)} {unit}"
         if p is None or q is None:
-            absent += [told] if p is not q or match.one.contact_law != match.two.contact_law else []
+            absent += [details] if p is not q or match.one.contact_law != match.two.contact_law else []
         elif not match.same(p, q):
-            wrong.append(told)
+            wrong.append(details)
     if absent and not wrong:
         return match.different(quantity, _some(absent))
     values = sorted(value for value in seen if value is not None)
-    told = f"{values_told(tuple(values[:TOLD]))} {unit}" if values else "of no pair"
-    return _line(match, quantity, wrong + absent, told)
+    details = f"{values_told(tuple(values[:TOLD]))} {unit}" if values else "of no pair"
+    return _line(match, quantity, wrong + absent, details)
 
 
 def _dissipation(match: Match, shared: Shared) -> ContractLine:
@@ -429,19 +429,19 @@ def _dissipation(match: Match, shared: Shared) -> ContractLine:
         if x.dissipation is not None and y.dissipation is not None and not match.same(x.dissipation, y.dissipation):
             wrong.append(f"{name}: {match.both(x.dissipation, y.dissipation)} [s/m]")
         p, q = x.relaxation_time, y.relaxation_time
-        told = f"{name}: {match.both(p, q)} [s]"
+        details = f"{name}: {match.both(p, q)} [s]"
         if p is None or q is None:
-            absent += [told] if p is not q else []
+            absent += [details] if p is not q else []
         elif not match.same(p, q):
             critical = any(_critical(match, pair) for pair in (x, y))
-            (mapped if critical else wrong).append(told)
+            (mapped if critical else wrong).append(details)
     if wrong:
         return _line(match, quantity, wrong, "")
     if absent:
         return match.different(quantity, _some(absent))
     if mapped:
-        said = f"relaxation times {_some(mapped)}: the damping is critical, which is the engine's own"
-        return ContractLine(quantity, "mapped", said)
+        values = f"relaxation times {_some(mapped)}: the damping is critical, which is the engine's own"
+        return ContractLine(quantity, "mapped", values)
     return ContractLine(quantity, "equal", f"of {len(shared)} pairs" if shared else "of no pair")
 
 

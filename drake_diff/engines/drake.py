@@ -24,8 +24,8 @@ class DrakeEngine:
 
     def __init__(self, model: Model, *, contact: str | None = None, method: str = "autodiff"):
         check_method(method)
-        own = model.contract.contact.approximation
-        self.model = model if contact in (None, own) else model.with_contact(str(contact))
+        approximation = model.contract.contact.approximation
+        self.model = model if contact in (None, approximation) else model.with_contact(str(contact))
         self.method = method
         self.name = f"drake ({self.model.contract.contact.approximation}, {method})"
 
@@ -38,8 +38,8 @@ class DrakeEngine:
         return step(self.model, x, u)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
-        found = differentiate_step(self.model, x, u, method=self.method)
-        return StepJacobian(found.A, found.B, found.method)
+        derivatives = differentiate_step(self.model, x, u, method=self.method)
+        return StepJacobian(derivatives.A, derivatives.B, derivatives.method)
 
     def energy(self, x: ArrayLike) -> float:
         set_state(self.model.double, finite_array("x", x, (self.model.nx,)))
@@ -63,7 +63,7 @@ class DrakeEngine:
     @property
     def contract(self) -> EngineContract:
         contact = self.model.contract.contact
-        found = EngineContract(
+        whole = EngineContract(
             engine=self.name, joints=joint_contracts(self.description),
             native_order=tuple(link.joint for link in self.description.moving), inputs=self.model.input_names,
             actuation=float_rows(self.description.actuation), effort_limits=floats(self.description.effort_limits),
@@ -74,4 +74,4 @@ class DrakeEngine:
             limit_law="implicit springs in the step's solver, from two steps before the limit on",
             derivatives="by every entry of x and u",
         )  # fmt: skip
-        return reduced_contract(found, self.model)
+        return reduced_contract(whole, self.model)

@@ -123,13 +123,13 @@ class ClosedForm(Arguments):
         self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
         self.coordinates, self.time_step = coordinates_of(model), model.time_step
         self._drakes = DrakeEngine(model).contract
-        own = [joint.name for joint in self._drakes.joints]
+        joint_names = [joint.name for joint in self._drakes.joints]
         entries = [(i, j, 7, 6) for i, j in self.coordinates.free] + [(i, j, 1, 1) for i, j in self.coordinates.single]
-        places = dict(zip(own, sorted(entries, key=lambda place: place[1]), strict=True))
-        self.joints = _order("joints", joints, own)
+        places = dict(zip(joint_names, sorted(entries, key=lambda entry: entry[1]), strict=True))
+        self.joints = _order("joints", joints, joint_names)
         of_q = [range(i, i + n) for i, _, n, _ in (places[joint] for joint in self.joints)]
         of_v = [range(j, j + n) for _, j, _, n in (places[joint] for joint in self.joints)]
-        self._of_q, self._of_v = (np.array([k for r in found for k in r], dtype=int) for found in (of_q, of_v))
+        self._of_q, self._of_v = (np.array([k for r in ranges for k in r], dtype=int) for ranges in (of_q, of_v))
         names = list(model.input_names)
         self._of_u = np.array([names.index(x) for x in _order("inputs", inputs, names)], dtype=int)
         self._limits = np.array(self._drakes.effort_limits)
@@ -170,9 +170,9 @@ class ClosedForm(Arguments):
             given = self._acceleration(q[self._of_q], v[self._of_v], u[self._of_u], *self._extra)
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
             raise SimulationError(f"{self.name} fails at q = {q}, v = {v}: {type(error).__name__}: {error}") from error
-        found = np.empty(self.nv)
-        found[self._of_v] = finite_array(f"{self.name}: acceleration at q = {q}, v = {v}", given, (self.nv,))
-        return found
+        reordered = np.empty(self.nv)
+        reordered[self._of_v] = finite_array(f"{self.name}: acceleration at q = {q}, v = {v}", given, (self.nv,))
+        return reordered
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         """The state (nx,) one time step after `x` (nx,) under `u` (nu,)."""
@@ -214,8 +214,8 @@ class ClosedForm(Arguments):
         """The forces that `M` (nv, nv) makes of the accelerations."""
         still, no_u = np.zeros(self.nv), np.zeros(self.nu)
         rest, ahead, back = (self.acceleration(q, w, no_u) for w in (still, v, -v))
-        found = (rest, (ahead + back) / 2 - rest, (ahead - back) / 2, self.acceleration(q, v, u) - ahead)
-        return Parts(*(M @ a for a in found))
+        accelerations = (rest, (ahead + back) / 2 - rest, (ahead - back) / 2, self.acceleration(q, v, u) - ahead)
+        return Parts(*(M @ a for a in accelerations))
 
     def terms(self, M: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Bias, B u and joint damping, (nv,) each, that make these accelerations of `M` (nv, nv)."""
@@ -235,17 +235,17 @@ class ClosedForm(Arguments):
             wanted = [_parts_of(theirs, *state, u) for state, u in zip(states, us, strict=True)]
             given = [self.parts(M, *s, u) for M, s, u in zip(masses, states, us, strict=True)]
         except (InputError, NotOfferedError, SimulationError) as error:
-            return tuple(ContractLine(part, "different", f"not comparable: {error}") for part in PARTS)
+            return tuple(ContractLine(force, "different", f"not comparable: {error}") for force in PARTS)
         tolerance = max(SAME_NUMBER[match.precision], ROUNDING * max(float(np.linalg.cond(M)) for M in masses))
         names = [j.name for j in contract.joints for _ in range(6 if j.kind == "quaternion_floating" else 1)]
-        scale = np.array([max(float(np.abs(part).max(initial=0.0)) for part in parts) for parts in wanted])
+        scale = np.array([max(float(np.abs(force).max(initial=0.0)) for force in parts) for parts in wanted])
         lines = []
         for i, quantity in enumerate(PARTS):
-            a, b = (np.array([parts[i] for parts in found]) for found in (wanted, given))
+            a, b = (np.array([parts[i] for parts in all_parts]) for all_parts in (wanted, given))
             off = np.abs(b - a) > tolerance * np.maximum(scale, np.abs(b).max(axis=1, initial=0.0))[:, None]
             wrong = [f"of {names[j]}, {_told(a[:, j], b[:, j])}" for j in np.flatnonzero(off.any(axis=0))]
-            told = f"of {', '.join(dict.fromkeys(names))}, at {len(states)} random states"
-            lines.append(ContractLine(quantity, "different" if wrong else "equal", "; ".join(wrong) or told))
+            summary = f"of {', '.join(dict.fromkeys(names))}, at {len(states)} random states"
+            lines.append(ContractLine(quantity, "different" if wrong else "equal", "; ".join(wrong) or summary))
         wrong_inputs = lines[-1].verdict == "different"
         if wrong_inputs and sum(line.verdict == "different" for line in lines) > 1:
             remark = "a wrong inertia looks like this, as the forces are taken with M(q) of the other engine"
@@ -324,15 +324,15 @@ def _told(wanted: Array, given: Array) -> str:
     return f"{at_most}: {factor:.6g} times what it is to be"
 
 
-def _order(subject: str, given: Sequence[str] | None, own: Sequence[str]) -> tuple[str, ...]:
+def _order(subject: str, given: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:
     """`given`, which must have each of `own` once."""
     if given is None:
-        return tuple(own)
+        return tuple(known)
     for name in given:
-        if name not in own:
-            raise UnknownNameError(subject, got=name, known=own)
-    if sorted(given) != sorted(own):
-        raise InputError(subject, got=", ".join(given), expected=f"each of {', '.join(own)} once")
+        if name not in known:
+            raise UnknownNameError(subject, got=name, known=known)
+    if sorted(given) != sorted(known):
+        raise InputError(subject, got=", ".join(given), expected=f"each of {', '.join(known)} once")
     return tuple(given)
 
 

@@ -88,12 +88,12 @@ def bullet_urdf(links: Sequence[tuple[int, RigidLink]], geometries: Sequence[tup
 
 def carried_by(description: Description, base: str) -> tuple[Link, ...]:
     """The links that stand on `base`, a free body or "world", free bodies not among them."""
-    bodies, found = {base}, []
+    bodies, links = {base}, []
     for link in description.links:
         if link.parent in bodies and link.kind != "quaternion_floating":
             bodies.add(link.body)
-            found.append(link)
-    return tuple(found)
+            links.append(link)
+    return tuple(links)
 
 
 class AtZero:
@@ -102,9 +102,9 @@ class AtZero:
     def __init__(self, description: Description):
         self.bodies, self.frames = {"world": RigidTransform()}, {"world": RigidTransform()}
         for link in description.links:
-            at = self.bodies[link.parent] @ link.on_parent
-            self.bodies[link.body] = at @ link.on_child.inverse()
-            self.frames[link.body] = RigidTransform(at.translation())
+            pose = self.bodies[link.parent] @ link.on_parent
+            self.bodies[link.body] = pose @ link.on_child.inverse()
+            self.frames[link.body] = RigidTransform(pose.translation())
 
     def in_frame(self, body: str) -> RigidTransform:
         """The pose of a body in its link's frame."""
@@ -140,11 +140,15 @@ def _tree(description: Description, base: str, links: tuple[Link, ...]) -> tuple
         kind = KINDS.get(link.kind) or ("revolute" if limited else "continuous")
         joint = _add_joint(root, link.joint, kind, (link.parent, link.body), zero.in_parent(link))
         if link.kind in ("revolute", "prismatic"):
-            own = [e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint]
+            efforts = [
+                e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint
+            ]
             sides = None if kind == "continuous" else (link.lower, link.upper)
-            _add_freedom(joint, zero.axis(link), link.damping, min([UNLIMITED, *own]), sides)
-            for each in (each for each in description.followers if each.joint == link.joint):
-                SubElement(joint, "mimic", joint=each.leader, multiplier=row(each.ratio), offset=row(each.offset))
+            _add_freedom(joint, zero.axis(link), link.damping, min([UNLIMITED, *efforts]), sides)
+            for follower in (follower for follower in description.followers if follower.joint == link.joint):
+                SubElement(
+                    joint, "mimic", joint=follower.leader, multiplier=row(follower.ratio), offset=row(follower.offset)
+                )
     return root, elements
 
 
@@ -171,7 +175,7 @@ def _add_inertial(body: Element, mass: float, center: RigidTransform, inertia: A
     _place(inertial, center)
     SubElement(inertial, "mass", value=row(mass))
     places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-    SubElement(inertial, "inertia", {name: row(inertia[place]) for name, place in places.items()})
+    SubElement(inertial, "inertia", {name: row(inertia[index]) for name, index in places.items()})
 
 
 def _add_collision(body: Element, geometry: Geometry, X: RigidTransform) -> Element:
@@ -235,9 +239,9 @@ def mjcf(description: Description, time_step: float, inverse_masses: Mapping[str
                 s = pair.stiffness * (1 - IMPEDANCE) * sum(inverse_masses[body_of[name]] for name in pair.names)
                 element.set("solref", row([-s, -2 * np.sqrt(s)]))
     equality = SubElement(root, "equality") if description.followers else root
-    for each in description.followers:
-        element = SubElement(equality, "joint", joint1=each.joint, joint2=each.leader)
-        element.set("polycoef", row([each.offset, each.ratio, 0, 0, 0]))
+    for follower in description.followers:
+        element = SubElement(equality, "joint", joint1=follower.joint, joint2=follower.leader)
+        element.set("polycoef", row([follower.offset, follower.ratio, 0, 0, 0]))
         element.set("solimp", row([STIFFEST, STIFFEST, 0.001]))
     return xml_text(root)
 
@@ -359,12 +363,12 @@ def _add_sdf_joint(model: Element, description: Description, link: Link, zero: A
     numbers = {"damping": link.damping, "spring_reference": link.rest, "spring_stiffness": link.stiffness}
     for name, value in numbers.items():
         SubElement(dynamics, name).text = row(value)
-    for each in (each for each in description.followers if each.joint == link.joint):
-        numbers = {"multiplier": each.ratio, "offset": each.offset}
-        mimic = SubElement(axis, "mimic", joint=each.leader)
+    for follower in (follower for follower in description.followers if follower.joint == link.joint):
+        numbers = {"multiplier": follower.ratio, "offset": follower.offset}
+        mimic = SubElement(axis, "mimic", joint=follower.leader)
         for name, value in {**numbers, "reference": 0.0}.items():
             SubElement(mimic, name).text = row(value)
-        SubElement(joint, "drake:mimic", {"joint": each.leader, **{name: row(x) for name, x in numbers.items()}})
+        SubElement(joint, "drake:mimic", {"joint": follower.leader, **{name: row(x) for name, x in numbers.items()}})
     if link.armature:
         SubElement(joint, "drake:rotor_inertia").text = row(link.armature)
         SubElement(joint, "drake:gear_ratio").text = "1.0"

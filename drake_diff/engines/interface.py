@@ -238,10 +238,10 @@ class PlantEngine(Arguments):
 
     def _stretch(self, q: Array) -> Array:
         """(nv,) of the springs on hinges and slides."""
-        found = -self.rest
+        stretch = -self.rest
         for i, j in self.coordinates.single:
-            found[j] += q[i]
-        return found
+            stretch[j] += q[i]
+        return stretch
 
     def _spring_energy(self, q: Array) -> float:
         """[J]."""
@@ -292,15 +292,15 @@ def without_lines(*greetings: str) -> Iterator[None]:
 def _filtered(stream: int, greetings: tuple[str, ...]) -> Iterator[None]:
     """Of one file descriptor."""
     _flush()
-    kept = os.dup(stream)
+    original = os.dup(stream)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), stream)
         try:
             yield
         finally:
             _flush()
-            os.dup2(kept, stream)
-            os.close(kept)
+            os.dup2(original, stream)
+            os.close(original)
             file.seek(0)
             for line in file.read().splitlines(keepends=True):
                 if not line.startswith(tuple(g.encode() for g in greetings)):
@@ -343,17 +343,17 @@ def geometry_contracts(description: Description) -> tuple[GeometryContract, ...]
     frames: list[RigidTransform] = []
     for link in moving:
         frames.append(link.on_parent if link.parent < 0 else frames[link.parent] @ link.on_parent)
-    found = []
+    contracts = []
     for g in description.geometries:
-        place, pose = on[g.body]
-        pose = pose @ g.pose if place < 0 else frames[place] @ pose @ g.pose
+        link_index, pose = on[g.body]
+        pose = pose @ g.pose if link_index < 0 else frames[link_index] @ pose @ g.pose
         kind, sizes = shape_of(g)
-        carrier = "world" if place < 0 else moving[place].joint.joint
+        carrier = "world" if link_index < 0 else moving[link_index].joint.joint
         if sizes:
             lengths = () if kind == "HalfSpace" else floats(np.concatenate(list(sizes.values())))
             X = (pose.translation(), pose.rotation().matrix())
-            found.append(geometry_contract(g.name, carrier, kind, lengths, *X))
-    return tuple(found)
+            contracts.append(geometry_contract(g.name, carrier, kind, lengths, *X))
+    return tuple(contracts)
 
 
 def without_damping(pair: PairContract) -> PairContract:

@@ -118,19 +118,19 @@ class ReducedEngine(EulerEngine):
         q, v, whole, coupling = x[: self.nq], x[self.nq :], self.whole, self.coupling
         A = whole.mass_matrix(coupling.positions(q)) + self.time_step * np.diag(whole.damping)
         force = whole._effort(u) - self._bias(q, v) - whole.damping * coupling.velocities(v)
-        own = coupling.next_velocities(A, np.linalg.solve(A, force))
-        return A, own, A @ coupling.velocities(own) - force
+        acceleration = coupling.next_velocities(A, np.linalg.solve(A, force))
+        return A, acceleration, A @ coupling.velocities(acceleration) - force
 
     def _acceleration(self, x: Array, u: Array) -> Array:
         return self._balance(x, u)[1]
 
     def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
-        A, own, holding = self._balance(x, u)
+        A, acceleration, holding = self._balance(x, u)
         with self.whole.holding(holding):
             _, by = self.whole._acceleration_derivative(self.coupling.state(x), u)
         E, m = self.coupling.spread, len(A)
         by = A @ np.hstack([by[:, :m] @ E, by[:, m : 2 * m] @ E, by[:, 2 * m :]])
-        return own, np.linalg.solve(E.T @ A @ E, E.T @ by)
+        return acceleration, np.linalg.solve(E.T @ A @ E, E.T @ by)
 
     @property
     def contract(self) -> EngineContract:
@@ -142,7 +142,7 @@ def reduced_contract(contract: EngineContract, model: Model) -> EngineContract:
     coupling: Coupling | None = model.coupling
     if coupling is None:
         return contract
-    damping, kept, start = np.zeros(len(coupling.of_v)), [], 0
+    damping, joints_left, start = np.zeros(len(coupling.of_v)), [], 0
     joints: Mapping[int, Any] = {}
     for joint in contract.joints:
         joints = {**joints, start: joint}
@@ -158,11 +158,11 @@ def reduced_contract(contract: EngineContract, model: Model) -> EngineContract:
         if k in single:
             limits = {"lower": float(lower[single[k]]), "upper": float(upper[single[k]])}
             joint = replace(joint, damping=float(own_damping[k]), **limits)
-        kept.append(joint)
-    names = {joint.name for joint in kept}
+        joints_left.append(joint)
+    names = {joint.name for joint in joints_left}
     return replace(
         contract,
-        joints=tuple(kept),
+        joints=tuple(joints_left),
         native_order=tuple(name for name in contract.native_order if name in names),
         actuation=float_rows(coupling.spread.T @ np.array(contract.actuation).reshape(len(coupling.of_v), -1)),
     )

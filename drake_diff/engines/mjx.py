@@ -55,11 +55,11 @@ class MjxEngine(PlantEngine):
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         x, u = self._point(x, u)
-        found, unbalanced = self._run(_step, x, u)
-        if not np.all(np.isfinite(found)):
+        state, unbalanced = self._run(_step, x, u)
+        if not np.all(np.isfinite(state)):
             raise SimulationError(f"MJX cannot take this step: from x = {x}, u = {u}")
         self.status = "ok" if unbalanced <= UNBALANCED else f"the solver left {unbalanced:.1e} of the forces unbalanced"
-        return self.native.to_drake(found[: self.nq], found[self.nq :])
+        return self.native.to_drake(state[: self.nq], state[self.nq :])
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         x, u = self._point(x, u)
@@ -90,8 +90,8 @@ class MjxEngine(PlantEngine):
         springs = 0.0
         for j in self.native.joints:
             if m.jnt_stiffness[j]:
-                at = int(m.jnt_qposadr[j])
-                springs += float(m.jnt_stiffness[j] * (terms.qpos[at] - m.qpos_spring[at]) ** 2) / 2
+                index = int(m.jnt_qposadr[j])
+                springs += float(m.jnt_stiffness[j] * (terms.qpos[index] - m.qpos_spring[index]) ** 2) / 2
         return float(v @ self.mass_matrix(q) @ v) / 2 - float(height) + springs
 
     def contact_depth(self, x: ArrayLike) -> float:

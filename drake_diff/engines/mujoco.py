@@ -116,8 +116,8 @@ class MujocoEngine(PlantEngine):
         self._set(self._zero(), np.zeros(self.nu))
         mujoco.mj_forward(self.model, self.data)
         derivatives = "by tangent vectors of qpos and by qvel, centred differences in C"
-        own = {"who": "MuJoCo", "engine": self.name, "derivatives": derivatives}
-        return read_contract(self.model, self.data, self.native, self.description, **own)
+        fields = {"who": "MuJoCo", "engine": self.name, "derivatives": derivatives}
+        return read_contract(self.model, self.data, self.native, self.description, **fields)
 
     def _set(self, x: Array, u: Array) -> None:
         mujoco.mj_resetData(self.model, self.data)  # which takes the warm start too

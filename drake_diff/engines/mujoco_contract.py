@@ -142,25 +142,25 @@ Given = tuple[int, Array, Array, Array, Array, Array]
 
 def geometry_name(m: Any, g: int) -> str:
     """The geom's own name, or its number and its body's."""
-    own = name_of(m, m.name_geomadr[g])
-    return own or f"geom {g} of {name_of(m, m.name_bodyadr[int(m.geom_bodyid[g])])}"
+    given = name_of(m, m.name_geomadr[g])
+    return given or f"geom {g} of {name_of(m, m.name_bodyadr[int(m.geom_bodyid[g])])}"
 
 
 def read_geometries(m: Any, d: Any) -> tuple[GeometryContract, ...]:
     """Every geom, where `d` is at Drake's q = 0; a mesh or height field without sizes."""
-    found = []
+    geometries = []
     for g in range(m.ngeom):
         body = int(m.body_weldid[int(m.geom_bodyid[g])])
         last = int(m.body_jntadr[body]) + int(m.body_jntnum[body]) - 1
         carrier = "world" if body == 0 else name_of(m, m.name_jntadr[last])
         kind = SHAPES.get(int(m.geom_type[g]), "Mesh")
-        at = np.array(d.geom_xpos[g], dtype=float), np.array(d.geom_xmat[g], dtype=float).reshape(3, 3)
+        position = np.array(d.geom_xpos[g], dtype=float), np.array(d.geom_xmat[g], dtype=float).reshape(3, 3)
         size = [float(s) for s in m.geom_size[g]]
         sizes = {
             "HalfSpace": [], "Mesh": [], "Sphere": size[:1], "Ellipsoid": size, "Box": [2 * s for s in size],
         }.get(kind, [size[0], 2 * size[1]])  # fmt: skip
-        found.append(geometry_contract(geometry_name(m, g), carrier, kind, sizes, *at))
-    return tuple(found)
+        geometries.append(geometry_contract(geometry_name(m, g), carrier, kind, sizes, *position))
+    return tuple(geometries)
 
 
 def read_pairs(m: Any) -> tuple[PairContract, ...]:
@@ -203,12 +203,20 @@ def _of_geoms(m: Any, a: int, b: int) -> Given:
         g = a if rank > 0 else b
         friction = np.array(m.geom_friction[g])[[0, 0, 1, 2, 2]]
         return int(m.geom_condim[g]), friction, np.array(m.geom_solref[g]), none, np.array(m.geom_solimp[g]), apart
-    one, two = float(m.geom_solmix[a]), float(m.geom_solmix[b])
-    part = 0.5 if max(one, two) < SMALL else 0.0 if one < SMALL else 1.0 if two < SMALL else one / (one + two)
+    weight_a, weight_b = float(m.geom_solmix[a]), float(m.geom_solmix[b])
+    share = (
+        0.5
+        if max(weight_a, weight_b) < SMALL
+        else 0.0
+        if weight_a < SMALL
+        else 1.0
+        if weight_b < SMALL
+        else weight_a / (weight_a + weight_b)
+    )
     solref_a, solref_b = np.array(m.geom_solref[a]), np.array(m.geom_solref[b])
-    mixed = part * solref_a + (1 - part) * solref_b
+    mixed = share * solref_a + (1 - share) * solref_b
     solref = mixed if min(solref_a[0], solref_b[0]) > 0 else np.minimum(solref_a, solref_b)
-    solimp = part * np.array(m.geom_solimp[a]) + (1 - part) * np.array(m.geom_solimp[b])
+    solimp = share * np.array(m.geom_solimp[a]) + (1 - share) * np.array(m.geom_solimp[b])
     friction = np.maximum(m.geom_friction[a], m.geom_friction[b])[[0, 0, 1, 2, 2]]
     return max(int(m.geom_condim[a]), int(m.geom_condim[b])), friction, solref, none, solimp, apart
 
@@ -253,11 +261,11 @@ def _stiffness(m: Any, both: tuple[int, int], dim: int, friction: Array, K: floa
     """[N/m] where the contact rests, at the impedance `d`; a pyramid's edges share the force."""
     bodies = [int(m.geom_bodyid[g]) for g in both]
     inverse_mass = sum(float(m.body_invweight0[b][0]) for b in bodies)
-    found = K * d**2 / ((1 - d) * inverse_mass) if inverse_mass else np.inf
+    stiffness = K * d**2 / ((1 - d) * inverse_mass) if inverse_mass else np.inf
     if dim == 1 or int(m.opt.cone) != PYRAMIDAL_CONE:
-        return float(found)
+        return float(stiffness)
     mu = float(friction[0])
-    return float(found * (dim - 1) * float(m.opt.impratio) / (mu**2 * (1 + mu**2)))
+    return float(stiffness * (dim - 1) * float(m.opt.impratio) / (mu**2 * (1 + mu**2)))
 
 
 CONES = {0: "pyramidal", 1: "elliptic"}  # mjtCone
@@ -298,18 +306,18 @@ def check_known(m: Any) -> None:
     if number not in INTEGRATORS:
         expected = f"one of {', '.join(INTEGRATORS.values())}, whose steps MuJoCo differentiates"
         raise ModelError(f"integrator of the MJCF: expected {expected}, got {OTHERS.get(number, number)}")
-    found = [said for name, said in COUNTED.items() if getattr(m, name, 0)]
-    found += [said for name, said in UNKNOWN.items() if np.any(getattr(m, name, 0))]
+    unknown = [description for name, description in COUNTED.items() if getattr(m, name, 0)]
+    unknown += [description for name, description in UNKNOWN.items() if np.any(getattr(m, name, 0))]
     if m.opt.density or m.opt.viscosity or np.any(m.opt.wind):
-        found.append("a fluid")
+        unknown.append("a fluid")
     if getattr(m.opt, "disableactuator", 0):
-        found.append("disabled groups of actuators")
+        unknown.append("disabled groups of actuators")
     off = _named_bits(int(m.opt.disableflags), DISABLED, HARMLESS)
     on = _named_bits(int(getattr(m.opt, "enableflags", 0)), ENABLED, HARMLESS_ENABLED)
-    found += [f"disabled parts of the physics ({', '.join(off)})"] if off else []
-    found += [f"enabled options ({', '.join(on)})"] if on else []
-    if found:
-        raise ModelError(f"the MJCF has {', '.join(dict.fromkeys(found))}, which Drake's plant does not have")
+    unknown += [f"disabled parts of the physics ({', '.join(off)})"] if off else []
+    unknown += [f"enabled options ({', '.join(on)})"] if on else []
+    if unknown:
+        raise ModelError(f"the MJCF has {', '.join(dict.fromkeys(unknown))}, which Drake's plant does not have")
 
 
 def _named_bits(flags: int, names: tuple[str, ...], harmless: tuple[str, ...]) -> list[str]:
@@ -317,7 +325,7 @@ def _named_bits(flags: int, names: tuple[str, ...], harmless: tuple[str, ...]) -
     return [name for name in (names[i] if i < len(names) else f"bit {i}" for i in bits) if name not in harmless]
 
 
-def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Description, **own: Any) -> EngineContract:
+def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Description, **fields: Any) -> EngineContract:
     """What `m` has, where `d` is at Drake's q = 0; `own` are the fields and `reasons` that MuJoCo and MJX differ in."""
     limits, B = [], np.zeros((len(native.dofs), len(native.actuator)))
     pairs, geometries = read_pairs(m), read_geometries(m, d)
@@ -335,7 +343,7 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
         limits.append(min(by_force / abs(float(m.actuator_gainprm[i][0])), by_control))
     law = f"soft constraint, {CONES[int(m.opt.cone)]} cone, impratio {float(m.opt.impratio):g}"
     law += f", {slips} noslip iterations" if (slips := int(getattr(m.opt, "noslip_iterations", 0))) else ""
-    free, who = native.coordinates.free, own.pop("who")
+    free, who = native.coordinates.free, fields.pop("who")
     name, explicit = INTEGRATORS[int(m.opt.integrator)], bool(int(m.opt.disableflags) & NO_EULERDAMP)
     drakes = name == "IMPLICITFAST" or (name == "EULER" and not explicit)
     damping = "implicit" if drakes or name == "IMPLICIT" else "explicit"
@@ -361,7 +369,7 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
         gravity=floats(m.opt.gravity), contact_law=law if touches(m) else "none", geometries=geometries,
         contacts=pairs,
         solver_tolerance=float(m.opt.tolerance), limit_law="soft constraint of the step's solver", reasons=reasons,
-        **own,
+        **fields,
     )  # fmt: skip
 
 
@@ -379,7 +387,7 @@ def _side(name: str, both: Any) -> float:
 
 def read_followers(m: Any) -> tuple[Follower, ...]:
     """The joints that follow others; ModelError for an equality that is something else."""
-    found = []
+    followers = []
     for k in range(m.neq):
         joint, leader, coefficients = int(m.eq_obj1id[k]), int(m.eq_obj2id[k]), [float(x) for x in m.eq_data[k][:5]]
         if int(m.eq_type[k]) != JOINT_EQUALITY or leader < 0 or not m.eq_active0[k] or any(coefficients[2:]):
@@ -387,8 +395,8 @@ def read_followers(m: Any) -> tuple[Follower, ...]:
         names = [name_of(m, m.name_jntadr[j]) for j in (joint, leader)]
         start, leader_start = (float(m.qpos0[m.jnt_qposadr[j]]) for j in (joint, leader))
         offset = start + coefficients[0] - coefficients[1] * leader_start
-        found.append(Follower(names[0], names[1], coefficients[1], offset))
-    return tuple(found)
+        followers.append(Follower(names[0], names[1], coefficients[1], offset))
+    return tuple(followers)
 
 
 def touches(m: Any) -> bool:

@@ -78,8 +78,8 @@ class NewtonEngine(RigidEngine):
         after = self.newton.state(requires_grad=True)
         contacts = self._contacts(before)
         self.solver.step(before, after, control, contacts, self.time_step)
-        found, room = 0 if contacts is None else int(contacts.rigid_contact_count.numpy()[0]), _count(contacts)
-        self.status = "ok" if found <= room else f"{found} contacts, and Newton has room for {room}"
+        contact_count, room = 0 if contacts is None else int(contacts.rigid_contact_count.numpy()[0]), _count(contacts)
+        self.status = "ok" if contact_count <= room else f"{contact_count} contacts, and Newton has room for {room}"
         return self._drakes(after, x, u)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
@@ -99,7 +99,7 @@ class NewtonEngine(RigidEngine):
             for row in np.eye(result.shape[0], dtype=np.float32):
                 tape.backward(grads={result: wp.array(row, dtype=wp.float32, device="cpu")})
                 given = (before.joint_q, before.joint_qd, control.joint_f)
-                rows.append(np.concatenate([one.grad.numpy() for one in given]))
+                rows.append(np.concatenate([array.grad.numpy() for array in given]))
                 tape.zero()
         here = np.concatenate([self.positions, self.nq + self.dofs])
         by = np.array(rows, dtype=float)[here]
@@ -228,9 +228,9 @@ class NewtonEngine(RigidEngine):
 def _build(tree: RigidLinks, gravity: Array) -> tuple[Any, dict[str, int]]:
     """Newton's model, and the number of each geometry's shape in it."""
     builder = newton.ModelBuilder(gravity=tuple(float(g) for g in gravity))
-    for part in tree.trees:
+    for members in tree.trees:
         joints = []
-        for link in (tree.links[i] for i in part):
+        for link in (tree.links[i] for i in members):
             body = {"mass": link.mass, "com": floats(link.center_of_mass), "inertia": wp.mat33(*floats(link.inertia))}
             number = builder.add_link(**body, lock_inertia=True, label=link.joint.body)
             joints.append(_add_joint(builder, link, int(number)))
@@ -256,16 +256,16 @@ def _add_joint(builder: Any, link: RigidLink, number: int) -> int:
 
 def _add_shape(builder: Any, number: int, geometry: Geometry) -> int:
     kind, sizes = shape_of(geometry)
-    place = {"body": number, "xform": _pose(geometry.pose), "label": geometry.name}
+    frame = {"body": number, "xform": _pose(geometry.pose), "label": geometry.name}
     if kind == "HalfSpace":
-        return int(builder.add_shape_plane(width=0.0, length=0.0, **place))
+        return int(builder.add_shape_plane(width=0.0, length=0.0, **frame))
     if kind == "Sphere":
-        return int(builder.add_shape_sphere(radius=sizes["radius"][0], **place))
+        return int(builder.add_shape_sphere(radius=sizes["radius"][0], **frame))
     if kind == "Box":
         halves = {name: side / 2 for name, side in zip(("hx", "hy", "hz"), sizes["size"], strict=True)}
-        return int(builder.add_shape_box(**halves, **place))
+        return int(builder.add_shape_box(**halves, **frame))
     add = builder.add_shape_cylinder if kind == "Cylinder" else builder.add_shape_capsule
-    return int(add(radius=sizes["radius"][0], half_height=sizes["length"][0] / 2, **place))
+    return int(add(radius=sizes["radius"][0], half_height=sizes["length"][0] / 2, **frame))
 
 
 def _numbers(array: Any) -> Array:
@@ -282,19 +282,24 @@ def _centers_of_mass(m: Any, state: Any) -> Array:
 def _read_joints(m: Any, state: Any, tree: RigidLinks) -> tuple[JointContract, ...]:
     """In Drake's order, where `state` is at Drake's q = 0."""
     values = {name: _numbers(getattr(m, f"joint_{name}")) for name in OF_JOINTS}
-    centers, poses, inertias, found = _centers_of_mass(m, state), _numbers(state.body_q), _numbers(m.body_inertia), {}
+    centers, poses, inertias, contracts = (
+        _centers_of_mass(m, state),
+        _numbers(state.body_q),
+        _numbers(m.body_inertia),
+        {},
+    )
     for i, link in enumerate(tree.links):
         kind, R = KINDS[int(m.joint_type.numpy()[i])], _matrix(poses[i])
         j, single = int(m.joint_qd_start.numpy()[i]), kind != "quaternion_floating"
         rest = values["rest_q"][int(m.joint_q_start.numpy()[i])]
-        found[link.joint.v_start] = joint_contract(
+        contracts[link.joint.v_start] = joint_contract(
             name=m.joint_label[i], kind=kind, axis=R @ values["axis"][j] if single else np.zeros(3),
             anchor=poses[i, :3], carried=[(float(m.body_mass.numpy()[i]), centers[i], R @ inertias[i] @ R.T)],
             damping=float(values["damping"][j]), armature=float(values["armature"][j]),
             stiffness=float(values["stiffness"][j]), rest=float(rest) if single else 0.0,
             lower=limit(values["limit_lower"][j]), upper=limit(values["limit_upper"][j]),
         )  # fmt: skip
-    return tuple(found[start] for start in sorted(found))
+    return tuple(contracts[start] for start in sorted(contracts))
 
 
 def _matrix(pose: Array) -> Array:

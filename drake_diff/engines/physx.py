@@ -80,11 +80,11 @@ class SapienEngine(RigidEngine):
         world = self._world(x, self._effort(u) - self.stiffness * self._stretch(x[: self.nq]))
         world.scene.step()
         q, v = np.zeros(self.nq), np.zeros(self.nv)
-        for tree, part in zip(world.trees, self.tree.trees, strict=True):
-            rigid = {self.tree.links[i].joint.joint: self.tree.links[i].joint for i in part}
+        for tree, members in zip(world.trees, self.tree.trees, strict=True):
+            rigid = {self.tree.links[i].joint.joint: self.tree.links[i].joint for i in members}
             for joint, position, speed in zip(tree.active_joints, tree.qpos, tree.qvel, strict=True):
                 q[rigid[joint.name].q_start], v[rigid[joint.name].v_start] = position, speed
-            root = self.tree.links[part.start]
+            root = self.tree.links[members.start]
             if root.free:
                 i, j = root.joint.q_start, root.joint.v_start
                 q[i : i + 4], q[i + 4 : i + 7] = tree.root_pose.q, tree.root_pose.p
@@ -178,14 +178,14 @@ class SapienEngine(RigidEngine):
             scene.add_entity(entity)
         q = unit(self.coordinates, x[: self.nq])
         v = self.centers.turn(q) @ x[self.nq :]
-        for tree, part in zip(trees, self.tree.trees, strict=True):
-            self._place(tree, part, q, v, force)
+        for tree, members in zip(trees, self.tree.trees, strict=True):
+            self._place(tree, members, q, v, force)
         return World(system, scene, links, trees)
 
     def _links(self, scene: Any) -> list[Any]:
-        found: list[Any] = []
+        links: list[Any] = []
         for i, rigid in enumerate(self.tree.links):
-            parent = found[rigid.parent] if rigid.parent >= 0 else None if rigid.free else _fixed(scene)
+            parent = links[rigid.parent] if rigid.parent >= 0 else None if rigid.free else _fixed(scene)
             link = physx.PhysxArticulationLinkComponent(parent)
             entity = sapien.Entity()
             entity.add_component(link)
@@ -197,42 +197,42 @@ class SapienEngine(RigidEngine):
             link.max_linear_velocity = link.max_angular_velocity = UNLIMITED
             for geometry in (g for number, g in self.tree.geometries if number == i and g.name in self.groups):
                 link.attach(self._shape(geometry))
-            joint, own = link.joint, rigid.joint
-            joint.name = link.name = own.joint
+            joint, fields = link.joint, rigid.joint
+            joint.name = link.name = fields.joint
             if not rigid.free:
                 along = RigidTransform(RotationMatrix.MakeFromOneVector(rigid.axis, 0), np.zeros(3))  # PhysX's axis: x
-                joint.type = "revolute_unwrapped" if own.kind == "revolute" else "prismatic"
+                joint.type = "revolute_unwrapped" if fields.kind == "revolute" else "prismatic"
                 joint.pose_in_parent, joint.pose_in_child = _pose(rigid.on_parent @ along), _pose(along)
-                joint.limit = np.array([[own.lower, own.upper]], dtype=np.float32)
-                joint.friction, joint.armature = 0.0, np.array([own.armature], dtype=np.float32)
+                joint.limit = np.array([[fields.lower, fields.upper]], dtype=np.float32)
+                joint.friction, joint.armature = 0.0, np.array([fields.armature], dtype=np.float32)
                 joint.max_velocity = UNLIMITED
-                joint.set_drive_properties(0.0, own.damping)
-            found.append(link)
+                joint.set_drive_properties(0.0, fields.damping)
+            links.append(link)
             scene.add_entity(entity)
-        return found
+        return links
 
     def _shape(self, geometry: Geometry) -> Any:
         (kind, sizes), X, material = shape_of(geometry), geometry.pose, _material(self.friction.get(geometry.name))
         if kind == "Sphere":
-            found = physx.PhysxCollisionShapeSphere(sizes["radius"][0], material)
+            shape = physx.PhysxCollisionShapeSphere(sizes["radius"][0], material)
         elif kind == "Box":
-            found = physx.PhysxCollisionShapeBox([side / 2 for side in sizes["size"]], material)
+            shape = physx.PhysxCollisionShapeBox([side / 2 for side in sizes["size"]], material)
         else:  # PhysX's axis is x, Drake's z
             X = X @ RigidTransform(RotationMatrix.MakeYRotation(-np.pi / 2), np.zeros(3))
             if kind == "HalfSpace":
-                found = physx.PhysxCollisionShapePlane(material)
+                shape = physx.PhysxCollisionShapePlane(material)
             else:
                 make = physx.PhysxCollisionShapeCylinder if kind == "Cylinder" else physx.PhysxCollisionShapeCapsule
-                found = make(sizes["radius"][0], sizes["length"][0] / 2, material)
-        found.local_pose = _pose(X)
-        found.set_collision_groups([*self.groups[geometry.name], 0, 0])
-        return found
+                shape = make(sizes["radius"][0], sizes["length"][0] / 2, material)
+        shape.local_pose = _pose(X)
+        shape.set_collision_groups([*self.groups[geometry.name], 0, 0])
+        return shape
 
-    def _place(self, tree: Any, part: range, q: Array, v: Array, force: Array) -> None:
+    def _place(self, tree: Any, members: range, q: Array, v: Array, force: Array) -> None:
         tree.set_solver_position_iterations(ITERATIONS)
         tree.sleep_threshold = 0.0
-        rigid = {self.tree.links[i].joint.joint: self.tree.links[i] for i in part}
-        root = self.tree.links[part.start]
+        rigid = {self.tree.links[i].joint.joint: self.tree.links[i] for i in members}
+        root = self.tree.links[members.start]
         if root.free:
             i, j = root.joint.q_start, root.joint.v_start
             tree.root_pose = sapien.Pose(q[i + 4 : i + 7], q[i : i + 4])
@@ -262,10 +262,10 @@ def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int
 
 def _read_part(link: Any) -> tuple[float, Array, Array, Array]:
     """Mass, centre of mass (3,), inertia (3, 3) about it and orientation of the body (3, 3), in world."""
-    pose, at = link.entity_pose, link.cmass_local_pose
+    pose, frame = link.entity_pose, link.cmass_local_pose
     body = rotation(np.array(pose.q, dtype=float))
-    R = body @ rotation(np.array(at.q, dtype=float))
-    center = np.array(pose.p, dtype=float) + body @ np.array(at.p, dtype=float)
+    R = body @ rotation(np.array(frame.q, dtype=float))
+    center = np.array(pose.p, dtype=float) + body @ np.array(frame.p, dtype=float)
     return float(link.mass), center, R @ np.diag(np.array(link.inertia, dtype=float)) @ R.T, body
 
 
@@ -273,11 +273,12 @@ def _read_joint(link: Any, rigid: RigidLink) -> JointContract:
     """Where PhysX is at Drake's q = 0; springs are those of the engine."""
     mass, center, inertia, body = _read_part(link)
     joint, kind = link.joint, KINDS[link.joint.type]
-    single, at = kind != "quaternion_floating", link.joint.pose_in_child
+    single, pose = kind != "quaternion_floating", link.joint.pose_in_child
     limit = np.array(joint.limit, dtype=float).ravel() if single else np.array([-np.inf, np.inf])
+    axis = body @ rotation(np.array(pose.q, dtype=float))[:, 0] if single else np.zeros(3)
     return joint_contract(
-        name=joint.name, kind=kind, axis=body @ rotation(np.array(at.q, dtype=float))[:, 0] if single else np.zeros(3),
-        anchor=np.array(link.entity_pose.p, dtype=float) + body @ np.array(at.p, dtype=float),
+        name=joint.name, kind=kind, axis=axis,
+        anchor=np.array(link.entity_pose.p, dtype=float) + body @ np.array(pose.p, dtype=float),
         carried=[(mass, center, inertia)], damping=float(joint.damping) if single else 0.0,
         armature=float(joint.armature[0]) if single else 0.0, stiffness=rigid.joint.stiffness, rest=rigid.joint.rest,
         lower=float(limit[0]), upper=float(limit[1]),

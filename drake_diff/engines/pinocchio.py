@@ -97,7 +97,7 @@ class PinocchioEngine(EulerEngine, PlantEngine):
 
     def _joints(self) -> tuple[JointContract, ...]:
         pin.forwardKinematics(self.pin, self.data, pin.neutral(self.pin))
-        found = []
+        contracts = []
         for i in range(1, self.pin.njoints):
             pose, inertia, link = self.data.oMi[i], self.pin.inertias[i], self.description.moving[i - 1]
             R, j = pose.rotation, self.pin.idx_vs[i]
@@ -105,7 +105,7 @@ class PinocchioEngine(EulerEngine, PlantEngine):
             S = np.asarray(self.data.joints[i].S) if self.pin.nvs[i] == 1 else np.zeros((6, 1))
             hinge = bool(np.any(S[3:]))
             kind = "quaternion_floating" if self.pin.nvs[i] == 6 else "revolute" if hinge else "prismatic"
-            found.append(
+            contracts.append(
                 joint_contract(
                     name=self.pin.names[i], kind=kind, axis=R @ (S[3:] if hinge else S[:3]).ravel(),
                     anchor=pose.translation, carried=[carried], damping=float(self.damping[j]),
@@ -113,7 +113,7 @@ class PinocchioEngine(EulerEngine, PlantEngine):
                     rest=float(self.rest[j]), lower=link.lower, upper=link.upper,
                 )
             )  # fmt: skip
-        return tuple(found)
+        return tuple(contracts)
 
 
 def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:

@@ -227,11 +227,6 @@ def make_absolute(xml: XmlText, path: Path) -> None:
             set_uri(xml, element, f"file://{(path.parent / uri).resolve()}")
 
 
-def find_file(uri: str, path: Path, packages: PackageMap) -> Path | None:
-    """The file that a robot file at `path` calls `uri`, whatever letters are capital; None where there is none."""
-    return _file(_place(uri, path, packages))
-
-
 def _file(location: Path | None) -> Path | None:
     return None if location is None else in_any_case(location) or in_any_case(Path(unquote(str(location))))
 
