@@ -45,6 +45,7 @@ class VerdictOptions:
     significant: float = 30.0  # times the scatter: what can be told from it
     jitter_change: float = 0.1  # of an entry, 1e-9 beside the point
     mixed: float = 1e-9  # of the largest entry of all: what as large a mixed derivative makes 1e-9 beside the point
+    jitter: float = 1e-9  # of the scale: how far beside the point the derivative is taken once more
 
 
 LIMITS = VerdictOptions()
@@ -236,9 +237,6 @@ def _jittery(around: Neighbourhood, a: Array, beside: Array) -> Flags:
     return np.asarray(
         (change > smooth) & (change > LIMITS.jitter_change * size) & (size > LIMITS.negligible * row_size)
     )
-
-
-JITTER = 1e-9
 
 
 @dataclass(frozen=True)
@@ -520,4 +518,4 @@ def certificate_of(
 def jitter(scale: Array) -> Array:
     """(n,) entries between a half and all of 1e-9 `scale` (n,), of either sign, always the same ones."""
     random, size = np.random.default_rng(0), len(scale)
-    return JITTER * scale * (random.uniform(0.5, 1.0, size) * random.choice([-1.0, 1.0], size))
+    return LIMITS.jitter * scale * (random.uniform(0.5, 1.0, size) * random.choice([-1.0, 1.0], size))

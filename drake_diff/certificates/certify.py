@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.differences import one_by_one
-from drake_diff.certificates.certificate import JITTER, Certificate, ModeChange, certificate_of, jitter
+from drake_diff.certificates.certificate import LIMITS, Certificate, ModeChange, certificate_of, jitter
 from drake_diff.certificates.differences import Neighbourhood, is_broken, look_around
 from drake_diff.certificates.directions import FirstLook, LookAt, certificate_by
 from drake_diff.derivatives.refine_step import refine_steps
@@ -27,13 +27,21 @@ from drake_diff.model.step import advance, check_point
 from drake_diff.model.tangent import TangentSpace, tangent_space
 
 SHARED = "the derivative is of differences too, of another step: the two share a method, and what it misses is missed"
-LIMIT_REACH = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
-EFFORT_ROOM = 0.02  # of max(1, |u|): twice the widest step of the differences
-EFFORT_PART = 0.5  # of an effort limit at most, however small that is
-LEAP = 1e-6  # of what an entry is weighed by: of another derivative at a limit than beside it
-NEIGHBOURHOOD = 1e-4  # in scaled coordinates: how far away a change of contact mode is looked for
-# A row is touched by one if its change departs from what the derivative predicts by this part of the larger one.
-TOUCHED = 1e-2
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """Where a step is differenced, and what around it is told."""
+
+    limit_reach: float = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
+    effort_room: float = 0.02  # of max(1, |u|): twice the widest step of the differences
+    effort_part: float = 0.5  # of an effort limit at most, however small that is
+    leap: float = 1e-6  # of what an entry is weighed by: of another derivative at a limit than beside it
+    neighbourhood: float = 1e-4  # in scaled coordinates: how far away a change of contact mode is looked for
+    touched: float = 1e-2  # by what part of the larger one a row's change departs from the derivative's prediction
+
+
+STEP = StepOptions()
 
 
 def certify(
@@ -116,7 +124,7 @@ def _at_limits(model: Model, x: Array) -> str:
     """Which positions are at or beyond a joint limit, where a step has a corner and its forces are stiff."""
     limits = []
     for name, q, low, high in zip(model.position_names, x, *model.position_limits, strict=False):
-        reach = NEIGHBOURHOOD * max(1.0, abs(q))
+        reach = STEP.neighbourhood * max(1.0, abs(q))
         if q <= low + reach or q >= high - reach:
             where = "beyond" if q < low or q > high else "at"
             limits.append(f"{name} is {q:.6g}, {where} its limits [{low:g}, {high:g}]")
@@ -139,7 +147,7 @@ def certify_inside(
         return certificate
     note = _joined(certificate.told, beside_limits(model, moved))
     leap = leap_at_limits(model, x, u, np.sign(inside - u), parameters)
-    if np.any(np.abs(leap) > LEAP * certificate.size):
+    if np.any(np.abs(leap) > STEP.leap * certificate.size):
         note += f", at which the derivative is another one, by up to {np.max(np.abs(leap)):.3g}"
         certificate = replace(certificate.of(certificate.derivative + leap), mode_changes=certificate.mode_changes)
     return replace(certificate, told=note)
@@ -153,7 +161,7 @@ def beside_limits(model: Model, at_limit: NDArray[np.bool_]) -> str:
 def with_room(model: Model, us: Array) -> Array:
     """Inputs (..., nu) that leave differences room to effort limits."""
     limits = form_of(model).cut
-    room = np.minimum(EFFORT_ROOM * np.maximum(1.0, np.abs(us)), EFFORT_PART * limits)
+    room = np.minimum(STEP.effort_room * np.maximum(1.0, np.abs(us)), STEP.effort_part * limits)
     return np.minimum(np.maximum(us, room - limits), limits - room)
 
 
@@ -162,7 +170,7 @@ def leap_at_limits(model: Model, x: Array, u: Array, inward: Array, parameters: 
     vector, both = select(model, parameters), []
     with applied(vector) as model:
         space = tangent_space(model)
-        for inputs in (u, u + JITTER * np.maximum(1.0, np.abs(u)) * inward):
+        for inputs in (u, u + LIMITS.jitter * np.maximum(1.0, np.abs(u)) * inward):
             d = step_jacobians(model, vector, x, inputs, "auto")
             both.append(space.jacobian(x, d.x_next, d.A, d.B, d.C))
     return np.asarray(both[0] - both[1])
@@ -261,13 +269,13 @@ def _find_mode_changes(step: StepAround, derivative: Array) -> tuple[ModeChange,
     centre, changes = f(np.zeros(len(directions))), []
     here = active_modes(model)
     for j, column in enumerate(space.names + model.input_names):
-        for reach in (NEIGHBOURHOOD, -NEIGHBOURHOOD):
+        for reach in (STEP.neighbourhood, -STEP.neighbourhood):
             move_by = reach * directions[j]
             change = space.minus(f(move_by), centre)
             there = active_modes(model)
             predicted = derivative @ move_by
             size = np.maximum(np.abs(predicted), np.abs(change))
-            missed = np.abs(change - predicted) > TOUCHED * np.maximum(size, 1e-6 * size.max(initial=0.0))
+            missed = np.abs(change - predicted) > STEP.touched * np.maximum(size, 1e-6 * size.max(initial=0.0))
             touched = tuple(name for name, miss in zip(space.names, missed, strict=True) if miss)
             for pair in sorted(pair for pair in here.keys() | there.keys() if here.get(pair) != there.get(pair)):
                 before, after = here.get(pair, SEPARATED), there.get(pair, SEPARATED)
@@ -279,7 +287,7 @@ def solver_tolerance(model: Model, x: Array, u: Array) -> float:
     """How accurately the step at (`x`, `u`) is solved: SAP's tolerance if SAP has anything to solve, else 0."""
     plant = model.plant
     advance(model.double, x, u)
-    q, reach = x[: model.nq], LIMIT_REACH + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)
+    q, reach = x[: model.nq], STEP.limit_reach + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)
     lower, upper = model.position_limits
     near_limit = np.any(q < lower + reach) or np.any(q > upper - reach)
     pd = any(actuator.has_controller() for actuator in actuators(plant))
@@ -332,7 +340,7 @@ def certify_steps(model: Model, xs: Array, us: Array, *, parameters: Parameters 
         at_limit = within != u
         if sure is not None and at_limit.any():
             leap = leap_at_limits(model, x, u, np.sign(within - u), parameters)
-            if np.any(np.abs(leap) > LEAP * sure.size):
+            if np.any(np.abs(leap) > STEP.leap * sure.size):
                 sure = None
             else:
                 sure = replace(sure, told=f"{sure.told}; {beside_limits(model, at_limit)}")

@@ -17,7 +17,7 @@ from math import comb
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.differences import RATIO_SQUARED, Difference, Many
+from drake_diff._base.differences import Difference, Many, richardson, sweep_of
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Neighbourhood:
         may be off: the spread of the three, the scatter and what the solver left, over the step.
         """
         central = (self.forward + self.backward) / 2
-        values = central[1:] + (central[1:] - central[:-1]) / (RATIO_SQUARED - 1)
+        values = richardson(central)
         three = np.array([values[w : w + 3] for w in range(len(values) - 2)])
         steps = np.array(DIFFERENCES.steps)[:, None, None]
         # An entry's own values scatter no more than they change at all: many entries are zero, and solved exactly.
@@ -94,27 +94,22 @@ def look_around(
     `unsolved` (m,) is how wrong a value may be at most because a solver stopped early: such jumps are no stairs. Nor is
     what comes of rounding the displaced `point` (n,), which is more than the value's own rounding where terms cancel.
     """
-    steps = np.array(DIFFERENCES.steps)[:, None, None]
-    sides = np.stack([steps * np.eye(n), -steps * np.eye(n)]).reshape(-1, n)
-    direction = _line(n)
-    values = f(np.vstack([np.zeros((1, n)), sides, _along(n)]))
-    centre = values[0]
+    sweep = sweep_of(f, n, DIFFERENCES.steps, minus=minus)
+    centre, ahead = sweep.centre, sweep.forward
+    rows, direction = ahead.shape[1], _line(n)
 
     def apart(some: Array) -> Array:
         return some - centre if minus is np.subtract else np.array([minus(value, centre) for value in some])
 
-    changes = apart(np.asarray(values[1:], dtype=float))
-    rows = changes.shape[1]
-    ahead, behind = changes[: len(sides)].reshape(2, len(DIFFERENCES.steps), n, rows).swapaxes(2, 3) / steps
     size = np.abs(centre) if minus is np.subtract else np.ones(rows)
-    along, rounding, by_spacing = _scattered(changes[len(sides) :], size)
+    along, rounding, by_spacing = _scattered(apart(np.asarray(f(_along(n)), dtype=float)), size)
     unknown = np.array(np.broadcast_to(unsolved, rows), dtype=float)
     if point is not None:
         unknown = np.maximum(unknown, DIFFERENCES.rounded_point * np.nan_to_num(np.abs(ahead[0])) @ np.abs(point))
     scatter = np.maximum(by_spacing[:, : DIFFERENCES.near].max(axis=(0, 1)), unknown / DIFFERENCES.safety)
     finest = np.maximum(by_spacing[:, 0].max(axis=0), unknown / DIFFERENCES.safety)
     stairs = _stairs(lambda t: apart(f(np.multiply.outer(t, direction))), along, by_spacing, rounding, unknown)
-    return Neighbourhood(centre, size, ahead, -behind, scatter, finest, stairs)
+    return Neighbourhood(centre, size, ahead, sweep.backward, scatter, finest, stairs)
 
 
 def is_broken(changes: Many, n: int) -> str:

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.differences import RATIO_SQUARED, Difference
+from drake_diff._base.differences import Difference, richardson
 from drake_diff.certificates.certificate import LIMITS, VERDICTS, Certificate, Flags, Scales, weighed
 
 
@@ -76,7 +76,7 @@ class FirstLook:
     def slopes(self) -> Array:
         """(s - 1, K, m) along the directions, from wide steps to small, with an error of order h^4."""
         central = (self.ahead + self.behind) / 2
-        return np.asarray(central[1:] + (central[1:] - central[:-1]) / (RATIO_SQUARED - 1))
+        return richardson(central)
 
     @property
     def noticeable(self) -> Array:
@@ -299,6 +299,9 @@ class SampleOptions:
     widest: float = 1e-2
     steady: float = 0.25  # numbers at two step sizes that differ by this part, or less, are not the differences' own
     alone: float = 1e-3  # of the squared gaps may be left by the one entry that explains them
+    rollouts: int = 20  # at most
+    doubt: float = 0.05  # of the derivative along a direction: what Drake's solver, stopping early, changed it by
+    elsewhere: float = 1e-3  # of the scale: how far from the motion a policy is led before it is asked again
 
 
 SAMPLE = SampleOptions()

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
 from drake_diff._base.differences import Many
 from drake_diff._base.values import ShowsItsRepr
-from drake_diff.certificates.certificate import JITTER, VERDICTS, Certificate, certify_displacement, jitter
+from drake_diff.certificates.certificate import LIMITS, VERDICTS, Certificate, certify_displacement, jitter
 from drake_diff.certificates.certify import differences_of_drake, differences_of_solved
 from drake_diff.certificates.directions import SAMPLE, Gaps, Probe, judge, weights
 from drake_diff.certificates.displaced import (
@@ -41,9 +41,6 @@ from drake_diff.model.parameters import Parameters, select
 from drake_diff.motion.gradient import CONTINUOUS, RolloutGradient
 from drake_diff.motion.loss import Loss
 from drake_diff.motion.rollout import Policy, check_inputs
-
-ROLLOUTS = 20
-DOUBT = 0.05  # of the derivative along a direction: what Drake's solver, stopping early, was seen to change it by
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -131,7 +128,7 @@ def certify_sampled(moved: Displaced, g: RolloutGradient, seed: int, spent: int,
         except NotSolvedError as why:
             note = differences_of_drake(str(why))
             probe = drake
-    doubt = DOUBT * float(np.linalg.norm(derivative * weight)) if probe is drake and tolerance else 0.0
+    doubt = SAMPLE.doubt * float(np.linalg.norm(derivative * weight)) if probe is drake and tolerance else 0.0
     if first is None:
         first, second = _two(drake, g.loss, budget)
     verdict, reason = judge(first, second, doubt)
@@ -168,7 +165,7 @@ class _Budget:
 
     @property
     def left(self) -> int:
-        return ROLLOUTS - self.spent
+        return SAMPLE.rollouts - self.spent
 
     def counting(self, f: Callable[[Array], Array]) -> Callable[[Array], Array]:
         def counted(displacements: Array) -> Array:
@@ -184,9 +181,6 @@ def _two(probe: Probe, loss: float, budget: _Budget) -> tuple[Gaps, Gaps | None]
     if judge(first, None, 0.0)[0] == "agree" or budget.left < 2 * SAMPLE.second:
         return first, None
     return first, probe.second(loss, first, SAMPLE.second)
-
-
-ELSEWHERE = 1e-3  # of the scale: how far from the motion a policy is led before it is asked again
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -369,7 +363,7 @@ def _checked(moved: Displaced, gradient: RolloutGradient) -> str:
     if moved.policy is None:
         return stairs
     elsewhere, time_step = fresh(moved.policy), moved.vector.time_step(moved.vector.values)
-    moved.losses(jitter(np.full(len(moved.scale), ELSEWHERE / JITTER))[None], elsewhere)
+    moved.losses(jitter(np.full(len(moved.scale), SAMPLE.elsewhere / LIMITS.jitter))[None], elsewhere)
     check_memory(elsewhere, gradient, time_step)
     return stairs or stairs_of_policy(moved.policy, gradient, moved.space, time_step)
 

@@ -57,6 +57,10 @@ class TruthOptions:
     sure: float = 3.0  # times what the integration's error is found to be
     rounded: float = 1e-15  # of a loss: its rounding
     unknown: float = 1e6  # of its size: what would have been noticed where nothing is measured
+    contraction: float = 0.75  # halfway between 1/2, which first order promises, and 1, no convergence
+    trusted: float = 0.1  # how far from its limit a gradient at finer steps may be, relative to it
+    still: float = 1e-2  # changes below this part tell no rate
+    spread: float = 0.05  # how uncertain a slope may be that a gradient is compared with, relative to its size
 
 
 TRUTH = TruthOptions()
@@ -368,11 +372,6 @@ def by_truth(truth: Truth, subject: str) -> dict[str, Any]:
 
 
 REFINEMENTS = (1, 2, 4)  # parts of a time step
-CONTRACTION = 0.75  # halfway between 1/2, which first order promises, and 1, no convergence
-TRUSTED = 0.1  # how far from its limit a gradient may be, relative to it
-STILL = 1e-2  # changes below this part tell no rate
-NEGLIGIBLE = 1e-3  # entries below this part of the largest are judged by its measure
-SPREAD = 0.05  # how uncertain the slope of the motion in continuous time may be, relative to its size
 
 
 @dataclass(frozen=True, eq=False)
@@ -451,13 +450,13 @@ def judge_levels(levels: tuple[float, ...], columns: Sequence[str], values: Arra
     d1, d2 = np.diff(values, axis=0)
     limit = values[2] + d2
     size = np.maximum(np.abs(values).max(axis=0), np.abs(limit))
-    scale = np.maximum(size, NEGLIGIBLE * float(size.max(initial=0.0)))
+    scale = np.maximum(size, TRUTH.negligible * float(size.max(initial=0.0)))
     for kind in set(kinds):
         alike = np.array(kinds) == kind
         scale[alike] = np.maximum(scale[alike], np.sqrt((size[alike] ** 2).mean()))
-    contracts = np.abs(d2) <= CONTRACTION * np.abs(d1)
-    still = np.maximum(np.abs(d1), np.abs(d2)) <= STILL * scale
-    near = np.abs(values[0] - limit) <= TRUSTED * scale
+    contracts = np.abs(d2) <= TRUTH.contraction * np.abs(d1)
+    still = np.maximum(np.abs(d1), np.abs(d2)) <= TRUTH.still * scale
+    near = np.abs(values[0] - limit) <= TRUTH.trusted * scale
     converged = ((contracts & near) | still) & np.all(np.isfinite(values), axis=0)
     return Refinement(levels, tuple(columns), frozen(values), frozen(limit), frozen(scale), converged)
 
@@ -497,7 +496,7 @@ def beside_truth(refinement: Refinement, lines: Sequence[Line], truth: Truth | N
         else:
             size = max(float(refinement.scale[line.columns].sum()), abs(slope.value))
             gap = abs(float(refinement.values[0, line.columns].sum()) - slope.value)
-            is_truth = slope.exists and gap <= TRUSTED * size and slope.error <= SPREAD * size
+            is_truth = slope.exists and gap <= TRUTH.trusted * size and slope.error <= TRUTH.spread * size
         if not is_truth:
             converged[line.columns] = False
             apart.append(line.name)
