@@ -115,12 +115,6 @@ def test_a_box_on_the_ground_has_the_derivative_that_autodiff_does_not():
     assert np.abs(found.A - differences.A).max() <= 1e-5 * np.abs(found.A).max()  # differences of 1e-6 of a stiff step
 
 
-def test_a_sliding_box_on_corner_spheres_is_differentiated_by_autodiff():
-    model = box_on_ground("corner_spheres")
-    x = sliding(model, (0.02, -0.03), 0.052)
-    check_the_derivative(model, x, 1e-7)  # measured 6e-10; SAP solves to a tolerance
-
-
 @pytest.mark.parametrize("contact_model", ["hydroelastic", "hydroelastic_with_fallback"])
 def test_a_sliding_hydroelastic_box_is_differentiated_by_autodiff(contact_model):
     model = box_on_ground("hydroelastic", contact_model)
@@ -203,23 +197,6 @@ def test_many_geometries_on_one_body_are_each_replaced():
         assert properties.GetProperty("material", "point_contact_stiffness") == 1e4 + i
 
 
-def test_the_material_is_carried_over():
-    plant = Plant(0.005)
-    properties = contact_properties(1234.0, 0.7, 0.35, 0.012)
-    properties.AddProperty("user", "label", 3.0)
-    body = add_body(plant, Box(*SIZE), properties=properties)
-    replaced(plant)
-    inspector = plant.scene_graph.model_inspector()
-    for i in range(8):
-        carried = inspector.GetProximityProperties(geometry_id(plant, body, f"box_shape_corner_{i}"))
-        friction = carried.GetProperty("material", "coulomb_friction")
-        assert (friction.static_friction(), friction.dynamic_friction()) == (0.35, 0.35)
-        assert carried.GetProperty("material", "point_contact_stiffness") == 1234.0
-        assert carried.GetProperty("material", "hunt_crossley_dissipation") == 0.7
-        assert carried.GetProperty("material", "relaxation_time") == 0.012
-        assert carried.GetProperty("user", "label") == 3.0
-
-
 def test_what_is_fixed_to_the_world_stays():
     plant = Plant(0.005)
     plant.shape(plant.plant.world_body(), Box(*SIZE), contact_properties(1e4))
@@ -229,14 +206,6 @@ def test_what_is_fixed_to_the_world_stays():
     plant.plant.WeldFrames(shelf.body_frame(), lip.body_frame())
     assert replaced(plant) == ()
     assert sorted(collision_names(plant)) == ["lip_shape", "shelf_shape", "world_shape"]
-
-
-def test_what_is_welded_to_a_moving_body_moves():
-    plant = Plant(0.005)
-    base, tool = add_body(plant, Sphere(0.1), name="base"), add_body(plant, Box(*SIZE), name="tool")
-    plant.plant.WeldFrames(base.body_frame(), tool.body_frame())
-    replaced(plant)
-    assert sorted(collision_names(plant)) == ["base_shape", *(f"tool_shape_corner_{i}" for i in range(8))]
 
 
 @pytest.mark.parametrize("kind", ["Ellipsoid", "Convex", "Mesh"])
@@ -288,18 +257,6 @@ def test_hydroelastic_properties_are_added_and_the_material_stays():
     assert carried.GetProperty("hydroelastic", "resolution_hint") == pytest.approx(0.05, rel=1e-12)  # half of 0.1 m
     assert carried.GetProperty("material", "point_contact_stiffness") == 1234.0
     assert carried.GetProperty("material", "coulomb_friction").dynamic_friction() == 0.35
-
-
-def test_hydroelastic_properties_of_its_own_stay():
-    plant = Plant(0.005, contact_model="hydroelastic")
-    properties = contact_properties(1e4)
-    AddCompliantHydroelasticProperties(0.02, 3e6, properties)
-    body = add_body(plant, Box(*SIZE), properties=properties)
-    (note,) = replaced(plant, "hydroelastic")
-    assert "keeps its own" in note
-    carried = plant.scene_graph.model_inspector().GetProximityProperties(geometry_id(plant, body, "box_shape"))
-    assert carried.GetProperty("hydroelastic", "hydroelastic_modulus") == 3e6
-    assert carried.GetProperty("hydroelastic", "resolution_hint") == 0.02
 
 
 def test_hydroelastic_in_a_plant_with_point_contact_is_an_error():

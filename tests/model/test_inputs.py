@@ -205,21 +205,6 @@ def test_a_body_force_that_makes_no_sense_is_refused(options, words):
         BodyForce(**({"name": "a", "body": "body"} | options))
 
 
-def test_a_body_force_beside_an_actuator_comes_after_it():
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=H, body_forces=[BodyForce("jet", "pole", lower=-9.0)])
-    assert model.input_names == ("force", "jet")
-    assert model.inputs.lower.tolist()[1] == -9.0
-    plain = dd.load_model(MODELS / "cart_pole.urdf", time_step=H)
-    x = np.array([0.1, 0.7, 0.2, -0.4])
-    assert dd.step(model, x, [3.0, 0.0]) == pytest.approx(dd.step(plain, x, [3.0]), abs=1e-13)
-    assert dd.differentiate_step(model, x, [3.0, 0.0]).B[:, :1] == pytest.approx(
-        dd.differentiate_step(plain, x, [3.0]).B, abs=1e-13
-    )
-    assert dd.certify(model, x, [3.0, 0.5]).verdict == "agree"
-    with pytest.raises(InputError, match="no name of an actuator"):
-        dd.load_model(MODELS / "cart_pole.urdf", time_step=H, body_forces=[BodyForce("force", "pole")])
-
-
 def pushed(add, *, robot_diagram=False, gains=None, mass=2.0):
     """A block of `mass` on a slide with a motor; `add(builder, plant)` adds the rest."""
     robot = RobotDiagramBuilder(time_step=H) if robot_diagram else None
@@ -400,39 +385,6 @@ def unconnected_drag():
 def test_systems_that_a_step_of_x_and_u_does_not_know_are_refused_by_name(add, words):
     with pytest.raises(ModelError, match=words):
         pushed(add)
-
-
-def test_a_state_that_does_not_act_on_the_plant_is_no_matter():
-    def add(builder, plant):
-        builder.ExportInput(builder.AddSystem(named_system(ZeroOrderHold(0.1, 1), "logger")).get_input_port(), "log")
-
-    model = pushed(add)
-    assert model.input_names == ("push",)
-    assert model.notes == ("the exported input log does not reach the plant",)
-
-
-def test_actuators_stand_where_the_diagram_exports_them():
-    def add(builder, plant):
-        gain = builder.AddSystem(Gain(2.0, 1))
-        builder.ExportInput(gain.get_input_port(), "before")
-        builder.Connect(gain.get_output_port(), plant.get_applied_generalized_force_input_port())
-        builder.ExportInput(plant.get_actuation_input_port(), "motors")
-
-    model = pushed(add)
-    assert model.input_names == ("before", "push")
-    assert model.inputs.upper.tolist() == [np.inf, 50.0]
-    d = dd.differentiate_step(model, [0.0, 0.0], [1.0, 1.0])
-    assert d.B[1] == pytest.approx([H * 2 / 2, H / 2], abs=1e-14)
-
-
-def test_a_generalized_force_that_is_exported_is_an_input_but_for_robot_diagrams():
-    """Those export all ports of the plant."""
-    add = lambda builder, plant: builder.ExportInput(plant.get_applied_generalized_force_input_port(), "force")  # noqa: E731
-    model = pushed(add)
-    assert model.input_names == ("push", "force")
-    assert model.contract.inputs[1].unit == "N"
-    assert dd.differentiate_step(model, [0.0, 0.0], [1.0, 2.0]).B[1] == pytest.approx([H / 2, H / 2], abs=1e-14)
-    assert pushed(lambda builder, plant: None, robot_diagram=True).input_names == ("push",)
 
 
 def test_targets_of_pd_control_can_be_inputs():

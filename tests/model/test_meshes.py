@@ -123,30 +123,6 @@ def test_a_mesh_is_found_by_any_of_its_names(tmp_path, uri):
     assert CalcVolume(shape) == pytest.approx(np.prod(EDGES), rel=ROUNDING)
 
 
-SDF = """<sdf version="1.9"><model name="r"><link name="base"/><link name="foot"><inertial><mass>2</mass></inertial>
-<pose>0 0 1 0 0 0</pose>
-<collision name="sole"><pose>0.1 0.2 0.3 0 0 1.5707963267948966</pose><geometry><mesh><uri>{uri}</uri>
-<scale>1 2 1</scale></mesh></geometry></collision>
-<visual name="seen"><geometry><mesh><uri>{uri}</uri></mesh></geometry></visual></link>
-<joint name="slide" type="prismatic"><parent>base</parent><child>foot</child><axis><xyz>0 0 1</xyz></axis></joint>
-</model></sdf>"""
-
-
-def test_sdf_has_its_own_words_for_the_same(tmp_path):
-    shapes().box(EDGES).export(tmp_path / "box.stl")
-    path = saved(tmp_path, "r.sdf", SDF.format(uri="box.stl"))
-    [(shape, pose)] = shapes_of(load(path))
-    assert CalcVolume(shape) == pytest.approx(2 * np.prod(EDGES), rel=ROUNDING)
-    np.testing.assert_allclose(pose.translation(), [0.1, 0.2, 0.3])
-    found = shapes_of(load(path, "spheres"))
-    centres = np.array([pose.translation() for _, pose in found])
-    radius = found[0][0].radius()
-    half = EDGES * [1, 2, 1] / 2
-    turned = half[[1, 0, 2]]  # by a quarter turn about z
-    reach = np.max(np.abs(centres - [0.1, 0.2, 0.3]), axis=0) + radius
-    np.testing.assert_allclose(reach, turned, rtol=1e-6)  # the corner spheres touch each face: the solver's tolerance
-
-
 def test_a_ball_becomes_one_sphere_of_its_size(tmp_path):
     ball = shapes().icosphere(subdivisions=3, radius=0.05)
     ball.export(tmp_path / "ball.stl")
@@ -209,25 +185,6 @@ def test_spheres_are_differentiated_and_hulls_are_refused(tmp_path):
     assert dd.certify(model, x, []).verdict == "agree"
     with pytest.raises(SimulationError, match="Convex"):
         dd.differentiate_step(load(path, ground=0.5), x, [], method="autodiff")
-
-
-def test_all_spheres_have_what_the_file_gives_to_the_mesh(tmp_path):
-    shapes().box(EDGES).export(tmp_path / "box.stl")
-    other = """<link name="hand"><inertial><mass value="1"/>
-    <inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>
-    <collision name="c"><geometry><sphere radius="0.1"/></geometry></collision></link>
-    <joint name="lift" type="prismatic"><parent link="base"/><child link="hand"/><axis xyz="0 0 1"/></joint>
-    <drake:collision_filter_group name="g"><drake:member link="foot"/><drake:member link="hand"/>
-    <drake:ignored_collision_filter_group name="g"/></drake:collision_filter_group>"""
-    model = load(saved(tmp_path, "r.urdf", urdf('<mesh filename="box.stl"/>', other)), "spheres")
-    inspector = model.double.inspector
-    found = list(inspector.GetAllGeometryIds(Role.kProximity))
-    feet = [g for g in found if "box" in inspector.GetName(g)]
-    [hand] = [g for g in found if g not in feet]
-    assert len(feet) == 8
-    assert all(inspector.CollisionFiltered(g, hand) for g in feet)
-    frictions = [inspector.GetProximityProperties(g).GetProperty("material", "coulomb_friction") for g in feet]
-    assert {friction.static_friction() for friction in frictions} == {0.3}
 
 
 @pytest.mark.solve

@@ -11,7 +11,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.derivatives.analytic import Reduced
-from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning
+from drake_diff.exceptions import GradientError, ModelError, ModelWarning
 from drake_diff.mechanics.description import describe
 from drake_diff.model.plant import actuators
 from drake_diff.model.plant import joints as joints_of
@@ -225,32 +225,6 @@ def test_what_cannot_be_reduced_is_refused(tmp_path, parts, words):
     )  # fmt: skip
     with pytest.raises(ModelError, match=words):
         load(path)
-
-
-def test_joints_that_follow_each_other_are_refused(tmp_path):
-    first = joint("a", "prismatic", "world", "a_link", "1 0 0", follows("b", 2.0))
-    second = joint("b", "prismatic", "world", "b_link", "1 0 0", follows("a", 0.5))
-    path = urdf(tmp_path, link("a_link", 1.0, 1.0), link("b_link", 1.0, 1.0), first, second)
-    for mimic in ("reduce", "fix"):
-        with pytest.raises(ModelError, match="follows itself"):
-            load(path, mimic)
-
-
-def test_a_policy_on_a_motor_of_a_follower_is_refused(tmp_path):
-    with pytest.raises(InputError, match="an actuator on b"):
-        dd.PD(load(sliders(tmp_path, motors=("b",))), kp=1.0, kd=1.0)
-
-
-def test_audit_names_the_joints_and_the_argument(tmp_path):
-    found = [f for f in dd.audit(load(sliders(tmp_path), None)) if f.code == "mimic_joint"]
-    assert [(f.severity, f.subject) for f in found] == [("warning", "b")]
-    assert "b = 1.7 a + 0.3" in found[0].message
-    assert 'mimic="reduce"' in found[0].remedy
-    assert not [f for f in dd.audit(load(sliders(tmp_path))) if f.code in ("mimic_joint", "constraints")]
-    path = tmp_path / "m.sdf"
-    path.write_text(SDF.format(inside=OF_SDF, beside=""))
-    (found,) = [f for f in dd.audit(load(path, None)) if f.code == "mimic_joint"]
-    assert "does not read" in found.message
 
 
 @each_row("name", ["pinocchio", "casadi"])

@@ -170,25 +170,6 @@ def test_a_spring_of_no_number_is_refused(tmp_path, spring):
         load(write(tmp_path, body))
 
 
-def test_what_is_included_is_read_and_other_lines_keep_their_numbers(tmp_path):
-    (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "arm.xml").write_text(
-        '<mujoco>\n<default>\n<joint damping="3"/></default>\n<!-- an arm -->\n<worldbody>\n'
-        f'{HINGE.format("", "")}</worldbody>\n<actuator>\n<motor joint="j" gear="3" ctrlrange="-2 2"/></actuator>'
-        "</mujoco>"
-    )
-    path = tmp_path / "scene.xml"
-    path.write_text('<mujoco model="scene">\n<include file="parts/arm.xml"/>\n<option wind="1 0 0"/>\n</mujoco>')
-    model = load(path)
-    assert model.plant.GetJointByName("j").default_damping() == 3.0
-    assert actuators(model.plant)[0].effort_limit() == 6.0
-    path.write_text(
-        '<mujoco model="scene">\n<include file="parts/arm.xml"/>\n<worldbody>\n<geom type="box"/></worldbody></mujoco>'
-    )
-    with pytest.raises(ModelError, match=rf"{path}:4: error: The size attribute"):
-        load(path)
-
-
 PYRAMID = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 

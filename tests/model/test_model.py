@@ -15,7 +15,6 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
-from drake_diff.model.parameters import applied, select
 
 NAMES = sorted(p.name for p in MODELS.iterdir())
 
@@ -63,11 +62,6 @@ def test_the_contract_is_the_models_own_whatever_was_set_when_it_was_first_asked
     model = load("cart_pole.urdf")
     dd.differentiate_step(model, np.zeros(4), [0.0], parameters={"pole.mass": 3.3})
     assert [body.mass for body in model.contract.bodies] == [1.0, 0.3]
-
-
-def test_a_ground_plane_can_be_added_with_its_friction(load):
-    c = load("projectile.sdf", ground=0.3).contract
-    assert [(g.body, g.shape, g.friction) for g in c.geometries] == [("world", "HalfSpace", 0.3)]
 
 
 @each_row(
@@ -320,14 +314,6 @@ def test_each_set_of_changes_is_a_model_of_its_own(load):
     assert model.changed(contact_approximation="lagged").time_step == model.time_step
 
 
-@pytest.mark.parametrize("gravity", [[0, 0, -1.62], (0, 0, -1.62), np.array([0, 0, -1.62])])
-def test_a_vector_is_the_same_change_as_list_tuple_or_array(load, gravity):
-    model = load("pendulum.urdf")
-    moon = model.changed(gravity=gravity)
-    assert moon.contract.gravity == (0, 0, -1.62)
-    assert model.changed(gravity=(0.0, 0.0, -1.62)) is moon
-
-
 def test_a_change_that_load_model_does_not_know_is_refused(load):
     with pytest.raises(UnknownNameError, match=r"one of actuators.*contact_approximation.*got 'friction'"):
         load("pendulum.urdf").changed(friction=1.0)
@@ -344,19 +330,3 @@ def test_a_change_that_load_model_does_not_know_is_refused(load):
 def test_a_change_that_has_no_hash_is_refused_by_name(load, change, words):
     with pytest.raises(InputError, match=words):
         load("pendulum.urdf").changed(**change)
-
-
-def test_what_is_made_under_other_parameters_is_not_kept(load):
-    model = load("pendulum.urdf")
-    with applied(select(model, {"pole.mass": 5.0})):
-        assert model.cache("key", lambda: "of the heavy pole") == "of the heavy pole"
-    assert model.cache("key", lambda: "its own") == "its own"
-    assert model.cache("key", lambda: "another") == "its own"
-
-
-def test_names_from_a_file_are_escaped_in_html(tmp_path):
-    (tmp_path / "r.urdf").write_text(urdf('name="j"', 'name="&lt;script&gt;"'))
-    model = dd.load_model(tmp_path / "r.urdf", time_step=0.01)
-    for html in (model._repr_html_(), model.contract._repr_html_()):
-        assert "&lt;script&gt;" in html
-        assert "<script>" not in html

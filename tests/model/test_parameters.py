@@ -33,7 +33,6 @@ from drake_diff.model.parameters import (
     from_log_cholesky,
     matrix,
     room_of_inertia,
-    second_moment,
     to_log_cholesky,
 )
 
@@ -265,20 +264,6 @@ def test_beside_an_inertia_the_mass_no_longer_moves_it(h, q, w, u):
         assert d.C[1, d.parameters.index("pole.mass")] == pytest.approx(by_mass, rel=SMOOTH)
 
 
-@each_row("k, rest", [(20.0, 0.3), (0.0, -1.0), (150.0, 2.0)])
-@each_row("h, q, w, u", PENDULA)
-def test_a_pendulum_by_its_spring(h, q, w, u, k, rest):
-    """(I + h b) w+ = I w + h (u - m g l sin q - k (q - rest))."""
-    whole, b = 0.2 + 1.4 * 0.25, 0.3
-    model = compound(h=h, spring=(k, rest))
-    by_k, d = column(model, [q, w], [u], "hinge.spring_stiffness")
-    by_rest, _ = column(model, [q, w], [u], "hinge.spring_rest_angle")
-    torque = u - 1.4 * G * 0.5 * math.sin(q) - k * (q - rest)
-    assert d.x_next[1] == pytest.approx((whole * w + h * torque) / (whole + h * b), rel=SMOOTH)
-    assert by_k[0, 0] == pytest.approx(-h * (q - rest) / (whole + h * b), rel=SMOOTH)
-    assert by_rest[0, 0] == pytest.approx(h * k / (whole + h * b), rel=SMOOTH, abs=1e-14)
-
-
 @pytest.mark.parametrize(("x", "v", "u", "h"), [(0.35, -0.4, 1.0, 0.01), (-0.2, 2.0, -7.0, 0.003)])
 def test_a_block_by_its_spring(load, x, v, u, h):
     """v+ = s (v + h (u - k (x - rest)) / m), s = 1 / (1 + h c / m)."""
@@ -338,48 +323,6 @@ def test_a_spinning_body_by_its_inertia(seed, central):
         expected = R @ (h * inverse @ (E @ inverse @ gyroscopic - np.cross(w, E @ w)))
         assert d.C[7:10, i] == pytest.approx(expected, rel=1e-8, abs=1e-12)
     assert d.C[10:] == pytest.approx(0, abs=1e-12)  # a free fall knows no inertia
-
-
-@each_row("seed", range(3))
-@each_row("offset", [(0.0, 0.0, -0.8), (0.3, 0.1, -0.5), (0.0, 0.0, 0.0)])
-def test_a_double_pendulum_by_its_link_length(seed, offset):
-    """With the elbow at (ox, oy, oz) of the upper rod: M, bias and G are polynomials in ox and oz."""
-    random, h = np.random.default_rng(seed), 0.005
-    (q1, q2), (w1, w2), u = random.standard_normal((3, 2))
-    m1, m2, l1, l2 = 1.0, 0.7, 0.8, 0.5
-    made = Plant(h)
-    plant = made.plant
-    upper = plant.AddRigidBody("upper", rod(m1, l1))
-    lower = plant.AddRigidBody("lower", rod(m2, l2))
-    shoulder = plant.AddJoint(RevoluteJoint("shoulder", plant.world_frame(), upper.body_frame(), [0, 1, 0]))
-    frame = plant.AddFrame(FixedOffsetFrame("mount", upper.body_frame(), RigidTransform(np.array(offset))))
-    elbow = plant.AddJoint(RevoluteJoint("elbow", frame, lower.body_frame(), [0, 1, 0]))
-    plant.AddJointActuator("shoulder_motor", shoulder)
-    plant.AddJointActuator("elbow_motor", elbow)
-
-    half = m2 * l2 / 2
-    cosine, sine = np.array([[2, 1], [1, 0]]), np.array([-(2 * w1 * w2 + w2**2), w1**2])
-
-    def terms(ox, oz, square):
-        """M, bias + G of the arm (ox, oz), `square` being what ox^2 + oz^2 contributes."""
-        arm_dot = -half * (oz * math.cos(q2) + ox * math.sin(q2))  # c cos(q2 - phi)
-        arm_cross = half * (ox * math.cos(q2) - oz * math.sin(q2))  # c sin(q2 - phi)
-        weight = -m2 * G * (oz * math.sin(q1) + ox * math.cos(q1))
-        return m2 * square * np.diag([1, 0]) + arm_dot * cosine, arm_cross * sine + [weight, 0]
-
-    ox, _, oz = offset
-    M, forces = terms(ox, oz, ox**2 + oz**2)
-    M = M + np.array([[m1 * l1**2 / 3 + m2 * l2**2 / 3, m2 * l2**2 / 3], [m2 * l2**2 / 3, m2 * l2**2 / 3]])
-    lower_weight = half * G * math.sin(q1 + q2)
-    forces = forces + np.array([m1 * G * l1 / 2 * math.sin(q1) + lower_weight, lower_weight])
-    acceleration = np.linalg.solve(M, u - forces)
-    c, d = column(made.model(), [q1, q2, w1, w2], u, "elbow.offset")
-    assert d.x_next[2:] == pytest.approx([w1, w2] + h * acceleration, rel=1e-10, abs=1e-12)
-    for axis, by_arm, square in ((0, (1, 0), 2 * ox), (2, (0, 1), 2 * oz)):
-        by_M, by_forces = terms(*by_arm, square)
-        expected = -h * np.linalg.solve(M, by_forces + by_M @ acceleration)
-        assert c[:, axis] == pytest.approx(expected, rel=1e-8, abs=1e-12)
-    assert c[:, 1] == pytest.approx(0, abs=1e-12)  # along the hinges nothing changes
 
 
 def rod(mass, length):
@@ -695,14 +638,6 @@ def test_an_arm_with_a_value_given_is_the_arm_built_with_it(name):
     same_motion(arm(), {name: ARM_CHANGES[name]}, arm(**{name: ARM_CHANGES[name]}), np.array(x), np.tile(u, (8, 1)))
 
 
-def test_an_arm_with_all_values_given_is_the_arm_built_with_them():
-    """In an order in which each setting would spoil another one, were it applied as given."""
-    x, u = ARM_POINT
-    values = {name: ARM_CHANGES[name] for name in ("pole.inertia", "pole.center_of_mass", "pole.mass")}
-    values |= {k: v for k, v in ARM_CHANGES.items() if k not in values}
-    same_motion(arm(), values, arm(**ARM_CHANGES), np.array(x), np.tile(u, (8, 1)))
-
-
 @pytest.mark.slow
 @each_row("approximation", ["lagged", "sap", "similar"])
 @each_row("name", [name for name in BALL_CHANGES if "modulus" not in name])
@@ -713,15 +648,6 @@ def test_a_ball_with_a_value_given_is_the_ball_built_with_it(name, approximation
         differs = not np.allclose(dd.step(model, ball_state(model)), dd.step(built, ball_state(model)), atol=1e-6)
         assert differs == (not name.endswith(unused))
     same_motion(model, {name: BALL_CHANGES[name]}, built, ball_state(model), np.zeros((8, 0)))
-
-
-@pytest.mark.slow
-@each_row("name", ["ball.hydroelastic_modulus", "ball.friction"])
-def test_a_hydroelastic_ball_with_a_value_given_is_the_ball_built_with_it(name):
-    made = [ball("lagged", "hydroelastic", **change) for change in ({}, {name: BALL_CHANGES[name]})]
-    x = ball_state(made[0])
-    assert not np.allclose(dd.step(made[0], x), dd.step(made[1], x), atol=1e-7)
-    same_motion(made[0], {name: BALL_CHANGES[name]}, made[1], x, np.zeros((4, 0)))
 
 
 @pytest.mark.parametrize(
@@ -743,16 +669,6 @@ def test_every_round_shape_has_a_radius_that_can_be_given(shape):
     other = dd.step(lying(0.12), x)
     assert not np.allclose(other, dd.step(model, x), atol=1e-6)
     assert dd.step(model, x, parameters={"roll.radius": 0.12}) == pytest.approx(other, abs=1e-10)
-
-
-@each_row("name", ["pendulum.urdf", "acrobot.xml", "sphere_on_ground.sdf"])  # a file of each kind
-def test_another_time_step_given_is_the_model_loaded_with_it(load, name):
-    model, built = load(name), load(name, time_step=0.004)
-    x = model.default_state
-    x[-1] += 0.3
-    us = np.full((5, model.nu), 0.2)
-    same_motion(model, {"model.time_step": 0.004}, built, x, us)
-    assert dd.rollout(model, x, us, parameters={"model.time_step": 0.004}).times[-1] == pytest.approx(0.02)
 
 
 def test_a_time_step_and_other_values_go_together(load):
@@ -898,11 +814,6 @@ def test_bad_values_are_named(load, parameters, error, words):
     assert np.array_equal(dd.step(model, [0.3, 0.1], [0.2]), before)
 
 
-def test_a_name_given_twice_is_refused(load):
-    with pytest.raises(InputError, match="each name once"):
-        dd.differentiate_step(load("pendulum.urdf"), [0, 0], [0], parameters=("pole.mass", "pole.mass"))
-
-
 def test_a_body_and_one_of_its_geometries_are_refused_together():
     model = ball()
     with pytest.raises(InputError, match=r"ball\.friction and ball/tip\.friction"):
@@ -953,16 +864,6 @@ def test_the_derivative_of_log_cholesky_coordinates_agrees_with_differences(seed
     value, jacobian = derivative_of_from_log_cholesky(z)
     assert value == pytest.approx(from_log_cholesky(z), rel=1e-14)
     certify_jacobian(lambda z: np.asarray(from_log_cholesky(z), dtype=float), z, jacobian).require()
-
-
-@each_row("seed", range(30))
-def test_all_coordinates_are_of_an_inertia_that_a_body_can_have(seed):
-    """Positive definite, and each principal moment at most the sum of the other two."""
-    inertia = from_log_cholesky(3 * np.random.default_rng(seed).standard_normal(6))
-    moments = np.linalg.eigvalsh(matrix(inertia))
-    assert moments[0] > 0
-    assert moments[2] <= moments[0] + moments[1] + 1e-12 * moments[2]
-    assert np.linalg.eigvalsh(second_moment(inertia))[0] > -1e-12 * moments[2]
 
 
 def test_a_cube_has_the_coordinates_of_its_second_moment():

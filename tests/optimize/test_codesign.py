@@ -193,25 +193,6 @@ def test_a_block_whose_lightness_has_its_price(method, steps, close):
     assert solution.cost == pytest.approx(effort * mass**2 + price * (heaviest - mass) ** 2, rel=close)
 
 
-def test_a_parameter_at_its_bound_stays_within_it():
-    """A lighter pole always needs less."""
-    problem = dd.Problem(
-        named("pendulum.urdf"),
-        x0=[0, 0],
-        x_goal=[2, 0],
-        num_steps=100,
-        running_cost=EFFORT,
-        optimize=BOTH,
-        parameters=("pole.mass",),
-        parameter_bounds={"pole.mass": (0.5, 2.0)},
-    )
-    solution = dd.solve(problem)
-    assert solution.method == "collocation"
-    assert solution.success, solution.message
-    assert 0.5 <= solution.parameters[0] <= 0.5 + 1e-6
-    assert solution.bound_violation == 0
-
-
 # ------------------------------------------------------------------------------ the length of a step
 
 
@@ -314,20 +295,6 @@ def test_a_diagram_has_one_length_of_a_step():
             InputError, match=r"steps of a diagram, which are of one length: method=.collocation. takes"
         ):
             dd.solve(problem, method=method)
-
-
-@pytest.mark.slow
-def test_a_plan_with_a_free_step_is_in_its_record(tmp_path):
-    problem = dd.Problem(
-        sliding(1.0, 2.0, tmp_path), x0=[0, 0], x_goal=[1, 0], num_steps=6, horizon=(0.5, 10), running_cost=1.0
-    )
-    solution = dd.solve(problem, method="ilqr")
-    assert solution.success, solution.message
-    dd.save(solution, tmp_path / "run")
-    assert dd.verify(tmp_path / "run").holds
-    forged = dataclasses.replace(solution, free_horizon=1.1 * solution.horizon)
-    dd.save(forged, tmp_path / "forged")
-    assert not dd.verify(tmp_path / "forged").holds
 
 
 # ------------------------------------------------------------------------------ refusals
@@ -478,25 +445,3 @@ def test_what_is_linearized_has_the_parameters_that_are_applied(name, parameters
         assert found == pytest.approx(wanted, abs=1e-8)
     own = dd.linearize(model, xs, us, "autodiff")[0][0]
     assert own == pytest.approx(dd.differentiate_step(model, xs[0], us[0]).A, abs=1e-12)
-
-
-def test_the_parameters_of_plain_dynamics_need_not_be_named():
-    """The lightest of masses between 0.5 and 2 kg is the quickest: T = 2 sqrt(m d / F)."""
-    block = dd.Dynamics(
-        lambda x, u, p: [x[1], u[0] / p[0]], nx=2, nu=1, parameters={"mass": 1.0}, u_lower=[-1], u_upper=[1]
-    )
-    problem = dd.Problem(
-        block,
-        x0=[0, 0],
-        x_goal=[1, 0],
-        num_steps=30,
-        horizon=(0.1, 10),
-        running_cost=1.0,
-        optimize=("controls", "parameters"),
-        parameter_bounds={"mass": (0.5, 2)},
-    )
-    assert problem.parameters.names == ("mass",)
-    solution = dd.solve(problem)
-    assert solution.success, solution.message
-    assert solution.parameters[0] == pytest.approx(0.5, rel=1e-6)
-    assert solution.horizon == pytest.approx(2 * 0.5**0.5, rel=2e-3)  # the switch lies within an interval

@@ -1,7 +1,6 @@
 """Collocation against closed forms and a dense solve of the same transcription, and what it refuses."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -33,16 +32,6 @@ def collocate(problem, **options):
     return dd.solve(problem, method="collocation", scheme="drake", **options)
 
 
-@pytest.mark.slow
-@each_row("count", [2, 4, 10, 20])
-@each_row("solver", ["ipopt", "snopt"])
-def test_the_block_moves_by_the_transcriptions_own_optimum(count, solver):
-    """Of Drake's scheme J = 12 / (1 - 2/N^2 + 4/(3 N^3)): linear inputs, the running cost by trapezoids."""
-    solution = collocate(move(count), solver=solver)
-    assert solution.success, solution.message
-    assert solution.cost == pytest.approx(12 / (1 - 2 / count**2 + 4 / (3 * count**3)), rel=1e-8)
-
-
 def dense_block(count, h, Q, R, Qf, target):
     """xs, us (knots) of min trapezoid(x'Qx + R u^2) + (x_N - target)'Qf(x_N - target), by least squares."""
     steps = np.zeros((count + 1, 2, count + 1))  # x_k = steps[k] @ u, exact for linear u
@@ -69,26 +58,6 @@ def test_running_and_final_costs_give_the_dense_solves_optimum(as_functions):
     assert solution.success, solution.message
     assert solution.xs == pytest.approx(xs, abs=1e-6)
     assert solution.inputs_at_knots[:, 0] == pytest.approx(us, abs=1e-5)
-
-
-@each_row("solver", ["ipopt", "snopt"])
-def test_a_state_bound_is_kept_between_the_knots(solver):
-    """Bryson and Denham: x <= 1/9 from (0, 1) to (0, -1) within 1 s costs 4 at least, 3.98 with knots alone bounded."""
-    fields = {"x0": [0, 1], "x_goal": [0, -1], "running_cost": dd.QuadraticCost(R=[[0.5]])}
-    solution = collocate(move(bounds=dd.Bounds(x_upper=[1 / 9, 9]), **fields), solver=solver)
-    assert solution.success, solution.message
-    assert solution.transcribed.at(np.linspace(0, 1, 5001))[0][:, 0].max() < 1 / 9 + 1e-7
-    assert 4 < solution.cost < 4.2
-
-
-def test_a_free_initial_velocity_keeps_its_bound():
-    """v_0 <= 0.3 although 1 would need no effort: shooting keeps this bound, and so must collocation."""
-    changes = {"optimize": ("controls", "initial_state"), "initial_state_mask": [False, True]}
-    problem = move(x_goal=[1, math.nan], bounds=dd.Bounds(x_upper=[9, 0.3], u_upper=[99]), **changes)
-    wide = move(x_goal=[1, math.nan], bounds=dd.Bounds(x_upper=[9, 2.0]), **changes)
-    assert collocate(wide).xs[0, 1] == pytest.approx(1.0, abs=1e-6)
-    solution = collocate(problem)
-    assert not solution.success or solution.xs[0, 1] <= 0.3 + 1e-6
 
 
 def test_a_coupled_model_is_refused():

@@ -10,7 +10,6 @@ from helpers.problems import DOUBLE_INTEGRATOR, lqr
 
 import drake_diff as dd
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
-from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 METHODS = {
@@ -60,20 +59,6 @@ def test_a_waypoint_is_the_kkt_systems_solution(method):
     assert solution.us[:, 0] == pytest.approx(us, abs=1e-5)
     assert solution.cost == pytest.approx(us @ us / count, rel=1e-7)
     assert solution.xs[10, 0] == pytest.approx(1.5, abs=1e-7)
-
-
-@by_each_method
-def test_a_speed_limit_as_a_constraint_is_the_same_as_a_bound(method):
-    """v <= 1.2. Where it is not active the input is linear: u_k - u_(k+1) is one constant at either end."""
-    as_bound = solved(move(bounds=dd.Bounds(x_upper=[np.inf, 1.2])), method)
-    as_constraint = solved(move(constraints=dd.Constraint(lambda x: x[1], upper=1.2, name="speed")), method)
-    assert as_constraint.cost == pytest.approx(as_bound.cost, rel=1e-6)
-    assert as_constraint.xs == pytest.approx(as_bound.xs, abs=1e-6)
-    active = np.flatnonzero(as_constraint.xs[:, 1] > 1.2 - 1e-7)
-    assert len(active) > 3
-    S = double_integrator(20)  # the KKT system with the limit as an equality where it is active
-    us = least_effort(20, np.vstack([S[20], S[active, 1]]), np.concatenate([[1, 0], np.full(len(active), 1.2)]))
-    assert as_constraint.us[:, 0] == pytest.approx(us, abs=1e-5)
 
 
 @pytest.mark.solve
@@ -148,17 +133,6 @@ def test_a_point_goes_around_a_disc(method):
     assert distance.min() == pytest.approx(0.5, abs=1e-6)
     assert solution.xs[np.argmin(distance), 1] > 0
     assert solution.cost == pytest.approx(solved(problem, "ilqr", initial_guess=solution).cost, rel=1e-6)
-
-
-@by_each_method
-def test_contradictory_constraints_are_infeasible(method):
-    apart = [
-        dd.Constraint(lambda x: x[0], lower=1, knots=5),
-        dd.Constraint(lambda x: x[0] + 0 * x[1], upper=0.5, knots=5),
-    ]
-    solution = dd.solve(move(10, constraints=apart), **METHODS[method])
-    assert solution.status is Status.INFEASIBLE, solution.message
-    assert any(c.what == "constraint" for c in solution.plan_checks.failing)
 
 
 def test_a_constraint_that_never_acts_leaves_one_full_step():

@@ -76,11 +76,6 @@ def test_an_indefinite_hessian_keeps_its_positive_part():
     assert hessian == pytest.approx(np.full((2, 2), 0.5), abs=1e-8)
 
 
-def test_a_semidefinite_weight_is_allowed():
-    """[[1, 1], [1, 1]] has the eigenvalue 0, which rounding may put below."""
-    assert dd.QuadraticCost(Q=[[1.0, 1.0], [1.0, 1.0]])(np.array([1.0, -1.0])) == 0.0
-
-
 @each_row(
     "fields, words",
     [

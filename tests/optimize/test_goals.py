@@ -178,39 +178,11 @@ def test_checks_say_in_metres_how_far_the_hand_ends(arm):
         assert (c.value, c.tolerance, c.unit) == (pytest.approx(np.linalg.norm(off), rel=1e-9), 0.005, "m")
 
 
-def test_a_hand_that_replays_miss_is_no_success(arm):
-    """Steps of 50 ms move the end by more than 1 um, however well the plan itself ends."""
-    solution = dd.solve(reach(arm, goals=tip(tolerance=1e-6)), method="collocation", progress=False)
-    assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
-    assert any(c.tolerance == 1e-6 and c.where == "lower position" for c in solution.checks.failing)
-
-
 @pytest.mark.slow
 def test_a_goal_out_of_reach_is_named(arm):
     far = dd.solve(reach(arm, goals=tip(position=[-2.0, None, 0.0])), method="collocation", progress=False)
     assert not far.success
     assert "a goal within reach (lower position is " in far.message
-
-
-TWO_SLIDES = """<robot name="two"><link name="a">{mass}</link><link name="b">{mass}</link>
-<joint name="slide_a" type="prismatic"><parent link="world"/><child link="a"/><axis xyz="1 0 0"/></joint>
-<joint name="slide_b" type="prismatic"><parent link="world"/><child link="b"/><axis xyz="0 1 0"/></joint>
-<transmission><type>transmission_interface/SimpleTransmission</type><joint name="slide_a">
-<hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="m"/></transmission></robot>"""
-
-
-def test_a_goal_that_nothing_moves_is_named(tmp_path):
-    """A slide without a motor, beside one that has one."""
-    file = tmp_path / "two.urdf"
-    mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-    file.write_text(TWO_SLIDES.format(mass=mass))
-    model = dd.load_model(file, time_step=0.02)
-    for frame, moved in (("a", True), ("b", False)):
-        goal = dd.FrameGoal(frame, [0.1, None, None] if moved else [None, 0.1, None])
-        problem = dd.Problem(model, x0={}, num_steps=10, goals=goal, running_cost=dd.QuadraticCost(R=[[1.0]]))
-        solution = dd.solve(problem, method="shooting", progress=False)
-        assert ("no variable moves b position, and b position is 0.1 m off" in solution.message) != moved
-        assert (solution.status is dd.Status.NO_GRADIENT) != moved
 
 
 def test_a_weight_makes_a_goal_a_cost(arm):
@@ -314,18 +286,6 @@ def test_goals_have_the_same_derivatives_by_symbols_and_by_autodiff(name):
     if name == "solo12.urdf":
         states[2, :4] *= 1.1
     check_symbols(model, states, random)
-
-
-def test_a_frame_on_a_joint_that_follows_another_is_placed_too():
-    """The Panda's second finger, whose coordinate is not in the state."""
-    model, random = (
-        dd.load_model(robot_file("panda.urdf"), time_step=0.01, actuators="all", mimic="reduce"),
-        np.random.default_rng(0),
-    )
-    assert model.nq == model.plant.num_positions() - 1
-    check_symbols(model, random.uniform(-0.5, 0.5, (2, model.nx)), random)
-    with pytest.raises(UnknownNameError, match="panda_finger_joint1,"):
-        dd.Problem(model, x0={"panda_finger_joint2": 0.01}, num_steps=3, x_goal={})
 
 
 def test_joints_of_every_kind_are_placed_as_drake_does():

@@ -103,16 +103,6 @@ def test_drakes_trajectories_are_a_guess(write_urdf):
     assert collocated.search.guess[2] == 1.0
 
 
-@pytest.mark.slow
-def test_a_run_that_began_from_drakes_trajectories_verifies(write_urdf, tmp_path):
-    """What is recorded are the arrays that they came to, so that the search is the same one again."""
-    first = dd.solve(plant(write_urdf), method="ilqr")
-    problem = plant(write_urdf, 20, 0.05)
-    for name, guess in (("trajectories", first.trajectory()), ("solution", first)):
-        dd.save(dd.solve(problem, method="shooting", initial_guess=guess), tmp_path / name)
-        assert dd.verify(tmp_path / name).holds
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [

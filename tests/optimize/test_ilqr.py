@@ -13,9 +13,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic, minimize_in_box, solve_riccati
-from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.solution import Status
 
 pytestmark = pytest.mark.solve
@@ -40,13 +38,6 @@ def test_one_step_from_any_guess_is_the_riccati_recursions_optimum(case, seed, i
     assert solution.cost == pytest.approx(x0 @ P @ x0, rel=1e-12)
     for x, u, K in zip(solution.xs, solution.us, gains, strict=False):
         assert u == pytest.approx(-K @ x, abs=1e-10)
-
-
-def test_the_oracles_digits():
-    """The double integrator: J* = 12.948481280713864, u_0 = -K_0 x_0 = -2.61821518."""
-    solution = dd.solve(lqr(*DOUBLE_INTEGRATOR), method="ilqr")
-    assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)
-    assert solution.us[0, 0] == pytest.approx(-2.61821518, abs=5e-9)  # half of the last digit given
 
 
 @pytest.mark.parametrize("case", OTHERS)
@@ -116,15 +107,6 @@ def test_the_cost_falls_from_row_to_row():
     assert costs[-1] == solution.cost
 
 
-def test_a_function_is_optimized_like_the_quadratic_cost_it_is():
-    """The same problem; second derivatives by differences of 1e-5 cost digits, so it may take more than one step."""
-    h, _, Q, R, Qf = DOUBLE_INTEGRATOR
-    running = {"running_cost": lambda x, u: (x @ Q @ x + R * u[0] ** 2) / h}
-    solution = dd.solve(lqr(*DOUBLE_INTEGRATOR, **running, final_cost=lambda x: x @ Qf @ x), method="ilqr")
-    assert solution.success, solution.message
-    assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -150,47 +132,6 @@ def test_ctrl_c_ends_it_with_the_motion_so_far():
     assert solution.cost < 50.2 * np.pi**2  # that of the guess
     assert solution.defect < 1e-12
     assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_a_guess_outside_the_bounds_is_taken_inside():
-    """min u^2 within 1 <= u <= 2 is u = 1, at the bound; the guess is at 9."""
-    problem = dd.Problem(
-        block(),
-        x0=[0, 0],
-        num_steps=5,
-        running_cost=dd.QuadraticCost(R=[[1.0]]),
-        bounds=dd.Bounds(u_lower=[1.0], u_upper=[2.0]),
-    )
-    solution = dd.solve(problem, method="ilqr", initial_guess=(np.zeros((6, 2)), np.full((5, 1), 9.0)))
-    assert solution.success, solution.message
-    assert solution.us.tolist() == [[1.0]] * 5
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_two_blocks_too_are_solved_in_one_step_from_an_infeasible_guess(seed):
-    """4 states and 2 inputs whose costs are coupled, against the normal equations of the stacked problem."""
-    random, h, count = np.random.default_rng(seed), 0.1, 12
-    root = random.standard_normal((6, 6))
-    weight = root @ root.T
-    Q, R, x0 = weight[:4, :4], weight[4:, 4:] + np.eye(2), random.standard_normal(4)
-    problem = dd.Problem(
-        block(time_step=h, blocks=2, actuated=2),
-        x0=x0,
-        num_steps=count,
-        running_cost=dd.QuadraticCost(Q=Q / h, R=R / h),
-        final_cost=dd.QuadraticCost(Q=Q),
-    )
-    guess = 10 * random.standard_normal((count + 1, 4)), 10 * random.standard_normal((count, 2))
-    solution = dd.solve(problem, method="ilqr", initial_guess=guess)
-    A, B = np.kron([[1, h], [0, 1]], np.eye(2)), np.kron([[h**2], [h]], np.eye(2))
-    P = Q
-    for _ in range(count):
-        P = Q + A.T @ P @ (A - B @ np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
-    assert solution.success, solution.message
-    assert len(solution.iterations) == 2
-    assert solution.iterations[0].primal_infeasibility > 1
-    assert solution.iterations[1].primal_infeasibility == 0
-    assert solution.cost == pytest.approx(x0 @ P @ x0, rel=1e-12)
 
 
 def test_a_step_of_size_a_leaves_the_rest_of_each_gap():
@@ -230,17 +171,6 @@ def test_the_pendulum_of_drake_ddp():
     assert len(solution.iterations) < 40  # 199 without
 
 
-@pytest.mark.parametrize(("count", "mass", "distance"), [(10, 1.0, 1.0), (100, 1.0, 1.0), (25, 2.5, -0.3)])
-def test_a_block_is_moved_with_the_least_effort(count, mass, distance):
-    """Least effort by symplectic Euler: 12 m^2 d^2 / T^3 / (1 - 1 / N^2); rounding of a multiplier, the goal's 1e-8."""
-    model = block(mass=mass, time_step=1 / count)
-    problem = dd.Problem(model, x0=[0, 0], x_goal=[distance, 0], num_steps=count, running_cost=EFFORT)
-    solution = dd.solve(problem, method="ilqr")
-    assert solution.success, solution.message
-    assert solution.cost == pytest.approx(12 * mass**2 * distance**2 / (1 - 1 / count**2), rel=1e-8)
-    assert solution.goal_error < 1e-8
-
-
 def move(count=20, goal=(1, 0), **bounds):
     model = block(time_step=1 / count)
     fields = {"x0": [0, 0], "num_steps": count, "running_cost": EFFORT, "bounds": dd.Bounds(**bounds)}
@@ -267,16 +197,6 @@ def test_a_velocity_limit_is_met_and_pays():
     assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
 
 
-@pytest.mark.parametrize("bounds", [{"u_lower": [-5.0], "u_upper": [5.0]}, {"u_lower": [-4.5], "x_upper": [2, 1.4]}])
-def test_input_bounds_with_a_goal_give_the_optimum_of_ipopt(bounds):
-    problem = move(**bounds)
-    a = dd.solve(problem, method="ilqr")
-    b = dd.solve(problem, method="shooting")
-    assert a.success, a.message
-    assert a.us.min() == bounds["u_lower"][0]
-    assert a.cost == pytest.approx(b.cost, rel=1e-6)
-
-
 def test_cart_pole_swing_up_from_rest():
     """The optimum of examples/cart_pole_swing_up.py at 50 steps: 58.6088 by SNOPT and IPOPT.
 
@@ -294,19 +214,6 @@ def test_cart_pole_swing_up_from_rest():
         assert found.goal_error < 1e-6
         assert found.cost == pytest.approx(58.6088133284, rel=1e-8)
     assert len(again.iterations) < 12  # a good guess is not left
-
-
-def test_a_floating_body_is_turned_upright_and_stopped():
-    """The quaternion's vector part and the rates are the goal; its norm grows, so that its scalar part is free."""
-    model = craft()
-    goal = np.full(model.nx, np.nan)
-    goal[[1, 2, 3, *range(model.nq, model.nq + 3)]] = 0
-    cost = dd.QuadraticCost(R=np.eye(3))
-    problem = dd.Problem(model, x0=tilted(model), x_goal=goal, num_steps=40, running_cost=cost)
-    solution = dd.solve(problem, method="ilqr")
-    assert solution.success, solution.message
-    shooting = dd.solve(problem, method="shooting")
-    assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
 
 
 @pytest.mark.parametrize("target", [[1, 0, 0, 0], [0, 1, 0, 0]])
@@ -422,25 +329,6 @@ def _around(scale):
         np.zeros(3),
         np.zeros(3),
     )
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-def test_an_effort_limit_is_a_bound_like_any_other(write_urdf, side):
-    """From a guess at |u| = 1, where the optimum begins at it: of a plant with that limit, at which its derivative
-    is 0, and of one without, bounded. The cost's rounding, 1e-15 of 14, is 1e-7 of an input."""
-    h, count, Q, R, Qf = DOUBLE_INTEGRATOR
-    costs = {"running_cost": dd.QuadraticCost(Q=Q / h, R=[[R / h]]), "final_cost": dd.QuadraticCost(Q=Qf)}
-    at_limit, found = np.full((count, 1), -float(side)), []
-    for limit in (1.0, 1e9):
-        bounds = dd.Bounds(u_lower=[-1.0], u_upper=[1.0])
-        model = write_urdf(time_step=h, limit=limit)
-        problem = dd.Problem(model, x0=[side, 0], num_steps=count, bounds=bounds, **costs)
-        guess = dd.rollout(model, problem.x0, at_limit).xs
-        result, _, us = solve_ilqr(problem, guess, at_limit, limits=Limits(100, np.inf, 1e-8), report=None)
-        assert result.outcome is Outcome.SOLVED
-        found.append(us)
-    assert found[0][0] == -side
-    np.testing.assert_allclose(found[0], found[1], atol=1e-7)
 
 
 def without_derivatives(monkeypatch, refuses, error=GradientError):

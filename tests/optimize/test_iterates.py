@@ -61,26 +61,6 @@ def test_states_are_those_of_the_inputs_whose_cost_is_told(swing, method):
     np.testing.assert_allclose(rows[-1].us, solution.us, atol=1e-3)
 
 
-@pytest.mark.usefixtures("every_point")
-@pytest.mark.parametrize(
-    "options", [{"scheme": "trapezoid"}, {"scheme": "drake", "solver": "snopt"}], ids=["ipopt", "snopt"]
-)
-def test_collocated_states_have_the_cost_that_is_told(options):
-    """The trapezoid rule of x'x over the times that are told, the horizon being free where that is possible."""
-    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.1)
-    free = {} if "solver" in options else {"horizon": (0.5, 2.0)}
-    cost = dd.QuadraticCost(Q=np.eye(2))
-    problem = dd.Problem(model, x0=[0, 0], x_goal=[1.0, 0], num_steps=8, running_cost=cost, **free)
-    rows, solution = searched(problem, method="collocation", refine=False, **options)
-    for row in rows:
-        by_knot = np.sum(row.xs**2, axis=1)
-        assert row.objective == pytest.approx(np.trapezoid(by_knot, row.times), rel=1e-9)
-        assert row.us.shape == (8, 1)
-        assert row.contacts == ((),) * 8
-    np.testing.assert_allclose(rows[-1].xs, solution.xs, atol=1e-6)
-    np.testing.assert_allclose(rows[-1].us, solution.us, atol=1e-3)
-
-
 def test_contacts_are_what_newton_asks_for_and_reading_them_changes_nothing(pushed):
     """m (v' - v) / h = the weight, the push along the ball's own x axis, and the forces of contact."""
     rows = []

@@ -86,12 +86,6 @@ def finely(solution):
     return solution.transcribed.at(np.linspace(0, solution.horizon, 1 + round(1000 * solution.horizon)))[0]
 
 
-@each_row("name", ["ball", "post"])
-def test_without_them_the_plan_goes_through(name):
-    without = dd.solve(arm([]), method="collocation")
-    assert depth_by_drake(without.problem.model, finely(without), {"ball": BALL, "post": POST}[name]) > 0.05
-
-
 def test_where_a_plan_jumps_through_between_knots_the_mesh_is_refined(monkeypatch):
     problem = arm([BALL], num_steps=8, time_step=0.2)
     solution = dd.solve(problem, method="collocation", max_iterations=200)

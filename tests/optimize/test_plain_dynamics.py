@@ -208,21 +208,6 @@ def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):
     assert np.array_equal(again["xs"], fine.xs)
 
 
-def test_mean_inputs_over_equal_parts_of_a_refined_mesh_are_the_polynomials():
-    """u = 6 - 12 t, whose mean over a part is its value in the middle; the mesh has no place in it."""
-    dense = dd.solve(block_move(num_steps=5))
-    mesh = np.array([0, 0.2, 0.25, 0.3, 0.4, 0.6, 0.77, 0.8, 1.0])
-    xs, us = dense.transcribed.at(mesh)
-    middles = dense.transcribed.at((mesh[1:] + mesh[:-1]) / 2)[1]
-    fine = dataclasses.replace(dense, mesh=mesh, xs=xs, us=us[:-1], u_final=us[-1], us_mid=middles)
-    assert fine.plan_checks.failing == []
-    assert list(fine.knots) == [0, 1, 4, 5, 7, 8]
-    parts = (np.arange(15) + 0.5) / 15
-    assert fine.transcribed.sample(3)[1][:, 0] == pytest.approx(6 - 12 * parts, abs=1e-8)
-    t = np.arange(16) / 15
-    assert fine.transcribed.sample(3)[0][:, 0] == pytest.approx(3 * t**2 - 2 * t**3, abs=1e-9)
-
-
 def test_a_midpoint_beyond_a_bound_or_constraint_is_measured():
     """There and back in one interval: what both knots keep, its middle breaks."""
     solution = dd.solve(block_move(num_steps=1, x_goal=None, final_cost=lambda x: 100 * x[0] ** 2, x0=[0, 1.2]))
@@ -233,16 +218,6 @@ def test_a_midpoint_beyond_a_bound_or_constraint_is_measured():
     assert dataclasses.replace(solution, problem=bounded).bound_violation == pytest.approx(0.05, rel=1e-9)
     kept = dataclasses.replace(solution.problem, constraints=dd.Constraint(lambda x: x[0], upper=limit))
     assert dataclasses.replace(solution, problem=kept).constraint_violation == pytest.approx(0.05, rel=1e-9)
-
-
-# ------------------------------------------------------------------------------ artifact
-
-
-def test_a_failed_solve_of_plain_dynamics_leaves_an_artifact_that_fails(tmp_path):
-    """1 m in 1 s from rest to rest needs an input of 4 at least."""
-    solution = dd.solve(block_move(num_steps=5, bounds=dd.Bounds(u_lower=[-3.9], u_upper=[3.9])))
-    assert not solution.success
-    assert dd.save(solution, tmp_path / "run").verdict == "fail"
 
 
 # ------------------------------------------------------------------------------ what is printed

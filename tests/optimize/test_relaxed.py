@@ -169,21 +169,6 @@ def test_the_true_plant_follows_what_was_rolled_out(two_spheres):
     assert inputs == pytest.approx(us, abs=1e-12)
 
 
-@pytest.mark.solve
-def test_a_push_from_a_distance_arrives_and_keeps_momentum(two_spheres):
-    """As by soft contact; the stages are told, and the last is the true plant's."""
-    problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
-    solution = dd.solve(problem, continuation="relaxed", max_iterations=100)
-    assert solution.success, solution.message
-    end = solution.replay.xs[-1]
-    assert end[1] == pytest.approx(1.0, abs=1e-8)
-    assert 1.0 * end[2] + 0.5 * end[3] == pytest.approx(0.02 * solution.us.sum(), rel=1e-10)
-    logs = solution.options["continuation"]
-    assert [log["kind"] for log in logs] == ["relaxed"] * 5 + ["true plant"]
-    assert [log["distance"] for log in logs][:2] == pytest.approx([0.1, 0.05], rel=1e-9)  # a ball's radius, and half
-    assert logs[-1]["cost"] == pytest.approx(solution.cost, rel=1e-12)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("time_step", "clearance"), [(0.005, 0.05), (0.01, 0.05), (0.02, None), (0.05, None)])
 def test_a_hopper_that_stands_gets_half_a_metre_on(time_step, clearance):

@@ -4,12 +4,10 @@ import signal
 
 import numpy as np
 import pytest
-from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
-from drake_diff.optimize.optima import distinct
 
 pytestmark = pytest.mark.solve
 
@@ -56,17 +54,6 @@ def test_the_ways_around_a_disk_are_listed():
     assert sorted(sides) == [-1, 1]
 
 
-@pytest.mark.slow
-def test_both_swing_ups_of_kellys_cart_pole_are_listed():
-    """58.8077 and 57.9448, as in test_transcription, where a guess leads to each; 50 intervals here."""
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
-    limits = dd.Bounds(u_lower=[-20], u_upper=[20])
-    effort = dd.QuadraticCost(R=[[1.0]])
-    problem = dd.Problem(model, x0=[0] * 4, x_goal=[1, np.pi, 0, 0], num_steps=50, running_cost=effort, bounds=limits)
-    solution = dd.solve(problem, restarts=8)
-    assert [each["cost"] for each in solution.options["optima"]] == pytest.approx([57.9448, 58.8077], rel=1e-3)
-
-
 def test_restarts_come_out_the_same_and_none_leaves_all_as_it_is():
     once, again = (dd.solve(around(), restarts=2, seed=3) for _ in range(2))
     assert once.xs.tobytes() == again.xs.tobytes()
@@ -84,18 +71,6 @@ def test_discrete_methods_restart_too(write_urdf, method):
     solution = dd.solve(problem, method=method, restarts=2)
     assert solution.success
     assert [optimum["count"] for optimum in solution.options["optima"]] == [3]  # a convex problem has one
-
-
-def test_what_is_no_plan_is_no_optimum():
-    """A time limit that is over ends the restarts; a status that is no success is not listed."""
-    solution = dd.solve(around(), restarts=3, time_limit=1e-6)
-    assert solution.status is dd.Status.TIME_LIMIT
-    assert not solution.optima
-    found = dd.solve(around())
-    same = found.told(message="again")
-    failed = found.told(status=dd.Status.CONVERGED_NOT_VERIFIED)
-    optima = distinct([(found, "a"), (same, "b"), (failed, "c")])
-    assert [(optimum.guess, optimum.count) for optimum in optima] == [("a", 2)]
 
 
 def test_ctrl_c_ends_restarts_and_keeps_the_plan():

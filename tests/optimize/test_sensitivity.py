@@ -52,18 +52,6 @@ def test_least_time_with_a_limited_input_has_the_closed_forms_derivative():
         assert found.differences[0] < 1e-4
 
 
-def test_by_the_mass_of_a_block(write_urdf):
-    """u = m a: cost = 12 m^2 d^2 / T^3."""
-    problem = dd.Problem(
-        write_urdf(mass=1.5, time_step=0.1), x0=[0, 0], x_goal=[1, 0], num_steps=10, running_cost=EFFORT
-    )
-    found = dd.sensitivity(dd.solve(problem, method="collocation"), ["block.mass"])
-    assert found.columns == ("block.mass",)
-    assert found.cost[0] == pytest.approx(24 * 1.5, rel=1e-7)
-    np.testing.assert_allclose(found.us[:, 0, 0], 6 - 12 * np.arange(10) / 10, atol=1e-6)
-    assert found.verdict == "agree"
-
-
 def test_a_limit_that_is_touched_without_force_is_a_corner():
     """u = 6 at both ends is just what the limit allows: a farther goal is held by it, a nearer one is not."""
     found = dd.sensitivity(dd.solve(block(6.0)), "goal")
@@ -73,16 +61,6 @@ def test_a_limit_that_is_touched_without_force_is_a_corner():
     held = dd.sensitivity(dd.solve(block(5.0)), "goal")
     assert held.verdict == "agree"
     assert held.active > 0
-
-
-def test_a_constraint_that_holds_the_plan_is_kept():
-    """v <= 1.3 holds in the middle; a goal that is farther by 1 moves the middle by what the ends leave."""
-    slow = dd.Constraint(lambda x: x[1], upper=1.3, name="slow")
-    found = dd.sensitivity(dd.solve(block(constraints=slow, num_steps=20)), "goal")
-    held = found.solution.xs[:, 1] > 1.3 - 1e-6
-    assert held.any()
-    np.testing.assert_allclose(found.xs[held, 1, 0], 0.0, atol=1e-8)
-    assert found.differences[0] < 1e-4
 
 
 def test_a_wrong_derivative_is_told(monkeypatch):

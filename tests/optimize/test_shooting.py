@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.plants import block
-from helpers.problems import DOUBLE_INTEGRATOR, lqr
 from helpers.table import each_row, slow_after
 from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 
@@ -185,18 +184,6 @@ def test_the_block_moves_by_symplectic_eulers_optimum(count):
     assert solution.cost == pytest.approx(12 / (1 - 1 / count**2), rel=1e-8)
 
 
-def test_lqr_by_shooting_has_the_riccati_recursions_cost():
-    """From a given guess, so that iLQR does not help; 1e-12 since the cost is flat at its minimum."""
-    problem = lqr(*DOUBLE_INTEGRATOR)
-    count = problem.num_steps
-    us = 10 * np.random.default_rng(5).standard_normal((count, 1))
-    solution = shoot(problem, initial_guess=(np.zeros((count + 1, 2)), us))
-    assert solution.success, solution.message
-    assert solution.options["initial_guess"] == "given"
-    assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)
-    assert solution.us[0, 0] == pytest.approx(-2.61821518, abs=1e-6)
-
-
 def test_initial_state_and_inputs_together_are_the_dense_kkt_solution():
     """min sum_k (x'Qx + R u^2) + x_N'Qf x_N over v_0 and u with x_0 = 0.2 fixed and x_N = 1 required."""
     h, count, Q, R, Qf = 0.1, 8, np.diag([1.0, 0.5]), 0.2, np.diag([2.0, 3.0])
@@ -253,30 +240,6 @@ def test_the_projectile_lands_at_six_metres(by):
     assert solution.us.shape == (300, 0)
 
 
-def test_a_speed_limit_and_a_force_limit_are_used_up():
-    """|u| <= 1 and v <= 0.5 on 1 kg for 1 s: x_N = 0.1 (0.1 + 0.2 + 0.3 + 0.4 + 6 * 0.5) = 0.4 at the most."""
-    problem = dd.Problem(
-        block(),
-        x0=[0, 0],
-        num_steps=10,
-        final_cost=lambda x: (x[0] - 1) ** 2,
-        bounds=dd.Bounds(x_upper=[9, 0.5], u_lower=[-1], u_upper=[1]),
-    )
-    solution = shoot(problem)
-    assert solution.success, solution.message
-    assert solution.xs[-1, 0] == pytest.approx(0.4, abs=1e-6)
-    assert solution.bound_violation < 1e-6
-
-
-def test_a_pendulum_too_weak_and_too_late_is_infeasible():
-    """0.6 s and |u| <= 0.5, where hanging straight out takes 4.9: the energy of half a turn is out of reach."""
-    solution = shoot(pendulum(num_steps=30, bounds=dd.Bounds(u_lower=[-0.5], u_upper=[0.5])))
-    assert solution.status is Status.INFEASIBLE
-    assert any(c.what == "defect" for c in solution.plan_checks.failing)
-    assert np.all(np.isfinite(solution.xs))
-    assert np.abs(solution.us).max() <= 0.5 + 1e-6
-
-
 @pytest.mark.parametrize(("row", "column"), slow_after(2, [(0, 1), (1, 2), (0, 0), (0, 2), (1, 0), (1, 1)]))
 def test_a_step_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
     """Each entry of [A B] of the pendulum; the wrong one is used by the solver and by the certificate alike."""
@@ -320,16 +283,6 @@ def test_inputs_that_move_nothing_of_the_goal_end_as_no_gradient():
     assert f"no variable moves {model.state_names[1]}, whose goal is not reached" in solution.message
 
 
-def test_a_goal_that_nothing_moves_may_be_reached_already():
-    """The neighbour is to stay where it is: that holds without any gradient."""
-    problem = dd.Problem(
-        block(blocks=2, actuated=1), x0=np.zeros(4), num_steps=5, running_cost=EFFORT, x_goal=[1, 0, 0, 0]
-    )
-    solution = shoot(problem)
-    assert solution.success, solution.message
-    assert solution.xs[-1] == pytest.approx([1, 0, 0, 0], abs=1e-6)
-
-
 def test_ctrl_c_ends_it_with_a_motion(monkeypatch):
     monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     before = signal.getsignal(signal.SIGINT)
@@ -346,15 +299,6 @@ def test_another_seed_starts_elsewhere_and_the_same_seed_in_the_same_place():
 
     assert first_row(1) == first_row(1)
     assert first_row(1) != first_row(2)
-
-
-@pytest.mark.parametrize("effort", [math.inf, 20.0, 1e9])
-def test_the_default_guess_is_near_zero_whatever_the_limit(effort):
-    """1e9 N is a file's way of saying no limit: the guess's effort, h sum u^2, must not be 1e12."""
-    problem = dd.Problem(block(effort=effort), x0=[0, 0], x_goal=[1, 0], running_cost=EFFORT, num_steps=10)
-    rows = []
-    dd.solve(problem, method="shooting", callback=rows.append)
-    assert rows[0].objective < 1.0
 
 
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])

@@ -184,17 +184,6 @@ def test_a_quadrotor_has_quaternions_and_no_set():
         )  # fmt: skip
 
 
-def test_a_heavier_bob_has_a_set_of_its_own():
-    """Its linear part is that of the file in which the mass is another."""
-    heavy = swung_up(parameters={"pole.mass": 2.0}, goals=[TerminalSet([np.pi, 0])], x_goal=None)
-    found, light = heavy.kept_goals[0].region, swung_up().kept_goals[0].region
-    assert np.max(np.abs(found.cost_to_go - light.cost_to_go)) > 1.0
-    model = heavy.model
-    with dd.model.parameters.applied(dd.model.parameters.select(model, {"pole.mass": 2.0})) as set_model:
-        regulator = LQR(set_model, [np.pi, 0], [0], np.eye(2), np.eye(1))
-    np.testing.assert_allclose(found.cost_to_go, regulator.cost_to_go, rtol=1e-9)
-
-
 def test_a_set_is_one_of_the_model_as_it_is():
     solution = dd.solve(swung_up())
     assert dd.sensitivity(solution).verdict == "agree"

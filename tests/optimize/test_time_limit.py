@@ -24,7 +24,6 @@ from drake_diff._base.clock import (
 from drake_diff._base.compiled import time_compilations
 from drake_diff.model import twin
 from drake_diff.optimize import run
-from drake_diff.optimize.program import Watch
 from drake_diff.optimize.transcription import steps
 
 STATUS = dd.Status.TIME_LIMIT
@@ -145,21 +144,6 @@ def test_no_iteration_is_begun_that_would_end_after_the_limit(monkeypatch):
     found = dd.solve(swing(), method="shooting", time_limit=10.0, tolerance=1e-14)
     assert found.status is STATUS
     assert each < clock.now - begun <= 10.0  # a fourth evaluation would end after 12 s
-
-
-def test_no_iteration_of_a_collocation_is_begun_that_would_end_after_the_limit(monkeypatch):
-    """Of a Panda each takes half a second, in which CasADi asks nobody."""
-    clock, real, each = stopped(monkeypatch), Watch.look_up, 3.0
-
-    def slow(self):
-        clock.now += each
-        return real(self)
-
-    monkeypatch.setattr(Watch, "look_up", slow)
-    begun = clock.now
-    found = dd.solve(swing(), method="collocation", time_limit=10.0, tolerance=1e-14)
-    assert found.status is STATUS
-    assert each < clock.now - begun <= 10.0  # a fourth iteration would end after 12 s
 
 
 @each_row("method, solver", METHODS[1:])

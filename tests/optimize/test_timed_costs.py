@@ -91,22 +91,6 @@ def test_the_cost_of_a_reference_is_the_sum_over_its_steps(write_urdf):
     assert problem.objective(at, held) == pytest.approx(wanted, rel=1e-12)
 
 
-@pytest.mark.slow
-def test_a_sum_of_costs_is_one_cost(write_urdf):
-    t = np.linspace(0, 1, 5)
-    follow = TrackingCost((t, np.column_stack([np.sin(t), np.cos(t)])), Q=np.eye(2))
-    parts = [follow, dd.QuadraticCost(R=[[0.1]]), lambda x, u: x[0] ** 2, lambda x, u, t: t * u[0] ** 2]
-
-    def whole(x, u, t):
-        known = follow.known_at(np.array([t]))[0]
-        return (x - known) @ (x - known) + 0.1 * u[0] ** 2 + x[0] ** 2 + t * u[0] ** 2
-
-    for method in ("ilqr", "shooting"):
-        a, b = (dd.solve(block(write_urdf, running_cost=cost), method=method) for cost in (parts, whole))
-        assert a.cost == pytest.approx(b.cost, rel=1e-9)
-        np.testing.assert_allclose(a.us, b.us, atol=1e-5)
-
-
 def test_goals_that_are_paid_for_go_with_it():
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     side = dd.FrameGoal("pole", point=[0, 0, -0.5], position=[-0.3, None, None], weight=1e3)

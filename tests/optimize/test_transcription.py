@@ -32,7 +32,6 @@ from drake_diff.optimize.transcription.task import SCHEMES as SCHEMES_OF
 pytestmark = pytest.mark.solve
 
 SCHEMES = ("trapezoid", "hermite_simpson")
-EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
 def half_effort(x, u):
@@ -51,22 +50,6 @@ def test_the_blocks_move_has_each_schemes_own_optimum(count):
     t = by_simpson.times
     assert by_simpson.inputs_at_knots[:, 0] == pytest.approx(6 - 12 * t, abs=1e-6)
     assert by_simpson.xs[:, 0] == pytest.approx(3 * t**2 - 2 * t**3, abs=1e-8)
-
-
-def test_drakes_own_scheme_stands_in_between():
-    """12 / J = 1 - 2/N^2 + 4/(3 N^3): Drake's midpoint input is the mean, its cost by trapezoids."""
-    problem = dd.Problem(block(), x0=[0, 0], x_goal=[1, 0], running_cost=EFFORT, num_steps=10)
-    drake = dd.solve(problem, method="collocation", scheme="drake")
-    assert 12 / drake.cost == pytest.approx(1 - 2 / 10**2 + 4 / (3 * 10**3), rel=1e-8)
-    assert move(10).cost < drake.cost < move(10, scheme="trapezoid").cost
-    assert move(10, plant_dynamics(block())).cost == pytest.approx(12, rel=1e-9)
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_quadratic_cost_and_a_function_are_the_same(scheme):
-    a, b = move(scheme=scheme), move(scheme=scheme, running_cost=EFFORT)
-    assert a.cost == pytest.approx(b.cost, rel=1e-12)
-    assert a.us == pytest.approx(b.us, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -165,40 +148,8 @@ def test_the_brachistochrone(count, rel):
 # ------------------------------------------------------------------------------ linear and chains
 
 
-@pytest.mark.parametrize(("scheme", "count", "rel"), [("hermite_simpson", 40, 2e-8), ("trapezoid", 80, 2e-4)])
-def test_the_scalar_problem(scheme, count, rel):
-    dynamics = Dynamics(lambda x, u: u, 1, 1)
-    cost = dd.QuadraticCost(Q=[[0.5]], R=[[0.5]])
-    motion = move(count, dynamics, x0=[1], x_goal=[0.5], horizon=2.0, running_cost=cost, scheme=scheme)
-    assert motion.cost == pytest.approx(0.510461418068826, rel=rel)
-
-
-@pytest.mark.parametrize(("order", "optimum", "rel"), [(2, 12, 1e-9), (3, 720, 1e-5), (4, 100800, 5e-5)])
-def test_chains_of_integrators(order, optimum, rel):
-    dynamics = Dynamics(lambda x, u: [*x[1:], u[0]], order, 1)
-    motion = move(20, dynamics, x0=np.zeros(order), x_goal=[1] + [0] * (order - 1))
-    assert motion.cost == pytest.approx(optimum, rel=rel)
-
-
 def test_a_free_final_velocity():
     assert move(x_goal=[1, np.nan], running_cost=half_effort).cost == pytest.approx(1.5, rel=1e-9)
-
-
-def test_a_free_initial_velocity():
-    """From any speed to any speed, the block needs no effort at all."""
-    free = {"optimize": ("controls", "initial_state"), "initial_state_mask": [False, True]}
-    motion = move(x_goal=[1, np.nan], **free)
-    assert motion.cost == pytest.approx(0, abs=1e-8)
-    assert motion.xs[0, 1] == pytest.approx(1, abs=1e-6)
-
-
-def test_a_final_cost():
-    """min 1/2 int u^2 + c/2 (x(1) - 1)^2 from rest: x(1) = c / (c + 3), J = 3 c / (2 (c + 3))."""
-    motion = move(x_goal=None, running_cost=half_effort, final_cost=lambda x: 5 * (x[0] - 1) ** 2)
-    assert motion.cost == pytest.approx(30 / 26, rel=1e-8)
-    assert motion.xs[-1, 0] == pytest.approx(10 / 13, rel=1e-6)
-    quadratic = dd.QuadraticCost(Q=[[5, 0], [0, 0]], x_ref=[1, 0])
-    assert move(x_goal=None, running_cost=half_effort, final_cost=quadratic).cost == pytest.approx(30 / 26, rel=1e-8)
 
 
 # ------------------------------------------------------------------------------ bounds
@@ -527,36 +478,6 @@ def test_a_plants_derivatives_are_those_of_its_equations_of_motion(load, name):
         assert f == pytest.approx(ExtractValue(expected).ravel(), rel=1e-12, abs=1e-12)
         assert np.hstack([A, B]) == pytest.approx(ExtractGradient(expected), rel=1e-10, abs=1e-10)
         assert dynamics(x, u) == pytest.approx(f, rel=1e-12, abs=1e-12)
-
-
-def test_kellys_acceleration_from_the_file(load):
-    """The two accelerations, from Kelly's equations of motion for l = 0.5, m1 = 1, m2 = 0.3, g = 9.81."""
-    dynamics = plant_dynamics(load("cart_pole.urdf"))
-    assert dynamics([0.1, 0.7, -0.3, 1.1], [2.0])[2:] == pytest.approx([3.172075726216, -17.491825696946], abs=1e-11)
-    assert dynamics.input_names == ("force",)
-
-
-FORMS = {
-    "columns": lambda x, u: np.array([x[1] * u[0], np.sin(x[0]) - u[1]]),
-    "a list": lambda x, u: [x[1] * u[0], np.sin(x[0]) - u[1]],
-    "matrix products": lambda x, u: np.array([[0, 1.0], [2, 3]]) @ x + u,
-    "knot by knot": lambda x, u: np.array([u @ u, x[0] * np.sum(x)]),
-    "with constants": lambda x, u: np.array([x[1] * u[0], 9.81]),
-}
-
-
-@each_row("form", FORMS)
-def test_dynamics_of_many_knots_are_those_of_each(form):
-    f, rng = FORMS[form], np.random.default_rng(0)
-    dynamics, knots = Dynamics(f, 2, 2), rng.standard_normal((5, 4))
-    values, rows = dynamics.linearize(knots)
-    assert dynamics.values(knots) == pytest.approx(values, abs=1e-14)
-    for k, knot in enumerate(knots):
-        assert values[k] == pytest.approx(f(knot[:2], knot[2:]), abs=1e-14)
-        steps = 1e-6 * np.eye(4)
-        rough = [(np.array(f(*np.split(knot + e, 2))) - np.array(f(*np.split(knot - e, 2)))) / 2e-6 for e in steps]
-        assert rows[k] == pytest.approx(np.array(rough).T, abs=1e-8)
-    assert dynamics.form.takes_columns == (form in ("columns", "a list", "matrix products"))
 
 
 # ------------------------------------------------------------------------------ bad input

@@ -93,14 +93,6 @@ def test_a_constraint_of_the_input_holds_at_the_last_knot_and_is_a_bound(scheme)
     assert only_last.us[0, 0] > 5
 
 
-def test_a_constraint_of_several_numbers_and_an_equality():
-    """Where v = 6 x (1 - x) is kept at one knot, and v <= 1.6 nowhere matters."""
-    both = dd.Constraint(lambda x: [x[1] - 6 * x[0] * (1 - x[0]), x[1]], lower=[0, -9], upper=[0, 1.6], knots=[3])
-    motion = move(10, constraints=both)
-    assert motion.xs[3, 1] == pytest.approx(6 * motion.xs[3, 0] * (1 - motion.xs[3, 0]), abs=1e-8)
-    assert motion.cost > 12
-
-
 def test_a_given_first_state_need_not_keep_a_constraint():
     motion = move(10, x0=[0, 1], constraints=dd.Constraint(lambda x: x[1], lower=None, upper=0.9), x_goal=[0.4, 0])
     assert motion.success

@@ -67,10 +67,6 @@ def test_states_are_seeded_and_within_limits(load, name):
         assert np.all(np.abs(state.u) <= plant.GetEffortUpperLimits())
 
 
-def test_a_model_that_cannot_touch_is_sampled_in_free_motion(load):
-    assert {state.kind for state in sample_states(load("acrobot.xml"), 6)} == {"free"}
-
-
 def test_a_wrong_derivative_fails_the_model(load, monkeypatch):
     monkeypatch.setattr("drake_diff.model.parameters.IDENTITY_OFFSET", 0.0)
 

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 import drake_diff as dd
 from drake_diff.exceptions import ArtifactError
-from drake_diff.runs.fields import DataBoundary, DataUse, canonical
+from drake_diff.runs.fields import canonical
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.provenance import embodiment_of
 from drake_diff.runs.sections import asked
@@ -80,16 +80,6 @@ def test_a_motion_that_a_cost_follows_is_data_that_the_search_saw(solved):
     assert "5 times" in data.seen[3].what
     assert "not recorded" in data.seen[4].what
     assert not data.statement.startswith("no recording")
-
-
-def test_data_that_were_seen_are_not_held_out():
-    seen, new = DataUse(name="a", what="log", sha256="1"), DataUse(name="b", what="log", sha256="2")
-    copied = DataUse(name="c", what="a copy of a", sha256="1")
-    told = {"statement": "s", "seen": [seen], "judged_on": [seen, new, copied]}
-    assert DataBoundary(**told, held_out=["b"]).held_out == ["b"]
-    for name in ("a", "c", "elsewhere"):
-        with pytest.raises(ValidationError, match="held out"):
-            DataBoundary(**told, held_out=[name])
 
 
 def test_the_panel_is_that_of_the_replays_and_its_hash_is_its_own(record):

@@ -1,7 +1,6 @@
 """The run directory: complete, true, the same bytes for the same input, and honest when the run failed."""
 
 import dataclasses
-import json
 import math
 from hashlib import sha256
 
@@ -11,7 +10,6 @@ from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.logs.mcap_file import read_mcap
-from drake_diff.runs.save import begin
 from drake_diff.runs.trace import read_trace
 
 pytestmark = pytest.mark.solve
@@ -90,13 +88,6 @@ def test_the_same_solve_gives_the_same_bytes_but_for_the_wall_clock(swing_up, ru
     assert record.model_dump(exclude=apart) == first.model_dump(exclude=apart)
 
 
-def test_an_unfinished_run_says_so(swing_up, tmp_path):
-    begin(tmp_path / "run.partial-1-00000000", swing_up.problem)
-    record = dd.load_record(tmp_path / "run.partial-1-00000000")
-    assert (record.name, record.state, record.verdict) == ("run", "incomplete", "incomplete")
-    assert "killed" in record.sentence
-
-
 def test_a_failed_solution_is_saved_with_a_labelled_failure(swing_up, tmp_path):
     failed = dd.solve(swing_up.problem, method="ilqr", max_iterations=2)
     record = dd.save(failed, tmp_path / "run")
@@ -123,14 +114,6 @@ def test_the_trace_gives_back_states_and_inputs_bit_for_bit(run, swing_up):
     assert trace.times.tobytes() == swing_up.times.tobytes()
     assert trace.diagnostics["energy_total"].tobytes() == swing_up.replay.energy.tobytes()
     assert trace.diagnostics["work_actuators"].tobytes() == swing_up.replay.work.tobytes()
-
-
-def test_the_trace_carries_the_model_file_and_the_record(run):
-    attachments = read_trace(run / "trace.mcap").attachments
-    assert attachments["pendulum.urdf"] == (MODELS / "pendulum.urdf").read_bytes()
-    record = json.loads(attachments["record.json"])
-    assert record["verdict"] == "pass"
-    assert "wall_clock" not in record
 
 
 def test_the_trace_has_well_known_channels_with_units_in_simulated_time(run):

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from html import escape
 
 import numpy as np
 import pytest
@@ -11,12 +10,11 @@ from helpers.pendulum import swing
 
 import drake_diff as dd
 from drake_diff.comparison import save_comparison
-from drake_diff.comparison.files import PAGE, hash_of_arrays
+from drake_diff.comparison.files import hash_of_arrays
 from drake_diff.comparison.recordings import place_of, read_arrays, with_own_names, write_arrays
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.identification import recorded_causes
-from drake_diff.identification.messages import search_ended
-from drake_diff.identification.recorded_causes import ENDED, as_recorded, cause_of
+from drake_diff.identification.recorded_causes import as_recorded, cause_of
 from drake_diff.runs.fields import canonical
 from drake_diff.runs.other_records import CauseEvidence
 from drake_diff.runs.read import load_record
@@ -110,16 +108,6 @@ def test_whatever_number_or_name_of_a_cause_is_planted_it_is_refused(saved, seed
             assert as_recorded("lab", near, told) == (near, [])
 
 
-def test_a_search_that_its_limit_ended_is_undecided(saved):
-    told = load_record(saved).engines[-1].cause
-    ended = search_ended(45.0)
-    assert ended.strip().startswith(ENDED)
-    early = told.model_copy(update={"sentence": told.sentence + ended})
-    again, doubts = as_recorded("lab", early, told)
-    assert again == early
-    assert "is not repeated" in doubts[0]
-
-
 def test_a_row_of_a_recording_that_lies_is_refused(copy):
     record = load_record(copy)
     row = record.engines[-1]
@@ -175,14 +163,6 @@ def test_another_model_is_refused_however_much_was_made_to_fit(copy):
     record.model_copy(update=fitting).write(copy)
     found = verify_own(copy)
     assert any("[lab].cause.sentence" in line for line in found.complaints), found.complaints
-
-
-def test_a_page_that_says_another_cause_is_refused(copy):
-    text, cause = (copy / PAGE).read_text(), load_record(copy).engines[-1].cause
-    assert escape(cause.sentence) in text
-    (copy / PAGE).write_text(text.replace(escape(cause.sentence), "The robot is right."))
-    load_record(copy).write(copy)
-    assert f"{PAGE}: it does not say what record.json says of the cause of lab" in str(verify_own(copy))
 
 
 def test_a_record_of_before_says_that_its_cause_was_not_looked_for_again(copy):

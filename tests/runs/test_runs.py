@@ -11,7 +11,6 @@ from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
 from drake_diff.cli.main import main
-from drake_diff.cli.text import plain
 from drake_diff.exceptions import ArtifactError
 from drake_diff.runs.compare import compare_runs, list_runs
 from drake_diff.runs.save import begin, begin_failure
@@ -75,12 +74,6 @@ def test_two_runs_differ_in_what_was_changed_and_what_that_changed(runs):
     assert found.comparable
 
 
-def test_the_same_run_twice_differs_in_nothing(runs, tmp_path):
-    dd.save(solve(), tmp_path / "a")
-    found = compare_runs(runs / "a", tmp_path / "a")
-    assert (found.configuration, found.versions, found.metrics, found.refused) == ((), (), (), ())
-
-
 def test_metrics_that_are_defined_otherwise_are_not_compared(runs, tmp_path):
     directory = Path(shutil.copytree(runs / "b", tmp_path / "b"))
     record = dd.load_record(directory)
@@ -107,10 +100,6 @@ def test_the_record_of_an_error_has_a_label_and_the_message(runs):
     assert (failure.label, failure.code) == ("evaluation_error", "exception")
     assert failure.message.startswith("ZeroDivisionError")
     assert "ZeroDivisionError" in str(dd.verify(runs / FAILED))
-
-
-def test_text_of_a_record_changes_nothing_on_a_terminal():
-    assert plain("[red]no[/]\x1b[31m\u202e\n").plain == "[red]no[/]\ufffd[31m\ufffd\ufffd"
 
 
 @pytest.mark.slow

@@ -72,10 +72,6 @@ def test_how_a_call_ends_is_reported(function, kind, sentence, monkeypatch):
     assert (outcome.value, bool(outcome.sentence)) == (None, True)
 
 
-def test_a_value_comes_back(monkeypatch):
-    assert ask(give, monkeypatch, value=[1, "a"]).value == [1, "a"]
-
-
 def test_a_call_that_never_ends_is_ended(monkeypatch):
     start = time.monotonic()
     assert "within 0.5 s" in ask(never_end, monkeypatch, seconds=0.5).exceeded

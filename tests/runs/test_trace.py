@@ -16,7 +16,6 @@ from mcap.reader import make_reader
 
 import drake_diff as dd
 from drake_diff._base.values import Refusal
-from drake_diff.certificates import certify_jacobian
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs import read_mcap
 from drake_diff.optimize.program import Iteration
@@ -168,26 +167,6 @@ def test_every_replay_has_its_row(collocated, trace_of_collocated):
     assert found["failures"] == [list(r.failures) for r in replays]
     assert bits(found["goal_error"]) == bits([r.goal_error for r in replays])
     assert bits(found["time_step"]) == bits([r.time_step for r in replays])
-
-
-def test_every_certificate_has_its_row(collocated, trace_of_collocated):
-    found = read_mcap(trace_of_collocated).arrays("/gradient/check")
-    certificates = collocated.certificates
-    assert len(certificates) > 0
-    assert found["verdict"] == [c.verdict for c in certificates]
-    assert found["entries"].tolist() == [c.codes.size for c in certificates]
-    assert found["worst_derivative"].tolist() == [c.worst.derivative for c in certificates]
-    assert found["cosine"] == pytest.approx(1, abs=1e-6)  # the derivatives agree: so do their directions
-
-
-def test_a_certificate_without_entries_and_one_that_is_zero_have_a_row_too(tmp_path):
-    nothing = certify_jacobian(lambda x: np.zeros(0), np.zeros(2), np.zeros((0, 2)))
-    zero = certify_jacobian(lambda x: np.zeros(2), np.zeros(2), np.zeros((2, 2)))
-    write_trace(tmp_path / "a.mcap", measure(solution_of(pendulum(), certificates=(nothing, zero))), {})
-    found = read_mcap(tmp_path / "a.mcap").arrays("/gradient/check")
-    assert found["verdict"] == ["agree", "agree"]
-    assert np.isnan(found["cosine"]).all()
-    assert found["worst_row"][0] == ""
 
 
 def test_contact_made_and_broken_are_events_at_the_steps_where_they_happen(thrown):
