@@ -142,6 +142,7 @@ def test_pairs_that_autodiff_takes_are_not_refused():
         assert codes(audit(*pair(Sphere(0.1), lower, 0.4)), "error", "warning") == set()
 
 
+@pytest.mark.solve
 def test_refused_pairs_are_grouped_by_bodies_and_other_throws_are_told_apart():
     plant = Plant(0.01)
     for i, height in enumerate((0.0, 0.05, 2.0)):

@@ -62,6 +62,7 @@ def refuses(model, x):
         return True  # AutoDiffXd gives NaN here in Drake 1.51
 
 
+@pytest.mark.solve
 def test_a_sphere_exactly_on_a_cylinders_axis_is_caught():
     assert refuses(*pair(Sphere(0.1), Cylinder(0.2, 0.2), hydroelastic=False, height=0.0995))
 

@@ -31,6 +31,7 @@ def physx(model):
 # ---- the step -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.solve
 def test_nothing_is_clamped_or_dragged_by_itself(load):
     engine, h = physx(load("pendulum.urdf")), 0.01
     v = 500 / (1 + h * 0.1 / 0.25)  # PhysX would clamp at 100 rad/s
@@ -82,6 +83,7 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(wrong, monkeypatch):
 # ---- contact --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.solve
 def test_it_rests_at_no_depth_slides_by_coulomb_and_stops():
     h, mu = 0.002, 0.5
     model, _ = block_on_rails(h, mu)

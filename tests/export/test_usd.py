@@ -57,6 +57,7 @@ def test_newton_finds_the_free_ball_and_the_box(load, tmp_path):
     assert pusher[0] == pytest.approx(0.05, rel=1e-6)  # the radius
 
 
+@pytest.mark.solve
 def test_what_usd_cannot_say_is_told_and_not_written(load, tmp_path):
     from drake_diff.export.usd import usd
 

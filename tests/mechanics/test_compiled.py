@@ -32,6 +32,7 @@ def test_the_slope_of_a_trees_inertia_is_its_difference():
         assert slope[:, j] == pytest.approx((ahead - behind) / 2e-5, abs=1e-9)  # of second differences of 1e-10
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
 @pytest.mark.parametrize("time_step", [0.005, 0.05])
 def test_steps_with_impulses_are_autodiffs(approximation, time_step):

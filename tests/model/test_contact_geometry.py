@@ -115,6 +115,7 @@ def test_a_box_on_the_ground_has_the_derivative_that_autodiff_does_not():
     assert np.abs(found.A - differences.A).max() <= 1e-5 * np.abs(found.A).max()  # differences of 1e-6 of a stiff step
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("contact_model", ["hydroelastic", "hydroelastic_with_fallback"])
 def test_a_sliding_hydroelastic_box_is_differentiated_by_autodiff(contact_model):
     model = box_on_ground("hydroelastic", contact_model)

@@ -311,6 +311,7 @@ def as_generalized_force(system, *, velocity=False):
     return add
 
 
+@pytest.mark.solve
 def test_a_system_of_ones_own_that_sees_the_state():
     """v+ = v + h (motor + u - c v^3) / m; the motor, which is not exported, is the first input."""
     model = pushed(as_generalized_force(drag_system(), velocity=True))

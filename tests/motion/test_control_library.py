@@ -36,6 +36,7 @@ def test_the_poles_of_a_mass_on_a_spring(load, control, name):
     np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(expected), atol=1e-9)
 
 
+@pytest.mark.solve
 @each_row("name", ENGINES)
 def test_the_poles_of_a_hanging_pendulum(load, control, name):
     """With w^2 = m g l / J the free pendulum is the oscillator above, damped as there."""

@@ -62,6 +62,7 @@ def test_free_fall_drifts_as_symplectic_euler_must(load):
     assert motion.energy_oscillation < 1e-12
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("approximation", ["lagged", "similar", "sap"])
 def test_what_slides_to_a_stop_loses_mu_m_g_d_to_contact_and_no_energy_is_unexplained(load, approximation):
     """A block of 2 kg on four spheres, mu = 0.4, from 1 m/s: all of m v^2 / 2 = mu m g d is what friction did."""

@@ -168,6 +168,7 @@ def test_a_smoothed_step_has_the_slope_of_its_closed_form_where_first_order_has_
     assert again.jacobian.item() == found.jacobian.item()
 
 
+@pytest.mark.solve
 def test_where_no_width_has_a_slope_there_is_no_number():
     """|x - 0.3| at 0.3: it falls as often as it rises."""
     g, undefined = gradient(ball(), [0.3, 1.0, 0, 0], lambda x: abs(x[0] - 0.3), 5)

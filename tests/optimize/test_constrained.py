@@ -93,6 +93,7 @@ def test_a_force_and_a_power_are_limited(method):
     assert solution.cost == pytest.approx(bounded.cost, rel=1e-6)
 
 
+@pytest.mark.solve
 @by_each_method
 def test_a_pendulums_tip_reaches_a_height(method):
     """0.3 m below the hinge, at rest: cos q = 0.6."""
@@ -171,6 +172,7 @@ def test_the_augmented_lagrangians_derivatives_are_differences(free):
     assert np.all(np.linalg.eigvalsh(hessians) > -1e-9)
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("knot", [3, 10, 20])
 def test_a_motion_that_breaks_a_constraint_is_told(knot):
     """Of v <= 1.2 with one velocity set to 1.3, and of a waypoint moved by a thousandth."""

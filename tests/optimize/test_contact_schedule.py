@@ -111,6 +111,7 @@ def test_a_foot_is_on_the_ground_before_and_after_each_step_it_stands_in():
     assert swings(touching(~stands)[:, 0]) == [(0, 2), (5, 7)]
 
 
+@pytest.mark.solve
 def test_a_guess_keeps_its_schedule_and_nearly_the_steps(solo, standing):
     schedule = dd.optimize.ContactSchedule(HOP)
     xs, us = schedule.guess(solo, standing)

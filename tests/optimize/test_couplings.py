@@ -90,6 +90,7 @@ def test_what_cannot_be_traced_is_called_back():
     assert abs(solution.xs[15, 0] - solution.xs[5, 0] - 0.4) < 1e-6
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("method", ["collocation", "shooting"])
 def test_a_pendulum_swings_in_a_period(method):
     solution = dd.solve(swing(), method=method)

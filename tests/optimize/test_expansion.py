@@ -47,6 +47,7 @@ def assert_second_differences(model, motion, v, found):
             assert found[k, i, j] == pytest.approx(corners / 4e-8, abs=2e-6 * max(1.0, np.abs(found).max()))
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("file", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "panda"])
 def test_of_hinges_and_slides_by_differences(file):
     """Second differences of Drake's own steps by 1e-4, as of the body below; no limit acts."""
@@ -61,6 +62,7 @@ def test_of_hinges_and_slides_by_differences(file):
     assert_second_differences(model, motion, v, curvature_along(problem, motion, v)[0])
 
 
+@pytest.mark.solve
 def test_of_a_floating_body_with_wheels_by_differences():
     """Second differences of Drake's own steps by 1e-4, of entries up to 1: rounding of 1e-16 leaves 1e-8 of them."""
     model = craft()

@@ -69,6 +69,7 @@ CASES = [
 ]
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize(("name", "frame", "point", "axes", "columns"), CASES)
 def test_motion_and_forces_are_those_of_drakes_matrices(name, frame, point, axes, columns):
     model = dd.load_model(MODELS / name, time_step=0.01, contact=False)
@@ -127,6 +128,7 @@ def test_an_impact_stops_the_foot_and_keeps_the_momentum_of_the_rest():
     assert rod.speeds(hit) == pytest.approx([0.0], abs=1e-12)
 
 
+@pytest.mark.solve
 def test_a_hopper_jumps_to_its_height():
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
     stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
@@ -160,6 +162,7 @@ def test_a_hopper_jumps_to_its_height():
     assert any(replay.holds for replay in second.replays)
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("seed", range(4))
 def test_a_start_that_slides_or_a_place_that_is_missed_is_refused(seed):
     """By its own equations the motion is right in both: only what a stance keeps says that the foot does not stand."""
@@ -177,6 +180,7 @@ def test_a_start_that_slides_or_a_place_that_is_missed_is_refused(seed):
     assert solution.constraint_violation > 0.5 * abs(off) - 1e-3
 
 
+@pytest.mark.solve
 def test_a_force_that_leaves_its_cone_is_refused():
     """A hopper that is pushed sideways on ice: the plan of a rough ground breaks the smooth one's cone."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)

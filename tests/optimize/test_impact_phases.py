@@ -60,6 +60,7 @@ def inputs(phase):
     return lambda t: phase.transcribed.applied_at(np.array([min(t, phase.horizon)]))[0]
 
 
+@pytest.mark.solve
 def test_a_ball_bounces_into_its_target(thrown):
     """Free flight and z' -> -e z' at z = r, by SciPy: the floor is met where it is, and not when the plan says."""
     assert thrown.success, thrown.message
@@ -156,6 +157,7 @@ def rejudged(solution, **fields):
     return judged_phases(replace(solution, **fields), result)
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize("seed", range(4))
 def test_a_plan_that_the_law_of_impact_does_not_have_is_refused(landed, seed):
     """The landing said to be on a floor of less friction than its impulse needs, and by another restitution."""

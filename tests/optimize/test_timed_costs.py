@@ -102,6 +102,7 @@ def test_goals_that_are_paid_for_go_with_it():
     np.testing.assert_allclose(held.xs[:, 0], 0.2, atol=0.01)
 
 
+@pytest.mark.solve
 def test_mpc_follows_a_reference_that_moves_on():
     """Each plan begins later in the reference: one that began anew would follow its first second for ever."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)

@@ -67,6 +67,7 @@ def test_a_link_that_leads_nowhere_and_what_would_be_fetched_are_found(tmp_path)
     ]
 
 
+@pytest.mark.solve
 def test_the_pictures_of_contact_models_are_those_that_the_command_draws(tmp_path):
     pytest.importorskip("matplotlib")
     spec = importlib.util.spec_from_file_location("pictures", DOCS / "pictures.py")

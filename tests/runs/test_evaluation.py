@@ -63,6 +63,7 @@ def test_a_robot_that_is_held_and_one_of_equations_alone_say_so(record):
     assert asked(problem)["embodiment"].base.startswith("none")
 
 
+@pytest.mark.solve
 def test_the_data_boundary_names_what_was_seen_and_holds_nothing_out(record, solved):
     assert record.data.statement.startswith("no recording was used")
     assert [use.name for use in record.data.seen] == ["model", "initial guess", "seed"]

@@ -37,6 +37,7 @@ def messages(bag, topic):
         return [(m.message.log_time, m.decoded_message) for m in reader.iter_decoded_messages(topics=[topic])]
 
 
+@pytest.mark.solve
 def test_joint_states_are_the_trace_s_bit_for_bit(run, bag):
     trace, found = read_trace(run / "trace.mcap"), messages(bag, "/joint_states")
     assert [t for t, _ in found] == [20_000_000 * k for k in range(11)]

@@ -23,6 +23,8 @@ from drake_diff.optimize.solution import Solution
 from drake_diff.runs import measure, read_trace
 from drake_diff.runs.trace import write_trace
 
+pytestmark = pytest.mark.solve
+
 
 def pendulum(folder=MODELS, name="pendulum.urdf", **options):
     model = dd.load_model(folder / name, time_step=0.02)
