@@ -39,7 +39,7 @@ from .optimize.sensitivity import sensitivity as sensitivity
 from .optimize.solution import Solution as Solution
 from .optimize.solution import Status as Status
 from .optimize.solve import solve as solve
-from .runs.read import load_record as load_record
+from .runs.directory import load_record as load_record
 from .runs.save import save as save
 from .runs.verify import verify as verify
 from .trials.run import robustness as robustness

@@ -215,9 +215,7 @@ def panel(
         rows.add_row(*(plain(word) for word in words))
     show(rows)
     show(f"{results.summary['trials']} trials, {results.errors} errors")
-    show(
-        f"wrote {directory}: record.json, table.csv, summary.json, trials.jsonl, panel.html, a record of each in trials"
-    )
+    show(f"wrote {directory}: record.json, table.csv, summary.json, panel.html, a record of each trial in trials")
     raise typer.Exit(1 if results.errors else 0)
 
 

@@ -245,7 +245,7 @@ def list_all(
     directory: Annotated[Path, typer.Argument(metavar="DIRECTORY", help="Where the runs are.")] = Path("artifacts"),
 ) -> None:
     """List the records in DIRECTORY and their verdicts as written; `verify` checks them."""
-    from drake_diff.runs.compare import list_runs
+    from drake_diff.runs.view import list_runs
 
     rows = table("run", "verdict", "kind", "status", "cost", "model", "written")
     for line in list_runs(directory):
@@ -283,7 +283,7 @@ def compare_runs(
     With --out, a page shows both plans in one replay and in the same plots as well.
     Exit status 1 if the two define a metric differently; such metrics are not compared.
     """
-    from drake_diff.runs.compare import compare_runs as compare
+    from drake_diff.runs.view import compare_runs as compare
 
     comparison = compare(a, b)
     for title in ("configuration", "versions", "metrics"):
@@ -297,7 +297,7 @@ def compare_runs(
     for line in comparison.refused:
         show(plain(f"not compared: {line}", "red"))
     if out is not None:
-        from drake_diff.runs.compare import write_runs_page
+        from drake_diff.runs.view import write_runs_page
 
         write_runs_page(out, a, b, models=models)
         show(f"wrote {out}")
@@ -308,7 +308,7 @@ def schema(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="plan, fit or comparison.")] = "plan",
 ) -> None:
     """Print the JSON Schema of record.json, of one kind of record."""
-    from drake_diff.runs.read import KINDS
+    from drake_diff.runs.directory import KINDS
 
     if kind not in KINDS:
         raise UnknownNameError("KIND", got=kind, known=KINDS)
@@ -338,7 +338,7 @@ def export(
     ros2: Annotated[bool, typer.Option("--ros2", help="Write a bag for ROS 2.")] = False,
 ) -> None:
     """Write the motion in RUN for other tools."""
-    from drake_diff.runs.ros2 import export_ros2
+    from drake_diff.runs.trace import export_ros2
 
     if not ros2:
         raise InputError("export", got="no format", expected="--ros2")

@@ -24,10 +24,9 @@ from drake_diff.model.model import Model
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.runs import other_records as records
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse
+from drake_diff.runs.fields import DataBoundary, DataUse, WallClock
 from drake_diff.runs.other_records import ComparisonRecord
 from drake_diff.runs.provenance import embodiment_of, gradient_evidence, model_input, provenance_of, written_now
-from drake_diff.runs.sealed import WallClock
 
 TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
 MOTION = "motion"  # among the data: the name of what every engine was given

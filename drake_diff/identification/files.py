@@ -32,13 +32,13 @@ from drake_diff.logs.channels import input_channel, state_channel, transform_cha
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.runs import other_records as records
+from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, canonical, finite
+from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, finite, reproducible
 from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.provenance import embodiment_of, model_input, provenance_of, written_now
 from drake_diff.runs.rebuild import TRACE, rebuilt
-from drake_diff.runs.reproduce import Reproduced, contract_as, model_as
-from drake_diff.runs.sealed import WallClock, reproducible
+from drake_diff.runs.reproduce import contract_as, model_as
 
 REPORT = "report.html"
 MADE = (TRACE, REPORT)  # what is made again, beside the record

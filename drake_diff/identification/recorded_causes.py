@@ -23,11 +23,11 @@ from drake_diff.exceptions import DrakeDiffError
 from drake_diff.identification.explain import explain
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.model import Model
-from drake_diff.runs.differences import ABSOLUTE, NUMBER, is_near
+from drake_diff.runs.differences import ABSOLUTE, NUMBER, Reproduced, is_near
 from drake_diff.runs.other_records import CauseEvidence, ComparisonRecord, Numbers
 from drake_diff.runs.provenance import embodiment_of, model_input
 from drake_diff.runs.rebuild import rebuilt
-from drake_diff.runs.reproduce import Reproduced, contract_as, model_as
+from drake_diff.runs.reproduce import contract_as, model_as
 
 SAME_VALUE = 2e-3  # of half the interval: see above
 SAME_DIGIT = 1.01  # of the last digit in a text: a number that lies between two is rounded to either

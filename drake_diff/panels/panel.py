@@ -29,8 +29,17 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from drake_diff._base.arrays import positive_int
 from drake_diff.exceptions import InputError, MissingDependencyError, UnknownNameError
-from drake_diff.panels.panel_file import PanelTrial, Row, expand, load_panel
-from drake_diff.panels.results import PanelTable, begun_record, ended_record, journal, write_table
+from drake_diff.panels.results import (
+    PanelTable,
+    PanelTrial,
+    Row,
+    begun_record,
+    ended_record,
+    expand,
+    finished_trials,
+    load_panel,
+    write_table,
+)
 from drake_diff.runs.provenance import provenance_of
 
 ENGINES = ("local", "ray")
@@ -283,13 +292,13 @@ def run_panel(
 ) -> PanelTable:
     r"""Evaluate every trial of a panel file in parallel, and write the table and summary of what was found.
 
-    Each finished trial is at once a line of `trials.jsonl`. After a kill or Ctrl-C the same call evaluates only what
+    Each finished trial has at once its record in `trials/`. After a kill or Ctrl-C the same call evaluates only what
     is missing. Table and summary are the same to the byte as without the interruption, for any number of workers and
     for both engines. A trial that raises is a row with the column `error`. `dd.load_record`, `dd.verify` and
     `drake-diff list` take the directory, and the record of each trial in it.
 
     Args:
-        path: the panel, a TOML file; `drake_diff.panels.panel_file` says what stands in it.
+        path: the panel, a TOML file; `drake_diff.panels.results` says what stands in it.
         out: the directory to write; artifacts/<name of the file> where None.
         workers: how many processes; None means one for each core.
         engine: "local" (processes of this machine) or "ray".
@@ -301,7 +310,7 @@ def run_panel(
 
     Raises:
         InputError: the panel file is wrong, its function cannot be loaded, or `out` holds what no panel wrote.
-        ArtifactError: `out` holds another panel or a damaged journal, or another process is writing there.
+        ArtifactError: `out` holds another panel or a damaged record, or another process is writing there.
         MissingDependencyError: Ray is asked for and not installed.
 
     Example:
@@ -334,17 +343,16 @@ def run_panel(
     }
     directory = Path(out) if out is not None else Path("artifacts") / path.stem
     start = time.monotonic()
-    with journal(directory, made) as book:
-        begun = begun_record(directory, len(trials), made)
-        begun.begin(directory)
-        errors = sum("error" in row for row in book.rows.values())
-        left = [trial for trial in trials if trial.id not in book.rows]
-        with closing(evaluate(left, function, count, engine, address)) as finished:
-            for trial, row in finished:
-                book.add(trial.id, row)
+    begun = begun_record(directory, len(trials), made)
+    with finished_trials(directory, begun, made) as finished:
+        errors = sum("error" in row for row in finished.rows.values())
+        left = [trial for trial in trials if trial.id not in finished.rows]
+        with closing(evaluate(left, function, count, engine, address)) as evaluated:
+            for trial, row in evaluated:
+                finished.add(trial, row)
                 errors += "error" in row
                 if progress:
-                    progress(len(book.rows), len(trials), errors)
-        table = write_table(directory, trials, book.rows, made)
+                    progress(len(finished.rows), len(trials), errors)
+        table = write_table(directory, trials, finished.rows, made)
         ended_record(begun, table, time.monotonic() - start).write(directory)
         return table

@@ -1,132 +1,238 @@
-"""What a panel writes: a journal with a line for each finished trial, and at the end a table and a summary by cell.
+"""A panel: its file, the trials that it stands for, and what it writes.
 
-The first line of the journal says what the panel is. Each line carries a hash of itself and of the first line, so that
-a changed line and a line of another panel are noticed.
+That is a record of each finished trial, which a later run goes on from, and at the end the table, summary and ranking
+that are made of these records. The file is TOML, and may say:
+
+evaluate = "trials.py:balance"   # a file beside this one, or "package.module:function"
+seed = 0
+seeds = 20                       # trials of each cell
+
+[axes]                           # every combination of their values is a cell
+method = ["ilqr", "shooting"]
+level = [0.0, 0.1]
+
+[fixed]                          # the same in all trials
+model = "models/pendulum.urdf"
+
+[[cells]]                        # one more cell
+method = "none"
 """
 
 import csv
-import fcntl
 import io
 import json
-import os
 import statistics
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from hashlib import sha256
+from itertools import product
 from pathlib import Path
-from typing import Any, BinaryIO
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
 
-from drake_diff._base.files import doing, make_folder, write_whole
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from drake_diff._base.files import MOST_TEXT, make_folder, read_plain, write_whole
 from drake_diff._base.statistics import success_rate
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.pages.html import page_data, write_page
-from drake_diff.panels.panel_file import PanelTrial, Row, canonical, cell_name
-from drake_diff.runs.directory import is_taken
-from drake_diff.runs.fields import ModelInput
-from drake_diff.runs.other_records import TRIALS, ComparisonRecord, PanelSection, trial_record
-from drake_diff.runs.provenance import provenance_of, written_now
-from drake_diff.runs.sealed import WallClock
+from drake_diff.runs.differences import Reproduced
+from drake_diff.runs.directory import is_taken, load_record, read_checked, writing
+from drake_diff.runs.fields import FiniteTable, read_fields
+from drake_diff.runs.other_records import TRIALS, ComparisonRecord, PanelSection, TrialSection, trial_record
+from drake_diff.runs.provenance import header, provenance_of
 
-JOURNAL, TABLE, SUMMARY, PAGE = "trials.jsonl", "table.csv", "summary.json", "panel.html"
+# Names of what drake_diff itself gives each trial; an axis, cell or fixed value cannot have them.
+OURS = ("id", "repeat", "seed")
+Row = dict[str, Any]  # what came of a trial, in JSON's types
+
+
+class Panel(BaseModel):
+    """What a panel file says."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    evaluate: Annotated[str, Field(pattern=r"^[^:]+:[A-Za-z_]\w*$")]
+    seed: Annotated[int, Field(ge=0)] = 0
+    seeds: Annotated[int, Field(ge=1)] = 1
+    axes: Annotated[FiniteTable, Field(default_factory=dict)]
+    fixed: Annotated[FiniteTable, Field(default_factory=dict)]
+    cells: Annotated[list[FiniteTable], Field(default_factory=list)]
+
+    @field_validator("axes")
+    @classmethod
+    def _are_lists(cls, axes: FiniteTable) -> FiniteTable:
+        for name, values in axes.items():
+            if not isinstance(values, list) or not values:
+                raise ValueError(f"axis {name}: expected a list of at least one value, got {values!r}")
+        return axes
+
+    @model_validator(mode="after")
+    def _names_are_told_apart(self) -> "Panel":
+        if not self.axes and not self.cells:
+            raise ValueError("expected at least one axis or one of [[cells]], got neither")
+        for name in {*self.axes, *(name for cell in self.cells for name in cell)} & {*self.fixed, *OURS}:
+            why = "it is in [fixed], or drake_diff gives it to each trial"
+            raise ValueError(f"axes and cells: {name} cannot be used: {why}")
+        for name in self.fixed.keys() & set(OURS):
+            raise ValueError(f"fixed: {name} cannot be used: drake_diff gives it to each trial")
+        return self
+
+    @property
+    def sha256(self) -> str:
+        """The hash of what the file says; comments and the order of its tables do not change it."""
+        return sha256(canonical(self.model_dump())).hexdigest()
+
+
+@dataclass(frozen=True)
+class PanelTrial:
+    """One trial of a panel: its `cell` (its values on the axes) and `fields`, all that its function is given.
+
+    `fields` are the cell, the fixed values, `repeat` (its number within the cell, from 0) and its own `seed` of 53
+    bits, drawn from the panel's seed and all other fields, so that a new value on an axis changes no other trial.
+    `id` is the start of the SHA-256 of the fields.
+    """
+
+    cell: dict[str, Any]
+    fields: dict[str, Any]
+    id: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "id", sha256(canonical(self.fields)).hexdigest()[:16])
+
+    @property
+    def name(self) -> str:
+        """As people read it: `method=ilqr level=0.1 repeat=3`."""
+        return f"{cell_name(self.cell)} repeat={self.fields['repeat']}"
+
+
+def canonical(value: Any) -> bytes:
+    """The same value always gives the same JSON: sorted keys, no spaces, no NaN."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def cell_name(cell: dict[str, Any]) -> str:
+    """A cell in one line."""
+    return " ".join(f"{k}={v if isinstance(v, str) else canonical(v).decode()}" for k, v in cell.items())
+
+
+def load_panel(path: Path) -> Panel:
+    """The panel in the TOML file at `path`; InputError names every wrong entry."""
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(str(path), got=f"{type(error).__name__}: {error}", expected="a panel in TOML") from error
+    try:
+        return Panel.model_validate(document)
+    except ValidationError as error:
+        wrong = []
+        for issue in error.errors():
+            location = ".".join(str(key) for key in issue["loc"])
+            if issue["type"] == "extra_forbidden":
+                wrong.append(f"{location}, which is not one of them")
+            elif issue["type"] == "missing":
+                wrong.append(f"no {location}")
+            else:
+                got = "" if issue["type"] == "value_error" else f", got {issue['input']!r:.80}"
+                wrong.append(f"{location or 'panel'}: {issue['msg'].removeprefix('Value error, ')}{got}")
+        expected = f"the fields {', '.join(Panel.model_fields)}"
+        raise InputError(str(path), got="; ".join(wrong), expected=expected) from error
+
+
+def expand(panel: Panel) -> tuple[PanelTrial, ...]:
+    """Every trial: the axes' combinations (the last axis fastest), then the cells, each `panel.seeds` times."""
+    axes: dict[str, Any] = panel.axes
+    combinations = product(*axes.values()) if axes else ()
+    cells = [*(dict(zip(axes, values, strict=True)) for values in combinations), *panel.cells]
+    trials: dict[str, PanelTrial] = {}
+    for cell, repeat in product(cells, range(panel.seeds)):
+        fields = {**panel.fixed, **cell, "repeat": repeat}
+        words = np.frombuffer(sha256(canonical(fields)).digest(), "<u4")
+        state = np.random.SeedSequence([panel.seed, *words.tolist()]).generate_state(1, np.uint64)
+        trial = PanelTrial(cell, {**fields, "seed": int(state[0]) >> 11})
+        if trial.id in trials:
+            raise InputError("axes and cells", got=f"{cell_name(cell)} twice", expected="each cell once")
+        trials[trial.id] = trial
+    return tuple(trials.values())
+
+
+TABLE, SUMMARY, PAGE = "table.csv", "summary.json", "panel.html"
+STATED = ("panel", "verdict", "sentence")  # of the record of a panel, by its table
 RANKED = ("place", "name", "apart", "trials", "errors", "success", "numbers")  # of a cell in the record of a panel
 SHOWN_CELLS = 8  # in a repr
 COST = "cost"  # the number that ranks where nothing is judged, and among equals: less is better
 
 
-class Journal:
-    """The rows of the finished trials, by id, each a line on the disk before the next trial is counted."""
+class Finished:
+    """The rows of the finished trials, by id, each in the record of its trial on the disk."""
 
-    def __init__(self, path: Path, file: BinaryIO, panel: Mapping[str, Any]):
-        self.path, self.file, self.rows = path, file, dict[str, Row]()
-        self.head = _line({"panel": panel}, b"")
-        data = file.read()
-        whole = data[: data.rfind(b"\n") + 1]  # a killed process leaves a line half written: it is cut off
-        file.seek(len(whole))
-        file.truncate()
-        if not whole:
-            self._write(self.head)
-            return
-        old, self.rows = read_journal(path, whole)
-        for key in sorted({*old, *panel}):
-            if old.get(key) != panel.get(key):
-                raise ArtifactError(
-                    f"{path} is the journal of another panel: {key}: expected {panel.get(key)}, got {old.get(key)}; "
-                    "choose another directory, or remove this one to start over"
-                )
+    def __init__(self, directory: Path, conditions: Mapping[str, Any]):
+        self.folder, self.conditions = directory / TRIALS, dict(conditions)
+        make_folder(self.folder)
+        for partial in self.folder.glob("*.partial"):  # a killed process leaves a record half written
+            partial.unlink()
+        self.rows = {path.stem: self._read(path) for path in sorted(self.folder.iterdir())}
 
-    def add(self, trial: str, row: Row) -> None:
-        """Write the row of a finished trial to the disk."""
-        self._write(_line({"id": trial, "row": row}, self.head))
-        self.rows[trial] = row
+    def add(self, trial: PanelTrial, row: Row) -> None:
+        """Write the record of a finished trial to the disk."""
+        record = trial_record(trial.id, trial.name, trial.cell, trial.fields, row, self.conditions)
+        write_whole(self.folder / f"{trial.id}.json", record.to_json().encode())
+        self.rows[trial.id] = row
 
-    def _write(self, line: bytes) -> None:
-        with doing("write", self.path):
-            self.file.write(line)
-            self.file.flush()
-            os.fsync(self.file.fileno())
+    def _read(self, path: Path) -> Row:
+        trial, problems = _read_trial(path)
+        if problems:
+            raise ArtifactError(f"{path}: {problems[0]}")
+        if trial.conditions != self.conditions:
+            raise ArtifactError(f"{path}: it is of another panel; remove it")
+        return trial.result
 
 
 @contextmanager
-def journal(directory: Path, panel: Mapping[str, Any]) -> Iterator[Journal]:
-    """Open the journal in `directory` of the panel that `panel` describes.
+def finished_trials(directory: Path, begun: ComparisonRecord, conditions: Mapping[str, Any]) -> Iterator[Finished]:
+    """What an earlier run of the panel finished in `directory`, in which nobody else writes while the block runs.
 
-    ArtifactError where it is another panel's, where a whole line is damaged, or where another process has it open;
-    InputError where the directory holds other things, and no journal.
+    ArtifactError where the directory is another panel's, where a record is damaged, or where another process writes
+    there; InputError where the directory holds what no panel wrote.
     """
-    path = directory / JOURNAL
-    if not path.exists() and is_taken(directory):
+    with writing(directory.resolve()):
+        if is_taken(directory):
+            _check_same_panel(directory, conditions)
+        begun.begin(directory)
+        yield Finished(directory, conditions)
+
+
+def _check_same_panel(directory: Path, conditions: Mapping[str, Any]) -> None:
+    record = None
+    with suppress(ArtifactError):  # what has no record of a panel is refused below
+        record = load_record(directory)
+    if not isinstance(record, ComparisonRecord) or record.panel is None:
         expected = "a new or empty directory, or one in which a panel was begun"
         raise InputError("out", got=f"{directory}, which holds {next(directory.iterdir()).name!r}", expected=expected)
-    make_folder(directory)
-    with open(path, "a+b") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise ArtifactError(f"{path}: another process is at work on this panel") from error
-        file.seek(0)
-        yield Journal(path, file, panel)
+    old = record.panel.conditions
+    for key in sorted({*old, *conditions}):
+        if old.get(key) != conditions.get(key):
+            raise ArtifactError(
+                f"{directory} is of another panel: {key}: expected {conditions.get(key)}, got {old.get(key)}; "
+                "choose another directory, or remove this one to start over"
+            )
 
 
-def read_journal(path: Path, data: bytes) -> tuple[dict[str, Any], dict[str, Row]]:
-    """What the panel is, and the rows by trial, of the bytes of a journal of whole lines.
-
-    ArtifactError where a line is damaged, half written, or of a trial that stands there twice.
-    """
-    *lines, rest = data.split(b"\n")
-    if rest or not lines:
-        raise ArtifactError(f"{path}: its last line is half written")
-    panel, rows, head = _read_line(path, 1, lines[0], b"").get("panel"), {}, lines[0] + b"\n"
-    for number, line in enumerate(lines[1:], 2):
-        content = _read_line(path, number, line, head)
-        if not isinstance(content.get("row"), dict) or content.get("id") in rows:
-            raise ArtifactError(f"{path}, line {number}: expected a row, of each trial once")
-        rows[str(content["id"])] = content["row"]
-    if not isinstance(panel, dict):
-        raise ArtifactError(f"{path}, line 1: expected what the panel is")
-    return panel, rows
-
-
-def _line(content: Mapping[str, Any], head: bytes) -> bytes:
-    return _json({**content, "sha256": sha256(head + _json(content)).hexdigest()}) + b"\n"
-
-
-def _json(content: Mapping[str, Any]) -> bytes:
-    """Keys keep their order: a row's is that of the table's columns."""
-    return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
-
-
-def _read_line(path: Path, number: int, line: bytes, head: bytes) -> dict[str, Any]:
-    """What `line` says; ArtifactError where it is not as it was written."""
-    try:
-        content: dict[str, Any] = json.loads(line)
-        content.pop("sha256")
-        if _line(content, head) == line + b"\n":
-            return content
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ArtifactError(f"{path}, line {number} is damaged: {type(error).__name__}: {error}") from error
-    raise ArtifactError(f"{path}, line {number} is damaged or another panel's: its hash does not fit")
+def _read_trial(path: Path) -> tuple[TrialSection, tuple[str, ...]]:
+    """The record of a trial, and what in it is damaged or does not fit its inputs."""
+    record, problems = read_checked(path)
+    trial = record.trial if isinstance(record, ComparisonRecord) else None
+    if trial is None:
+        raise ArtifactError(f"{path}: expected the record of a trial")
+    made = PanelTrial(trial.cell, trial.inputs)
+    if trial.id != made.id or path.stem != made.id:
+        return trial, (*problems, f"{path.name}: id {trial.id}, but its inputs are those of trial {made.id}")
+    wrong = [name for name, value in trial.cell.items() if trial.inputs.get(name) != value]
+    return trial, (*problems, *(f"{path.name}: {name} of its cell is not that of its inputs" for name in wrong))
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +268,8 @@ class PanelTable(ShowsItsRepr):
 def write_table(
     directory: Path, trials: Sequence[PanelTrial], results: Mapping[str, Row], made: Mapping[str, Any]
 ) -> PanelTable:
-    """Write `table.csv`, `summary.json`, a record of each trial and the ranking of all `trials` into `directory`.
-
-    `made` says what the panel is.
-    """
+    """Write `table.csv`, `summary.json` and the ranking of all `trials`; `made` says what the panel is."""
+    results = {name: dict(sorted(row.items())) for name, row in results.items()}  # as in the records of trials
     cells: dict[bytes, list[PanelTrial]] = {}
     for trial in trials:
         cells.setdefault(canonical(trial.cell), []).append(trial)
@@ -182,10 +286,6 @@ def write_table(
     write_whole(directory / TABLE, _csv(rows, {name for row in results.values() for name in row}))
     text = json.dumps(summary, indent=1, allow_nan=False, ensure_ascii=False)
     write_whole(directory / SUMMARY, text.encode() + b"\n")
-    (directory / TRIALS).mkdir(exist_ok=True)
-    for trial in trials:
-        record = trial_record(trial.id, trial.name, trial.cell, trial.fields, results[trial.id], made)
-        write_whole(directory / TRIALS / f"{trial.id}.json", record.to_json().encode())
     write_ranking(directory / PAGE, summary)
     return PanelTable(directory, rows, summary)
 
@@ -193,13 +293,10 @@ def write_table(
 def begun_record(directory: Path, trials: int, made: Mapping[str, Any]) -> ComparisonRecord:
     """The record while trials are missing."""
     return ComparisonRecord(
-        name=directory.name,
         verdict="incomplete",
         sentence="the panel has started and not finished: it is still running, or it was killed",
         panel=PanelSection(conditions=dict(made), trials=trials, errors=None),
-        model=ModelInput(file=None, options=None),
-        provenance=provenance_of(),
-        wall_clock=WallClock(written_utc=written_now()),
+        **header(directory.name),
     )
 
 
@@ -215,7 +312,7 @@ def ended_record(begun: ComparisonRecord, table: PanelTable, seconds: float) -> 
             "verdict": "fail" if table.errors else "pass",
             "sentence": f"{rows[0]['name']} is the best of {len(rows)} cells, by {by}; {table.errors} errors",
             "panel": begun.panel.model_copy(update=results),
-            "wall_clock": WallClock(written_utc=written_now(), duration_s=seconds),
+            "wall_clock": header(begun.name, seconds=seconds)["wall_clock"],
         }
     )
 
@@ -303,3 +400,73 @@ def _cell(cell: dict[str, Any], rows: Sequence[Row], judged: bool) -> dict[str, 
         for name, values in numbers.items()
     }
     return summary
+
+
+def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Reproduced:
+    """What of a panel's directory, or of the record of one trial at `folder`, does not follow from the trials."""
+    problems = _odd_trial(folder) if record.trial is not None else _odd_panel(folder, record)
+    return Reproduced({}, {}, problems=tuple(problems))
+
+
+def _odd_trial(path: Path) -> Iterator[str]:
+    """What of a trial does not fit its inputs, or the panel's record and table where they are beside it."""
+    trial, problems = _read_trial(path)
+    yield from problems
+    panel = path.parent.parent
+    if not (panel / TABLE).exists():
+        return
+    row, record = _read_table(panel / TABLE).get(trial.id, {}), load_record(panel)
+    conditions = record.panel.conditions if isinstance(record, ComparisonRecord) and record.panel is not None else {}
+    if trial.conditions != conditions or any(row.get(name) != _text(value) for name, value in trial.result.items()):
+        yield f"{path.name}: its result or its panel is not that of {TABLE}"
+
+
+def _odd_panel(folder: Path, record: ComparisonRecord) -> list[str]:
+    """What of the table, the summary and the record of a panel does not come out of the records of its trials again."""
+    if record.panel is None:
+        raise ArtifactError(f"{record.FILE}: expected the record of a panel")
+    panel, table, summary = record.panel.conditions, _read_table(folder / TABLE), read_fields(folder / SUMMARY)
+    listed = {Path(name).stem for name in record.files if name.startswith(f"{TRIALS}/")}
+    result = [f"{TABLE} and {TRIALS}: only one of them has trial {name}" for name in sorted(listed ^ table.keys())]
+    # Records sort names; the summary has those of a cell in the panel's order.
+    cells = summary.get("cells")
+    ordered: dict[bytes, Any] = {canonical(entry["cell"]): entry["cell"] for entry in cells} if cells else {}
+    trials, rows = [], {}
+    for name in () if result else table:
+        item, problems = _read_trial(folder / TRIALS / f"{name}.json")
+        trial = PanelTrial(ordered.get(canonical(item.cell), item.cell), item.inputs)
+        made = trial_record(trial.id, trial.name, trial.cell, trial.fields, item.result, panel)
+        written = read_fields(folder / TRIALS / f"{name}.json")
+        apart = ("schema_version", "record_sha256")
+        fields = {**made.model_dump(mode="json"), **{key: written.get(key) for key in apart}}
+        result += problems or [f"{name}.json: it is not what the panel writes of its result"] * (fields != written)
+        trials.append(trial)
+        rows[name] = item.result
+    if result:
+        return result
+    with TemporaryDirectory() as location:
+        made_again = write_table(Path(location), trials, rows, panel)
+        for name, old, new in (
+            (TABLE, table, _read_table(Path(location) / TABLE)),
+            (SUMMARY, summary, read_fields(Path(location) / SUMMARY)),
+        ):
+            result += [f"{name}: it does not come out of {TRIALS} again"] * (old != new)
+    begun = record.panel.model_copy(update={"trials": len(trials)})
+    ended = ended_record(record.model_copy(update={"panel": begun}), made_again, 0.0)
+    wrong = [name for name in STATED if getattr(ended, name) != getattr(record, name)]
+    return [*result, *(f"{record.FILE}: {name} is not what the table says" for name in wrong)]
+
+
+def _read_table(path: Path) -> dict[str, dict[str, str]]:
+    """The rows of a table by the id of their trial; ArtifactError where it is none."""
+    data = read_plain(path, MOST_TEXT)
+    most = csv.field_size_limit(len(data) + 1)
+    try:
+        rows = {row["id"]: row for row in csv.DictReader(io.StringIO(data.decode(), newline=""), strict=True)}
+    except (UnicodeDecodeError, KeyError, csv.Error) as error:
+        raise ArtifactError(f"{TABLE}: not a table of trials: {type(error).__name__}: {error}") from error
+    finally:
+        csv.field_size_limit(most)
+    if any(not name.isalnum() for name in rows):  # it becomes a path
+        raise ArtifactError(f"{TABLE}: expected ids of trials, got other names")
+    return rows

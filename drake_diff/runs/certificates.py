@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import finite_array, positive_int
 from drake_diff._base.files import write_whole
@@ -20,7 +19,7 @@ from drake_diff.model.parameters import Parameters, select
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import SampledState, sample_states
 from drake_diff.runs.directory import written_whole
-from drake_diff.runs.fields import evidence
+from drake_diff.runs.fields import Passed, evidence
 from drake_diff.runs.plan_record import (
     CertificationSection,
     CertifiedState,
@@ -29,8 +28,7 @@ from drake_diff.runs.plan_record import (
     SlopeEvidence,
     TruthEvidence,
 )
-from drake_diff.runs.provenance import embodiment_of, gradient_evidence, model_input, provenance_of, written_now
-from drake_diff.runs.sealed import Passed, WallClock
+from drake_diff.runs.provenance import gradient_evidence, header
 
 
 def certify_model(
@@ -117,16 +115,7 @@ def _certify_state(model: Model, state: SampledState, parameters: Parameters, me
 
 
 def _record(model: Model, verdict: Passed, sentence: str, seconds: float | None = None, **sections: Any) -> PlanRecord:
-    return PlanRecord(
-        name=model.name,
-        verdict=verdict,
-        sentence=sentence,
-        model=model_input(model),
-        embodiment=embodiment_of(model.contract),
-        provenance=provenance_of(),
-        wall_clock=WallClock(written_utc=written_now(), duration_s=seconds),
-        **sections,
-    )
+    return PlanRecord(verdict=verdict, sentence=sentence, **header(model.name, model, seconds), **sections)
 
 
 def save_rollout(
@@ -165,11 +154,11 @@ def save_rollout(
     agree, truth = certificate.count("agree"), certificate.truth
     slopes = [] if truth is None else [evidence(SlopeEvidence, slope) for slope in truth.slopes]
     section = RolloutSection(
-        x0=_plain(motion.xs[0]),
-        us=[_plain(u) for u in motion.us],
+        x0=motion.xs[0].tolist(),
+        us=motion.us.tolist(),
         loss=motion.loss,
         columns=list(certificate.columns),
-        derivative=_plain(certificate.derivative[0]),
+        derivative=certificate.derivative[0].tolist(),
         verdicts=[certificate.entry(0, j).verdict for j in range(count)],
         certificate=gradient_evidence(certificate),
         truth=None if truth is None else evidence(TruthEvidence, truth, slopes=slopes),
@@ -179,7 +168,3 @@ def save_rollout(
     record = _record(model, verdict, f"{agree} of {count} entries of the gradient agree", rollout=section)
     with written_whole(directory) as folder:
         return record.write(folder)
-
-
-def _plain(values: ArrayLike) -> list[float]:
-    return [float(value) for value in np.asarray(values, dtype=float).ravel()]

@@ -37,6 +37,29 @@ BLOB = re.compile(r"[A-Za-z0-9+/=_-]{40,}")  # hashes, and what a page draws: ba
 
 
 @dataclass(frozen=True)
+class Reproduced:
+    """A directory that was reproduced: the record's fields, and the bytes of the other files by name.
+
+    `apart` is how far the plan of the search is from the recorded one, relative, 0 where they are the same to the last
+    bit; `unrepeated` says why the search was not run again, and `missing` which keys of the record rest on that.
+    `unchecked` are parts of the record that could not be measured on this machine, and stand as they are recorded.
+    `problems` are contradictions between the files of the directory, `undecided` what cannot be judged, `written` the
+    files that drake_diff writes there. `recorded` are the fields to compare with, where not all are compared.
+    """
+
+    fields: dict[str, Any]
+    files: dict[str, bytes]
+    apart: float = 0.0
+    unrepeated: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+    unchecked: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
+    undecided: tuple[str, ...] = ()
+    written: tuple[str, ...] = ()
+    recorded: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
 class Difference:
     """A value that is not the one that was computed again; `allowed` where machines may round so differently."""
 

@@ -24,7 +24,7 @@ from drake_diff.optimize.problem.names import units_of
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
 from drake_diff.optimize.solution import Solution, Status
-from drake_diff.runs.fields import Event, Failure, Label, Metric, ReplayEvidence
+from drake_diff.runs.fields import Event, Failure, Label, Metric, ReplayEvidence, evidence, finite
 
 AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
 ON_THE_PLANT = {  # by the problem's motion
@@ -107,11 +107,6 @@ class Measurement(ShowsItsRepr):
     invariants: tuple[Metric, ...]
     failures: tuple[Failure, ...]
     events: tuple[Event, ...]
-
-    @property
-    def state_unit(self) -> str:
-        """The unit of the worst of all states: "rad or rad/s"."""
-        return _unit((*self.positions, *self.velocities))
 
     @property
     def shown(self) -> tuple[Rollout | None, str]:
@@ -282,20 +277,13 @@ def gradient_norms(solution: Solution) -> tuple[Array | None, Array | None]:
 
 def replay_evidence(r: Replay) -> ReplayEvidence:
     """A replay as it stands in a record."""
-    goal, bound, energy, depth = (
-        float(v) if math.isfinite(v) else None for v in (r.goal_error, r.bound_violation, r.energy_error, r.penetration)
-    )
-    return ReplayEvidence(
-        variant=r.variant,
-        control=r.control,
+    return evidence(
+        ReplayEvidence,
+        r,
         time_step_s=r.time_step,
         contact_approximation=r.approximation,
-        goal_error=goal,
-        bound_violation=bound,
-        energy_error_J=energy,
-        penetration_m=depth,
-        holds=r.holds,
-        failures=list(r.failures),
+        energy_error_J=finite(r.energy_error),
+        penetration_m=finite(r.penetration),
     )
 
 
@@ -309,8 +297,8 @@ def failure_of(error: BaseException) -> Failure:
     return _failure(label, code, message, "the exception that ended the run", None)
 
 
-def _failure(label: Label, code: str, message: str, detected_by: str, evidence: str | None) -> Failure:
-    return Failure(label=label, code=code, message=message, detected_by=detected_by, evidence=evidence)
+def _failure(label: Label, code: str, message: str, detected_by: str, section: str | None) -> Failure:
+    return Failure(label=label, code=code, message=message, detected_by=detected_by, evidence=section)
 
 
 def _events(solution: Solution, motion: Rollout | None, failures: Sequence[Failure]) -> Iterator[Event]:
@@ -367,17 +355,17 @@ def measured(
     t_s: float | None = None,
 ) -> Metric:
     """A metric that is to be at most `tolerance`, or that informs; `reason` is why where `value` is not finite."""
-    finite = math.isfinite(value)
+    known = math.isfinite(value)
     return Metric(
         name=name,
         definition=definition,
         unit=unit,
-        value=float(value) if finite else None,
-        reason=None if finite else reason,
+        value=float(value) if known else None,
+        reason=None if known else reason,
         tolerance=tolerance,
         direction="info" if tolerance is None else "at_most",
         verdict="info" if tolerance is None else "pass" if value <= tolerance else "fail",
-        t_s=t_s if finite else None,
+        t_s=t_s if known else None,
     )
 
 

@@ -18,9 +18,9 @@ from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, Sp
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.terminal import TerminalSet
 from drake_diff.runs.differences import shown
+from drake_diff.runs.fields import SealedRecord
 from drake_diff.runs.other_records import ComparisonRecord, FitRecord
 from drake_diff.runs.plan_record import PlanRecord
-from drake_diff.runs.sealed import SealedRecord
 from drake_diff.runs.sections import COSTS, LIMITS
 
 STILL = 1e-3  # [rad/s or m/s] what is no faster is at rest

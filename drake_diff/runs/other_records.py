@@ -7,8 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from drake_diff.runs.fields import Certified, Fields, FiniteTable, ModelInput, Provenance
-from drake_diff.runs.sealed import SealedRecord, WallClock
+from drake_diff.runs.fields import Certified, Fields, FiniteTable, ModelInput, Provenance, SealedRecord, WallClock
 
 
 class Mounted(Fields):

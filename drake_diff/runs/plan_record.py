@@ -21,9 +21,9 @@ from drake_diff.runs.fields import (
     Observation,
     ParameterEvidence,
     ReplayEvidence,
+    SealedRecord,
     Solver,
 )
-from drake_diff.runs.sealed import SealedRecord
 
 
 class PhaseEvidence(Fields):

@@ -12,7 +12,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
-from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,17 @@ from drake_diff.model.meshes import in_any_case
 from drake_diff.model.model import Model
 from drake_diff.model.plant import FLOATING
 from drake_diff.model.xml_text import XmlText
-from drake_diff.runs.fields import Certified, Drive, Embodiment, FileEvidence, ModelInput, Provenance
+from drake_diff.runs.fields import (
+    Certified,
+    Drive,
+    Embodiment,
+    FileEvidence,
+    ModelInput,
+    Provenance,
+    WallClock,
+    evidence,
+    file_evidence,
+)
 
 NO_BODY = Embodiment(
     robot="plain dynamics",
@@ -53,21 +62,25 @@ PACKAGES = ("drake", "drake-diff", "numpy", "casadi", "pin", "numba", "mujoco", 
 
 def gradient_evidence(certificate: Certificate) -> Certified:
     """A certificate as it stands in a record."""
-    return Certified(
-        subject=certificate.subject,
-        method=certificate.method,
-        verdict=certificate.verdict,
+    return evidence(
+        Certified,
+        certificate,
         entries=int(certificate.codes.size),
         counts={v: certificate.count(v) for v in VERDICTS},
         worst=str(certificate.worst) if certificate.codes.size else None,
-        power=certificate.power,
-        told=certificate.told,
     )
 
 
-def model_input(model: Model) -> ModelInput:
+def header(name: str, model: Model | None = None, seconds: float | None = None) -> dict[str, Any]:
+    """The fields of every record: its name, model and robot, the versions, when it was made, and how long that took."""
+    robot = {} if model is None else {"embodiment": embodiment_of(model.contract)}
+    clock = WallClock(written_utc=written_now(), duration_s=seconds)
+    return {"name": name, "model": model_input(model), **robot, "provenance": provenance_of(), "wall_clock": clock}
+
+
+def model_input(model: Model | None) -> ModelInput:
     """The model file with what it names, and the options it was loaded with."""
-    source, options = model.source, model.options
+    source, options = (None, None) if model is None else (model.source, model.options)
     if source is None or options is None:
         return ModelInput(file=None, options=None)
     packages = options["packages"]
@@ -124,12 +137,6 @@ def _git() -> dict[str, str | bool] | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return {"commit": run[0], "dirty": bool(run[1])}
-
-
-def file_evidence(path: Path, name: str) -> FileEvidence:
-    """Size and hash of the file at `path`, under the name it has in the record."""
-    data = path.read_bytes()
-    return FileEvidence(path=name, bytes=len(data), sha256=sha256(data).hexdigest())
 
 
 def named_files(
@@ -223,16 +230,12 @@ def embodiment_of(contract: Contract) -> Embodiment:
         robot=contract.name,
         base=_base(contract, moving),
         driven=[
-            Drive(
+            evidence(
+                Drive,
+                a,
                 actuator=a.name,
-                joint=a.joint,
                 command="effort" if a.kp is None else "effort, added to PD control to the joint's default position",
                 unit=_unit(a.name, a.joint, inputs, contract),
-                effort_limit=a.effort_limit if abs(a.effort_limit) < float("inf") else None,
-                gear_ratio=a.gear_ratio,
-                rotor_inertia=a.rotor_inertia,
-                kp=a.kp,
-                kd=a.kd,
             )
             for a in contract.actuators
         ],

@@ -27,9 +27,9 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.solve import solve
-from drake_diff.runs.fields import ModelInput
+from drake_diff.runs.fields import ModelInput, file_evidence
 from drake_diff.runs.plan_record import PlanRecord
-from drake_diff.runs.provenance import file_evidence, named_files, names_in
+from drake_diff.runs.provenance import named_files, names_in
 from drake_diff.runs.sections import rebuild_problem
 
 ANYWHERE = Path("/")  # the folder of models of a directory that is one's own

@@ -7,7 +7,7 @@ steps to the same end: then the recorded plan is measured, and what the search t
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,11 +27,11 @@ from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.solve import solve
 from drake_diff.runs.certificates import certify_model
 from drake_diff.runs.cross_check import NOT_INSTALLED, SIMULATORS, cross_check
-from drake_diff.runs.differences import is_near
-from drake_diff.runs.fields import ModelInput, finite
+from drake_diff.runs.differences import Reproduced, is_near
+from drake_diff.runs.directory import load_plan_record
+from drake_diff.runs.fields import ModelInput, SealedRecord, finite, read_fields, reproducible
 from drake_diff.runs.measurement import measure
 from drake_diff.runs.plan_record import CertificationSection, PhasesSection, PlanRecord
-from drake_diff.runs.read import load_plan_record
 from drake_diff.runs.rebuild import PLAN, REMOVED, TRACE, plan_fields, read_plan, rebuilt, resolve, solve_again
 from drake_diff.runs.save import (
     FILES,
@@ -43,7 +43,6 @@ from drake_diff.runs.save import (
     record_of_phases,
     write_files,
 )
-from drake_diff.runs.sealed import SealedRecord, read_fields, reproducible
 from drake_diff.runs.sections import COSTS, unknown_functions
 from drake_diff.runs.trace import Trace, read_trace
 
@@ -71,36 +70,13 @@ GIVEN_IN_PHASES = "in each phase's record problem and model, and here links and 
 REPRODUCED_BY = {
     "fit": "drake_diff.identification.files",
     "comparison": "drake_diff.identification.recorded_causes",
-    "panel": "drake_diff.panels.reproduce",
-    "trial": "drake_diff.panels.reproduce",
+    "panel": "drake_diff.panels.results",
+    "trial": "drake_diff.panels.results",
 }
 NOT_REPEATED = {
     Status.TIME_LIMIT: "how far a search gets within its time limit is another on every run",
     Status.INTERRUPTED: "the search was interrupted, at no moment that could be found again",
 }
-
-
-@dataclass(frozen=True)
-class Reproduced:
-    """A directory that was reproduced: the record's fields, and the bytes of the other files by name.
-
-    `apart` is how far the plan of the search is from the recorded one, relative, 0 where they are the same to the last
-    bit; `unrepeated` says why the search was not run again, and `missing` which keys of the record rest on that.
-    `unchecked` are parts of the record that could not be measured on this machine, and stand as they are recorded.
-    `problems` are contradictions between the files of the directory, `undecided` what cannot be judged, `written` the
-    files that drake_diff writes there. `recorded` are the fields to compare with, where not all are compared.
-    """
-
-    fields: dict[str, Any]
-    files: dict[str, bytes]
-    apart: float = 0.0
-    unrepeated: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
-    unchecked: tuple[str, ...] = ()
-    problems: tuple[str, ...] = ()
-    undecided: tuple[str, ...] = ()
-    written: tuple[str, ...] = ()
-    recorded: dict[str, Any] | None = None
 
 
 def reproduce(folder: Path, record: SealedRecord, models: Path | None) -> Reproduced | None:

@@ -25,15 +25,34 @@ from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Solution
-from drake_diff.runs.directory import is_partial, is_taken, move_into_place, name_of, partial_of, writing, written_whole
-from drake_diff.runs.fields import Claim, Event, ModelInput, Solver, canonical, finite
+from drake_diff.runs.directory import (
+    is_partial,
+    is_taken,
+    load_record,
+    move_into_place,
+    name_of,
+    partial_of,
+    record_path,
+    writing,
+    written_whole,
+)
+from drake_diff.runs.fields import (
+    Claim,
+    Event,
+    Passed,
+    SealedRecord,
+    Solver,
+    canonical,
+    evidence,
+    files_below,
+    finite,
+    reproducible,
+)
 from drake_diff.runs.measurement import Measurement, failure_of, measure, replay_evidence
 from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.plan_record import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesSection, PlanRecord
-from drake_diff.runs.provenance import gradient_evidence, provenance_of, written_now
-from drake_diff.runs.read import load_record, record_path
+from drake_diff.runs.provenance import gradient_evidence, header
 from drake_diff.runs.rebuild import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve, rows_of, write_plan
-from drake_diff.runs.sealed import Passed, SealedRecord, WallClock, files_below, reproducible
 from drake_diff.runs.sections import asked, found, panel_of, unknown_functions
 
 LIMITATIONS = ["of the model in simulation only: nothing here was measured on a robot"]
@@ -61,12 +80,11 @@ def save_phases(solution: PhasedSolution, folder: Path, save_phase: Callable[[So
 def phases_record(folder: Path, problem: PhasedProblem, verdict: Passed, sentence: str) -> PlanRecord:
     """The record of a run without a solution."""
     section = PhasesSection(**_asked_of_all(problem))
-    return PlanRecord(
-        name=name_of(folder), verdict=verdict, sentence=sentence, phases=section, **_asked_of_phases(problem)
-    )
+    asked = _asked_of_phases(folder, problem)
+    return PlanRecord(verdict=verdict, sentence=sentence, phases=section, **asked)
 
 
-def _asked_of_phases(problem: PhasedProblem) -> dict[str, Any]:
+def _asked_of_phases(folder: Path, problem: PhasedProblem, seconds: float | None = None) -> dict[str, Any]:
     names = ", then ".join(problem.names)
     repeated = " and again from the start" if problem.periodic is not False else ""
     rigid = [isinstance(switch.reset, Impact) and switch.reset.has_gap for switch in problem.switches]
@@ -75,9 +93,7 @@ def _asked_of_phases(problem: PhasedProblem) -> dict[str, Any]:
         f"{problem.name} in {len(problem.phases)} phases ({names}{repeated}), linked by resets, each as its record"
     )
     return {
-        "model": ModelInput(file=None, options=None),  # each phase has its own
-        "provenance": provenance_of(),
-        "wall_clock": WallClock(written_utc=written_now()),
+        **header(name_of(folder), seconds=seconds),  # each phase has its own model
         "claim": Claim(statement=f"{statement} says", limitations=limitations),
     }
 
@@ -91,10 +107,7 @@ def record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
     """The record of a solution in phases, but for the files; `folder` is where they are written."""
     given = None if solution.search is None else solution.search.guess
     options = json.loads(json.dumps(solution.options, default=str), parse_constant=str)
-    asked = _asked_of_phases(solution.problem)
-    asked["wall_clock"] = WallClock(written_utc=written_now(), duration_s=solution.wall_time)
     return PlanRecord(
-        name=name_of(folder),
         verdict="pass" if solution.success else "fail",
         sentence=solution.message,
         solver=Solver(
@@ -112,11 +125,12 @@ def record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
             initial_guess=None if given is None else type(given).__name__,
             cost=finite(solution.cost),
             phases=[
-                PhaseEvidence(
+                evidence(
+                    PhaseEvidence,
+                    phase,
                     name=name,
                     directory=directory_of(i),
                     status=phase.status.value,
-                    cost=finite(phase.cost),
                     duration=phase.horizon,
                 )
                 for i, (name, phase) in enumerate(zip(solution.problem.names, solution.phases, strict=True))
@@ -125,16 +139,15 @@ def record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
             chain=chain_evidence(solution.chain),
             **_asked_of_all(solution.problem),
         ),
-        **asked,
+        **_asked_of_phases(folder, solution.problem, solution.wall_time),
     )
 
 
 def _link(solution: PhasedSolution, i: int, switch: Switch) -> LinkEvidence:
     certificates = {c.subject: gradient_evidence(c) for c in solution.link_certificates}
-    return LinkEvidence(
-        before=switch.before,
-        after=switch.after,
-        told=switch.told,
+    return evidence(
+        LinkEvidence,
+        switch,
         reset=_reset(switch, solution.problem),
         errors=[finite(error) for error in solution.link_errors[switch.label]],
         tolerance=FEASIBILITY_TOLERANCE,
@@ -239,12 +252,9 @@ def write_run(solution: Solution | PhasedSolution, folder: Path) -> PlanRecord:
 def record_without_problem(name: str, sentence: str) -> PlanRecord:
     """The record of a run that ended before there was a problem: it says that, when and with which versions."""
     return PlanRecord(
-        name=name,
         verdict="incomplete",
         sentence=sentence,
-        model=ModelInput(file=None, options=None),
-        provenance=provenance_of(),
-        wall_clock=WallClock(written_utc=written_now()),
+        **header(name),
         events=[Event(t_s=None, kind="failure", message=sentence)],
     )
 
@@ -340,6 +350,7 @@ def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedP
 
 def record_of(m: Measurement, folder: Path) -> PlanRecord:
     """The record of a measurement, but for the files; `folder` is where they are written."""
+    replays = [replay_evidence(r) for r in (*m.replays, *m.solution.cross_checks)]
     return _record(
         folder,
         m.solution.wall_time,
@@ -348,8 +359,8 @@ def record_of(m: Measurement, folder: Path) -> PlanRecord:
         metrics=m.metrics,
         invariants=m.invariants,
         events=m.events,
-        replays=[replay_evidence(r) for r in (*m.replays, *m.solution.cross_checks)],
-        panel=panel_of(m.solution),
+        replays=replays,
+        panel=panel_of(m.solution, replays),
         failures=m.failures,
         **asked(m.solution.problem, m.solution),
         **found(m.solution),
@@ -357,8 +368,7 @@ def record_of(m: Measurement, folder: Path) -> PlanRecord:
 
 
 def _record(folder: Path, duration: float | None = None, **fields: Any) -> PlanRecord:
-    clock = WallClock(written_utc=written_now(), duration_s=duration)
-    return PlanRecord(name=name_of(folder), provenance=provenance_of(), wall_clock=clock, **fields)
+    return PlanRecord(**{**header(name_of(folder), seconds=duration), **fields})
 
 
 def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecord:

@@ -4,7 +4,7 @@ A problem is written as plain numbers and names, and comes back from them: all o
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from typing import Any
 
@@ -20,7 +20,7 @@ from drake_diff.model.plant import FLOATING, joints
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost, SumOfCosts, TrackingCost
-from drake_diff.optimize.problem.coupling import Couples, InputRate, Jerk, Periodic
+from drake_diff.optimize.problem.coupling import InputRate, Jerk, Periodic
 from drake_diff.optimize.problem.dwell import Dwell
 from drake_diff.optimize.problem.fixed_contacts import (
     IMPACT_QUANTITIES,
@@ -54,7 +54,10 @@ from drake_diff.runs.fields import (
     PanelCase,
     ParameterEvidence,
     Quantity,
+    ReplayEvidence,
     Solver,
+    evidence,
+    plain,
 )
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.provenance import NO_BODY, embodiment_of, gradient_evidence, model_input
@@ -115,6 +118,11 @@ KINDS_OF_OBSTACLES = (SphereObstacle, BoxObstacle, SelfCollision)
 # By the names that a record has.
 GOALS: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS_OF_GOALS, *KINDS_OVER_TIME, *KINDS_OF_OBSTACLES)}
 
+KINDS_OF_COSTS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "ConstantCost": (ConstantCost, ("rate",)),
+    "QuadraticCost": (QuadraticCost, ("Q", "R", "x_ref", "u_ref")),
+    "CostToGo": (CostToGo, ("x_ref", "gradient", "hessian")),
+}
 COUPLINGS: dict[str, Any] = {kind.__name__: kind for kind in (Periodic, InputRate, Jerk)}
 
 
@@ -186,20 +194,11 @@ def _given_data(problem: Problem) -> Iterator[DataUse]:
             yield DataUse(name=f"constraint {c.label}", what="a function: what it knows is not recorded")
 
 
-def panel_of(solution: Solution) -> EvaluationPanel:
-    """Under what a solution is judged: every replay, and which of them its verdict rests on."""
+def panel_of(solution: Solution, replays: Sequence[ReplayEvidence]) -> EvaluationPanel:
+    """Under what a solution is judged: every replay of its record, and which of them its verdict rests on."""
     problem = solution.problem
     decides = deciding(solution.plan, solution.replays) if problem.has_model else []
-    cases = [
-        PanelCase(
-            variant=r.variant,
-            control=r.control,
-            time_step_s=r.time_step,
-            contact_approximation=r.approximation,
-            decides=r.variant in decides,
-        )
-        for r in (*solution.replays, *solution.cross_checks)
-    ]
+    cases = [evidence(PanelCase, r, decides=r.variant in decides) for r in replays]
     statement = "the plan's own start, model and inputs in each case; a variant that decides holds under one control"
     if not problem.has_model:
         statement = "the given equations alone, at and between the knots: there is no plant to replay it on"
@@ -222,7 +221,7 @@ def found(solution: Solution, *, measured: bool = True) -> dict[str, Any]:
     """
     problem, vector = solution.problem, solution.vector
     units = [p.unit for p in vector.parameters for _ in p.value]
-    lower, upper = (finite_list(side) for side in problem.bounds_of_parameters())
+    lower, upper = (plain(side) for side in problem.bounds_of_parameters())
     parameters = [
         ParameterEvidence(
             name=name,
@@ -237,13 +236,10 @@ def found(solution: Solution, *, measured: bool = True) -> dict[str, Any]:
         for i, name in enumerate(vector.names)
     ]
     options = {k: v.item() if isinstance(v, np.generic) else v for k, v in solution.options.items() if k not in GUESS}
-    solver = Solver(
-        method=solution.method,
-        solver=solution.solver,
-        scheme=solution.scheme,
+    solver = evidence(
+        Solver,
+        solution,
         status=solution.status.value,
-        message=solution.message,
-        solver_message=solution.solver_message,
         options={k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in options.items()},
         iterations=len(solution.iterations),
     )
@@ -281,7 +277,7 @@ def _action(problem: Problem, time_step: float, limit: float | None) -> ActionIn
         kind = "effort, held over each step"
         if any(a.kp is not None for a in problem.model.contract.actuators):
             kind += ", added to the actuators' PD control"
-    limits = (finite_list(problem.bounds.u_lower), finite_list(problem.bounds.u_upper))
+    limits = (plain(problem.bounds.u_lower), plain(problem.bounds.u_upper))
     inputs = zip(problem.input_names, units_of(problem)[problem.nx :], *limits, strict=True)
     reason = "of the solve as a whole" if limit else "none: planned ahead in simulation, no time limit was given"
     return ActionInterface(
@@ -324,9 +320,9 @@ def _gradient(solution: Solution, measured: bool) -> GradientEvidence:
         solver_tolerance=tolerance,
         horizon=Quantity(value=solution.horizon, unit="s"),
         final_state_norm_definition=f"none: {ends}" if isinstance(ends, Refusal) else FINAL_STATE_NORM,
-        final_state_norms=[] if isinstance(ends, Refusal) else finite_list(ends),
+        final_state_norms=[] if isinstance(ends, Refusal) else plain(ends),
         lagrangian_norm_definition=f"none: {result}" if isinstance(result, Refusal) else LAGRANGIAN_NORM,
-        lagrangian_norms=[] if isinstance(result, Refusal) else finite_list(result.state_norms),
+        lagrangian_norms=[] if isinstance(result, Refusal) else plain(result.state_norms),
         stationarity=Quantity(
             value=ratio, unit="1", reason=str(result) if isinstance(result, Refusal) else STATIONARITY
         ),
@@ -345,14 +341,14 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
         "horizon_s": problem.start_horizon,
         "state_names": list(problem.state_names),
         "input_names": list(problem.input_names),
-        "x0": finite_list(problem.x0),
-        "x_goal": finite_list(problem.goal),
-        "waypoints": {str(k): finite_list(x) for k, x in problem.waypoints.items()},
+        "x0": plain(problem.x0),
+        "x_goal": plain(problem.goal),
+        "waypoints": {str(k): plain(x) for k, x in problem.waypoints.items()},
         "constraints": [
             {
                 "name": c.label,
-                "lower": finite_list(c.lower),
-                "upper": finite_list(c.upper),
+                "lower": plain(c.lower),
+                "upper": plain(c.upper),
                 "knots": position,
                 "every_knot": c.knots is None,
                 "quantity": _quantity(c.function),  # null: a user's function
@@ -362,7 +358,7 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
         **({"couplings": [c.to_dict() for c in problem.couplings]} if problem.couplings else {}),
         "goals": [goal.to_dict() for goal in problem.goals],
         "free_horizon_s": None if problem.horizon is None else list(problem.horizon),
-        **{name: finite_list(getattr(problem.bounds, name)) for name in LIMITS},
+        **{name: plain(getattr(problem.bounds, name)) for name in LIMITS},
         "optimize": list(problem.optimize),
         "parameters": [p.name for p in problem.parameters.parameters],
         **{name: _cost(getattr(problem, name)) for name in COSTS},
@@ -377,30 +373,18 @@ def _quantity(function: Any) -> dict[str, Any] | None:
     return function.to_dict() if isinstance(function, FixedContactQuantity) else description_of(function)
 
 
-def finite_list(values: Any) -> list[float | None]:
-    """Numbers for JSON; None where there is no bound or no goal (infinite, NaN)."""
-    return [float(v) if math.isfinite(v) else None for v in np.asarray(values).ravel()]
-
-
 def _cost(cost: Any) -> Any:
-    if isinstance(cost, ConstantCost):
-        return {"ConstantCost": {"rate": cost.rate}}
-    if isinstance(cost, QuadraticCost):
-        parts = {name: getattr(cost, name) for name in ("Q", "R", "x_ref", "u_ref")}
-        return {"QuadraticCost": {name: np.asarray(v).tolist() for name, v in parts.items() if v is not None}}
-    if isinstance(cost, CostToGo):
-        return {
-            "CostToGo": {name: np.asarray(getattr(cost, name)).tolist() for name in ("x_ref", "gradient", "hessian")}
-        }
-    if isinstance(cost, TrackingCost):
-        named = zip(("times", "xs", "us"), cost.reference, strict=True)
-        parts = {**dict(named), "Q": cost.Q, "R": cost.R}
-        return {"TrackingCost": {name: np.asarray(v).tolist() for name, v in parts.items() if v is not None}}
     if isinstance(cost, SumOfCosts):
         result = [_cost(entry) for entry in cost.costs]
         unknown = [entry for entry in result if isinstance(entry, str)]
         return f"a sum with {', '.join(unknown)}" if unknown else {"SumOfCosts": result}
-    return None if cost is None else getattr(cost, "__qualname__", type(cost).__name__)
+    kind, names = KINDS_OF_COSTS.get(type(cost).__name__, (None, ()))
+    values = {name: getattr(cost, name) for name in names if type(cost) is kind}
+    if isinstance(cost, TrackingCost):
+        values = {**dict(zip(("times", "xs", "us"), cost.reference, strict=True)), "Q": cost.Q, "R": cost.R}
+    if not values:
+        return None if cost is None else getattr(cost, "__qualname__", type(cost).__name__)
+    return {type(cost).__name__: {name: np.asarray(v).tolist() for name, v in values.items() if v is not None}}
 
 
 def unknown_functions(record: PlanRecord) -> tuple[list[str], list[str]]:
@@ -432,7 +416,7 @@ def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array
     goals = [rebuild_goal(element) for element in p["goals"]]
     system = FixedContacts(model, **p["fixed_contacts"]) if p.get("fixed_contacts") else model
     constraints = [_rebuild_constraint(c, system) for c in p["constraints"] if c["quantity"] is not None]
-    couplings = [rebuild_coupling(element) for element in p.get("couplings", ()) if "Coupling" not in element]
+    couplings = [_rebuild("coupling", COUPLINGS, c) for c in p.get("couplings", ()) if "Coupling" not in c]
     asked = goals or constraints or couplings or running is not None or final is not None
     if not asked and np.all(np.isnan(goal)):
         final = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem wants something to be asked
@@ -476,22 +460,18 @@ def _rebuild_constraint(c: dict[str, Any], system: Model | FixedContacts) -> Con
 
 def rebuild_goal(told: Any) -> Goal:
     """A goal from what a record tells of it; InputError where that is none."""
-    if not (isinstance(told, dict) and len(told) == 1 and next(iter(told)) in GOALS):
-        raise InputError("goal", got=repr(told)[:80], expected=f"one of {', '.join(GOALS)} with its values")
+    goal: Goal = _rebuild("goal", GOALS, told)
+    return goal
+
+
+def _rebuild(subject: str, kinds: Mapping[str, Any], told: Any) -> Any:
+    """One of `kinds` with its values; InputError where `told` is none."""
+    if not (isinstance(told, dict) and len(told) == 1 and next(iter(told)) in kinds):
+        raise InputError(subject, got=repr(told)[:80], expected=f"one of {', '.join(kinds)} with its values")
     ((kind, values),) = told.items()
     if kind == Dwell.__name__:
         values = {**values, "goal": rebuild_goal(values.get("goal"))}
-    result: Goal = GOALS[kind](**values)
-    return result
-
-
-def rebuild_coupling(told: Any) -> Couples:
-    """A coupling from what a record tells of it; InputError where that is none."""
-    if not (isinstance(told, dict) and len(told) == 1 and next(iter(told)) in COUPLINGS):
-        raise InputError("coupling", got=repr(told)[:80], expected=f"one of {', '.join(COUPLINGS)} with its values")
-    ((kind, values),) = told.items()
-    result: Couples = COUPLINGS[kind](**values)
-    return result
+    return kinds[kind](**values)
 
 
 def _numbers(values: Any, missing: float) -> Array:
@@ -502,14 +482,11 @@ def _numbers(values: Any, missing: float) -> Array:
 def _rebuild_cost(cost: Any) -> Any:
     if not isinstance(cost, dict):
         return None  # none, or the user's function
-    if "ConstantCost" in cost:
-        return ConstantCost(cost["ConstantCost"]["rate"])
-    if "CostToGo" in cost:
-        return CostToGo(**{name: np.array(value, dtype=float) for name, value in cost["CostToGo"].items()})
-    if "TrackingCost" in cost:
-        parts = {name: np.array(value, dtype=float) for name, value in cost["TrackingCost"].items()}
-        reference = parts["times"], parts["xs"], parts.get("us")
-        return TrackingCost(reference, Q=parts.get("Q"), R=parts.get("R"))
-    if "SumOfCosts" in cost:
-        return [_rebuild_cost(entry) for entry in cost["SumOfCosts"]]
-    return QuadraticCost(**cost["QuadraticCost"])
+    ((kind, values),) = cost.items()
+    if kind == "SumOfCosts":
+        return [_rebuild_cost(entry) for entry in values]
+    values = {name: np.array(value, dtype=float)[()] for name, value in values.items()}
+    if kind == "TrackingCost":
+        reference = values["times"], values["xs"], values.get("us")
+        return TrackingCost(reference, Q=values.get("Q"), R=values.get("R"))
+    return KINDS_OF_COSTS[kind][0](**values)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from drake_diff._base.arrays import positive_float
-from drake_diff._base.files import MOST_READ, MOST_TEXT, files_in, read_plain, sha256_of
+from drake_diff._base.files import read_plain
 from drake_diff._base.sandbox import Outcome, call
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, MissingDependencyError, ModelError
@@ -17,33 +17,31 @@ from drake_diff.optimize.solution import Solution
 from drake_diff.runs.differences import (
     Compared,
     Difference,
+    Reproduced,
     compare_bytes,
     compare_fields,
     compare_text,
     compare_traces,
 )
-from drake_diff.runs.directory import is_partial
-from drake_diff.runs.fields import FileEvidence, canonical
+from drake_diff.runs.directory import FILES as OLD_FILES
+from drake_diff.runs.directory import is_partial, load_plan_record, load_record, read_checked, record_path
+from drake_diff.runs.fields import SCHEMA_VERSION, SealedRecord
 from drake_diff.runs.messages import claims_of
 from drake_diff.runs.other_records import ComparisonRecord, FitRecord, is_trial_file
 from drake_diff.runs.plan_record import PhasesSection, PlanRecord
 from drake_diff.runs.provenance import packages_here
-from drake_diff.runs.read import FILES as OLD_FILES
-from drake_diff.runs.read import load_plan_record, load_record, parse_record, record_path
 from drake_diff.runs.rebuild import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve
 from drake_diff.runs.reproduce import (
     OF_RECOVERED,
     SAME_PLAN,
     SEARCH_TOPICS,
     SEARCHED,
-    Reproduced,
     is_below,
     odd_metrics,
     odd_trace,
     reproduce,
 )
 from drake_diff.runs.save import FILES
-from drake_diff.runs.sealed import SCHEMA_VERSION, SealedRecord, own_sha256, read_fields
 from drake_diff.runs.trace import CONFIGURATION, read_trace
 
 MOST = 16  # lines of a kind that are printed
@@ -178,11 +176,11 @@ def verify(
     easier task is as true as any: `claimed` says what was asked.
 
     Comparisons, robustness trials, panels and rollouts' certificates are not run again: their verdict is at best
-    "intact". But recordings that were compared are compared again, and their causes looked for. Of a panel, and of the
-    record of one trial of it, what follows from its journal is made again. What cannot be run again (a model that came
-    from a diagram, a user's functions, a search that a time limit ended) makes the verdict "undecided", and so does
-    another version of Drake where numbers differ. It takes as long as the solve or the search for causes did, of which
-    it waits for 60 seconds where `time_limit` says nothing else.
+    "intact". But recordings that were compared are compared again, and their causes looked for; table, summary and
+    ranking of a panel are made again from its trials. What cannot be run again (a model that came from a diagram, a
+    user's functions, a search that a time limit ended) makes the verdict "undecided", and so does another version of
+    Drake where numbers differ. It takes as long as the solve or the search for causes did, of which it waits for 60
+    seconds where `time_limit` says nothing else.
 
     The directory may be a stranger's. Its model is read and run in a child process with limits of time and memory, and
     with the rights of this one (see docs/strangers.md). Where that process crashes the verdict is "broken", where it
@@ -269,7 +267,7 @@ def _looked_at(folder: Path) -> Verification:
     if path is None:
         return Verification(folder, None, complaints=(f"there is no record: no {SealedRecord.FILE}",))
     try:
-        record, problems = _read_checked(path)
+        record, problems = read_checked(path)
     except ArtifactError as error:
         return Verification(folder, None, complaints=(str(error),))
     result = Verification(folder, record, problems, claimed=claims_of(record), notes=_other_versions(record))
@@ -320,7 +318,7 @@ def _with_phases(found: Verification, section: PhasesSection, models: Path | Non
     )
     checked = found.checked
     for name in (phase.directory for phase in section.phases):
-        inner, problems = _read_checked(found.directory / name / PlanRecord.FILE)
+        inner, problems = read_checked(found.directory / name / PlanRecord.FILE)
         phase = _run_again(Verification(found.directory / name, inner), inner, models)
         complaints += [f"{name}: {line}" for line in (*problems, *phase.complaints)]
         undecided += [f"{name}: {line}" for line in phase.undecided if WITHIN_PHASES not in line]
@@ -382,7 +380,7 @@ def _recalled_apart(directory: str, models: str | None) -> None:
 @contextmanager
 def _recalled(folder: Path, models: Path | None) -> Iterator[Solution]:
     record = load_plan_record(folder)
-    _refuse(folder, _read_checked(folder / record.FILE)[1])
+    _refuse(folder, read_checked(folder / record.FILE)[1])
     _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
     plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
     with rebuilt(record.model, record.contract.get("source"), trace.attachments, models) as model:
@@ -393,49 +391,6 @@ def _recalled(folder: Path, models: Path | None) -> Iterator[Solution]:
 def _refuse(folder: Path, problems: Sequence[str]) -> None:
     if problems:
         raise ArtifactError(f"{folder}: {problems[0]}")
-
-
-def _read_checked(path: Path) -> tuple[SealedRecord, tuple[str, ...]]:
-    """The record in a file, and what of it and of the files beside it is damaged."""
-    problems = []
-    try:
-        fields = read_fields(path)
-        record = parse_record(path, fields)
-        if canonical(fields).encode() != read_plain(path, MOST_TEXT):
-            problems.append(f"{path.name}: its bytes are not those that drake_diff writes for its content")
-        if fields.get("schema_version") == SCHEMA_VERSION and fields != record.model_dump(mode="json"):
-            problems.append(f"{path.name}: a field is missing, or has another type than drake_diff writes")
-        if own_sha256(fields) != fields.get("record_sha256"):
-            problems.append(f"{path.name}: its content does not match its record_sha256: something in it was changed")
-    except RecursionError as error:
-        raise ArtifactError(f"{path.name}: nested too deep") from error
-    if record.subject != "trial":
-        problems += _damage_of_files(path, record)
-    return record, tuple(problems)
-
-
-def _damage_of_files(path_of_record: Path, record: SealedRecord) -> Iterator[str]:
-    """Whether the directory holds the recorded files, as they were, and no others. Nothing outside it is opened."""
-    paths, read, lister = files_in(path_of_record.parent), 0, path_of_record.name
-    paths.pop(lister, None)
-    for name in sorted(record.files.keys() - paths.keys()):
-        yield f"{name}: missing, {lister} lists it"
-    for name, path in sorted(paths.items()):
-        described = record.files.get(name)
-        if not path.is_file(follow_symlinks=False):
-            yield f"{name}: a link, or not a plain file"
-        elif described is None:
-            yield f"{name}: {lister} does not list it"
-        else:
-            size, result = path.stat(follow_symlinks=False).st_size, ""
-            if size == described.bytes:  # one of another size is not read
-                read += size
-                if read > MOST_READ:
-                    yield f"{name}: it and the files before it have more than {MOST_READ} bytes"
-                    return
-                size, result = sha256_of(Path(path.path))
-            if described != FileEvidence(path=name, bytes=size, sha256=result):
-                yield f"{name}: its {size} bytes are not those that {lister} describes"
 
 
 def _compared(found: Verification, record: SealedRecord, again: Reproduced) -> Verification:

@@ -1,29 +1,208 @@
-"""A run's motion served by Meshcat, from its directory alone: the plan's model, and the motion in trace.mcap."""
+"""Runs for a reader: a list of them, one served by Meshcat, what differs between two, and both plans on one page."""
 
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.geometry import Meshcat, MeshcatParams, Rgba
 
+from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ArtifactError, ModelError
 from drake_diff.logs.mcap_file import McapLog, read_mcap
 from drake_diff.model.parameters import applied
 from drake_diff.optimize.goal_markers import drawn_goals
 from drake_diff.optimize.live import differ
 from drake_diff.optimize.solution import Solution
-from drake_diff.pages.meshcat import draw
-from drake_diff.pages.scene import BLUE, Force, Scene, scene_of
-from drake_diff.runs.read import load_plan_record
+from drake_diff.pages.html import Line, Plot, page_data, write_page
+from drake_diff.pages.meshcat import draw, write_replay
+from drake_diff.pages.scene import BLUE, Force, Poses, Scene, longest_path, scene_of
+from drake_diff.runs.differences import READ, differences, is_near, is_number
+from drake_diff.runs.directory import is_partial, load_plan_record, load_record, record_path
+from drake_diff.runs.other_records import TRIALS, ComparisonRecord, is_trial_file
+from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.rebuild import TRACE
 from drake_diff.runs.save import REPLAY
+from drake_diff.runs.trace import read_trace
 from drake_diff.runs.verify import recalled
 
 PLAN, WITHOUT = "plan", "without_feedback"  # the names of ghosts
 OPEN_LOOP = "open loop"
 LOOPBACK = "127.0.0.1"
 UNDER_FEEDBACK = "what moves is the plan, near which feedback keeps the robot; blue: the robot without feedback"
+CONFIGURATION = ("problem", "contract", "model", "inputs", "solver", "action", "observation")
+# What nobody chose, of the configuration: where a file was, what the solver said.
+NO_CHOICE = ("contract.source", "solver.status", "solver.message", "solver.solver_message", "solver.iterations")
+
+
+@dataclass(frozen=True)
+class RunLine:
+    """One directory: what its record says, unverified; `verdict` is "unreadable" where it says nothing.
+
+    It is "incomplete" of what was not moved to its place, whatever it says. `kind` is what the record is of, as "plan",
+    "comparison" or "trial"; only a solve has a status, and only a solve and a trial of a panel a cost. A trial is
+    called by its cell.
+
+    Example:
+        >>> from drake_diff.runs import list_runs
+        >>> line = next(line for line in list_runs("artifacts") if line.name == "pendulum_swing_up")
+        >>> line.kind, line.status, line.model
+        ('plan', 'converged', 'pendulum')
+    """
+
+    directory: Path
+    name: str
+    kind: str
+    verdict: str
+    status: str
+    cost: float | None
+    model: str
+    written_utc: str
+
+
+@dataclass(frozen=True)
+class ChangedEntry:
+    """One entry that differs between two records; None stands for an entry that is not there."""
+
+    key: str
+    a: Any
+    b: Any
+
+
+@dataclass(frozen=True)
+class RunComparison:
+    """What differs between two solves.
+
+    Attributes:
+        configuration: Entries of what was asked that differ.
+        versions: Packages and commits that differ.
+        metrics: Metrics and invariants whose value or verdict differs.
+        refused: Metrics that cannot be compared, as they are defined in other words, units or tolerances.
+
+    Example:
+        >>> from drake_diff.runs import compare_runs
+        >>> run = "artifacts/pendulum_swing_up"
+        >>> compare_runs(run, run).comparable
+        True
+    """
+
+    configuration: tuple[ChangedEntry, ...]
+    versions: tuple[ChangedEntry, ...]
+    metrics: tuple[ChangedEntry, ...]
+    refused: tuple[str, ...]
+
+    @property
+    def comparable(self) -> bool:
+        """Whether every metric could be compared."""
+        return not self.refused
+
+    def __str__(self) -> str:
+        counts = f"versions: {len(self.versions)}; metrics: {len(self.metrics)}; not compared: {len(self.refused)}"
+        return f"configuration: {len(self.configuration)} entries differ; {counts}"
+
+
+def list_runs(directory: str | Path) -> list[RunLine]:
+    """List the directories in `directory` that have a record, by name, without verifying them.
+
+    Args:
+        directory: Where the directories are. Of a panel's own directory its trials are listed.
+
+    Returns:
+        A `RunLine` for each.
+
+    Raises:
+        ArtifactError: There is no such directory.
+
+    Example:
+        >>> from drake_diff.runs import list_runs
+        >>> {line.name: line.verdict for line in list_runs("artifacts")}["pendulum_swing_up"]
+        'pass'
+    """
+    folder = Path(directory)
+    if not folder.is_dir():
+        raise ArtifactError(f"{folder}: expected a directory of runs, got no directory")
+    trials = folder / TRIALS
+    files = trials.iterdir() if trials.is_dir() else folder.iterdir() if folder.name == TRIALS else ()
+    paths = [*(path for path in folder.iterdir() if path.is_dir()), *(path for path in files if is_trial_file(path))]
+    return [_line(path) for path in sorted(paths) if record_path(path) or is_partial(path)]
+
+
+def _line(path: Path) -> RunLine:
+    if record_path(path) is None:
+        return RunLine(path, path.name, "", "incomplete", "", None, "", "")
+    try:
+        record = load_record(path)
+    except ArtifactError:
+        return RunLine(path, path.name, "", "unreadable", "", None, "", "")
+    cost, status, model = None, "-", record.model.file.path if record.model.file else ""
+    if isinstance(record, PlanRecord) and record.subject in ("plan", "phases"):
+        cost = next((m.value for m in record.metrics if m.name == "cost"), None)
+        status = record.solver.status if record.solver else "-"
+        model = str(record.contract.get("name", ""))
+    verdict, name = "incomplete" if is_partial(path) else record.verdict, path.name
+    if isinstance(record, ComparisonRecord) and record.trial is not None:
+        name, given = record.name, record.trial.result.get("cost")
+        cost = float(given) if isinstance(given, (int, float)) else None
+    return RunLine(path, name, record.subject, verdict, status, cost, model, record.wall_clock.written_utc)
+
+
+def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
+    """Compare what the records of two solves say: configuration, versions, metrics.
+
+    Args:
+        a: The directory of the first run.
+        b: The directory of the second one.
+
+    Returns:
+        A `RunComparison`.
+
+    Raises:
+        ArtifactError: One of them has no record that can be read.
+
+    Example:
+        >>> from drake_diff.runs import compare_runs
+        >>> run = "artifacts/pendulum_swing_up"
+        >>> print(compare_runs(run, run))
+        configuration: 0 entries differ; versions: 0; metrics: 0; not compared: 0
+    """
+    first, second = load_plan_record(a), load_plan_record(b)
+    ours = {m.name: m for m in (*first.metrics, *first.invariants)}
+    theirs = {m.name: m for m in (*second.metrics, *second.invariants)}
+    result, refused = [], []
+    for name in dict.fromkeys([*ours, *theirs]):
+        if name not in ours or name not in theirs:
+            refused.append(f"{name}: only {'the first' if name in ours else 'the second'} run has it")
+            continue
+        item, other = ours[name], theirs[name]
+        keys = ("definition", "unit", "direction")
+        odd = next((key for key in keys if getattr(item, key) != getattr(other, key)), None)
+        if odd is not None:
+            refused.append(f"{name}: its {odd} differs: {getattr(item, odd)!r} and {getattr(other, odd)!r}")
+            continue
+        if (item.value, item.verdict) != (other.value, other.verdict):
+            result.append(ChangedEntry(f"{name} [{item.unit}]", item.value, other.value))
+        if item.tolerance != other.tolerance:  # some follow from the motion
+            result.append(ChangedEntry(f"tolerance of {name} [{item.unit}]", item.tolerance, other.tolerance))
+    return RunComparison(
+        configuration=_differences(first, second, CONFIGURATION, NO_CHOICE),
+        versions=_differences(first, second, ("schema_version", "provenance"), ("provenance.command",)),
+        metrics=tuple(result),
+        refused=tuple(refused),
+    )
+
+
+def _differences(
+    first: PlanRecord, second: PlanRecord, sections: tuple[str, ...], apart: tuple[str, ...]
+) -> tuple[ChangedEntry, ...]:
+    item, other = first.model_dump(mode="json"), second.model_dump(mode="json")
+    result = differences({s: item[s] for s in sections}, {s: other[s] for s in sections})
+    return tuple(
+        ChangedEntry(key, was, now)
+        for key, was, now in result
+        if not (key.startswith(apart) or (is_number(was) and is_number(now) and is_near(was, now, *READ)))
+    )
 
 
 def serve(directory: str | Path, *, models: str | Path | None = None) -> tuple[Meshcat, tuple[str, ...]]:
@@ -76,3 +255,140 @@ def _forces(message: Any) -> tuple[Force, ...]:
     points = np.array([message.px, message.py, message.pz]).T
     forces = np.array([message.fx, message.fy, message.fz]).T
     return tuple(Force(point, force) for point, force in zip(points, forces, strict=True))
+
+
+SECOND = Rgba(0.85, 0.4, 0.05, 0.45)  # near the colour of its lines
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """A column of a plan: its unit, values at `times`, and limits."""
+
+    unit: str
+    times: Array
+    values: Array
+    limits: tuple[float | None, float | None]
+
+
+def write_runs_page(path: Path, a: str | Path, b: str | Path, *, models: str | Path | None = None) -> None:
+    """Write the page that compares the plans of the runs in the directories `a` and `b`; `models` as in `verify`.
+
+    Raises:
+        ArtifactError: One of them has no record or no trace that can be read.
+    """
+    result, folders = compare_runs(a, b), (Path(a), Path(b))
+    records = [load_plan_record(folder) for folder in folders]
+    names = [record.name for record in records]
+    if names[0] == names[1]:
+        names = [str(folder) for folder in folders]
+    states, inputs = zip(*(_curves(r, folder) for r, folder in zip(records, folders, strict=True)), strict=True)
+    plots = [*_plots("Positions and velocities", names, states), *_plots("Inputs", names, inputs, held=True)]
+    ends = [float(max(c.times[-1] for c in item.values())) for item in states]
+    view, caption = _replay(folders, names, models)
+    runs = [
+        {"name": n, "verdict": r.verdict, "sentence": r.sentence, "duration_s": end}
+        for n, r, end in zip(names, records, ends, strict=True)
+    ]
+    record = {"runs": runs, **asdict(result), "sentence": _sentence(names, states)}
+    data = page_data(max(ends), plots)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_page(path, "compare_runs.html.j2", record=record, data=data, view=view, caption=caption)
+
+
+def _curves(record: PlanRecord, folder: Path) -> tuple[dict[str, _Curve], dict[str, _Curve]]:
+    """The states and the inputs of a run's plan, by name."""
+    trace = read_trace(folder / TRACE)
+    problem: dict[str, Any] = dict(record.problem)
+    if not len(trace.times):
+        raise ArtifactError(f"{folder / TRACE} has no plan")
+    states = {
+        v.name: _Curve(v.unit, trace.times, trace.planned_xs[:, i], (problem["x_lower"][i], problem["x_upper"][i]))
+        for i, v in enumerate(record.observation.variables)
+    }
+    times = trace.times[: len(trace.planned_us)]
+    inputs = {
+        c.name: _Curve(c.unit, times, trace.planned_us[:, i], (c.lower, c.upper))
+        for i, c in enumerate(record.action.commands)
+    }
+    return states, inputs
+
+
+def _plots(group: str, names: Sequence[str], both: Sequence[dict[str, _Curve]], held: bool = False) -> Iterator[Plot]:
+    """A plot for each column of either run; their limits where they are the same."""
+    for title in dict.fromkeys([*both[0], *both[1]]):
+        curves = [item.get(title) for item in both]
+        known = [c for c in curves if c is not None]
+        times = np.unique(np.concatenate([c.times for c in known]))
+        lines = [
+            Line(name, np.full(len(times), np.nan) if c is None else _at(times, c, held), held=held)
+            for name, c in zip(names, curves, strict=True)
+        ]
+        limits = known[0].limits if all(c.limits == known[0].limits for c in known) else (None, None)
+        odd = len({c.unit for c in known}) > 1
+        unit = " and ".join(dict.fromkeys(c.unit for c in known))
+        heading = f"input {title}" if held else title
+        yield Plot(heading, unit, times, lines, limits=limits, percent=held and not odd, group=group)
+
+
+def _at(times: Array, curve: _Curve, held: bool) -> Array:
+    """A curve at other times: along straight lines between its knots, or held from each; NaN after its end."""
+    if held:
+        result = curve.values[np.searchsorted(curve.times, times, side="right") - 1]
+    else:
+        result = np.interp(times, curve.times, curve.values)
+    return np.where(times > curve.times[-1], np.nan, result)
+
+
+def _sentence(names: Sequence[str], states: Sequence[dict[str, _Curve]]) -> str:
+    """Where the plans are furthest apart, of the states that both have and as a part of what the first one moves."""
+    shared = [name for name in states[0] if name in states[1]]
+    worst, sentence = -1.0, "the two plans have no state in common"
+    for name in shared:
+        item, other = states[0][name], states[1][name]
+        times = np.unique(np.concatenate([item.times, other.times]))
+        gap = np.abs(_at(times, item, False) - _at(times, other, False))
+        if not np.any(np.isfinite(gap)):
+            continue
+        k = int(np.nanargmax(gap))
+        fraction = float(gap[k] / max(float(np.nanmax(np.abs(np.append(item.values, other.values)))), 1e-12))
+        if fraction > worst:
+            worst = fraction
+            sentence = f"the plans are furthest apart in {name}: by {gap[k]:.4g} {item.unit} at {times[k]:.4g} s"
+    return f"{names[0]} and {names[1]}: {sentence}" if worst else f"{names[0]} and {names[1]} have the same plan"
+
+
+def _replay(folders: Sequence[Path], names: Sequence[str], models: str | Path | None) -> tuple[str, str]:
+    """The page with both plans, and what is seen in it; "" and why where one has none."""
+    try:
+        scenes = [scene_of_run(folder, models=models) for folder in folders]
+    except ArtifactError as error:
+        return "", str(error)
+    with TemporaryDirectory() as folder:
+        page = Path(folder) / "replay.html"
+        write_replay(page, _together(*scenes), title=f"{names[0]} and {names[1]}")
+        view = page.read_text(encoding="utf-8")
+    first, second = names
+    seen = f"The plans of both runs, {first} in its own colours and {second} in orange. The one that ends first waits"
+    return view, seen
+
+
+def _together(first: Scene, second: Scene) -> Scene:
+    """Both plans at the same times; the one that ends first waits. No contact forces: those are of the motions."""
+    end = max(float(first.times[-1]), float(second.times[-1]))
+    step = min(float(np.min(np.diff(scene.times))) for scene in (first, second))
+    times = np.linspace(0.0, end, max(2, round(end / step) + 1))
+    poses = dict(_resampled(first, times))
+    poses |= {f"second.{path}": result for path, result in _resampled(second, times).items()}
+    others = tuple(replace(d, body=f"second.{d.body}", colour=SECOND) for d in second.shapes if d.body)
+    trail = longest_path(_resampled(first, times))
+    marks = tuple(mark for mark in (*first.marks, *second.marks) if not mark.body)
+    shapes = (*first.shapes, *others)
+    return Scene(shapes=shapes, times=times, poses=poses, ghosts=(), contacts=(), trail=trail, marks=marks)
+
+
+def _resampled(scene: Scene, times: Array) -> Poses:
+    """The poses of a run's plan, which is a ghost where the motion is another, at the nearest of its times."""
+    poses = next((ghost.poses for ghost in scene.ghosts if ghost.name == PLAN), scene.poses)
+    middles = (scene.times[:-1] + scene.times[1:]) / 2
+    nearest = np.searchsorted(middles, times)
+    return {path: [result[k] for k in nearest] for path, result in poses.items()}

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import make_folder, write_whole
@@ -25,8 +24,8 @@ from drake_diff.loop.run import OK, Loop
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.pages.html import Line, Plot, page_data, write_page
-from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, EvaluationPanel, canonical, finite
+from drake_diff.runs.directory import load_plan_record, name_of, written_whole
+from drake_diff.runs.fields import DataBoundary, DataUse, EvaluationPanel, WallClock, canonical, evidence, finite, plain
 from drake_diff.runs.plan_record import (
     CellEvidence,
     EventEvidence,
@@ -38,16 +37,15 @@ from drake_diff.runs.plan_record import (
     RunEvidence,
     TrialEvidence,
 )
-from drake_diff.runs.provenance import embodiment_of, model_input, provenance_of, written_now
-from drake_diff.runs.read import load_plan_record
-from drake_diff.runs.sealed import WallClock
-from drake_diff.trials.perturbation import Setup, perturbation_named, perturbed
+from drake_diff.runs.provenance import header
 from drake_diff.trials.run import Cell, Robustness, agrees, sized
-from drake_diff.trials.trial import Task, Trial, result_of
+from drake_diff.trials.trial import Setup, Task, Trial, perturbation_named, perturbed, result_of
 
 LATENCY = "latency"  # the perturbation whose levels are steps of the controller
 PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
 PLAIN = Loop()
+SENSED = ("noise", "bias", "delay", "every", "dropout")
+ACTUATED = ("delay", "every", "lower", "upper", "strength", "lag")
 
 
 def save_robustness(result: Robustness, directory: str | Path, run: str | Path | None = None) -> PlanRecord:
@@ -94,9 +92,9 @@ def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -
     record = record_of(result, name_of(folder), source)
     # A trial can be run again from what trial.json says where nothing in the loop is a user's own.
     loop, named = task.loop, ("sensor", "actuator", "fallback", "substeps")
-    plain = all(repr(getattr(loop, name)) == repr(getattr(PLAIN, name)) for name in named)
-    plain = plain and isinstance(task.controller, str) and type(loop.estimator) is Hold and not loop.pushes
-    again = str(run) if run is not None and plain else None
+    usual = all(repr(getattr(loop, name)) == repr(getattr(PLAIN, name)) for name in named)
+    usual = usual and isinstance(task.controller, str) and type(loop.estimator) is Hold and not loop.pushes
+    again = str(run) if run is not None and usual else None
     for name in result.names:
         write_trial(folder / _place(result.worst(name)), task, result.worst(name).worst, again)
     write_whole(folder / TABLE, _table(result).encode())
@@ -116,17 +114,11 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
         trials=result.trials,
         seed=result.seed,
         loop=_loop(task),
-        nominal=Nominal(
-            success=nominal.success,
-            failures=list(nominal.failures),
-            goal_error=finite(nominal.goal_error),
-            ended=nominal.run.ended,
-        ),
+        nominal=evidence(Nominal, nominal, ended=nominal.run.ended),
         perturbations=[
-            PerturbationEvidence(
-                name=name,
-                unit=perturbation_named(name).unit,
-                meaning=perturbation_named(name).meaning,
+            evidence(
+                PerturbationEvidence,
+                perturbation_named(name),
                 margin=result.margins[name],
                 cells=[_cell(c) for c in result.of(name)],
                 worst=_place(result.worst(name)),
@@ -134,7 +126,7 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
             for name in result.names
         ],
     )
-    sections = {"panel": _panel(result), "data": _data(result, run), "wall_clock": _times(result)}
+    sections = {"panel": _panel(result), "data": _data(result, run), "wall_clock": _times(result, record.wall_clock)}
     return record.model_copy(update=sections)
 
 
@@ -163,16 +155,8 @@ def _data(result: Robustness, run: RunEvidence | None) -> DataBoundary:
 
 def _record(name: str, model: Model, verdict: Any, sentence: str, **trials: Any) -> PlanRecord:
     states, inputs = list(model.state_names), list(model.input_names)
-    return PlanRecord(
-        name=name,
-        verdict=verdict,
-        sentence=sentence,
-        model=model_input(model),
-        embodiment=embodiment_of(model.contract),
-        provenance=provenance_of(),
-        wall_clock=WallClock(written_utc=written_now()),
-        robustness=RobustnessSection(state_names=states, input_names=inputs, **trials),
-    )
+    section = RobustnessSection(state_names=states, input_names=inputs, **trials)
+    return PlanRecord(verdict=verdict, sentence=sentence, robustness=section, **header(name, model))
 
 
 def _place(cell: Cell) -> str:
@@ -180,8 +164,9 @@ def _place(cell: Cell) -> str:
 
 
 def _cell(c: Cell) -> CellEvidence:
-    return CellEvidence(
-        level=c.level,
+    return evidence(
+        CellEvidence,
+        c,
         successes=c.rate.successes,
         trials=c.rate.trials,
         rate=c.rate.value,
@@ -192,52 +177,41 @@ def _cell(c: Cell) -> CellEvidence:
         controller_errors=dict(c.controller_errors),
         goal_error_median=finite(c.goal_error),
         goal_error_worst=finite(c.worst_goal_error),
-        displacement=c.displacement,
-        predicted=c.predicted,
-        ratio=c.ratio,
     )
 
 
 def _loop(task: Task) -> LoopEvidence:
     loop, period = task.loop, task.loop.substeps * task.model.time_step
     sensor, actuator = loop.sensor, loop.actuator
-    seen = {n: getattr(sensor, n) for n in ("noise", "bias", "delay", "every", "dropout")}
-    done = {n: getattr(actuator, n) for n in ("delay", "every", "lower", "upper", "strength", "lag")}
+    seen = {n: plain(np.asarray(getattr(sensor, n), dtype=float)[()]) for n in SENSED}
+    done = {n: plain(np.asarray(getattr(actuator, n), dtype=float)[()]) for n in ACTUATED}
     return LoopEvidence(
         controller=task.controller_name,
         period_s=period,
         steps=len(task.us),
         judged_by=task.judged_by,
-        sensor={key: _numbers(value) for key, value in seen.items()},
+        sensor=seen,
         estimator=type(loop.estimator).__name__,
-        actuator={key: _numbers(value) for key, value in done.items()},
+        actuator=done,
         fallback=None if loop.fallback is None else loop.fallback.mode,
         latency_budget_s=period if loop.latency_budget is None else loop.latency_budget,
         latency_budget_is="the controller's period" if loop.latency_budget is None else "stated",
     )
 
 
-def _numbers(value: ArrayLike) -> float | list[float | None] | None:
-    """A number or a list of them; null for no limit."""
-    if np.ndim(value) == 0:
-        return finite(float(np.asarray(value)))
-    return [finite(float(v)) for v in np.asarray(value, dtype=float)]
-
-
-def _times(result: Robustness) -> WallClock:
+def _times(result: Robustness, clock: WallClock) -> WallClock:
     runs = [result.task.nominal.run, *(c.worst.outcome.run for c in result.cells)]
     taken = np.concatenate([run.latencies for run in runs])
     if not len(taken):
-        return WallClock(written_utc=written_now())
-    budget = _loop(result.task).latency_budget_s
-    return WallClock(
-        written_utc=written_now(),
-        latency_median_s=float(np.median(taken)),
-        latency_99_percent_s=float(np.quantile(taken, 0.99)),
-        latency_largest_s=float(np.max(taken)),
-        late=int(np.sum(taken > budget)),
-        controller_steps=len(taken),
-    )
+        return clock
+    latencies = {
+        "latency_median_s": float(np.median(taken)),
+        "latency_99_percent_s": float(np.quantile(taken, 0.99)),
+        "latency_largest_s": float(np.max(taken)),
+        "late": int(np.sum(taken > _loop(result.task).latency_budget_s)),
+        "controller_steps": len(taken),
+    }
+    return clock.model_copy(update=latencies)
 
 
 def _table(result: Robustness) -> str:
@@ -377,8 +351,8 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
     from drake_diff.pages.scene import BLUE, scene_of
 
     make_folder(folder)
-    evidence = trial_evidence(task, trial, run)
-    write_whole(folder / TRIAL, canonical(evidence.model_dump(mode="json")).encode())
+    told = trial_evidence(task, trial, run)
+    write_whole(folder / TRIAL, canonical(told.model_dump(mode="json")).encode())
     latencies = {"budget_s": trial.outcome.run.latency_budget, "latencies_s": trial.outcome.run.latencies.tolist()}
     write_whole(folder / LATENCIES, canonical(latencies).encode())
     setup, motion = perturbed(task.setup, trial.levels, trial.seed), trial.outcome.run.motion
@@ -391,7 +365,7 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
         contacts = motion.contacts if len(motion.contacts) == len(xs) - 1 else ()
         scene = scene_of(model, times, xs, us=motion.us, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
         far = f", drawn up to {FURTHEST:g} only" if np.any(np.abs(motion.xs) > FURTHEST) else ""
-        title = f"{evidence.perturbation} {evidence.level:g}: {trial.label or 'success'}{far}"
+        title = f"{told.perturbation} {told.level:g}: {trial.label or 'success'}{far}"
         write_replay(folder / REPLAY, scene, title=title)
 
 

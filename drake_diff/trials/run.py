@@ -26,8 +26,15 @@ from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs.fields import Label
-from drake_diff.trials.perturbation import PERTURBATIONS, parameters_of, perturbation_named
-from drake_diff.trials.trial import MakeController, Task, Trial, run_trial
+from drake_diff.trials.trial import (
+    PERTURBATIONS,
+    MakeController,
+    Task,
+    Trial,
+    parameters_of,
+    perturbation_named,
+    run_trial,
+)
 
 AGREE = 2.0  # a prediction within this factor of what is measured counts as right
 UNIFORM = 1 / np.sqrt(3)  # the standard deviation of a number that is uniform in [-1, 1]
@@ -320,7 +327,7 @@ class Sensitivity:
         d_(k+1) = (A_k + B_k K_k) d_k + C_k dp + B_k K_k n_k
 
     so the last displacement is linear in the first one d_0, a change dp of the parameters and the noise n_k. What is
-    told is its root mean square, sqrt(E |d_N|^2), for independent perturbations as `trials.perturbation` draws them.
+    told is its root mean square, sqrt(E |d_N|^2), for independent perturbations as `trials.trial` draws them.
 
     Known only in an ideal loop: None with a delay, a lag, lost samples, another estimator, a fallback in charge, or a
     controller with a memory (one with `start`, as MPC), whose answer is no function of what it sees.

@@ -21,8 +21,8 @@ from drake_diff.derivatives import METHODS
 from drake_diff.exceptions import ArtifactError
 from drake_diff.optimize import solve as solving
 from drake_diff.runs import directory as directories
-from drake_diff.runs.compare import list_runs
 from drake_diff.runs.save import recover
+from drake_diff.runs.view import list_runs
 
 pytestmark = pytest.mark.solve
 

@@ -16,7 +16,7 @@ from drake_diff.comparison import save_comparison
 from drake_diff.comparison.files import comparison_data, record_of
 from drake_diff.logs import read_mcap
 from drake_diff.runs import ComparisonRecord
-from drake_diff.runs.sealed import own_sha256
+from drake_diff.runs.fields import own_sha256
 
 pytestmark = pytest.mark.solve
 

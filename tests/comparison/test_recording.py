@@ -275,7 +275,7 @@ def test_our_own_trace_is_a_recording_to_the_bit(run, load):
 
 def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
     pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
-    from drake_diff.runs.ros2 import export_ros2
+    from drake_diff.runs.trace import export_ros2
 
     model, motion, folder = run
     export_ros2(folder, tmp_path / "bag")
@@ -288,7 +288,7 @@ def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
 
 def test_a_damaged_bag_is_no_recording(run, tmp_path):
     pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
-    from drake_diff.runs.ros2 import export_ros2
+    from drake_diff.runs.trace import export_ros2
 
     model, _, folder = run
     export_ros2(folder, tmp_path / "bag")

@@ -14,7 +14,7 @@ import numpy as np
 import drake_diff as dd
 from drake_diff._base import files
 from drake_diff.runs import page, save
-from drake_diff.runs.sealed import files_below
+from drake_diff.runs.fields import files_below
 from helpers.forks import fork, status_of
 
 ERRORS = ("ENOSPC", "EIO", "EACCES")

@@ -25,7 +25,7 @@ from drake_diff.identification.recordings import Chart, given_noise, read_pieces
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns, set_numbers
 from drake_diff.mechanics.description import coordinates_of
-from drake_diff.runs.read import load_record
+from drake_diff.runs.directory import load_record
 
 pytestmark = pytest.mark.solve
 

@@ -17,7 +17,7 @@ import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.logs.mcap_file import read_mcap
-from drake_diff.runs.sealed import own_sha256
+from drake_diff.runs.fields import own_sha256
 
 pytestmark = pytest.mark.solve
 

@@ -15,8 +15,7 @@ from drake_diff.exceptions import InputError, ModelWarning
 from drake_diff.optimize import FixedContacts, Impact, PhasedProblem
 from drake_diff.optimize.phased import _across, judged_phases
 from drake_diff.optimize.program import NlpResult, Outcome
-from drake_diff.runs.fields import canonical
-from drake_diff.runs.sealed import own_sha256
+from drake_diff.runs.fields import canonical, own_sha256
 
 G, RESTITUTION = 9.81, 0.7
 FOOT = [0, 0, -0.05]

@@ -12,7 +12,6 @@ import drake_diff as dd
 from drake_diff.exceptions import ArtifactError, InputError, ModelError
 from drake_diff.optimize.program import Outcome
 from drake_diff.optimize.transcription.collocation import Transcription
-from drake_diff.runs import read_trace
 from drake_diff.runs.view import scene_of_run
 
 pytestmark = pytest.mark.solve
@@ -203,7 +202,7 @@ def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):
     assert verification.complaints == ()
     assert verification.checked > 800
     assert record.problem["num_steps"] == 20
-    again = read_trace(tmp_path / "run" / "trace.mcap").plan
+    again = np.load(tmp_path / "run" / "plan.npz")
     assert np.array_equal(again["mesh"], fine.mesh)
     assert np.array_equal(again["xs"], fine.xs)
 

@@ -24,7 +24,7 @@ from helpers.table import each_row, slow_after
 import drake_diff as dd
 from drake_diff.certificates.certificate import certify_jacobian
 from drake_diff.pages.html import MOST_POINTS, Line, Plot, page_data, write_page
-from drake_diff.runs.compare import write_runs_page
+from drake_diff.runs.view import write_runs_page
 
 pytestmark = pytest.mark.solve
 

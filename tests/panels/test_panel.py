@@ -24,11 +24,10 @@ from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.panels import run_panel
 from drake_diff.panels.panel import row_of
-from drake_diff.panels.panel_file import expand, load_panel
-from drake_diff.panels.results import ranked
+from drake_diff.panels.results import expand, load_panel, ranked
 from drake_diff.runs import list_runs
 from drake_diff.runs.fields import canonical as sealed_canonical
-from drake_diff.runs.sealed import own_sha256
+from drake_diff.runs.fields import own_sha256
 
 pytestmark = pytest.mark.solve
 
@@ -112,10 +111,9 @@ def start(path, out, *words):
     )
 
 
-def finished(journal):
-    """The ids in the whole lines of a journal."""
-    lines = journal.read_bytes().split(b"\n")[1:-1] if journal.exists() else []
-    return {json.loads(line)["id"] for line in lines}
+def finished(out):
+    """The ids of the trials that have their record."""
+    return {path.stem for path in (out / "trials").glob("*.json")}
 
 
 def wait_for(condition, seconds=60):
@@ -160,19 +158,19 @@ def thousand(tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_thousand_trials_killed_three_times_at_random_give_the_same_bytes(thousand):
-    out, journal = thousand.parent / "killed", thousand.parent / "killed" / "trials.jsonl"
+    out = thousand.parent / "killed"
     names = {trial.id: f"{trial.cell['method']} {trial.cell['level']} {trial.fields['repeat']}" for trial in
              expand(load_panel(thousand))}  # fmt: skip
     (thousand.parent / "log").unlink()
     drawn = random.Random()
     for least in sorted(drawn.sample(range(1, 950), 3)):
         process = start(thousand, out, "--workers", 2)
-        wait_for(lambda least=least: len(finished(journal)) >= least)
+        wait_for(lambda least=least: len(finished(out)) >= least)
         time.sleep(drawn.uniform(0, 0.01))
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()
         wait_for(lambda: no_worker_lives(thousand), seconds=5)
-        done, begun = finished(journal), len(logged(thousand))
+        done, begun = finished(out), len(logged(thousand))
         assert least <= len(done) < 1000
         assert not (out / "table.csv").exists()
     output = start(thousand, out, "--workers", 2).communicate()[0]
@@ -199,7 +197,7 @@ def test_a_finished_panel_is_read_and_written_again_to_the_same_bytes_without_an
     table = run_panel(path, out=tmp_path / "out", workers=1)
     assert files(tmp_path / "out") == before
     assert logged(path) == begun
-    assert list(table.rows[0]) == ["id", "method", "level", "repeat", "seed", "success", "cost", "also"]
+    assert list(table.rows[0]) == ["id", "method", "level", "repeat", "seed", "also", "cost", "success"]
 
 
 def test_global_generators_start_from_the_trials_own_seed():
@@ -246,63 +244,62 @@ def test_workers_end_with_their_parent_in_the_middle_of_a_trial(write, tmp_path)
 def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
     path, out = write("cheap", seeds=100, seconds=0.02), tmp_path / "out"
     process = start(path, out, "--workers", 2)
-    wait_for(lambda: len(finished(out / "trials.jsonl")) >= 3)
+    wait_for(lambda: len(finished(out)) >= 3)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes at once
     output = process.communicate(timeout=30)[0]
     assert process.returncode == 130
     assert "the same command goes on" in output
     assert "Traceback" not in output
     assert no_worker_lives(path)
-    assert 3 <= len(finished(out / "trials.jsonl")) < 500
+    assert 3 <= len(finished(out)) < 500
 
 
-# --- the journal ------------------------------------------------------------------------------------------------------
+# --- the records of the trials ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_a_torn_last_line_is_dropped_and_its_trial_evaluated_again(write, tmp_path):
+def test_a_record_that_is_missing_or_half_written_is_made_again(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
     run_panel(path, out=out, workers=1)
-    before, whole = files(out), (out / "trials.jsonl").read_bytes()
-    for cut in (1, 30, len(whole.split(b"\n")[-2])):  # also one that lacks nothing but its end
-        (out / "trials.jsonl").write_bytes(whole[:-cut])
-        begun = len(logged(path))
-        run_panel(path, out=out, workers=1)
-        assert len(logged(path)) == begun + 1
-        assert (out / "trials.jsonl").read_bytes() == whole
-        assert files(out) == before
-    (out / "trials.jsonl").write_bytes(whole[:20])  # of the first line, which says what the panel is
+    before, trial = files(out), min((out / "trials").iterdir())
+    whole = trial.read_bytes()
+    trial.rename(f"{trial}.partial")  # as a process that is killed while it writes leaves it
+    begun = len(logged(path))
     run_panel(path, out=out, workers=1)
+    assert len(logged(path)) == begun + 1
+    assert trial.read_bytes() == whole
+    assert not list(out.rglob("*.partial"))
     assert files(out) == before
 
 
 @pytest.mark.slow
-def test_a_changed_byte_in_any_line_is_refused(write, tmp_path):
+def test_a_changed_byte_in_a_record_is_refused(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
     run_panel(path, out=out, workers=1)
-    whole = (out / "trials.jsonl").read_bytes()
-    drawn = random.Random(0)
-    for place in drawn.sample(range(len(whole) - 1), 40):
+    trial, drawn = max((out / "trials").iterdir()), random.Random(0)
+    whole = trial.read_bytes()
+    for place in drawn.sample(range(len(whole)), 40):
         changed = bytes([*whole[:place], whole[place] ^ 1 << drawn.randrange(7), *whole[place + 1 :]])
-        if whole[place : place + 1] == b"\n":
-            continue
-        (out / "trials.jsonl").write_bytes(changed)
-        with pytest.raises(ArtifactError, match=r"trials\.jsonl"):
+        trial.write_bytes(changed)
+        with pytest.raises(ArtifactError, match=trial.stem):
             run_panel(path, out=out, workers=1)
-        assert (out / "trials.jsonl").read_bytes() == changed
+        assert trial.read_bytes() == changed
 
 
 @pytest.mark.slow
-def test_another_panels_journal_is_refused_and_so_is_one_of_its_lines(write, tmp_path):
+def test_another_panels_directory_is_refused_and_so_is_one_of_its_trials(write, tmp_path):
     run_panel(write("cheap"), out=tmp_path / "out", workers=1)
     run_panel(write("cheap", methods='["other"]'), out=tmp_path / "other", workers=1)
     with pytest.raises(ArtifactError, match="another panel: sha256: expected "):
         run_panel(write("cheap"), out=tmp_path / "other", workers=1)
-    foreign = (tmp_path / "other" / "trials.jsonl").read_bytes().splitlines(keepends=True)[1]
-    with open(tmp_path / "out" / "trials.jsonl", "ab") as file:
-        file.write(foreign)
-    with pytest.raises(ArtifactError, match="line 7 is damaged or another panel's"):
+    foreign = min((tmp_path / "other" / "trials").iterdir())
+    shutil.copy(foreign, tmp_path / "out" / "trials")
+    with pytest.raises(ArtifactError, match=f"{foreign.name}: it is of another panel"):
         run_panel(write("cheap"), out=tmp_path / "out", workers=1)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes").touch()
+    with pytest.raises(InputError, match="holds 'notes'"):
+        run_panel(write("cheap"), out=tmp_path / "mine", workers=1)
 
 
 @pytest.mark.slow
@@ -310,7 +307,7 @@ def test_two_at_once_on_one_directory_are_refused(write, tmp_path):
     path, out = write("cheap", seconds=60), tmp_path / "out"
     process = start(path, out, "--workers", 1)
     wait_for(lambda: len(logged(path)) == 1)
-    with pytest.raises(ArtifactError, match="another process is at work"):
+    with pytest.raises(ArtifactError, match="another run is being written there"):
         run_panel(path, out=out, workers=1)
     process.kill()
     process.communicate()
@@ -450,7 +447,7 @@ def files_again(directory):
 
 
 @pytest.mark.slow
-def test_a_panel_whose_files_do_not_follow_from_its_journal_is_broken(write, tmp_path):
+def test_a_panel_whose_files_do_not_follow_from_its_trials_is_broken(write, tmp_path):
     made = run_panel(write("fails"), out=tmp_path / "panel", workers=1).directory
     trial = min((made / "trials").iterdir())
     one = json.loads(trial.read_bytes())
@@ -471,8 +468,12 @@ def test_a_panel_whose_files_do_not_follow_from_its_journal_is_broken(write, tmp
         "verdict": "pass",
         "sentence": "it ran, and does not say whether it is a success",
     }
-    broken(lambda d: sealed_again(d / in_trials, **better), "its result or its panel is not that of trials.jsonl")
-    broken(lambda d: sealed_again(d / in_trials, **better), "is not that of trials.jsonl", of=in_trials)
+    broken(lambda d: sealed_again(d / in_trials, **better), "table.csv: it does not come out")
+    broken(lambda d: sealed_again(d / in_trials, **better), "is not that of table.csv", of=in_trials)
+    platform = {**one["trial"]["conditions"], "platform": "another"}
+    broken(lambda d: sealed_again(d / in_trials, conditions=platform), "is not what the panel writes")
+    broken(lambda d: sealed_again(d / in_trials, conditions=platform), "its result or its panel", of=in_trials)
+    broken(lambda d: sealed_again(d / in_trials, name="another"), "is not what the panel writes")
     other = {**one["trial"]["inputs"], "seed": 1}
     broken(lambda d: sealed_again(d / in_trials, inputs=other), "its inputs are those of trial", of=in_trials)
     wrong = (made / "table.csv").read_text().replace("ValueError", "Nothing")
@@ -482,11 +483,7 @@ def test_a_panel_whose_files_do_not_follow_from_its_journal_is_broken(write, tmp
     ranking = [{**row, "place": 1} for row in dd.load_record(made).panel.ranking]
     broken(lambda d: sealed_again(d / "record.json", ranking=ranking), "record.json: panel is not what the table says")
 
-    def cut(directory):
-        lines = (directory / "trials.jsonl").read_bytes().splitlines(keepends=True)
-        (directory / "trials.jsonl").write_bytes(b"".join(lines[:-1]))
-
-    broken(cut, "only one of them has trial|does not have this trial")
+    broken(lambda d: (d / in_trials).unlink(), "only one of them has trial")
     plain = tmp_path / "changed"
     shutil.copytree(made, plain)
     (plain / "summary.json").write_text("{}")  # without new hashes

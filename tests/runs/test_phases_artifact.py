@@ -9,8 +9,7 @@ import pytest
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.runs.fields import canonical
-from drake_diff.runs.sealed import own_sha256
+from drake_diff.runs.fields import canonical, own_sha256
 
 pytestmark = [pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning"), pytest.mark.solve]
 

@@ -18,11 +18,10 @@ from pydantic import BaseModel, JsonValue, ValidationError
 import drake_diff as dd
 from drake_diff.exceptions import ArtifactError
 from drake_diff.runs import measure
-from drake_diff.runs.fields import DataBoundary, Metric, canonical
+from drake_diff.runs.directory import KINDS, parse_record
+from drake_diff.runs.fields import SCHEMA_VERSION, DataBoundary, Metric, canonical, own_sha256
 from drake_diff.runs.plan_record import PlanRecord, RolloutSection, SlopeEvidence
 from drake_diff.runs.provenance import named_files
-from drake_diff.runs.read import KINDS, parse_record
-from drake_diff.runs.sealed import SCHEMA_VERSION, own_sha256
 
 pytestmark = pytest.mark.solve
 

@@ -12,10 +12,9 @@ from helpers.models import MODELS, ROOT
 import drake_diff as dd
 from drake_diff.comparison import save_comparison
 from drake_diff.runs import certify_model, save_rollout
-from drake_diff.runs.fields import canonical
+from drake_diff.runs.directory import upgraded
+from drake_diff.runs.fields import SCHEMA_VERSION, canonical, own_sha256
 from drake_diff.runs.provenance import embodiment_of
-from drake_diff.runs.read import upgraded
-from drake_diff.runs.sealed import SCHEMA_VERSION, own_sha256
 from drake_diff.trials import save_robustness
 
 pytestmark = pytest.mark.solve

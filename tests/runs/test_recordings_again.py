@@ -15,10 +15,9 @@ from drake_diff.comparison.recordings import place_of, read_arrays, with_own_nam
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.identification import recorded_causes
 from drake_diff.identification.recorded_causes import as_recorded, cause_of
-from drake_diff.runs.fields import canonical
+from drake_diff.runs.directory import load_record
+from drake_diff.runs.fields import canonical, own_sha256
 from drake_diff.runs.other_records import CauseEvidence
-from drake_diff.runs.read import load_record
-from drake_diff.runs.sealed import own_sha256
 from drake_diff.runs.verify import verify_own
 
 pytestmark = pytest.mark.solve

@@ -10,7 +10,7 @@ import drake_diff as dd
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
 from drake_diff.logs import read_mcap
 from drake_diff.runs import read_trace
-from drake_diff.runs.ros2 import export_ros2
+from drake_diff.runs.trace import export_ros2
 
 needs("rosbags")
 

@@ -35,11 +35,10 @@ from drake_diff.optimize import run as optimize_run
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.panels import run_panel
 from drake_diff.runs import recover
-from drake_diff.runs.compare import list_runs
 from drake_diff.runs.directory import writing, written_whole
-from drake_diff.runs.fields import canonical
+from drake_diff.runs.fields import canonical, own_sha256
 from drake_diff.runs.save import begin, keep_plan
-from drake_diff.runs.sealed import own_sha256
+from drake_diff.runs.view import list_runs
 
 pytestmark = pytest.mark.solve
 

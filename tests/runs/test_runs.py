@@ -12,8 +12,8 @@ from helpers.models import MODELS, ROOT
 import drake_diff as dd
 from drake_diff.cli.main import main
 from drake_diff.exceptions import ArtifactError
-from drake_diff.runs.compare import compare_runs, list_runs
 from drake_diff.runs.save import begin, begin_failure
+from drake_diff.runs.view import compare_runs, list_runs
 
 pytestmark = pytest.mark.solve
 

@@ -21,6 +21,7 @@ from drake_diff.logs import read_mcap
 from drake_diff.optimize.program import Iteration
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs import measure, read_trace
+from drake_diff.runs.rebuild import plan_fields, read_plan, write_plan
 from drake_diff.runs.trace import write_trace
 
 pytestmark = pytest.mark.solve
@@ -73,11 +74,12 @@ def thrown(tmp_path_factory):
     return solution, read_mcap(path)
 
 
-def test_a_collocated_plan_comes_back_as_the_same_solution(collocated, trace_of_collocated):
-    plan = read_trace(trace_of_collocated).plan
+def test_a_collocated_plan_comes_back_as_the_same_solution(collocated, tmp_path):
+    write_plan(tmp_path / "plan.npz", collocated)
+    plan = plan_fields(read_plan(tmp_path / "plan.npz"))
     for name in ("xs", "us", "us_mid", "u_final", "free_horizon"):
         assert bits(plan[name]) == bits(getattr(collocated, name)), name
-    again = solution_of(collocated.problem, **plan)
+    again = solution_of(collocated.problem, scheme=collocated.scheme, **plan)
     assert (again.cost, again.defect, again.integration_error) == (
         collocated.cost,
         collocated.defect,
@@ -97,8 +99,8 @@ def test_parameters_that_were_found_come_back_and_move_the_frames(tmp_path, load
     )
     solution = solution_of(problem, parameters=np.array([0.1, 0.0, -0.9]))
     write_trace(tmp_path / "a.mcap", measure(solution), {})
-    assert bits(read_trace(tmp_path / "a.mcap").plan["parameters"]) == bits(solution.parameters)
     log = read_mcap(tmp_path / "a.mcap")
+    assert bits(log.arrays("/planned/plan")["parameters"][0]) == bits(solution.parameters)
     assert log.channel_metadata["/planned/plan"]["names"]["parameters"] == [f"elbow.offset[{i}]" for i in range(3)]
     lower = log.messages["/tf"][0][1].transforms[1].translation
     assert [lower.x, lower.y, lower.z] == pytest.approx([0.1, 0.0, -0.9], abs=1e-12)
@@ -125,9 +127,8 @@ def test_any_plan_round_trips_whatever_its_numbers(tmp_path_factory, data):
     solution = solution_of(problem, **fields)
     write_trace(path, measure(solution), {})
     trace, log = read_trace(path), read_mcap(path)
-    assert bits(trace.plan["xs"]) == bits(solution.xs)
-    assert bits(trace.plan["us"]) == bits(solution.us)
-    assert trace.plan["u_final"] is None
+    assert bits(trace.planned_xs) == bits(solution.xs)
+    assert bits(trace.planned_us) == bits(solution.us)
     assert bits(trace.times) == bits(solution.times)
     norms = solution.final_state_norms
     logged = log.arrays("/gradient/norm")["final_state"]

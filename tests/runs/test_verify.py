@@ -26,12 +26,12 @@ import drake_diff.runs.save as evidence
 from drake_diff.comparison import save_comparison
 from drake_diff.exceptions import ArtifactError
 from drake_diff.runs import ComparisonRecord, certify_model, measure
-from drake_diff.runs.compare import list_runs
 from drake_diff.runs.differences import is_near, is_near_text
+from drake_diff.runs.fields import reproducible
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.save import begin
-from drake_diff.runs.sealed import reproducible
 from drake_diff.runs.trace import write_trace
+from drake_diff.runs.view import list_runs
 from drake_diff.trials import save_robustness
 
 pytestmark = pytest.mark.solve

@@ -14,9 +14,8 @@ from drake_diff._base.statistics import margin, success_rate
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.parameters import list_parameters
 from drake_diff.optimize.replay import track
-from drake_diff.trials.perturbation import Setup, parameters_of, perturbed
 from drake_diff.trials.run import TOLD, Sensitivity, levels_named, trial_seed
-from drake_diff.trials.trial import Task, run_trial
+from drake_diff.trials.trial import Setup, Task, parameters_of, perturbed, run_trial
 
 pytestmark = pytest.mark.solve
 

@@ -18,7 +18,7 @@ from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 from drake_diff.logs import read_mcap
 from drake_diff.runs import PlanRecord
-from drake_diff.runs.sealed import own_sha256
+from drake_diff.runs.fields import own_sha256
 from drake_diff.runs.verify import recalled
 from drake_diff.trials import files as robustness_page
 from drake_diff.trials import save_robustness
