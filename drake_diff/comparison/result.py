@@ -12,7 +12,7 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.values import preformatted
 from drake_diff.comparison.attribution import AGREES, BROKE_OFF, Attribution, EngineMotion, JacobianAt
 from drake_diff.comparison.recordings import Recording
-from drake_diff.engines.contract import LAWS, UNKNOWN, ContractLine, is_another_model
+from drake_diff.engines.contract import UNKNOWN, ContractLine, is_another_model
 from drake_diff.engines.equations import UserFunction
 from drake_diff.engines.interface import Precision
 from drake_diff.model.model import Model
@@ -140,7 +140,7 @@ class Compared:
         if self.broken:
             return "other model"
         if self.first_apart is not None and self.first.as_if and self.first.as_if == self.largest.as_if:
-            return "other law" if self.first.responsible in LAWS else "other model"
+            return "other law"
         if self.first_apart is not None:
             return "other law" if self.told else "unexplained"
         if self.motion.status.startswith(BROKE_OFF) or not all(self.tells(self.laws[i]) for i in self.other_states):
@@ -167,7 +167,7 @@ class Compared:
             jacobians = f", Jacobians within {_largest(self.jacobian_gaps)} of their largest entry"
             return f"the same simulation: each of {within}{jacobians if self.jacobians else ''}{but}"
         if self.verdict == "other model":
-            lines = [f"{line.quantity}: {line.detail}" for line in self.broken] or [self.first.as_if]
+            lines = [f"{line.quantity}: {line.detail}" for line in self.broken]
             words = f"another model ({'; '.join(lines)})"
             if self.first_apart is None:
                 return f"{words}, though each of {within}"

@@ -162,15 +162,3 @@ def _compile(text: str) -> Any:
         return mujoco.MjModel.from_xml_string(text)
     except ValueError as error:
         raise ModelError(f"MuJoCo cannot take this model: {error}") from error
-
-
-def exponential_gap(x: Array, x_next: Array, h: float, q_start: int = 0, w_start: int = 7) -> Array:
-    """(4,) MuJoCo's quaternion after a step less Drake's of the norm 1: exp(h w') against 1 + h w' / 2.
-
-    The one is (cos, sin) of |h w'| / 2 and the other of arctan(|h w'| / 2), about |h w'|^3 / 24 less.
-    """
-    q, turn = x[q_start : q_start + 4], h * x_next[w_start : w_start + 3] / 2
-    angle = float(np.linalg.norm(turn))
-    axis = turn / angle if angle else turn
-    w, v = np.cos(angle) - np.cos(np.arctan(angle)), (np.sin(angle) - np.sin(np.arctan(angle))) * axis
-    return np.concatenate([[w * q[0] - v @ q[1:]], w * q[1:] + q[0] * v + np.cross(v, q[1:])]) / np.linalg.norm(q)
