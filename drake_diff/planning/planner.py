@@ -17,6 +17,8 @@ from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.certificates.audit import audit
 from drake_diff.certificates.finding import Finding
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning, WriteError
+from drake_diff.legs.feet import Legs
+from drake_diff.legs.standing import Rest, random_shift, shift_to
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import QuadraticCost
@@ -25,14 +27,19 @@ from drake_diff.optimize.problem.obstacles import Obstacle, along_steps, doubts_
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.solve import solve
-from drake_diff.planning.around import Space, lines
-from drake_diff.planning.flying import flight
-from drake_diff.planning.motion import OF_EFFORT, Guess, along, by_controller
-from drake_diff.planning.posture import TOUCHING, effort_limits, of_joints
-from drake_diff.planning.robot import Robot, load_robot
-from drake_diff.planning.shifting import random_shift, shift_to
-from drake_diff.planning.standing import Legged, Rest
-from drake_diff.planning.task import Task, asked, postures
+from drake_diff.planning.guesses import (
+    OF_EFFORT,
+    Guess,
+    Space,
+    Task,
+    along,
+    by_controller,
+    flight,
+    lines,
+    postures,
+    read_goals,
+)
+from drake_diff.planning.robot import TOUCHING, Robot, effort_limits, load_robot, of_joints
 from drake_diff.runs.directory import check_place, is_taken, name_of, written_whole
 from drake_diff.runs.measurement import measure
 from drake_diff.runs.plan_record import PlanRecord
@@ -184,17 +191,17 @@ def plan(
     with warnings.catch_warnings(), ExitStack() as stack:
         warnings.simplefilter("ignore", ModelWarning)
         folders: list[Path] = []
-        held = "the least time is sought without contact" if time else ""
+        weld = "the least time is sought without contact" if time else ""
         for _ in range(2):
             clock.begin("load", path.name)
-            ready = load_robot(path, seed, held)
+            ready = load_robot(path, seed, weld)
             if not folders:
                 directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
                 folders.append(stack.enter_context(written_whole(directory)))
             clock.begin("audit", str(ready.model))
             findings = tuple(audit(ready.model))
             clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
-            task = asked(ready.model, goals or {}, avoid)
+            task = read_goals(ready.model, goals or {}, avoid)
             try:
                 attempts = (attempt.restarted(restarts) for attempt in _attempts(ready, task, time, seed))
                 tried, solutions, apart = _first_that_holds(attempts, clock, partial(_keep, folder=folders[0]))
@@ -204,7 +211,7 @@ def plan(
                 tried, solutions, apart = [str(error)], [], False
             if apart or ready.standing is None or (solutions and solutions[-1].status is Status.INTERRUPTED):
                 break
-            held = f"no plan with its feet on the ground was verified: {'; '.join(tried)}"
+            weld = f"no plan with its feet on the ground was verified: {'; '.join(tried)}"
         if not solutions:
             raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or NOTHING}")
         best = solutions[-1] if apart else min(solutions, key=lambda s: s.defect + s.goal_error)
@@ -299,7 +306,7 @@ def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterato
     if robot.standing is not None:
         yield from _of_standing(robot, robot.standing, task, seed)
         return
-    Space.of(robot, task.avoid).check("start", robot.q)
+    Space.around(robot, task.avoid).check("start", robot.q)
     if robot.model.body_forces:
         yield _feasible(robot, task, flight(robot, task.frames, seed))
     elif robot.is_fully_driven:
@@ -310,17 +317,17 @@ def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterato
         yield from _of_passive(robot, task)
 
 
-def _of_standing(robot: Robot, standing: tuple[Legged, Rest], task: Task, seed: int) -> Iterator[_Attempt]:
+def _of_standing(robot: Robot, standing: tuple[Legs, Rest], task: Task, seed: int) -> Iterator[_Attempt]:
     """A robot on its feet, which stay where they are; where the goal is free, to another one if need be."""
-    legged, rest = standing
+    legs, rest = standing
     for again in range(1 + (task.is_free and robot.model.nv <= TRIED_TWICE)):
         if task.is_free:
-            shift = random_shift(legged, rest, [seed, again], robot.overlap)
+            shift = random_shift(legs, rest, [seed, again], robot.overlap)
         else:
-            shift = shift_to(legged, rest, task.frames, task.joints)
+            shift = shift_to(legs, rest, task.frames, task.joints)
         if isinstance(shift, Refusal):
             raise ModelError(f"from where it stands no other posture was found: {shift}")
-        moved = np.max(np.abs(legged.apart(shift.xs[-1][: robot.model.nq], robot.q)))
+        moved = np.max(np.abs(legs.apart(shift.xs[-1][: robot.model.nq], robot.q)))
         name = f"its feet where they are, up to {moved:.2g} rad or m to a posture that it holds"
         yield _feasible(robot, task, Guess(name, robot.model, shift.xs, shift.us, 0.0))
 
@@ -329,7 +336,7 @@ def _of_driven(robot: Robot, task: Task, least: str | None, seed: int) -> Iterat
     """A robot whose every smooth motion can be driven: from each posture that keeps the goals, the best guess first."""
     if least:
         _check_that_limits_bound_time(robot.model)
-    space = Space.of(robot, task.avoid)
+    space = Space.around(robot, task.avoid)
     for target in postures(robot, task, seed):
         guesses = _guesses(space, target, seed)
         for guess in guesses[:2]:
@@ -410,7 +417,7 @@ def _of_reachable(robot: Robot, task: Task, seed: int) -> Iterator[_Attempt]:
     target = robot.q + fractions * (robot.upper - robot.lower) / 2
     guesses = [_reachable(robot, robot.model, target, *REACHES[0])]
     if robot.apart is not None:
-        space, elsewhere = Space.of(robot, task.avoid), _elsewhere(robot, random)
+        space, elsewhere = Space.around(robot, task.avoid), _elsewhere(robot, random)
         for reach, begun in product(REACHES, (robot, elsewhere)):
             guess = _reachable(begun, robot.apart, target, *reach, "touching nothing (contact=False)")
             guesses += [guess] if guess is not None and _touched(space, guess) <= 0 else []

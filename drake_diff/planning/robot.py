@@ -1,39 +1,63 @@
-"""A stranger's file as a robot that can be planned for: what it leaves out is mended, each repair a sentence."""
+"""A stranger's file as a robot that can be planned for, in a posture to begin in.
+
+What the file leaves out is mended, each repair a sentence: motors, thrusters of what floats, a ground to stand on.
+"""
 
 import warnings
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
+from drake_diff.legs.feet import Legs
+from drake_diff.legs.standing import Rest, input_limits, stand
+from drake_diff.model.contact import overlaps
+from drake_diff.model.inputs import BodyForce
 from drake_diff.model.model import Model, load_model
-from drake_diff.model.plant import actuators, joints
+from drake_diff.model.plant import actuators, bodies, joints, labelled
 from drake_diff.model.step import advance, set_state
-from drake_diff.planning.posture import (
-    Pair,
-    Start,
-    deepest,
-    inside,
-    of_joints,
-    pairs_always,
-    ranges,
-    shares_to_hold,
-    start,
-)
-from drake_diff.planning.standing import Legged, Rest, stand
-from drake_diff.planning.thrusters import lifted, thrusters
 
 TIME_STEP = 0.02  # [s] of a plan
 FEW = 0.5  # of all joints: where fewer have a motor, the file says nothing of motors, or forgot some
 TEXTBOOK = 6  # joints: a file of more is no cart-pole, and none of them is meant to be without a motor
 SMALLEST_DRIVE = 1e-9  # of the largest singular value: a velocity with less is not driven
 NAMED = 4  # of a long list of names
+# Where it begins.
+INSIDE = 0.05  # of a joint's range: a start is at least that far from both its limits
+TURN, SHIFT = 1.0, 0.2  # [rad], [m] the range on each side of 0 of a joint without limits
+WIDEST = 4 * np.pi  # a wider range is as good as none
+TOUCHING = 1e-4  # [m] of overlap: less is none
+HOLD_SHARE = 0.63  # of the effort limits: what a start may need to be held
+SEEN = 16  # postures in which a pair of shapes overlaps before it is said to do so always
+ROOM, BESIDE = 0.1, 6  # [rad or m] that all joints can move at once from a start, in so many ways at random
+ATTEMPTS, FINER = 60, 1000  # at a start: drawn ever farther from the file's, and near the best so far
+DEPTH = 0.01  # [m] of overlap that weighs as much as all that the motors have
+# Thrusters of what nothing else drives.
+STRENGTH = 1.5  # of the weight: what one thruster has, of the two along each axis
+SMALLEST_ARM = 0.01  # [m]
+GRAVITY = 9.81  # [m/s^2] that the weight is reckoned with, also where a model has none
+LIFTS = (0.1, 0.2, 0.5, 1.0, 2.0)  # [m] of a body that begins inside something
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A posture q (nq,), the sum of its overlaps [m] and what it takes of the effort limits.
+
+    `always` are the pairs of shapes that overlap in every posture that was seen, which are not looked at.
+    """
+
+    q: Array
+    overlap: float
+    load: float
+    always: frozenset[Pair]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +68,7 @@ class Robot:
     `shapes` is the model with its collision shapes, in which overlap is looked for; None where there is nothing to
     look for. `always` are the pairs of shapes that overlap in every posture, which is not looked at. `apart` is the
     model without contact in its steps, for a way on which nothing touches, where `model` has contact. `standing`
-    tells how it stands on its feet, where it does; else what floats is held.
+    tells how it stands on its feet, where it does; else what floats is welded.
     """
 
     model: Model
@@ -55,7 +79,7 @@ class Robot:
     repairs: tuple[str, ...]
     is_fully_driven: bool
     always: frozenset[Pair] = frozenset()
-    standing: tuple[Legged, Rest] | None = None
+    standing: tuple[Legs, Rest] | None = None
     apart: Model | None = None
 
     def overlap(self, q: Array) -> float:
@@ -63,10 +87,10 @@ class Robot:
         return 0.0 if self.shapes is None else deepest(self.shapes, q, self.always)
 
 
-def load_robot(path: Path, seed: int, held: str = "") -> Robot:
+def load_robot(path: Path, seed: int, weld: str = "") -> Robot:
     """The robot in a file, mended where it has to be; ModelError where nothing in it can be driven.
 
-    What floats and can stand on feet does so, unless `held` says why it is to be held.
+    What floats and can stand on feet does so, unless `weld` says why it is to be fixed to the world.
     """
     options: dict[str, Any] = {"time_step": TIME_STEP}
     repairs: list[str] = []
@@ -84,10 +108,10 @@ def load_robot(path: Path, seed: int, held: str = "") -> Robot:
             begin = f"only {had} joints had a motor" if had else "no joint had a motor"
             repairs.append(f"{begin}: all {model.nu} that can be driven have one (actuators='all')")
     if model.plant.GetFloatingBaseBodies() and joints(model.plant):
-        standing = Refusal(held) if held else _standing(path, model, options, repairs, seed)
+        standing = Refusal(weld) if weld else _standing(path, model, options, repairs, seed)
         if isinstance(standing, Robot):
             return standing
-        welded = _held(path, options)
+        welded = _welded(path, options)
         if welded is not None and welded.nv < model.nv:
             names = _few(model.plant.get_body(b).name() for b in sorted(model.plant.GetFloatingBaseBodies()))
             options["base"], model = "weld", welded
@@ -226,8 +250,8 @@ def _loaded(path: Path, options: dict[str, Any]) -> Model:
         return load_model(path, **options)
 
 
-def _held(path: Path, options: dict[str, Any]) -> Model | None:
-    """With its base held; None where nothing can move then."""
+def _welded(path: Path, options: dict[str, Any]) -> Model | None:
+    """With its base welded; None where nothing can move then."""
     try:
         return _loaded(path, options | {"base": "weld"})
     except ModelError:
@@ -258,14 +282,14 @@ def _with_mass(path: Path, options: dict[str, Any], model: Model, repairs: list[
     if _can_step(model):
         return model
     if options.get("mimic"):
-        held = _loaded(path, options | {"mimic": "fix"})
-        if _can_step(held):
+        fixed = _loaded(path, options | {"mimic": "fix"})
+        if _can_step(fixed):
             options["mimic"] = "fix"
             repairs.append(
                 "joints that follow others, and those that they follow, are fixed (mimic='fix'), as Drake cannot "
                 f"take a step with them: {_why_not(model)}"
             )
-            return held
+            return fixed
     moved = model.double.mass_matrix()
     light = tuple(
         joint.name()
@@ -315,3 +339,175 @@ def is_fully_driven(model: Model) -> bool:
         return False
     size = np.linalg.svd(model.actuation, compute_uv=False)
     return bool(size[-1] > SMALLEST_DRIVE * size[0])
+
+
+def start(
+    shapes: Model | None, driven: Model | None, first: Array, lower: Array, upper: Array, random: np.random.Generator
+) -> Start:
+    """The posture `first` (nq,), or one that is better: where nothing overlaps, and which the motors of `driven` hold.
+
+    It has room beside it where one of ATTEMPTS has, since searches go on from it in all directions.
+    `lower` and `upper` (nq,) are the ranges of all coordinates; those of a free body's pose are left alone.
+    """
+    model = shapes or driven
+    if model is None:
+        return Start(first, 0.0, 0.0, frozenset())
+    is_joint, margin = of_joints(model), INSIDE * (upper - lower)
+
+    def drawn(middle: Array, width: Array, moved: NDArray[np.bool_]) -> Array:
+        q = np.clip(middle + width * random.uniform(-1, 1, len(first)), lower + margin, upper - margin)
+        return np.where(is_joint & moved, q, middle)
+
+    every, whole = np.ones(len(first), dtype=bool), upper - lower
+    always = pairs_always([first, *(drawn(first, whole, every) for _ in range(SEEN - 1))], shapes)
+
+    def measured(q: Array) -> Start:
+        load = 0.0 if driven is None else share_to_hold(driven, q)
+        depths = {} if shapes is None else _overlaps(shapes, q)
+        overlap = sum(depth for pair, depth in depths.items() if pair not in always and depth > TOUCHING)
+        return Start(q, overlap, load, always)
+
+    def has_room(q: Array) -> bool:
+        beside = [q + np.where(is_joint, random.choice([-ROOM, ROOM], len(q)), 0.0) for _ in range(BESIDE)]
+        return shapes is None or all(deepest(shapes, other, always) <= TOUCHING for other in beside)
+
+    best, tight = measured(first), None
+    for i in range(ATTEMPTS + FINER):
+        if i == ATTEMPTS and tight is not None:
+            return tight
+        if _badness(best) == 0:
+            if has_room(best.q):
+                break
+            tight, best = tight or best, replace(best, overlap=np.inf)  # unless all others are worse
+        if i < ATTEMPTS:
+            fraction = (i + 1) / ATTEMPTS
+            q = np.where(is_joint, first + fraction * (random.uniform(lower + margin, upper - margin) - first), first)
+        else:
+            few = random.random(len(first)) < max(0.1, 3 / len(first))
+            q = drawn(best.q, whole * 0.5 ** random.uniform(0, 6), few)
+        candidate = measured(q)
+        best = candidate if _badness(candidate) < _badness(best) else best
+    return best
+
+
+def _badness(candidate: Start) -> float:
+    return candidate.overlap / DEPTH + max(0.0, candidate.load - HOLD_SHARE)
+
+
+def pairs_always(tried: list[Array], shapes: Model | None) -> frozenset[Pair]:
+    """The pairs of shapes that overlap in each of the postures (nq,)."""
+    if shapes is None:
+        return frozenset()
+    overlaps = [{pair for pair, depth in _overlaps(shapes, q).items() if depth > TOUCHING} for q in tried]
+    return frozenset(set.intersection(*overlaps))
+
+
+def deepest(shapes: Model, q: Array, besides: frozenset[Pair]) -> float:
+    """[m] the deepest overlap in posture q (nq,), that of the pairs `besides` apart."""
+    return max((depth for pair, depth in _overlaps(shapes, q).items() if pair not in besides), default=0.0)
+
+
+def _overlaps(shapes: Model, q: Array) -> dict[Pair, float]:
+    set_state(shapes.double, np.concatenate([q, np.zeros(shapes.nv)]))
+    return overlaps(shapes)
+
+
+def share_to_hold(model: Model, q: Array) -> float:
+    """The share of its effort limits that a fully driven robot needs to hold posture q (nq,)."""
+    return float(np.max(shares_to_hold(model, q), initial=0.0))
+
+
+def shares_to_hold(model: Model, q: Array) -> Array:
+    """(nu,) the same of each input."""
+    set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
+    needed = model.double.inverse_dynamics(np.zeros(model.nv))
+    return shares(model, np.linalg.lstsq(model.actuation, needed, rcond=None)[0])
+
+
+def shares(model: Model, us: Array) -> Array:
+    """(..., nu) of the effort limits, in inputs us (..., nu); 0 where there is none."""
+    limits = effort_limits(model)
+    return np.asarray(np.abs(us) / np.where((limits > 0) & np.isfinite(limits), limits, np.inf))
+
+
+def effort_limits(model: Model) -> Array:
+    """(nu,) the smaller of the two limits of each input, infinite where there is none."""
+    return np.asarray(np.min(np.abs(input_limits(model)), axis=0))
+
+
+def ranges(model: Model) -> tuple[Array, Array]:
+    """(lower, upper) (nq,): the limits of each coordinate, or a range around 0 where it has none, or a wide one."""
+    lower = np.array([p.lower for p in model.contract.positions], dtype=float)
+    upper = np.array([p.upper for p in model.contract.positions], dtype=float)
+    reach = np.array([SHIFT if p.unit == "m" else TURN for p in model.contract.positions])
+    wide = upper - lower > WIDEST  # so is what has no limits
+    low = np.where(wide, np.maximum(lower, -reach), lower)
+    high = np.where(wide, np.minimum(upper, reach), upper)
+    beyond = low > high  # one limit alone, on the other side of 0
+    low = np.where(beyond & np.isfinite(upper), upper - 2 * reach, low)
+    high = np.where(beyond & np.isfinite(lower), lower + 2 * reach, high)
+    return low, high
+
+
+def of_joints(model: Model) -> NDArray[np.bool_]:
+    """(nq,) whether a coordinate is that of a joint, and no part of a free body's pose."""
+    if model.nq == model.nv:
+        return np.ones(model.nq, dtype=bool)
+    mask = np.zeros(model.nq, dtype=bool)
+    for joint in joints(model.plant):
+        if joint.num_positions() == 1:
+            mask[list(model.places(joint)[0])] = True
+    return mask
+
+
+def inside(model: Model, lower: Array, upper: Array) -> Array:
+    """The file's posture; in the middle of a joint's limits where that is outside, and inside where it is at one."""
+    q = model.default_state[: model.nq].copy()
+    margin = INSIDE * (upper - lower)
+    outside = (q < lower) | (q > upper)
+    moved = np.where(outside, (lower + upper) / 2, np.clip(q, lower + margin, upper - margin))
+    return np.where(of_joints(model), moved, q)
+
+
+def thrusters(model: Model) -> tuple[BodyForce, ...]:
+    """Six for each body that floats: two along each of its axes, on both sides of its centre of mass.
+
+    Together they can push and turn it in any direction. Each is beside the centre of mass by the body's radius of
+    gyration.
+    """
+    plant, forces = model.plant, list[BodyForce]()
+    set_state(model.double, model.default_state)
+    for label, body in labelled(bodies(plant)).items():
+        if body.index() not in plant.GetFloatingBaseBodies():
+            continue
+        whole = [welded.index() for welded in plant.GetBodiesWeldedTo(body)]
+        inertia = plant.CalcSpatialInertia(model.double.context, body.body_frame(), whole)
+        mass, centre = float(inertia.get_mass()), np.asarray(inertia.get_com())
+        if not mass > 0:
+            raise ModelError(f"{label} floats, nothing drives it, and it has no mass: give it an inertial element")
+        about = inertia.Shift(centre).CalcRotationalInertia().CopyToFullMatrix3()
+        arm = max(SMALLEST_ARM, float(np.sqrt(np.max(np.linalg.eigvalsh(about)) / mass)))
+        limit = float(f"{STRENGTH * mass * GRAVITY:.3g}")
+        for axis, beside in ((0, 1), (1, 2), (2, 0)):
+            for side in (1.0, -1.0):
+                point = centre + side * float(f"{arm:.3g}") * np.eye(3)[beside]
+                name = f"{label}_{'xyz'[axis]}{'+' if side > 0 else '-'}"
+                forces.append(BodyForce(name, label, point, np.eye(3)[axis], lower=-limit, upper=limit))
+    return tuple(forces)
+
+
+def lifted(shapes: Model, q: Array) -> Array:
+    """Posture q (nq,) with what floats as much higher as it takes to overlap with nothing; as it is if none helps."""
+    for up in (0.0, *LIFTS):
+        higher = q.copy()
+        for i, (_, q_start, _) in enumerate(floating(shapes)):
+            higher[q_start + 6] += up * (1 + i)
+        if deepest(shapes, higher, frozenset()) <= TOUCHING:
+            return higher
+    return q
+
+
+def floating(model: Model) -> list[tuple[str, int, int]]:
+    """(name, where its quaternion and position begin in q, where its velocities begin in v) of what floats."""
+    free = [model.plant.get_body(index) for index in sorted(model.plant.GetFloatingBaseBodies())]
+    return [(b.name(), int(b.floating_positions_start()), int(b.floating_velocities_start_in_v())) for b in free]

@@ -13,8 +13,9 @@ import numpy as np
 
 import drake_diff as dd
 from drake_diff.exceptions import ModelWarning
+from drake_diff.legs.feet import Legs
+from drake_diff.legs.motion import posture
 from drake_diff.model.step import advance
-from drake_diff.optimize.scheduled.legs import Legs
 
 from .models import robot_file
 
@@ -202,11 +203,11 @@ def rest(name, model, joints, random=None):
     x = np.array(model.default_state)
     x[:nq] = 0.0
     x[0], x[nq - count : nq] = 1.0, joints
-    legs = Legs(model, robot.feet, x[:nq])
+    legs = Legs.named(model, robot.feet, x[:nq])
     legs.put(x[:nq])
     x[6] -= np.mean(legs.points()[:, 2]) + sink
     legs.put(x[:nq])
-    places, mass, size = legs.points(), np.array(legs.center_of_mass()[0]), robot.drawn * x[6]
+    places, mass, size = legs.points(), legs.center_of_mass(), robot.drawn * x[6]
     if robot.is_flat:
         mass[:2] = np.mean(places[:, :2], axis=0)
     turn = np.zeros(model.nv)
@@ -216,7 +217,7 @@ def rest(name, model, joints, random=None):
         mass += size * random.uniform(-1, 1, 3)
     if random is not None or robot.is_flat:
         places[:, 2] = -sink
-        x[:nq] = legs.posture(x[:nq], legs.moved(x[:nq], turn), mass, places, np.zeros(len(places), dtype=bool))
+        x[:nq] = posture(legs, x[:nq], legs.moved(x[:nq], turn), mass, places)
     kp, kd = robot.gains
     drive, held = model.actuation[-count:], x[nq - count : nq].copy()
     still = _that_hold(legs, x[:nq], count) if robot.is_flat else 0.0
@@ -232,7 +233,7 @@ def _that_hold(legs, q, count):
     legs.put(q)
     needed, by_force = (
         legs.twin.inverse_dynamics(np.zeros(legs.model.nv)),
-        legs.jacobians()[0].reshape(-1, legs.model.nv).T,
+        legs.jacobian().reshape(-1, legs.model.nv).T,
     )
     base = slice(legs.base_v, legs.base_v + 6)
     forces = np.linalg.lstsq(by_force[base], needed[base], rcond=None)[0]

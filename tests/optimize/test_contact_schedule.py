@@ -8,13 +8,12 @@ from helpers.legged import LEGGED, SOLO_FEET, legged_model, rest, robot_on_feet
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.legs.feet import Legs
+from drake_diff.legs.motion import LANDS, _slow_phases, _sunk, plan_forces, swings, touching
 from drake_diff.model.parameters import select
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.replay import Plan, broken_variants, held, replays
-from drake_diff.optimize.scheduled.centroidal import plan_forces
-from drake_diff.optimize.scheduled.legs import Legs
-from drake_diff.optimize.scheduled.motion import LANDS, _slow_phases, _sunk, swings, touching
 from drake_diff.runs.sections import rebuild_goal
 
 H, G = 0.02, np.array([0.0, 0.0, -9.81])
@@ -58,18 +57,18 @@ def test_a_schedule_comes_back_from_what_a_record_tells_of_it():
 @pytest.mark.parametrize("seed", range(3))
 def test_soles_move_as_differences_say(solo, seed):
     x, nq, nv = posed(solo, seed), solo.nq, solo.nv
-    legs, space, step = Legs(solo, SOLO_FEET, np.array(solo.default_state[:nq])), tangent_space(solo), 1e-6
+    legs, space, step = Legs.named(solo, SOLO_FEET, np.array(solo.default_state[:nq])), tangent_space(solo), 1e-6
 
     def at(d):
         moved = space.plus(x, np.concatenate([d, np.zeros(nv)]))
         legs.put(moved[:nq], x[nq:])
-        return legs.points(), legs.along(np.concatenate([moved[:nq], x[nq:]])[None]).velocities(x[None, nq:])[0]
+        return legs.points(), legs.soles([legs.read(np.concatenate([moved[:nq], x[nq:]]))]).velocities(x[None, nq:])[0]
 
     units = step * np.eye(nv)
     slopes = [[(a - b) / (2 * step) for a, b in zip(at(d), at(-d), strict=True)] for d in units]
     legs.put(x[:nq], x[nq:])
-    moves, turns = legs.jacobians()
-    soles = legs.along(x[None])
+    moves, soles = legs.jacobian(), legs.soles([legs.read(x)])
+    turns = soles.turns[0].swapaxes(1, 2)
     velocities, by_posture = soles.velocities(x[None, nq:])[0], soles.slopes(x[None, nq:])[0].swapaxes(1, 2)
     assert np.allclose(velocities, moves @ x[nq:], atol=1e-12)
     assert np.allclose(by_posture, np.moveaxis([s[1] for s in slopes], 0, -1), atol=1e-7)  # of differences of 1e-6
@@ -242,10 +241,10 @@ def test_solo_lifts_a_foot(solo, lifted):
     problem, solution = lifted
     assert solution.success, solution.message
     x0 = np.asarray(problem.x0)
-    legs, xs = Legs(solo, SOLO_FEET, x0[: solo.nq]), [x0]
+    legs, xs = Legs.named(solo, SOLO_FEET, x0[: solo.nq]), [x0]
     for u in solution.us:  # Drake's own steps
         xs.append(advance(solo.double, xs[-1], u))
-    heights = legs.along(np.array(xs)).places[..., 2]
+    heights = legs.soles([legs.read(x) for x in xs]).places[..., 2]
     assert heights[37, 0] > 0.01
     assert np.max(heights[:, 1:]) < 1e-5  # 0 is kept to the tolerance of a search
     assert np.max(np.abs(xs[-1][solo.nq : solo.nq + 6])) < 0.3

@@ -7,8 +7,8 @@ from pydrake.systems.analysis import Simulator
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.optimize.scheduled.legs import Legs
-from drake_diff.optimize.scheduled.standing import standing
+from drake_diff.legs.feet import Legs
+from drake_diff.legs.standing import standing
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 LEGS = "FL", "FR", "RL", "RR"
@@ -37,9 +37,9 @@ def with_stiffness(tmp_path, value):
 def test_springs_under_the_feet_carry_the_weight_by_the_lever_rule(tmp_path, stiffness, time_step):
     model = quadruped(with_stiffness(tmp_path, stiffness), time_step=time_step)
     x = STAND.standing(model, BENT)
-    legs = Legs(model, FEET, x[: model.nq])
+    legs = Legs.named(model, FEET, x[: model.nq])
     legs.put(x[: model.nq])
-    points, center = legs.points(), legs.center_of_mass()[0]
+    points, center = legs.points(), legs.center_of_mass()
     forces = stiffness * OF_GROUND / (stiffness + OF_GROUND) * -points[:, 2]
     assert np.sum(forces) == pytest.approx(legs.mass * G, rel=1e-6)  # by a velocity of 1e-7 m/s after the step
     # Sideways forces of the feet are 0 in all and act within some tenths of a millimetre of one height.
@@ -53,21 +53,21 @@ def test_drake_alone_keeps_it_where_it_stands():
     model = quadruped()
     posture = np.array(model.default_state[: model.nq])
     posture[[model.state_names.index(f"{name}_q") for name in BENT]] = list(BENT.values())
-    x, u = standing(Legs(model, FEET, posture), posture)
+    rest = standing(Legs.named(model, FEET, posture), posture)
     simulator = Simulator(model.diagram)
     context = model.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    model.plant.SetPositionsAndVelocities(context, x)
-    model.plant.get_actuation_input_port().FixValue(context, u)
+    model.plant.SetPositionsAndVelocities(context, rest.x)
+    model.plant.get_actuation_input_port().FixValue(context, rest.u)
     simulator.AdvanceTo(10 * model.time_step)
     # 1e-7 is left after a step; inputs alone let it fall, e-fold in some 0.1 s.
-    assert np.max(np.abs(model.plant.GetPositionsAndVelocities(context) - x)) < 1e-5
+    assert np.max(np.abs(model.plant.GetPositionsAndVelocities(context) - rest.x)) < 1e-5
 
 
 def test_a_softened_foot_sinks_by_a_sixteenth_of_a_metre_per_second_times_the_step(tmp_path):
     for h in (0.005, 0.02):
         model = STAND.with_soft_feet(quadruped(with_stiffness(tmp_path, None), time_step=h, near_rigid=None))
         x = STAND.standing(model, BENT)
-        legs = Legs(model, FEET, x[: model.nq])
+        legs = Legs.named(model, FEET, x[: model.nq])
         legs.put(x[: model.nq])
         assert -np.mean(legs.points()[:, 2]) == pytest.approx(0.0625 * h, rel=1e-6)
     own = STAND.with_soft_feet(quadruped())

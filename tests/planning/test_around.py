@@ -10,8 +10,8 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.cli.main import main
 from drake_diff.exceptions import InputError, MissingDependencyError
-from drake_diff.planning import around, plan
-from drake_diff.planning.around import Line, Space, lines
+from drake_diff.planning import guesses, plan
+from drake_diff.planning.guesses import Line, Space, lines
 from drake_diff.planning.robot import load_robot
 
 pytestmark = pytest.mark.solve
@@ -63,7 +63,7 @@ def test_a_line_is_bent_around_a_disk_that_the_straight_one_meets(arm):
     center = -0.95 * np.array([np.sin(angle), 0, np.cos(angle)])
     ball = dd.SphereObstacle(center, 0.08)
     target = np.array([1.0, 0.0])
-    space = Space.of(robot, [ball])
+    space = Space.around(robot, [ball])
     straight = Line("", np.array([robot.q, target]))
     assert np.min(distance(straight.postures, center)) < 0.0
     assert not space.is_free(straight.postures)
@@ -81,16 +81,16 @@ def test_a_line_is_bent_around_a_disk_that_the_straight_one_meets(arm):
 def test_what_a_space_lacks_is_the_closed_form(arm):
     robot, random = load_robot(arm, 0), np.random.default_rng(0)
     center = np.array([0.3, 0.1, -0.5])
-    space = Space.of(robot, [dd.SphereObstacle(center, 0.08, margin=0.02)])
+    space = Space.around(robot, [dd.SphereObstacle(center, 0.08, margin=0.02)])
     qs = random.uniform(-2, 2, (200, 2))
     assert space.lacking(qs) == pytest.approx(0.02 + 0.08 - distance(qs, center), abs=1e-9)
 
 
 def test_where_no_bent_line_is_clear_and_ompl_is_missing_it_is_asked_for(arm, monkeypatch):
     robot = load_robot(arm, 0)
-    space, target = Space.of(robot, [dd.SphereObstacle([-0.45, 0, -0.8], 0.08)]), np.array([1.0, 0.0])
-    monkeypatch.setattr(around, "find_spec", lambda name: None)
-    monkeypatch.setattr(around, "BENDS", 0)
+    space, target = Space.around(robot, [dd.SphereObstacle([-0.45, 0, -0.8], 0.08)]), np.array([1.0, 0.0])
+    monkeypatch.setattr(guesses, "find_spec", lambda name: None)
+    monkeypatch.setattr(guesses, "BENDS", 0)
     with pytest.raises(MissingDependencyError, match="pip install ompl"):
         lines(space, target, 0)
 

@@ -13,8 +13,7 @@ from drake_diff.cli.main import main
 from drake_diff.exceptions import ModelError
 from drake_diff.model.example import example_files
 from drake_diff.planning import plan
-from drake_diff.planning.around import Line
-from drake_diff.planning.motion import along
+from drake_diff.planning.guesses import Line, along
 from drake_diff.planning.robot import load_robot
 from drake_diff.runs import read_trace
 

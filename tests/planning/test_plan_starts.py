@@ -8,9 +8,8 @@ import pytest
 import drake_diff as dd
 from drake_diff.exceptions import ModelError
 from drake_diff.planning import plan
-from drake_diff.planning.posture import TOUCHING, share_to_hold
-from drake_diff.planning.robot import load_robot
-from drake_diff.planning.task import Task, postures
+from drake_diff.planning.guesses import Task, postures
+from drake_diff.planning.robot import TOUCHING, load_robot, share_to_hold
 from drake_diff.runs.fields import Failure
 
 pytestmark = pytest.mark.solve

@@ -118,9 +118,9 @@ CONSTANTS = {
     },
     "docs/plan.md": {
         "7": "drake_diff.planning.planner:SMALL",
-        "0.7": "drake_diff.planning.standing:OF_FRICTION",
-        "0.8": "drake_diff.planning.standing:OF_EFFORT",
-        "1e-4": "drake_diff.planning.posture:TOUCHING",
+        "0.7": "drake_diff.legs.standing:OF_FRICTION",
+        "0.8": "drake_diff.legs.standing:OF_EFFORT",
+        "1e-4": "drake_diff.planning.robot:TOUCHING",
     },
     "docs/contact.md": {
         "1000": "drake_diff.model.triangles:MOST_CORNERS",

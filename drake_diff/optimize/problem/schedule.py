@@ -9,14 +9,14 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, finite_array, positive_float
 from drake_diff.exceptions import InputError
+from drake_diff.legs.feet import Legs, Soles
+from drake_diff.legs.motion import scheduled_motion, swings, touching
+from drake_diff.legs.standing import standing, with_soft_feet
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import StateFunction
 from drake_diff.optimize.problem.cost import QuadraticCost, TrackingCost
 from drake_diff.optimize.problem.goals import USED, Goal, GoalConstraint, name_of
 from drake_diff.optimize.problem.names import coordinates
-from drake_diff.optimize.scheduled.legs import Legs, Soles
-from drake_diff.optimize.scheduled.motion import scheduled_motion, swings, touching
-from drake_diff.optimize.scheduled.standing import standing, with_soft_feet
 
 MIDDLE = 0.25  # of a swing at either end is left out where its clearance is looked at
 KEPT = 1000  # states of which it is remembered where the feet are
@@ -99,7 +99,7 @@ class ContactSchedule(Goal):
         return self._bound(problem.model, np.asarray(problem.x0))
 
     def _bound(self, model: Model, x0: Array) -> tuple[GoalConstraint, ...]:
-        soles = _Soles(Legs(model, self.feet, x0[: model.nq]))
+        soles = _Soles(Legs.named(model, self.feet, x0[: model.nq]))
         stands, on = self.stands, touching(self.stands)
         alike = dict[bytes, list[int]]()
         for foot in range(len(self.feet)):
@@ -174,7 +174,7 @@ class ContactSchedule(Goal):
                 got = model.state_names[index]
                 raise InputError("ContactSchedule.standing: joints", got=got, expected="positions, not velocities")
             posture[index] = float(finite_array(f"ContactSchedule.standing {model.state_names[index]}", value, ()))
-        return standing(Legs(model, self.feet, posture), posture)[0]
+        return standing(Legs.named(model, self.feet, posture), posture).x
 
     def guess(self, model: Model, x0: Any, end: Any = None, *, swing: float = 0.04) -> tuple[Array, Array]:
         """A motion by the schedule: forces at the standing feet bring the centre of mass to where it is to be.
@@ -197,9 +197,9 @@ class ContactSchedule(Goal):
         """
         x0 = np.array(finite_array("x0", x0, (model.nx,)))
         last = x0[: model.nq] if end is None else np.array(finite_array("end", end, (model.nq,)))
-        legs = Legs(model, self.feet, x0[: model.nq])
+        legs = Legs.named(model, self.feet, x0[: model.nq])
         self._check_touching(legs, x0)
-        height, friction = positive_float("swing [m]", swing), OF_FRICTION * legs.friction()
+        height, friction = positive_float("swing [m]", swing), OF_FRICTION * float(np.min(legs.frictions))
         return scheduled_motion(model, legs, x0, last, self.stands, height, friction)
 
     def _check_touching(self, legs: Legs, x0: Array) -> None:
@@ -225,7 +225,7 @@ class ContactSchedule(Goal):
             Both by name, so that `Problem(model, ..., **schedule.follow(model, guess))` has them.
         """
         xs, us = guess
-        base = Legs(model, self.feet, xs[0, : model.nq]).base_q
+        base = Legs.named(model, self.feet, xs[0, : model.nq]).base_q
         unit = np.concatenate([np.full(model.nq, JOINT), np.full(model.nv, JOINT_SPEED)])
         unit[base : base + 4], unit[base + 4 : base + 7] = TURN, PLACE
         unit[model.nq + base : model.nq + base + 6] = BASE_SPEED

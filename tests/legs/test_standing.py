@@ -10,14 +10,14 @@ from pydrake.multibody.plant import MultibodyPlant
 import drake_diff as dd
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError
+from drake_diff.legs.feet import Legs, find_feet
+from drake_diff.legs.standing import Shift, hold, shift_to, stand, standing_posture
 from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion import TVLQR
-from drake_diff.planning import plan, shifting
-from drake_diff.planning.feet import find_feet
+from drake_diff.planning import plan
 from drake_diff.planning.robot import GROUND, ON_FEET, load_robot, ranges
-from drake_diff.planning.standing import Legged, hold, stand, standing_posture
 
 pytestmark = [pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning"), pytest.mark.solve]
 G = 9.81
@@ -63,7 +63,7 @@ def on_feet(tmp_path):
 def legged(model):
     feet = find_feet(model, model.default_state[: model.nq])
     assert not isinstance(feet, Refusal), feet
-    return Legged(model, feet, *ranges(model))
+    return Legs(model, feet, *ranges(model))
 
 
 def test_four_feet_share_the_weight(on_feet):
@@ -73,6 +73,7 @@ def test_four_feet_share_the_weight(on_feet):
     total = np.sum(stance.forces, axis=0)
     assert total == pytest.approx([0.0, 0.0, 14 * G], abs=1e-5)  # what Clarabel may be off, 1e-8 of the weight
     assert stance.forces[:, 2] == pytest.approx(np.full(4, 14 * G / 4), rel=0.05)  # the trunk is centred to mm
+    robot.put(stance.q)
     center = robot.model.plant.CalcCenterOfMassPositionInWorld(robot.model.double.context)
     moment = np.sum(np.cross(stance.points - center, stance.forces), axis=0)
     assert moment == pytest.approx([0.0, 0.0, 0.0], abs=1e-5)
@@ -129,7 +130,7 @@ def test_at_rest_the_step_changes_nothing_and_drake_carries_the_weight(on_feet):
     assert forces == pytest.approx([0.0, 0.0, 14 * G], abs=0.05)  # at 1e-4 m/s per step of 5 ms: 14 kg * 0.02 m/s^2
     assert np.max(np.abs(x[model.nq :])) < 5e-3  # what counts as rest
     assert {contact.body_a for contact in contacts_of_the_step(model)} == {f"{leg}_shank" for leg in HIPS}
-    assert np.max(np.abs(robot.soles(rest.x[: model.nq])[0][:, 2])) < 1e-3
+    assert np.max(np.abs(robot.points_in(rest.x[: model.nq])[:, 2])) < 1e-3
 
 
 def test_a_frame_and_a_joint_go_where_they_are_asked_to(on_feet):
@@ -138,15 +139,15 @@ def test_a_frame_and_a_joint_go_where_they_are_asked_to(on_feet):
     robot, rest = stand(model, *ranges(model))
     frame, context = model.plant.GetFrameByName("trunk"), model.plant.CreateDefaultContext()
     lower = rest.x[robot.base_q + 4 : robot.base_q + 7] - np.array([0.01, 0.0, 0.01])
-    found = shifting.shift_to(robot, rest, {"trunk": lower}, {})
-    assert isinstance(found, shifting.Shift), found
+    found = shift_to(robot, rest, {"trunk": lower}, {})
+    assert isinstance(found, Shift), found
     model.plant.SetPositions(context, found.xs[-1][: model.nq])
     assert frame.CalcPoseInWorld(context).translation() == pytest.approx(lower, abs=5e-4)
     knee = model.position_names.index("fl_knee_q")
-    found = shifting.shift_to(robot, rest, {}, {knee: rest.x[knee] + 0.05})
-    assert isinstance(found, shifting.Shift), found
+    found = shift_to(robot, rest, {}, {knee: rest.x[knee] + 0.05})
+    assert isinstance(found, Shift), found
     assert found.xs[-1][knee] == pytest.approx(rest.x[knee] + 0.05, abs=2e-3)
-    sideways = shifting.shift_to(robot, rest, {"trunk": lower + np.array([0.0, 0.1, 0.0])}, {})
+    sideways = shift_to(robot, rest, {"trunk": lower + np.array([0.0, 0.1, 0.0])}, {})
     assert isinstance(sideways, Refusal)  # legs of two joints about y keep the trunk in its plane
 
 

@@ -1,0 +1,445 @@
+"""Robots on their feet: the forces that carry a posture, states at rest, and motions in which no foot moves.
+
+A posture comes from inverse kinematics, with the soles on the ground and the centre of mass over them. Forces at the
+soles and inputs that hold it are a small quadratic program. From there Gauss and Newton lead to a state that a step of
+the model does not change: an equilibrium of the steps and not of a formula.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from pydrake.solvers import ClarabelSolver, MathematicalProgram
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.values import Refusal
+from drake_diff.derivatives.step import linearize
+from drake_diff.exceptions import GradientError, InputError, SimulationError
+from drake_diff.legs.feet import GRAVITY, Legs, find_feet
+from drake_diff.legs.inverse_kinematics import Target, Wish, inverse_kinematics
+from drake_diff.legs.motion import smooth
+from drake_diff.model.contact import contacts_of_the_step
+from drake_diff.model.model import Model
+from drake_diff.model.repairs import frame_named
+from drake_diff.model.step import advance, set_state
+from drake_diff.motion.policy import TVLQR
+
+# Forces and inputs that hold a posture.
+FOOT_SHARE = 0.1  # of an even share of the weight: what each foot carries at least, so that none lifts off
+OF_FRICTION, OF_EFFORT = 0.7, 0.8  # of the friction that is possible, and of an effort limit: what a posture may need
+SIDES = 8  # of the pyramid that stands for a cone of friction
+SIDEWAYS = 100.0  # how much a sideways force of a foot costs against an upright one: it lets the foot creep
+# A posture to stand in.
+ON_GROUND = 2e-5  # [m] how far soles may be off the ground
+BALANCED, LEVEL, TALL, ASIDE, POSED = 5e-3, 0.03, 0.01, 0.02, 0.5  # [m or rad] what counts as 1
+BENT = 0.88  # of its height on straight legs
+INSIDE = 0.08  # of a joint's range: how far from its limits a posture stays
+DEEP = 5e-5  # [m] how deep feet are in the ground
+STARTS, SPREAD = 6, 0.5  # first postures, and how far [rad or m] they are drawn from the file's
+ROUNDS = 3  # in which the lowest points of round feet are looked for
+# A state at rest. What counts as 1 of a turn, a height, any coordinate, and an input as a part of the weight times 1 m.
+TURN, HEIGHT, ANY, EFFORT = 1e-2, 1e-3, 1e-3, 1e-3
+ITERATIONS, HALVINGS, FARTHEST = 40, 8, 5e-3  # [rad or m] of one iteration
+AT_REST = 1e-7  # [rad/s or m/s] after a step
+# A foot is as soft as searches get on with: how deep an even share of the weight presses it is [m/s] times the step,
+# and its contact relaxes in so many steps. Drake's own dissipation would cut a foot's force off as it leaves.
+SINK, RELAXES, DISSIPATION, NEAR_RIGID = 0.0625, 2.5, 0.5, 0.1  # the third in s/m
+FIRST_SINK = 1e-4  # [m] at least, with which it is begun: a sole that is in the air has no derivative
+# A motion from rest to rest.
+DURATIONS, HOLDING = (0.6, 1.0), 0.2  # [s] of it, and of holding its end
+SIZES = ((1.0, 1.0), (1.0, 0.2), (0.5, 0.2), (0.25, 0.1), (0.12, 0.0))  # of a random shift of the base and of the arms
+TURNED, SHIFTED, LOWERED = 0.1, 0.06, 0.12  # [rad], and shares of the height of the centre of mass: of the base
+MOVED = 0.1  # of the range of a joint that is no leg's
+ARRIVED, SLOW_ENOUGH = 0.01, 0.02  # [rad or m] off the rest that was to be reached, [rad/s or m/s] there
+FEET_STAY = 1e-3  # [m] how far a foot may be from where it stood
+FREE_BASE, FREE_JOINT, ALONG = 0.1, 0.3, 0.05  # [rad or m] that counts as 1, the last on the way
+BASE_TURN, BASE_PLACE = 0.003, 0.001  # the same of a base whose pose is asked for
+OVER_FEET = 0.02  # [m] the same of the centre of mass
+CORRECTIONS, FRAME_MISS, JOINT_MISS = 3, 3e-4, 1e-3  # [m], [rad or m]: what needs no other try
+NEAR, SLOW = 0.02, 0.5  # [rad or m], [rad/s or m/s] off that count as 1 of a regulator
+EFFORT_SHARE = 0.2  # of what an input holds (of the largest at least a tenth): the same of it
+
+
+@dataclass(frozen=True, eq=False)
+class Stance:
+    """A posture q (nq,), inputs u (nu,) that hold it, and forces (n, 3) [N] at the points (n, 3) [m] of the soles."""
+
+    q: Array
+    u: Array
+    points: Array
+    forces: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """A state x (nx,) at rest, and the inputs u (nu,) that hold it in the model's own steps."""
+
+    x: Array
+    u: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Shift:
+    """A motion xs (N+1, nx) under us (N, nu) of the model's own steps, from rest to rest."""
+
+    xs: Array
+    us: Array
+
+
+def stand(model: Model, lower: Array, upper: Array) -> tuple[Legs, Rest] | Refusal:
+    """The robot on its feet, at rest, joints within lower and upper (nq,); or why it cannot stand.
+
+    The base floats, z is up, and the ground is at z = 0.
+    """
+    file = model.default_state[: model.nq].copy()
+    feet = find_feet(model, file)
+    if isinstance(feet, Refusal):
+        return feet
+    stance = standing_posture(Legs(model, feet, lower, upper), file)
+    if isinstance(stance, Refusal):
+        return stance
+    legs = Legs(model, feet, lower, upper).on_lowest(stance.q)
+    rest = settled(legs, stance)
+    return rest if isinstance(rest, Refusal) else (legs, rest)
+
+
+def standing_posture(legs: Legs, file: Array) -> Stance | Refusal:
+    """On bent legs, the feet about where they are in the file's posture (nq,) and the centre of mass over them."""
+    model, legs = legs.model, legs.on_lowest(file)
+    q, base = file.copy(), legs.base_v
+    q[legs.base_q + 6] -= float(np.min(legs.points_in(file)[:, 2]))
+    places = legs.points_in(q)
+    places[:, 2] = -DEEP
+    wanted, unit = q.copy(), np.full(model.nv, POSED)
+    wanted[legs.base_q + 6] *= BENT
+    unit[base : base + 6] = LEVEL, LEVEL, LEVEL, ASIDE, ASIDE, TALL
+    wish = Wish(wanted, unit, [*np.mean(places[:, :2], axis=0), np.nan], BALANCED)
+    margin = _margin(legs, INSIDE)
+    near = [ASIDE, ASIDE, np.inf]
+    tolerance = [np.inf, np.inf, max(ON_GROUND, *(_unevenness(legs.centres[legs.owners == i]) for i in legs.owners))]
+    random, why, least = np.random.default_rng(0), Refusal(""), np.inf
+    best: Stance | None = None
+    for _ in range(STARTS):
+        drawn = np.zeros(model.nv)
+        drawn[legs.joint_v] = random.uniform(-SPREAD, SPREAD, len(legs.joint_v))
+        posture = legs.moved(wanted, drawn)
+        for _ in range(ROUNDS):
+            legs = legs.on_lowest(posture)
+            posture = inverse_kinematics(
+                model, posture, legs.at(places, tolerance, unit=near), wish, legs.lower + margin, legs.upper - margin
+            )
+        off_place = np.abs(legs.points_in(posture) - places)
+        cost = float(np.sum((legs.apart(posture, wanted) / unit) ** 2) + np.sum((off_place / near) ** 2))
+        off = float(np.max(off_place[:, 2])) - tolerance[2]
+        if off > FEET_STAY:
+            why = Refusal(f"its feet miss the ground by {off:.2g} m")
+        elif cost < least:
+            stance = hold(legs, posture)
+            if isinstance(stance, Refusal):
+                why = stance
+            else:
+                best, least = stance, cost
+    return best or why
+
+
+def _margin(legs: Legs, share: float) -> Array:
+    """(nq,) a share of the range of joints, 0 of the base."""
+    margin = np.zeros(legs.model.nq)
+    margin[legs.joint_q] = share * (legs.upper - legs.lower)[legs.joint_q]
+    return margin
+
+
+def _unevenness(points: Array) -> float:
+    """[m] how far points (k, 3) are off the plane through them, at most."""
+    middle = points - np.mean(points, axis=0)
+    return float(np.max(np.abs(middle @ np.linalg.svd(middle)[2][2]))) if len(points) > 3 else 0.0
+
+
+def hold(legs: Legs, q: Array, needed: Array | None = None) -> Stance | Refusal:
+    """The least forces and inputs that hold posture q (nq,); or that there are none.
+
+    `needed` (nv,) is the generalized force that they are to make in place of what holds the weight, for a motion.
+    """
+    model, owners = legs.model, legs.owners
+    points = legs.points_in(q)
+    friction = OF_FRICTION * legs.frictions[owners]
+    needed = model.double.inverse_dynamics(np.zeros(model.nv)) if needed is None else needed
+    limits = np.min(np.abs(input_limits(model)), axis=0)
+    count, share = len(points), legs.weight / len(legs.feet)
+    scale = np.where(np.isfinite(limits), limits, legs.weight)
+    program = MathematicalProgram()
+    f = program.NewContinuousVariables(3 * count)  # in shares of the weight
+    u = program.NewContinuousVariables(model.nu)  # in parts of the limits
+    balance = np.hstack([share * legs.jacobian().reshape(-1, model.nv).T, model.actuation * scale])
+    program.AddLinearEqualityConstraint(balance / legs.weight, needed / legs.weight, np.concatenate([f, u]))
+    angles = np.arange(SIDES) * 2 * np.pi / SIDES
+    for i in range(count):
+        cone = np.column_stack([np.cos(angles), np.sin(angles), np.full(SIDES, -friction[i])])
+        program.AddLinearConstraint(cone, np.full(SIDES, -np.inf), np.zeros(SIDES), f[3 * i : 3 * i + 3])
+    for foot in range(len(legs.feet)):
+        upward = f[2::3][owners == foot]
+        program.AddLinearConstraint(np.ones((1, len(upward))), [FOOT_SHARE], [np.inf], upward)
+    program.AddBoundingBoxConstraint(0.0, np.inf, f[2::3])
+    program.AddBoundingBoxConstraint(-OF_EFFORT, OF_EFFORT, u[np.isfinite(limits)])
+    program.AddQuadraticCost(2 * np.diag(np.tile([SIDEWAYS, SIDEWAYS, 1.0], count)), np.zeros(3 * count), f)
+    program.AddQuadraticCost(2 * np.eye(model.nu), np.zeros(model.nu), u)
+    result = ClarabelSolver().Solve(program)
+    if not result.is_success():
+        return Refusal("no forces of its feet, within friction, and of its motors, within their limits, balance it")
+    forces = share * np.asarray(result.GetSolution(f)).reshape(-1, 3)
+    return Stance(q, scale * np.asarray(result.GetSolution(u)), points, forces)
+
+
+def input_limits(model: Model) -> Array:
+    """(2, nu) the lower and the upper limits of the inputs."""
+    return np.array([[u.lower for u in model.contract.inputs], [u.upper for u in model.contract.inputs]])
+
+
+def settled(legs: Legs, stance: Stance) -> Rest | Refusal:
+    """Where a stance is at rest in the model's own steps; or why it is not."""
+    q = stance.q.copy()
+    q[legs.base_q + 6] -= float(np.max(stance.points[:, 2])) + DEEP  # all soles touch, and so have derivatives
+    return at_rest(legs, q, stance.u, np.arange(legs.model.nv), np.full(legs.model.nv, ANY))
+
+
+def standing(legs: Legs, posture: Array) -> Rest:
+    """The state at rest with joints as in `posture` (nq,), and the inputs under which a step keeps it.
+
+    The base is rolled, pitched and raised.
+
+    Raises:
+        InputError: No such state is found, a foot is in the air, something else touches, or a motor is too weak.
+    """
+    base, none = legs.base_v, np.zeros(legs.model.nu)
+    rest = at_rest(
+        legs, _level(legs, posture), none, np.array([base, base + 1, base + 5]), np.array([TURN, TURN, HEIGHT])
+    )
+    if isinstance(rest, Refusal):
+        expected = "a posture that rests on all feet of the schedule alone, the centre of mass over them"
+        raise InputError("ContactSchedule.standing: joints", got=str(rest), expected=expected)
+    return rest
+
+
+def _level(legs: Legs, posture: Array) -> Array:
+    """(nq,) the posture rolled, pitched and raised so that the plane through its soles is a little below the ground."""
+    q, turn = posture.copy(), np.zeros(legs.model.nv)
+    q[legs.base_q : legs.base_q + 4] = 1.0, 0.0, 0.0, 0.0
+    points = legs.points_in(q) - np.mean(legs.points_in(q), axis=0)
+    normal = np.append(-np.linalg.lstsq(points[:, :2], points[:, 2], rcond=1e-6)[0], 1.0)
+    normal /= np.linalg.norm(normal)
+    turn[legs.base_v : legs.base_v + 3] = 2 * np.cross(normal, [0.0, 0.0, 1.0]) / (1 + normal[2])  # see TangentSpace
+    q = legs.moved(q, turn)
+    q[legs.base_q + 6] -= np.mean(legs.points_in(q)[:, 2]) + max(SINK * legs.model.time_step / 2, FIRST_SINK)
+    return q
+
+
+def at_rest(legs: Legs, q: Array, u: Array, freed: Indices, unit: Array) -> Rest | Refusal:
+    """A state that a step does not move, near posture q (nq,) and inputs u (nu,); or why there is none.
+
+    By Gauss and Newton over the inputs and the coordinates `freed` of the tangent space, of which `unit` counts as 1.
+    """
+    model = legs.model
+    x = np.concatenate([q, np.zeros(model.nv)])
+    scale = np.concatenate([unit, np.full(model.nu, EFFORT * legs.weight)])
+    try:
+        x_next, off = _after(model, x, u)
+        for _ in range(ITERATIONS):
+            if off < AT_REST:
+                break
+            by_x, by_u, _ = linearize(model, x[None], u[None])
+            slopes = legs.space.jacobian(x, x_next, by_x[0], by_u[0])[model.nv :]
+            columns = np.hstack([slopes[:, freed], slopes[:, 2 * model.nv :]]) * scale
+            change = -scale * np.linalg.lstsq(columns, x_next[model.nq :], rcond=1e-10)[0]
+            change *= min(1.0, FARTHEST / max(float(np.max(np.abs(change[: len(freed)]))), 1e-300))
+            for _ in range(HALVINGS):
+                moved = np.zeros(2 * model.nv)
+                moved[freed] = change[: len(freed)]
+                there, inputs = legs.space.plus(x, moved), u + change[len(freed) :]
+                after, left = _after(model, there, inputs)
+                if left < off:
+                    break
+                change /= 2
+            else:
+                break
+            x, u, x_next, off = there, inputs, after, left
+        fault = _fault(legs, x, u, off)
+    except (SimulationError, GradientError) as error:
+        return Refusal(f"its standing cannot be stepped: {error}")
+    return Refusal(fault) if fault else Rest(x, u)
+
+
+def _after(model: Model, x: Array, u: Array) -> tuple[Array, float]:
+    """The state after a step, and the largest velocity in it."""
+    x_next = np.array(advance(model.double, x, u))
+    return x_next, float(np.max(np.abs(x_next[model.nq :])))
+
+
+def _fault(legs: Legs, x: Array, u: Array, off: float) -> str:
+    """Why the state is not at rest, not on its feet alone, or not held by motors within their limits; else ""."""
+    model = legs.model
+    for entry, value in zip(model.contract.inputs, u, strict=True):
+        if not entry.lower <= value <= entry.upper:
+            return f"more than {abs(entry.upper if value > 0 else entry.lower):.3g} of {entry.name}"
+    advance(model.double, x, u)
+    touching = {contact.body_a for contact in contacts_of_the_step(model)}
+    for foot, height in zip(legs.feet, legs.heights(), strict=True):
+        if not touching & set(foot.bodies):
+            return f"{foot.name} {1e3 * height:.3g} mm over the ground"
+    if off >= AT_REST:
+        return f"{off:.2g} rad/s or m/s after a step"
+    others = touching.difference(*(foot.bodies for foot in legs.feet))
+    return f"{min(others)} touches too" if others else ""
+
+
+def with_soft_feet(model: Model, feet: int) -> Model:
+    """The model with contact as soft for its step as plans on so many feet need, where its file gives none."""
+    h = model.time_step
+    weight = float(model.plant.CalcTotalMass(model.double.context)) * GRAVITY
+    stiffness = 2 * weight / feet / (SINK * h)  # two shapes in touch have half of it
+    return model.changed(
+        stiffness=stiffness, dissipation=DISSIPATION, relaxation_time=RELAXES * h, near_rigid=NEAR_RIGID
+    )
+
+
+def random_shift(legs: Legs, start: Rest, seed: Sequence[int], depth: Callable[[Array], float]) -> Shift | Refusal:
+    """To a posture drawn at random, the base lower and shifted and the arms moved; or why none was found.
+
+    `depth` tells how deep [m] shapes overlap in a posture: more than at the start is not wanted.
+    """
+    random = np.random.default_rng([*seed, 4])
+    model, q0, base = legs.model, start.x[: legs.model.nq], legs.base_v
+    deepest, feet = max(depth(q0), 1e-4), legs.points_in(q0)
+    tall = float(legs.center_of_mass()[2])
+    unit = np.full(model.nv, FREE_JOINT)
+    unit[base : base + 6] = np.repeat([BASE_TURN, BASE_PLACE], 3)
+    arms = np.array([v not in {i for foot in legs.feet for i in foot.joints} for v in legs.joint_v])
+    ranges = (legs.upper - legs.lower)[legs.joint_q][arms]
+    margin, why = _margin(legs, INSIDE / 2), Refusal("")
+    for size, of_arms in SIZES:
+        way = np.zeros(model.nv)
+        way[base : base + 3] = size * TURNED * random.uniform(-1, 1, 3)
+        way[base + 3 : base + 5] = size * SHIFTED * tall * random.uniform(-1, 1, 2)
+        way[base + 5] = -size * LOWERED * tall * random.uniform(0.5, 1)
+        way[legs.joint_v[arms]] = of_arms * MOVED * random.uniform(-1, 1, len(ranges)) * ranges
+        legs.put(q0)
+        wish, targets = Wish(legs.moved(q0, way), unit), legs.at(feet, ON_GROUND)
+        q = inverse_kinematics(model, q0, targets, wish, legs.lower + margin, legs.upper - margin)
+        shift = _shift_to(legs, start, q, feet)
+        if isinstance(shift, Refusal):
+            why = shift
+        elif max(depth(x[: model.nq]) for x in shift.xs[:: max(1, len(shift.us) // 20)]) > deepest:
+            why = Refusal("its own shapes would overlap")
+        else:
+            return shift
+    return why
+
+
+def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mapping[int, float]) -> Shift | Refusal:
+    """To where frames (3,) [m] by name and joints by their place in q are as asked, the feet where they stand."""
+    model, q0, base = legs.model, start.x[: legs.model.nq], legs.base_v
+    feet, unit = legs.points_in(q0), np.full(model.nv, FREE_JOINT)
+    unit[base : base + 6] = FREE_BASE
+    wish = Wish(q0, unit, [*np.mean(feet[:, :2], axis=0), np.nan], OVER_FEET)
+    plant, indices, asked = model.double.plant, list(joints), np.array(list(joints.values()))
+    origins = {n: plant.get_frame(frame_named(model.plant, "goal", n).index()) for n in frames}
+    aimed, places = asked.copy(), {name: np.array(position) for name, position in frames.items()}
+    for _ in range(CORRECTIONS + 1):
+        lower, upper = legs.lower.copy(), legs.upper.copy()
+        lower[indices] = upper[indices] = aimed
+        legs.put(q0)
+        targets = [Target(origins[name], np.zeros(3), position, ON_GROUND) for name, position in places.items()]
+        q = inverse_kinematics(model, q0, [*legs.at(feet, ON_GROUND), *targets], wish, lower, upper)
+        shift = _shift_to(legs, start, q, feet)
+        if isinstance(shift, Refusal):
+            return shift
+        end = shift.xs[-1][: model.nq]
+        legs.put(end)
+        context, off = model.double.context, asked - end[indices]
+        misses = {n: frames[n] - origins[n].CalcPoseInWorld(context).translation() for n in frames}
+        far = max((float(np.max(np.abs(miss))) for miss in misses.values()), default=0.0)
+        if far < FRAME_MISS and np.max(np.abs(off), initial=0.0) < JOINT_MISS:
+            return shift
+        aimed = aimed + off
+        places = {name: position + misses[name] for name, position in places.items()}
+    return Refusal(
+        f"its frames end {far:.2g} m and its joints {np.max(np.abs(off), initial=0.0):.2g} off what is asked"
+    )
+
+
+def _shift_to(legs: Legs, start: Rest, q: Array, feet: Array) -> Shift | Refusal:
+    """From rest to posture q (nq,), if that is one in which the robot stands with its `feet` (n, 3) where they are."""
+    off = max(float(np.max(np.abs(legs.points_in(q) - feet))), -float(np.min(legs.on_lowest(q).points_in(q)[:, 2])))
+    if off > FEET_STAY:
+        return Refusal(f"its feet would have to move, or roll, by {off:.2g} m")
+    stance = hold(legs, q)
+    end = stance if isinstance(stance, Refusal) else settled(legs, stance)
+    if isinstance(end, Refusal):
+        return end
+    why, nq = Refusal(""), legs.model.nq
+    for duration in DURATIONS:
+        shift = _between(legs, start, end, duration)
+        if isinstance(shift, Refusal):
+            why = shift
+            continue
+        x = shift.xs[-1]
+        away, speed = float(np.max(np.abs(legs.apart(x[:nq], end.x[:nq])))), float(np.max(np.abs(x[nq:])))
+        if away <= ARRIVED and speed <= SLOW_ENOUGH:
+            return shift
+        why = Refusal(f"it ends {away:.2g} rad or m from where it would rest, at {speed:.2g} rad/s or m/s")
+    return why
+
+
+def _between(legs: Legs, start: Rest, end: Rest, duration: float) -> Shift | Refusal:
+    """The model's own steps from one rest to (nearly) another in `duration` [s], the feet on the ground.
+
+    The inputs are those that make a smooth motion of the posture, its forces shared among the feet, and a regulator
+    keeps the steps to it.
+    """
+    model, h = legs.model, legs.model.time_step
+    moving, holding = round(duration / h), round(HOLDING / h)
+    q0, q1 = start.x[: model.nq], end.x[: model.nq]
+    s = smooth(np.linspace(0, 1, moving + 1))
+    feet = [legs.points_in(q) for q in (q0, q1)]
+    way, unit, qs = legs.apart(q1, q0), np.full(model.nv, ALONG), [q0]
+    for fraction in s[1:-1]:
+        legs.put(qs[-1])
+        targets = legs.at(feet[0] + fraction * (feet[1] - feet[0]), ON_GROUND)
+        wish = Wish(legs.moved(q0, fraction * way), unit)
+        qs.append(inverse_kinematics(model, qs[-1], targets, wish, legs.lower, legs.upper))
+    qs += [q1] * (holding + 1)
+    v = [np.zeros(model.nv)] + [legs.apart(b, a) / h for a, b in pairwise(qs)]
+    xs = np.array([np.concatenate([q, speed]) for q, speed in zip(qs, v, strict=True)])
+    us = []
+    for k in range(moving + 1):
+        change = v[k + 1] - v[k]
+        set_state(model.double, xs[k])
+        stance = hold(legs, qs[k], model.double.inverse_dynamics(change / h) + model.double.damping() * change)
+        if isinstance(stance, Refusal):
+            return Refusal(f"on the way {stance.reason}")
+        us.append(stance.u)
+    made = np.array(us[:-1] + [us[-1]] * holding)
+    s = np.concatenate([s[:-1], np.ones(holding)])[:, None]
+    return _regulated(legs, xs, made + (1 - s) * (start.u - us[0]) + s * (end.u - us[-1]))
+
+
+def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
+    """The model's own steps along xs (N+1, nx) under us (N, nu) and a regulator, which must stay within the limits."""
+    model, nv = legs.model, legs.model.nv
+    lower, upper = input_limits(model)
+    size = EFFORT_SHARE * np.maximum(np.abs(us[0]), 0.1 * float(np.max(np.abs(us[0]))))
+    Q = np.diag(np.concatenate([np.full(nv, NEAR**-2.0), np.full(nv, SLOW**-2.0)]))
+    try:
+        policy = TVLQR(model, xs, us, Q, np.diag(size**-2.0))
+        states, inputs = [xs[0]], list[Array]()
+        for k in range(len(us)):
+            inputs.append(np.clip(policy(states[-1], k * model.time_step), lower, upper))
+            states.append(np.array(advance(model.double, states[-1], inputs[-1])))
+    except (SimulationError, GradientError) as error:
+        return Refusal(f"the motion cannot be stepped: {error}")
+    terms = [*model.contract.positions, *model.contract.velocities]
+    low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
+    beyond = (low < high) & np.any((np.array(states) < low) | (np.array(states) > high), axis=0)
+    if np.any(beyond):
+        return Refusal(f"{model.state_names[int(np.argmax(beyond))]} would leave its limits")
+    return Shift(np.array(states), np.array(inputs))

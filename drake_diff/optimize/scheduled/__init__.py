@@ -1,1 +1,0 @@
-"""First guesses of a robot's motion where it is known which foot stands when."""

@@ -1,0 +1,520 @@
+"""First guesses of a plan: from goals to postures that keep them, lines that touch nothing, and motions along these.
+
+What is in the way is gone around by OMPL's RRT-Connect, since Drake has no planner that samples postures. These are
+guesses alone: what they lead to is checked as any other plan.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from pydrake.math import BsplineBasis
+from pydrake.trajectories import BsplineTrajectory
+
+from drake_diff._base.arrays import Array, Indices, finite_array
+from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError, UnknownNameError
+from drake_diff.legs.inverse_kinematics import Target, Wish, inverse_kinematics
+from drake_diff.legs.motion import smooth
+from drake_diff.mechanics.quantities import frame_position
+from drake_diff.model.model import Model
+from drake_diff.model.plant import joints
+from drake_diff.model.repairs import frame_named
+from drake_diff.model.step import advance, set_state
+from drake_diff.model.tangent import tangent_space
+from drake_diff.optimize.problem.obstacles import ClearanceConstraint, Obstacle, clearances
+from drake_diff.planning.robot import HOLD_SHARE, TOUCHING, Robot, drive, effort_limits, floating, share_to_hold, shares
+
+# Postures that keep goals.
+REACHED = 1e-6  # [m]
+LIMIT_MARGIN = 0.01  # of a joint's range: how far from its limits they are
+SEEDS, MORE_SEEDS = 12, 40  # first postures of inverse kinematics; where obstacles are in the way
+CANDIDATES = 3  # postures that are tried
+MOVE = 0.25  # part of a joint's range that a random goal is away, at most
+RANDOM, DRAWS, NEARER = 2, 50, 0.5  # random goals, postures that are drawn for one, and how they come nearer
+SOON = 2.0  # [s] a random goal is no further than what its joints do in that time
+# Lines of postures.
+BENDS, WIDTH = 100, 0.4  # lines bent at random that are looked at, and of a joint's range how far they are pulled
+MOST_LINES = 2
+NEAR = 0.04  # [rad or m] between the postures of a line that are looked at
+SEARCHES, MOST_LOOKS, LONGEST_LEG = 3, 20_000, 0.6  # searches, postures of one, [rad or m] that it adds at once
+CONTROLS, CUBIC = (8, 12, 20, 40), 4  # of a curve along what a search found: the fewest that keep it clear; its order
+# Motions.
+FASTEST = 1.0  # [rad/s or m/s] the peak of a joint without a velocity limit
+OF_SPEED, OF_EFFORT, OF_PULL = 0.6, 0.9, 0.8  # of a velocity limit, of an effort limit: what a guess, a controller uses
+SHORTEST, LONGEST = 0.6, 6.0  # [s] a motion
+STEPS = (30, 100)  # fewest and most of a plan
+PEAK = 1.875  # the greatest slope of the smooth way from 0 to 1
+CORRECTIONS, EXACT = 3, 1e-11  # [rad/s or m/s]
+PULL, DAMP = 30.0, 9.0  # [1/s^2], [1/s] of a controller
+# Flights: [m/s], [rad/s] at most; [m], [rad] to each side and [m] the height of a random goal; goals that are drawn.
+FLY_SPEED, FLY_TURN, FLY_FAR, FLY_TURNED, FLY_UP, FLIGHTS = 1.0, 1.0, (1.0, 1.0, 0.5), 1.0, 0.75, 20
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Goals of one robot: positions (3,) of frames, positions of joints by their place in q; none is a random goal.
+
+    `avoid` is what it keeps clear of on its way.
+    """
+
+    frames: Mapping[str, Array]
+    joints: Mapping[int, float]
+    avoid: tuple[Obstacle, ...] = ()
+
+    @property
+    def is_free(self) -> bool:
+        """Whether nothing is asked for."""
+        return not self.frames and not self.joints
+
+
+def read_goals(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle] = ()) -> Task:
+    """The task that `goals` are for `model`: a name with three numbers is a frame's, with one a joint's.
+
+    Raises UnknownNameError where there is no such frame or joint, InputError where the numbers do not fit.
+    """
+    places: dict[str, Array] = {}
+    angles: dict[int, float] = {}
+    of_joints = {name.rpartition("_")[0]: i for i, name in enumerate(model.position_names)}
+    for name, value in goals.items():
+        numbers = np.atleast_1d(np.asarray(value, dtype=float))
+        if len(numbers) == 3:
+            frame_position(model, name)  # which names the frames where this is none
+            places[name] = finite_array(f"goal {name} [m]", numbers, (3,))
+        elif len(numbers) == 1:
+            if name not in of_joints or (model.nq != model.nv and of_joints[name] < model.nq - model.nv + 6):
+                raise UnknownNameError("goal: joint", got=name, known=of_joints)
+            index = of_joints[name]
+            low, high = model.contract.positions[index].lower, model.contract.positions[index].upper
+            if not low <= numbers[0] <= high:
+                expected = f"a position within its limits [{low:g}, {high:g}]"
+                raise InputError(f"goal {name}", got=numbers[0], expected=expected)
+            angles[index] = float(numbers[0])
+        else:
+            expected = "three numbers (the position of a frame) or one (that of a joint)"
+            raise InputError(f"goal {name}", got=f"{len(numbers)} numbers", expected=expected)
+    for obstacle in avoid:
+        if not isinstance(obstacle, Obstacle):
+            raise InputError("avoid", got=repr(obstacle)[:80], expected="SphereObstacles and BoxObstacles")
+    return Task(places, angles, tuple(avoid))
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Where a robot may be: where its shapes do not overlap, and where it keeps clear of obstacles."""
+
+    robot: Robot
+    clear: tuple[ClearanceConstraint, ...]
+
+    @classmethod
+    def around(cls, robot: Robot, avoid: Sequence[Obstacle]) -> "Space":
+        """That of a robot and what it avoids."""
+        return cls(robot, tuple(clearances([c for obstacle in avoid for c in obstacle.bind(robot.model)])))
+
+    def lacking(self, qs: Array) -> Array:
+        """(K,) [m] what is used of an obstacle's margin at postures qs (K, nq), at most; below 0 where none is."""
+        xs = np.hstack([qs, np.zeros((len(qs), self.robot.model.nv))])
+        return np.asarray(np.max([np.full(len(qs), -np.inf), *(c.lacking(xs) for c in self.clear)], axis=0))
+
+    def is_free(self, qs: Array) -> bool:
+        """Whether the robot may be in all of the postures qs (K, nq)."""
+        return bool(np.max(self.lacking(qs)) <= 0) and all(self.robot.overlap(q) <= TOUCHING for q in qs)
+
+    def check(self, subject: str, q: Array) -> None:
+        """InputError where posture q (nq,) is too near to an obstacle."""
+        for c in self.clear:
+            c.check(subject, np.concatenate([q, np.zeros(self.robot.model.nv)]))
+
+    def obstruction(self, q: Array) -> str:
+        """What is too near to an obstacle at posture q (nq,); "" where nothing is."""
+        x = np.concatenate([q, np.zeros(self.robot.model.nv)])
+        worst = max(self.clear, key=lambda c: float(c.lacking(x[None])[0]), default=None)
+        return (
+            str(worst.check_at(x, "that posture", 0.0)) if worst is not None and worst.lacking(x[None])[0] > 0 else ""
+        )
+
+
+def postures(robot: Robot, task: Task, seed: int) -> list[Array]:
+    """Postures (nq,) that keep the task, the nearest to the start first; ModelError where none is found.
+
+    Where nothing is asked for it is a random one: inside the limits, without overlap, and held by its motors.
+    """
+    random, space = np.random.default_rng([seed, 1]), Space.around(robot, task.avoid)
+    if task.is_free:
+        return _random_goals(space, random)
+    start, fixed = robot.q.copy(), np.zeros(robot.model.nq, dtype=bool)
+    for index, value in task.joints.items():
+        start[index], fixed[index] = value, True
+    if not task.frames:
+        space.check("goal", start)
+        return [start]
+    candidates, nearest, blocked = list[Array](), np.inf, ""
+    for i in range(MORE_SEEDS if task.avoid else SEEDS):
+        if len(candidates) >= CANDIDATES and i >= SEEDS:
+            break
+        first = start if i == 0 else np.where(fixed, start, random.uniform(robot.lower, robot.upper))
+        q, off = _reach(robot, task, first, fixed)
+        nearest = min(nearest, off)
+        if off <= REACHED and robot.overlap(q) <= TOUCHING and share_to_hold(robot.model, q) <= 1.0:
+            blocked = space.obstruction(q)
+            candidates += [] if blocked else [q]
+    if not candidates and blocked:
+        expected = f"a goal that some posture reaches clear of all obstacles; {MORE_SEEDS} were tried"
+        raise InputError(f"goal {', '.join(task.frames)}", got=f"at the goal {blocked}", expected=expected)
+    if not candidates:
+        criteria = "inside all limits, without overlap and held by the motors"
+        if nearest > REACHED:
+            criteria = f"inside all limits: the nearest of {SEEDS} tries is {nearest:.3g} m away"
+        raise ModelError(f"no posture was found with {', '.join(task.frames)} at its goal, {criteria}")
+    return sorted(candidates, key=lambda q: float(np.max(np.abs(q - robot.q))))[:CANDIDATES]
+
+
+def _reach(robot: Robot, task: Task, first: Array, fixed: Array) -> tuple[Array, float]:
+    """The posture nearest to `first` (nq,) inside the limits that has the frames at their goals, and how far [m] it
+    is off; what is `fixed` (nq,) stays."""
+    model, plant = robot.model, robot.model.double.plant
+    margin, tolerance = LIMIT_MARGIN * (robot.upper - robot.lower), REACHED / 10
+    low, high = np.where(fixed, first, robot.lower + margin), np.where(fixed, first, robot.upper - margin)
+    frames = [plant.get_frame(frame_named(model.plant, "goal", name).index()) for name in task.frames]
+    goals = list(task.frames.values())
+    targets = [Target(frame, np.zeros(3), goal, tolerance) for frame, goal in zip(frames, goals, strict=True)]
+    q = inverse_kinematics(model, np.clip(first, low, high), targets, Wish(first, np.ones(model.nv)), low, high)
+    positions = [frame.CalcPoseInWorld(model.double.context).translation() for frame in frames]
+    return np.clip(q, low, high), float(np.max(np.abs(np.subtract(positions, goals))))
+
+
+def _random_goals(space: Space, random: np.random.Generator) -> list[Array]:
+    """Some postures at random; ModelError where none is found."""
+    goals = [q for q in (_random_posture(space, random) for _ in range(RANDOM)) if q is not None]
+    if not goals:
+        message = "no posture to go to was found: none that was drawn is clear of all shapes and held by the motors"
+        raise ModelError(f"{message}: give a goal")
+    return goals
+
+
+def _random_posture(space: Space, random: np.random.Generator) -> Array | None:
+    """Some way off the start, inside the limits, where nothing is touched and the motors hold the weight, best within
+    HOLD_SHARE; None where none of those drawn is."""
+    robot = space.robot
+    far = speed_limits(robot.model) * SOON / PEAK
+    reach = np.minimum(MOVE * (robot.upper - robot.lower), far)
+    margin = 0.2 * MOVE * (robot.upper - robot.lower)
+    best, least = None, 1.0
+    for i in range(DRAWS):
+        fraction = NEARER ** (i // (DRAWS // 5))  # some robots can only hold what is near
+        q = robot.q + fraction * random.uniform(-1, 1, len(reach)) * reach
+        q = np.clip(q, robot.lower + margin, robot.upper - margin)
+        if any(robot.overlap(robot.q + s * (q - robot.q)) > TOUCHING for s in (0.25, 0.5, 0.75, 1.0)):
+            continue
+        if space.obstruction(q):
+            continue
+        load = max(share_to_hold(robot.model, robot.q + s * (q - robot.q)) for s in (0.5, 1.0))
+        if load <= HOLD_SHARE:
+            return q
+        if load < least:
+            best, least = q, load
+    return best
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A curve of postures: a clamped B-spline by its control points (K, nq), the first and last of which it meets."""
+
+    name: str
+    controls: Array
+
+    def at(self, s: Array) -> Array:
+        """(M, nq) at s (M,), from 0 at the start to 1 at the end."""
+        return np.asarray(self._curve().vector_values(s)).T
+
+    def slopes(self, s: Array) -> Array:
+        """(M, nq) its derivatives by s."""
+        return np.asarray(self._curve().MakeDerivative().vector_values(s)).T
+
+    def _curve(self) -> BsplineTrajectory:
+        count = len(self.controls)
+        return BsplineTrajectory(BsplineBasis(min(count, CUBIC), count), [c[:, None] for c in self.controls])
+
+    @property
+    def length(self) -> float:
+        """[rad or m] that of its control points' chain, the largest coordinate of each piece."""
+        return float(np.sum(np.max(np.abs(np.diff(self.controls, axis=0)), axis=1)))
+
+    @property
+    def postures(self) -> Array:
+        """(M, nq) near each other, from the first to the last."""
+        return self.at(np.linspace(0, 1, 2 + int(np.ceil(self.length / NEAR))))
+
+
+def lines(space: Space, target: Array, seed: int) -> list[Line]:
+    """Lines from where the robot starts to `target` (nq,), the best first.
+
+    The straight one if it is clear; else the shortest bent ones that are, and of those that searches find; else the
+    straight one, for a solver to push out of the way. MissingDependencyError where only a search could help, without
+    OMPL.
+    """
+    robot = space.robot
+    straight = Line("a straight line in the joints", np.array([robot.q, target]))
+    if space.is_free(straight.postures):
+        return [straight]
+    random = np.random.default_rng([seed, 3])
+    can_search, candidates = find_spec("ompl") is not None, []
+    bent = "a bent line" if can_search else "a bent line (no search: ompl is not installed)"
+    for i in range(BENDS):
+        pull = WIDTH * (i + 1) / BENDS * random.uniform(-1, 1, len(target)) * (robot.upper - robot.lower)
+        middle = np.clip((robot.q + target) / 2 + pull, robot.lower, robot.upper)
+        line = Line(bent, np.array([robot.q, middle, target]))
+        if space.is_free(line.postures):
+            candidates.append(line)
+    if not (can_search or candidates):
+        raise MissingDependencyError("a way around what is in the way needs a search: pip install ompl")
+    searched = [_search(space, target, seed + i) for i in range(SEARCHES if can_search else 0)]
+    candidates += [line for line in searched if line is not None]
+    return sorted(candidates, key=lambda line: line.length)[:MOST_LINES] or [straight]
+
+
+def _search(space: Space, target: Array, seed: int) -> Line | None:
+    """Around what is in the way, by RRT-Connect; None where it finds nothing.
+
+    Source: Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path planning", 2000.
+    """
+    chain = _chain(space, target, seed)
+    if chain is None:
+        return None
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(chain, axis=0), axis=1))])
+    for count in CONTROLS:
+        knots = np.array(BsplineBasis(CUBIC, count).knots())
+        even = along[-1] * np.array([np.mean(knots[i + 1 : i + CUBIC]) for i in range(count)])  # of an even speed
+        line = Line("a way around by a search", np.array([np.interp(even, along, column) for column in chain.T]).T)
+        if space.is_free(line.postures):
+            return line
+    return None
+
+
+def _chain(space: Space, target: Array, seed: int) -> Array | None:
+    """(K, nq) postures from the start to `target`, the straight lines between which are clear; None without any."""
+    from ompl import base, geometric, util
+
+    robot, looks = space.robot, 0
+    start, size = robot.q, len(target)
+
+    def values(state: Any) -> Array:
+        return np.array(state[0:size])
+
+    def is_free(qs: Array) -> bool:
+        nonlocal looks
+        looks += len(qs)
+        return space.is_free(qs)
+
+    def is_over() -> bool:
+        nonlocal looks
+        looks += 1
+        return looks > MOST_LOOKS
+
+    class Lines(base.MotionValidator):  # type: ignore[misc]
+        def checkMotion(self, a: Any, b: Any) -> bool:
+            ends = np.array([values(a), values(b)])
+            return is_free(Line("", ends).postures)
+
+    level = util.getLogLevel()
+    util.setLogLevel(util.LOG_NONE)
+    try:
+        util.RNG.setSeed(seed + 1)  # 0 is no seed
+        limits = base.RealVectorBounds(size)
+        for i, ends in enumerate(zip(robot.lower, robot.upper, start, target, strict=True)):
+            limits.setLow(i, min(ends))
+            limits.setHigh(i, max(ends))
+        states = base.RealVectorStateSpace(size)
+        states.setBounds(limits)
+        information = base.SpaceInformation(states)
+        information.setStateValidityChecker(lambda state: is_free(values(state)[None]))
+        information.setMotionValidator(Lines(information))
+        information.setup()
+        first, last = information.allocState(), information.allocState()
+        first[0:size], last[0:size] = start.tolist(), target.tolist()
+        problem = base.ProblemDefinition(information)
+        problem.setStartAndGoalStates(first, last)
+        planner = geometric.RRTConnect(information)
+        planner.setRange(LONGEST_LEG)
+        planner.setProblemDefinition(problem)
+        planner.setup()
+        planner.solve(base.PlannerTerminationCondition(is_over))
+        path = problem.getSolutionPath() if problem.hasExactSolution() else None
+        if path is None:
+            return None
+        geometric.PathSimplifier(information).simplify(path, base.PlannerTerminationCondition(is_over))
+        return np.array([values(path.getState(i)) for i in range(path.getStateCount())])
+    finally:
+        util.setLogLevel(level)
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """A motion xs (N+1, nx) under us (N, nu) of `model`, and what it is called.
+
+    `effort` is the largest share of an effort limit that it takes, `depth` [m] its deepest overlap.
+    """
+
+    name: str
+    model: Model
+    xs: Array
+    us: Array
+    effort: float
+    depth: float = 0.0
+
+    @property
+    def num_steps(self) -> int:
+        """The number of steps."""
+        return len(self.us)
+
+    def in_steps(self, count: int) -> "Guess":
+        """The same motion at `count` + 1 even times, for a search whose horizon is free."""
+        now, then = np.linspace(0, 1, count + 1), np.linspace(0, 1, len(self.xs))
+        xs = np.array([np.interp(now, then, column) for column in self.xs.T]).T
+        us = np.array([np.interp((now[1:] + now[:-1]) / 2, (then[1:] + then[:-1]) / 2, c) for c in self.us.T]).T
+        return replace(self, xs=xs, us=us)
+
+
+def speed_limits(model: Model) -> Array:
+    """(nv,) what a first guess may use of the velocity limits; FASTEST where there is none, or one of 0."""
+    limits = np.array([min(abs(v.lower), abs(v.upper)) for v in model.contract.velocities])
+    return np.where((limits > 0) & np.isfinite(limits), np.minimum(OF_SPEED * limits, 5 * FASTEST), FASTEST)
+
+
+def along(robot: Robot, line: Line, *, slower: float = 1.0) -> Guess:
+    """The smooth motion along a line, at rest at both ends, and the inputs that make it.
+
+    It is as fast as the joints' speeds and efforts allow, within the limits of this module. SimulationError where
+    Drake cannot take a step of it.
+    """
+    t = np.linspace(0, 1, 101)
+    speeds = np.abs(line.slopes(smooth(t))) * (30 * t**2 * (1 - t) ** 2)[:, None]
+    duration = slower * float(np.max(speeds / speed_limits(robot.model), initial=0.0))
+    name = line.name if slower == 1 else f"{line.name} in {slower:g} times the time"
+    duration = float(np.clip(duration, SHORTEST, LONGEST))
+    guess = _timed(robot, name, line.at, duration)
+    while guess.effort > OF_EFFORT and duration < LONGEST:
+        duration = min(1.5 * duration, LONGEST)
+        guess = _timed(robot, name, line.at, duration)
+    return guess
+
+
+def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> Guess:
+    """A smooth flight of what floats to where the frames of `places` are at theirs (3,) [m], at rest.
+
+    Without places each body goes to a random one, by a straight line on which nothing overlaps, turned about the
+    vertical.
+    """
+    model, random, still = robot.model, np.random.default_rng([seed, 4]), np.zeros(robot.model.nv)
+    free, space = floating(model), tangent_space(model)
+    guesses = list[Guess]()
+    for _ in range(1 if places else FLIGHTS):
+        way = np.zeros(model.nv)
+        for _, _, v in () if places else free:
+            way[v + 3 : v + 6] = np.array(FLY_FAR) * random.uniform(-1, 1, 3) + np.array([0.0, 0.0, FLY_UP])
+            way[v + 2] = FLY_TURNED * random.uniform(-1, 1)
+        for name, position in places.items():
+            v = _carrier(robot, name)
+            way[v + 3 : v + 6] = position - frame_position(model, name)(np.append(robot.q, still))
+        speeds = [max(np.linalg.norm(way[v + 3 : v + 6]) / FLY_SPEED, abs(way[v + 2]) / FLY_TURN) for _, _, v in free]
+        duration = float(np.clip(PEAK * max(speeds), SHORTEST, LONGEST))
+
+        def postures_at(s: Array, way: Array = way) -> Array:
+            moves = [np.append(fraction * way, still) for fraction in s]
+            return np.array([space.plus(np.append(robot.q, still), move)[: model.nq] for move in moves])
+
+        guesses.append(_timed(robot, "a straight line through the air", postures_at, duration))
+        if guesses[-1].depth <= TOUCHING:
+            break
+    return min(guesses, key=lambda guess: guess.depth)
+
+
+def _carrier(robot: Robot, name: str) -> int:
+    """Where the velocities begin of the floating body that carries a frame or body: the one that takes it along."""
+    locate, still = frame_position(robot.model, name), np.zeros(robot.model.nv)
+    free = floating(robot.model)
+    for _, q_start, v_start in free:
+        moved = robot.q.copy()
+        moved[q_start + 4] += 1.0
+        if np.any(locate(np.concatenate([moved, still])) != locate(np.concatenate([robot.q, still]))):
+            return v_start
+    raise InputError("goals", got=name, expected=f"a frame on what flies: {', '.join(label for label, _, _ in free)}")
+
+
+def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], duration: float) -> Guess:
+    """The motion through postures (M, nq) at s (M,) from 0 to 1 in `duration` [s], and the inputs that make it."""
+    model = robot.model
+    steps = int(np.clip(round(duration / model.time_step), *STEPS))
+    if duration / steps > 1.25 * model.time_step:
+        model = model.at_time_step(float(f"{duration / steps:.1g}"))
+    # One step before the end it is at the goal, and rests there: Drake's step moves by the velocity after it.
+    path = postures_at(smooth(np.clip(np.arange(steps + 1) / (steps - 1), 0.0, 1.0)))
+    space, still = tangent_space(model), np.zeros(model.nv)
+    xs, us = [np.append(robot.q, still)], list[Array]()
+    for q in path[1:]:
+        way = space.minus(np.append(q, still), np.append(xs[-1][: model.nq], still))[: model.nv]
+        u, x_next = _inputs(model, xs[-1], way / model.time_step)
+        us.append(u)
+        xs.append(x_next)
+    depth = max(robot.overlap(x[: model.nq]) for x in xs[:: max(1, steps // 25)])
+    return Guess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))), depth)
+
+
+def _inputs(model: Model, x: Array, wanted: Array) -> tuple[Array, Array]:
+    """(nu,) the inputs whose step from x (nx,) leads to the velocities `wanted` (nv,), and (nx,) where it leads."""
+    twin, h, nq = model.double, model.time_step, model.nq
+    set_state(twin, x)
+    change = wanted - x[nq:]
+    # The step's own equation, whose damping acts on the velocity after it; probing the step would meet joint limits.
+    needed = twin.inverse_dynamics(change / h) + twin.damping() * change
+    effect = h * np.linalg.solve(twin.mass_matrix() + h * np.diag(twin.damping()), model.actuation)
+    u = np.linalg.lstsq(model.actuation, needed, rcond=None)[0]
+    for i in range(CORRECTIONS + 1):
+        x_next = np.array(advance(twin, x, u))
+        off = wanted - x_next[nq:]
+        if i == CORRECTIONS or np.max(np.abs(off), initial=0.0) < EXACT:
+            break
+        if (
+            i == 1
+        ):  # controllers in the plant, and thrusters that turn with their body, which the equation does not have
+            effect = np.array([np.array(advance(twin, x, u + d))[nq:] - x_next[nq:] for d in np.eye(model.nu)]).T
+        u = u + np.linalg.lstsq(effect, off, rcond=None)[0]
+    return np.asarray(u), x_next
+
+
+def _positions(model: Model) -> Indices:
+    """(nv,) where in q the coordinate of each velocity of a joint is."""
+    indices = np.arange(model.nv)
+    for joint in joints(model.plant):
+        q, v = model.places(joint)
+        if len(q) == len(v) == 1:
+            indices[v[0]] = q[0]
+    return indices
+
+
+def by_controller(robot: Robot, model: Model, target: Array, *, steps: int, reach: float, name: str) -> Guess | None:
+    """What `model` of the robot does when each input pulls its own joint toward `target` (nq,), `reach` of the way.
+
+    None where Drake cannot take a step of it.
+    """
+    x = np.concatenate([robot.q, np.zeros(model.nv)])
+    limits = np.minimum(effort_limits(model), 1e4)
+    xs, us = [x], []
+    try:
+        effect = drive(model, robot.q)
+        joint_v = np.argmax(np.abs(effect), axis=0)  # the velocity that an input acts on most
+        gain = model.time_step / effect[joint_v, np.arange(model.nu)]
+        joint_q = _positions(model)[joint_v]
+        for k in range(steps):
+            s = np.array(min(1.0, 1.25 * (k + 1) / steps))
+            aim = robot.q[joint_q] + reach * smooth(s) * (target[joint_q] - robot.q[joint_q])
+            u = gain * (PULL * (aim - x[joint_q]) - DAMP * x[model.nq + joint_v])
+            u = np.clip(u, -OF_PULL * limits, OF_PULL * limits)
+            x = np.array(advance(model.double, x, u))
+            xs.append(x)
+            us.append(u)
+    except SimulationError:
+        return None
+    depth = max(robot.overlap(x[: model.nq]) for x in xs) if model is robot.apart else 0.0
+    return Guess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))), depth)
