@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,16 +38,25 @@ from drake_diff.model.parameters import IDENTITY_OFFSET
 from drake_diff.model.plant import PROXIMITY, actuators, instances, joints
 from drake_diff.model.step import advance, check_point, set_state
 
-PAIRS_TOLD = 6  # of links, each with a finding of its own; a humanoid has hundreds
-AT_LIMIT = 1e-6  # [m or rad] from a joint's limit
-HUGE = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
-NEARLY_PARALLEL = 1e-2  # [rad]: jumps were measured up to 1e-3 and beyond
-IN_PLANE = 1e-6  # [m] from a plane of symmetry
+
+@dataclass(frozen=True)
+class AuditOptions:
+    """What an audit takes for near, large and many."""
+
+    pairs_told: int = 6  # of links, each with a finding of its own; a humanoid has hundreds
+    at_limit: float = 1e-6  # [m or rad] from a joint's limit
+    huge: float = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
+    nearly_parallel: float = 1e-2  # [rad]: jumps were measured up to 1e-3 and beyond
+    in_plane: float = 1e-6  # [m] from a plane of symmetry
+    reach: float = 1e-3  # [m] faces nearer than this count as touching
+    on_axis: float = 1e-9  # [m] from a sphere's centre to a cylinder's axis
+    touch: float = 1e-9  # [m] of signed distance, where Drake computes it exactly
+    rough_touch: float = 1e-6  # [m] where it iterates (measured: 1e-7 off for an ellipsoid)
+
+
+AUDIT = AuditOptions()
+
 ROUND = ("Sphere", "Ellipsoid", "Capsule")
-REACH = 1e-3  # [m] faces nearer than this count as touching
-ON_AXIS = 1e-9  # [m] from a sphere's centre to a cylinder's axis
-TOUCH = 1e-9  # [m] of signed distance, where Drake computes it exactly
-ROUGH_TOUCH = 1e-6  # [m] where it iterates (measured: 1e-7 off for an ellipsoid)
 
 UNITS = dict(zip(PROXIMITY, ("", " N/m", " s/m", " s", " Pa"), strict=True))
 
@@ -124,7 +133,7 @@ def _identity_frame(point: Place) -> Found:
 def _joint_limit(point: Place) -> Found:
     names, limits = point.model.position_names, zip(*point.model.position_limits, strict=True)
     for name, q, (low, high) in zip(names, point.x[: point.model.nq], limits, strict=True):
-        if q <= low + AT_LIMIT or q >= high - AT_LIMIT:
+        if q <= low + AUDIT.at_limit or q >= high - AUDIT.at_limit:
             message = f"{q:.9g} is at or beyond its limits [{low:g}, {high:g}]: the derivative is that of one side"
             remedy = "start inside the limits, or use `smooth_step`, which averages over both sides"
             yield Finding("warning", "joint_limit", name, message, remedy)
@@ -193,10 +202,12 @@ def _jacobian(point: Place) -> Found:
         return
     jacobian = np.abs(np.hstack([result.A, result.B]))
     row, column = np.unravel_index(int(np.argmax(jacobian)), jacobian.shape)
-    if jacobian[row, column] > HUGE:
-        names, count = point.model.state_names, int(np.sum(jacobian > HUGE))
+    if jacobian[row, column] > AUDIT.huge:
+        names, count = point.model.state_names, int(np.sum(jacobian > AUDIT.huge))
         entry = f"d {names[row]} / d {(*names, *point.model.input_names)[column]}"
-        message = f"{entry} is {jacobian[row, column]:.3g} (by {result.method}), {count} entries are above {HUGE:g}"
+        message = (
+            f"{entry} is {jacobian[row, column]:.3g} (by {result.method}), {count} entries are above {AUDIT.huge:g}"
+        )
         remedy = (
             "contact_approximation sap has the tamest Jacobians; otherwise a shorter time step, softer contact or a "
             "longer relaxation time, lighter inertia ratios, or `smooth_step`"
@@ -250,7 +261,7 @@ def _pair_refused(point: Place) -> Found:
         if pair.refused:
             groups.setdefault(pair.bodies, []).append(pair)
     by_choice = severity == "info"
-    named, rest = list(groups)[:PAIRS_TOLD], list(groups)[PAIRS_TOLD:]
+    named, rest = list(groups)[: AUDIT.pairs_told], list(groups)[AUDIT.pairs_told :]
     for bodies in named:
         arguments = {} if by_choice else _route(point.model, groups[bodies])
         advice = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
@@ -260,8 +271,8 @@ def _pair_refused(point: Place) -> Found:
         pairs = [pair for bodies in rest for pair in groups[bodies]]
         arguments = {} if by_choice else _route(point.model, pairs)
         advice = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
-        listed = ", ".join(" - ".join(bodies) for bodies in rest[:PAIRS_TOLD])
-        message = f"of such shapes, too: {listed}" + (" ..." if len(rest) > PAIRS_TOLD else "")
+        listed = ", ".join(" - ".join(bodies) for bodies in rest[: AUDIT.pairs_told])
+        message = f"of such shapes, too: {listed}" + (" ..." if len(rest) > AUDIT.pairs_told else "")
         yield Finding(severity, "pair_refused", f"{len(rest)} more pairs of links", message, advice, arguments)
 
 
@@ -307,10 +318,10 @@ def _aligned_faces(point: Place) -> Found:
             continue
         severity: Severity = "info"
         consequence = "tilted now; if they come to lie flat the hydroelastic step jumps"
-        if angle <= PARALLEL and gap <= REACH:
+        if angle <= PARALLEL and gap <= AUDIT.reach:
             severity = "error"
             consequence = "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
-        elif angle <= NEARLY_PARALLEL:
+        elif angle <= AUDIT.nearly_parallel:
             severity, consequence = "warning", "if they meet like this the hydroelastic step jumps"
         message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: {consequence}"
         arguments = {} if severity == "info" else {"contact_model": "point", "contact_geometry": "corner_spheres"}
@@ -326,7 +337,7 @@ def _alignment(pair: Pair) -> tuple[float | None, float]:
     for first, other in ((pair.a, pair.b), (pair.b, pair.a)):
         if first.kind in ROUND and other.kind in ("Box", "Cylinder"):
             offset = other.pose.inverse() @ first.pose.translation()
-            if np.min(np.abs(offset[: 3 if other.kind == "Box" else 2])) > IN_PLANE:
+            if np.min(np.abs(offset[: 3 if other.kind == "Box" else 2])) > AUDIT.in_plane:
                 return None, np.inf
     faces = [(n, m) for n in _normals(pair.a, pair.b) for m in _normals(pair.b, pair.a)]
     if not faces:
@@ -356,7 +367,7 @@ def _cylinder_axis(point: Place) -> Found:
             continue
         offset = both[0].pose.translation() - both[1].pose.translation()
         distance = float(np.linalg.norm(np.cross(both[1].axis(2), offset)))
-        if distance >= ON_AXIS:
+        if distance >= AUDIT.on_axis:
             beside[pair.label] = distance
             continue
         consequence = "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
@@ -409,7 +420,7 @@ def _touching(point: Place) -> Found:
             unmeasured.append(pair.label)
             continue
         exact = {pair.a.kind, pair.b.kind} <= MEETS_A_SPHERE and pair.of_kinds(Sphere, object) is not None
-        if abs(distance) < (TOUCH if exact or pair.of_kinds(Box, Box) else ROUGH_TOUCH):
+        if abs(distance) < (AUDIT.touch if exact or pair.of_kinds(Box, Box) else AUDIT.rough_touch):
             message = f"exactly at touch (signed distance {distance:.2g} m): the derivative is that of one side"
             remedy = "start a little apart or a little in contact, or use `smooth_step`"
             yield Finding("warning", "touching", pair.label, message, remedy)

@@ -219,10 +219,27 @@ def _check_solved(refined: RefinedSteps) -> None:
 
 SHARED = ("pydrake.", "drake_diff.model.")  # packages whose objects a copy shares with the original: models and plants
 REMEMBERING = (FunctionType, MethodType, CellType, partial, dict, list, tuple, set, deque, np.ndarray)
-STEPS = (1e-4, 1e-6)  # of the differences of a policy; a derivative must miss both
-MISSED = 1e-3  # of the row's largest entry
-LEAST = 1e-6  # of the input: a smaller derivative is not told from rounding
-ASKED = 5  # times along the motion at which the derivative is compared
+
+
+@dataclass(frozen=True)
+class ProbeOptions:
+    """How a loss and a policy are asked alone."""
+
+    steps: tuple[float, ...] = (1e-4, 1e-6)  # of the differences of a policy; a derivative must miss both
+    missed: float = 1e-3  # of the row's largest entry
+    least: float = 1e-6  # of the input: a smaller derivative is not told from rounding
+    asked: int = 5  # times along the motion at which the derivative is compared
+    cells: int = 16  # both sides together
+    stairs: int = 3  # jumps in as many cells: fewer are a switch, which the motion may never meet
+    quarterings: int = 10
+    settled: int = 2  # after so many a smooth function's cells differ by 1/256, those of a corner by 1/16
+    remains: float = 0.125  # and those of a jump by as much as before
+    rounded: float = 1e-12  # of the largest value: a smaller jump is its rounding
+    spread: float = 1e-6  # of what values differ by: the same
+    single: float = 5e-7  # of an input: single precision is no staircase
+
+
+ASK = ProbeOptions()
 
 
 class _Copier(cloudpickle.Pickler):  # type: ignore[misc]  # cloudpickle has no types
@@ -288,7 +305,7 @@ def check_memory(policy: Any, g: RolloutGradient, time_step: float) -> None:
 def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_step: float) -> str:
     """What the policy's own derivative misses at five times along the motion; empty where it is right there."""
     parameters, nu = policy_parameters(policy), g.us.shape[1]
-    for k in np.unique(np.linspace(0, len(g.us) - 1, ASKED).astype(int)):
+    for k in np.unique(np.linspace(0, len(g.us) - 1, ASK.asked).astype(int)):
         x, t = g.xs[k], float(k * time_step)
         acting = np.arange(len(parameters))[active_parameters(policy, t)]
         scale = np.maximum(1.0, np.abs(parameters[acting]))
@@ -303,11 +320,11 @@ def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_
 
         u, by_x, by_parameters = differentiate_policy(policy, x, t, nu)
         stated = np.hstack([by_x @ space.derivative_of_plus(x), by_parameters[:, acting] * scale])
-        quotients = [central_differences(moved, len(columns), h) for h in STEPS]
+        quotients = [central_differences(moved, len(columns), h) for h in ASK.steps]
         size = np.maximum(np.abs(stated), np.abs(quotients[-1])).max(axis=1, initial=0.0, keepdims=True)
-        size = np.maximum(size, LEAST * np.maximum(1.0, np.abs(u))[:, None])
+        size = np.maximum(size, ASK.least * np.maximum(1.0, np.abs(u))[:, None])
         gap = np.minimum(*(np.abs(stated - some) for some in quotients)) / size
-        if np.max(gap, initial=0.0) > MISSED:
+        if np.max(gap, initial=0.0) > ASK.missed:
             i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
             unit = np.concatenate([np.ones(space.size), scale])[j]
             return (
@@ -318,13 +335,6 @@ def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_
 
 
 LENGTHS = tuple(10.0**k for k in range(-4, 2))  # of the line, to each side
-CELLS = 16  # both sides together
-STAIRS = 3  # jumps in as many cells: fewer are a switch, which the motion may never meet
-QUARTERINGS = 10
-SETTLED = 2  # after so many a smooth function's cells differ by 1/256, those of a corner by 1/16
-KEPT = 0.125  # and those of a jump by as much as before
-ROUNDED, PART = 1e-12, 1e-6  # of the largest value, and of what they differ by: a jump that is told
-SINGLE = 5e-7  # of an input: single precision is no staircase
 OUTSIDE = (ValueError, ArithmeticError, LookupError)  # what a function may raise where it is not defined
 
 Jump = tuple[float, float]  # from where to where
@@ -343,7 +353,7 @@ def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
         return ""
     size = along(jump[1]) - along(jump[0])
     return (
-        f"the loss is a staircase: of {CELLS} parts of a line through the motion {jump[2]} jump, one by {size:.3g} "
+        f"the loss is a staircase: of {ASK.cells} parts of a line through the motion {jump[2]} jump, one by {size:.3g} "
         f"at {jump[0]:.3g}"
     )
 
@@ -361,11 +371,11 @@ def stairs_of_policy(policy: Callable[..., Array], g: RolloutGradient, space: Ta
         def along(s: float, u: Callable[[float], Array] = u) -> float:
             return float(weight @ u(s))
 
-        if jump := _stairs(along, SINGLE * float(np.abs(g.us[k]).sum())):
+        if jump := _stairs(along, ASK.single * float(np.abs(g.us[k]).sum())):
             change = u(jump[1]) - u(jump[0])
             i = int(np.argmax(np.abs(change)))
             return (
-                f"the policy is a staircase: at t = {t:g} s, of {CELLS} parts of a line through x {jump[2]} jump, "
+                f"the policy is a staircase: at t = {t:g} s, of {ASK.cells} parts of a line through x {jump[2]} jump, "
                 f"u[{i}] by {change[i]:.3g} at {jump[0]:.3g}"
             )
     return ""
@@ -381,18 +391,18 @@ def _stairs(f: Callable[[float], float], least: float) -> tuple[float, float, in
     """Where a function of one number jumps first, from and to, and in how many cells; None where it is no staircase."""
     with np.errstate(all="ignore"):
         for length in LENGTHS:
-            ends = np.linspace(-length, length, CELLS + 1)
+            ends = np.linspace(-length, length, ASK.cells + 1)
             try:
                 values = np.array([f(float(s)) for s in ends])
-                threshold = max(least, ROUNDED * float(np.max(np.abs(values))), PART * float(np.ptp(values)))
+                threshold = max(least, ASK.rounded * float(np.max(np.abs(values))), ASK.spread * float(np.ptp(values)))
                 if not np.max(np.abs(np.diff(values, 3))) > threshold:  # which is nothing where a function is smooth
                     continue
                 jumps = [
-                    jump for i in range(CELLS) if (jump := _jump(f, ends[i : i + 2], values[i : i + 2], threshold))
+                    jump for i in range(ASK.cells) if (jump := _jump(f, ends[i : i + 2], values[i : i + 2], threshold))
                 ]
             except OUTSIDE:
                 return None
-            if len(jumps) >= STAIRS:
+            if len(jumps) >= ASK.stairs:
                 return *jumps[0], len(jumps)
     return None
 
@@ -400,14 +410,14 @@ def _stairs(f: Callable[[float], float], least: float) -> tuple[float, float, in
 def _jump(f: Callable[[float], float], ends: Array, values: Array, least: float) -> Jump | None:
     """Where `f` jumps between two places (2,): the quarter that changes unlike the others is divided again."""
     sizes: list[float] = []
-    for k in range(QUARTERINGS):
+    for k in range(ASK.quarterings):
         places = np.linspace(float(ends[0]), float(ends[1]), 5)
         heights = np.array([values[0], *(f(float(s)) for s in places[1:-1]), values[1]])
         changes = np.diff(heights)
         apart = np.abs(changes - np.median(changes))
         i = int(np.argmax(apart))
         sizes.append(float(apart[i]))
-        if not apart[i] > least or (k == SETTLED and apart[i] < KEPT * sizes[0]):
+        if not apart[i] > least or (k == ASK.settled and apart[i] < ASK.remains * sizes[0]):
             return None
         ends, values = places[i : i + 2], heights[i : i + 2]
-    return (float(ends[0]), float(ends[1])) if sizes[-1] > sizes[SETTLED] / 2 else None
+    return (float(ends[0]), float(ends[1])) if sizes[-1] > sizes[ASK.settled] / 2 else None

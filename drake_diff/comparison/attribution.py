@@ -31,16 +31,29 @@ from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.tangent import TangentSpace
 
 BROKE_OFF = "broke off"
-TIMED = 15  # calls whose median is told, after one that may compile
-LONGEST = 1.0  # [s] less are timed where they take so long
+
+
+@dataclass(frozen=True)
+class ComparisonOptions:
+    """How engines are timed, differenced and attributed."""
+
+    timed: int = 15  # calls whose median is told, after one that may compile
+    longest: float = 1.0  # [s] less are timed where they take so long
+    # An engine's derivative that is made of differences is good to 1e-8 of the row's largest entry, and the certificate
+    # allows a hundred times what it is told was left unsolved.
+    differences_leave: float = 1e-10
+    single: float = 1e-2  # of the largest entry: as far as differences of single precision tell
+    window: float = 2.0  # steps by which Drake's limits look ahead, at the joint's speed
+    pushed: float = 1e-3  # of the largest generalized force: below it are what solvers leave, 1e-6, and rounding
+    closes: float = 0.01  # of the gap may be left by a change that explains it
+
+
+COMPARE = ComparisonOptions()
+
 # Steps of differences for engines without derivatives: where rounding and truncation are both small.
 DIFFERENCE_STEP: dict[Precision, float] = {"float64": 1e-5, "float32": 1e-2}
-# An engine's own derivative that is made of differences is good to 1e-8 of the row's largest entry, and the certificate
-# allows a hundred times what it is told was left unsolved.
-DIFFERENCES_LEAVE = 1e-10
 AGREES = "agree"
 NO_DERIVATIVE = (NotOfferedError, GradientError, SimulationError)  # the last: shapes that AutoDiffXd refuses
-SINGLE = 1e-2  # of the largest entry: as far as differences of single precision tell
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -97,7 +110,7 @@ def seconds(call: Callable[[], Any]) -> float | None:
     except NO_DERIVATIVE:
         return None
     taken: list[float] = []
-    while len(taken) < TIMED and sum(taken) < LONGEST:
+    while len(taken) < COMPARE.timed and sum(taken) < COMPARE.longest:
         start = perf_counter()
         call()
         taken.append(perf_counter() - start)
@@ -140,13 +153,15 @@ def jacobian_at(
     jacobian = space.jacobian(x, engine.step(x, u), derivatives.A, derivatives.B)
     if precision == "float32":
         gap = np.abs(jacobian - quotients()).max() / np.abs(jacobian).max()
-        return JacobianAt(state, frozen(jacobian), derivatives.method, AGREES if gap <= SINGLE else "undecided", None)
+        return JacobianAt(
+            state, frozen(jacobian), derivatives.method, AGREES if gap <= COMPARE.single else "undecided", None
+        )
     # What the engine's solver leaves unsolved of a step in contact, relative.
     unsolved = (engine.contract.solver_tolerance or 0.0) if engine.contact_depth(x) else 0.0
+    by_differences = COMPARE.differences_leave if "differences" in derivatives.method else 0.0
     certificate = certify_displacement(
         one_by_one(step), jacobian, rows=space.names, columns=(*space.names, *names), scale=np.ones(size),
-        minus=space.minus,
-        unsolved=unsolved, stopped=max(unsolved, DIFFERENCES_LEAVE if "differences" in derivatives.method else 0.0),
+        minus=space.minus, unsolved=unsolved, stopped=max(unsolved, by_differences),
         method=derivatives.method, subject=f"the Jacobian of {engine.name} at the {state} state",
     )  # fmt: skip
     return JacobianAt(state, frozen(jacobian), derivatives.method, certificate.verdict, certificate)
@@ -169,11 +184,6 @@ def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) 
 INTEGRATOR, CONTACT_LAW, LIMIT_LAW, UNEXPLAINED = "integrator", "contact law", "limit law", "unexplained"
 # How well a scheme must give a step to be the engine's, relative to the state: rounding, and no force.
 FITS: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-4}
-
-# Steps by which Drake's limits look ahead: its solver takes those within this many steps at the joint's speed.
-WINDOW = 2.0
-# Of the largest generalized force: below it are what solvers leave, 1e-6, and rounding.
-PUSHED = 1e-3
 
 
 class EulerScheme(NamedTuple):
@@ -335,7 +345,7 @@ def _push(coordinates: Coordinates, engine: Engine, x: Array, left: Array, after
         return set()
     _, damping = forces(engine.contract, np.zeros(len(engine.contract.inputs)))  # implicit in Drake's step
     force = np.abs((engine.mass_matrix(x[: coordinates.nq]) + engine.contract.time_step * np.diag(damping)) @ change)
-    return {int(j) for j in np.flatnonzero(force > PUSHED * np.max(force))}
+    return {int(j) for j in np.flatnonzero(force > COMPARE.pushed * np.max(force))}
 
 
 def _touching(engines: tuple[Engine, Engine], states: tuple[Array, ...]) -> bool:
@@ -357,7 +367,7 @@ def _joints_near_limits(
         joints = [joint for joint in engine.contract.joints if joint.kind != "quaternion_floating"]
         for joint, (i, j) in zip(joints, coordinates.single, strict=True):
             speed = max(abs(float(state[coordinates.nq + j])) for state in (x, *after))
-            reach = WINDOW * engine.contract.time_step * speed
+            reach = COMPARE.window * engine.contract.time_step * speed
             if not all(joint.lower <= state[i] - reach and state[i] + reach <= joint.upper for state in (x, *after)):
                 velocities.add(j)
     return velocities
@@ -367,7 +377,6 @@ def _size(difference: Array) -> float:
     return float(np.abs(difference).max(initial=0.0))
 
 
-CLOSES = 0.01  # of the gap may be left by a change that explains it
 PRECISIONS: dict[str, Precision] = {"float64": "float64", "float32": "float32"}
 
 
@@ -447,7 +456,7 @@ def attribute_recorded(
         for name, scheme in LAWS_OF_STEPS.items()
     }
     best = min(misfits, key=lambda name: misfits[name])
-    if not misfits[best] <= CLOSES * gap:
+    if not misfits[best] <= COMPARE.closes * gap:
         return Attribution(gap, {UNEXPLAINED: gap}, UNEXPLAINED, schemes)
     effects = {INTEGRATOR: gap, UNEXPLAINED: misfits[best]}
     return Attribution(gap, effects, INTEGRATOR, (SCHEMES[0], LAWS_OF_STEPS[best]), as_if=best)

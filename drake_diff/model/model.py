@@ -508,6 +508,7 @@ def load_model(
         >>> print(model)
         Model 'pendulum': nq=1, nv=1, nu=1, time step 0.01 s
     """
+    options = {option: value for option, value in locals().items() if option != "path"}
     time_step = seconds("time_step [s]", time_step)
     _check_choice("contact_model", contact_model, CONTACT_MODELS)
     _check_choice("contact_approximation", contact_approximation, CONTACT_APPROXIMATIONS)
@@ -530,26 +531,14 @@ def load_model(
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config, builder)
     _set_contact_law(plant, scene_graph, near_rigid, relaxation_time, stiffness, dissipation)
-    options: dict[str, Any] = {
+    options |= {
         "time_step": time_step,
-        "contact_model": contact_model,
-        "contact_approximation": contact_approximation,
-        "contact_geometry": contact_geometry,
-        "weld_base": weld_base,
         "ground": as_ground(ground),
         "gravity": None if gravity is None else tuple(finite_array("gravity [m/s^2]", gravity, (3,)).tolist()),
         "actuators": as_actuated(actuators),
-        "base": base,
         "fix_joints": as_names("fix_joints", fix_joints),
         "packages": as_packages(packages),
-        "contact": contact,
-        "mimic": mimic,
         "body_forces": body_forces,
-        "meshes": meshes,
-        "relaxation_time": relaxation_time,
-        "near_rigid": near_rigid,
-        "stiffness": stiffness,
-        "dissipation": dissipation,
     }
     fixed = options["fix_joints"] if mimic is None else ()  # else the followers are free of each other later
     read = read_into(plant, source, options["packages"], meshes, fixed)

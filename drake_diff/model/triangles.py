@@ -29,14 +29,24 @@ from drake_diff.exceptions import ModelError
 
 READ_BY_TRIMESH = (".stl", ".dae", ".obj", ".ply", ".off")
 OF_MUJOCO = ".msh"  # its own binary format, which is read here
-LARGEST_FILE = 2**29  # [bytes] of a mesh file that is read
-MOST_COLOURS = 12  # of one mesh; all others become one, their average
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """How large a mesh may be, and how it is made smaller."""
+
+    largest_file: int = 2**29  # [bytes] of a mesh file that is read
+    most_colours: int = 12  # of one mesh; all others become one, their average
+    most_points: int = 20_000  # that all have a say in a hull; of more, only those farthest out
+    few_directions: int = 40  # in which the farthest points span a first hull; what is inside it is inside the whole
+    small_part: int = 16  # cells along the diagonal of a mesh that it keeps at least, however small it is in the robot
+    joined: float = 2.0**-20  # of a mesh's size: vertices that are closer are one
+    searches: int = 8  # for the cell that keeps a robot's faces below their limit
+
+
+MESHES = MeshOptions()
+
 MOST_CORNERS = 1000  # of a convex hull
-MOST_POINTS = 20_000  # that all have a say in a hull; of more, only those farthest out
-FEW_DIRECTIONS = 40  # in which the farthest points span a first hull; what is inside it is inside the whole
-SMALL_PART = 16  # cells along the diagonal of a mesh that it keeps at least, however small it is in the robot
-JOINED = 2.0**-20  # of a mesh's size: vertices that are closer are one
-SEARCHES = 8  # for the cell that keeps a robot's faces below their limit
 PLAIN = (0.6, 0.6, 0.62)  # of what has no colour
 
 Integers = NDArray[np.int64]
@@ -102,8 +112,8 @@ def _state(path: Path) -> tuple[int, int]:
         state = path.stat()
     except OSError as error:
         raise ModelError(f"{path}: the mesh cannot be read: {error.strerror}") from error
-    if state.st_size > LARGEST_FILE:
-        raise ModelError(f"{path}: expected a mesh of at most {LARGEST_FILE} bytes, got {state.st_size}")
+    if state.st_size > MESHES.largest_file:
+        raise ModelError(f"{path}: expected a mesh of at most {MESHES.largest_file} bytes, got {state.st_size}")
     return state.st_mtime_ns, state.st_size
 
 
@@ -193,9 +203,9 @@ def _colours(visual: Any, count: int) -> Array | None:
 def _few_colours(colours: Array) -> Array:
     """The same colours where they are few; else the commonest, and the average of the others in place of these."""
     distinct, which, counts = np.unique(colours, axis=0, return_inverse=True, return_counts=True)
-    if len(distinct) <= MOST_COLOURS:
+    if len(distinct) <= MESHES.most_colours:
         return colours
-    rest = np.sort(np.argsort(-counts, kind="stable")[MOST_COLOURS - 1 :])
+    rest = np.sort(np.argsort(-counts, kind="stable")[MESHES.most_colours - 1 :])
     distinct[rest] = np.average(distinct[rest], axis=0, weights=counts[rest])
     return np.asarray(distinct[which.ravel()])
 
@@ -217,7 +227,7 @@ def with_fewer_faces(meshes: Sequence[Triangles], limit: int) -> tuple[Triangles
         return tuple(meshes)
     cell = float(np.sqrt(2 * sum(float(np.sum(_areas(mesh)[1])) for mesh in meshes) / limit))
     clustered = [_clusters(mesh, cell) for mesh in meshes]
-    for _ in range(SEARCHES):
+    for _ in range(MESHES.searches):
         count = sum(len(faces) for _, faces, _ in clustered)
         if 0.8 * limit <= count <= limit:
             break
@@ -237,7 +247,7 @@ def _areas(mesh: Triangles) -> tuple[Array, Array]:
 def _joined(vertices: Array, faces: Integers, colours: Array | None) -> Triangles:
     """The mesh with vertices as one that are closer than a millionth of its size, which files write once per face."""
     size = float(np.max(np.ptp(vertices, axis=0)))
-    _, first, which = _cells(vertices, size * JOINED if size > 0 else 1.0)
+    _, first, which = _cells(vertices, size * MESHES.joined if size > 0 else 1.0)
     return Triangles(vertices[first], which[faces], colours)
 
 
@@ -253,7 +263,7 @@ def _cells(vertices: Array, cell: float) -> tuple[int, Integers, Integers]:
 def _clusters(mesh: Triangles, cell: float) -> tuple[Integers, Integers, float]:
     """The cluster of each vertex, the faces that stay faces, and the cell that was used."""
     diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    cell = max(min(cell, diagonal / SMALL_PART), diagonal * JOINED)
+    cell = max(min(cell, diagonal / MESHES.small_part), diagonal * MESHES.joined)
     count, _, where = _cells(mesh.vertices, cell)
     a, b, c = np.sort(where[mesh.faces], axis=1).T
     apart = np.flatnonzero((a != b) & (b != c))
@@ -322,12 +332,12 @@ def _hull_of_file(path: Path, scale: tuple[float, float, float], changed: int, s
 def hull_of(points: Array, label: str) -> Hull:
     """The convex hull of `points` (n, 3), of at most MOST_CORNERS corners, by Drake.
 
-    Of more than MOST_POINTS points only those are taken that are farthest out in MOST_CORNERS directions. Raises
+    Of more than 20,000 points only those are taken that are farthest out in MOST_CORNERS directions. Raises
     ModelError where the points lie in one plane.
     """
-    if len(points) > MOST_POINTS:
-        points = _outside(points, _drakes_hull(_farthest(points, FEW_DIRECTIONS), label))
-    hull = _drakes_hull(points if len(points) <= MOST_POINTS else _farthest(points, MOST_CORNERS), label)
+    if len(points) > MESHES.most_points:
+        points = _outside(points, _drakes_hull(_farthest(points, MESHES.few_directions), label))
+    hull = _drakes_hull(points if len(points) <= MESHES.most_points else _farthest(points, MOST_CORNERS), label)
     if len(hull.corners) > MOST_CORNERS:
         hull = _drakes_hull(_farthest(hull.corners, MOST_CORNERS), label)
     return replace(hull, lost=max(0.0, float(np.max(_distance(points, hull)))))
@@ -336,7 +346,7 @@ def hull_of(points: Array, label: str) -> Hull:
 def _outside(points: Array, hull: Hull) -> Array:
     """Those of the points that are not inside the hull, its corners included."""
     size = float(np.max(np.ptp(hull.corners, axis=0)))
-    return points[_distance(points, hull) > -JOINED * size]
+    return points[_distance(points, hull) > -MESHES.joined * size]
 
 
 def _distance(points: Array, hull: Hull) -> Array:
@@ -375,7 +385,7 @@ def _drakes_hull(points: Array, label: str) -> Hull:
     normals = np.array([mesh.face_normal(e) for e in range(len(faces))])
     offsets = np.max(corners @ normals.T, axis=0)
     size = float(np.max(np.ptp(corners, axis=0)))
-    if float(np.min(offsets - np.min(corners @ normals.T, axis=0))) <= JOINED * size:
+    if float(np.min(offsets - np.min(corners @ normals.T, axis=0))) <= MESHES.joined * size:
         raise ModelError(f"{label}: expected a mesh that encloses a volume, got a flat one")
     triangles = [
         [face.vertex(0), face.vertex(i), face.vertex(i + 1)]
@@ -386,12 +396,21 @@ def _drakes_hull(points: Array, label: str) -> Hull:
 
 
 MOST_SPHERES = 8  # for one hull
-RADII = (0.95, 0.5, 0.25)  # of the largest sphere that fits in
-SAME = 0.5  # of their radius: spheres closer than that are as good as one
-GOOD_ENOUGH = 0.5  # of the largest radius: the largest spheres are taken that miss the hull by no more
-CLOSE_ENOUGH = 0.2  # of that radius: how far a hull may stick out of its spheres, towards a flat ground
-PROBES = 2000  # directions in which that is measured
-SURFACE_POINTS = 600  # about so many points of the surface are looked at for how much is open
+
+
+@dataclass(frozen=True)
+class SphereOptions:
+    """How a hull is filled with spheres."""
+
+    radii: tuple[float, ...] = (0.95, 0.5, 0.25)  # of the largest sphere that fits in
+    same: float = 0.5  # of their radius: spheres closer than that are as good as one
+    good_enough: float = 0.5  # of the largest radius: the largest spheres are taken that miss the hull by no more
+    close_enough: float = 0.2  # of that radius: how far a hull may stick out of its spheres, towards a flat ground
+    probes: int = 2000  # directions in which that is measured
+    surface_points: int = 600  # about so many points of the surface are looked at for how much is open
+
+
+SPHERES = SphereOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,9 +437,9 @@ def fit_spheres(hull: Hull, label: str) -> Spheres:
     shape = _Shape(corners, hull.normals, offsets, _surface_points(corners, hull.triangles), label)
     largest = shape.largest_radius()
     best = shape.alone(largest)
-    if best.ground_gap > CLOSE_ENOUGH * largest:
-        tried = [shape.filled(share * largest) for share in RADII]
-        enough = [spheres for spheres in tried if spheres.ground_gap <= GOOD_ENOUGH * largest]
+    if best.ground_gap > SPHERES.close_enough * largest:
+        tried = [shape.filled(share * largest) for share in SPHERES.radii]
+        enough = [spheres for spheres in tried if spheres.ground_gap <= SPHERES.good_enough * largest]
         best = enough[0] if enough else min(tried, key=lambda spheres: spheres.ground_gap)
     return Spheres(middle + size * best.centres, size * best.radius, size * best.ground_gap, size * best.open_gap)
 
@@ -472,7 +491,7 @@ class _Shape:
         while len(centres) < MOST_SPHERES:
             placed = np.array(centres)
             wanted = [self.closest_centre(point, radius) for point in self._missing(placed, radius)]
-            new = [c for c in wanted if np.min(np.linalg.norm(placed - c, axis=1)) >= SAME * radius]
+            new = [c for c in wanted if np.min(np.linalg.norm(placed - c, axis=1)) >= SPHERES.same * radius]
             if not new:
                 break  # the spheres will do, or none of this radius comes closer
             centres.append(new[0])
@@ -486,10 +505,10 @@ class _Shape:
 
     def _missing(self, centres: Array, radius: float) -> list[Array]:
         """The points (3,) of the hull that need a sphere most, the worst first."""
-        probes = directions(PROBES)
+        probes = directions(SPHERES.probes)
         ground, bare = self._ground_gaps(centres, radius), self._open_gaps(centres, radius)
         missing = []
-        if np.max(ground) > CLOSE_ENOUGH * radius:
+        if np.max(ground) > SPHERES.close_enough * radius:
             missing.append(self.corners[np.argmax(self.corners @ probes[np.argmax(ground)])])
         if np.max(bare) > radius:
             missing.append(self.surface[np.argmax(bare)])
@@ -497,7 +516,7 @@ class _Shape:
 
     def _ground_gaps(self, centres: Array, radius: float) -> Array:
         """How much farther than the spheres the hull reaches in each direction."""
-        probes = directions(PROBES)
+        probes = directions(SPHERES.probes)
         reach = np.max(self.corners @ probes.T, axis=0)
         return np.asarray(reach - np.max(centres @ probes.T, axis=0) - radius)
 
@@ -511,7 +530,7 @@ def _surface_points(corners: Array, triangles: Integers) -> Array:
     """Points on the hull's surface, about as many on each part as it is large, its corners among them."""
     a, b, c = (corners[triangles[:, i]] for i in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    cuts = np.ceil(np.sqrt(SURFACE_POINTS * areas / np.sum(areas))).astype(int)
+    cuts = np.ceil(np.sqrt(SPHERES.surface_points * areas / np.sum(areas))).astype(int)
     points = [corners]
     for p, q, r, n in zip(a, b, c, np.maximum(cuts, 1), strict=True):
         points += [p + (i * (q - p) + j * (r - p)) / n for i in range(n + 1) for j in range(n + 1 - i)]
