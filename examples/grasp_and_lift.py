@@ -32,9 +32,8 @@ def guess() -> tuple[np.ndarray, np.ndarray]:
 
 solve_options: dict[str, Any] = {
     "method": "ilqr",
-    "continuation": "relaxed",
-    "tolerance": 3e-2,
     "initial_guess": guess(),
+    "options": dd.optimize.Options(continuation="relaxed", tolerance=3e-2),
 }
 
 

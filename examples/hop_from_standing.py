@@ -18,7 +18,11 @@ MODEL = Path(__file__).parent.parent / "models" / "hopper.sdf"
 TIME_STEP, NUM_STEPS, WAY, CLEARANCE = 0.01, 100, 0.5, 0.05
 HEIGHT, LEG = 0.5, 0.45 + 12 / 2e4  # [m] the foot is pressed 0.6 mm into the ground, which carries 12 N
 
-solve_options: dict[str, Any] = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 100}
+solve_options: dict[str, Any] = {
+    "method": "ilqr",
+    "max_iterations": 100,
+    "options": dd.optimize.Options(continuation="relaxed"),
+}
 
 
 def problem() -> dd.Problem:

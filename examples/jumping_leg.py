@@ -22,7 +22,11 @@ BOUNDS = {  # [m], along z of the link before; [N m/rad]
     "hip.offset": ([0, 0, 0.05], [0, 0, 0.8]),
     "knee.spring_stiffness": (0.1, 30.0),
 }
-solve_options: dict[str, Any] = {"method": "shooting", "tolerance": 1e-6, "max_iterations": 600}
+solve_options: dict[str, Any] = {
+    "method": "shooting",
+    "max_iterations": 600,
+    "options": dd.optimize.Options(tolerance=1e-6),
+}
 
 
 def problem() -> dd.Problem:

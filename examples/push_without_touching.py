@@ -19,7 +19,11 @@ MODEL = Path(__file__).parent.parent / "models" / "two_spheres.sdf"
 TIME_STEP, NUM_STEPS, GAP, DIAMETER, GOAL = 0.02, 50, 0.3, 0.2, 1.0
 PUSHER, BALL = 0, 1  # in Drake's state: both positions, both velocities
 
-solve_options: dict[str, Any] = {"method": "ilqr", "continuation": "auto", "max_iterations": 100}
+solve_options: dict[str, Any] = {
+    "method": "ilqr",
+    "max_iterations": 100,
+    "options": dd.optimize.Options(continuation="auto"),
+}
 
 
 def problem() -> dd.Problem:

@@ -19,7 +19,7 @@ BENT = {"hip_pitch": 0.8, "knee": -1.6}  # [rad]
 TIME_STEP, WAY = 0.01, 0.06  # [s], [m] forward
 
 schedule = dd.optimize.ContactSchedule([(40, FEET), (16, ()), (50, FEET)])
-solve_options: dict[str, Any] = {"method": "ilqr", "tolerance": 1e-4}
+solve_options: dict[str, Any] = {"method": "ilqr", "options": dd.optimize.Options(tolerance=1e-4)}
 
 
 def problem() -> dd.Problem:

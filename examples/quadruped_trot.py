@@ -20,7 +20,7 @@ TIME_STEP, WAY = 0.02, 0.12  # [s], [m] forward
 ONE, OTHER = ("FL_foot", "RR_foot"), ("FR_foot", "RL_foot")
 steps = [(5, FEET), (8, ONE), (2, FEET), (8, OTHER), (2, FEET), (8, ONE), (20, FEET)]
 schedule = dd.optimize.ContactSchedule(steps)
-solve_options: dict[str, Any] = {"method": "ilqr", "tolerance": 1e-4}
+solve_options: dict[str, Any] = {"method": "ilqr", "options": dd.optimize.Options(tolerance=1e-4)}
 
 
 def problem() -> dd.Problem:

@@ -19,7 +19,10 @@ TIME_STEP, SWING, FLY, STOP = 0.005, 70, 90, 30  # [s], and steps
 START, TARGET = np.array([0.3, -0.15]), np.array([1.3, 0.1])  # x and z [m] of the ball
 LINK, SEAT, GRAVITY = 0.35, 0.0875, 9.81  # [m], [m] from the wrist to a ball in the cup, [m/s^2]
 
-solve_options: dict[str, Any] = {"method": "ilqr", "continuation": "relaxed", "tolerance": 1e-2}
+solve_options: dict[str, Any] = {
+    "method": "ilqr",
+    "options": dd.optimize.Options(continuation="relaxed", tolerance=1e-2),
+}
 
 
 def guess() -> np.ndarray:

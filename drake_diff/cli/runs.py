@@ -5,6 +5,7 @@ import inspect
 import shlex
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -18,7 +19,7 @@ from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, W
 
 LogFile = Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that drake_diff wrote.")]
 
-OURS = ("problem", "progress", "on_start", "on_plan", "view")  # arguments of `solve` that a script does not give
+OURS = ("problem", "progress", "view")  # arguments of `solve` that a script does not give
 MOST_MEMORY = 4 * 2**30  # bytes
 
 mcap = typer.Typer(no_args_is_help=True, help="Look at, check and repair trace.mcap.")
@@ -97,6 +98,7 @@ def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
     """The problem that a script defines, and its options of `solve`."""
     module = _loaded(script)
     problem, options = module.problem(), getattr(module, "solve_options", {})
+    from drake_diff.optimize.options import Options
     from drake_diff.optimize.problem.phases import PhasedProblem
     from drake_diff.optimize.problem.problem import Problem
     from drake_diff.optimize.solve import solve
@@ -110,6 +112,9 @@ def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
     known = [name for name in inspect.signature(solve).parameters if name not in OURS]
     for name in options.keys() - set(known):
         raise UnknownNameError("solve_options", got=name, known=known)
+    if not isinstance(options.get("options", Options()), Options):
+        got = type(options["options"]).__name__
+        raise InputError("solve_options, options", got=got, expected="a drake_diff.optimize.Options")
     parts = problem.phases if isinstance(problem, PhasedProblem) else (problem,)
     show(plain(script.name, "bold"), "; ".join(f"{phase.system}, {phase.num_steps} steps" for phase in parts))
     return problem, options
@@ -127,6 +132,7 @@ def _wait_at(location: str) -> None:
 
 def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str, Any], checked: bool) -> Any:
     """Solve, measure and write `folder`, which is to be `directory`; what is interrupted takes no other run's place."""
+    from drake_diff.optimize.options import Options
     from drake_diff.optimize.solve import solve
     from drake_diff.runs.cross_check import cross_check
     from drake_diff.runs.directory import is_taken
@@ -144,7 +150,8 @@ def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str,
 
     try:
         with progress_line("solving") as report:
-            solution: Any = solve(problem, progress=report, on_start=on_start, on_plan=on_plan, **options)
+            hooked = replace(options.pop("options", Options()), on_start=on_start, on_plan=on_plan)
+            solution: Any = solve(problem, progress=report, options=hooked, **options)
         if checked:
             with progress_line("replaying it in other plants"):
                 solution = cross_check(solution)

@@ -1,14 +1,15 @@
+from .options import Options as Options
 from .phased import PhasedSolution as PhasedSolution
 from .problem.cost import TrackingCost as TrackingCost
 from .problem.coupling import Coupling as Coupling
 from .problem.coupling import InputRate as InputRate
 from .problem.coupling import Jerk as Jerk
 from .problem.coupling import Periodic as Periodic
-from .problem.dwell import Dwell as Dwell
 from .problem.dynamics import DiscreteMap as DiscreteMap
 from .problem.dynamics import plant_dynamics as plant_dynamics
 from .problem.fixed_contacts import FixedContacts as FixedContacts
 from .problem.fixed_contacts import Impact as Impact
+from .problem.goals import Dwell as Dwell
 from .problem.phases import PhasedProblem as PhasedProblem
 from .problem.schedule import ContactSchedule as ContactSchedule
 from .problem.terminal import TerminalSet as TerminalSet

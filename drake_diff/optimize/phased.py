@@ -6,28 +6,29 @@ closes, by Drake's mass matrix, and the cost to go is led back through its salta
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
-from drake_diff._base.clock import StoppedError, noted_interrupts, now, until_set
+from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.clock import now
 from drake_diff._base.values import PicklesItsFields, ShowsItsRepr
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
-from drake_diff.optimize.certified import certify_equations
 from drake_diff.optimize.checks import Check, Checks, check
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
-from drake_diff.optimize.measure import INTEGRATION_TOLERANCE, derivative_check
+from drake_diff.optimize.measure import INTEGRATION_TOLERANCE, certify_equations, derivative_check
 from drake_diff.optimize.messages import under
+from drake_diff.optimize.options import Options
 from drake_diff.optimize.problem.fixed_contacts import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report, heard
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report
 from drake_diff.optimize.replay import FEEDBACK, OPEN_LOOP
+from drake_diff.optimize.run import PLANS, Run, SoFar, arrays_of
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
@@ -37,16 +38,15 @@ from drake_diff.optimize.transcription.collocation import (
     Transcribed,
     Transcription,
     finer_mesh,
+    kept,
+    solve_program,
 )
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, default_scheme
-from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, status_of, unmeasured
+from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, status_of
 
-OTHER_GUESSES = 8  # where no motion is found from the first
-FINER_ROUNDS = 6  # of meshes whose plan does not hold
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 LATE = 0.1  # of a phase's time: so long after it an impact is waited for
 HALVES = 50  # of a step in which a gap closes
-PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,10 +99,27 @@ class PhasedSolution(PicklesItsFields, ShowsItsRepr):
             lines.append(f"{name}: {lasts}, cost {phase.cost:.6g}, defect {phase.defect:.2g}, {phase.status.value}")
         return "\n  ".join(lines)
 
+    def told(self, **fields: Any) -> "PhasedSolution":
+        """The same motion with other `fields`; a status is that of the phases too of which nothing was said yet."""
+        changed = replace(self, **fields)
+        news = {name: fields[name] for name in ("status", "message") if name in fields}
+        phases = (p if p.message or "status" not in news else p.told(**news) for p in changed.phases)
+        return replace(changed, phases=tuple(phases))
+
     @property
     def success(self) -> bool:
         """Whether the solver converged and everything measured again holds."""
         return self.status is Status.CONVERGED
+
+    @property
+    def defect(self) -> float:
+        """The largest distance of a phase from its dynamics, or of a link from its reset."""
+        return max(self.link_error, *(phase.defect for phase in self.phases))
+
+    @property
+    def goal_error(self) -> float:
+        """The largest distance of a phase's last state from its goal."""
+        return max(phase.goal_error for phase in self.phases)
 
     @property
     def cost(self) -> float:
@@ -284,75 +301,15 @@ def _across(switch: Switch, before: Collocated, after: Collocated) -> Array:
     return impact.saltation(x, rates, after.task.moved(first, np.array([0]))[0])
 
 
-def solve_phased(
-    problem: PhasedProblem,
-    arguments: dict[str, Any],
-    given: Any,
-    report: Report,
-    on_start: Callable[[], None] | None,
-) -> PhasedSolution:
-    """See `solve`, whose other `arguments` are given by name."""
-    limits, scheme = _checked(problem, arguments)
-    guesses = _first_guesses(problem, given, arguments["seed"])
-    run = _PhasedRun(problem, scheme, limits, arguments, report, given is None)
-    with noted_interrupts() as interrupted:
-        if on_start is not None:
-            on_start()
-    if interrupted.is_set():
-        return replace(run.not_begun(guesses), search=Search(arguments, given))
-    solutions, chain = [], []
-    for number, begun in enumerate(_guesses(problem, guesses, given, arguments["seed"])):
-        solutions.append(run.attempt(begun, other=number > 0))
-        reason = "a straight line" if given is None else "given"
-        chain.append({"guess": reason if number == 0 else f"random {number}", "ended": solutions[-1].status.value})
-        report.say(f"from the guess {chain[-1]['guess']}: {solutions[-1].status.value}")
-        if not _may_mend(solutions[-1], arguments["refine"]):
-            break
-    best = min(solutions, key=_preference)
-    message = best.message
-    if len(solutions) > 1 and best.status not in PLANS:
-        message += f"; from none of {len(solutions)} first guesses was a plan found"
-    return replace(best, message=message, options={**best.options, "chain": chain}, search=Search(arguments, given))
-
-
-def _may_mend(solution: PhasedSolution, refine: bool | None) -> bool:
+def may_mend(solution: PhasedSolution, refine: bool | None) -> bool:
     """Whether another first guess may do better: nothing was found, or a plan that no mesh made hold."""
     if solution.status is not Status.CONVERGED_NOT_VERIFIED or refine is False:
         return solution.status in NOT_FOUND
-    agree = all(c.verdict == "agree" for phase in solution.phases for c in phase.certificates)
-    return agree and all(c.verdict == "agree" for c in solution.link_certificates)
+    certificates = [*solution.link_certificates, *(c for phase in solution.phases for c in phase.certificates)]
+    return all(c.verdict == "agree" for c in certificates)
 
 
-def _preference(solution: PhasedSolution) -> tuple[int, float]:
-    order = (*PLANS, Status.INTERRUPTED, Status.TIME_LIMIT)
-    rank = order.index(solution.status) if solution.status in order else len(order)
-    return rank, solution.link_error + sum(phase.defect + phase.goal_error for phase in solution.phases)
-
-
-def _checked(problem: PhasedProblem, asked: dict[str, Any]) -> tuple[Limits, str]:
-    """The limits and the scheme; refuses what phases cannot be asked."""
-    if asked["method"] not in ("auto", "collocation"):
-        expected = '"auto" or "collocation" for a PhasedProblem'
-        raise InputError("method", got=repr(asked["method"]), expected=expected)
-    if asked["solver"] not in (None, "ipopt"):
-        raise InputError("solver", got=repr(asked["solver"]), expected='"ipopt" for a PhasedProblem')
-    for name, none in (("continuation", None),):
-        if asked[name] != none:
-            raise InputError(name, got=repr(asked[name]), expected="none for a PhasedProblem")
-    scheme = default_scheme(problem.phases[0]) if asked["scheme"] is None else asked["scheme"]
-    if scheme not in SCHEMES:
-        raise UnknownNameError("scheme", got=scheme, known=[name for name in SCHEMES if name != MAP])
-    if scheme == "drake" or (scheme == MAP) != problem.is_map:
-        expected = repr(MAP) if problem.is_map else '"hermite_simpson" or "trapezoid" for a PhasedProblem in time'
-        raise InputError("scheme", got=repr(scheme), expected=expected)
-    if problem.is_map and asked["refine"]:
-        raise InputError("refine", got=True, expected="None or False: a DiscreteMap has no intervals to split")
-    most = positive_int("max_iterations", asked["max_iterations"])
-    seconds = np.inf if asked["time_limit"] is None else positive_float("time_limit [s]", asked["time_limit"])
-    return Limits(most, seconds, positive_float("tolerance", asked["tolerance"])), scheme
-
-
-def _first_guesses(problem: PhasedProblem, given: Any, seed: int) -> list[Guess]:
+def first_guesses(problem: PhasedProblem, given: Any, seed: int) -> list[Guess]:
     """One for each phase: of `given`, a PhasedSolution or one of each, or straight lines."""
     parts: Sequence[Any] = [None] * len(problem.phases)
     if isinstance(given, PhasedSolution):
@@ -364,6 +321,12 @@ def _first_guesses(problem: PhasedProblem, given: Any, seed: int) -> list[Guess]
         raise InputError("initial_guess", got=f"{len(parts)} guesses", expected=expected)
     pairs = zip(_aimed(problem), parts, strict=True)
     return [first_guess(phase, "collocation", sampled(phase, "collocation", guess), seed) for phase, guess in pairs]
+
+
+def other_guesses(problem: PhasedProblem, seed: int, number: int) -> list[Any]:
+    """Other first guesses of all phases, random ones by `seed`."""
+    every = enumerate(_aimed(problem))
+    return [another_guess(phase, seed * len(problem.phases) + i, number) for i, phase in every]
 
 
 def _aimed(problem: PhasedProblem) -> list[Problem]:
@@ -382,221 +345,221 @@ def _aimed(problem: PhasedProblem) -> list[Problem]:
     return phases
 
 
-def _guesses(problem: PhasedProblem, first: list[Guess], given: Any, seed: int) -> Iterator[list[Guess]]:
-    """The first guesses, and where they are not given others, by `seed`."""
-    yield first
-    for number in range(1, OTHER_GUESSES + 1) if given is None else ():
-        every = enumerate(_aimed(problem))
-        others = [another_guess(phase, seed * len(problem.phases) + i, number) for i, phase in every]
-        pairs = zip(problem.phases, others, strict=True)
-        yield [first_guess(phase, "collocation", other, seed) for phase, other in pairs]
+def check_phases(problem: PhasedProblem, method: str, options: Options) -> str:
+    """The scheme; refuses what phases cannot be asked."""
+    if method not in ("auto", "collocation"):
+        raise InputError("method", got=repr(method), expected='"auto" or "collocation" for a PhasedProblem')
+    if options.solver not in (None, "ipopt"):
+        raise InputError("solver", got=repr(options.solver), expected='"ipopt" for a PhasedProblem')
+    options.check_method("collocation")
+    scheme = options.scheme or default_scheme(problem.phases[0])
+    if scheme not in SCHEMES:
+        raise UnknownNameError("scheme", got=scheme, known=[name for name in SCHEMES if name != MAP])
+    if scheme == "drake" or (scheme == MAP) != problem.is_map:
+        expected = repr(MAP) if problem.is_map else '"hermite_simpson" or "trapezoid" for a PhasedProblem in time'
+        raise InputError("scheme", got=repr(scheme), expected=expected)
+    if problem.is_map and options.refine:
+        raise InputError("refine", got=True, expected="None or False: a DiscreteMap has no intervals to split")
+    return scheme
 
 
 @dataclass(frozen=True, eq=False)
-class _PhasedRun:
-    """One solve: certify at the guess, search, refine for as long as the plan does not hold, measure, judge."""
+class PhasedMotion:
+    """The motions of all phases that one solve found."""
 
-    problem: PhasedProblem
-    scheme: str
-    limits: Limits
-    asked: dict[str, Any]
-    report: Report
-    by_default: bool
-    start: float = field(default_factory=now)
-    begun: float = field(default_factory=time.monotonic)
+    phases: tuple[Transcribed, ...]
+    result: NlpResult
+    refinements: tuple[tuple[int, ...], ...] = ()
+    cleared = ()
 
-    @cached_property
-    def transcriptions(self) -> list[Transcription]:
-        return [Transcription(phase, self.scheme) for phase in self.problem.phases]
+    @property
+    def count(self) -> list[int]:
+        """How many intervals each phase has."""
+        return [motion.count for motion in self.phases]
 
-    @cached_property
-    def links(self) -> Any:
+    @property
+    def largest_error(self) -> float:
+        """Of an interval of all phases and of its part of the cost."""
+        return max(motion.largest_error for motion in self.phases)
+
+    @property
+    def row(self) -> tuple[int, ...]:
+        """What `refinements` say of it."""
+        return tuple(self.count)
+
+    def told(self, **fields: Any) -> "PhasedMotion":
+        """With another `result`."""
+        return replace(self, **fields)
+
+
+class PhasedTranscription:
+    """The phases of a problem in a scheme, solved as one program; see `Transcription`."""
+
+    def __init__(self, problem: PhasedProblem, scheme: str):
         from drake_diff.optimize.transcription.phased import link_functions  # loads CasADi
 
-        return link_functions(self.problem)
+        self.problem, self.links = problem, link_functions(problem)
+        self.phases = [Transcription(phase, scheme) for phase in problem.phases]
 
-    def attempt(self, guesses: list[Guess], *, other: bool) -> PhasedSolution:
-        """From one guess of each phase."""
-        most = min(self.limits.max_iterations, 200) if other else self.limits.max_iterations
-        with noted_interrupts() as interrupted:  # one that comes before the search ends it at its start
-            try:
-                with until_set(interrupted):
-                    meshes = [t.mesh for t in self.transcriptions]
-            except StoppedError:
-                return self.not_begun(guesses)
-            horizons = [t.problem.start_horizon if g.horizon is None else g.horizon for t, g in self._with(guesses)]
-            begun = []
-            for t, guess in self._with(guesses):
-                us_end = guess.us[-1:] if guess.u_final is None else guess.u_final[None]
-                begun.append(t.nodes_at(t.mesh, guess.motion or (guess.xs, np.vstack([guess.us, us_end]))))
-            result, motions, derivatives = self._solve_on(meshes, begun, horizons, most)
-            result = heard(result, interrupted)
-        solution = self._judged(result, motions, derivatives)
-        rounds = [[len(motion.mesh) - 1 for motion in motions]]
-        while len(rounds) <= FINER_ROUNDS and self.asked["refine"] is not False:
-            finer = self._finer(solution, motions)
-            if finer is None:
+    def solve(
+        self, guess: Sequence[Guess], *, limits: Limits, report: Report | None, refinement: Options | None
+    ) -> PhasedMotion:
+        """From a guess of each phase; with a `refinement` on meshes that are split until their errors are small."""
+        nodes, horizons, start = [], [], now()
+        for t, g in zip(self.phases, guess, strict=True):
+            us_end = g.us[-1:] if g.u_final is None else g.u_final[None]
+            nodes.append(t.nodes_at(t.mesh, g.motion or (g.xs, np.vstack([g.us, us_end]))))
+            horizons.append(t.problem.start_horizon if g.horizon is None else g.horizon)
+        motion = self._solve_on([t.mesh for t in self.phases], nodes, horizons, limits, report)
+        rounds = [motion.row]
+        while refinement is not None and len(rounds) <= refinement.mesh_rounds and motion.result.outcome in FOUND:
+            coarse = [phase.largest_error > refinement.error_tolerance for phase in motion.phases]
+            left = replace(limits, time_limit=max(0.0, limits.time_limit - (now() - start)))
+            finer = self.finer(motion, coarse, refinement.max_num_steps, left, report) if any(coarse) else None
+            if finer is None or finer.result.outcome not in FOUND:
+                motion = motion if finer is None else kept(motion, finer)
                 break
-            rounds.append([len(mesh) - 1 for mesh in finer])
-            self.report.say(f"what is found does not hold: refined to {rounds[-1]} intervals")
-            nodes = [t.nodes_at(mesh, m) for t, mesh, m in zip(self.transcriptions, finer, motions, strict=True)]
-            again = self._solve_on(finer, nodes, [motion.horizon for motion in motions], most)
-            if again[0].outcome not in FOUND:
-                counts = (
-                    f"on {rounds[-1]} intervals no motion was found ({again[0].message}): that on {rounds[-2]} is kept"
-                )
-                solution = replace(solution, message=f"{solution.message}; {counts}")
-                del rounds[-1]
-                break
-            result, motions, derivatives = again
-            solution = self._judged(result, motions, derivatives)
-        return replace(solution, options={**solution.options, "refinements": rounds}) if len(rounds) > 1 else solution
+            motion = finer
+            rounds.append(motion.row)
+        return replace(motion, refinements=tuple(rounds))
 
-    def not_begun(self, guesses: list[Guess]) -> PhasedSolution:
-        """The guesses, where a signal comes before the search."""
-        phases = []
-        for problem, guess in zip(self.problem.phases, guesses, strict=True):
-            last = guess.us[-1] if guess.u_final is None else np.ravel(guess.u_final)
-            at_end: dict[str, Any] = {} if problem.is_map else {"u_final": frozen(last)}
-            by = problem, "collocation", "ipopt", Status.FAILED, ""
-            draft = Solution(*by, frozen(guess.xs), frozen(guess.us), scheme=self.scheme, **at_end)
-            phases.append(ended(draft, Status.INTERRUPTED, "the search had not begun"))
-        solution = PhasedSolution(self.problem, Status.INTERRUPTED, phases[0].message, tuple(phases))
-        self.report.found(solution)
-        return solution
-
-    def _with(self, guesses: list[Guess]) -> Iterator[tuple[Transcription, Guess]]:
-        return zip(self.transcriptions, guesses, strict=True)
-
-    def _solve_on(
-        self, meshes: list[Array], nodes: list[Array], horizons: list[float], most: int
-    ) -> tuple[NlpResult, list[Transcribed], str]:
-        from drake_diff.optimize.transcription.phased import PhasedProgram
-        from drake_diff.optimize.transcription.program import NOT_FINITE, TranscribedProgram, solve_ipopt
-
-        parts = zip(self.transcriptions, meshes, strict=True)
-        programs = [TranscribedProgram(t.task, mesh, t.functions) for t, mesh in parts]
-        program = PhasedProgram(self.problem, programs, self.links)
-        inside = [float(np.clip(T, *t.task.horizon)) for T, t in zip(horizons, self.transcriptions, strict=True)]
-        guess = np.concatenate([p.pack(z, T) for p, z, T in zip(programs, nodes, inside, strict=True)])
-        left = max(0.0, self.limits.time_limit - (now() - self.start))
-        limits, why = replace(self.limits, time_limit=left, max_iterations=most), program.functions.why_not
-        derivatives = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-        result = solve_ipopt(program, guess, limits, self.report, exact=not why, motions=program.iterates)
-        if not why and result.message == NOT_FINITE:
-            again = solve_ipopt(program, guess, limits, self.report, exact=False, motions=program.iterates)
-            if again.message != NOT_FINITE:  # then it was the Hessian
-                derivatives, result = (
-                    "symbolic, limited-memory Hessian: the exact one is not finite at an iterate",
-                    again,
-                )
-        motions = []
-        for p, mesh, z in zip(programs, meshes, program.split(result.z), strict=True):
-            node_values, horizon = p.unpack(z)
-            motions.append(Transcribed(p.task, frozen(mesh), frozen(node_values), horizon, result, derivatives))
-        return result, motions, derivatives
-
-    def _finer(self, solution: PhasedSolution, motions: list[Transcribed]) -> list[Array] | None:
-        """The meshes to try next; None where the plan holds, or where finer ones cannot mend it."""
-        until, most = self.asked["error_tolerance"], self.asked["max_num_steps"]
-        if self.problem.is_map or solution.status not in PLANS:
-            return None
-        coarse = [motion.largest_error > until for motion in motions]
-        if not self.asked["refine"]:
-            of_phases = [may_be_too_coarse(phase) for phase in solution.phases]
-            drifts = solution.status is not Status.CONVERGED and not any(of_phases) and not solution.chain.passes
-            exceeded = [bool(violation_between_nodes(motion).intervals) for motion in motions]
-            every = zip(of_phases, coarse, exceeded, strict=True)
-            coarse = [(wanted or drifts) and (far or beyond) for wanted, far, beyond in every]
-        if not any(coarse):
-            return None
+    def finer(
+        self, motion: PhasedMotion, coarse: Sequence[bool], most: int, limits: Limits, report: Report | None
+    ) -> PhasedMotion | None:
+        """The problem on finer meshes of the `coarse` phases; None where one has more than `most` intervals."""
         meshes = []
-        for motion, wanted in zip(motions, coarse, strict=True):
-            mesh = finer_mesh(motion, violation_between_nodes(motion).intervals, most) if wanted else motion.mesh
+        for phase, wanted in zip(motion.phases, coarse, strict=True):
+            mesh = finer_mesh(phase, violation_between_nodes(phase).intervals, most) if wanted else phase.mesh
             if mesh is None:
                 return None
             meshes.append(mesh)
-        return meshes
+        if report is not None:
+            report.say(f"what is found does not hold: refined to {[len(mesh) - 1 for mesh in meshes]} intervals")
+        nodes = [t.nodes_at(mesh, m) for t, mesh, m in zip(self.phases, meshes, motion.phases, strict=True)]
+        return self._solve_on(meshes, nodes, [phase.horizon for phase in motion.phases], limits, report)
 
-    def _judged(self, result: NlpResult, motions: list[Transcribed], derivatives: str) -> PhasedSolution:
-        error: Exception | None = None
-        options = {"derivatives": derivatives, "initial_guess": "default" if self.by_default else "given"}
-        drafts = [self._draft(t, m, options) for t, m in zip(self.transcriptions, motions, strict=True)]
-        self._offer(drafts, result, options)
-        for i, (t, plan) in enumerate(zip(self.transcriptions, list(drafts), strict=True)):
-            if np.all(np.isfinite(plan.xs)):
-                try:
-                    certificates = certify_equations(t.problem, t.jacobian, plan.xs, plan.us, t.task)
-                    drafts[i] = replace(plan, certificates=certificates)
-                except (GradientError, SimulationError) as refusal:
-                    error = refusal
-        phases, links = tuple(judged(draft, result) for draft in drafts), tuple[Certificate, ...]()
+    def _solve_on(
+        self,
+        meshes: Sequence[Array],
+        nodes: Sequence[Array],
+        horizons: Sequence[float],
+        limits: Limits,
+        report: Report | None,
+    ) -> PhasedMotion:
+        from drake_diff.optimize.transcription.phased import PhasedProgram
+        from drake_diff.optimize.transcription.program import TranscribedProgram
+
+        parts = zip(self.phases, meshes, strict=True)
+        programs = [TranscribedProgram(t.task, mesh, t.functions) for t, mesh in parts]
+        program = PhasedProgram(self.problem, programs, self.links)
+        inside = [float(np.clip(T, *t.task.horizon)) for T, t in zip(horizons, self.phases, strict=True)]
+        guess = np.concatenate([p.pack(z, T) for p, z, T in zip(programs, nodes, inside, strict=True)])
+        result, derivatives = solve_program(program, guess, limits, report)
+        motions = []
+        for p, mesh, z in zip(programs, meshes, program.split(result.z), strict=True):
+            values, horizon = p.unpack(z)
+            motions.append(Transcribed(p.task, frozen(mesh), frozen(values), horizon, result, derivatives))
+        return PhasedMotion(tuple(motions), result)
+
+
+@dataclass(frozen=True, eq=False)
+class PhasedRun(Run):
+    """One solve of a problem in phases by collocation; see `Run`."""
+
+    problem: Any
+
+    def _of_guess(self, guess: Any) -> Any:
+        drafts = []
+        for problem, g in zip(self.problem.phases, guess, strict=True):
+            last = g.us[-1] if g.u_final is None else np.ravel(g.u_final)
+            drafts.append(self._draft_of(problem, g.xs, g.us, u_final=None if problem.is_map else frozen(last)))
+        return self._joined(drafts)
+
+    def _transcribe(self) -> Any:
+        return PhasedTranscription(self.problem, self.scheme)
+
+    def _certify_guess(self, transcription: Any, guess: Any) -> tuple[Certificate, ...]:
+        return ()  # of the result alone
+
+    def _begin(self, transcription: Any, guess: Any) -> dict[str, Any]:
+        return {"guess": guess}
+
+    def _draft_of(self, problem: Problem, xs: Array, us: Array, **fields: Any) -> Solution:
+        by = problem, self.method, self.solver, Status.FAILED, ""
+        return Solution(*by, frozen(xs), frozen(us), scheme=self.scheme, options=dict(self.options), **fields)
+
+    def _joined(self, phases: Sequence[Solution], **fields: Any) -> Any:
+        fields |= {"options": self.options, "wall_time": time.monotonic() - self.begun}
+        return PhasedSolution(self.problem, Status.FAILED, "", tuple(phases), **fields)
+
+    def _judge_collocated(self, transcription: Any, motion: Any, certificates: tuple[Certificate, ...]) -> Any:
+        self.options["derivatives"] = motion.phases[0].derivatives
+        drafts, error = [], None
+        for phase in motion.phases:
+            drafts.append(self._draft_of(phase.task.problem, phase.xs, phase.us[:-1], **arrays_of(phase)))
+        self._offer(self._joined(drafts), motion.result)
+        self._reach(2, self._joined(drafts), motion.result)
+        links = tuple[Certificate, ...]()
         try:
-            links = self._certified_links(motions)
+            for i, (t, plan) in enumerate(zip(transcription.phases, list(drafts), strict=True)):
+                if np.all(np.isfinite(plan.xs)):
+                    equations = certify_equations(t.problem, t.jacobian, plan.xs, plan.us, t.task)
+                    drafts[i] = replace(plan, certificates=equations)
+            links = _certified_links(transcription, motion.phases)
         except (GradientError, SimulationError) as refusal:
             error = refusal
-        draft = PhasedSolution(
-            self.problem,
-            Status.FAILED,
-            "",
-            phases,
-            iterations=result.iterations,
-            link_certificates=links,
-            options=options | {"seed": self.asked["seed"]},
-            solver_message=result.message,
-            wall_time=time.monotonic() - self.begun,
-        )
-        solution = judged_phases(draft, result)
+        solution = self._judge(self._joined(drafts, link_certificates=links), motion.result)
         if error is not None and solution.status in PLANS:
-            return _ended(solution, Status.NO_GRADIENT, [str(error)])
+            return ended(solution, Status.NO_GRADIENT, str(error))
         return solution
 
-    def _draft(self, t: Transcription, motion: Transcribed, options: dict[str, Any]) -> Solution:
-        fields = {name: value for name, value in _arrays(motion).items() if value is not None}
-        fields |= {"scheme": self.scheme, "options": dict(options)}
-        by = t.problem, "collocation", "ipopt", Status.FAILED, ""
-        return Solution(*by, frozen(motion.xs), frozen(motion.us[:-1]), **fields)
+    def _judge(self, draft: Any, result: NlpResult) -> Any:
+        self._reach(3, draft, result)
+        phases = tuple(judged(phase, result) for phase in draft.phases)
+        fields = {"phases": phases, "iterations": result.iterations, "solver_message": result.message}
+        return judged_phases(replace(draft, **fields), result)
 
-    def _offer(self, drafts: Sequence[Solution], result: NlpResult, options: dict[str, Any]) -> None:
-        """Hand on what a search came to; what it claims is not looked at yet."""
-        phases = tuple(unmeasured(draft, result) for draft in drafts)
-        summary = phases[0].status, phases[0].message, phases
-        self.report.found(PhasedSolution(self.problem, *summary, iterations=result.iterations, options=options))
+    def _with_rounds(self, solution: Any, rounds: Sequence[Any]) -> Any:
+        return solution
 
-    def _certified_links(self, motions: list[Transcribed]) -> tuple[Certificate, ...]:
-        """GradientError where a derivative is refused."""
-        certificates = []
-        for s, function in zip(self.problem.switches, self.links, strict=True):
-            point, count = np.concatenate([motions[s.before].xs[-1], motions[s.after].xs[0]]), len(s.columns)
-            if not np.all(np.isfinite(point)):
-                continue
-            with np.errstate(all="ignore"):
-                certificate = certify_jacobian(
-                    lambda x, s=s, count=count: s.link(x[:count], x[count:]),
-                    point,
-                    function.jacobian_of,
-                    rows=s.rows,
-                    columns=[*(f"last {name}" for name in s.columns), *(f"first {name}" for name in s.rows)],
-                    method="reset",
-                    subject=s.label,
-                )
-            certificates.append(certificate)
-        return tuple(certificates)
+    def _finer(self, transcription: Any, motion: Any, solution: Any) -> Any:
+        if self.problem.is_map or solution.status not in PLANS:
+            return None
+        of_phases = [may_be_too_coarse(phase) for phase in solution.phases]
+        drifts = solution.status is not Status.CONVERGED and not any(of_phases) and not solution.chain.passes
+        until = self.asked.error_tolerance
+        coarse = [
+            (wanted or drifts) and (phase.largest_error > until or bool(violation_between_nodes(phase).intervals))
+            for wanted, phase in zip(of_phases, motion.phases, strict=True)
+        ]
+        if not any(coarse):
+            return None
+        self.reached.append(SoFar(1, solution, judged=solution))
+        return transcription.finer(motion, coarse, self.asked.max_num_steps, self._left(), self.report)
 
 
-def _arrays(motion: Transcribed) -> dict[str, Any]:
-    """Those of a Solution that are beside its states and inputs."""
-    problem = motion.task.problem
-    refined = len(motion.mesh) - 1 > problem.num_steps
-    return {
-        "u_final": None if problem.is_map else frozen(motion.us[-1]),
-        "us_mid": motion.us_mid,
-        "mesh": motion.mesh if refined else None,
-        "free_horizon": motion.horizon if problem.horizon else None,
-    }
+def _certified_links(transcription: PhasedTranscription, motions: Sequence[Transcribed]) -> tuple[Certificate, ...]:
+    """GradientError where a derivative is refused."""
+    certificates = []
+    for s, function in zip(transcription.problem.switches, transcription.links, strict=True):
+        point, count = np.concatenate([motions[s.before].xs[-1], motions[s.after].xs[0]]), len(s.columns)
+        if not np.all(np.isfinite(point)):
+            continue
+        with np.errstate(all="ignore"):
+            certificate = certify_jacobian(
+                lambda x, s=s, count=count: s.link(x[:count], x[count:]),
+                point,
+                function.jacobian_of,
+                rows=s.rows,
+                columns=[*(f"last {name}" for name in s.columns), *(f"first {name}" for name in s.rows)],
+                method="reset",
+                subject=s.label,
+            )
+        certificates.append(certificate)
+    return tuple(certificates)
 
 
-def judged_phases(draft: PhasedSolution, result: NlpResult) -> PhasedSolution:
+def judged_phases(draft: PhasedSolution, result: NlpResult) -> Any:
     """The draft, whose phases are judged, with the status that they, the links and the chain allow."""
     statuses, complaints = [phase.status for phase in draft.phases], [str(c) for c in draft.link_checks.failing]
     details = [
@@ -608,11 +571,11 @@ def judged_phases(draft: PhasedSolution, result: NlpResult) -> PhasedSolution:
     if failed is None and complaints and result.outcome not in FOUND:
         failed = status_of(result.outcome)
     if failed is not None:
-        return _ended(draft, failed, [*complaints, *details] or [result.message])
+        return ended(draft, failed, "; ".join([*complaints, *details] or [result.message]))
     if complaints or details:
-        return _ended(draft, Status.CONVERGED_NOT_VERIFIED, [*complaints, *details])
+        return ended(draft, Status.CONVERGED_NOT_VERIFIED, "; ".join([*complaints, *details]))
     status = Status.CONVERGED if draft.chain.passes else Status.CONVERGED_NOT_VERIFIED
-    return _ended(draft, status, [f"integrated {under(draft.chain.feedback or OPEN_LOOP)} {draft.chain}"])
+    return ended(draft, status, f"integrated {under(draft.chain.feedback or OPEN_LOOP)} {draft.chain}")
 
 
 def _link_checks(draft: PhasedSolution) -> Iterator[Check]:
@@ -632,8 +595,3 @@ def _link_checks(draft: PhasedSolution) -> Iterator[Check]:
     for certificate in draft.link_certificates:
         row = derivative_check(certificate)
         yield replace(row, where=f"{certificate.subject}: {row.where}")
-
-
-def _ended(draft: PhasedSolution, status: Status, details: Sequence[str]) -> PhasedSolution:
-    sentences = "; ".join(detail for detail in details if detail)
-    return replace(draft, status=status, message=f"{status.sentence}: {sentences}" if sentences else status.sentence)

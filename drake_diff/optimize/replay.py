@@ -33,8 +33,8 @@ from drake_diff.motion.intervals import intervals_of
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import CONTINUOUS, Policy, Rollout, rollout
 from drake_diff.optimize.checks import Check, check
+from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.problem.goals import GoalConstraint
-from drake_diff.optimize.problem.names import units_of
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, along_steps, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.problem.terminal import TerminalConstraint

@@ -3,7 +3,7 @@
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -19,12 +19,13 @@ from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import TIME_STEP
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.rollout import STEPS
-from drake_diff.optimize.certified import certify_equations, first_knots, telling_knots
 from drake_diff.optimize.continuation import Stages, solve_continuation
 from drake_diff.optimize.guess import Guess
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr, takes
 from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through_jumps
+from drake_diff.optimize.measure import certify_equations, first_knots, telling_knots
 from drake_diff.optimize.optimality import HOLDS, doubt_of_the_slope, out_of_reach, why_blind
+from drake_diff.optimize.options import Options
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import SelfCollision, lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
@@ -34,7 +35,6 @@ from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
     FOUND,
-    MeshRefinement,
     Transcribed,
     Transcription,
     kept,
@@ -43,19 +43,16 @@ from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.steps import solve_shooting
 from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, refused, status_of, unmeasured
 
-CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
-FINER_ROUNDS = 6  # of a mesh whose plan does not hold
 GRACE = 0.05  # of the time limit, beyond it: for measures of what a search found that the limit ended
 # What a solve is made of, in this order; a time limit names what it cut.
 STAGES = ("certificates of the guess", "the search", "certificates of the result", "replays and other measures")
-FEW_STEPS = 100  # of iLQR, for the first guess of shooting: most that converge do so in fewer
 PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 
 Searcher = Callable[[Problem, Array, Array, Array], tuple[NlpResult, Array, Array]]
 
 
 @dataclass(eq=False)
-class _SoFar:
+class SoFar:
     """What a run has when the clock ends it, and the stage that it is in; see STAGES."""
 
     stage: int
@@ -73,20 +70,21 @@ class Run:
     scheme: str
     solver: str
     limits: Limits
-    options: dict[str, Any]
+    asked: Options
+    options: dict[str, Any]  # what the record says of the solver
     report: Report | None
     searched: Problem | None = None  # what is solved where that is more than what is asked
     start: float = field(default_factory=now)
     begun: float = field(default_factory=time.monotonic)
     certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
-    reached: list[_SoFar] = field(default_factory=list)  # the last is where it is
+    reached: list[SoFar] = field(default_factory=list)  # the last is where it is
 
-    def within_time(self, search: Callable[[], Solution], guess: Guess, begin: Callable[[], None]) -> Solution:
+    def within_time(self, search: Callable[[], Any], guess: Any, begin: Callable[[], None]) -> Any:
         """What `search`, one of the three below, gives; where the time limit comes first, what there is by then.
 
         `begin` is called before it; a signal that comes meanwhile leaves the guess, as one that comes later does.
         """
-        self.reached.append(_SoFar(0, self._of_guess(guess)))
+        self.reached.append(SoFar(0, self._of_guess(guess)))
         with noted_interrupts() as interrupted:
             begin()
         if interrupted.is_set():
@@ -104,7 +102,7 @@ class Run:
         last = guess.us[-1] if guess.u_final is None else np.ravel(guess.u_final)
         return self._draft(guess.xs, guess.us, u_final=last)
 
-    def _cut(self, reached: _SoFar, *, interrupted: bool) -> Solution:
+    def _cut(self, reached: SoFar, *, interrupted: bool) -> Solution:
         if reached.judged is not None:
             why = Status.INTERRUPTED.sentence if interrupted else "the time limit came first"
             return reached.judged.told(message=f"{reached.judged.message}; no finer mesh: {why}")
@@ -125,40 +123,25 @@ class Run:
         left = self.limits.time_limit - (now() - self.start)
         return dataclasses.replace(self.limits, time_limit=max(left, 0.0))
 
-    def collocate(self, guess: Guess, refinement: MeshRefinement | None, *, refine: bool | None) -> Solution:
+    def collocate(self, guess: Any) -> Any:
         """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation.
 
         The mesh is refined where `refine` is True; where it is None, for as long as the plan does not hold.
         """
+        refine = self.asked.refine
         if self.solver == "snopt":
             return self._collocate_in_drake(guess)
-        problem, report = self.problem, self.report
         with noted_interrupts() as interrupted:  # one that comes before the search ends it at its start
             try:
                 with until_set(interrupted):
-                    transcription = Transcription(self.searched or problem, self.scheme)
-                    before = certify_equations(
-                        self.problem,
-                        transcription.jacobian,
-                        guess.xs,
-                        guess.us,
-                        transcription.task,
-                        knots=first_knots(guess.us),
-                    )
+                    transcription = self._transcribe()
+                    before = self._certify_guess(transcription, guess)
             except (GradientError, SimulationError) as error:
                 return refused(self._of_guess(guess), error)
             self._reach(1)
-            us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
-            begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
+            refinement = self.asked if refine else None
             motion = transcription.solve(
-                begun,
-                horizon=guess.horizon,
-                limits=self._left(),
-                report=report,
-                refinement=refinement if refine else None,
-                parameters=guess.parameters,
-                far=guess.line,
-                **self._known(transcription, guess, finer=refine is not False),
+                **self._begin(transcription, guess), limits=self._left(), report=self.report, refinement=refinement
             )
             motion = motion.told(result=heard(motion.result, interrupted))
         if refine:
@@ -166,13 +149,23 @@ class Run:
         if motion.cleared:
             self.options["clearance_rounds"] = [list(row) for row in motion.cleared]
 
-        def judged(motion: Transcribed) -> Solution:
-            return self._judge_collocated(transcription, motion, before)
+        solution = self._judge_collocated(transcription, motion, before)
+        return solution if refine is not None else self._refined(transcription, motion, solution, before)
 
-        solution = judged(motion)
-        if refine is not None or refinement is None:
-            return solution
-        return self._refined(transcription, motion, solution, refinement, judged)
+    def _transcribe(self) -> Any:
+        return Transcription(self.searched or self.problem, self.scheme)
+
+    def _certify_guess(self, transcription: Any, guess: Guess) -> tuple[Certificate, ...]:
+        point = transcription.jacobian, guess.xs, guess.us, transcription.task
+        return certify_equations(self.problem, *point, knots=first_knots(guess.us))
+
+    def _begin(self, transcription: Any, guess: Any) -> dict[str, Any]:
+        """What a transcription solves from."""
+        us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
+        begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
+        known = self._known(transcription, guess, finer=self.asked.refine is not False)
+        fields = {"horizon": guess.horizon, "parameters": guess.parameters, "far": guess.line}
+        return {"guess": begun, **fields, **known}
 
     def _known(self, transcription: Transcription, guess: Guess, *, finer: bool) -> dict[str, Any]:
         """The mesh and the multipliers of a guess by the same scheme and in as many steps; `finer` may it be."""
@@ -184,24 +177,11 @@ class Run:
             return {}
         return {"mesh": np.asarray(motion.mesh), "multipliers": guess.multipliers}
 
-    def _refined(
-        self,
-        transcription: Transcription,
-        motion: Transcribed,
-        solution: Solution,
-        most: MeshRefinement,
-        judged: Callable[[Transcribed], Solution],
-    ) -> Solution:
+    def _refined(self, transcription: Any, motion: Any, solution: Any, before: Any) -> Any:
         """`solution`, or that on a mesh which is made finer for as long as the plan does not hold."""
         rounds = list(motion.refinements)
-        for _ in range(FINER_ROUNDS):
-            if not may_be_too_coarse(solution):
-                break
-            exceeded = violation_between_nodes(motion).intervals
-            if motion.largest_error <= most.tolerance and not exceeded:
-                break  # what does not hold is not the mesh's
-            self.reached.append(_SoFar(1, solution, judged=solution))
-            finer = transcription.finer(motion, exceeded, most.most, self._left(), self.report)
+        for _ in range(self.asked.mesh_rounds):
+            finer = self._finer(transcription, motion, solution)
             if finer is None:
                 break
             if finer.result.outcome not in FOUND:
@@ -210,13 +190,24 @@ class Run:
                     return self._judge(solution, last)
                 return solution.told(message=f"{solution.message}; {last.note}")
             motion = finer
-            rounds.append((len(finer.mesh) - 1, finer.largest_error))
+            rounds.append(finer.row)
             self.options["refinements"] = [list(row) for row in rounds]
-            solution = judged(motion)
-        if len(rounds) > 1:
-            note = f"the mesh was refined from {rounds[0][0]} to {rounds[-1][0]} intervals"
-            solution = solution.told(message=f"{solution.message}; {note}")
-        return solution
+            solution = self._judge_collocated(transcription, motion, before)
+        return self._with_rounds(solution, rounds) if len(rounds) > 1 else solution
+
+    def _with_rounds(self, solution: Any, rounds: Sequence[Any]) -> Any:
+        note = f"the mesh was refined from {rounds[0][0]} to {rounds[-1][0]} intervals"
+        return solution.told(message=f"{solution.message}; {note}")
+
+    def _finer(self, transcription: Any, motion: Any, solution: Any) -> Any:
+        """The motion on a finer mesh; None where the plan holds, or where what does not hold is not the mesh's."""
+        if not may_be_too_coarse(solution):
+            return None
+        exceeded = violation_between_nodes(motion).intervals
+        if motion.largest_error <= self.asked.error_tolerance and not exceeded:
+            return None
+        self.reached.append(SoFar(1, solution, judged=solution))
+        return transcription.finer(motion, exceeded, self.asked.max_num_steps, self._left(), self.report)
 
     def _collocate_in_drake(self, guess: Guess) -> Solution:
         """By Drake's own DirectCollocation."""
@@ -238,16 +229,10 @@ class Run:
             certificates += certify_equations(self.problem, jacobian, xs, us)
         return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates), result)
 
-    def _judge_collocated(
-        self, transcription: Transcription, motion: Transcribed, certificates: tuple[Certificate, ...]
-    ) -> Solution:
+    def _judge_collocated(self, transcription: Any, motion: Any, certificates: tuple[Certificate, ...]) -> Any:
         xs, us = motion.xs, motion.us[:-1]
         self.options["derivatives"] = motion.derivatives
-        fields: dict[str, Any] = {
-            "u_final": None if self.problem.is_map else motion.us[-1],
-            "us_mid": None if self.scheme == "drake" else motion.us_mid,
-            "free_horizon": motion.horizon if self.problem.horizon else None,
-            "mesh": motion.mesh if len(us) > self.problem.num_steps else None,
+        fields = arrays_of(motion) | {
             "parameters": frozen(motion.task.parameters),
             "multipliers": motion.result.multipliers,
         }
@@ -319,7 +304,7 @@ class Run:
         problem = dataclasses.replace(problem, couplings=())
         if not takes(problem):
             return None
-        few = dataclasses.replace(self._left(), max_iterations=min(FEW_STEPS, self.limits.max_iterations))
+        few = dataclasses.replace(self._left(), max_iterations=min(self.asked.sweeps, self.limits.max_iterations))
         try:
             with problem.intervals(problem.design.vector.at(values)) as intervals:
                 rolled = roll(intervals, x0, us)
@@ -423,7 +408,7 @@ class Run:
         """What `search` finds; where it comes too near to an obstacle between two states, again with these in view."""
         problem, rounds, guess = self.problem, list[list[float]](), (xs, us)
         result, xs, us = search(problem, xs, us, values)
-        for parts in CLEARANCE_PARTS:
+        for parts in self.asked.clearance_parts:
             lacking, enters = lacking_between(problem.kept, xs)
             if not lacking or result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE, Outcome.ITERATION_LIMIT):
                 break
@@ -500,6 +485,17 @@ class Run:
             self.certified.update(zip([keys[k] for k in new], taken, strict=True))
         certificates = tuple(self.certified[key] for key in keys.values())
         return xs, us, certificates, why_blind(self.problem, variables, z)
+
+
+def arrays_of(motion: Transcribed) -> dict[str, Any]:
+    """The arrays of a Solution that are beside its states and inputs."""
+    task, problem = motion.task, motion.task.problem
+    return {
+        "u_final": None if problem.is_map else frozen(motion.us[-1]),
+        "us_mid": None if task.scheme.input_is_linear else motion.us_mid,
+        "free_horizon": motion.horizon if problem.horizon else None,
+        "mesh": motion.mesh if motion.count > problem.num_steps else None,
+    }
 
 
 def kept_apart(problem: Problem) -> Problem:

@@ -3,6 +3,7 @@
 import copy
 import enum
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,6 +30,8 @@ from drake_diff.optimize.shooting import ShootingVariables
 from drake_diff.optimize.transcription.between import Excess, violation_between_nodes
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
+SAME_COST = 1e-2  # of the larger one, or of 1: what searches that stop at one optimum on other meshes may differ by
+SAME_MOTION = 5e-2  # of each state's range, the root of the mean square over the knots
 # Fields that no measure depends on.
 TOLD = ("cross_checks", "iterations", "message", "optima", "options", "search", "solver_message", "status")
 
@@ -502,6 +505,45 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             return False
         parts = [array for array in (self.xs, self.inputs_at_knots, self.us_mid) if array is not None]
         return self.scheme == "step" or all(bool(np.all(np.isfinite(array))) for array in parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """A verified solution, the first guess that led to it first, and how many did."""
+
+    solution: Solution
+    guess: str
+    count: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        s = self.solution
+        return {"cost": s.cost, "horizon": s.horizon, "guess": self.guess, "count": self.count}
+
+
+def distinct(pairs: Sequence[tuple[Solution, str]]) -> list[Optimum]:
+    """Those of the verified solutions and their guesses that are no other's motion, the cheapest first."""
+    optima: list[Optimum] = []
+    for solution, guess in pairs:
+        if not solution.success:
+            continue
+        for i, other in enumerate(optima):
+            if _are_same(solution, other.solution):
+                cheapest = min((other.solution, solution), key=lambda s: s.cost)
+                optima[i] = Optimum(cheapest, other.guess, other.count + 1)
+                break
+        else:
+            optima.append(Optimum(solution, guess, 1))
+    return sorted(optima, key=lambda optimum: optimum.solution.cost)
+
+
+def _are_same(solution: Solution, other: Solution) -> bool:
+    """Whether two solutions of one problem have one cost and one motion at its knots."""
+    if abs(solution.cost - other.cost) > SAME_COST * max(1.0, abs(solution.cost), abs(other.cost)):
+        return False
+    first, second = (np.asarray(s.xs)[s.knots] for s in (solution, other))
+    apart = np.abs(first - second) / solution.problem.ranges(np.vstack([first, second]))
+    return bool(np.max(np.sqrt(np.mean(apart**2, axis=0))) <= SAME_MOTION)
 
 
 class Trajectories(NamedTuple):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import sha256
 from typing import Any, overload
@@ -12,7 +12,7 @@ import numpy as np
 from drake_diff._base.arrays import LARGEST_SEED, count, positive_float, positive_int
 from drake_diff._base.clock import now, uncounted
 from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError, UnknownNameError
-from drake_diff.model.contact import SoftContact, penetration
+from drake_diff.model.contact import penetration
 from drake_diff.model.parameters import applied
 from drake_diff.model.step import set_state
 from drake_diff.motion.intervals import roll
@@ -20,30 +20,23 @@ from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.optimize.continuation import check_schedule
 from drake_diff.optimize.guess import another_guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, takes
-from drake_diff.optimize.optima import distinct
-from drake_diff.optimize.phased import PhasedSolution, solve_phased
+from drake_diff.optimize.options import Options
+from drake_diff.optimize.phased import PhasedRun, PhasedSolution, check_phases, first_guesses, may_mend, other_guesses
 from drake_diff.optimize.problem.cost import TimedCost
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, Report
 from drake_diff.optimize.run import PLANS, Run, is_kept_apart, kept_apart
-from drake_diff.optimize.solution import Search, Solution, Status
-from drake_diff.optimize.transcription.collocation import (
-    MeshRefinement,
-)
+from drake_diff.optimize.solution import Search, Solution, Status, distinct
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
 from drake_diff.optimize.verification import advice, overlaps
 
 COMPILED = 0.5  # [s] that are worth a word
-LARGEST_TOLERANCE = 1e3
-SOLVERS = ("ipopt", "snopt")
+DEFAULTS = Options()
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": "ipopt", "ilqr": "riccati"}
-OTHER_GUESSES = 8  # of a collocation that finds no motion from a straight line
-OTHER_ITERATIONS = 200  # of each
 OTHER_GUESS = "another first guess"
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
-GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
 BLIND = (Status.NO_GRADIENT, Status.DIVERGED)
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
 # The order in which a chain that ends without a verified motion prefers what it has.
@@ -61,21 +54,13 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
     *,
     method: str = "auto",
     initial_guess: Any = None,
-    scheme: str | None = None,
-    solver: str | None = None,
     max_iterations: int = 500,
     time_limit: float | None = None,
-    tolerance: float = 1e-8,
     seed: int = 0,
-    continuation: Any = None,
-    refine: bool | None = None,
-    error_tolerance: float = 1e-6,
-    max_num_steps: int = 1000,
     restarts: int = 0,
+    options: Options | None = None,
     progress: bool | Progress = False,
     callback: Callable[[Iteration], None] | None = None,
-    on_start: Callable[[], None] | None = None,
-    on_plan: Callable[[Any], None] | None = None,
     view: bool | Callable[[str], None] = False,
 ) -> Solution | PhasedSolution:
     """Solve `problem`, certify the derivatives that were used, and measure the result again on Drake's plant.
@@ -95,31 +80,17 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
             Solution of any method, number of steps and horizon, a pair of Drake's trajectories (state, input) as
             `Solution.trajectory` gives, or (xs, us) with shapes (N+1, nx) and (N, nu). Collocation also takes us
             (N+1, nu), and a third entry, the horizon [s]. In phases: a PhasedSolution, or a list, one for each phase.
-        scheme: of collocation: "hermite_simpson" (order 4, the default), "trapezoid" (order 2), or "drake", which is
-            what Drake's DirectCollocation transcribes.
-        solver: "ipopt", or "snopt" with scheme="drake", which then is Drake's own DirectCollocation.
         max_iterations: of the solver, and of each round of a refinement.
         time_limit: [s] of the whole solve, but for what Numba compiles, once on a machine; the message says how long.
-        tolerance: the solver's, on feasibility and optimality.
         seed: of the noise in a default guess, and of the other first guesses.
-        continuation: finds contact that the guess does not make, by stages of a force at a distance before the true
-            plant: "auto" or a sequence of SoftContacts, with method="ilqr"; or "relaxed": by inverse dynamics over the
-            positions of the guess, with contact and friction at a distance, of hinges, slides and free bodies that
-            spheres touch. `Solution.options` has the stages' log.
-        refine: with collocation, whether coarse intervals are split and the problem is solved again. None: where the
-            plan does not hold between its knots or in a replay, until it does or every error is at most
-            `error_tolerance`. True: until every error is. False: never.
-        error_tolerance: of an interval, against an accurate integration, in the states' units; and of its part of
-            the cost, relative to the whole.
-        max_num_steps: the most intervals of a refined mesh.
         restarts: how many more first guesses are tried, one after the other, smooth random ones by `seed`, also where
             one was verified: the cheapest verified plan is kept, and `Solution.optima` has those that differ.
+        options: what the algorithms are told beside that, an `optimize.Options`: schemes, tolerances, continuations
+            through contact, refinement of meshes.
         progress: True prints a line a few times a second, a function gets each line.
         callback: gets an `optimize.Iteration` for each of the solver's, with the motion there: times, xs, us, contacts.
             SNOPT, and IPOPT by shooting, evaluate without saying where an iteration ends: of these it gets the point
             of an evaluation, a few times a second. Relaxed stages give none. What it raises ends the solve.
-        on_start: called once, when all input has been checked and the work begins.
-        on_plan: gets what each search comes to, a `Solution` or `PhasedSolution` that is not measured yet.
         view: True serves a page for browsers on this machine and prints its address, a function gets the address: the
             iterates in Drake's Meshcat beside their cost and violation, and at the end the motion of the plan, to be
             played. It changes nothing of what is found, but takes time. It is served until the process ends. Plain
@@ -146,47 +117,38 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
     _check_common(problem, seed, callback, progress, view)
     if method not in METHODS:
         raise UnknownNameError("method", got=method, known=METHODS)
-    if solver is not None and solver not in SOLVERS:
-        raise UnknownNameError("solver", got=solver, known=SOLVERS)
-    if solver is not None and method == "ilqr":
-        raise InputError("solver", got=repr(solver), expected='none for method="ilqr", which is its own')
+    if not (options is None or isinstance(options, Options)):
+        raise InputError(
+            "options", got=f"{options!r:.80}", expected="an optimize.Options, such as Options(refine=True)"
+        )
+    chosen = Options() if options is None else options
+    chosen.check_method(method)
     limits = Limits(
         positive_int("max_iterations", max_iterations),
         np.inf if time_limit is None else positive_float("time_limit [s]", time_limit),
-        _tolerance("tolerance", tolerance),
+        chosen.tolerance,
     )
-    refinement = MeshRefinement(
-        _tolerance("error_tolerance", error_tolerance), positive_int("max_num_steps", max_num_steps)
-    )
-    if not (refine is None or isinstance(refine, (bool, np.bool_))):
-        raise InputError("refine", got=repr(refine), expected="None, True or False")
-    report = Report(print if progress is True else (progress or None), callback, on_plan)
+    report = Report(print if progress is True else (progress or None), callback, chosen.on_plan)
     arguments: dict[str, Any] = {
         "method": method,
-        "scheme": scheme,
-        "solver": solver,
         "max_iterations": limits.max_iterations,
         "time_limit": None if time_limit is None else limits.time_limit,
-        "tolerance": limits.tolerance,
         "seed": int(seed),
-        "continuation": _plain_stages(continuation),
-        "refine": refine,
-        "error_tolerance": refinement.tolerance,
-        "max_num_steps": refinement.most,
+        "options": chosen.to_dict(),
     }
     if count("restarts", restarts, 0):
         arguments["restarts"] = int(restarts)
-    asked = Attempt(method, "asked for", scheme, solver, continuation, int(seed), refine, refinement)
-    options: dict[str, Any] = {"limits": limits, "restarts": restarts}
+    asked = Attempt(method, "asked for", chosen, int(seed))
+    report.asked = Search(arguments, initial_guess)
     compiled = uncounted()
     if view is False:
-        solution = _solved(problem, asked, arguments, initial_guess, report, on_start, **options)
+        solution = _solved(problem, asked, limits, restarts, report, chosen.on_start)
         return _with_compilation(solution, uncounted() - compiled, report)
     from drake_diff.optimize.live import LiveSearch  # loads a web server
 
     live = LiveSearch(problem, _print_address if view is True else view)
-    with live.running(on_start) as start:
-        solution = _solved(problem, asked, arguments, initial_guess, live.beside(report), start, **options)
+    with live.running(chosen.on_start) as start:
+        solution = _solved(problem, asked, limits, restarts, live.beside(report), start)
         live.end(solution)
     return _with_compilation(solution, uncounted() - compiled, report)
 
@@ -210,22 +172,19 @@ def _print_address(address: str) -> None:
 def _solved(
     problem: Problem | PhasedProblem,
     asked: "Attempt",
-    arguments: dict[str, Any],
-    initial_guess: Any,
-    report: Report,
-    on_start: Callable[[], None] | None,
-    *,
     limits: Limits,
     restarts: int,
+    report: Report,
+    on_start: Callable[[], None] | None,
 ) -> Solution | PhasedSolution:
-    """What `solve` gives, whose `arguments` have been checked one by one."""
-    report.asked = Search(arguments, initial_guess)
+    """What `solve` gives, whose arguments, those of `report.asked`, have been checked one by one."""
+    arguments, initial_guess = report.asked.arguments, report.asked.guess
+    task = _Task(problem, limits, asked.seed, report, on_start)
     if isinstance(problem, PhasedProblem):
         if restarts:
             raise InputError("restarts", got=restarts, expected="0 for a PhasedProblem")
-        return solve_phased(problem, arguments, initial_guess, report, on_start)
-    task = _Task(problem, limits, asked.seed, report, on_start)
-    if asked.method == "auto" and asked.continuation is not None:
+        return _solve_in_chain(task, asked, initial_guess).told(search=report.asked)
+    if asked.method == "auto" and asked.options.continuation is not None:
         asked = replace(asked, method="ilqr", reason="a continuation is asked for")
     initial_guess = sampled(problem, asked.method, initial_guess)
     in_chain = asked.method in ("auto", "collocation")
@@ -253,13 +212,6 @@ def _check_common(problem: Any, seed: Any, callback: Any, progress: Any, view: A
         raise InputError("view", got=repr(view), expected="True, False or a function")
 
 
-def _tolerance(name: str, given: Any) -> float:
-    tolerance = positive_float(name, given)
-    if tolerance > LARGEST_TOLERANCE:
-        raise InputError(name, got=tolerance, expected=f"at most {LARGEST_TOLERANCE:g}")
-    return tolerance
-
-
 def _takes(problem: Problem, method: str) -> bool:
     """Whether `method` can be asked for `problem`, and says anything of its contact."""
     if method == "collocation" and problem.has_model and problem.model.contract.contact.collision_pairs:
@@ -275,34 +227,31 @@ def _is_possible(problem: Problem, attempt: "Attempt") -> bool:
     return True
 
 
-def _plain_stages(stages: Any) -> Any:
-    """Stages of a continuation as plain numbers; what is none stays as it is, and is refused where it is checked."""
-    if not isinstance(stages, (list, tuple)):
-        return stages
-    return [asdict(stage) if isinstance(stage, SoftContact) else stage for stage in stages]
-
-
 @dataclass(frozen=True)
 class Attempt:
-    """One method, and why it is taken; with `max_iterations` where they are fewer than the task's."""
+    """One method with its options, and why it is taken; with `max_iterations` where they are fewer than the task's."""
 
     method: str
     reason: str
-    scheme: str | None = None
-    solver: str | None = None
-    continuation: Any = None
+    options: Options = DEFAULTS
     seed: int = 0
-    refine: bool | None = None
-    refinement: MeshRefinement | None = None
     max_iterations: int | None = None
     apart: bool = False  # whether links are kept from each other that nothing else keeps apart
+
+    def told(self, in_phases: bool) -> dict[str, str]:
+        """What the chain says of it."""
+        return {"guess": self.reason} if in_phases else {"method": self.method, "reason": self.reason}
+
+    def by(self, method: str, reason: str) -> "Attempt":
+        """The attempt by a `method` that is chosen, with the options that it takes."""
+        return replace(self, method=method, reason=reason, options=self.options.of_method(method))
 
 
 @dataclass(eq=False)
 class _Task:
     """What all attempts at a problem share."""
 
-    problem: Problem
+    problem: Any
     limits: Limits
     seed: int
     report: Report
@@ -320,23 +269,21 @@ class _Task:
         if on_start is not None:
             on_start()
 
-    def prepare(self, attempt: Attempt, given: Any) -> Callable[[], Solution]:
+    def prepare(self, attempt: Attempt, given: Any) -> Callable[[], Any]:
         """Check that `attempt` can be made from the guess `given`; what is returned makes it."""
         problem, method = self.problem, attempt.method
         scheme = _check_attempt(problem, attempt)
+        if isinstance(problem, PhasedProblem):
+            return self._prepare_phases(problem, attempt, scheme, given)
         guess = first_guess(problem, method, given, self.seed)
         xs, us = guess.xs, guess.us
-        if attempt.continuation is not None and method != "ilqr":
-            expected = f'none for method="{method}"; method="ilqr" takes it'
-            raise InputError("continuation", got="given", expected=expected)
-        if attempt.continuation is not None and problem.design.vector.parameters:
+        continuation = attempt.options.continuation
+        if continuation is not None and problem.design.vector.parameters:
             given_too = "with parameters or a horizon"
             raise InputError("continuation", got=given_too, expected="none of them: leave the continuation out")
-        stages = () if attempt.continuation is None else check_schedule(problem, attempt.continuation)
+        stages = () if continuation is None else check_schedule(problem, continuation)
         searched = kept_apart(problem) if attempt.apart else None
-        left = self.limits.time_limit - (now() - self.start)
-        most = min(attempt.max_iterations or self.limits.max_iterations, self.limits.max_iterations)
-        limits = replace(self.limits, time_limit=max(left, 0.0), max_iterations=most)
+        limits = self._limits_of(attempt)
         options = {
             "max_iterations": limits.max_iterations,
             "time_limit": None if np.isinf(self.limits.time_limit) else self.limits.time_limit,
@@ -346,12 +293,12 @@ class _Task:
             "initial_guess": "default" if given is None else "given",
             "initial_guess_sha256": sha256(xs.tobytes() + us.tobytes()).hexdigest(),
         }
-        solver = attempt.solver or DEFAULT_SOLVERS[method]
-        run = Run(problem, method, scheme, solver, limits, options, self.report, searched)
+        solver = attempt.options.solver or DEFAULT_SOLVERS[method]
+        run = Run(problem, method, scheme, solver, limits, attempt.options, options, self.report, searched)
 
         def make() -> Solution:
             if method == "collocation":
-                search = partial(run.collocate, guess, attempt.refinement, refine=attempt.refine)
+                search = partial(run.collocate, guess)
             elif method == "ilqr":
                 search = partial(run.sweep, guess, given=given is not None, stages=stages)
             else:
@@ -360,39 +307,54 @@ class _Task:
 
         return make
 
+    def _prepare_phases(self, problem: PhasedProblem, attempt: Attempt, scheme: str, given: Any) -> Callable[[], Any]:
+        guesses = first_guesses(problem, given, self.seed)
+        options = {"initial_guess": "default" if self.report.asked.guess is None else "given", "seed": self.seed}
+        limits, asked = self._limits_of(attempt), attempt.options
+        run = PhasedRun(problem, "collocation", scheme, "ipopt", limits, asked, options, self.report)
+        return lambda: run.within_time(partial(run.collocate, guesses), guesses, self.begin)
 
-def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
+    def _limits_of(self, attempt: Attempt) -> Limits:
+        """What is left for an attempt."""
+        left = self.limits.time_limit - (now() - self.start)
+        most = min(attempt.max_iterations or self.limits.max_iterations, self.limits.max_iterations)
+        return replace(self.limits, time_limit=max(left, 0.0), max_iterations=most)
+
+
+def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Any:
     """Attempt after attempt until one is verified; the best of them, with what was tried in its options.
 
     A collocation that was asked for is tried from other first guesses alone.
     """
-    solutions: list[Solution] = []
+    solutions: list[Any] = []
     chain: list[dict[str, str]] = []
-    for attempt, guess in _attempts(task.problem, asked, given, solutions):
+    in_phases = isinstance(task.problem, PhasedProblem)
+    for attempt, guess in (_in_phases if in_phases else _attempts)(task.problem, asked, given, solutions):
         if solutions and task.is_late:
-            chain.append({"method": attempt.method, "reason": attempt.reason, "ended": "not begun: time limit"})
+            chain.append({**attempt.told(in_phases), "ended": "not begun: time limit"})
             break
         try:
             make = task.prepare(attempt, guess)
         except DrakeDiffError as error:
             if not solutions:
                 raise
-            chain.append({"method": attempt.method, "reason": attempt.reason, "ended": f"not possible: {error}"})
+            chain.append({**attempt.told(in_phases), "ended": f"not possible: {error}"})
             continue
         solutions.append(make())
         last = solutions[-1]
         if last.status is not Status.INTERRUPTED:
             task.report.say(f"{attempt.method} ({attempt.reason}): {last.status.value}")
-        chain.append({"method": attempt.method, "reason": attempt.reason, "ended": last.status.value})
-        if attempt.continuation is not None:
+        chain.append({**attempt.told(in_phases), "ended": last.status.value})
+        if attempt.options.continuation is not None:
             chain[-1]["continuation"] = "auto"
         if last.status in ENDED:
             break
 
     best = _best_of(solutions)
-    if asked.method != "auto" and len(chain) == 1:
+    if asked.method != "auto" and len(chain) == 1 and not in_phases:
         return best
-    if len(solutions) > 1 and best.status not in PLANS and all(s.method == "collocation" for s in solutions):
+    by_collocation = in_phases or all(s.method == "collocation" for s in solutions)
+    if len(solutions) > 1 and best.status not in PLANS and by_collocation:
         best = best.told(message=f"{best.message}; from none of {len(solutions)} first guesses was a plan found")
     return best.told(options=best.options | {"chain": chain})
 
@@ -413,8 +375,9 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> S
     first_link = {"method": first.method, "reason": asked.reason, "ended": first.status.value}
     chain = list(first.options.get("chain", (first_link,)))
     used = sum(OTHER_GUESS in link["reason"] for link in chain)
-    solver = asked.solver if first.method == asked.method else None
-    base = replace(asked, method=first.method, solver=solver, continuation=None)
+    base = replace(
+        asked, method=first.method, options=replace(asked.options.of_method(first.method), continuation=None)
+    )
     attempts = [(first, f"that of {len(chain)} in the chain" if len(chain) > 1 else "the first")]
     for number in range(1, restarts + 1):
         if attempts[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
@@ -452,7 +415,7 @@ def _preference(solution: Solution) -> tuple[int, float, float]:
     return rank, 0.0 if solution.success else solution.defect + solution.goal_error, solution.cost
 
 
-def _attempts(problem: Problem, asked: Attempt, given: Any, solutions: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
+def _attempts(problem: Problem, asked: Attempt, given: Any, solutions: list[Any]) -> Iterator[tuple[Attempt, Any]]:
     """What to try next and from which guess, by what the attempts before, in `solutions`, came to."""
     if asked.method == "collocation":
         yield asked, given
@@ -461,11 +424,11 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, solutions: list[Solu
         return
     method, reason = choose_method(problem)
     if problem.motion == CONTINUOUS:
-        yield from _in_continuous_time(problem, replace(asked, method=method, reason=reason), given, solutions)
+        yield from _in_continuous_time(problem, asked.by(method, reason), given, solutions)
         return
-    first = replace(asked, method=method, reason=reason, solver=asked.solver if method == "collocation" else None)
+    first = asked.by(method, reason)
     explanation = "nothing touches at first, and every coordinate is driven"
-    free = replace(asked, method="collocation", reason=explanation)
+    free = asked.by("collocation", explanation)
     by_steps = method == "ilqr" or (method == "shooting" and problem.couplings)
     if by_steps and _is_free_at_first(problem) and _is_possible(problem, free):
         yield free, given
@@ -476,29 +439,43 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, solutions: list[Solu
         yield from _other_guesses(problem, first, given, solutions)
         yield from _kept_apart(problem, first, solutions)
     if solutions[-1].status is Status.NO_GRADIENT and method == "ilqr":
-        yield Attempt("ilqr", "the guess has no gradient", continuation="auto"), given
+        touching = replace(first.options, continuation="auto")
+        yield replace(first, reason="the guess has no gradient", options=touching), given
     if method == "shooting" or not problem.has_model or problem.couplings:  # which iLQR does not take
         return
     if method == "collocation":
         reason = "collocation was not verified: a guess for it"
-        yield Attempt("ilqr", reason, max_iterations=GUESS_ITERATIONS), given
+        yield replace(asked.by("ilqr", reason), max_iterations=asked.options.guess_iterations), given
     if np.all(np.isfinite(solutions[-1].xs)):
         begun: Any = (solutions[-1].xs, solutions[-1].us)
         if problem.design.vector.parameters:
             begun = solutions[-1]
         after = "collocation" if method == "collocation" else "shooting"
-        yield replace(asked, method=after, reason="from the motion that iLQR found"), begun
+        yield asked.by(after, "from the motion that iLQR found"), begun
+
+
+def _in_phases(
+    problem: PhasedProblem, asked: Attempt, given: Any, solutions: list[Any]
+) -> Iterator[tuple[Attempt, Any]]:
+    """Collocation of all phases from the guess, and where none is given from others, for as long as that may help."""
+    yield replace(asked, reason="a straight line" if given is None else "given"), given
+    options = asked.options
+    for number in range(1, options.other_guesses + 1) if given is None else ():
+        if not may_mend(solutions[-1], options.refine):
+            return
+        begun = other_guesses(problem, asked.seed, number)
+        yield replace(asked, reason=f"random {number}", max_iterations=options.other_iterations), begun
 
 
 def _in_continuous_time(
     problem: Problem, first: Attempt, given: Any, solutions: list[Solution]
 ) -> Iterator[tuple[Attempt, Any]]:
     """One method, shooting from what iLQR found, and other first guesses: one that touches nothing has no slope."""
-    first = replace(first, solver=None)
     yield first, given
-    for number in range(OTHER_GUESSES + 1):
+    most = first.options.other_guesses
+    for number in range(most + 1):
         if number:
-            reason = f"no plan was found: {OTHER_GUESS} ({number} of {OTHER_GUESSES})"
+            reason = f"no plan was found: {OTHER_GUESS} ({number} of {most})"
             yield replace(first, reason=reason), _rolled_guess(problem, first.seed, number)
         last = solutions[-1]
         if (
@@ -508,7 +485,7 @@ def _in_continuous_time(
             and np.all(np.isfinite(last.xs))
         ):
             reason = "from the motion that iLQR found"
-            yield replace(first, method="shooting", reason=reason), last
+            yield first.by("shooting", reason), last
 
 
 def _rolled_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
@@ -525,20 +502,21 @@ def _other_guesses(
     problem: Problem, attempt: Attempt, given: Any, solutions: list[Solution]
 ) -> Iterator[tuple[Attempt, Any]]:
     """A collocation from other first guesses than a straight line, from which no motion was found."""
-    if given is not None or attempt.solver == "snopt":
+    if given is not None or attempt.options.solver == "snopt":
         return
-    for number in range(1, OTHER_GUESSES + 1):
+    most = attempt.options.other_guesses
+    for number in range(1, most + 1):
         if solutions[-1].status not in NOT_FOUND:
             return
-        reason = f"no motion was found: {OTHER_GUESS} ({number} of {OTHER_GUESSES})"
+        reason = f"no motion was found: {OTHER_GUESS} ({number} of {most})"
         begun = another_guess(problem, attempt.seed, number)
-        yield replace(attempt, reason=reason, max_iterations=OTHER_ITERATIONS), begun
+        yield replace(attempt, reason=reason, max_iterations=attempt.options.other_iterations), begun
 
 
 def _kept_apart(problem: Problem, attempt: Attempt, solutions: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
     """A collocation whose links went through each other, from where it ended, with these kept apart."""
     last = solutions[-1]
-    if attempt.solver == "snopt" or last.status is not Status.CONVERGED_NOT_VERIFIED or is_kept_apart(problem):
+    if attempt.options.solver == "snopt" or last.status is not Status.CONVERGED_NOT_VERIFIED or is_kept_apart(problem):
         return
     if overlaps(last):
         yield replace(attempt, reason="links overlapped: they are kept apart", apart=True), last
@@ -569,18 +547,18 @@ def _is_free_at_first(problem: Problem) -> bool:
     return penetration(model) <= 0
 
 
-def _check_attempt(problem: Problem, attempt: Attempt) -> str:
+def _check_attempt(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
     """The scheme, "step" of the discrete methods; refuses what the method cannot take, and what is another's."""
-    method, scheme = attempt.method, attempt.scheme
+    method = attempt.method
+    if isinstance(problem, PhasedProblem):
+        return check_phases(problem, method, attempt.options)
     if problem.motion == CONTINUOUS:
         _check_motion(attempt)
     if method == "collocation":
         return _check_collocation(problem, attempt)
     takes = 'method="collocation" takes it'
-    if attempt.solver == "snopt":
+    if attempt.options.solver == "snopt":
         raise InputError("solver", got='"snopt"', expected=f'none for method="{method}": scheme="drake" takes it')
-    if scheme is not None:
-        raise InputError("scheme", got=repr(scheme), expected=f'none for method="{method}"')
     if not problem.has_model:
         expected = f'a model for method="{method}"; method="collocation" takes both'
         raise InputError("problem", got="plain dynamics", expected=expected)
@@ -589,8 +567,6 @@ def _check_attempt(problem: Problem, attempt: Attempt) -> str:
             "horizon", got="given", expected=f"none for steps of a diagram, which are of one length: {takes}"
         )
     _check_timed_cost(problem)
-    if attempt.refine:
-        raise InputError("refine", got=True, expected=f'None or False for method="{method}": {takes}')
     if problem.rate_limits and problem.horizon is not None and problem.horizon[0] < problem.horizon[1]:
         expected = f'a horizon that is given for method="{method}": {takes}'
         raise InputError("couplings", got=f"{problem.rate_limits[0]!r} and a free horizon", expected=expected)
@@ -604,14 +580,14 @@ def _check_motion(attempt: Attempt) -> None:
     if attempt.method == "collocation":
         expected = 'method="ilqr" or "shooting" for motion="continuous": collocation leaves contact out'
         raise InputError("method", got='"collocation"', expected=expected)
-    if attempt.continuation is not None:
+    if attempt.options.continuation is not None:
         expected = 'none for motion="continuous": restarts try other first guesses'
         raise InputError("continuation", got="given", expected=expected)
 
 
 def _check_collocation(problem: Problem, attempt: Attempt) -> str:
     scheme = _check_scheme(problem, attempt)
-    if attempt.solver == "snopt" and scheme != "drake":
+    if attempt.options.solver == "snopt" and scheme != "drake":
         raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"; scheme="drake" takes both')
     if problem.trajectory_cost is not None:
         raise InputError("trajectory_cost", got="given", expected='method="shooting"')
@@ -619,7 +595,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
         raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
     _check_timed_cost(problem)
     OptimalControl(problem, scheme)  # raises where a cost is no function that can be differentiated
-    if attempt.solver == "snopt":  # Drake's DirectCollocation gets bounds, ends and costs alone
+    if attempt.options.solver == "snopt":  # Drake's DirectCollocation gets bounds, ends and costs alone
         left_out = {
             "dynamics": not problem.has_model,
             "waypoints": problem.waypoints,
@@ -629,7 +605,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
             "horizon": problem.horizon,
             "parameters": problem.parameters.parameters,
             "a running_cost that changes in time": isinstance(problem.running_cost, TimedCost),
-            "refine": attempt.refine,
+            "refine": attempt.options.refine,
         }
         for name, value in left_out.items():
             if value:
@@ -638,13 +614,13 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
 
 
 def _check_scheme(problem: Problem, attempt: Attempt) -> str:
-    scheme = default_scheme(problem) if attempt.scheme is None else attempt.scheme
+    scheme = attempt.options.scheme or default_scheme(problem)
     if scheme not in SCHEMES:
         raise UnknownNameError("scheme", got=scheme, known=[name for name in SCHEMES if name != MAP])
     if (scheme == MAP) != problem.is_map:
         expected = f"{MAP!r}, as the system is a DiscreteMap" if problem.is_map else "one of motions in time"
         raise InputError("scheme", got=repr(scheme), expected=expected)
-    if problem.is_map and attempt.refine:
+    if problem.is_map and attempt.options.refine:
         raise InputError("refine", got=True, expected="None or False: a DiscreteMap has no intervals to split")
     return scheme
 

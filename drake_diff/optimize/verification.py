@@ -115,7 +115,7 @@ def refused(draft: Solution, error: Exception) -> Solution:
     return ended(draft, status, str(error))
 
 
-def ended(draft: Solution, status: Status, detail: str, **fields: Any) -> Solution:
+def ended(draft: Any, status: Status, detail: str, **fields: Any) -> Any:
     """The draft with its final status, whose sentence and `detail` are the message."""
     message = f"{status.sentence}: {detail}" if detail else status.sentence
     return draft.told(status=status, message=message, **fields)

@@ -20,6 +20,7 @@ from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelW
 from drake_diff.legs.feet import Legs
 from drake_diff.legs.standing import Rest, random_shift, shift_to
 from drake_diff.model.model import Model
+from drake_diff.optimize.options import Options
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import QuadraticCost
 from drake_diff.optimize.problem.goals import FrameGoal
@@ -249,7 +250,8 @@ class _Attempt:
 
     def solved(self, progress: Callable[[str], None], on_plan: Callable[[Solution], None]) -> Solution:
         begun = None if self.guess is None else (self.guess.xs, self.guess.us)
-        return solve(self.problem, initial_guess=begun, progress=progress, on_plan=on_plan, **self.options)
+        arguments = {**self.options, "options": replace(self.options.get("options", Options()), on_plan=on_plan)}
+        return solve(self.problem, initial_guess=begun, progress=progress, **arguments)
 
     def depth(self, solution: Solution) -> float:
         """[m] the deepest overlap of shapes along a solution; 0 where none is looked for, or all are in its steps."""
@@ -381,7 +383,8 @@ def _collocated(robot: Robot, task: Task, guess: Guess, least: str | None) -> _A
     problem = _problem(task, guess, x1, **asked)
     what = "least time" if least else "least effort"
     error, limit = (COARSE, BUDGET_OF_LEAST) if least else (FINE, BUDGET)
-    options = {"method": "collocation", "refine": True, "error_tolerance": error, "time_limit": limit}
+    refined = Options(refine=True, error_tolerance=error)
+    options = {"method": "collocation", "time_limit": limit, "options": refined}
     name = f"{what} from {guess.name}"
     near = replace(problem, bounds=_bounds(model, guess.xs[:, : model.nq]))
     instead = _Attempt(f"{name}, near it", robot, near, guess, options)

@@ -23,7 +23,7 @@ from drake_diff.model.step import set_state
 from drake_diff.motion.continuous import replayed
 from drake_diff.motion.rollout import CONTINUOUS, Policy, rollout
 from drake_diff.optimize.checks import Check, check
-from drake_diff.optimize.problem.names import units_of
+from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.replay import (
     BROKEN,

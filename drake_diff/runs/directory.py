@@ -71,6 +71,7 @@ SECTIONS = {
     "trial": ("id", "cell", "inputs", "result", "panel"),
 }  # fmt: skip
 DROPPED = ("evaluations", "elsewhere")  # a second measurement, which is a test now, and what replays say now
+ARGUMENTS = ("method", "initial_guess", "max_iterations", "time_limit", "seed", "restarts")  # of `solve`
 RENAMED = {"panel": "conditions"}  # within the sections of a panel and of a trial
 FIXED_CONTACTS = {"HeldSpeeds": "FixedSpeeds", "HeldPlaces": "FixedPositions", "HeldForce": "FixedForce"}  # constraints
 
@@ -147,12 +148,23 @@ def load_plan_record(directory: str | Path) -> PlanRecord:
     return record
 
 
+def options_of_search(fields: dict[str, Any]) -> None:
+    """Move the arguments of `solve` that are options now to where they are, in a record that was written before."""
+    for section in (fields.get("inputs"), fields.get("phases")):
+        search = section.get("search") if isinstance(section, dict) else None
+        if isinstance(search, dict) and "options" not in search:
+            options = {name: search.pop(name) for name in [*search] if name not in ARGUMENTS}
+            search["options"] = options
+
+
 def parse_record(path: Path, fields: Mapping[str, Any]) -> SealedRecord:
     """The record with these fields, read from `path`; of a later minor version without what is not known here."""
     version, major = fields.get("schema_version"), SCHEMA_VERSION.split(".")[0]
     if not isinstance(version, str) or version.split(".")[0] not in ("2", major):
         raise ArtifactError(f"{path}: schema_version {version!r}; this drake_diff reads 2.x.y and {major}.x.y")
     known = json.loads(json.dumps(upgraded(fields) if version.startswith("2.") else fields))
+    if version.startswith(("2.", "3.0.")):
+        options_of_search(known)
     kind = KINDS.get(str(known.get("kind")))
     if kind is None:
         raise ArtifactError(f"{path}: kind {fields.get('kind')!r}; expected one of {', '.join(KINDS)}")

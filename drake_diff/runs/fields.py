@@ -21,7 +21,7 @@ from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError
 
 # A new major one where a field goes or changes its meaning, a minor one where one is added.
-SCHEMA_VERSION = "3.0.0"
+SCHEMA_VERSION = "3.1.0"
 # How others are read, word for word in every published schema.
 READING = (
     f"This is version {SCHEMA_VERSION}. An earlier minor version of the same major one is read with what it lacks "

@@ -20,7 +20,7 @@ from drake_diff.model.plant import FLOATING, bodies, joints
 from drake_diff.model.step import set_state
 from drake_diff.motion.rollout import CONTINUOUS, STEPS, Rollout, drift, smooth_mean
 from drake_diff.optimize.measure import INTEGRATION_TOLERANCE
-from drake_diff.optimize.problem.names import units_of
+from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
 from drake_diff.optimize.solution import Solution, Status

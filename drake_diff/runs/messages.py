@@ -11,9 +11,16 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.optimize.problem.cost import ConstantCost
-from drake_diff.optimize.problem.dwell import Dwell
-from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
-from drake_diff.optimize.problem.names import UNKNOWN, units_of
+from drake_diff.optimize.problem.dynamics import UNKNOWN, units_of
+from drake_diff.optimize.problem.goals import (
+    CenterOfMassGoal,
+    Dwell,
+    FrameGoal,
+    FrameVelocityGoal,
+    Goal,
+    JointGoal,
+    KeepLevel,
+)
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.terminal import TerminalSet

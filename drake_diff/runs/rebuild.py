@@ -20,9 +20,9 @@ import numpy as np
 from drake_diff._base.arrays import Array, positive_float
 from drake_diff._base.files import arrays_of, write_whole
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
-from drake_diff.model.contact import SoftContact
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
+from drake_diff.optimize.options import Options
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.solution import Search, Solution, Status
@@ -39,7 +39,7 @@ REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "
 ROWS = "iterations"  # the solver's table, of a run that is not measured yet: later trace.mcap has it
 COLUMNS = ("iteration", "objective", "primal_infeasibility", "dual_infeasibility", "step")  # of that
 START = "start_us"  # the first guess of the inputs that the problem has
-REMOVED = ("segments",)  # arguments of `solve` that records of before 3 have
+REMOVED = ("segments",)  # options of `solve` that records of before 3 have
 GUESS = "guess_"  # before the name of an array of the guess that `solve` was given
 GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps", "multipliers", "row_multipliers")
 
@@ -197,15 +197,13 @@ def solve_again(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Sol
     _check_shapes(record, model, plan)
     with _refusing_a_problem():
         arguments: dict[str, Any] = dict(search)
-        kind, stages = arguments.pop("initial_guess"), arguments["continuation"]
-        if isinstance(stages, list):
-            arguments["continuation"] = [SoftContact(**stage) for stage in stages]
+        kind, options = arguments.pop("initial_guess"), arguments.pop("options")
+        chosen = Options.from_dict({name: value for name, value in options.items() if name not in REMOVED})
         problem = rebuild_problem(record, model, plan["us"], plan.get(START))
         limit, guess = arguments.pop("time_limit"), _rebuild_guess(problem, kind, plan)
         limit = None if limit is None else positive_float("time_limit [s]", limit)
-        removed = {name: arguments.pop(name) for name in REMOVED if name in arguments}
-        found = solve(problem, initial_guess=guess, **arguments)
-    asked = {**(found.search.arguments if found.search else {}), **removed, "time_limit": limit}
+        found = solve(problem, initial_guess=guess, options=chosen, **arguments)
+    asked = {**arguments, "options": options, "time_limit": limit}
     return found.told(options=found.options | {"time_limit": limit}, search=Search(asked, guess))
 
 

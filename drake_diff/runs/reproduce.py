@@ -19,6 +19,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.files import read_plain
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, ModelError
 from drake_diff.model.model import Model
+from drake_diff.optimize.options import Options
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.fixed_contacts import FixedContacts, Impact
 from drake_diff.optimize.problem.phases import PhasedProblem
@@ -372,9 +373,10 @@ def _solved_in_phases(
     recorded = PhasedSolution(problem, status, record.sentence, phases)
     if section.search is None or section.initial_guess is not None:
         return recorded, 0.0, ("it began from a guess that the directory does not have",)
-    left_out = ("time_limit", "solver", "continuation", *REMOVED)
-    arguments: dict[str, Any] = {name: value for name, value in section.search.items() if name not in left_out}
-    solved = solve(problem, **arguments)
+    arguments: dict[str, Any] = {name: value for name, value in section.search.items() if name != "time_limit"}
+    options = arguments.pop("options").items()
+    chosen = Options.from_dict({name: value for name, value in options if name not in REMOVED})
+    solved = solve(problem, options=chosen, **arguments)
     apart = max(_distance(one, other) for one, other in zip(solved.phases, phases, strict=True))
     if apart > SAME_PLAN:
         return recorded, 0.0, (f"run again, it ends at another plan, {apart:.2g} of its largest number away",)

@@ -21,7 +21,7 @@ from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost, SumOfCosts, TrackingCost
 from drake_diff.optimize.problem.coupling import InputRate, Jerk, Periodic
-from drake_diff.optimize.problem.dwell import Dwell
+from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.problem.fixed_contacts import (
     IMPACT_QUANTITIES,
     QUANTITIES,
@@ -30,8 +30,15 @@ from drake_diff.optimize.problem.fixed_contacts import (
     fixed_contact_quantity,
     impact_quantity,
 )
-from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
-from drake_diff.optimize.problem.names import units_of
+from drake_diff.optimize.problem.goals import (
+    CenterOfMassGoal,
+    Dwell,
+    FrameGoal,
+    FrameVelocityGoal,
+    Goal,
+    JointGoal,
+    KeepLevel,
+)
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.schedule import ContactSchedule

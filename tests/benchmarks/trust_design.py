@@ -16,7 +16,7 @@ from trust import Figure
 import drake_diff as dd
 from drake_diff.certificates.certify import certify_inside
 from drake_diff.exceptions import DrakeDiffError
-from drake_diff.optimize.certified import certify_equations
+from drake_diff.optimize.measure import certify_equations
 from drake_diff.optimize.transcription.collocation import Transcription
 
 COUNT = 200

@@ -14,6 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 from pydrake.systems.framework import OutputPortSelection
 from pydrake.systems.primitives import FirstOrderTaylorApproximation
+from solving import solve_with
 from trust import Figure
 
 import drake_diff as dd
@@ -86,7 +87,7 @@ def periodic(random):
 def rate(random):
     path, model, given = drawn(random)
     given["x_goal"] = np.concatenate([random.uniform(-1, 1, model.nq), np.zeros(model.nv)])
-    free = dd.solve(dd.Problem(model, **given), method="collocation", refine=False)
+    free = solve_with(dd.Problem(model, **given), method="collocation", refine=False)
     jerk = bool(random.random() < 0.5)
     times, xs, us = dense(free)
     limit = float(random.uniform(0.75, 0.98) * steepest(times, accelerations(path, xs, us) if jerk else us).max())

@@ -16,6 +16,7 @@ from pydrake.symbolic import Variable
 from pydrake.systems.framework import DiagramBuilder, InputPortIndex
 from pydrake.systems.primitives import SymbolicVectorSystem
 from referee import judge
+from solving import solve_with
 from trust import Figure
 
 import drake_diff as dd
@@ -414,7 +415,7 @@ def case(seed, number):
     """(task, solution, why it is false if it claims to be true, its worst miss as a part of the range)."""
     task = TASKS[number % len(TASKS)]
     problem, options, build = task(np.random.default_rng([seed, number]))
-    solution = dd.solve(problem, **options)
+    solution = solve_with(problem, **options)
     if not solution.success:
         return task, solution, "", 0.0
     plan, h = plan_of(solution, build), solution.time_step

@@ -18,6 +18,7 @@ import numpy as np
 from helpers.models import MODELS
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
+from solving import solve_with
 from trust import Figure
 
 import drake_diff as dd
@@ -57,7 +58,7 @@ def save_runs(folder, rng):
         "sliding": (sliding(float(rng.uniform(0.05, 0.08))), {"method": "shooting"}),
     }
     for name, (problem, options) in tasks.items():
-        dd.save(dd.solve(problem, **options), folder / name)
+        dd.save(solve_with(problem, **options), folder / name)
     return list(tasks)
 
 

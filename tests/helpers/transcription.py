@@ -6,6 +6,7 @@ import numpy as np
 
 import drake_diff as dd
 from drake_diff.optimize.problem.dynamics import Dynamics
+from helpers.solving import solve_with
 
 
 def effort(x, u):
@@ -34,7 +35,7 @@ def heavy_pendulum(damping, **bounds):
 
 OPTIONS = (
     *("scheme", "initial_guess", "tolerance", "max_iterations", "time_limit", "progress", "callback"),
-    *("refine", "error_tolerance", "max_num_steps"),
+    *("refine", "error_tolerance", "max_num_steps", "other_guesses"),
 )
 
 
@@ -43,7 +44,7 @@ def collocate(dynamics, **asked):
     options = {"tolerance": 1e-9, "max_iterations": 3000, "refine": False} | {
         k: asked.pop(k) for k in OPTIONS if k in asked
     }
-    return dd.solve(dd.Problem(dynamics, **asked), method="collocation", **options)
+    return solve_with(dd.Problem(dynamics, **asked), method="collocation", **options)
 
 
 def solved(dynamics, **asked):

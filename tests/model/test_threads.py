@@ -10,6 +10,7 @@ import pytest
 import drake_diff as dd
 from drake_diff.exceptions import ModelError
 from drake_diff.model.step import advance
+from drake_diff.optimize import Options
 
 pytestmark = pytest.mark.solve
 
@@ -67,7 +68,7 @@ def test_threads_with_a_model_each_solve_as_one_thread_does():
         model = dd.example_model("pendulum", time_step=0.05)
         cost = dd.QuadraticCost(R=[[1.0]])
         problem = dd.Problem(model, x0=[0, 0], x_goal=[0.5, 0], num_steps=12, running_cost=cost)
-        found = dd.solve(problem, method=method, solver=solver)
+        found = dd.solve(problem, method=method, options=Options(solver=solver))
         assert found.success
         return found.xs, found.us, found.cost, found.message
 

@@ -8,6 +8,7 @@ from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff.optimize import Options
 
 pytestmark = pytest.mark.solve
 
@@ -43,7 +44,7 @@ def test_a_tolerance_that_no_solver_reaches_is_judged_by_our_own_measures(method
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT)
     exact = dd.solve(problem, method=method)
-    solution = dd.solve(problem, method=method, tolerance=1e-17)
+    solution = dd.solve(problem, method=method, options=Options(tolerance=1e-17))
     assert solution.solver_message == "IPOPT: Solved To Acceptable Level"
     assert solution.success, solution.message
     assert f"by our own measures, where the solver says {solution.solver_message!r}" in solution.message

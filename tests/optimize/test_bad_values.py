@@ -5,10 +5,12 @@ from decimal import Decimal
 
 import numpy as np
 import pytest
+from helpers.solving import solve_with
 from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
+from drake_diff.optimize import Options
 
 NO_ARRAYS = [
     np.array(["2020-01-01", "2020-01-02"], dtype="datetime64[s]"),
@@ -66,14 +68,14 @@ TIMES = {
 }
 POSITIVE = {
     "time_limit": lambda m, v: dd.solve(problem(m), time_limit=v),
-    "tolerance": lambda m, v: dd.solve(problem(m), tolerance=v),
-    "error_tolerance": lambda m, v: dd.solve(problem(m), error_tolerance=v),
+    "tolerance": lambda m, v: dd.solve(problem(m), options=Options(tolerance=v)),
+    "error_tolerance": lambda m, v: dd.solve(problem(m), options=Options(error_tolerance=v)),
     "goal": lambda m, v: dd.FrameGoal("pole", position=[0, 0, 0], tolerance=v),
 }
 COUNTS = {
     "num_steps": lambda m, v: problem(m, num_steps=v),
     "max_iterations": lambda m, v: dd.solve(problem(m), max_iterations=v),
-    "max_num_steps": lambda m, v: dd.solve(problem(m), max_num_steps=v),
+    "max_num_steps": lambda m, v: dd.solve(problem(m), options=Options(max_num_steps=v)),
     "waypoints": lambda m, v: problem(m, waypoints=v if isinstance(v, (list, np.ndarray)) else {v: [0, 0]}),
 }
 
@@ -134,7 +136,7 @@ def test_a_problem_of_such_values_is_refused(model, given):
 
 @each_row("name, value", [("tolerance", 1e300), ("seed", np.timedelta64(1, "s")), ("restarts", np.array([1, 2]))])
 def test_a_solve_with_such_an_option_is_refused(model, name, value):
-    refused(lambda m, v: dd.solve(problem(m), **{name: v}), model, value)
+    refused(lambda m, v: solve_with(problem(m), **{name: v}), model, value)
 
 
 @each_row("value", [np.timedelta64(1, "s"), 10**400, -0.5, np.nan, "1"])

@@ -14,6 +14,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.mechanics.casadi_tree import symbolic_plant
 from drake_diff.model.parameters import ParameterCoordinates, applied, select
+from drake_diff.optimize import Options
 from drake_diff.optimize.problem.dynamics import Moved, plant_dynamics
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.optimize.transcription.program import TranscribedProgram
@@ -236,7 +237,7 @@ def test_a_block_in_least_time_by_discrete_steps(method, solver, steps, tmp_path
     problem = dd.Problem(
         sliding(mass, force, tmp_path), x0=[0, 0], x_goal=[way, 0], num_steps=steps, horizon=(0.2, 10), running_cost=1.0
     )
-    solution = dd.solve(problem, method=method, solver=solver)
+    solution = dd.solve(problem, method=method, options=Options(solver=solver))
     assert solution.success, solution.message
     assert solution.horizon == pytest.approx(2 * np.sqrt(way * mass / force), rel=1e-6)
     assert solution.time_step == pytest.approx(solution.horizon / steps, rel=1e-12)

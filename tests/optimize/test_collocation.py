@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.plants import block
+from helpers.solving import solve_with
 from helpers.table import each_row
 
 import drake_diff as dd
@@ -29,7 +30,7 @@ def swing_up(count=20, **changes):
 
 
 def collocate(problem, **options):
-    return dd.solve(problem, method="collocation", scheme="drake", **options)
+    return solve_with(problem, method="collocation", scheme="drake", **options)
 
 
 def dense_block(count, h, Q, R, Qf, target):

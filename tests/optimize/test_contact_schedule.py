@@ -13,6 +13,7 @@ from drake_diff.legs.motion import LANDS, _slow_phases, _sunk, plan_forces, swin
 from drake_diff.model.parameters import select
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
+from drake_diff.optimize import Options
 from drake_diff.optimize.replay import Plan, broken_variants, held, replays
 from drake_diff.runs.sections import rebuild_goal
 
@@ -192,7 +193,7 @@ def test_solo_hops_and_lands(solo, standing):
     guess = schedule.guess(solo, standing)
     place = dd.FrameGoal("base_link", position=standing[4:7], tolerance=0.05)
     problem = dd.Problem(solo, x0=standing, num_steps=48, goals=[schedule, place], **schedule.follow(solo, guess))
-    solution = dd.solve(problem, method="ilqr", initial_guess=guess, tolerance=1e-4)
+    solution = dd.solve(problem, method="ilqr", initial_guess=guess, options=Options(tolerance=1e-4))
     assert solution.success, solution.message
     # A referee of its own: every foot is in the air in the middle of the flight, by Drake's own numbers.
     context = solo.plant.CreateDefaultContext()
@@ -225,7 +226,9 @@ def test_a_sole_sinks_by_its_share_of_the_weight():
 def lifted(solo, request):
     """A foot lifted for half a second, solved: its problem, the steps of its schedule, and the solution."""
     problem, guess = _lift(solo, request.param)
-    return problem, dd.solve(problem, method="ilqr", initial_guess=guess, tolerance=1e-4, max_iterations=20)
+    return problem, dd.solve(
+        problem, method="ilqr", initial_guess=guess, options=Options(tolerance=1e-4), max_iterations=20
+    )
 
 
 def _lift(solo, seed):

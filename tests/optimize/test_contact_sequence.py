@@ -8,6 +8,7 @@ from helpers.table import each_row, slow_after
 import drake_diff as dd
 from drake_diff.model.contact import separations
 from drake_diff.model.step import set_state
+from drake_diff.optimize import Options
 from drake_diff.optimize.ilqr.through_contact import MARGIN, beginnings, restore_goal
 from drake_diff.optimize.shooting import ShootingVariables
 
@@ -111,7 +112,7 @@ def test_a_minimum_at_a_jump_meets_the_conditions_of_one_on_its_side(elastic):
     The slopes are the product of Drake's step Jacobians; the search ends at 1e-8 of the cost's scale.
     """
     problem = at_a_jump(elastic)
-    solution = dd.solve(problem, method="ilqr", continuation="auto")
+    solution = dd.solve(problem, method="ilqr", options=Options(continuation="auto"))
     assert solution.success, solution.message
     note = solution.options["contact_sequence"]
     assert note in solution.message
@@ -137,7 +138,9 @@ def test_a_minimum_at_a_jump_meets_the_conditions_of_one_on_its_side(elastic):
 @pytest.mark.parametrize("goal", [0.3, -1.0])
 def test_a_goal_that_no_contact_reaches_is_no_success(two_spheres, goal):
     """The ball at 0.6 m can only be pushed away from the pusher."""
-    solution = dd.solve(push(two_spheres(), gap=0.4, goal=goal), method="ilqr", continuation="auto", max_iterations=60)
+    solution = dd.solve(
+        push(two_spheres(), gap=0.4, goal=goal), method="ilqr", options=Options(continuation="auto"), max_iterations=60
+    )
     assert not solution.success
     assert solution.goal_error > 0.25
 

@@ -9,6 +9,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
+from drake_diff.optimize import Options
 from drake_diff.optimize.continuation import default_schedule
 from drake_diff.optimize.ilqr.through_contact import restore_goal
 from drake_diff.optimize.solution import Status
@@ -22,7 +23,7 @@ def test_a_push_from_a_distance_arrives_and_keeps_momentum(two_spheres):
     SAP solves its impulses to 1e-6 of the largest, but applies each to both bodies alike: the balance is rounding.
     """
     problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
-    solution = dd.solve(problem, continuation="auto", max_iterations=100)
+    solution = dd.solve(problem, options=Options(continuation="auto"), max_iterations=100)
     assert solution.success, solution.message
     end = solution.replay.xs[-1]
     assert end[1] == pytest.approx(1.0, abs=1e-8)
@@ -40,7 +41,9 @@ def test_auto_finds_contact_that_its_guess_does_not_make(two_spheres):
 
 def test_before_touching_the_push_is_the_closed_form_of_least_effort(two_spheres):
     """The pusher alone is a double integrator: whatever it is to do at touching, least effort is linear in time."""
-    solution = dd.solve(push(two_spheres(damping=0), gap=0.4, goal=1.0), continuation="auto", max_iterations=100)
+    solution = dd.solve(
+        push(two_spheres(damping=0), gap=0.4, goal=1.0), options=Options(continuation="auto"), max_iterations=100
+    )
     first = next(k for k, contacts in enumerate(solution.replay.contacts) if contacts)
     bend = np.diff(solution.us[:first, 0], 2)
     assert first > 10
@@ -50,7 +53,7 @@ def test_before_touching_the_push_is_the_closed_form_of_least_effort(two_spheres
 def test_a_soft_final_cost_is_reached_too(two_spheres):
     problem = push(two_spheres(damping=0), gap=0.4, goal=1.0, x_goal=None, final_cost=lambda x: 10 * (x[1] - 1.0) ** 2)
     assert dd.solve(problem, method="ilqr").status is Status.NO_GRADIENT
-    solution = dd.solve(problem, continuation="auto", max_iterations=100)
+    solution = dd.solve(problem, options=Options(continuation="auto"), max_iterations=100)
     assert solution.success, solution.message
     assert abs(solution.replay.xs[-1][1] - 1.0) < 1e-3  # effort 1e-3 against 10: the miss is of their ratio
 
@@ -81,7 +84,7 @@ def test_a_stage_that_is_refused_is_told_and_the_schedule_goes_on(two_spheres):
     """h^2 k / m = 1e9: the first stage throws the ball out of every number."""
     problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
     given = [dd.model.SoftContact(1.0, 1e12), *default_schedule(problem)]
-    solution = dd.solve(problem, continuation=given, max_iterations=100)
+    solution = dd.solve(problem, options=Options(continuation=given), max_iterations=100)
     first, *rest = solution.options["continuation"]
     assert first["status"] != "solved"
     assert len(rest) == len(given)
@@ -90,7 +93,7 @@ def test_a_stage_that_is_refused_is_told_and_the_schedule_goes_on(two_spheres):
 
 def test_the_time_limit_is_that_of_all_stages(two_spheres, monkeypatch):
     monkeypatch.setattr("drake_diff.optimize.run.GRACE", 1e6)  # else it ends before the first stage
-    solution = dd.solve(push(two_spheres(), gap=0.4, goal=1.0), continuation="auto", time_limit=0.05)
+    solution = dd.solve(push(two_spheres(), gap=0.4, goal=1.0), options=Options(continuation="auto"), time_limit=0.05)
     assert solution.status is Status.TIME_LIMIT
     assert "in stage 1" in solution.message
     assert len(solution.options["continuation"]) == 1
@@ -100,15 +103,15 @@ def test_the_time_limit_is_that_of_all_stages(two_spheres, monkeypatch):
 @each_row("wrong", ["soft", 0.1, [], [0.1], (dd.model.SoftContact(0.1, 1.0), None)])
 def test_a_schedule_that_is_none_is_refused(two_spheres, wrong):
     with pytest.raises(InputError, match="continuation"):
-        dd.solve(push(two_spheres(), gap=0.4, goal=1.0), continuation=wrong)
+        dd.solve(push(two_spheres(), gap=0.4, goal=1.0), options=Options(continuation=wrong))
 
 
 def test_only_ilqr_takes_a_continuation(two_spheres, load):
     with pytest.raises(InputError, match='method="ilqr" takes it'):
-        dd.solve(push(two_spheres(), gap=0.4, goal=1.0), method="shooting", continuation="auto")
+        dd.solve(push(two_spheres(), gap=0.4, goal=1.0), method="shooting", options=Options(continuation="auto"))
     pendulum = load("pendulum.urdf")
     with pytest.raises(InputError, match="may collide"):
-        dd.solve(dd.Problem(pendulum, x0=[0, 0], num_steps=5, x_goal=[1, 0]), continuation="auto")
+        dd.solve(dd.Problem(pendulum, x0=[0, 0], num_steps=5, x_goal=[1, 0]), options=Options(continuation="auto"))
 
 
 def test_restoration_leaves_a_goal_that_nothing_moves(two_spheres):
@@ -161,7 +164,7 @@ def test_a_hopper_jumps_to_an_apex(load):
         running_cost=posture,
         x_goal=goal,
     )
-    solution = dd.solve(problem, continuation="auto", max_iterations=100)
+    solution = dd.solve(problem, options=Options(continuation="auto"), max_iterations=100)
     assert solution.success, solution.message
     replay = solution.replay
     assert replay.xs[-1][[0, 1, 5]] == pytest.approx([0.2, 0.6, 0.0], abs=1e-7)

@@ -10,7 +10,7 @@ from helpers.robots import example_robot, state_in_contact
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.motion.continuous import replayed
-from drake_diff.optimize import optimality
+from drake_diff.optimize import Options, optimality
 
 pytestmark = pytest.mark.solve
 
@@ -165,7 +165,7 @@ def test_a_plan_in_continuous_time_is_refused_what_it_has_not():
     with pytest.raises(InputError, match='method="ilqr" or "shooting"'):
         dd.solve(problem, method="collocation")
     with pytest.raises(InputError, match="restarts try other first guesses"):
-        dd.solve(problem, method="ilqr", continuation="auto")
+        dd.solve(problem, method="ilqr", options=Options(continuation="auto"))
     with pytest.raises(InputError, match=r"num_steps \* model\.time_step"):
         dd.Problem(model, motion="continuous", horizon=(0.1, 0.2), **asked)
     with pytest.raises(UnknownNameError, match="motion"):

@@ -9,7 +9,7 @@ from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
-from drake_diff.optimize import Coupling, Periodic
+from drake_diff.optimize import Coupling, Options, Periodic
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.optimize.transcription.program import TranscribedProgram
 
@@ -114,7 +114,7 @@ def test_what_takes_no_couplings_says_so():
     with pytest.raises(InputError, match=r'couplings.*method="shooting" takes it'):
         dd.solve(problem, method="ilqr")
     with pytest.raises(InputError, match=r"couplings"):
-        dd.solve(problem, method="collocation", scheme="drake", solver="snopt")
+        dd.solve(problem, method="collocation", options=Options(scheme="drake", solver="snopt"))
     with pytest.raises(InputError, match=r"couplings"):
         dd.loop.MPC(swing(waypoints=None, optimize="controls", initial_state_mask=None), horizon=5)
 

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from helpers.solving import solve_with
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
+from drake_diff.optimize import Options
 
 A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
 STEPS = 30
@@ -108,11 +110,11 @@ def test_what_a_map_cannot_be_asked():
     problem = kicked_problem()
     for asked in ({"scheme": "trapezoid"}, {"refine": True}, {"method": "shooting"}, {"method": "ilqr"}):
         with pytest.raises(InputError):
-            dd.solve(problem, **asked)
+            solve_with(problem, **asked)
     pendulum = dd.load_model("models/pendulum.urdf", time_step=0.05)
     driven = dd.Problem(pendulum, x0=[0, 0], num_steps=5, running_cost=dd.QuadraticCost(R=[[1.0]]))
     with pytest.raises(InputError, match="scheme"):
-        dd.solve(driven, method="collocation", scheme="map")
+        dd.solve(driven, method="collocation", options=Options(scheme="map"))
 
 
 @pytest.mark.solve

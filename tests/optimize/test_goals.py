@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, robot_file
 from helpers.robots import example_robot, state_in_range
+from helpers.solving import solve_with
 from helpers.table import each_row, slow_after
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
@@ -153,7 +154,7 @@ def test_goals_are_made_again_from_their_values():
     ],
 )
 def test_a_two_link_arm_ends_at_the_angles_of_the_law_of_cosines(arm, method, options):
-    solution = dd.solve(reach(arm), method=method, progress=False, **options)
+    solution = solve_with(reach(arm), method=method, progress=False, **options)
     x, z = -0.6, -0.7
     bend = np.arccos((x**2 + z**2 - UPPER**2 - LOWER**2) / (2 * UPPER * LOWER))
     found = []

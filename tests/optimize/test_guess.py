@@ -10,6 +10,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ShapeError
+from drake_diff.optimize import Options
 from drake_diff.optimize.guess import another_guess, first_guess
 
 pytestmark = pytest.mark.solve
@@ -31,7 +32,7 @@ def plant(write_urdf, count=10, h=0.1):
 
 @each_row("scheme", ["hermite_simpson", "trapezoid", "drake"])
 def test_a_collocated_solution_as_drakes_trajectories_is_its_motion(scheme):
-    solution = dd.solve(block(), scheme=scheme)
+    solution = dd.solve(block(), options=Options(scheme=scheme))
     state, held = solution.trajectory()
     assert (state.start_time(), state.end_time(), held.end_time()) == (0.0, 1.0, 1.0)
     at = np.linspace(0, 1, 57)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers.models import MODELS
+from helpers.solving import solve_with
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 
@@ -37,7 +38,7 @@ def pushed():
 
 def searched(problem, **options):
     rows = []
-    solution = dd.solve(problem, callback=rows.append, **options)
+    solution = solve_with(problem, callback=rows.append, **options)
     assert len(rows) >= 1
     return rows, solution
 

@@ -13,9 +13,9 @@ from helpers.table import each_row
 from pydrake.math import RigidTransform
 
 import drake_diff as dd
-import drake_diff.optimize.run as run_module
 import drake_diff.optimize.transcription.collocation as collocation_module
 from drake_diff.exceptions import InputError, ModelWarning, UnknownNameError
+from drake_diff.optimize import Options
 from drake_diff.optimize.problem.obstacles import along_steps
 from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.optimize.verification import judged
@@ -95,7 +95,7 @@ def test_where_a_plan_jumps_through_between_knots_the_mesh_is_refined(monkeypatc
     assert rounds[-1] == [len(solution.us), 0.0]
     assert depth_by_drake(problem.model, finely(solution), BALL) < 0
     monkeypatch.setattr(collocation_module, "CLEARANCE_ROUNDS", 0)
-    solution = dd.solve(problem, method="collocation", max_iterations=200, refine=False)
+    solution = dd.solve(problem, method="collocation", max_iterations=200, options=Options(refine=False))
     assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
     assert failing(solution, "between the nodes")[0].where.startswith("lower and obstacle 'ball' at ")
 
@@ -111,7 +111,7 @@ def test_no_obstacle_is_so_thin_that_a_motion_jumps_over_it_unseen():
     How deep the rods are in each is Pythagoras at 10,000 times.
     """
     ends = {"num_steps": 4, "time_step": 0.4, "x0": [-1.5, 0.1, 0, 0], "x_goal": [1.5, -0.1, 0, 0]}
-    plan = dd.solve(arm([], **ends), method="collocation", refine=False)
+    plan = dd.solve(arm([], **ends), method="collocation", options=Options(refine=False))
     angles = np.cumsum(plan.transcribed.at(np.linspace(0, plan.horizon, 10_000))[0][:, :2], axis=1)
     hinges = -0.8 * np.column_stack([np.sin(angles[:, 0]), np.cos(angles[:, 0])])
     tips = hinges - 0.49 * np.column_stack([np.sin(angles[:, 1]), np.cos(angles[:, 1])])
@@ -140,10 +140,9 @@ def test_steps_are_looked_at_as_closely_and_a_motion_too_wild_to_be_seen_is_none
 
 
 @pytest.mark.slow
-def test_where_steps_jump_through_they_are_looked_at_within(monkeypatch):
+def test_where_steps_jump_through_they_are_looked_at_within():
     problem = arm([BALL])
-    monkeypatch.setattr(run_module, "CLEARANCE_PARTS", ())
-    through = dd.solve(problem, method="ilqr", max_iterations=200)
+    through = dd.solve(problem, method="ilqr", max_iterations=200, options=Options(clearance_parts=()))
     assert not through.success
     assert through.constraint_violation <= 1e-5  # every knot is clear
     assert failing(through, "between the knots")[0].value > BALL.margin

@@ -7,6 +7,7 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ShapeError
+from drake_diff.optimize import Options
 from drake_diff.optimize.phased import judged_phases
 from drake_diff.optimize.program import NlpResult, Outcome
 
@@ -261,7 +262,7 @@ def test_coarse_meshes_are_refined():
     solution = dd.solve(dd.optimize.PhasedProblem([coarse], periodic=heel_strike))
     assert solution.success, solution.message
     assert solution.options["refinements"][-1][0] > 3
-    unrefined = dd.solve(dd.optimize.PhasedProblem([coarse], periodic=heel_strike), refine=False)
+    unrefined = dd.solve(dd.optimize.PhasedProblem([coarse], periodic=heel_strike), options=Options(refine=False))
     assert unrefined.status is dd.Status.CONVERGED_NOT_VERIFIED
 
 
@@ -301,7 +302,7 @@ def test_what_does_not_fit_is_refused_early():
         (lambda: make([fall, dd.Problem(saving, x0=[0, 0], x_goal=[1, 0], num_steps=3)]), "map"),
         (lambda: dd.solve(problem, method="ilqr"), "method"),
         (lambda: dd.solve(problem, method="shooting"), "method"),
-        (lambda: dd.solve(problem, scheme="drake"), "scheme"),
+        (lambda: dd.solve(problem, options=Options(scheme="drake")), "scheme"),
         (lambda: dd.solve(problem, initial_guess=[None]), "initial_guess"),
     ]
     for make_it, words in bad:

@@ -5,11 +5,13 @@ import types
 
 import numpy as np
 import pytest
+from helpers.solving import solve_with
 from helpers.table import each_row
 from helpers.transcription import BLOCK, own_derivatives
 
 import drake_diff as dd
 from drake_diff.exceptions import ArtifactError, InputError, ModelError
+from drake_diff.optimize import Options
 from drake_diff.optimize.program import Outcome
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.runs.view import scene_of_run
@@ -103,7 +105,7 @@ def test_a_problem_of_plain_dynamics_says_that_it_has_no_model():
         (
             {"system": "model", "horizon": None},
             {"method": "shooting", "refine": True},
-            "refine: expected None or False for",
+            "refine: expected none for",
         ),
     ],
 )
@@ -112,7 +114,7 @@ def test_what_a_solver_would_leave_out_is_refused(load, changes, options, match)
         changes = changes | {"system": load("pendulum.urdf", time_step=0.05)}
     problem = dataclasses.replace(block_move(), **changes)
     with pytest.raises(InputError, match=match):
-        dd.solve(problem, **{"method": "collocation"} | options)
+        solve_with(problem, **{"method": "collocation"} | options)
 
 
 def test_a_run_of_plain_dynamics_has_no_body_to_draw(tmp_path):
@@ -130,7 +132,7 @@ def test_a_mesh_on_which_the_plan_does_not_hold_is_refined_by_itself():
     up = dd.Problem(swing, x0=[0, 0], x_goal=[np.pi, 0], num_steps=4, horizon=2.0, running_cost=EFFORT)
     slow = block_move(num_steps=4, constraints=dd.Constraint(lambda x: x[1], upper=1.25, name="slow"))
     for problem in (up, slow):
-        coarse, found, fine = (dd.solve(problem, refine=refine) for refine in (False, None, True))
+        coarse, found, fine = (dd.solve(problem, options=Options(refine=refine)) for refine in (False, None, True))
         assert coarse.status is dd.Status.CONVERGED_NOT_VERIFIED
         assert found.success, found.message
         rounds = found.options["refinements"]
@@ -152,7 +154,7 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
     """The first mesh is solved, and every finer one is said to have none."""
     swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
     problem = dd.Problem(swing, x0=[0, 0], x_goal=[np.pi, 0], num_steps=4, horizon=2.0, running_cost=EFFORT)
-    coarse = dd.solve(problem, refine=False)
+    coarse = dd.solve(problem, options=Options(refine=False))
     honest = Transcription.solve_on
 
     def fails_later(outcome):
@@ -167,7 +169,7 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
     for outcome in (Outcome.INFEASIBLE, Outcome.TIME_LIMIT, Outcome.INTERRUPTED):
         with monkeypatch.context() as patched:
             patched.setattr(Transcription, "solve_on", fails_later(outcome))
-            solution = dd.solve(problem, refine=refine, method="collocation", time_limit=60)
+            solution = dd.solve(problem, options=Options(refine=refine), method="collocation", time_limit=60)
         np.testing.assert_array_equal(solution.xs, coarse.xs)
         if outcome is Outcome.INFEASIBLE:
             assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
@@ -189,7 +191,7 @@ def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):
         constraints=dd.Constraint(lambda x: x[1], upper=6.0, name="speed"),
     )
     coarse = dd.solve(problem, method="collocation")
-    fine = dd.solve(problem, method="collocation", refine=True, error_tolerance=1e-8)
+    fine = dd.solve(problem, method="collocation", options=Options(refine=True, error_tolerance=1e-8))
     assert len(fine.us) > 20
     assert fine.integration_error <= 1e-8 < coarse.integration_error
     assert fine.times[fine.knots] == pytest.approx(coarse.times, rel=1e-12)

@@ -12,6 +12,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.model.tangent import tangent_space
+from drake_diff.optimize import Options
 from drake_diff.optimize.continuation import follow, read_relaxed_plant, relaxed_schedule
 from drake_diff.optimize.relaxed.plant import Softness, relaxed_plant
 from drake_diff.optimize.relaxed.search import Band, RelaxedSearch, between, slopes_of
@@ -183,7 +184,7 @@ def test_a_hopper_that_stands_gets_half_a_metre_on(time_step, clearance):
     above = {} if clearance is None else {round(0.6 * count): {"z": 0.5 + clearance, "leg": 0.45}}
     cost = dd.QuadraticCost(R=1e-3 * np.eye(2), u_ref=[0, 10])
     problem = dd.Problem(model, x0=x0, x_goal=goal, num_steps=count, running_cost=cost, waypoints=above)
-    solution = dd.solve(problem, continuation="relaxed", max_iterations=100)
+    solution = dd.solve(problem, options=Options(continuation="relaxed"), max_iterations=100)
     assert solution.success, solution.message
     assert any(not contacts for contacts in solution.replay.contacts) or clearance is None
     assert solution.replay.contacts[-1]
@@ -211,7 +212,7 @@ def test_a_quadruped_stands_up_from_a_crouch():
     Q[7 : model.nq], Q[model.nq :] = 0.1, 0.01
     cost = dd.QuadraticCost(Q=np.diag(Q), R=1e-3 * np.eye(model.nu), x_ref=ref)
     problem = dd.Problem(model, x0=x0, x_goal=goal, num_steps=30, running_cost=cost)
-    solution = dd.solve(problem, continuation="relaxed", max_iterations=150)
+    solution = dd.solve(problem, options=Options(continuation="relaxed"), max_iterations=150)
     assert solution.success, solution.message
     assert posture[6] - x0[6] > 0.04
     assert len(solution.replay.contacts[-1]) == 4
@@ -220,10 +221,10 @@ def test_a_quadruped_stands_up_from_a_crouch():
 def test_what_has_no_relaxed_contact_is_refused_by_name(load, two_spheres):
     pendulum = dd.Problem(load("pendulum.urdf"), x0=[0, 0], num_steps=5, x_goal=[1, 0])
     with pytest.raises(InputError, match="no sphere may touch"):
-        dd.solve(pendulum, method="ilqr", continuation="relaxed")
+        dd.solve(pendulum, method="ilqr", options=Options(continuation="relaxed"))
     free = push(two_spheres(), gap=0.4, goal=1.0, optimize=("controls", "initial_state"))
     with pytest.raises(InputError, match="free initial state"):
-        dd.solve(free, method="ilqr", continuation="relaxed")
+        dd.solve(free, method="ilqr", options=Options(continuation="relaxed"))
     hydroelastic = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01, contact_model="hydroelastic")
     assert isinstance(relaxed_plant(hydroelastic), Refusal)
     assert "couplers" in relaxed_plant(example_robot("panda.urdf")).reason  # of its two fingers

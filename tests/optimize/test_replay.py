@@ -11,6 +11,7 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.model.parameters import select
 from drake_diff.motion import LQR
+from drake_diff.optimize import Options
 from drake_diff.optimize.replay import (
     FEEDBACK_TOLERANCE,
     STATE_TOLERANCE,
@@ -229,7 +230,7 @@ def test_inputs_that_cannot_be_stepped_are_missing_not_zero(write_urdf):
 def test_a_collocated_plan_is_replayed_in_finer_steps_until_two_hold(write_urdf):
     """4 intervals: at h = 0.25 the simulator ends h T / 2 times the mean slope elsewhere, at h/16 within 5 %."""
     problem = block(write_urdf, time_step=0.25, count=4, x_goal=[1, 0])
-    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson")
+    solution = dd.solve(problem, method="collocation", options=Options(scheme="hermite_simpson"))
     assert solution.success, solution.message
     variants = list(dict.fromkeys(r.variant for r in solution.replays))
     assert variants[:2] == ["in steps of 0.25 s", "in steps of 0.125 s"]

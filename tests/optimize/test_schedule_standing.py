@@ -9,6 +9,7 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.legs.feet import Legs
 from drake_diff.legs.standing import standing
+from drake_diff.optimize import Options
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 LEGS = "FL", "FR", "RL", "RR"
@@ -145,7 +146,7 @@ def test_a_strangers_quadruped_trots():
     guess = schedule.guess(model, x0, end)
     goals = [schedule, dd.FrameGoal("base", end[4:7], tolerance=0.05)]
     problem = dd.Problem(model, x0=x0, num_steps=len(guess[1]), goals=goals, **schedule.follow(model, guess))
-    solution = dd.solve(problem, method="ilqr", tolerance=1e-4, initial_guess=guess)
+    solution = dd.solve(problem, method="ilqr", options=Options(tolerance=1e-4), initial_guess=guess)
     assert solution.success, solution.message
     context = model.plant.CreateDefaultContext()
 

@@ -10,6 +10,7 @@ from helpers.table import each_row, slow_after
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, UnknownNameError
+from drake_diff.optimize import Options
 from drake_diff.optimize.transcription.kkt import HeldPlan
 
 pytestmark = pytest.mark.solve
@@ -27,7 +28,7 @@ def block(limit=np.inf, **asked):
 @each_row("scheme", ["hermite_simpson", "trapezoid"])
 def test_a_block_between_two_states_has_the_closed_forms_derivative(scheme):
     """cost = 12 d^2 - 12 d (v0 + v1) + 4 (v0^2 + v0 v1 + v1^2), d the way and v0, v1 the speeds at the ends."""
-    solution = dd.solve(block(), scheme=scheme)
+    solution = dd.solve(block(), options=Options(scheme=scheme))
     by_goal, by_x0 = dd.sensitivity(solution, "goal"), dd.sensitivity(solution, "x0")
     exact = scheme == "hermite_simpson"  # of order 2 the other's is off by 4 % in ten intervals
     np.testing.assert_allclose(by_goal.cost, [24, -12], rtol=1e-9 if exact else 0.05)
@@ -96,7 +97,11 @@ def test_what_has_no_sensitivity_is_refused(write_urdf):
         (problem, "x0", "solution: expected a Solution"),
         (dd.solve(problem, method="ilqr"), (), 'expected "x0", "goal", or names of parameters'),
         (dd.solve(block(3.9)), "x0", "expected one that is a success"),
-        (dd.solve(problem, method="collocation", scheme="drake"), "x0", "hermite_simpson, trapezoid, iLQR or shooting"),
+        (
+            dd.solve(problem, method="collocation", options=Options(scheme="drake")),
+            "x0",
+            "hermite_simpson, trapezoid, iLQR or shooting",
+        ),
         (solution, (), 'expected "x0", "goal", or names of parameters'),
         (dd.solve(block(x_goal=None, final_cost=lambda x: (x[0] - 1) ** 2)), "goal", "all of its entries are free"),
     ):

@@ -11,6 +11,7 @@ from helpers.plants import block
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff.optimize import Options
 
 METHODS = ("collocation", "shooting", "ilqr")
 N, H = 10, 0.1
@@ -174,7 +175,7 @@ def test_the_integration_error_falls_by_the_fourth_order_of_hermite_simpson():
         problem = dd.Problem(
             model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=count, running_cost=dd.QuadraticCost(R=[[1.0]])
         )
-        errors.append(dd.solve(problem, method="collocation", refine=False).integration_error)
+        errors.append(dd.solve(problem, method="collocation", options=Options(refine=False)).integration_error)
     assert 0 < errors[1] < errors[0] / 16
 
 

@@ -7,6 +7,7 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.derivatives.smooth_step import SmoothStep
+from drake_diff.optimize import Options
 
 pytestmark = pytest.mark.solve
 
@@ -26,7 +27,7 @@ def test_minimum_time_is_bang_bang(write_urdf, scheme):
         horizon=(0.5, 8.0),
         bounds=dd.Bounds(u_lower=[-1], u_upper=[1]),
     )
-    solution = dd.solve(problem, method="collocation", scheme=scheme)
+    solution = dd.solve(problem, method="collocation", options=Options(scheme=scheme))
     # The input jumps at the middle, where all have to be continuous, so that O(h^2) of the way is lost.
     assert 2.0 < solution.horizon < 2.01, solution.message
     assert solution.cost == pytest.approx(solution.horizon, rel=1e-12)
@@ -59,7 +60,7 @@ def test_what_a_constraint_is_exceeded_by_between_the_nodes_is_in_the_record(wri
         running_cost=EFFORT,
         constraints=dd.Constraint(lambda x: x[1], upper=1.25, name="slow"),
     )
-    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson", refine=False)
+    solution = dd.solve(problem, method="collocation", options=Options(scheme="hermite_simpson", refine=False))
     record = dd.save(solution, tmp_path / f"run{count}")
     metrics = {m.name: m for m in record.metrics}
     beyond = solution.transcribed.at(np.linspace(0, 1, 5001))[0][:, 1].max() - 1.25

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from helpers.models import Plant, contact_properties
 from helpers.plants import pd_pendulum
+from helpers.solving import solve_with
 from helpers.table import each_row, slow_after
 from pydrake.geometry import Sphere
 
 import drake_diff as dd
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
+from drake_diff.optimize import Options
 from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.optimize.run import Run
 from drake_diff.optimize.solution import Status
@@ -29,7 +31,7 @@ def swing_up(load, count, cost=EFFORT, **changes):
 
 @pytest.mark.slow
 def test_snopt_finds_the_same_swing_up(load):
-    solution = dd.solve(swing_up(load, 20), method="collocation", scheme="drake", solver="snopt")
+    solution = dd.solve(swing_up(load, 20), method="collocation", options=Options(scheme="drake", solver="snopt"))
     assert solution.cost == pytest.approx(62.58516350539, rel=1e-8)
 
 
@@ -47,7 +49,7 @@ SOFT = {
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])
 def test_pendulum_with_a_soft_goal(load, method):
     """J* = 1.88951695347 by a solve of the same steps beside Drake."""
-    solution = dd.solve(pendulum(load, **SOFT), method=method, tolerance=1e-10)
+    solution = dd.solve(pendulum(load, **SOFT), method=method, options=Options(tolerance=1e-10))
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(1.88951695347, rel=1e-10)
     assert solution.us[:4, 0] == pytest.approx([3.31679908, 3.64914248, 3.96280849, 4.25531903], abs=1e-5)
@@ -63,7 +65,7 @@ def test_active_input_bounds_give_the_same_optimum_by_ilqr_and_by_shooting(load)
 
 
 def test_a_coarse_collocation_is_not_called_converged(load):
-    solution = dd.solve(swing_up(load, 8), method="collocation", refine=False)
+    solution = dd.solve(swing_up(load, 8), method="collocation", options=Options(refine=False))
     assert not solution.success
     assert "an accurate integration from knot" in solution.message
 
@@ -101,7 +103,7 @@ def test_a_refused_derivative_ends_as_no_gradient(load, monkeypatch):
 )
 def test_the_solvers_own_table_is_kept(load, method, solver):
     scheme = "drake" if (method, solver) == ("collocation", "snopt") else None
-    rows = dd.solve(swing_up(load, 20), method=method, solver=solver, scheme=scheme).iterations
+    rows = dd.solve(swing_up(load, 20), method=method, options=Options(solver=solver, scheme=scheme)).iterations
     assert len(rows) > 5
     assert all(math.isfinite(row.objective) and math.isfinite(row.primal_infeasibility) for row in rows)
     assert [row.iteration for row in rows] == sorted({row.iteration for row in rows})
@@ -188,7 +190,7 @@ def test_collocation_through_a_ball_between_two_knots_is_not_verified():
 def test_bad_options_are_named_before_anything_runs(load, options, words):
     started = []
     with pytest.raises(InputError, match=words):
-        dd.solve(swing_up(load, 20), on_start=lambda: started.append(1), **options)
+        solve_with(swing_up(load, 20), on_start=lambda: started.append(1), **options)
     assert not started
 
 
@@ -208,14 +210,14 @@ def test_auto_goes_on_from_what_a_failed_attempt_left(load, monkeypatch):
     honest = Run.collocate
     calls = []
 
-    def fail_once(self, guess, refinement, *, refine):
+    def fail_once(self, guess):
         calls.append(guess)
-        solution = honest(self, guess, refinement, refine=refine)
+        solution = honest(self, guess)
         return dataclasses.replace(solution, status=Status.INFEASIBLE) if len(calls) == 1 else solution
 
     monkeypatch.setattr(Run, "collocate", fail_once)
-    monkeypatch.setattr("drake_diff.optimize.solve.OTHER_GUESSES", 0)
-    solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]))
+    problem = pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0])
+    solution = dd.solve(problem, options=Options(other_guesses=0))
     assert solution.success, solution.message
     assert [link["method"] for link in solution.options["chain"]] == ["collocation", "ilqr"]
     assert solution.options["chain"][1]["reason"] == "collocation was not verified: a guess for it"

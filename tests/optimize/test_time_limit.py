@@ -23,7 +23,7 @@ from drake_diff._base.clock import (
 )
 from drake_diff._base.compiled import time_compilations
 from drake_diff.model import twin
-from drake_diff.optimize import run
+from drake_diff.optimize import Options, run
 from drake_diff.optimize.transcription import steps
 
 STATUS = dd.Status.TIME_LIMIT
@@ -87,7 +87,7 @@ def test_what_is_found_in_time_and_not_certified_is_not_called_verified(monkeypa
     clock = stopped(monkeypatch)
     for name in ("certify_equations", "certify_steps"):
         monkeypatch.setattr(run, name, late(clock, getattr(run, name), from_call=2))
-    found = dd.solve(swing(), method=method, solver=solver, time_limit=10.0)
+    found = dd.solve(swing(), method=method, options=Options(solver=solver), time_limit=10.0)
     assert found.status is STATUS
     assert "not made within the time limit: certificates of the result, replays and other measures" in found.message
     assert found.goal_error < 1e-5  # the motion is the one that was found
@@ -141,7 +141,7 @@ def test_no_iteration_is_begun_that_would_end_after_the_limit(monkeypatch):
 
     monkeypatch.setattr(steps.StepProgram, "_hessian", slow)
     begun = clock.now
-    found = dd.solve(swing(), method="shooting", time_limit=10.0, tolerance=1e-14)
+    found = dd.solve(swing(), method="shooting", time_limit=10.0, options=Options(tolerance=1e-14))
     assert found.status is STATUS
     assert each < clock.now - begun <= 10.0  # a fourth evaluation would end after 12 s
 
@@ -162,7 +162,7 @@ def test_a_signal_in_the_middle_of_an_evaluation_ends_it(monkeypatch, method, so
     def on_plan(plan):
         plans.append((plan.status, len(calls) - signalled))
 
-    found = dd.solve(swing(), method=method, solver=solver, tolerance=1e-14, on_plan=on_plan)
+    found = dd.solve(swing(), method=method, options=Options(solver=solver, tolerance=1e-14, on_plan=on_plan))
     assert found.status is dd.Status.INTERRUPTED
     ((status, after),) = plans
     assert status is dd.Status.INTERRUPTED
@@ -202,11 +202,11 @@ def test_what_numba_compiles_is_told_and_no_limit_counts_it(monkeypatch, method,
     name = "certify_equations" if method == "collocation" else "certify_steps"
     real = getattr(run, name)
     monkeypatch.setattr(run, name, compiling)
-    found = dd.solve(problem, method=method, solver=solver, time_limit=10.0, progress=lines.append)
+    found = dd.solve(problem, method=method, options=Options(solver=solver), time_limit=10.0, progress=lines.append)
     assert found.success
     assert uncounted() - before == pytest.approx(6e7)  # certificates of the guess, and of the result
     assert lines[-1] == "Numba compiled for 6e+07 s, once on this machine, which no time limit counts"
     monkeypatch.setattr(run, "judged", late(clock, run.judged, from_call=1))
-    found = dd.solve(problem, method=method, solver=solver, time_limit=10.0)
+    found = dd.solve(problem, method=method, options=Options(solver=solver), time_limit=10.0)
     assert found.status is STATUS
     assert found.message.endswith(lines[-1])

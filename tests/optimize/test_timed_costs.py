@@ -11,7 +11,7 @@ from pydrake.trajectories import PiecewisePolynomial
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ShapeError
 from drake_diff.loop import MPC, closed_loop
-from drake_diff.optimize import TrackingCost
+from drake_diff.optimize import Options, TrackingCost
 from drake_diff.runs.sections import describe_problem
 
 METHODS = ["collocation", "ilqr", "shooting"]
@@ -143,7 +143,7 @@ def test_what_cannot_be_is_refused(cost, options, message):
 def test_drakes_own_transcription_has_no_time(write_urdf):
     problem = block(write_urdf, running_cost=lambda x, u, t: t * u[0] ** 2, x_goal=[1, 0])
     with pytest.raises(InputError, match="changes in time"):
-        dd.solve(problem, method="collocation", scheme="drake", solver="snopt")
+        dd.solve(problem, method="collocation", options=Options(scheme="drake", solver="snopt"))
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, random_state
 from helpers.plants import block, floating
+from helpers.solving import solve_with
 from helpers.table import each_row
 from helpers.transcription import BLOCK, collocate, effort, heavy_pendulum, move, own_derivatives, push, unit_inputs
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
@@ -209,9 +210,9 @@ def test_an_input_that_is_too_large_between_the_nodes_is_no_success(monkeypatch)
     at_nodes_alone(monkeypatch)
     asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 20, "horizon": (0.1, 10), "running_cost": 1.0}
     once = {"method": "collocation", "refine": False}
-    by_model = dd.solve(dd.Problem(block(effort=1.0), **asked), **once)
-    by_formula = dd.solve(dd.Problem(BLOCK, bounds=unit_inputs(), **asked), **once)
-    by_its_limits = dd.solve(dd.Problem(dd.Dynamics(push, 2, 1, u_lower=[-1], u_upper=[1]), **asked), **once)
+    by_model = solve_with(dd.Problem(block(effort=1.0), **asked), **once)
+    by_formula = solve_with(dd.Problem(BLOCK, bounds=unit_inputs(), **asked), **once)
+    by_its_limits = solve_with(dd.Problem(dd.Dynamics(push, 2, 1, u_lower=[-1], u_upper=[1]), **asked), **once)
     for motion in (by_model, by_formula, by_its_limits):
         assert motion.horizon < 2
         assert np.abs(motion.us).max() < 1 + 1e-7

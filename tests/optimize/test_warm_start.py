@@ -7,6 +7,7 @@ import pytest
 from helpers.table import each_row, slow_after
 
 import drake_diff as dd
+from drake_diff.optimize import Options
 from drake_diff.optimize.program import Multipliers
 
 pytestmark = pytest.mark.solve
@@ -89,13 +90,13 @@ def test_a_refined_mesh_is_gone_on_from():
     model = dd.example_model("double_pendulum", time_step=0.03)
     cost = dd.QuadraticCost(R=np.eye(2))
     problem = dd.Problem(model, x0=[0] * 4, x_goal=[np.pi, 0, 0, 0], num_steps=40, running_cost=cost)
-    solution = dd.solve(problem, method="collocation", refine=True, error_tolerance=1e-5)
+    solution = dd.solve(problem, method="collocation", options=Options(refine=True, error_tolerance=1e-5))
     assert len(solution.us) > 40
     again = dd.solve(problem, method="collocation", initial_guess=solution)
     assert again.success
     assert len(again.us) == len(solution.us)
     assert steps(again) <= 3
-    never = dd.solve(problem, method="collocation", initial_guess=solution, refine=False)
+    never = dd.solve(problem, method="collocation", initial_guess=solution, options=Options(refine=False))
     assert len(never.us) == 40
 
 

@@ -10,6 +10,7 @@ from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.logs.mcap_file import read_mcap
+from drake_diff.optimize import Options
 from drake_diff.runs.trace import read_trace
 
 pytestmark = pytest.mark.solve
@@ -186,7 +187,7 @@ def test_plain_dynamics_are_saved_and_what_cannot_be_known_is_said(tmp_path):
 
 
 def test_a_refined_mesh_comes_back_and_is_measured_at_the_problem_s_own_knots(swing_up, tmp_path):
-    solution = dd.solve(swing_up.problem, method="collocation", refine=True, error_tolerance=1e-9)
+    solution = dd.solve(swing_up.problem, method="collocation", options=Options(refine=True, error_tolerance=1e-9))
     assert len(solution.mesh) == len(solution.xs) > 41
     record = dd.save(solution, tmp_path / "run")
     trace = read_trace(tmp_path / "run" / "trace.mcap")

@@ -23,6 +23,7 @@ from helpers.faults import (
     two_solutions,
 )
 from helpers.models import MODELS
+from helpers.solving import solve_with
 from helpers.table import each_row
 
 import drake_diff as dd
@@ -45,12 +46,12 @@ pytestmark = pytest.mark.solve
 OLD, NEW = 0.2, 0.3  # the goals of the two runs
 SEARCHES = {
     "collocation": (Transcription, "solve"),
-    "in phases": (phased._PhasedRun, "_solve_on"),
+    "in phases": (phased.PhasedTranscription, "solve"),
     "shooting": (optimize_run, "solve_shooting"),
 }
 BUILT = {
     "collocation": "optimize.run.Transcription",
-    "in phases": "optimize.phased.Transcription",
+    "in phases": "optimize.phased.PhasedTranscription",
     "ilqr": "optimize.run.certify_steps",
 }
 
@@ -265,7 +266,7 @@ def test_every_fault_in_any_call_loses_nothing(run, solutions, monkeypatch, exch
 def test_each_signal_ends_a_search_with_its_best_plan(solutions, tmp_path, number):
     before, plans = signal.getsignal(number), []
     words = {"method": "ilqr", "on_plan": plans.append, "progress": lambda _: signal.raise_signal(number)}
-    solution = dd.solve(solutions[1].problem, **words)
+    solution = solve_with(solutions[1].problem, **words)
     assert solution.status is dd.Status.INTERRUPTED
     assert signal.getsignal(number) is before
     (plan,) = plans
@@ -292,7 +293,7 @@ def test_a_signal_before_the_search_leaves_the_guess_as_a_plan(solutions, tmp_pa
     if early == "as the record is begun":
         words["on_start"] = interrupted
     before = signal.getsignal(signal.SIGTERM)
-    solution = dd.solve(problem, **words)
+    solution = solve_with(problem, **words)
     assert solution.status is dd.Status.INTERRUPTED
     assert signal.getsignal(signal.SIGTERM) is before
     (plan,) = plans

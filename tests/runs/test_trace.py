@@ -18,6 +18,7 @@ import drake_diff as dd
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs import read_mcap
+from drake_diff.optimize import Options
 from drake_diff.optimize.program import Iteration
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs import measure, read_trace
@@ -47,7 +48,7 @@ def bits(value):
 @pytest.fixture(scope="module")
 def collocated():
     """Free horizon, inputs at the midpoints."""
-    solution = dd.solve(pendulum(horizon=(0.5, 3.0)), method="collocation", scheme="hermite_simpson")
+    solution = dd.solve(pendulum(horizon=(0.5, 3.0)), method="collocation", options=Options(scheme="hermite_simpson"))
     assert solution.us_mid is not None
     assert solution.free_horizon is not None
     return solution

@@ -25,6 +25,7 @@ import drake_diff as dd
 import drake_diff.runs.save as evidence
 from drake_diff.comparison import save_comparison
 from drake_diff.exceptions import ArtifactError
+from drake_diff.optimize import Options
 from drake_diff.runs import ComparisonRecord, certify_model, measure
 from drake_diff.runs.differences import is_near, is_near_text
 from drake_diff.runs.fields import reproducible
@@ -550,7 +551,7 @@ def test_a_given_guess_and_the_problems_own_are_run_again(solution, tmp_path):
         "solution": dd.solve(free, method="collocation", initial_guess=coarse),
         "inputs": swing_up(us=np.full((20, 1), 0.5)),
         "auto": dd.solve(solution.problem, initial_guess=solution, max_iterations=3),
-        "stages": dd.solve(push, continuation=[stage], max_iterations=2),
+        "stages": dd.solve(push, options=Options(continuation=[stage]), max_iterations=2),
     }
     for name, run in runs.items():
         dd.save(run, tmp_path / name)
@@ -563,7 +564,7 @@ def test_collocation_and_found_parameters_are_run_again(tmp_path):
     cost = dd.QuadraticCost(R=[[1.0]])
     for scheme in ("hermite_simpson", "drake"):
         problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost, horizon=(0.3, 0.5))
-        dd.save(dd.solve(problem, method="collocation", scheme=scheme), tmp_path / scheme)
+        dd.save(dd.solve(problem, method="collocation", options=Options(scheme=scheme)), tmp_path / scheme)
         assert dd.verify(tmp_path / scheme).require().holds
     problem = dd.Problem(
         model,

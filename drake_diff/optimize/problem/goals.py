@@ -8,8 +8,9 @@ A plan aims at the middle of a goal's tolerance (see AIMED), and each replay on 
 steps of another length end a little elsewhere.
 """
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, MISSING, dataclass, fields
+from dataclasses import KW_ONLY, MISSING, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -27,10 +28,12 @@ from drake_diff.mechanics.quantities import (
 )
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.names import coordinates
+from drake_diff.optimize.problem.dynamics import coordinates
 
 LAST = (-1,)
 AIMED = 0.1  # of a tolerance: what a plan may use of it; the rest is for what steps of other lengths do to it
+STAYED = 0.5  # the same of a goal that stays so for a while
+ROUNDED = 1e-9  # of an interval
 USED = 0.9  # the same of a tolerance that is there to be used
 SAME_ROTATION = 1e-3  # of a quaternion's norm from 1: typed by hand, it is made one
 SMALLEST_BALL = 0.015  # [m] the radius of what is drawn
@@ -113,6 +116,7 @@ class Goal:
     """
 
     weight: float | None
+    knots: Any
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         """What has to hold of a motion of `model`; UnknownNameError where it has no such frame or joint."""
@@ -141,6 +145,14 @@ class Goal:
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    def _check(self, **values: Any) -> None:
+        """Check the fields that goals have in common, and set these and the `values` of the others."""
+        given, kind = vars(self), type(self).__name__
+        for name in given:
+            if name in CHECKS and name not in values:
+                values[name] = CHECKS[name](f"{kind}.{name}", given[name])
+        self._set(**values, weight=checked_weight(kind, self.weight, self.knots))
 
 
 @dataclass(frozen=True, repr=False)
@@ -190,16 +202,8 @@ class FrameGoal(Goal):
         position = None if self.position is None else with_gaps("FrameGoal.position", self.position, 3)
         if self.rotation is None and (position is None or not any(p is not None for p in position)):
             raise InputError("FrameGoal", got="no position and no rotation", expected="one of them, or both")
-        self._set(
-            frame=name_of("FrameGoal.frame", self.frame),
-            position=position,
-            rotation=None if self.rotation is None else rotation_of("FrameGoal.rotation", self.rotation),
-            point=tuple(finite_array("FrameGoal.point", self.point, (3,)).tolist()),
-            tolerance=positive_float("FrameGoal.tolerance [m]", self.tolerance),
-            rotation_tolerance=positive_float("FrameGoal.rotation_tolerance [rad]", self.rotation_tolerance),
-            knots=checked_knots("FrameGoal.knots", self.knots),
-            weight=checked_weight("FrameGoal", self.weight, self.knots),
-        )
+        rotation = None if self.rotation is None else rotation_of("FrameGoal.rotation", self.rotation)
+        self._check(position=position, rotation=rotation)
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         constraints = []
@@ -258,15 +262,9 @@ class FrameVelocityGoal(Goal):
     def __post_init__(self) -> None:
         free = (None, None, None)
         velocity, turning = (free if v is None else v for v in (self.velocity, self.angular_velocity))
-        self._set(
-            frame=name_of("FrameVelocityGoal.frame", self.frame),
+        self._check(
             velocity=with_gaps("FrameVelocityGoal.velocity", velocity, 3),
             angular_velocity=with_gaps("FrameVelocityGoal.angular_velocity", turning, 3),
-            point=tuple(finite_array("FrameVelocityGoal.point", self.point, (3,)).tolist()),
-            tolerance=positive_float("FrameVelocityGoal.tolerance [m/s]", self.tolerance),
-            angular_tolerance=positive_float("FrameVelocityGoal.angular_tolerance [rad/s]", self.angular_tolerance),
-            knots=checked_knots("FrameVelocityGoal.knots", self.knots),
-            weight=checked_weight("FrameVelocityGoal", self.weight, self.knots),
         )
         if all(v is None for v in (*self.velocity, *self.angular_velocity)):
             raise InputError("FrameVelocityGoal", got="nothing but free entries", expected="a velocity")
@@ -320,15 +318,8 @@ class JointGoal(Goal):
     def __post_init__(self) -> None:
         if not isinstance(self.values, Mapping) or not self.values:
             raise InputError("JointGoal", got=repr(self.values)[:80], expected="a value for each name")
-        self._set(
-            values={
-                name_of("JointGoal", name): float(finite_array(f"JointGoal {name}", value, ()))
-                for name, value in sorted(self.values.items(), key=lambda item: str(item[0]))  # a record has them so
-            },
-            tolerance=positive_float("JointGoal.tolerance", self.tolerance),
-            knots=checked_knots("JointGoal.knots", self.knots),
-            weight=checked_weight("JointGoal", self.weight, self.knots),
-        )
+        values = sorted(self.values.items(), key=lambda item: str(item[0]))  # a record has them so
+        self._check(values={name_of("JointGoal", n): float(finite_array(f"JointGoal {n}", v, ())) for n, v in values})
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         wanted, contract = coordinates(model, "JointGoal", self.values), model.contract
@@ -374,12 +365,7 @@ class CenterOfMassGoal(Goal):
         position = with_gaps("CenterOfMassGoal.position", self.position, 3)
         if not any(p is not None for p in position):
             raise InputError("CenterOfMassGoal", got="nothing but free entries", expected="a position")
-        self._set(
-            position=position,
-            tolerance=positive_float("CenterOfMassGoal.tolerance [m]", self.tolerance),
-            knots=checked_knots("CenterOfMassGoal.knots", self.knots),
-            weight=checked_weight("CenterOfMassGoal", self.weight, self.knots),
-        )
+        self._check(position=position)
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         wanted = _gaps(self.position)
@@ -420,13 +406,7 @@ class KeepLevel(Goal):
         axis = tuple(finite_array("KeepLevel.axis", self.axis, (3,)).tolist())
         if not any(axis):
             raise InputError("KeepLevel.axis", got=list(axis), expected="a direction")
-        self._set(
-            frame=name_of("KeepLevel.frame", self.frame),
-            axis=axis,
-            tolerance=positive_float("KeepLevel.tolerance [rad]", self.tolerance),
-            knots=checked_knots("KeepLevel.knots", self.knots),
-            weight=checked_weight("KeepLevel", self.weight, self.knots),
-        )
+        self._check(axis=axis)
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         leans = frame_tilt(model, self.frame, self.axis)
@@ -444,6 +424,90 @@ class KeepLevel(Goal):
 
     def marks(self) -> tuple[Mark, ...]:
         return (Mark(f"{self.frame} level", "arrow", tuple(0.15 * a for a in _unit(self.axis)), frame=self.frame),)
+
+
+@dataclass(frozen=True, repr=False)
+class Dwell(Goal):
+    """A goal holds at every moment of at least so many seconds: before the end, or before another knot.
+
+    It begins at the last knot that is early enough. A plan uses half of the goal's tolerance, and is looked at between
+    its knots too; the replays have all of it at each of their steps. Every method keeps it.
+
+    Args:
+        goal: What holds, such as a `FrameGoal` or a `JointGoal`; its own `knots` are not used.
+        seconds: [s] for how long at least.
+        end: The knot at which it ends; negative ones count from the end.
+
+    Raises:
+        InputError: Values that are none; or, by the Problem, a horizon that is free or too short. With a free one, a
+            `PhasedProblem` has a phase for the stay.
+
+    Example:
+        >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.05)
+        >>> stay = dd.optimize.Dwell(dd.JointGoal({"slide_x": 0.5}, tolerance=0.02), 0.5)
+        >>> problem = dd.Problem(
+        ...     model, x0=np.zeros(4), num_steps=50, goals=[stay], running_cost=dd.QuadraticCost(R=[[1.0]])
+        ... )
+        >>> solution = dd.solve(problem)
+        >>> solution.success, bool(np.abs(solution.xs[-11:, 0] - 0.5).max() < 0.02)
+        (True, True)
+    """
+
+    goal: Goal
+    seconds: float
+    _: KW_ONLY
+    end: int = -1
+
+    weight = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.goal, Goal) or "knots" not in {f.name for f in fields(self.goal)}:  # type: ignore[arg-type]
+            raise InputError("Dwell.goal", got=repr(self.goal)[:80], expected="a goal of a state, such as a FrameGoal")
+        if self.goal.weight is not None or self.goal.knots not in (None, LAST):
+            raise InputError("Dwell.goal", got=repr(self.goal)[:80], expected="a goal without knots and weight")
+        if isinstance(self.end, bool) or not isinstance(self.end, (int, np.integer)):
+            raise InputError("Dwell.end", got=repr(self.end), expected="a whole number")
+        self._set(seconds=positive_float("Dwell.seconds [s]", self.seconds), end=int(self.end))
+
+    def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
+        knots = self.knots_in(problem)
+        goal: Any = self.goal
+        return tuple(_held(c) for c in replace(goal, knots=knots).bind_to(problem))
+
+    def knots_in(self, problem: Any) -> tuple[int, ...]:
+        """The knots of a Problem at which it holds."""
+        count, horizon = problem.num_steps, problem.horizon
+        if not -count - 1 <= self.end <= count:
+            raise InputError("Dwell.end", got=self.end, expected=f"a whole number from {-count - 1} to {count}")
+        if horizon is not None and horizon[0] < horizon[1]:
+            expected = "a horizon that is given; a PhasedProblem has a phase for a stay"
+            raise InputError("Dwell", got="a free horizon", expected=expected)
+        last, h = self.end % (count + 1), problem.start_horizon / count
+        first = last - math.ceil(self.seconds / h - ROUNDED)
+        if first < 0:
+            raise InputError("Dwell.seconds [s]", got=self.seconds, expected=f"at most {last * h:g}, from knot 0 on")
+        return tuple(range(first, last + 1))
+
+    def marks(self) -> Any:
+        return self.goal.marks()
+
+    def to_dict(self) -> dict[str, Any]:
+        end = {} if self.end == -1 else {"end": self.end}
+        return {"Dwell": {"goal": self.goal.to_dict(), "seconds": self.seconds, **end}}
+
+    def __repr__(self) -> str:
+        end = "" if self.end == -1 else f", end={self.end}"
+        return f"Dwell({self.goal!r}, {self.seconds:g}{end})"
+
+
+def _held(c: GoalConstraint) -> GoalConstraint:
+    """`c` all along between its knots, with the part of its tolerance that a stay may use."""
+    fraction = STAYED / AIMED if c.measured is None else 1.0
+    middle = np.nan_to_num(c.wanted)
+    lower, upper = (
+        np.where(np.isnan(c.wanted), side, middle + fraction * (side - middle)) for side in (c.lower, c.upper)
+    )
+    return replace(c, lower=lower, upper=upper, name=f"{c.label}, stayed at", dwells=True)
 
 
 @dataclass(frozen=True)
@@ -554,6 +618,15 @@ def name_of(subject: str, given: Any) -> str:
     return given
 
 
+def names_of(subject: str, given: Any) -> tuple[str, ...] | None:
+    """Names of bodies as a tuple; None, which is all of them, as it is."""
+    if given is None:
+        return None
+    if isinstance(given, str) or not len(given):
+        raise InputError(subject, got=repr(given)[:80], expected="names of bodies, or None for all")
+    return tuple(name_of(subject, name) for name in given)
+
+
 def checked_knots(subject: str, given: Any) -> tuple[int, ...] | None:
     """Whole numbers as a tuple; None, which is all knots, as it is."""
     if given is None:
@@ -579,6 +652,18 @@ def rotation_of(subject: str, given: Any) -> tuple[tuple[float, ...], ...]:
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
+
+
+CHECKS: dict[str, Callable[[str, Any], Any]] = {
+    "frame": name_of,
+    "knots": checked_knots,
+    "links": names_of,
+    "margin": lambda subject, value: (
+        0.0 if type(value) in (int, float) and not value else positive_float(subject, value)
+    ),
+    "point": lambda subject, value: tuple(finite_array(subject, value, (3,)).tolist()),
+    **dict.fromkeys(("tolerance", "rotation_tolerance", "angular_tolerance"), positive_float),
+}
 
 
 def _plain(value: Any) -> Any:

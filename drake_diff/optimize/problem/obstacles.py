@@ -24,7 +24,7 @@ from drake_diff.model.plant import bodies, labelled
 from drake_diff.model.tangent import any_state
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, checked_weight, name_of, rotation_of
+from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, names_of, rotation_of
 
 MARGIN = 0.01  # [m]
 TOLERANCE_PART, SMALLEST_TOLERANCE = 0.1, 1e-4  # of the margin, and [m]: what a plan may be nearer between its knots
@@ -126,17 +126,7 @@ class Obstacle(Goal):
 
     margin: float
     links: Any
-    weight: float | None
     knots = None  # all of them
-
-    def checked_common(self) -> dict[str, Any]:
-        """The fields that every obstacle has, checked."""
-        kind = type(self).__name__
-        return {
-            "margin": _margin(f"{kind}.margin [m]", self.margin),
-            "links": _names(f"{kind}.links", self.links),
-            "weight": checked_weight(kind, self.weight, None),
-        }
 
     def constraints(
         self, clearance: Clearance, margin: float, name: str, thing: str
@@ -161,8 +151,28 @@ class Obstacle(Goal):
         return (constraint,)
 
 
+class _Solid(Obstacle):
+    """An obstacle in the world, with a `center` (3,) [m] and a `name`."""
+
+    center: Any
+    name: str
+    shape: str
+
+    @property
+    def label(self) -> str:
+        """The name, or where it is."""
+        return repr(self.name) if self.name else f"{self.shape} at " + ", ".join(f"{c:g}" for c in self.center)
+
+    def _kept_from(self, model: Model, radius: float, distance: Callable[..., Clearance]) -> Any:
+        """What keeps away all that may come within `radius` [m] and the margin, by its `distance`."""
+        kinematics, center = _kinematics(model), np.array(self.center)
+        pieces = _near(kinematics, _pieces(model, kinematics, self.links), center, radius + self.margin)
+        clearance = distance(model, kinematics, pieces, center)
+        return self.constraints(clearance, self.margin, f"clear of {self.label}", f"obstacle {self.label}")
+
+
 @dataclass(frozen=True, repr=False)
-class SphereObstacle(Obstacle):
+class SphereObstacle(_Solid):
     """A ball in the world that a robot keeps clear of, at every knot of a plan and in between.
 
     The robot is a few spheres and capsules on each link, which contain its collision shapes, or those that are drawn
@@ -198,30 +208,21 @@ class SphereObstacle(Obstacle):
     name: str = ""
     weight: float | None = None
 
-    def __post_init__(self) -> None:
-        self._set(
-            center=tuple(finite_array("SphereObstacle.center", self.center, (3,)).tolist()),
-            radius=positive_float("SphereObstacle.radius [m]", self.radius),
-            **self.checked_common(),
-        )
+    shape = "sphere"
 
-    @property
-    def label(self) -> str:
-        """The name, or where it is."""
-        return _called(self.name, "sphere", self.center)
+    def __post_init__(self) -> None:
+        center = tuple(finite_array("SphereObstacle.center", self.center, (3,)).tolist())
+        self._check(center=center, radius=positive_float("SphereObstacle.radius [m]", self.radius))
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        kinematics, center = _kinematics(model), np.array(self.center)
-        pieces = _near(kinematics, _pieces(model, kinematics, self.links), center, self.radius + self.margin)
-        clearance = FromBall(model, kinematics, pieces, center, self.radius)
-        return self.constraints(clearance, self.margin, f"clear of {self.label}", f"obstacle {self.label}")
+        return self._kept_from(model, self.radius, lambda m, p, near, c: FromBall(m, p, near, c, self.radius))
 
     def marks(self) -> tuple[Mark, ...]:
         return (Mark(f"obstacle {self.label}", "sphere", (self.radius,), self.center, colour=RED),)
 
 
 @dataclass(frozen=True, repr=False)
-class BoxObstacle(Obstacle):
+class BoxObstacle(_Solid):
     """A box in the world that a robot keeps clear of, at every knot of a plan and in between.
 
     The robot is what it is for a `SphereObstacle`. Beside a box its capsules are rows of balls that contain them and
@@ -256,28 +257,20 @@ class BoxObstacle(Obstacle):
     name: str = ""
     weight: float | None = None
 
+    shape = "box"
+
     def __post_init__(self) -> None:
         size = finite_array("BoxObstacle.size", self.size, (3,))
         if np.any(size <= 0):
             raise InputError("BoxObstacle.size [m]", got=size.tolist(), expected="three numbers above 0")
-        self._set(
-            center=tuple(finite_array("BoxObstacle.center", self.center, (3,)).tolist()),
-            size=tuple(size.tolist()),
-            rotation=rotation_of("BoxObstacle.rotation", self.rotation),
-            **self.checked_common(),
-        )
-
-    @property
-    def label(self) -> str:
-        """The name, or where it is."""
-        return _called(self.name, "box", self.center)
+        center = tuple(finite_array("BoxObstacle.center", self.center, (3,)).tolist())
+        rotation = rotation_of("BoxObstacle.rotation", self.rotation)
+        self._check(center=center, size=tuple(size.tolist()), rotation=rotation)
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        kinematics, center, half = _kinematics(model), np.array(self.center), np.array(self.size) / 2
-        reach = float(np.linalg.norm(half)) + self.margin
-        pieces = _near(kinematics, _pieces(model, kinematics, self.links), center, reach)
-        clearance = FromBox(model, kinematics, pieces, center, np.array(self.rotation), half)
-        return self.constraints(clearance, self.margin, f"clear of {self.label}", f"obstacle {self.label}")
+        rotation, half = np.array(self.rotation), np.array(self.size) / 2
+        radius = float(np.linalg.norm(half))
+        return self._kept_from(model, radius, lambda m, p, near, c: FromBox(m, p, near, c, rotation, half))
 
     def marks(self) -> tuple[Mark, ...]:
         return (Mark(f"obstacle {self.label}", "box", self.size, self.center, self.rotation, colour=RED),)
@@ -312,15 +305,10 @@ class SelfCollision(Obstacle):
     weight: float | None = None
 
     def __post_init__(self) -> None:
-        self._set(
-            **self.checked_common(),
-            ignore=tuple(_pair("SelfCollision.ignore", pair) for pair in self.ignore),
-        )
+        self._check(ignore=tuple(_pair("SelfCollision.ignore", pair) for pair in self.ignore))
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        pairs, touching = self._pairs(model)
-        free_pairs = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
-        return self.constraints(OfPairs(model, _kinematics(model), free_pairs), self.margin, "clear of itself", "")
+        return self._apart(model, *self._pairs(model))
 
     def apart_but_at(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
         """What keeps all pairs of `model` apart but those that are nearer than the margin at one of xs (K, nx).
@@ -332,8 +320,12 @@ class SelfCollision(Obstacle):
             return ()
         near = np.any(OfPairs(model, kinematics, pairs).values(xs) < self.margin, axis=0)
         touching = {frozenset((a.body, b.body)) for (a, b), close in zip(pairs, near, strict=True) if close}
+        return self._apart(model, pairs, touching)
+
+    def _apart(self, model: Model, pairs: list[tuple[Piece, Piece]], touching: set[frozenset[str]]) -> Any:
+        """What keeps the pairs apart but those of `touching` bodies."""
         free_pairs = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
-        return self.constraints(OfPairs(model, kinematics, free_pairs), self.margin, "clear of itself", "")
+        return self.constraints(OfPairs(model, _kinematics(model), free_pairs), self.margin, "clear of itself", "")
 
     def left_out(self, model: Model) -> tuple[str, ...]:
         """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b"."""
@@ -423,24 +415,8 @@ def _near(kinematics: ForwardKinematics, pieces: Sequence[Piece], center: Array,
     return [p for p, away, extent in zip(pieces, apart, extents, strict=True) if away - extent <= reach]
 
 
-def _called(name: str, kind: str, center: Sequence[float]) -> str:
-    return repr(name) if name else f"{kind} at " + ", ".join(f"{c:g}" for c in center)
-
-
-def _margin(subject: str, given: Any) -> float:
-    return 0.0 if isinstance(given, (int, float)) and given == 0 else positive_float(subject, given)
-
-
-def _names(subject: str, given: Any) -> tuple[str, ...] | None:
-    if given is None:
-        return None
-    if isinstance(given, str) or not len(given):
-        raise InputError(subject, got=repr(given)[:80], expected="names of bodies, or None for all")
-    return tuple(name_of(subject, name) for name in given)
-
-
 def _pair(subject: str, given: Any) -> tuple[str, str]:
-    names = _names(subject, given) or ()
+    names = names_of(subject, given) or ()
     if len(names) != 2:
         raise InputError(subject, got=repr(given)[:80], expected="pairs of names of bodies")
     return names[0], names[1]

@@ -40,9 +40,8 @@ from drake_diff.optimize.problem.cost import (
 )
 from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, RateLimit, checked_couplings, excess_of
 from drake_diff.optimize.problem.design import Design
-from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, plant_dynamics
+from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, bounds_of, plant_dynamics, state_of
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
-from drake_diff.optimize.problem.names import bounds_of, state_of
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
 
 MOST_STEPS = 10**8  # each has a state and an input, at least

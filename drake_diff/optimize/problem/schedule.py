@@ -15,8 +15,8 @@ from drake_diff.legs.standing import standing, with_soft_feet
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import StateFunction
 from drake_diff.optimize.problem.cost import QuadraticCost, TrackingCost
+from drake_diff.optimize.problem.dynamics import coordinates
 from drake_diff.optimize.problem.goals import USED, Goal, GoalConstraint, name_of
-from drake_diff.optimize.problem.names import coordinates
 
 MIDDLE = 0.25  # of a swing at either end is left out where its clearance is looked at
 KEPT = 1000  # states of which it is remembered where the feet are

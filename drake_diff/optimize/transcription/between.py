@@ -68,7 +68,7 @@ def violation_between_nodes(motion: Collocated) -> Excess:
         >>> problem = dd.Problem(
         ...     block, x0=[0, 0], x_goal=[1, 0], num_steps=4, horizon=1.0, running_cost=effort, constraints=slow
         ... )
-        >>> solution = dd.solve(problem, refine=False)
+        >>> solution = dd.solve(problem, options=dd.optimize.Options(refine=False))
         >>> excess = dd.optimize.violation_between_nodes(solution.transcribed)
         >>> excess.state, excess.input, round(excess.constraint, 3), solution.status.value
         (0.0, 0.0, 0.004, 'converged_not_verified')

@@ -15,6 +15,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff._base.clock import now
+from drake_diff.optimize.options import Options
 from drake_diff.optimize.problem.coupling import RateLimit
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearances
@@ -352,6 +353,16 @@ class Transcribed(Collocated):
     cleared: tuple[tuple[int, float], ...] = ()  # the same, with what was lacking of a margin [m]; empty if nothing was
 
     @property
+    def count(self) -> int:
+        """How many intervals there are."""
+        return len(self.mesh) - 1
+
+    @property
+    def row(self) -> tuple[int, float]:
+        """What `refinements` say of it."""
+        return self.count, self.largest_error
+
+    @property
     def largest_error(self) -> float:
         """Of an interval and of its part of the cost."""
         return float(np.max(_worst(self)))
@@ -394,14 +405,6 @@ def collocated(
     return Collocated(task, mesh, nodes, horizon)
 
 
-@dataclass(frozen=True)
-class MeshRefinement:
-    """Until when a mesh is refined: `errors` and `cost_errors` at most `tolerance`, or `most` intervals."""
-
-    tolerance: float
-    most: int
-
-
 class Transcription:
     """A `Problem` in a scheme, on its own `num_steps` equal intervals to begin with."""
 
@@ -435,7 +438,7 @@ class Transcription:
         horizon: float | None = None,
         limits: Limits,
         report: Report | None,
-        refinement: MeshRefinement | None = None,
+        refinement: Options | None = None,
         parameters: Array | None = None,
         mesh: Array | None = None,
         multipliers: Multipliers | None = None,
@@ -457,7 +460,9 @@ class Transcription:
         motion = self.solve_on(mesh, begun, first, limits, report, parameters, multipliers, far=far)
         if motion.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):  # there is no time to measure it
             return motion
-        tolerance, most = (np.inf, MOST_INTERVALS) if refinement is None else (refinement.tolerance, refinement.most)
+        tolerance, most = np.inf, MOST_INTERVALS
+        if refinement is not None:
+            tolerance, most = refinement.error_tolerance, refinement.max_num_steps
         rounds, near = [(len(mesh) - 1, motion.largest_error)], [_nearer(motion)]
         while motion.result.outcome in FOUND:
             (count, error), lacking = rounds[-1], near[-1] if len(near) <= CLEARANCE_ROUNDS else np.zeros(1)
@@ -518,37 +523,52 @@ class Transcription:
     ) -> Transcribed:
         """IPOPT on one mesh, from `nodes` (K, nx + nu), `horizon` [s] and `parameters` (np,), the problem's if None.
 
-        These may be `far` from a motion: a line. Where `multipliers` are as many as the program's they begin the
-        search; where that fails, it begins without.
+        These may be `far` from a motion: a line. For `multipliers` see `solve_program`.
         """
-        from drake_diff.optimize.transcription.program import FAR, NOT_FINITE, TranscribedProgram, solve_ipopt
+        from drake_diff.optimize.transcription.program import FAR, TranscribedProgram
 
-        program, why = TranscribedProgram(self.task, mesh, self.functions), self.functions.why_not
+        program = TranscribedProgram(self.task, mesh, self.functions)
         moved = None if parameters is None else self.task.at(self._inside(parameters)).coordinates
         guess = program.pack(nodes, horizon, moved)
-        derivatives = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-        start = now()
-        sizes = len(program.lower), len(program.sides[0])
-        begun = multipliers if multipliers and multipliers.sizes == sizes else None
-        options: dict[str, Any] = {"more": FAR if far and program.free else None, "motions": program.iterates}
-        result = solve_ipopt(program, guess, limits, report, exact=not why, begun=begun, **options)
-        if begun and result.outcome not in (*FOUND, Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
-            result = solve_ipopt(program, guess, _left(limits, start), report, exact=not why, **options)
-        elif begun:
-            result = replace(result, message=f"{result.message}, from the guess's multipliers")
-        if not why and result.message == NOT_FINITE:
-            again = solve_ipopt(program, guess, limits, report, exact=False, **options)
-            if again.message != NOT_FINITE:  # then it was the Hessian
-                derivatives, result = (
-                    "symbolic, limited-memory Hessian: the exact one is not finite at an iterate",
-                    again,
-                )
+        more = FAR if far and program.free else None
+        result, derivatives = solve_program(program, guess, limits, report, multipliers, more)
         solution_nodes, horizon = program.unpack(result.z)
         task = self.task.at(program.parameter_values(result.z)) if self.task.varied else self.task
         return Transcribed(task, frozen(mesh), frozen(solution_nodes), horizon, result, derivatives)
 
     def _inside(self, values: Array) -> Array:
         return np.clip(values, *self.problem.bounds_of_parameters())
+
+
+def solve_program(
+    program: Any,
+    guess: Array,
+    limits: Limits,
+    report: Report | None,
+    multipliers: Multipliers | None = None,
+    more: dict[str, Any] | None = None,
+) -> tuple[NlpResult, str]:
+    """The result of IPOPT, and where the derivatives came from: with an exact Hessian, if there is one that is finite.
+
+    Where `multipliers` are as many as the program's they begin the search; where that fails, it begins without.
+    """
+    from drake_diff.optimize.transcription.program import NOT_FINITE, solve_ipopt
+
+    why, start = program.functions.why_not, now()
+    derivatives = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+    sizes = len(program.lower), len(program.sides[0])
+    begun = multipliers if multipliers and multipliers.sizes == sizes else None
+    options: dict[str, Any] = {"more": more, "motions": program.iterates}
+    result = solve_ipopt(program, guess, limits, report, exact=not why, begun=begun, **options)
+    if begun and result.outcome not in (*FOUND, Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
+        result = solve_ipopt(program, guess, _left(limits, start), report, exact=not why, **options)
+    elif begun:
+        result = replace(result, message=f"{result.message}, from the guess's multipliers")
+    if not why and result.message == NOT_FINITE:
+        again = solve_ipopt(program, guess, limits, report, exact=False, **options)
+        if again.message != NOT_FINITE:  # then it was the Hessian
+            return again, "symbolic, limited-memory Hessian: the exact one is not finite at an iterate"
+    return result, derivatives
 
 
 def finer_mesh(motion: Transcribed, exceeded: Sequence[int], most: int) -> Array | None:
@@ -572,15 +592,15 @@ def _left(limits: Limits, start: float) -> Limits:
     return replace(limits, time_limit=max(0.0, limits.time_limit - (now() - start)))
 
 
-def kept(last: Transcribed, failed: Transcribed) -> Transcribed:
+def kept(last: Any, failed: Any) -> Any:
     """The last motion that was found, with a note on the finer mesh on which none was.
 
     Where that was cut short, by Ctrl-C or by the time limit, the whole search was: where it leads is not known.
     """
     if failed.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
-        return replace(last, result=replace(failed.result, z=last.result.z))
-    counts = len(failed.mesh) - 1, len(last.mesh) - 1
-    note = f"on {counts[0]} intervals no motion was found ({failed.result.message}): that on {counts[1]} is kept"
+        return last.told(result=replace(failed.result, z=last.result.z))
+    failure = f"on {failed.count} intervals no motion was found ({failed.result.message})"
+    note = f"{failure}: that on {last.count} is kept"
     return last.told(result=replace(last.result, note="; ".join(filter(None, (last.result.note, note)))))
 
 

@@ -1,0 +1,150 @@
+"""How `solve` searches: what its algorithms are told beside the problem, the method and the limits."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import count, positive_float, positive_int
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.model.contact import SoftContact
+
+LARGEST_TOLERANCE = 1e3
+SOLVERS = ("ipopt", "snopt")
+HOOKS = ("on_start", "on_plan")
+# What only some methods take; "auto" takes all, and hands each to those that do.
+TAKEN_BY = {
+    "scheme": ("collocation",),
+    "solver": ("collocation", "shooting"),
+    "continuation": ("ilqr",),
+    "refine": ("collocation",),
+    "error_tolerance": ("collocation",),
+    "max_num_steps": ("collocation",),
+}
+NAMED = ("scheme", "solver", "continuation", "refine")
+
+
+@dataclass(frozen=True, repr=False)
+class Options:
+    """Options of `solve`, each with a default that serves most problems; the record of a run has them all.
+
+    Attributes:
+        scheme: of collocation: "hermite_simpson" (order 4, the default), "trapezoid" (order 2), or "drake", which is
+            what Drake's DirectCollocation transcribes.
+        solver: "ipopt", or "snopt" with scheme="drake", which then is Drake's own DirectCollocation.
+        tolerance: the solver's, on feasibility and optimality.
+        continuation: finds contact that the guess does not make, by stages of a force at a distance before the true
+            plant: "auto" or a sequence of SoftContacts, with method="ilqr"; or "relaxed": by inverse dynamics over the
+            positions of the guess, with contact and friction at a distance, of hinges, slides and free bodies that
+            spheres touch. `Solution.options` has the stages' log.
+        refine: with collocation, whether coarse intervals are split and the problem is solved again. None: where the
+            plan does not hold between its knots or in a replay, until it does or every error is at most
+            `error_tolerance`. True: until every error is. False: never.
+        error_tolerance: of an interval, against an accurate integration, in the states' units; and of its part of
+            the cost, relative to the whole.
+        max_num_steps: the most intervals of a refined mesh.
+        mesh_rounds: how often a mesh is refined whose plan does not hold.
+        other_guesses: how many random first guesses follow a straight line from which no motion is found.
+        other_iterations: of the solver, from each of these.
+        guess_iterations: of an attempt of "auto" that is to find a guess for the next.
+        sweeps: iterations of iLQR before shooting that has no guess.
+        clearance_parts: into how many parts a step is divided where a plan in steps comes too near to an obstacle
+            between two of them; one round for each entry.
+        on_start: called once, when all input has been checked and the work begins. Not recorded.
+        on_plan: gets what each search comes to, a `Solution` that is not measured yet. Not recorded.
+
+    Raises:
+        InputError: a value does not fit; UnknownNameError for an unknown solver.
+
+    Example:
+        >>> dd.optimize.Options(refine=True, error_tolerance=1e-8)
+        Options(refine=True, error_tolerance=1e-08)
+    """
+
+    scheme: str | None = None
+    solver: str | None = None
+    tolerance: float = 1e-8
+    continuation: Any = None
+    refine: bool | None = None
+    error_tolerance: float = 1e-6
+    max_num_steps: int = 1000
+    mesh_rounds: int = 6
+    other_guesses: int = 8
+    other_iterations: int = 200
+    guess_iterations: int = 100
+    sweeps: int = 100
+    clearance_parts: Any = (4, 8, 16)
+    on_start: Callable[[], None] | None = field(default=None, compare=False)
+    on_plan: Callable[[Any], None] | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.solver is not None and self.solver not in SOLVERS:
+            raise UnknownNameError("solver", got=self.solver, known=SOLVERS)
+        if not (self.refine is None or isinstance(self.refine, (bool, np.bool_))):
+            raise InputError("refine", got=repr(self.refine), expected="None, True or False")
+        for name in ("tolerance", "error_tolerance"):
+            self._set(name, _tolerance(name, getattr(self, name)))
+        for name in ("max_num_steps", "other_iterations", "guess_iterations", "sweeps"):
+            self._set(name, positive_int(name, getattr(self, name)))
+        for name in ("mesh_rounds", "other_guesses"):
+            self._set(name, count(name, getattr(self, name), 0))
+        if not isinstance(self.clearance_parts, (tuple, list)):
+            expected = "whole numbers above 1"
+            raise InputError("clearance_parts", got=repr(self.clearance_parts), expected=expected)
+        self._set("clearance_parts", tuple(count("clearance_parts", parts, 2) for parts in self.clearance_parts))
+        for name in HOOKS:
+            if not (getattr(self, name) is None or callable(getattr(self, name))):
+                raise InputError(name, got=repr(getattr(self, name)), expected="None or a function")
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"Options({', '.join(f'{name}={value!r}' for name, value in self.changed().items())})"
+
+    def changed(self) -> dict[str, Any]:
+        """The options that are not at their defaults."""
+        pairs = ((f, getattr(self, f.name)) for f in fields(self))
+        return {f.name: value for f, value in pairs if value is not f.default and value != f.default}
+
+    def check_method(self, method: str) -> None:
+        """Raise InputError where an option was changed that `method` does not take."""
+        for name, value in self.changed().items():
+            methods = TAKEN_BY.get(name, (method,))
+            if value is not False and method not in ("auto", *methods):
+                taken = " and ".join(f'method="{other}"' for other in methods)
+                expected = f'none for method="{method}": {taken} takes it'
+                raise InputError(name, got=f"{value!r:.80}", expected=expected)
+
+    def of_method(self, method: str) -> "Options":
+        """These options with those that `method` does not take at their defaults."""
+        left_out: dict[str, Any] = {name: None for name in NAMED if method not in TAKEN_BY[name]}
+        return replace(self, **left_out)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All options as plain values but the functions, for a record."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in HOOKS}
+        stages = values["continuation"]
+        if isinstance(stages, (list, tuple)):
+            values["continuation"] = [asdict(s) if isinstance(s, SoftContact) else s for s in stages]
+        return values | {"clearance_parts": list(self.clearance_parts)}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Options":
+        """The options of a record; those that it does not have are at their defaults."""
+        known = [f.name for f in fields(cls) if f.name not in HOOKS]
+        for name in values:
+            if name not in known:
+                raise UnknownNameError("options", got=name, known=known)
+        stages = values.get("continuation")
+        if isinstance(stages, (list, tuple)):
+            values = {**values, "continuation": [SoftContact(**stage) for stage in stages]}
+        return cls(**values)
+
+
+def _tolerance(name: str, given: Any) -> float:
+    tolerance = positive_float(name, given)
+    if tolerance > LARGEST_TOLERANCE:
+        raise InputError(name, got=tolerance, expected=f"at most {LARGEST_TOLERANCE:g}")
+    return tolerance
