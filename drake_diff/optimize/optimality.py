@@ -17,7 +17,7 @@ nothing of the motion beside it: it is compared with slopes of another integrati
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ from pydrake.multibody.tree import (
     RevoluteSpring,
     UniformGravityFieldElement,
 )
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.derivatives.step import StepDerivatives
@@ -37,14 +39,14 @@ from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.plant import bodies, joints
 from drake_diff.model.step import set_state
 from drake_diff.motion.continuous import ContinuousMotion
-from drake_diff.motion.loss import Totals, accumulate
 from drake_diff.optimize.ilqr.riccati import minimize_in_box
-from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import cost_at, final_cost_hessian, running_cost_hessian
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
-from drake_diff.optimize.shooting import RolloutCost, ShootingVariables, final_sensitivity
+from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
+from drake_diff.optimize.transcription.steps import StepProgram
 
+AT_ONCE = 64  # rows: each takes as much memory as the plan
 RIDGE = 1e-12  # on columns of length 1: rows that say the same have no multipliers of their own
 NO_EFFECT = 1e-12
 DIFFERENCED = 1e-6  # of the largest effect: the noise of differences of a contact solver that stops early
@@ -74,17 +76,6 @@ class Optimality:
         return self.gradient / self.terms if self.terms else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """A row that holds the plan: its derivatives by states and inputs, and the signs that its multiplier may have."""
-
-    knots: tuple[int, ...]
-    by_x: Array  # (knots, nx)
-    by_u: Array  # (knots, nu)
-    lowest: float  # -inf or 0
-    highest: float  # inf or 0
-
-
 def final_state_norms(linearization: list[StepDerivatives]) -> Array:
     """(N+1,) |d x_N / d x_k|, the largest singular value, from the derivatives of N steps."""
     product = np.eye(len(linearization[-1].x_next))
@@ -95,103 +86,75 @@ def final_state_norms(linearization: list[StepDerivatives]) -> Array:
     return frozen(norms[::-1])
 
 
-def optimality(problem: Problem, variables: ShootingVariables, z: Array) -> Optimality:
-    """How far the plan at z (size,) is from a stationary point of the Lagrangian.
+def optimality(problem: Problem, xs: Array, us: Array, values: Array) -> Optimality:
+    """How far a plan xs (N+1, nx), us (N, nu) is from a stationary point of the Lagrangian of its program of steps.
 
-    Raises GradientError where a cost or constraint has no derivative.
+    `values` (np,) are those of the problem's design. The multipliers of the steps are the costates: they leave no
+    gradient by a state. Raises GradientError where a cost or constraint has no derivative.
     """
-    linearization = variables.linearization(z)
-    xs, us = variables.states(z), variables.unpack(z)[1]
-    direct_xs, direct_us = RolloutCost(problem, variables).partials(z)[1:]
-    rows = list(_rows(problem, xs, us))
-    columns = [variables.gradient(z, _totals(linearization, row, xs, us)) for row in rows]
-    of_parameters = RolloutCost(problem, variables).by_design(z)[1]
-    of_cost = of_parameters + variables.gradient(z, accumulate(linearization, direct_xs, direct_us))
-    jacobian = np.array(columns).reshape(len(rows), len(of_cost)).T
-    sides = _sides(variables, z)
-    free = ~(sides[0] | sides[1])
-    multipliers = _multipliers(of_cost[free], jacobian[free], rows)
-    for row, multiplier in zip(rows, multipliers, strict=True):
-        for knot, by_x, by_u in zip(row.knots, row.by_x, row.by_u, strict=True):
-            direct_xs[knot] += multiplier * by_x
-            if knot < len(us):
-                direct_us[knot] += multiplier * by_u
-    totals = accumulate(linearization, direct_xs, direct_us)
-    left = of_parameters + variables.gradient(z, totals)
-    left = np.where(sides[0], np.minimum(left, 0.0), np.where(sides[1], np.maximum(left, 0.0), left))
-    terms = np.abs(variables.gradient(z, Totals(direct_xs, direct_us, 0 * totals.parameters, totals.policy)))
-    steps = [d.A.T @ state for d, state in zip(linearization[:1], totals.states[1:], strict=False)]
-    by_us = [d.B.T @ state for d, state in zip(linearization, totals.states[1:], strict=True)]
-    by_p = sum(np.abs(d.C.T @ state) for d, state in zip(linearization, totals.states[1:], strict=True))
-    through = Totals(np.array([*steps, *totals.states[1:]]), np.array(by_us), np.asarray(by_p), totals.policy)
-    terms += np.abs(variables.gradient(z, through)) + np.abs(of_parameters)
+    program = StepProgram(problem)
+    z = program.pack(xs, us, values)
+    program.require(z)
+    derivatives, count = program.derivatives(), problem.num_steps * problem.nx
+    slope = np.asarray(derivatives["grad_f"](z, [])[1]).ravel()
+    rows, jacobian = derivatives["jac_g"](z, [])
+    if not (np.all(np.isfinite(slope)) and np.all(np.isfinite(jacobian.nonzeros()))):
+        raise GradientError(program.refusal or "a cost or a constraint has no finite derivative along the plan")
+    every, steps = sparse.csr_matrix(jacobian.sparse()), program.states_at[1:].ravel()
+    others = np.setdiff1d(np.flatnonzero(program.lower < program.upper), steps)
+    of_steps = splu(sparse.csc_matrix(every[:count, steps]).T.tocsc())
+
+    on_lower, on_upper = _sides(np.asarray(rows).ravel()[count:], *(side[count:] for side in program.sides))
+    acting = on_lower | on_upper
+    signs, of_held = [(on_lower[acting], on_upper[acting])], every[count:][acting]
+    on_lower, on_upper = _sides(z, program.lower, program.upper)
+    states = steps[(on_lower | on_upper)[steps]]
+    signs.append((on_lower[states], on_upper[states]))
+    of_held = sparse.vstack([of_held, sparse.identity(program.size, format="csr")[states]], format="csr")
+    lowest, highest = (np.where(np.concatenate(sides), np.inf, 0.0) for sides in zip(*signs, strict=True))
+
+    def reduced(gradients: Array) -> Array:
+        """(others, k) what is left of gradients (n, k) by all variables when the states follow the others."""
+        return np.asarray(gradients[others] - every[:count, others].T @ of_steps.solve(gradients[steps]))
+
+    free = ~(on_lower | on_upper)[others]
+    of_cost = reduced(slope[:, None])[:, 0]
+    parts = (of_held[i : i + AT_ONCE].toarray().T for i in range(0, of_held.shape[0], AT_ONCE))
+    of_rows = np.hstack([np.zeros((len(others), 0)), *map(reduced, parts)])
+    multipliers = _multipliers(of_cost[free], of_rows[free], -lowest, highest)
+    total = slope + of_held.T @ multipliers
+    costates = of_steps.solve(total[steps])
+    left = reduced(total[:, None])[:, 0]
+    left = np.where(on_lower[others], np.minimum(left, 0.0), np.where(on_upper[others], np.maximum(left, 0.0), left))
+    terms = np.abs(total[others]) + abs(every[:count, others].T) @ np.abs(costates)
+    at_start = total[program.states_at[0]] - every[:count, program.states_at[0]].T @ costates
+    states_and_start = np.vstack([at_start, costates.reshape(-1, problem.nx)])
     return Optimality(
         multipliers=frozen(multipliers),
-        state_norms=frozen(np.linalg.norm(totals.states, axis=1)),
+        state_norms=frozen(np.linalg.norm(states_and_start, axis=1)),
         gradient=float(np.max(np.abs(left), initial=0.0)),
         terms=float(np.max(terms, initial=0.0)),
     )
 
 
-def _totals(linearization: list[StepDerivatives], row: _Row, xs: Array, us: Array) -> Totals:
-    by_xs, by_us = np.zeros_like(xs), np.zeros_like(us)
-    for knot, by_x, by_u in zip(row.knots, row.by_x, row.by_u, strict=True):
-        by_xs[knot] = by_x
-        if knot < len(us):
-            by_us[knot] = by_u
-    return accumulate(linearization, by_xs, by_us)
+def _sides(values: Array, lower: Array, upper: Array) -> tuple[Mask, Mask]:
+    """Which values lie on their lower bound, and which on their upper one."""
+    return values <= lower + FEASIBILITY_TOLERANCE, values >= upper - FEASIBILITY_TOLERANCE
 
 
-def _rows(problem: Problem, xs: Array, us: Array) -> Iterator[_Row]:
-    """Goal, waypoints, and each bound of a state after the first, constraint and coupling that the plan lies on."""
-    none = np.zeros(us.shape[1])
-    lower, upper = problem.state_limits()
-    for k, i in np.argwhere((xs <= lower + FEASIBILITY_TOLERANCE) | (xs >= upper - FEASIBILITY_TOLERANCE)):
-        if k:
-            yield _Row((int(k),), np.eye(problem.nx)[[i]], none[None], *_signs(xs[k, i], lower[k, i], upper[k, i]))
-    for constraint in problem.kept:
-        for k in problem.knots_of(constraint, input_at_end=False):
-            yield from _held(constraint, (k,), xs[k], us[min(k, len(us) - 1)])
-    for coupling in problem.coupled_steps():
-        for knots in coupling.knots:
-            yield from _held(coupling.rows, tuple(knots.tolist()), *coupling.packed(xs, us, knots))
-
-
-def _held(constraint: Constraint, knots: tuple[int, ...], x: Array, u: Array) -> Iterator[_Row]:
-    """The rows of `constraint` that lie on a bound, with x and u the states and inputs at the `knots` side by side."""
-    values, by_xu = constraint.differentiate(x, u)
-    count = len(knots)
-    for value, slopes, least, most in zip(values, by_xu, constraint.lower, constraint.upper, strict=True):
-        if value <= least + FEASIBILITY_TOLERANCE or value >= most - FEASIBILITY_TOLERANCE:
-            by_x, by_u = slopes[: len(x)].reshape(count, -1), slopes[len(x) :].reshape(count, -1)
-            yield _Row(knots, by_x, by_u, *_signs(value, least, most))
-
-
-def _signs(value: float, lower: float, upper: float) -> tuple[float, float]:
-    """What a multiplier may be: below 0 on a lower bound alone, above 0 on an upper one alone."""
-    on_lower, on_upper = value <= lower + FEASIBILITY_TOLERANCE, value >= upper - FEASIBILITY_TOLERANCE
-    return -np.inf if on_lower else 0.0, np.inf if on_upper else 0.0
-
-
-def _sides(variables: ShootingVariables, z: Array) -> tuple[Mask, Mask]:
-    """Which variables lie on their lower bound, and which on their upper one."""
-    lower, upper = variables.limits()
-    return z <= lower + FEASIBILITY_TOLERANCE, z >= upper - FEASIBILITY_TOLERANCE
-
-
-def _multipliers(of_cost: Array, jacobian: Array, rows: list[_Row]) -> Array:
-    """(m,) those with the least |of_cost + jacobian mu|, each of its own signs."""
-    if not rows or not len(of_cost):
-        return np.zeros(len(rows))
-    lowest, highest = (np.array([getattr(row, side) for row in rows]) for side in ("lowest", "highest"))
+def _multipliers(of_cost: Array, jacobian: Array, lowest: Array, highest: Array) -> Array:
+    """(m,) those with the least |of_cost + jacobian mu|, each from `lowest` to `highest`."""
+    count = len(lowest)
+    if not count or not len(of_cost):
+        return np.zeros(count)
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0] = 1.0
-    unit, acts = jacobian / scale, np.ones(len(rows), dtype=bool)
+    unit, acts = jacobian / scale, np.ones(count, dtype=bool)
     multipliers = np.linalg.lstsq(unit, -of_cost)[0]
     if np.any((multipliers < lowest) | (multipliers > highest)):
-        hessian = unit.T @ unit + RIDGE * np.eye(len(rows))
+        hessian = unit.T @ unit + RIDGE * np.eye(count)
         _, acts = minimize_in_box(hessian, unit.T @ of_cost, lowest, highest)
-        multipliers = np.zeros(len(rows))
+        multipliers = np.zeros(count)
         multipliers[acts] = np.linalg.lstsq(unit[:, acts], -of_cost)[0]
         multipliers = np.clip(multipliers, lowest, highest)
     return np.asarray(multipliers / scale)
@@ -303,7 +266,7 @@ class _Plan:
 
     def asked(self) -> Iterator[tuple[int, tuple[float, int]]]:
         """(coordinate that nothing moves, (how far the cost asks it to go, at which knot)), the furthest knot each."""
-        total, by_xs, by_us = RolloutCost(self.problem, self.variables).partials(self.z)
+        total, by_xs, by_us = self._slopes
         still, worth = np.flatnonzero(~self.moved), WORTH * (1 + abs(total))
         furthest: dict[int, tuple[float, int]] = {}
         for k in range(1, len(self.xs)):
@@ -316,6 +279,14 @@ class _Plan:
                 if g * ASKED > worth and distance > ASKED:
                     furthest[i] = max(furthest.get(i, (0.0, k)), (distance, k))
         yield from furthest.items()
+
+    @cached_property
+    def _slopes(self) -> tuple[float, Array, Array]:
+        """The cost, and its derivatives by the states (N+1, nx) and the inputs (N, nu) themselves, the steps apart."""
+        program = StepProgram(self.problem)
+        z = program.pack(self.xs, self.us, self.variables.parameters(self.z).values)
+        cost, slope = program.gradient(z)
+        return cost, slope[program.states_at], slope[program.inputs_at]
 
     def _left_to_ask(self, slope: Array, hessian: Array, still: NDArray[np.intp]) -> tuple[Array, Array]:
         """The cost's slope and curvature by the coordinates that are `still`, at the best of all that is not."""
@@ -344,7 +315,7 @@ class _Plan:
         """Whether a goal, constraint or the cost is about a coordinate that something moves."""
         if np.any(~np.isnan(self.problem.goal) & self.moved) or self.problem.waypoints or self.problem.kept:
             return True
-        by_xs = RolloutCost(self.problem, self.variables).partials(self.z)[1]
+        by_xs = self._slopes[1]
         curved = (np.diag(self._hessian(k))[: self.problem.nx] for k in (1, len(self.xs) - 1))
         about = np.any(by_xs[1:] != 0, axis=0) | np.any([row > 0 for row in curved], axis=0)
         return bool(np.any(about & self.moved))

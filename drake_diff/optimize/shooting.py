@@ -1,7 +1,5 @@
 """What a motion by discrete steps comes from: its variables, and the derivatives along it by them."""
 
-from typing import Any
-
 import numpy as np
 
 from drake_diff._base.arrays import Array
@@ -9,8 +7,6 @@ from drake_diff._base.clock import check_time
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.model.parameters import ParameterVector
 from drake_diff.motion.intervals import roll
-from drake_diff.motion.loss import Totals, differentiate_loss
-from drake_diff.optimize.problem.cost import cost_at, differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.problem import Problem
 
 
@@ -58,11 +54,6 @@ class ShootingVariables:
         """[s] the length of a step at z (size,)."""
         return self.design.time_step(self.design.values(z[self.inputs.stop :]))
 
-    def gradient(self, z: Array, totals: Totals) -> Array:
-        """(size,) the gradient by z from those by x0 (nx,), us (N, nu) and parameters (np,)."""
-        inputs = totals.inputs.ravel() if self.problem.optimizes_controls else np.zeros(0)
-        return np.concatenate([totals.states[0][self.free], inputs, self.pull_back(z, totals.parameters)])
-
     def pull_back(self, z: Array, by_parameters: Array) -> Array:
         """(..., nc) the derivative by the coordinates of the design in z."""
         return self.design.pull_back(z[self.inputs.stop :], by_parameters)
@@ -105,47 +96,3 @@ def final_sensitivity(variables: ShootingVariables, z: Array) -> Array:
         after = after @ d.A
     jacobian[:, np.arange(len(variables.free))] = after[:, variables.free]
     return jacobian
-
-
-class RolloutCost:
-    """The derivatives of the objective along the states of z, the steps apart."""
-
-    def __init__(self, problem: Problem, variables: ShootingVariables):
-        self.variables, self.running = variables, problem.total_running_cost
-        self.first_step = problem.design.time_step(problem.design.vector.values)
-        self.final, self.trajectory = problem.total_final_cost, problem.trajectory_cost
-        self.of_parameters = problem.parameter_cost
-
-    def _rate(self, k: int) -> Any:
-        """The running cost at step `k`; one that changes in time has steps of one length."""
-        return cost_at(self.running, k * self.first_step)
-
-    def by_design(self, z: Array) -> tuple[float, Array]:
-        """(what the parameters cost, the gradient (size,) by z of that and of the running cost by a step's length)."""
-        design, gradient, total = self.variables.design, np.zeros(self.variables.size), 0.0
-        by_values = np.zeros(len(design.vector.values))
-        if self.of_parameters is not None:
-            parameters = np.array(design.own(self.variables.parameters(z).values))
-            total, by_values[: len(parameters)] = differentiate_final_cost(self.of_parameters, parameters)
-        if design.moves_step and self.running is not None:
-            pairs = zip(self.variables.states(z), self.variables.unpack(z)[1], strict=False)
-            by_values[design.own_count] = sum(float(self._rate(k)(x, u)) for k, (x, u) in enumerate(pairs))
-        gradient[self.variables.inputs.stop :] = self.variables.pull_back(z, by_values)
-        return total, gradient
-
-    def partials(self, z: Array) -> tuple[float, Array, Array]:
-        """(value, its derivatives by the states (n+1, nx) and the inputs (n, nu) themselves, the steps apart) at z."""
-        xs, us, h = self.variables.states(z), self.variables.unpack(z)[1], self.variables.time_step(z)
-        by_xs, by_us, total = np.zeros_like(xs), np.zeros_like(us), 0.0
-        if self.running is not None:
-            for k, u in enumerate(us):
-                value, by_x, by_u = differentiate_cost(self._rate(k), xs[k], u)
-                total += h * value
-                by_xs[k], by_us[k] = h * by_x, h * by_u
-        if self.final is not None:
-            value, by_xs[-1] = differentiate_final_cost(self.final, xs[-1])
-            total += value
-        if self.trajectory is not None:
-            value, added_xs, added_us, _ = differentiate_loss(self.trajectory, xs, us)
-            total, by_xs, by_us = total + value, by_xs + added_xs, by_us + added_us
-        return total, by_xs, by_us

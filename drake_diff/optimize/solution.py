@@ -26,7 +26,6 @@ from drake_diff.optimize.optimality import Optimality, final_state_norms, optima
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.replay import OPEN_LOOP, Plan, Replay, held, judged_replay, replays
-from drake_diff.optimize.shooting import ShootingVariables
 from drake_diff.optimize.transcription.between import Excess, violation_between_nodes
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
@@ -441,9 +440,8 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             return Refusal("of discrete steps alone: the Lagrangian of a collocation is that of its scheme")
         if not self._is_whole or not np.all(np.isfinite(self.xs)):
             return Refusal("the plan is not finite")
-        variables = ShootingVariables(self.problem, around=np.asarray(self.xs))
         try:
-            return optimality(self.problem, variables, variables.pack(self.xs[0], self.us, self.step_vector.values))
+            return optimality(self.problem, np.asarray(self.xs), self.us, self.step_vector.values)
         except (GradientError, SimulationError) as error:
             return Refusal(f"a step or a derivative is refused: {error}")
 

@@ -165,12 +165,12 @@ class StepProgram:
 
         An interior-point method would leave such a point for the middle of the bounds.
         """
-        cost, gradient = self._gradient(z, z)
+        cost, gradient = self.gradient(z)
         rows, (lower, upper) = self._values(z)[1], self.sides
         violation = float(np.max(np.maximum(lower - rows, rows - upper), initial=0.0))
         if np.any(gradient) or not violation <= tolerance:
             return None
-        table = (Iteration(0, float(cost), violation, 0.0, 0.0),)
+        table = (Iteration(0, cost, violation, 0.0, 0.0),)
         message = "the guess keeps every constraint, and the cost has no slope there"
         multipliers = Multipliers(np.zeros(self.size), np.zeros(len(rows)))
         return NlpResult(z, Outcome.SOLVED, message, table, stationarity=0.0, multipliers=multipliers)
@@ -286,6 +286,11 @@ class StepProgram:
     def _cost(self, z: Array) -> float:
         parameters = self.design.own(self.design.values(z[self.parameters_at]))
         return self.problem.objective(*self._read(z)) + self.problem.cost_of_parameters(parameters)
+
+    def gradient(self, z: Array) -> tuple[float, Array]:
+        """The cost and its derivatives (n,) by all variables, the steps apart."""
+        cost, slope = self._gradient(z, z)
+        return float(cost), np.asarray(slope)
 
     def _gradient(self, z: Array, _: Array) -> list[Any]:
         xs, us, h = self._read(z)
