@@ -86,9 +86,11 @@ class EquationsOfMotion:
         set_state(twin, x)
         if self.systems:
             twin.set_input(u)
-        constant = np.array([AutoDiffXd(a) for a in acceleration])
-        residual = twin.inverse_dynamics(constant) - self.actuation @ u
-        return np.concatenate([self.q_dot(twin, x), acceleration - np.linalg.inv(mass) @ residual])
+        residual = twin.inverse_dynamics(np.array([AutoDiffXd(a) for a in acceleration]))
+        width = max(len(z.derivatives()) for z in (*x, *u, *residual))
+        rows = gradient_rows(residual, width) - self.actuation @ gradient_rows(u, width)
+        by_row = InitializeAutoDiff(acceleration, -np.linalg.solve(mass, rows)).ravel()
+        return np.concatenate([self.q_dot(twin, x), by_row])
 
     def jacobian(self, knot: Array) -> Array:
         """(nx, nx + nu) at `knot` = [x; u], by AutoDiffXd."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from pydrake.autodiffutils import AutoDiffXd, InitializeAutoDiff
+from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, array_with_gaps, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_rows
@@ -28,7 +28,6 @@ from drake_diff.model.parameters import (
     write_autodiff,
 )
 from drake_diff.model.plant import joints, labelled
-from drake_diff.model.step import set_state
 from drake_diff.optimize.problem.constraint import Bounds, carried, plant_limits, resolve_bounds
 
 SMALLEST_TRIED = 1e-3  # of a parameter's first value: where a smaller one's derivatives are certified
@@ -394,8 +393,8 @@ def plant_dynamics(model: Model, parameters: Any = ()) -> Dynamics:
 class PlantKnots:
     """`EquationsOfMotion` at many knots: with r the residual by inverse dynamics at the solved acceleration a,
 
-    da = -M^-1 dr and dr/du = -B, so that AutoDiffXd takes one inverse dynamics by x alone; a tree of hinges and slides
-    gives dr for all knots in one call. Knots [x, u, p] where the model has parameters p, all knots the same or not.
+    da = -M^-1 dr, which a tree of hinges and slides gives for all knots in one call, and AutoDiffXd knot by knot. Knots
+    [x, u, p] where the model has parameters p, all knots the same or not.
     """
 
     def __init__(self, model: Model, vector: ParameterVector):
@@ -427,10 +426,10 @@ class PlantKnots:
             for alike, vector in self._alike(knots):
                 with applied(vector):
                     for k in alike:
-                        values[k], rows[k] = self._linearize(knots[k, : self.model.nx], knots[k, self.model.nx :])
+                        values[k], rows[k] = self._linearize(knots[k])
             return values, rows
         if self.tree is None:
-            pairs = [self._linearize(k[: self.model.nx], k[self.model.nx :]) for k in knots]
+            pairs = [self._linearize(k) for k in knots]
             return np.array([value for value, _ in pairs]), np.array([rows for _, rows in pairs])
         n, actuation = self.model.nv, self.equations.actuation
         q, values = knots[:, :n], self.values(knots)
@@ -441,33 +440,13 @@ class PlantKnots:
         rows[:, n:] = -np.linalg.solve(d.mass, np.concatenate([d.by_q, d.by_v, by_u], axis=2))
         return values, rows
 
-    def _linearize(self, x: Array, z: Array) -> tuple[Array, Array]:
-        """At a knot of x (nx,) and z = [u, p]; with parameters, which are applied."""
-        equations, model, twin = self.equations, self.model, self.model.autodiff
-        u, p = z[: model.nu], z[model.nu :]
-        set_state(model.double, x)
-        acceleration, mass = equations.acceleration(u)
-        q_dot = equations.q_dot(model.double, x)
-        systems = equations.systems  # whose forces depend on u
-        variables = InitializeAutoDiff(np.concatenate([x, u, p]) if systems or len(p) else x).ravel()
-        if len(p):
-            write_autodiff(self.vector, model, variables[self.width :])
-        set_state(twin, variables[: model.nx])
-        if systems:
-            twin.set_input(variables[model.nx : self.width])
-        constant = np.array([AutoDiffXd(a) for a in acceleration])
-        residual = twin.inverse_dynamics(constant)
-        rows = np.zeros((model.nx, self.width + len(p)))
-        if equations.plain_rates:
-            rows[: model.nq, model.nq : model.nx] = np.eye(model.nq)
-        else:
-            q_dot_rows = gradient_rows(equations.q_dot(twin, variables[: model.nx]), len(variables))
-            rows[: model.nq, : model.nx] = q_dot_rows[:, : model.nx]
-        by_knot = np.zeros((model.nv, self.width + len(p)))
-        by_knot[:, : len(variables)] = gradient_rows(residual, len(variables))
-        by_knot[:, model.nx : self.width] -= equations.actuation
-        rows[model.nq :] = -np.linalg.solve(mass, by_knot)
-        return np.concatenate([q_dot, acceleration]), rows
+    def _linearize(self, knot: Array) -> tuple[Array, Array]:
+        """At a knot [x, u, p]; its parameters are applied."""
+        variables, nx = InitializeAutoDiff(knot).ravel(), self.model.nx
+        if len(knot) > self.width:
+            write_autodiff(self.vector, self.model, variables[self.width :])
+        rates = self.equations.autodiff(variables[:nx], variables[nx : self.width])
+        return ExtractValue(rates.reshape(-1, 1)).ravel(), gradient_rows(rates, len(knot))
 
 
 def _takes_a_step(f: Any) -> bool:
