@@ -233,7 +233,7 @@ def _joint_states(shown: Shown, topic: str, xs: Array, efforts: Array | None) ->
 
 
 def transform_channel(
-    model: Model, times: Array, motions: Mapping[str, Array], told: Mapping[str, str] | None = None
+    model: Model, times: Array, motions: Mapping[str, Array], more: Mapping[str, str] | None = None
 ) -> Channel:
     """foxglove.FrameTransforms in /tf of the bodies in `motions`, (n, nx) by what their frames' names begin with."""
     plant = model.plant
@@ -252,7 +252,7 @@ def transform_channel(
             if message.transforms:
                 yield nanoseconds(t), message
 
-    metadata = {"units": {"translation": "m", "rotation": "1"}, **(told or {})}
+    metadata = {"units": {"translation": "m", "rotation": "1"}, **(more or {})}
     return Channel("/tf", FrameTransforms, rows(), metadata)
 
 

@@ -375,13 +375,13 @@ def _unpacked(data: bytes) -> Iterator[tuple[int, bytes]]:
             yield opcode, inner[position - length : position]
 
 
-def _declared(data: bytes, at: int) -> int:
-    """How many messages the statistics say there are, in the summary that begins at `at`; ValueError if too many."""
-    while at + RECORD.size <= len(data):
-        opcode, length = RECORD.unpack_from(data, at)
-        at += RECORD.size + length
+def _declared(data: bytes, position: int) -> int:
+    """How many messages the statistics say there are, in the summary at `position`; ValueError if too many."""
+    while position + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, position)
+        position += RECORD.size + length
         if opcode == STATISTICS:
-            result = kinds.Statistics.read(ReadDataStream(BytesIO(data[at - length : at])))
+            result = kinds.Statistics.read(ReadDataStream(BytesIO(data[position - length : position])))
             most = {
                 "messages": (result.message_count, MOST_MESSAGES),
                 "channels": (result.channel_count, MOST_CHANNELS),

@@ -98,13 +98,13 @@ def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Cer
 def _drawn(plot: Plot) -> dict[str, Any]:
     """A plot for JSON, `points` of how many its series have; what is left out lies within what is drawn."""
     x, ys = numbers(plot.x), [numbers(line.y) for line in plot.series]
-    retained = _kept(ys, len(x)) if plot.marks == "lines" else range(len(x))
+    retained = _points_to_draw(ys, len(x)) if plot.marks == "lines" else range(len(x))
     series = [{**vars(line), "y": [y[i] for i in retained]} for line, y in zip(plot.series, ys, strict=True)]
     content = {"x": [x[i] for i in retained], "points": len(x), "series": series, "limits": numbers(plot.limits)}
     return {**vars(plot), **content}
 
 
-def _kept(ys: Sequence[Sequence[float | None]], count: int) -> Sequence[int]:
+def _points_to_draw(ys: Sequence[Sequence[float | None]], count: int) -> Sequence[int]:
     """Which of `count` points to draw, MOST_POINTS at most: both ends, and each series' extremes in every stretch."""
     stretches = MOST_POINTS // (2 * max(1, len(ys)) + 1)
     if count <= MOST_POINTS:

@@ -330,20 +330,19 @@ def camera_of(scene: Scene) -> tuple[Array, Array]:
     target = (low + high) / 2
     half = FILLED * np.tan(FIELD_OF_VIEW / 2) * np.array([ASPECT, 1.0])
 
-    def distance(at: Array) -> float:
+    def distance(centred: Array) -> float:
         """How far away balls at these places in the picture are in view."""
-        reach = (np.abs(at[:, :2]) + radii[:, None]) / half
-        return max(float(np.max(at[:, 2] + np.max(reach, axis=1))), SMALLEST_SIZE / 2 / np.tan(FIELD_OF_VIEW / 2))
+        reach = (np.abs(centred[:, :2]) + radii[:, None]) / half
+        nearest = SMALLEST_SIZE / 2 / np.tan(FIELD_OF_VIEW / 2)
+        return max(float(np.max(centred[:, 2] + np.max(reach, axis=1))), nearest)
 
     for _ in range(3):  # what is in the middle of the picture depends on how far away the camera is
-        at = (centres - target) @ axes.T
-        back = distance(at)
-        depth = np.maximum(back - at[:, 2], 1e-6)[:, None]
-        ends = (
-            np.min((at[:, :2] - radii[:, None]) / depth, axis=0),
-            np.max((at[:, :2] + radii[:, None]) / depth, axis=0),
-        )
-        target = target + (ends[0] + ends[1]) / 2 * back @ axes[:2]
+        centred = (centres - target) @ axes.T
+        back = distance(centred)
+        depth = np.maximum(back - centred[:, 2], 1e-6)[:, None]
+        low = np.min((centred[:, :2] - radii[:, None]) / depth, axis=0)
+        high = np.max((centred[:, :2] + radii[:, None]) / depth, axis=0)
+        target = target + (low + high) / 2 * back @ axes[:2]
     return target + distance((centres - target) @ axes.T) * view, target
 
 

@@ -182,8 +182,8 @@ def _bone(path: str, start: Array, end: Array, radius: float) -> Drawn:
     return Drawn(path, Cylinder(radius, length), pose, BONE, middle, length / 2)
 
 
-def _ball(path: str, at: Array, radius: float) -> Drawn:
-    return Drawn(path, Sphere(radius), RigidTransform(at), JOINT, at, radius)
+def _ball(path: str, centre: Array, radius: float) -> Drawn:
+    return Drawn(path, Sphere(radius), RigidTransform(centre), JOINT, centre, radius)
 
 
 def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Drawn:

@@ -251,7 +251,7 @@ def written_whole(directory: str | Path) -> Iterator[Path]:
             with suppress(OSError):
                 partial.rmdir()  # where nothing was written
             if partial.is_dir() and isinstance(error, WriteError):
-                raise _kept(f"{error}; what was written is in {partial}", partial) from error
+                raise _with_files_in(f"{error}; what was written is in {partial}", partial) from error
             if partial.is_dir():
                 error.add_note(f"what was written is in {partial}")
             raise
@@ -338,10 +338,10 @@ def _clear(old: Path | None, target: Path) -> None:
             remove_folder(replaced)
     except WriteError as error:
         left = "" if old is None else f", and the one before in {old}"
-        raise _kept(f"{error}; the run is in {target}{left}", target) from error
+        raise _with_files_in(f"{error}; the run is in {target}{left}", target) from error
 
 
-def _kept(message: str, folder: Path) -> WriteError:
+def _with_files_in(message: str, folder: Path) -> WriteError:
     error = WriteError(message)
     error.kept = folder
     return error

@@ -271,8 +271,8 @@ def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure
 
 def gradient_norms(solution: Solution) -> tuple[Array | None, Array | None]:
     """(N+1,) |d x_N / d x_k| and |d L / d x_k|, None where they are not known."""
-    ends, found = solution.final_state_norms, solution.optimality
-    return None if isinstance(ends, Refusal) else ends, None if isinstance(found, Refusal) else found.state_norms
+    ends, result = solution.final_state_norms, solution.optimality
+    return None if isinstance(ends, Refusal) else ends, None if isinstance(result, Refusal) else result.state_norms
 
 
 def replay_evidence(r: Replay) -> ReplayEvidence:
@@ -375,8 +375,8 @@ def _invariants(vector: ParameterVector, motion: Rollout | None, unit: str, here
     `vector` has the parameters' values that the motion is of, `unit` is that of the positions, `here` says which it is.
     """
     if motion is None:
-        for name, own in INVARIANTS.items():
-            yield measured(name, here, np.inf, own or unit, reason=NO_REPLAY)
+        for name, of_its_own in INVARIANTS.items():
+            yield measured(name, here, np.inf, of_its_own or unit, reason=NO_REPLAY)
         return
     positions, (lower, upper) = motion.xs[:, : vector.model.nq], vector.model.position_limits
     limits = (positions <= lower) | (positions >= upper)
@@ -400,14 +400,14 @@ def _worst(name: str, definition: str, unit: str, motion: Rollout, values: Array
 def _energy(motion: Rollout, free: int, here: str) -> Iterator[Metric]:
     """Of the first, free part: what neither actuators nor damping explain, drift apart from oscillation."""
     error = motion.energy_error[: free + 1]
-    part = f"over the {free} steps from the start without contact, {here}"
+    where = f"over the {free} steps from the start without contact, {here}"
     lasting = swing = math.inf
     if free > 0:
         lasting = drift(error)
         swing = float(np.abs(error - smooth_mean(error) - lasting * np.linspace(-0.5, 0.5, len(error))).max())
-    definition = f"lasting part of the energy that neither actuators nor damping explain, {part}"
+    definition = f"lasting part of the energy that neither actuators nor damping explain, {where}"
     yield measured("free-motion energy drift", definition, lasting, "J", reason=NEVER_FREE)
-    definition = f"largest distance of that energy from its drift line, {part}"
+    definition = f"largest distance of that energy from its drift line, {where}"
     yield measured("free-motion energy oscillation", definition, swing, "J", reason=NEVER_FREE)
 
 

@@ -82,11 +82,13 @@ def _of_a_problem(p: Mapping[str, Any]) -> Iterator[str]:
     names, inputs, horizon = p.get("state_names"), p.get("input_names"), p.get("free_horizon_s") or p.get("horizon_s")
     count = f"{p.get('num_steps')} intervals of {shown(p.get('time_step_s'))} s, horizon {shown(horizon)} s"
     yield f"from {_named(names, p.get('x0'))} to {_named(names, p.get('x_goal')) or 'no goal'} in {count}"
-    bounds = [(side, _named(of, p.get(side))) for side, of in zip(LIMITS, (names, names, inputs, inputs), strict=True)]
+    bounds = [
+        (side, _named(listed, p.get(side))) for side, listed in zip(LIMITS, (names, names, inputs, inputs), strict=True)
+    ]
     yield "bounds: " + ("; ".join(f"{side} {values}" for side, values in bounds if values) or "none")
     for key in PARTS:
         parts, label = p.get(key), key.replace("_", " ").removesuffix("s")
-        yield from (f"{label} {shown(part)}" for part in (parts if isinstance(parts, list) else [parts]) if part)
+        yield from (f"{label} {shown(entry)}" for entry in (parts if isinstance(parts, list) else [parts]) if entry)
     mask = p.get("initial_state_free")
     free = zip(names or (), mask if isinstance(mask, list) else (), strict=False)
     optimized = [*map(str, p.get("optimize") or ()), *(f"the first {name}" for name, moves in free if moves)]

@@ -55,13 +55,13 @@ def write_plan(path: Path, solution: Solution, *, partial: bool = False) -> None
     given[START] = problem.us if problem.optimizes_controls and np.any(problem.us) else None
     guess = None if solution.search is None else solution.search.guess
     if isinstance(guess, Solution):
-        found = {name: getattr(guess, name) for name in ("xs", "us", "us_mid", "u_final", "mesh", "horizon")}
-        found["num_steps"] = guess.problem.num_steps
+        arrays_of_guess = {name: getattr(guess, name) for name in ("xs", "us", "us_mid", "u_final", "mesh", "horizon")}
+        arrays_of_guess["num_steps"] = guess.problem.num_steps
         if guess.multipliers is not None:
-            found |= {"multipliers": guess.multipliers.variables, "row_multipliers": guess.multipliers.rows}
+            arrays_of_guess |= {"multipliers": guess.multipliers.variables, "row_multipliers": guess.multipliers.rows}
     else:
-        found = {} if guess is None else dict(zip(("xs", "us", "horizon"), guess, strict=False))
-    given |= {GUESS + name: value for name, value in found.items()}
+        arrays_of_guess = {} if guess is None else dict(zip(("xs", "us", "horizon"), guess, strict=False))
+    given |= {GUESS + name: value for name, value in arrays_of_guess.items()}
     if partial and solution.iterations:
         given[ROWS] = [[getattr(row, name) for name in COLUMNS] for row in solution.iterations]
     buffer = io.BytesIO()
@@ -72,12 +72,12 @@ def write_plan(path: Path, solution: Solution, *, partial: bool = False) -> None
 
 def read_plan(path: Path, *, partial: bool = False) -> dict[str, Array]:
     """The arrays in `path`, of a `partial` run or a whole one, by name. ArtifactError where it is no such file."""
-    found, known = arrays_of(path), {*REQUIRED, *OPTIONAL, START, *(GUESS + name for name in GUESSED)}
+    arrays, known = arrays_of(path), {*REQUIRED, *OPTIONAL, START, *(GUESS + name for name in GUESSED)}
     known |= {ROWS} if partial else set()
-    unknown, missing = found.keys() - known, set(REQUIRED) - found.keys()
+    unknown, missing = arrays.keys() - known, set(REQUIRED) - arrays.keys()
     if unknown or missing:
         raise ArtifactError(f"{path}: unknown arrays {sorted(unknown)}, missing {sorted(missing)}")
-    return found
+    return arrays
 
 
 def rows_of(plan: dict[str, Array]) -> tuple[Iteration, ...]:
@@ -90,10 +90,10 @@ def rows_of(plan: dict[str, Array]) -> tuple[Iteration, ...]:
 
 def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
     """Those of the arrays of a plan that are fields of a `Solution`."""
-    found: dict[str, Any] = {name: plan[name] for name in (*REQUIRED, *OPTIONAL) if name in plan}
-    if "free_horizon" in found:
-        found["free_horizon"] = float(found["free_horizon"])
-    return found
+    result: dict[str, Any] = {name: plan[name] for name in (*REQUIRED, *OPTIONAL) if name in plan}
+    if "free_horizon" in result:
+        result["free_horizon"] = float(result["free_horizon"])
+    return result
 
 
 @contextmanager
@@ -125,14 +125,14 @@ def rebuilt(
         yield _load(path, {**given.options, "packages": None})
 
 
-def _source_if_unchanged(given: ModelInput, place: str, models: Path | None) -> tuple[Path, dict[str, Any]]:
+def _source_if_unchanged(given: ModelInput, location: str, models: Path | None) -> tuple[Path, dict[str, Any]]:
     """The model file where it stood, and its options; ModelError where a file is not the recorded one."""
     if models is None:
         what = f"names {len(given.named)} files, which the artifact does not hold" if given.named else "is not in it"
         raise ModelError(
             f"the model {what}: models=FOLDER, or --models, lets them be read below a folder that you give"
         )
-    source, options = _below(models, place, "the model's file"), dict(given.options or {})
+    source, options = _below(models, location, "the model's file"), dict(given.options or {})
     if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
         raise ModelError(f"the model's file {source} is gone, and the artifact has no copy that could be used")
     if file_evidence(source, given.file.path) != given.file:
@@ -148,12 +148,12 @@ def _source_if_unchanged(given: ModelInput, place: str, models: Path | None) -> 
     return source, options
 
 
-def _below(models: Path, place: str, what: str) -> Path:
+def _below(models: Path, location: str, what: str) -> Path:
     """A path that a record has, a relative one in `models` or else from here; ModelError where it is not below that."""
-    found = models / place if (models / place).exists() else Path(place)
-    if not found.resolve().is_relative_to(models.resolve()):
-        raise ModelError(f"{what} {found} is not below {models}, the folder of models that was given")
-    return found
+    path = models / location if (models / location).exists() else Path(location)
+    if not path.resolve().is_relative_to(models.resolve()):
+        raise ModelError(f"{what} {path} is not below {models}, the folder of models that was given")
+    return path
 
 
 def _load(path: Path, options: dict[str, Any]) -> Model:
@@ -202,9 +202,9 @@ def solve_again(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Sol
         problem = rebuild_problem(record, model, plan["us"], plan.get(START))
         limit, guess = arguments.pop("time_limit"), _rebuild_guess(problem, kind, plan)
         limit = None if limit is None else positive_float("time_limit [s]", limit)
-        found = solve(problem, initial_guess=guess, options=chosen, **arguments)
+        solution = solve(problem, initial_guess=guess, options=chosen, **arguments)
     asked = {**arguments, "options": options, "time_limit": limit}
-    return found.told(options=found.options | {"time_limit": limit}, search=Search(asked, guess))
+    return solution.told(options=solution.options | {"time_limit": limit}, search=Search(asked, guess))
 
 
 def _rebuild_guess(problem: Problem, kind: Any, plan: dict[str, Array]) -> Any:
@@ -249,5 +249,5 @@ def _refusing_a_problem() -> Iterator[None]:
     except ModelError:  # what the model cannot do: see `rebuilt`
         raise
     except (DrakeDiffError, ValueError, KeyError, TypeError, AttributeError) as error:
-        told = f"{type(error).__name__}: {error}"
-        raise ArtifactError(f"record.json: its problem cannot be rebuilt: {told}") from error
+        message = f"{type(error).__name__}: {error}"
+        raise ArtifactError(f"record.json: its problem cannot be rebuilt: {message}") from error

@@ -128,13 +128,13 @@ def odd_trace(folder: Path, trace: Trace, plan: Mapping[str, Any], record: PlanR
 def why_not_repeated(record: PlanRecord) -> tuple[str, ...]:
     """Why the search of a record cannot be run again; nothing where it can."""
     costs, constraints = unknown_functions(record)
-    found = [f"{cost} is a user's function" for cost in costs]
-    found += [f"constraint {name} is a user's function" for name in constraints]
+    reasons = [f"{cost} is a user's function" for cost in costs]
+    reasons += [f"constraint {name} is a user's function" for name in constraints]
     if record.inputs.search is None:
         recovered = record.sentence.endswith(RECOVERED)
-        found.append(OF_RECOVERED if recovered else "the record does not say what solve was called with")
+        reasons.append(OF_RECOVERED if recovered else "the record does not say what solve was called with")
     status = None if record.solver is None else Status(record.solver.status)
-    return (*found, *([NOT_REPEATED[status]] if status in NOT_REPEATED else []))
+    return (*reasons, *([NOT_REPEATED[status]] if status in NOT_REPEATED else []))
 
 
 def _run_again(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Reproduced:
@@ -156,11 +156,11 @@ def _run_again(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Repr
     return _written(replace(solution, **plan_fields(plan)), record, apart)
 
 
-def _distance(one: Solution, other: Solution) -> float:
+def _distance(solution: Solution, other: Solution) -> float:
     """Between two plans: the largest of each array, relative to its largest number; inf where their shapes differ."""
     names, largest = ("xs", "us", "us_mid", "u_final", "mesh", "free_horizon"), 0.0
-    pairs = [(getattr(one, name), getattr(other, name)) for name in names]
-    for first, second in (*pairs, (one.vector.values, other.vector.values)):
+    pairs = [(getattr(solution, name), getattr(other, name)) for name in names]
+    for first, second in (*pairs, (solution.vector.values, other.vector.values)):
         if np.shape(first) != np.shape(second):
             return np.inf
         if first is None or np.array_equal(first, second, equal_nan=True):
@@ -179,10 +179,10 @@ def _written(solution: Solution, record: PlanRecord, apart: float) -> Reproduced
     if isinstance(engines, list):
         solution = cross_check(solution, [str(name) for name in engines])
     with TemporaryDirectory() as folder:
-        place, measurement = Path(folder), measure(solution)
-        again, unchecked = _but_for_simulators(_as_given(record_of(measurement, place), record), record)
-        write_files(place, measurement, again)
-        files = {path.name: path.read_bytes() for path in place.iterdir()}
+        location, measurement = Path(folder), measure(solution)
+        again, unchecked = _but_for_simulators(_as_given(record_of(measurement, location), record), record)
+        write_files(location, measurement, again)
+        files = {path.name: path.read_bytes() for path in location.iterdir()}
     return Reproduced(again.model_dump(mode="json"), files, apart, unchecked=unchecked)
 
 
@@ -247,7 +247,7 @@ def _without_the_search(recorded: Solution, record: PlanRecord, unrepeated: tupl
 
 def is_below(key: str, sections: Sequence[str]) -> bool:
     """Whether a key of a record is one of `sections`, or in one."""
-    return any(key == part or key.startswith((f"{part}.", f"{part}[")) for part in sections)
+    return any(key == section or key.startswith((f"{section}.", f"{section}[")) for section in sections)
 
 
 def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
@@ -262,17 +262,19 @@ def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
     goal, start = numbers("x_goal", np.nan), numbers("x0", np.nan)
     start[np.array(p["initial_state_free"], dtype=bool)] = np.nan
     for name, x, wanted in (("goal error", xs[-1], goal), ("initial state error", xs[0], start)):
-        told, again = metrics.get(name), finite(float(np.max(np.abs(x - wanted)[~np.isnan(wanted)], initial=0.0)))
-        if (told is None) != (again is None) or abs((told or 0.0) - (again or 0.0)) > ROUNDED * max(1.0, again or 0.0):
-            yield f"{record.FILE}: metrics[{name}] is {told}, and the plan's is {again}"
+        recorded, again = metrics.get(name), finite(float(np.max(np.abs(x - wanted)[~np.isnan(wanted)], initial=0.0)))
+        if (recorded is None) != (again is None) or abs((recorded or 0.0) - (again or 0.0)) > ROUNDED * max(
+            1.0, again or 0.0
+        ):
+            yield f"{record.FILE}: metrics[{name}] is {recorded}, and the plan's is {again}"
     inputs = [plan[name].reshape(-1, plan["us"].shape[1]) for name in ("us", "us_mid", "u_final") if name in plan]
     us, later = np.vstack(inputs), xs[1:] if np.all(np.isfinite(start)) else xs
     beyond = [numbers("u_lower", -np.inf) - us, us - numbers("u_upper", np.inf)]
     beyond += [numbers("x_lower", -np.inf) - later, later - numbers("x_upper", np.inf)]
-    least = max(float(np.max(each, initial=0.0)) for each in beyond)
-    told = metrics.get("bound violation")
-    if told is not None and not told >= least - ROUNDED:  # midpoint states are no part of the plan
-        yield f"{record.FILE}: metrics[bound violation] is {told}, and the plan's is at least {least:.6g}"
+    least = max(float(np.max(excess, initial=0.0)) for excess in beyond)
+    recorded = metrics.get("bound violation")
+    if recorded is not None and not recorded >= least - ROUNDED:  # midpoint states are no part of the plan
+        yield f"{record.FILE}: metrics[bound violation] is {recorded}, and the plan's is at least {least:.6g}"
 
 
 def _in_phases(folder: Path, record: PlanRecord, section: PhasesSection, models: Path | None) -> Reproduced:
@@ -317,9 +319,9 @@ def _odd_phases(
     if links not in ([(i, i + 1) for i in range(count - 1)], [(i, (i + 1) % count) for i in range(count)]):
         yield f"{record.FILE}: its links are {links}, which is no chain of {count} phases"
         return
-    for phase, own in zip(section.phases, records, strict=True):
-        metrics = {metric.name: metric.value for metric in own.metrics}
-        expected = (own.solver and own.solver.status, metrics.get("cost"), metrics.get("horizon"))
+    for phase, inner in zip(section.phases, records, strict=True):
+        metrics = {metric.name: metric.value for metric in inner.metrics}
+        expected = (inner.solver and inner.solver.status, metrics.get("cost"), metrics.get("horizon"))
         if (phase.status, phase.cost, phase.duration) != expected:
             yield f"{record.FILE}: {phase.name} has status, cost and duration {expected} in {phase.directory}"
     total, duration = (sum(getattr(p, name) or 0.0 for p in section.phases) for name in ("cost", "duration"))
@@ -353,13 +355,13 @@ def _rebuilt_phases(
     for i, link in enumerate(section.links):
         if link.reset is None:
             raise ModelError(f"links[{i}]: its reset {link.told} is a user's function")
-    for phase, own, plan in zip(section.phases, records, plans, strict=True):
-        reasons = [r for r in why_not_repeated(own) if "what solve was called with" not in r]
+    for phase, inner, plan in zip(section.phases, records, plans, strict=True):
+        reasons = [r for r in why_not_repeated(inner) if "what solve was called with" not in r]
         if reasons:
             raise ModelError(f"{phase.name}: {reasons[0]}")
         attachments = read_trace(folder / phase.directory / TRACE).attachments
-        model = stack.enter_context(rebuilt(own.model, own.contract.get("source"), attachments, models))
-        yield resolve(own, model, plan)
+        model = stack.enter_context(rebuilt(inner.model, inner.contract.get("source"), attachments, models))
+        yield resolve(inner, model, plan)
 
 
 def _solved_in_phases(
@@ -377,13 +379,13 @@ def _solved_in_phases(
     options = arguments.pop("options").items()
     chosen = Options.from_dict({name: value for name, value in options if name not in REMOVED})
     solved = solve(problem, options=chosen, **arguments)
-    apart = max(_distance(one, other) for one, other in zip(solved.phases, phases, strict=True))
+    apart = max(_distance(plan, other) for plan, other in zip(solved.phases, phases, strict=True))
     if apart > SAME_PLAN:
         return recorded, 0.0, (f"run again, it ends at another plan, {apart:.2g} of its largest number away",)
     ended = replace(solved, search=Search(dict(section.search)))
     if apart > 0:
         pairs = zip(phases, solved.phases, strict=True)
-        ended = replace(ended, phases=tuple(one.told(status=other.status) for one, other in pairs))
+        ended = replace(ended, phases=tuple(plan.told(status=other.status) for plan, other in pairs))
     return ended, apart, ()
 
 

@@ -39,7 +39,6 @@ from drake_diff.runs.directory import (
 from drake_diff.runs.fields import (
     Claim,
     Event,
-    Passed,
     SealedRecord,
     Solver,
     canonical,
@@ -77,11 +76,12 @@ def save_phases(solution: PhasedSolution, folder: Path, save_phase: Callable[[So
     return record_of_phases(folder, solution).write(folder)
 
 
-def phases_record(folder: Path, problem: PhasedProblem, verdict: Passed, sentence: str) -> PlanRecord:
-    """The record of a run without a solution."""
-    section = PhasesSection(**_asked_of_all(problem))
-    asked = _asked_of_phases(folder, problem)
-    return PlanRecord(verdict=verdict, sentence=sentence, phases=section, **asked)
+def unfinished_record(folder: Path, problem: Problem | PhasedProblem, sentence: str, **fields: Any) -> PlanRecord:
+    """The record of a run that has no measured solution."""
+    if isinstance(problem, PhasedProblem):
+        fields |= {"phases": PhasesSection(**_asked_of_all(problem)), **_asked_of_phases(folder, problem)}
+        return PlanRecord(verdict="incomplete", sentence=sentence, **fields)
+    return _record(folder, verdict="incomplete", sentence=sentence, **asked(problem), **fields)
 
 
 def _asked_of_phases(folder: Path, problem: PhasedProblem, seconds: float | None = None) -> dict[str, Any]:
@@ -180,10 +180,7 @@ FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record a
 
 def begin(folder: Path, problem: Problem | PhasedProblem, sentence: str = UNDER_WAY) -> None:
     """Mark `folder` as a run that is under way: whatever happens next, its record says "incomplete"."""
-    if isinstance(problem, PhasedProblem):
-        phases_record(folder, problem, "incomplete", sentence).begin(folder)
-        return
-    _record(folder, verdict="incomplete", sentence=sentence, **asked(problem)).begin(folder)
+    unfinished_record(folder, problem, sentence).begin(folder)
 
 
 @overload
@@ -269,7 +266,7 @@ def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
         if isinstance(solution, PhasedSolution):
             for i, phase in enumerate(solution.phases):
                 keep_plan(phase, folder / directory_of(i))
-            phases_record(folder, solution.problem, "incomplete", sentence).begin(folder)
+            unfinished_record(folder, solution.problem, sentence).begin(folder)
             return
         make_folder(folder)
         write_plan(folder / PLAN, solution, partial=True)
@@ -335,17 +332,9 @@ def begin_interrupted(folder: Path, problem: Problem | PhasedProblem) -> None:
 def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedProblem) -> None:
     """Say in the record of a run that is under way in `folder` that `error` ended it before there was a solution."""
     failure = failure_of(error)
+    event = Event(t_s=None, kind="failure", message=failure.message)
     sentence = f"the run ended with an error: {failure.message}"
-    if isinstance(problem, PhasedProblem):
-        phases_record(folder, problem, "incomplete", sentence).begin(folder)
-        return
-    content: dict[str, Any] = {
-        "verdict": "incomplete",
-        "sentence": sentence,
-        "failures": [failure],
-        "events": [Event(t_s=None, kind="failure", message=failure.message)],
-    }
-    _record(folder, **content, **asked(problem)).begin(folder)
+    unfinished_record(folder, problem, sentence, failures=[failure], events=[event]).begin(folder)
 
 
 def record_of(m: Measurement, folder: Path) -> PlanRecord:

@@ -465,17 +465,17 @@ def _rebuild_constraint(c: dict[str, Any], system: Model | FixedContacts) -> Con
     return Constraint(function, lower=lower, upper=upper, knots=knots, name=c["name"])
 
 
-def rebuild_goal(told: Any) -> Goal:
+def rebuild_goal(described: Any) -> Goal:
     """A goal from what a record tells of it; InputError where that is none."""
-    goal: Goal = _rebuild("goal", GOALS, told)
+    goal: Goal = _rebuild("goal", GOALS, described)
     return goal
 
 
-def _rebuild(subject: str, kinds: Mapping[str, Any], told: Any) -> Any:
+def _rebuild(subject: str, kinds: Mapping[str, Any], described: Any) -> Any:
     """One of `kinds` with its values; InputError where `told` is none."""
-    if not (isinstance(told, dict) and len(told) == 1 and next(iter(told)) in kinds):
-        raise InputError(subject, got=repr(told)[:80], expected=f"one of {', '.join(kinds)} with its values")
-    ((kind, values),) = told.items()
+    if not (isinstance(described, dict) and len(described) == 1 and next(iter(described)) in kinds):
+        raise InputError(subject, got=repr(described)[:80], expected=f"one of {', '.join(kinds)} with its values")
+    ((kind, values),) = described.items()
     if kind == Dwell.__name__:
         values = {**values, "goal": rebuild_goal(values.get("goal"))}
     return kinds[kind](**values)

@@ -289,43 +289,43 @@ def _of_a_part(folder: Path) -> Verification:
     return Verification(folder, record, undecided=(f"it is incomplete, and never took its place: {why}",))
 
 
-def _run_again(found: Verification, record: SealedRecord, models: Path | None) -> Verification:
+def _run_again(verification: Verification, record: SealedRecord, models: Path | None) -> Verification:
     """The directory beside the same reproduced, where it can be."""
     try:
-        made = reproduce(found.directory, record, models)
+        made = reproduce(verification.directory, record, models)
         if made is None:
-            return replace(found, unchecked=(f"every number: {NOT_RERUN[record.subject]}",))
-        compared = _compared(found, record, made)
+            return replace(verification, unchecked=(f"every number: {NOT_RERUN[record.subject]}",))
+        compared = _compared(verification, record, made)
         if isinstance(record, PlanRecord) and record.phases is not None and not made.problems:
             return _with_phases(compared, record.phases, models)
         return compared
     except (ModelError, MissingDependencyError) as error:
-        return _without_its_functions(found, record, error)
+        return _without_its_functions(verification, record, error)
     except ArtifactError as error:
-        return _judged(found, [str(error)], [])
+        return _judged(verification, [str(error)], [])
     except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
         # what a forger put together need not fit in any way
-        return _judged(found, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
+        return _judged(verification, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
 
 
-def _with_phases(found: Verification, section: PhasesSection, models: Path | None) -> Verification:
+def _with_phases(verification: Verification, section: PhasesSection, models: Path | None) -> Verification:
     """What was found of all phases, and of the directory of each."""
     complaints, undecided, unchecked, rounded = (
-        [*found.complaints],
-        [*found.undecided],
-        [*found.unchecked],
-        [*found.rounded],
+        [*verification.complaints],
+        [*verification.undecided],
+        [*verification.unchecked],
+        [*verification.rounded],
     )
-    checked = found.checked
+    checked = verification.checked
     for name in (phase.directory for phase in section.phases):
-        inner, problems = read_checked(found.directory / name / PlanRecord.FILE)
-        phase = _run_again(Verification(found.directory / name, inner), inner, models)
+        inner, problems = read_checked(verification.directory / name / PlanRecord.FILE)
+        phase = _run_again(Verification(verification.directory / name, inner), inner, models)
         complaints += [f"{name}: {line}" for line in (*problems, *phase.complaints)]
         undecided += [f"{name}: {line}" for line in phase.undecided if WITHIN_PHASES not in line]
         unchecked += [f"{name}: {line}" for line in phase.unchecked if line.startswith(OF_FUNCTIONS)]
         rounded += [f"{name}: {line}" for line in phase.rounded]
         checked += phase.checked
-    content = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
+    content = replace(verification, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
     return _judged(content, complaints, undecided)
 
 
@@ -334,22 +334,22 @@ def has_recordings(record: SealedRecord) -> bool:
     return isinstance(record, ComparisonRecord) and bool(record.recordings)
 
 
-def _without_its_functions(found: Verification, record: SealedRecord, error: Exception) -> Verification:
+def _without_its_functions(verification: Verification, record: SealedRecord, error: Exception) -> Verification:
     """What the files of a run that cannot be made again say of each other."""
     content = (f"not run again: {error}",)
     if not isinstance(record, PlanRecord) or record.subject != "plan":
-        return replace(found, undecided=content, unchecked=("everything but the hashes",))
-    plan = read_plan(found.directory / PLAN)
+        return replace(verification, undecided=content, unchecked=("everything but the hashes",))
+    plan = read_plan(verification.directory / PLAN)
     try:
-        trace = read_trace(found.directory / TRACE)
+        trace = read_trace(verification.directory / TRACE)
         problems = [
             *_odd_schema(record),
-            *odd_trace(found.directory, trace, plan, record),
+            *odd_trace(verification.directory, trace, plan, record),
             *odd_metrics(record, plan),
         ]
     except (ArtifactError, KeyError, LookupError, TypeError, ValueError) as wrong:
         problems = [f"its files do not go together: {type(wrong).__name__}: {wrong}"]
-    return _judged(replace(found, unchecked=(OF_FUNCTIONS,)), problems, content)
+    return _judged(replace(verification, unchecked=(OF_FUNCTIONS,)), problems, content)
 
 
 @contextmanager
@@ -393,7 +393,7 @@ def _refuse(folder: Path, problems: Sequence[str]) -> None:
         raise ArtifactError(f"{folder}: {problems[0]}")
 
 
-def _compared(found: Verification, record: SealedRecord, again: Reproduced) -> Verification:
+def _compared(verification: Verification, record: SealedRecord, again: Reproduced) -> Verification:
     """Record and files of a directory beside the same made again."""
     converted = record.schema_version != SCHEMA_VERSION
     recorded, fields = record.model_dump(mode="json"), Compared(record.FILE)
@@ -414,8 +414,8 @@ def _compared(found: Verification, record: SealedRecord, again: Reproduced) -> V
         elif converted and name.endswith(".html"):
             unchecked.append(f"{name}: schema {record.schema_version} wrote it, whose pages are not those of this one")
         else:
-            compared.append(_compared_file(found.directory / name, again))
-    return _told_of_a_solve(found, again, [*_odd_schema(record), *again.problems], compared, unchecked)
+            compared.append(_compared_file(verification.directory / name, again))
+    return _told_of_a_solve(verification, again, [*_odd_schema(record), *again.problems], compared, unchecked)
 
 
 def _compared_file(path: Path, again: Reproduced) -> Compared:
@@ -447,7 +447,11 @@ def _odd_schema(record: SealedRecord) -> Iterator[str]:
 
 
 def _told_of_a_solve(
-    found: Verification, again: Reproduced, problems: list[str], compared: Sequence[Compared], unchecked: list[str]
+    verification: Verification,
+    again: Reproduced,
+    problems: list[str],
+    compared: Sequence[Compared],
+    unchecked: list[str],
 ) -> Verification:
     """The verdict on what differs, by what it rests on."""
     undecided = [*again.undecided, *(f"the search was not run again: {why}" for why in again.unrepeated)]
@@ -473,7 +477,7 @@ def _told_of_a_solve(
     if OF_RECOVERED in again.unrepeated and not problems:
         files = ", ".join(item.file for item in compared)
         undecided.append(f"what holds: measured again from the plan, all {checked} other values of {files} came out")
-    content = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
+    content = replace(verification, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
     return _judged(content, problems, undecided)
 
 
@@ -484,12 +488,12 @@ def _is_searched(d: Difference) -> bool:
     return d.file != TRACE or d.key.startswith((*SEARCH_TOPICS, "attachment ", "metadata "))
 
 
-def _judged(found: Verification, problems: Sequence[str], undecided: Sequence[str]) -> Verification:
+def _judged(verification: Verification, problems: Sequence[str], undecided: Sequence[str]) -> Verification:
     """With problems, which are none but a reason for doubt where other versions made the record."""
-    if found.notes and problems:
-        why = f"{'; '.join(found.notes)}: that may be why {len(problems)} things differ"
-        return replace(found, undecided=(*undecided, why, *problems))
-    return replace(found, complaints=tuple(problems), undecided=tuple(undecided))
+    if verification.notes and problems:
+        why = f"{'; '.join(verification.notes)}: that may be why {len(problems)} things differ"
+        return replace(verification, undecided=(*undecided, why, *problems))
+    return replace(verification, complaints=tuple(problems), undecided=tuple(undecided))
 
 
 def _odd_contract(record: PlanRecord, again: dict[str, Any]) -> Iterator[str]:

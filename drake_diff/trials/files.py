@@ -351,8 +351,8 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
     from drake_diff.pages.scene import BLUE, scene_of
 
     make_folder(folder)
-    told = trial_evidence(task, trial, run)
-    write_whole(folder / TRIAL, canonical(told.model_dump(mode="json")).encode())
+    record = trial_evidence(task, trial, run)
+    write_whole(folder / TRIAL, canonical(record.model_dump(mode="json")).encode())
     latencies = {"budget_s": trial.outcome.run.latency_budget, "latencies_s": trial.outcome.run.latencies.tolist()}
     write_whole(folder / LATENCIES, canonical(latencies).encode())
     setup, motion = perturbed(task.setup, trial.levels, trial.seed), trial.outcome.run.motion
@@ -365,7 +365,7 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
         contacts = motion.contacts if len(motion.contacts) == len(xs) - 1 else ()
         scene = scene_of(model, times, xs, us=motion.us, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
         far = f", drawn up to {FURTHEST:g} only" if np.any(np.abs(motion.xs) > FURTHEST) else ""
-        title = f"{told.perturbation} {told.level:g}: {trial.label or 'success'}{far}"
+        title = f"{record.perturbation} {record.level:g}: {trial.label or 'success'}{far}"
         write_replay(folder / REPLAY, scene, title=title)
 
 
