@@ -69,13 +69,6 @@ def directory_of(i: int) -> str:
     return f"phase_{i}"
 
 
-def save_phases(solution: PhasedSolution, folder: Path, save_phase: Callable[[Solution, Path], Any]) -> PlanRecord:
-    """Write the solution in phases into `folder`; `save_phase` writes that of one."""
-    for i, phase in enumerate(solution.phases):
-        save_phase(phase, folder / directory_of(i))
-    return record_of_phases(folder, solution).write(folder)
-
-
 def unfinished_record(folder: Path, problem: Problem | PhasedProblem, sentence: str, **fields: Any) -> PlanRecord:
     """The record of a run that has no measured solution."""
     if isinstance(problem, PhasedProblem):
@@ -239,7 +232,9 @@ def write_run(solution: Solution | PhasedSolution, folder: Path) -> PlanRecord:
     """Write what `save` does into `folder`, which `written_whole` gave."""
     keep_plan(solution, folder)  # what is measured next may take long
     if isinstance(solution, PhasedSolution):
-        return save_phases(solution, folder, write_run)
+        for i, phase in enumerate(solution.phases):
+            write_run(phase, folder / directory_of(i))
+        return record_of_phases(folder, solution).write(folder)
     measurement = measure(solution)
     record = record_of(measurement, folder)
     write_files(folder, measurement, record)

@@ -13,7 +13,7 @@ import numpy as np
 
 import drake_diff as dd
 from drake_diff._base import files
-from drake_diff.runs import page, save
+from drake_diff.runs import page, provenance
 from drake_diff.runs.fields import files_below
 from helpers.forks import fork, status_of
 
@@ -130,8 +130,8 @@ def two_solutions():
 def quick_pages(monkeypatch):
     """Pages of a word each, and versions that are looked up once: what is written is as much, what is computed less."""
     monkeypatch.setattr(page, "write_pages", lambda *words: [files.write_whole(path, b"a page") for path in words[:2]])
-    known = save.provenance_of()
-    monkeypatch.setattr(save, "provenance_of", lambda: known)
+    known = provenance.provenance_of()
+    monkeypatch.setattr(provenance, "provenance_of", lambda: known)
 
 
 def goal_of(directory):

@@ -79,7 +79,7 @@ def test_a_run_with_such_a_file_is_broken_and_listed(tmp_path, told, name):
 def test_a_run_whose_files_are_too_much_to_read_is_broken(tmp_path, monkeypatch):
     """A thousand files of 1 GiB that are holes take no room, and an hour."""
     folder = Path(shutil.copytree(RUN, tmp_path / "run"))
-    monkeypatch.setattr("drake_diff.runs.verify.MOST_READ", (folder / "plan.npz").stat().st_size)
+    monkeypatch.setattr("drake_diff.runs.directory.MOST_READ", (folder / "plan.npz").stat().st_size)
     found = dd.verify(folder)
     assert found.verdict == "broken"
     assert "and the files before it have more than" in found.sentence
