@@ -296,7 +296,7 @@ def slope_by_height_is_right(model, x):
     return dd.differentiate_step(model, x, method="autodiff").A[-1, 6] == pytest.approx(slope, rel=2e-2)
 
 
-@pytest.mark.solve
+@pytest.mark.slow
 @pytest.mark.parametrize("lower", [Cylinder(0.2, 0.2), Box(1, 1, 0.2)])
 def test_a_sphere_over_a_flat_mesh_is_aligned_only_in_its_planes_of_symmetry(lower):
     """The meshes' edges lie on each other there: certify says the same."""

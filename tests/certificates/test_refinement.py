@@ -5,10 +5,7 @@ import pytest
 from helpers.bounces import Bounce
 from helpers.models import MODELS, Plant, contact_properties
 from helpers.table import each_row
-from pydrake.geometry import Sphere
-from pydrake.math import RigidTransform
-from pydrake.multibody.tree import PdControllerGains, SpatialInertia
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.multibody.tree import PdControllerGains
 
 import drake_diff as dd
 from drake_diff.certificates.displaced import Line
@@ -74,50 +71,6 @@ def test_the_continuous_motion_is_that_of_the_contact_law(tmp_path, approximatio
     model = ball.model(tmp_path / "bouncer.sdf", approximation, 0.01)
     found = ContinuousMotion(model).states(np.array([0.5, -0.5]), np.zeros((100, 0)))[-1]
     assert found == pytest.approx(ball.end(approximation, (0.5, -0.5), 1.0), abs=1e-5)
-
-
-@pytest.mark.slow
-def test_the_continuous_motion_of_a_tossed_cube_is_that_of_drakes_own_continuous_plant():
-    """To the accuracy of both integrations, and the slope to what that is over the width of its differences."""
-    x0 = np.zeros(13)
-    x0[[0, 1, 6, 11, 12]] = np.cos(np.pi / 6), np.sin(np.pi / 6), 0.2, -0.1, -2.0
-    motion = ContinuousMotion(tossed_cube(0.01).model())
-    plant = tossed_cube(0.0)
-    plant.plant.Finalize()
-    plant.plant.set_stiction_tolerance(1e-3)
-    diagram = plant.builder.Build()
-    config = SimulatorConfig(
-        integration_scheme="runge_kutta3", max_step_size=0.01, accuracy=1e-8, use_error_control=True
-    )
-
-    def drakes(x):
-        simulator = Simulator(diagram)
-        ApplySimulatorConfig(config, simulator)
-        context = plant.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-        plant.plant.SetPositionsAndVelocities(context, x)
-        simulator.AdvanceTo(1.0)
-        return plant.plant.GetPositionsAndVelocities(context)[5]
-
-    def ours(x):
-        return motion.states(x, np.zeros((100, 0)))[-1][5]
-
-    assert ours(x0) == pytest.approx(drakes(x0), abs=1e-7)
-    up = 1e-3 * np.eye(13)[12]
-    slope = (drakes(x0 + up) - drakes(x0 - up)) / 2e-3
-    assert (ours(x0 + up) - ours(x0 - up)) / 2e-3 == pytest.approx(slope, abs=1e-4)
-    assert abs(slope) > 0.1
-
-
-def tossed_cube(h):
-    """Of 0.1 m and 0.1 kg, spheres at its corners, on the ground, under little gravity."""
-    plant = Plant(h, "lagged", gravity=2.0)
-    cube = plant.plant.AddRigidBody("cube", SpatialInertia.SolidBoxWithMass(0.1, 0.1, 0.1, 0.1))
-    properties = contact_properties(4e3, 0.5, 0.5)
-    for i, corner in enumerate(np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T):
-        pose = RigidTransform(0.045 * corner)
-        plant.plant.RegisterCollisionGeometry(cube, pose, Sphere(0.005), f"corner{i}", properties)
-    plant.ground(properties)
-    return plant
 
 
 def test_a_smooth_motion_converges_to_the_slopes_of_the_motion_itself(load):

@@ -76,6 +76,7 @@ def dropped(tmp_path):
     return make
 
 
+@pytest.mark.slow
 def test_the_truth_of_a_bounce_is_that_of_its_events_and_the_steps_have_another_sign(dropped):
     ball, model = dropped("lagged", dissipation=0.2)
     exact, uncertain = ball.slopes("lagged", DROP, 0.5)

@@ -17,7 +17,6 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.cli import main as cli
-from drake_diff.derivatives import METHODS
 from drake_diff.exceptions import ArtifactError
 from drake_diff.optimize import solve as solving
 from drake_diff.runs import directory as directories
@@ -273,42 +272,6 @@ def exit_of(monkeypatch, *words):
     return end.value.code
 
 
-COMMANDS = (
-    "run", "audit", "certify", "compare", "export-model", "robustness", "panel", "verify", "list", "compare-runs",
-    "view", "export",
-)  # fmt: skip
-
-
-def test_help_tells_all_defaults_and_no_text_is_taken_for_markup(monkeypatch, capsys):
-    """Rich takes [s] or [default] in a help text for markup, and shows nothing there."""
-    monkeypatch.setenv("COLUMNS", "200")
-    shown = {}
-    for command in COMMANDS:
-        assert exit_of(monkeypatch, command, "--help") == 0
-        shown[command] = capsys.readouterr().out
-    for method in METHODS:
-        assert method in shown["certify"]
-    assert "Time step of the discrete plant, in seconds. [default: 0.01]" in shown["audit"]
-    assert "[default: (artifacts/<script>)]" in shown["run"]
-    assert "tvlqr, mpc or open_loop [default: tvlqr]" in shown["robustness"]
-    for command in ("audit", "certify", "compare", "export-model"):
-        for option in (
-            "time-step",
-            "contact-model",
-            "contact-approximation",
-            "contact-geometry",
-            "actuators",
-            "base",
-            "fix-joints",
-            "meshes",
-            "packages",
-            "mimic",
-            "ground",
-            "no-contact",
-        ):
-            assert f"--{option}" in shown[command]
-
-
 @each_row(
     "words, told",
     [
@@ -369,38 +332,6 @@ def test_what_the_audit_tells_can_be_typed_until_nothing_is_left_to_mend(tmp_pat
     told = ["--actuators all", "--contact-geometry corner_spheres", "--ground true", "--mimic reduce"]
     assert sorted(seen) == told
     assert exit_of(monkeypatch, "certify", "arm.urdf", "--states", "2", *typed) == 0
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
-@each_row(
-    "words, kept",
-    [
-        (("--actuators", "all"), {"actuators": "all", "meshes": "skip", "contact": True}),
-        (("--actuators", "the hinge"), {"actuators": ("the hinge",)}),
-        (("--actuators", "the hinge=3"), {"actuators": {"the hinge": 3.0}}),
-        (("--base", "weld", "--fix-joints", "the hinge", "--mimic", "reduce"), None),
-        (("--base", "base", "--mimic", "fix"), None),
-        (("--ground", "0.3", "--meshes", "convex"), {"ground": 0.3, "meshes": "convex"}),
-        (("--ground", "true"), {"ground": True}),
-        (("--gravity", "0,0,-1.62"), {"gravity": (0.0, 0.0, -1.62)}),
-        (
-            ("--no-contact", "--packages", "a=.", "--packages", "b=.."),
-            {"contact": False, "packages": {"a": ".", "b": ".."}},
-        ),
-    ],
-)
-def test_the_options_are_those_of_load_model(tmp_path, monkeypatch, capsys, words, kept):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "arm.urdf").write_text(STRANGER)
-    seen = []
-    monkeypatch.setattr("drake_diff.certificates.audit.audit", lambda model: seen.append(model) or [])
-    status = exit_of(monkeypatch, "audit", "arm.urdf", *words)
-    if kept is None:  # a refusal in the words of load_model
-        assert (status, "ModelError" in capsys.readouterr().err) == (cli.USAGE, True)
-    else:
-        assert status == 0
-        assert seen[0].options | kept == seen[0].options
 
 
 def test_the_version_is_that_of_the_installation(tmp_path):

@@ -315,6 +315,7 @@ def test_a_sliding_balls_friction_in_closed_form(tmp_path):
     np.testing.assert_allclose(d.C[2:], exact, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("approximation", ["sap", pytest.param("similar", marks=pytest.mark.slow), "lagged"])
 def test_columns_by_the_material_are_differences_of_the_step(tmp_path, approximation):
     model = _walker(tmp_path, contact_approximation=approximation)

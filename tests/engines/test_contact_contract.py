@@ -10,7 +10,7 @@ from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.comparison.result import LAWS
+from drake_diff.engines.contract import LAWS
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.exceptions import ModelError
 from drake_diff.export.export import export_model, written

@@ -46,6 +46,7 @@ def test_of_a_right_model_nothing_is_said(ball):
     assert w.explained
 
 
+@pytest.mark.slow
 def test_a_right_model_is_not_blamed_where_its_motion_is_hard_to_find():
     """Steps from the measured first state of this block end at twice the noise, from which stiffness looked wrong."""
     model, log, name, _ = identify_contact_causes.recorded("sliding_block", 0.005, False, 50009)

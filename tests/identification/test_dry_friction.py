@@ -8,7 +8,6 @@ import pytest
 from helpers.models import robot_file
 from scipy import stats
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 
 import drake_diff as dd
 from drake_diff.identification.fit import Fit
@@ -240,39 +239,6 @@ def fit_of(model, law, unknowns, us, xs, times, seed):
     pieces = read_pieces(model, dd.Recording("lab", "1", times, ys, us), 0.0)
     fit = Fit(model, law, Chart(coordinates_of(model)), unknowns, pieces, np.array([NOISE, NOISE, np.nan, np.nan]))
     return fit, xs[fit.segments.first].copy()
-
-
-@pytest.mark.slow
-def test_a_fit_of_which_least_is_left_at_a_kink_ends_there(load):
-    """A joint stops just when its input changes: a little later or earlier it goes on otherwise, and noise wants both.
-
-    Plain steps are stuck before that in 5 of these 12. One has three kinks, and stays so.
-    """
-    model, count = load("double_pendulum.urdf"), 100
-    tree = tree_for_identification(model)
-    unknowns = choose_unknowns(model, tree, ["shoulder.coulomb_friction"])
-    law = ContinuousMotion(model, tree, unknowns, H)
-    times, true = H * np.arange(count + 1), np.array([4.0])
-    us = np.column_stack([9 * np.sin(4.4 * times[:-1]), 0.6 * np.sin(8.2 * times[:-1])])
-    us[:2, 0], us[2:17, 0] = 0.0, -12.0
-
-    def speed_after(first, steps):
-        starts = np.array([[0.3, -0.2, first, 0.0]])
-        return law.run(true, starts, np.full((1, steps), H), us[None, :steps])[0, :, 2]
-
-    first = brentq(lambda v: speed_after(v, 2)[-1] - 1e-9, 0.1, 1.0, xtol=1e-12)  # stops as the input changes
-    xs = law.run(true, np.array([[0.3, -0.2, first, 0.0]]), np.full((1, count), H), us[None])[0]
-    assert xs[2, 2] < 1e-8
-    assert xs[3, 2] < -1e-3  # and goes back
-    ended, off = [], []
-    for seed in range(12):
-        fit, starts = fit_of(model, law, unknowns, us, xs, times, seed)
-        starts[0, 2] += 0.02  # [rad/s]
-        solved = fit.solve(true, starts, 12)
-        ended.append(solved.converged)
-        off.append(float((solved.z - true)[0] * np.abs(solved.reduced.R[0, 0])))
-    assert sum(ended) >= 11
-    assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 12)  # of standard normal numbers
 
 
 def test_a_least_squares_mixed_with_itself_is_the_same(load):

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from helpers.models import MODELS
-from helpers.mujoco_arm import MuJoCoArm, bare_arm, drakes, shaken
 from helpers.pendulum import GRAVITY, LEVER, swing
 from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
@@ -145,41 +144,3 @@ def test_what_makes_no_sense_is_refused(load):
     refused(UnknownNameError, "sensor of which there are columns", "pole.gyro_x", sensors={"imu": ("pole", [0, 0, 0])})
     refused(InputError, "x, y, z", "imu.gyro_x", sensors={"imu": ("pole", [0, 0])})
     refused(ModelError, "continuous", "pole.gyro_x", motion="steps")
-
-
-@pytest.mark.slow
-def test_an_arm_is_known_by_its_hand_its_imu_and_its_torques_in_another_simulator(tmp_path):
-    """A UR5 in MuJoCo with a heavier forearm, with encoders of 4 mrad and MuJoCo's own sensors."""
-    mujoco = pytest.importorskip("mujoco")
-    path = bare_arm(tmp_path)
-    model, random = drakes(path), np.random.default_rng(0)
-    q0 = np.array([0.3, -1.2, 1.0, -0.5, 0.4, 0.2])
-    us = shaken(model, q0, 150, 0.01, random)
-    arm = MuJoCoArm(mujoco, path)
-    point = [0.05, 0.02, 0.1]
-    arm.spec.body("wrist_3_link").add_site(name="imu", pos=point)
-    for kind in ("FRAMEPOS", "GYRO", "ACCELEROMETER"):
-        arm.spec.add_sensor(
-            name=kind, type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"), objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu"
-        )
-    arm.spec.body("forearm_link").add_site(name="elbow")  # whose y is the joint's axis
-    site = {"objtype": mujoco.mjtObj.mjOBJ_SITE, "objname": "elbow"}
-    arm.spec.add_sensor(name="torque", type=mujoco.mjtSensor.mjSENS_TORQUE, **site)
-    q, v, sensed = arm.move(q0, us, 0.01, masses={"forearm_link": 1.2})
-    sensed = sensed[:, [*range(9), 10]]
-    noise = [*np.repeat([1e-3, 2e-3, 2e-2], 3), 0.5]
-    sensed = sensed + noise * random.standard_normal(sensed.shape)
-    names = [*columns("imu"), "elbow_joint.force"]
-    xs = np.hstack([q + 4e-3 * random.standard_normal(q.shape), np.full_like(v, np.nan)])
-    start = next(p.value[0] for p in dd.list_parameters(model) if p.name == "forearm_link.mass")
-    found = {}
-    for name, outputs in (("encoders", {}), ("all", dict(zip(names, sensed.T, strict=True)))):
-        log = dd.Recording("MuJoCo", mujoco.__version__, 0.01 * np.arange(151), xs, us, outputs=outputs)
-        more = {"sensors": {"imu": ("wrist_3_link", point)}} if outputs else {}
-        found[name] = dd.identify(model, log, ["forearm_link.mass", "elbow_joint.damping"], motion="continuous", **more)
-        assert found[name].explained, found[name].reason
-        for parameter, truth in (("forearm_link.mass", 1.2 * start), ("elbow_joint.damping", 0.5)):
-            # Intervals of 95 % twice as wide, in which the truth is but once in 10,000 times not.
-            assert abs(found[name].values[parameter] - truth) < np.ptp(found[name].intervals[parameter]), parameter
-    widths = {name: np.ptp(e.intervals["elbow_joint.damping"]) for name, e in found.items()}
-    assert widths["all"] < 0.5 * widths["encoders"]

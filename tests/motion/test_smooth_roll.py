@@ -106,6 +106,7 @@ def test_what_is_told_is_drakes_own_rollout():
     assert result.iterations[-1].objective == problem.objective(xs, us)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [1 + 1e-6, 1.01])
 def test_a_form_that_moves_otherwise_is_found_out(wrong, monkeypatch):
     """A search that tries motions with other masses ends where Drake's own does, 1e-9 of its cost."""

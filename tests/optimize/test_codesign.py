@@ -247,25 +247,6 @@ def test_a_block_in_least_time_by_discrete_steps(method, solver, steps, tmp_path
 
 
 @pytest.mark.slow
-@each_row("method", ["ilqr", "shooting"])
-def test_a_time_that_is_weighed_against_effort(method, tmp_path):
-    """w T + c 12 m^2 d^2 / T^3 is least at T = (36 c m^2 d^2 / w)^(1/4); of N steps c = 1 / (1 - 1/N^2)."""
-    mass, way, weight, steps = 1.3, 1.0, 3.0, 20
-    problem = dd.Problem(
-        sliding(mass, 100.0, tmp_path),
-        x0=[0, 0],
-        x_goal=[way, 0],
-        num_steps=steps,
-        horizon=(0.5, 10),
-        running_cost=lambda x, u: weight + u[0] ** 2,
-    )
-    solution = dd.solve(problem, method=method)
-    assert solution.success, solution.message
-    effort = 36 * mass**2 * way**2 / (1 - 1 / steps**2)
-    assert solution.horizon == pytest.approx((effort / weight) ** 0.25, rel=1e-5)
-
-
-@pytest.mark.slow
 def test_a_mass_that_pushes_through_contact_is_where_its_price_meets_what_it_saves():
     """The slope of the least effort by the mass, from plans with masses on both sides, against that of the price."""
     model = dd.load_model(MODELS / "two_spheres.sdf", time_step=0.01)

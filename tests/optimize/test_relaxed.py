@@ -171,7 +171,7 @@ def test_the_true_plant_follows_what_was_rolled_out(two_spheres):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("time_step", "clearance"), [(0.005, 0.05), (0.01, 0.05), (0.02, None), (0.05, None)])
+@pytest.mark.parametrize(("time_step", "clearance"), [(0.01, 0.05), (0.05, None)])
 def test_a_hopper_that_stands_gets_half_a_metre_on(time_step, clearance):
     """The guess stays on the ground: a line to the goal. With a clearance on the way it has to hop.
 
@@ -188,34 +188,6 @@ def test_a_hopper_that_stands_gets_half_a_metre_on(time_step, clearance):
     assert solution.success, solution.message
     assert any(not contacts for contacts in solution.replay.contacts) or clearance is None
     assert solution.replay.contacts[-1]
-
-
-@pytest.mark.slow
-def test_a_quadruped_stands_up_from_a_crouch():
-    """A Solo12, from a line between the two postures, which carries no weight; it ends at rest, on its four feet."""
-    model = example_robot("solo12.urdf", 0.02, feet=True, approximation="sap", dissipation=5)
-
-    def standing(bend):
-        x = np.array(model.default_state)
-        x[:7] = 1, 0, 0, 0, 0, 0, 0
-        for i, name in enumerate(model.state_names[: model.nq]):
-            side = 1 if name.startswith("F") else -1
-            x[i] += side * (bend if "HFE" in name else -2 * bend if "KFE" in name else 0.0)
-        feet = relaxed_plant(model).distances(x[None, : model.nq])[0]
-        x[6] = -np.min(feet) - 3e-4  # 25 N on four feet of 2e4 N/m
-        return x
-
-    x0, posture = standing(1.1), standing(0.7)
-    goal = np.full(model.nx, np.nan)
-    goal[:7], goal[model.nq :] = posture[:7], 0.0
-    Q, ref = np.zeros(model.nx), np.array(posture)
-    Q[7 : model.nq], Q[model.nq :] = 0.1, 0.01
-    cost = dd.QuadraticCost(Q=np.diag(Q), R=1e-3 * np.eye(model.nu), x_ref=ref)
-    problem = dd.Problem(model, x0=x0, x_goal=goal, num_steps=30, running_cost=cost)
-    solution = dd.solve(problem, options=Options(continuation="relaxed"), max_iterations=150)
-    assert solution.success, solution.message
-    assert posture[6] - x0[6] > 0.04
-    assert len(solution.replay.contacts[-1]) == 4
 
 
 def test_what_has_no_relaxed_contact_is_refused_by_name(load, two_spheres):

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from helpers.models import MODELS, robot_file
+from helpers.models import MODELS
 from pydrake.systems.analysis import Simulator
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.legs.feet import Legs
 from drake_diff.legs.standing import standing
-from drake_diff.optimize import Options
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 LEGS = "FL", "FR", "RL", "RR"
@@ -129,32 +128,3 @@ def test_feet_in_the_air_are_refused_where_they_are_to_stand():
             STAND.guess(model, above)
     fall = dd.optimize.ContactSchedule([(4, ()), (30, FEET)])
     assert len(fall.guess(model, x0)[1]) == 34
-
-
-@pytest.mark.slow
-def test_a_strangers_quadruped_trots():
-    """As its file gives it, without a stiffness."""
-    feet, parts = FEET, ("hip", "thigh", "calf")
-    one, other = (feet[0], feet[3]), (feet[1], feet[2])
-    steps = [(5, feet), (8, one), (2, feet), (8, other), (2, feet), (8, one), (20, feet)]
-    schedule = dd.optimize.ContactSchedule(steps)
-    model = schedule.with_soft_feet(dd.load_model(robot_file("a1.urdf"), time_step=0.02, meshes="spheres", **OPTIONS))
-    angles = dict(zip(parts, (0.0, 0.8, -1.6), strict=True))
-    x0 = schedule.standing(model, {f"{leg}_{part}_joint": angles[part] for leg in LEGS for part in parts})
-    end = x0[: model.nq].copy()
-    end[4] += 0.5 * x0[6]
-    guess = schedule.guess(model, x0, end)
-    goals = [schedule, dd.FrameGoal("base", end[4:7], tolerance=0.05)]
-    problem = dd.Problem(model, x0=x0, num_steps=len(guess[1]), goals=goals, **schedule.follow(model, guess))
-    solution = dd.solve(problem, method="ilqr", options=Options(tolerance=1e-4), initial_guess=guess)
-    assert solution.success, solution.message
-    context = model.plant.CreateDefaultContext()
-
-    def heights(knot):
-        model.plant.SetPositions(context, solution.xs[knot, : model.nq])
-        bodies = [model.plant.GetBodyByName(foot) for foot in feet]
-        return np.array([model.plant.EvalBodyPoseInWorld(context, body).translation()[2] for body in bodies])
-
-    for knot, swinging in ((9, other), (19, one), (29, other)):
-        lifted = heights(knot) - heights(0)
-        assert [bool(value > 5e-3) for value in lifted] == [foot in swinging for foot in feet]  # its clearance, asked

@@ -229,39 +229,6 @@ def test_goals_are_in_the_replay(two, browser):
     assert "target of pole" in (two / "long" / "report.html").read_text()
 
 
-@pytest.mark.slow
-@browsing
-def test_a_goal_is_seen_through_the_robot_and_the_plan_behind_it(browser, tmp_path):
-    """The target is inside the cart where the motion ends, the plan 0.3 rad and 5 cm from the motion."""
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
-    us = np.full((20, 1), 1.0)
-    xs = np.array(dd.rollout(model, [0, 0.3, 0, 0], us).xs)
-    goal = dd.FrameGoal("cart", position=[float(xs[-1, 0]), 0, 0], tolerance=0.02)
-    xs[1:] += [0.05, 0.3, 0, 0]
-    dd.save(by_hand(model, xs, us, goals=(goal,)), tmp_path / "run")
-    open_page(browser, tmp_path / "run" / "report.html")
-    move_slider(browser, 1.0)
-
-    def seen(**shown):
-        for name, visible in shown.items():
-            browser.execute_script(
-                "document.getElementById('view').contentWindow.viewer.set_property(['drake', arguments[0]],"
-                "'visible', arguments[1])",
-                name,
-                visible,
-            )
-        return view_of(browser)
-
-    alone, nothing = seen(motion=True, plan=False), seen(motion=False, plan=False)
-    robot = np.abs(alone - nothing).max(axis=2) > 0.05
-    both = seen(motion=True, plan=True)
-    changed = np.abs(both - alone).max(axis=2)
-    assert robot.sum() > 1000
-    assert (changed[robot] > 0.02).mean() < 0.02  # the plan hides none of it: its edges alone are mixed with it
-    assert (changed[~robot] > 0.05).sum() > 200
-    assert (alone[..., 1] > alone[..., [0, 2]].max(axis=2) + 0.05).sum() > 50  # the target, inside the cart
-
-
 def certificate(rows, columns, wrong=()):
     matrix = np.arange(1.0, rows * columns + 1).reshape(rows, columns)
     given = matrix.copy()
