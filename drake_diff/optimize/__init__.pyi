@@ -14,4 +14,3 @@ from .problem.phases import PhasedProblem as PhasedProblem
 from .problem.schedule import ContactSchedule as ContactSchedule
 from .problem.terminal import TerminalSet as TerminalSet
 from .program import Iteration as Iteration
-from .transcription.between import violation_between_nodes as violation_between_nodes

@@ -41,9 +41,9 @@ from drake_diff.model.step import set_state
 from drake_diff.motion.continuous import ContinuousMotion
 from drake_diff.optimize.ilqr.riccati import minimize_in_box
 from drake_diff.optimize.problem.cost import cost_at, final_cost_hessian, running_cost_hessian
+from drake_diff.optimize.problem.design import ShootingVariables, final_sensitivity
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
-from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 from drake_diff.optimize.transcription.steps import StepProgram
 
 AT_ONCE = 64  # rows: each takes as much memory as the plan

@@ -396,7 +396,7 @@ class PhasedTranscription:
     """The phases of a problem in a scheme, solved as one program; see `Transcription`."""
 
     def __init__(self, problem: PhasedProblem, scheme: str):
-        from drake_diff.optimize.transcription.phased import link_functions  # loads CasADi
+        from drake_diff.optimize.transcription.coupled import link_functions  # loads CasADi
 
         self.problem, self.links = problem, link_functions(problem)
         self.phases = [Transcription(phase, scheme) for phase in problem.phases]
@@ -446,7 +446,7 @@ class PhasedTranscription:
         limits: Limits,
         report: Report | None,
     ) -> PhasedMotion:
-        from drake_diff.optimize.transcription.phased import PhasedProgram
+        from drake_diff.optimize.transcription.coupled import PhasedProgram
         from drake_diff.optimize.transcription.program import TranscribedProgram
 
         parts = zip(self.phases, meshes, strict=True)

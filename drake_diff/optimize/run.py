@@ -26,11 +26,11 @@ from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through
 from drake_diff.optimize.measure import certify_equations, first_knots, telling_knots
 from drake_diff.optimize.optimality import HOLDS, doubt_of_the_slope, out_of_reach, why_blind
 from drake_diff.optimize.options import Options
+from drake_diff.optimize.problem.design import ShootingVariables
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import SelfCollision, lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report, heard
-from drake_diff.optimize.shooting import ShootingVariables
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (

@@ -10,7 +10,7 @@ from drake_diff.model.contact import separations
 from drake_diff.model.step import set_state
 from drake_diff.optimize import Options
 from drake_diff.optimize.ilqr.through_contact import MARGIN, beginnings, restore_goal
-from drake_diff.optimize.shooting import ShootingVariables
+from drake_diff.optimize.problem.design import ShootingVariables
 
 pytestmark = pytest.mark.solve
 

@@ -151,7 +151,7 @@ def test_a_reset_without_an_expression_is_differentiated_too():
 def test_the_program_has_the_derivatives_of_its_differences():
     """Jacobian and Hessian of phases, resets and durations together, against central differences."""
     from drake_diff.optimize.transcription.collocation import Transcription
-    from drake_diff.optimize.transcription.phased import PhasedProgram, link_functions
+    from drake_diff.optimize.transcription.coupled import PhasedProgram, link_functions
     from drake_diff.optimize.transcription.program import TranscribedProgram
 
     step = gait().phases[0]

@@ -10,7 +10,7 @@ from pydrake.multibody.tree import LinearSpringDamper, RevoluteJoint, SpatialIne
 
 import drake_diff as dd
 from drake_diff.optimize.optimality import out_of_reach
-from drake_diff.optimize.shooting import ShootingVariables
+from drake_diff.optimize.problem.design import ShootingVariables
 
 pytestmark = pytest.mark.solve
 

@@ -15,8 +15,8 @@ import drake_diff as dd
 from drake_diff._base.autodiff import WIDE, chain, chain_rows
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.optimize.problem.coupling import Coupling
+from drake_diff.optimize.problem.design import ShootingVariables, final_sensitivity
 from drake_diff.optimize.program import Limits
-from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 from drake_diff.optimize.solution import Status
 from drake_diff.optimize.transcription import steps
 

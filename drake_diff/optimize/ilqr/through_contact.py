@@ -24,9 +24,9 @@ from drake_diff.model.step import advance, set_state
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.design import ShootingVariables, final_sensitivity
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Outcome, Report
-from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 
 MARGIN = 1e-5  # [m] that a held pair keeps from just touching: differences of 1e-6 then see no jump
 PRESSING = 1.01  # margins: nearer than that to just touching, a row is what holds the motion

@@ -52,26 +52,6 @@ def violation_between_nodes(motion: Collocated) -> Excess:
 
     The states are those that an accurate integration from each knot passes through, under the input as the plant
     applies it, cut off at its own limits. A cost below the optimum of the problem goes together with an excess here.
-
-    Args:
-        motion: `Solution.transcribed` of a solution by collocation.
-
-    Returns:
-        An `Excess`: the largest of a `state`, an `input` and a `constraint` over a bound, each in its own unit, `where`
-        the worst is, and a check of each. States and constraints are looked at in 9 places within each interval, inputs
-        in 39, and constraints also where they come nearest to a bound between these; a constraint that holds at some
-        knots only is left out.
-
-    Example:
-        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
-        >>> effort, slow = dd.QuadraticCost(R=[[0.5]]), dd.Constraint(lambda x: x[1], upper=1.3, name="slow")
-        >>> problem = dd.Problem(
-        ...     block, x0=[0, 0], x_goal=[1, 0], num_steps=4, horizon=1.0, running_cost=effort, constraints=slow
-        ... )
-        >>> solution = dd.solve(problem, options=dd.optimize.Options(refine=False))
-        >>> excess = dd.optimize.violation_between_nodes(solution.transcribed)
-        >>> excess.state, excess.input, round(excess.constraint, 3), solution.status.value
-        (0.0, 0.0, 0.004, 'converged_not_verified')
     """
     task, b, count = motion.task, motion.task.bounds, len(motion.mesh) - 1
     if task.is_map:

@@ -31,7 +31,7 @@ from drake_diff.optimize.program import (
     Report,
     Watch,
 )
-from drake_diff.optimize.transcription.coupled import SlopeRows, rows_of, slopes_of
+from drake_diff.optimize.transcription.coupled import SlopeRows, SparseSum, rows_of, slopes_of, sparse
 from drake_diff.optimize.transcription.expressions import KnotFunctions, Timed
 from drake_diff.optimize.transcription.task import OptimalControl
 
@@ -163,7 +163,7 @@ class TranscribedProgram:
     def _slope_weights(self) -> list[Any]:
         """Sparse, of the rates of all nodes or of z."""
         sizes = {True: self.every.size * self.nx, False: self.z.numel()}
-        return [_sparse(*c.entries, (c.count, sizes[c.of_rates])) for c in self.slopes]
+        return [sparse(*c.entries, (c.count, sizes[c.of_rates])) for c in self.slopes]
 
     @cached_property
     def nlp(self) -> dict[str, Any]:
@@ -211,8 +211,8 @@ class TranscribedProgram:
             np.concatenate([np.broadcast_to(getattr(link, name), link.rows.shape).ravel() for link in self._links])
             for name in ("rows", "columns", "state", "slope", "rates")
         )
-        self._S = _sparse(rows, columns, states, (self.num_links, self.z.numel()))
-        self._D = _sparse(rows, rates, slopes, (self.num_links, self.every.size * self.nx))
+        self._S = sparse(rows, columns, states, (self.num_links, self.z.numel()))
+        self._D = sparse(rows, rates, slopes, (self.num_links, self.every.size * self.nx))
         self._linear: Any = None
         self._linear_sides = np.zeros(0), np.zeros(0)
         inputs = np.arange(self.task.dynamics.nu)
@@ -230,7 +230,7 @@ class TranscribedProgram:
         rows = np.arange(middle.size).reshape(middle.shape)
         columns = np.stack([middle, middle - self.width, middle + self.width])
         values = np.array(weights)[:, None, None]
-        self._linear = _sparse(rows, columns, values, (middle.size, self.z.numel()))
+        self._linear = sparse(rows, columns, values, (middle.size, self.z.numel()))
         self._linear_sides = np.tile(lower, len(middle)), np.tile(upper, len(middle))
 
     def _relax_what_is_given(self, hull: "_Links") -> None:
@@ -564,39 +564,3 @@ class _Blocks:
         self.node = np.repeat(nodes[:, None], len(pattern[0]), axis=1)
         self.column = self.node * width + columns
         self.index = np.arange(self.rows.size).reshape(self.rows.shape)
-
-
-class SparseSum:
-    """A sparse matrix whose entries are sums: matrix[row, column] += coefficient * source[index]."""
-
-    def __init__(self, shape: tuple[int, int]):
-        self.shape = shape
-        self.places: list[Indices] = []
-        self.parts: list[tuple[Array, Any, Indices]] = []
-
-    def add(self, rows: Any, columns: Any, coefficients: Any, source: Any, index: Any) -> None:
-        """Add entries, one for each of `index`; the others are broadcast to it and it to them."""
-        rows, columns, coefficients, index = (
-            a.ravel() for a in np.broadcast_arrays(rows, columns, coefficients, index)
-        )
-        self.places.append(columns * self.shape[0] + rows)
-        self.parts.append((coefficients, source, index))
-
-    def matrix(self) -> Any:
-        """An MX of the places that were added to."""
-        places, targets = np.unique(np.concatenate(self.places), return_inverse=True)
-        nonzeros, start = 0, 0
-        for coefficients, source, index in self.parts:
-            rows = targets[start : start + len(index)]
-            gather = _sparse(rows, index, coefficients, (len(places), source.numel()))
-            nonzeros, start = nonzeros + ca.mtimes(gather, source), start + len(index)
-        columns, rows = np.divmod(places, self.shape[0])
-        starts = np.searchsorted(columns, np.arange(self.shape[1] + 1))
-        return ca.MX(ca.Sparsity(*self.shape, starts.tolist(), rows.tolist()), nonzeros)
-
-
-def _sparse(rows: Any, columns: Any, values: Any, shape: tuple[int, int]) -> Any:
-    """A DM of `shape` with `values` other than 0 at (rows, columns)."""
-    rows, columns, values = (a.ravel() for a in np.broadcast_arrays(rows, columns, values))
-    nonzero = values != 0
-    return ca.DM.triplet(rows[nonzero].tolist(), columns[nonzero].tolist(), ca.DM(values[nonzero]), *shape)
