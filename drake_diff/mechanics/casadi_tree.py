@@ -72,8 +72,8 @@ def _compared(
 ) -> PlantFunctions | Refusal:
     tree = tree_for(model)
     if tree is None:
-        found = tree_of(model)
-        return found if isinstance(found, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
+        read = tree_of(model)
+        return read if isinstance(read, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
     equations, random = EquationsOfMotion(model), np.random.default_rng(1)
     here = model.double.state()
     tail = np.zeros(0) if coordinates is None else coordinates.from_values(coordinates.start.values)
@@ -189,7 +189,7 @@ class SymbolicTree:
         self.turns = [np.eye(3) if link.free else _with_z(link.axis) for link in tree.links]
         self.links = [self._link(link, turn) for link, turn in zip(tree.links, self.turns, strict=True)]
         self.stiffness, self.rest, self.damping, self.reflected = (
-            ca.SX(ca.DM(each)) for each in (tree.stiffness, tree.rest, tree.damping, tree.reflected)
+            ca.SX(ca.DM(values)) for values in (tree.stiffness, tree.rest, tree.damping, tree.reflected)
         )
         self.gravity = ca.DM(tree.gravity)
 
@@ -233,8 +233,8 @@ class SymbolicTree:
     def _shift(self, joint: Link, value: Any) -> None:
         """Put a joint to `value` (3,) on its parent."""
         k = next(k for k, link in enumerate(self.tree.links) if link.joint.joint == joint.joint)
-        place, pose = self.tree.on[joint.parent]
-        turn = (np.eye(3) if place < 0 else self.turns[place]).T @ pose.rotation().matrix()
+        carrier, pose = self.tree.on[joint.parent]
+        turn = (np.eye(3) if carrier < 0 else self.turns[carrier]).T @ pose.rotation().matrix()
         moved = ca.DM(turn) @ (value - ca.DM(joint.on_parent.translation()))
         self.links[k] = replace(self.links[k], offset=self.links[k].offset + moved)
 
@@ -259,8 +259,8 @@ class SymbolicTree:
                 continue
             turn = self.turns[k].T
             R, t = ca.DM(turn @ pose.rotation().matrix()), ca.DM(turn @ pose.translation())
-            own = body.mass, body.center_of_mass, body.inertia
-            before = _moved(_weight(*own, about_center=True), R, t)
+            inertial = body.mass, body.center_of_mass, body.inertia
+            before = _moved(_weight(*inertial, about_center=True), R, t)
             after = _moved(_weight_of(body, given), R, t)
             change = (ca.sparsify(ca.SX(new - old)) for new, old in zip(after, before, strict=True))
             self.links[k] = replace(self.links[k], weight=_sum(self.links[k].weight, change))
@@ -292,8 +292,10 @@ def _weight_of(body: Link, given: dict[tuple[str, str], Any]) -> tuple[Any, Any,
         xx, yy, zz, xy, xz, yz = six
         full = ca.blockcat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         return _weight(mass, center, full, about_center=True)
-    own = _weight(body.mass, ca.DM(body.center_of_mass), ca.DM(body.inertia), about_center=True)[2]
-    return _weight(mass, center, mass * own / body.mass if body.mass else own, about_center=False)  # its unit inertia
+    about_origin = _weight(body.mass, ca.DM(body.center_of_mass), ca.DM(body.inertia), about_center=True)[2]
+    return _weight(
+        mass, center, mass * about_origin / body.mass if body.mass else about_origin, about_center=False
+    )  # its unit inertia
 
 
 def _regrouped(links: list[_Link]) -> list[_Link]:
@@ -309,8 +311,8 @@ def _regrouped(links: list[_Link]) -> list[_Link]:
         if link.kind != "revolute":
             continue
         unseen = m, h[2] * Z, inertia[1, 1] * ca.diag(ca.DM([1, 1, 0]))
-        own = inertia - unseen[2]
-        links[k] = replace(link, weight=(0.0, ca.vertcat(h[0], h[1], 0), own))
+        seen = inertia - unseen[2]
+        links[k] = replace(link, weight=(0.0, ca.vertcat(h[0], h[1], 0), seen))
         if link.parent >= 0:
             parent = links[link.parent]
             weight = _sum(parent.weight, _moved(unseen, link.rotation, link.offset))
@@ -358,8 +360,8 @@ class MovingTree:
             return (link.rotation @ turned, link.offset), ([Z], [none])
         R = quaternion_rotation(self.all_q[link.q : link.q + 4])
         axes = ca.horzsplit(R.T)
-        place = link.offset + link.rotation @ self.all_q[link.q + 4 : link.q + 7]
-        return (link.rotation @ R, place), ([*axes, *(3 * [none])], [*(3 * [none]), *axes])
+        origin = link.offset + link.rotation @ self.all_q[link.q + 4 : link.q + 7]
+        return (link.rotation @ R, origin), ([*axes, *(3 * [none])], [*(3 * [none]), *axes])
 
     @property
     def position_rates(self) -> Any:
@@ -465,13 +467,13 @@ class MovingTree:
 
     def body(self, name: str) -> tuple[Any, Any, list[int]]:
         """Rotation and origin of a body in world, and the degrees of freedom that move it."""
-        place, pose = self.plant.tree.on[name]
+        carrier, pose = self.plant.tree.on[name]
         R, p = ca.DM(pose.rotation().matrix()), ca.DM(pose.translation())
-        if place < 0:
+        if carrier < 0:
             return R, p, []
         places, above, _ = self._in_world
-        turn = places[place][0] @ ca.DM(self.plant.turns[place].T)
-        return turn @ R, places[place][1] + turn @ p, above[place]
+        turn = places[carrier][0] @ ca.DM(self.plant.turns[carrier].T)
+        return turn @ R, places[carrier][1] + turn @ p, above[carrier]
 
 
 def quaternion_rotation(q: Any) -> Any:
@@ -495,8 +497,8 @@ def _with_z(axis: Array) -> Array:
 
 def agrees(function: Any, probe: Array, wanted: Array, tolerance: float) -> bool:
     """Whether `function` gives `wanted` (P, m) at `probe` (P, nx + nu), relative to the largest value of each row."""
-    found = np.array([np.asarray(function(knot)).ravel() for knot in probe])
-    if found.shape != wanted.shape:
+    values = np.array([np.asarray(function(knot)).ravel() for knot in probe])
+    if values.shape != wanted.shape:
         return False
     scale = np.maximum(1.0, np.nanmax(np.abs(wanted), axis=1, initial=0.0, where=np.isfinite(wanted)))[:, None]
-    return bool(np.allclose(found / scale, wanted / scale, rtol=0.0, atol=tolerance, equal_nan=True))
+    return bool(np.allclose(values / scale, wanted / scale, rtol=0.0, atol=tolerance, equal_nan=True))

@@ -231,9 +231,9 @@ class OfPairs(Clearance):
         self.first, self.second = in_rows([a for a, _ in pairs]), in_rows([b for _, b in pairs])
 
     def _nearest(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
-        one, other = self.first.ends(frames), self.second.ends(frames)
-        s, t = along_segments(one, other, self.first.squared, self.second.squared)
-        return one[0] + s[..., None] * (one[1] - one[0]), other[0] + t[..., None] * (other[1] - other[0])
+        first, second = self.first.ends(frames), self.second.ends(frames)
+        s, t = along_segments(first, second, self.first.squared, self.second.squared)
+        return first[0] + s[..., None] * (first[1] - first[0]), second[0] + t[..., None] * (second[1] - second[0])
 
     def _distances(self, frames: tuple[Any, Any]) -> Any:
         a, b = self._nearest(frames)
@@ -279,10 +279,12 @@ class Swept(Clearance):
         return np.hstack([self.other.moved(self._earlier(xs, time)) for time in self.before])
 
     def linearize(self, xs: Array) -> tuple[Array, Array]:
-        found = [self.other.linearize(self._earlier(xs, time)) for time in self.before]
+        linearized = [self.other.linearize(self._earlier(xs, time)) for time in self.before]
         identity = np.eye(self.moves.shape[0])
-        slopes = [rows @ (identity - time * self.moves) for (_, rows), time in zip(found, self.before, strict=True)]
-        return np.hstack([values for values, _ in found]), np.concatenate(slopes, axis=1)
+        slopes = [
+            rows @ (identity - time * self.moves) for (_, rows), time in zip(linearized, self.before, strict=True)
+        ]
+        return np.hstack([values for values, _ in linearized]), np.concatenate(slopes, axis=1)
 
     def _earlier(self, x: Any, time: float) -> Any:
         return x - time * (x @ self.moves.T)
@@ -297,5 +299,5 @@ def balls_of(piece: Piece) -> list[Piece]:
     count = int(np.ceil(half_length / within))
     radius = float(np.hypot(piece.radius, half_length / count))
     excess = piece.excess + radius - piece.radius
-    centers = [piece.start + part * (piece.end - piece.start) for part in np.linspace(0, 1, count + 1)]
+    centers = [piece.start + share * (piece.end - piece.start) for share in np.linspace(0, 1, count + 1)]
     return [replace(piece, start=c, end=c, radius=radius, excess=excess) for c in centers]

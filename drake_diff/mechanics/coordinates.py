@@ -56,9 +56,9 @@ class Coordinates:
     @cached_property
     def single_as_is(self) -> Array:
         """(nv, nv) the identity but for free bodies, where it is 0."""
-        own = np.zeros(self.nv)
-        own[[j for _, j in self.single]] = 1.0
-        return np.diag(own)
+        diagonal = np.zeros(self.nv)
+        diagonal[[j for _, j in self.single]] = 1.0
+        return np.diag(diagonal)
 
     def rate(self, q: Array) -> Array:
         """N (..., nq, nv) with dq/dt = N v, at q (..., nq)."""
@@ -131,10 +131,10 @@ def rotation(quaternion: Array) -> Array:
 
 def unit(coordinates: Coordinates, q: Array) -> Array:
     """`q` with quaternions of the norm 1."""
-    found = np.array(q)
+    normalized = np.array(q)
     for i, _ in coordinates.free:
-        found[i : i + 4] /= np.linalg.norm(q[i : i + 4])
-    return found
+        normalized[i : i + 4] /= np.linalg.norm(q[i : i + 4])
+    return normalized
 
 
 def zero(coordinates: Coordinates) -> Array:
@@ -166,10 +166,10 @@ def turn(coordinates: Coordinates, q: Array) -> Array:
 
 def turning(coordinates: Coordinates, v: Array) -> Array:
     """(..., nv) w x v of free bodies, in Drake's v (..., nv)."""
-    found = np.zeros_like(v)
+    rates = np.zeros_like(v)
     for _, j in coordinates.free:
-        found[..., j + 3 : j + 6] = cross(v[..., j : j + 3], v[..., j + 3 : j + 6])
-    return found
+        rates[..., j + 3 : j + 6] = cross(v[..., j : j + 3], v[..., j + 3 : j + 6])
+    return rates
 
 
 def turn_change(coordinates: Coordinates, Q: Array, v: Array) -> Array:
@@ -211,11 +211,11 @@ class Centers:
 
     def turning(self, q: Array, v: Array) -> Array:
         """(nv,) dQ/dt v: w x (w x r)."""
-        found = np.zeros(self.coordinates.nv)
+        rates = np.zeros(self.coordinates.nv)
         for _, j, r in self._arms(q):
             w = v[j : j + 3]
-            found[j + 3 : j + 6] = np.cross(w, np.cross(w, r))
-        return found
+            rates[j + 3 : j + 6] = np.cross(w, np.cross(w, r))
+        return rates
 
     def derivative(self, x: Array) -> Array:
         """(nx, nx) of (q of norm 1, Q v) by (q, v)."""
@@ -231,10 +231,10 @@ class Centers:
 
     def _by_motion(self, q: Array, v: Array) -> Array:
         """(nv, nv) of Q v by small motion at fixed v."""
-        found = np.zeros((self.coordinates.nv, self.coordinates.nv))
+        derivative = np.zeros((self.coordinates.nv, self.coordinates.nv))
         for _, j, r in self._arms(q):
-            found[j + 3 : j + 6, j : j + 3] = -skew(v[j : j + 3]) @ skew(r)
-        return found
+            derivative[j + 3 : j + 6, j : j + 3] = -skew(v[j : j + 3]) @ skew(r)
+        return derivative
 
     def _arms(self, q: Array) -> list[tuple[int, int, Array]]:
         places = zip(self.coordinates.free, self.centers, strict=True)

@@ -73,11 +73,11 @@ def _cover(model: Model, kinematics: ForwardKinematics) -> Cover:
     inspector = whole.double.inspector
     for label, body in labelled(bodies(whole.plant)).items():
         link, pose = kinematics.on[label]
-        found = [] if inspector is None else list(_of_shapes(whole, inspector, body, unread))
-        found = found or list(_skeleton(whole, body))
-        pieces += [replace(p, body=label, link=link, start=pose @ p.start, end=pose @ p.end) for p in found]
-    for place, rigid in enumerate(kinematics.links):
-        if place not in kinematics.between and all(p.link != place for p in pieces):
+        shapes = [] if inspector is None else list(_of_shapes(whole, inspector, body, unread))
+        shapes = shapes or list(_skeleton(whole, body))
+        pieces += [replace(p, body=label, link=link, start=pose @ p.start, end=pose @ p.end) for p in shapes]
+    for number, rigid in enumerate(kinematics.links):
+        if number not in kinematics.between and all(p.link != number for p in pieces):
             bare.append(rigid.joint.body)
     return Cover(tuple(pieces), tuple(bare), (*unread, *_doubts(pieces, bare)))
 
@@ -114,13 +114,13 @@ def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> It
     for role in (Role.kProximity, Role.kIllustration):
         geometries = inspector.GetGeometries(frame, role)
         try:
-            found = [p for g in geometries for p in _around(inspector.GetShape(g), inspector.GetPoseInFrame(g))]
+            pieces = [p for g in geometries for p in _around(inspector.GetShape(g), inspector.GetPoseInFrame(g))]
         except (ModelError, RuntimeError) as error:
             kind = "collision shapes" if role == Role.kProximity else "drawn shapes"
             unread.append(f"{body.name()}: its {kind} cannot be read ({error}), so others stand for them")
             continue
-        if found:
-            yield from found
+        if pieces:
+            yield from pieces
             return
 
 
@@ -168,7 +168,7 @@ def _around_box(size: Array) -> list[tuple[Array, Array, float, float]]:
     places = ((np.arange(count) + 0.5) / count - 0.5) * size[b]
     sideways = size[b] / 2 / count  # by which the outermost lie inside
     excess = max(radius - short, radius - sideways)
-    return [(place * np.eye(3)[b] - end, place * np.eye(3)[b] + end, radius, excess) for place in places]
+    return [(offset * np.eye(3)[b] - end, offset * np.eye(3)[b] + end, radius, excess) for offset in places]
 
 
 def _surface(shape: Any) -> tuple[Array, Indices]:
@@ -196,10 +196,10 @@ def around_mesh(corners: Array, sides: Indices) -> list[tuple[Array, Array, floa
     axis = np.linalg.svd(used - np.mean(used, axis=0), full_matrices=False)[2][0]
     best: list[tuple[Array, Array, float, float]] = []
     for count in range(1, MOST_SLABS + 1):
-        found = [_around_slab(slab) for slab in _slabs(used, corners[sides], axis, count)]
-        if best and _volume(found) > WORTH_A_SLAB * _volume(best):
+        capsules = [_around_slab(slab) for slab in _slabs(used, corners[sides], axis, count)]
+        if best and _volume(capsules) > WORTH_A_SLAB * _volume(best):
             break
-        best = found
+        best = capsules
     return best
 
 
@@ -213,15 +213,15 @@ def _slabs(corners: Array, sides: Array, axis: Array, count: int) -> list[Array]
     What is inside a surface is, slab by slab, within the hulls of these.
     """
     heights, ends = corners @ axis, sides @ axis
-    found = []
+    slabs = []
     for low, high in pairwise(np.linspace(np.min(heights), np.max(heights), count + 1)):
         points = [corners[(heights >= low) & (heights <= high)]]
         for level in (low, high):
             across = (ends[:, 0] - level) * (ends[:, 1] - level) < 0
-            part = (level - ends[across, 0]) / (ends[across, 1] - ends[across, 0])
-            points.append(sides[across, 0] + part[:, None] * (sides[across, 1] - sides[across, 0]))
-        found.append(np.vstack(points))
-    return [slab for slab in found if len(slab)]
+            share = (level - ends[across, 0]) / (ends[across, 1] - ends[across, 0])
+            points.append(sides[across, 0] + share[:, None] * (sides[across, 1] - sides[across, 0]))
+        slabs.append(np.vstack(points))
+    return [slab for slab in slabs if len(slab)]
 
 
 def _around_slab(points: Array) -> tuple[Array, Array, float, float]:

@@ -180,48 +180,50 @@ def coordinates_of(model: Model) -> Coordinates:
 
 def describe(model: Model) -> Description:
     """The description of `model`; ModelError, naming the element, where the plant has what no other engine is given."""
-    found = [f"actuator {a.name()} has PD gains" for a in actuators(model.plant) if a.has_controller()]
+    refusals = [f"actuator {a.name()} has PD gains" for a in actuators(model.plant) if a.has_controller()]
     if model.num_constraints:
-        found.append(
+        refusals.append(
             f"{model.num_constraints} constraints (mimic joints, for which see mimic= of load_model, couplers, balls, "
             "welds, distances)"
         )
-    if found:
-        raise ModelError("this model cannot be given to another engine: " + "; ".join(found))
+    if refusals:
+        raise ModelError("this model cannot be given to another engine: " + "; ".join(refusals))
     return describe_tree(model)
 
 
 def describe_whole(model: Model) -> Description:
     """As `describe`, of a model whose mimic joints are reduced too: with all joints, and which of them follow."""
-    found, coupling = describe(model.whole), model.coupling
+    description, coupling = describe(model.whole), model.coupling
     if coupling is None:
-        return found
-    by_start = {link.v_start: link for link in found.moving}
+        return description
+    by_start = {link.v_start: link for link in description.moving}
     followers = []
     for i in np.setdiff1d(np.arange(len(coupling.of_v)), coupling.own_v):
         link, leader = by_start[int(i)], by_start[int(coupling.own_v[coupling.of_v[i]])]
         ratio, offset = float(coupling.ratio_v[i]), float(coupling.offset[link.q_start])
         followers.append(Follower(link.joint, leader.joint, ratio, offset))
-    return replace(found, followers=tuple(followers))
+    return replace(description, followers=tuple(followers))
 
 
 def describe_tree(model: Model) -> Description:
     """As `describe`, PD control of the actuators and constraints left out."""
     plant = model.plant
-    found = [
+    refusals = [
         f"joint {j.name()} is of type {j.type_name()}" for j in joints(plant) if j.type_name() not in ("weld", *MOVING)
     ]
-    found += [f"joint {j.name()} is locked" for j in joints(plant) if j.is_locked(model.double.context)]
+    refusals += [f"joint {j.name()} is locked" for j in joints(plant) if j.is_locked(model.double.context)]
     damped = [j for j in joints(plant) if np.any(j.default_damping_vector())]
-    found += [f"the free body of joint {j.name()} is damped" for j in damped if j.type_name() == "quaternion_floating"]
+    refusals += [
+        f"the free body of joint {j.name()} is damped" for j in damped if j.type_name() == "quaternion_floating"
+    ]
     if model.coupling is not None:
-        found.append('its mimic joints are reduced (mimic="fix" holds them)')
+        refusals.append('its mimic joints are reduced (mimic="fix" holds them)')
     if model.forces:
-        found.append("forces are added to Drake's")
-    found += [model.systems_act] if model.systems_act else []
+        refusals.append("forces are added to Drake's")
+    refusals += [model.systems_act] if model.systems_act else []
     springs = springs_of(plant)
-    if found or isinstance(springs, Refusal):
-        reasons = [*found, str(springs)] if isinstance(springs, Refusal) else found
+    if refusals or isinstance(springs, Refusal):
+        reasons = [*refusals, str(springs)] if isinstance(springs, Refusal) else refusals
         raise ModelError("this model cannot be given to another engine: " + "; ".join(reasons))
     body_names, joint_names = names_of(plant)
     geometries, pairs = _geometries(model, body_names)
@@ -245,19 +247,19 @@ def names_of(plant: Any) -> tuple[dict[Any, str], dict[Any, str]]:
 
 def springs_of(plant: Any) -> dict[Any, tuple[float, float]] | Refusal:
     """Stiffness and rest position by joint; a Refusal where a force element is none of gravity and these springs."""
-    found: dict[Any, tuple[float, float]] = {}
+    springs: dict[Any, tuple[float, float]] = {}
     for i in range(plant.num_force_elements()):
         element = plant.get_force_element(ForceElementIndex(i))
         if isinstance(element, UniformGravityFieldElement):
             if not all(element.is_enabled(model_instance=k) for k in instances(plant)):
                 return Refusal("gravity is off for a part of the model")
-        elif isinstance(element, RevoluteSpring) and element.joint().index() not in found:
-            found[element.joint().index()] = element.default_stiffness(), element.default_nominal_angle()
-        elif isinstance(element, PrismaticSpring) and element.joint().index() not in found:
-            found[element.joint().index()] = element.stiffness(), element.nominal_position()
+        elif isinstance(element, RevoluteSpring) and element.joint().index() not in springs:
+            springs[element.joint().index()] = element.default_stiffness(), element.default_nominal_angle()
+        elif isinstance(element, PrismaticSpring) and element.joint().index() not in springs:
+            springs[element.joint().index()] = element.stiffness(), element.nominal_position()
         else:
             return Refusal(f"force element {i} is of type {type(element).__name__}, or the second of its joint")
-    return found
+    return springs
 
 
 def read_links(plant: Any, springs: dict[Any, tuple[float, float]]) -> list[Link]:
@@ -314,18 +316,18 @@ def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometr
     inspector = model.double.inspector
     if inspector is None:
         return (), ()
-    found, names = [], {}
+    geometries, names = [], {}
     for i, geometry in enumerate(inspector.GetAllGeometryIds(Role.kProximity)):
         body = body_names[model.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).index()]
         names[geometry] = f"{inspector.GetName(geometry)}#{i}"
         pose, shape = inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry)
         given = {name: proximity_property(inspector, geometry, name) for name in MATERIAL}
         material = {name: float(value) for name, value in given.items() if value is not None and np.isfinite(value)}
-        found.append(Geometry(names[geometry], body, pose, shape, material))
+        geometries.append(Geometry(names[geometry], body, pose, shape, material))
     pairs = []
     for ids in sorted(inspector.GetCollisionCandidates(), key=lambda ids: (names[ids[0]], names[ids[1]])):
         pairs.append(_pair(inspector, ids, (names[ids[0]], names[ids[1]])))
-    return tuple(found), tuple(pairs)
+    return tuple(geometries), tuple(pairs)
 
 
 def _pair(inspector: Any, ids: Sequence[Any], names: tuple[str, str]) -> PairContract:
@@ -386,8 +388,8 @@ def rigid_links(description: Description) -> RigidLinks:
     Raises ModelError for a free body whose joint's frames are not its own and the world's.
     """
     for link in description.moving:
-        own = all(pose.IsExactlyIdentity() for pose in (link.on_parent, link.on_child))
-        if link.kind == "quaternion_floating" and (link.parent != "world" or not own):
+        is_identity = all(pose.IsExactlyIdentity() for pose in (link.on_parent, link.on_child))
+        if link.kind == "quaternion_floating" and (link.parent != "world" or not is_identity):
             raise ModelError(f"joint {link.joint}: expected a free body to be joined to the world by its own frame")
     links, on, anchored = without_welds(description.links)
     starts = [i for i, link in enumerate(links) if link.parent < 0]
@@ -431,8 +433,8 @@ def without_welds(
         else:
             on[link.body] = (len(moving), link.on_child.inverse())
             moving.append((link, parent, frame))
-        place, pose = on[link.body]
-        carried.setdefault(place, []).append(_moved((link.mass, link.center_of_mass, link.inertia), pose))
+        number, pose = on[link.body]
+        carried.setdefault(number, []).append(_moved((link.mass, link.center_of_mass, link.inertia), pose))
     rigid = []
     for i, (link, parent, frame) in enumerate(moving):
         axis = link.axis if link.kind == "quaternion_floating" else link.axis / np.linalg.norm(link.axis)
@@ -440,9 +442,9 @@ def without_welds(
     return tuple(rigid), on, carried[-1]
 
 
-def _moved(part: Part, pose: RigidTransform) -> Part:
+def _moved(body: Part, pose: RigidTransform) -> Part:
     """A part in the frame that its own has this pose in."""
-    mass, center_of_mass, inertia = part
+    mass, center_of_mass, inertia = body
     R = pose.rotation().matrix()
     return mass, pose @ center_of_mass, R @ inertia @ R.T
 
@@ -450,11 +452,11 @@ def _moved(part: Part, pose: RigidTransform) -> Part:
 def joint_contracts(description: Description) -> tuple[JointContract, ...]:
     """Each moving joint with what it carries by welds, in the world frame where q = 0, in the order of v."""
     frames: list[RigidTransform] = []
-    found: dict[int, JointContract] = {}
+    contracts: dict[int, JointContract] = {}
     for link in without_welds(description.links)[0]:
         joint, frame = link.joint, link.on_parent if link.parent < 0 else frames[link.parent] @ link.on_parent
         frames.append(frame)
-        found[joint.v_start] = joint_contract(
+        contracts[joint.v_start] = joint_contract(
             name=joint.joint,
             kind=joint.kind,
             axis=frame.rotation().matrix() @ link.axis,
@@ -462,7 +464,7 @@ def joint_contracts(description: Description) -> tuple[JointContract, ...]:
             carried=[_moved((link.mass, link.center_of_mass, link.inertia), frame)],
             **{k: getattr(joint, k) for k in ("damping", "armature", "stiffness", "rest", "lower", "upper")},
         )
-    return tuple(found[start] for start in sorted(found))
+    return tuple(contracts[start] for start in sorted(contracts))
 
 
 def joint_contract(*, kind: str, axis: Array, anchor: Array, carried: list[Part], **rest: Any) -> JointContract:
@@ -490,10 +492,10 @@ def merged(parts: list[Part]) -> Part:
 
 def split(given: Sequence[tuple[tuple[T, T], float]]) -> dict[T, float]:
     """s with s_a + s_b = the value of each pair (a, b): the least squares' solution, the smallest where many are."""
-    found = list(dict.fromkeys(side for pair, _ in given for side in pair))
-    sums = np.zeros((len(given), len(found)))
+    sides = list(dict.fromkeys(side for pair, _ in given for side in pair))
+    sums = np.zeros((len(given), len(sides)))
     for row, (pair, _) in zip(sums, given, strict=True):
         for side in pair:
-            row[found.index(side)] += 1.0
+            row[sides.index(side)] += 1.0
     values = np.linalg.lstsq(sums, np.array([value for _, value in given]), rcond=None)[0] if given else []
-    return dict(zip(found, (float(value) for value in values), strict=True))
+    return dict(zip(sides, (float(value) for value in values), strict=True))

@@ -108,35 +108,35 @@ class ForwardKinematics:
                 places.append(p + _times(R, b + angle * (A @ link.axis)))
         return np.stack([*turns, world], axis=-3), np.stack([*places, origin], axis=-2)
 
-    def pushes(self, q: Array, frames: tuple[Array, Array], at: Indices, points: Array, ways: Array) -> Array:
-        """(K, m, nx) how much each entry of the state moves `points` (K, m, 3), fixed in the links `at` (m,), along
+    def pushes(self, q: Array, frames: tuple[Array, Array], carriers: Indices, points: Array, ways: Array) -> Array:
+        """(K, m, nx) how much each entry of the state moves `points` (K, m, 3) along `ways` (K, m, 3).
 
-        `ways` (K, m, 3), for q (K, nq) and the `frames` there.
+        They are fixed in the links `carriers` (m,), for q (K, nq) and the `frames` there.
         """
         turns, places = frames
         q = self._all(q)
-        found = np.zeros((*points.shape[:2], max(self.nx, q.shape[1])))
+        slopes = np.zeros((*points.shape[:2], max(self.nx, q.shape[1])))
         for j, link in enumerate(self.links):
-            rows = np.flatnonzero((at >= 0) & self.carried[np.maximum(at, 0), j])
+            rows = np.flatnonzero((carriers >= 0) & self.carried[np.maximum(carriers, 0), j])
             if not len(rows):
                 continue
             start, way = link.joint.q_start, ways[:, rows]
             arm = points[:, rows] - places[:, j, None]
             if link.free:
                 A = turns[:, link.parent] @ link.on_parent.rotation().matrix()  # -1 is the world, the last
-                found[:, rows, start + 4 : start + 7] = way @ A
+                slopes[:, rows, start + 4 : start + 7] = way @ A
                 moment = cross(arm, way) @ A  # about the axes that the quaternion is of
-                found[:, rows, start : start + 4] = moment @ _turning(q[:, start : start + 4])
+                slopes[:, rows, start : start + 4] = moment @ _turning(q[:, start : start + 4])
                 continue
             axis = (turns[:, j] @ link.axis)[:, None]
             moving = cross(axis, arm) if link.joint.kind == "revolute" else np.broadcast_to(axis, way.shape)
-            found[:, rows, start] = np.sum(moving * way, axis=-1)
+            slopes[:, rows, start] = np.sum(moving * way, axis=-1)
         if self.coupling is None:
-            return found
-        own = np.zeros((*points.shape[:2], self.nx))
+            return slopes
+        independent = np.zeros((*points.shape[:2], self.nx))
         for i, (k, ratio) in enumerate(zip(self.coupling.of_q, self.coupling.ratio_q, strict=True)):
-            own[:, :, k] += ratio * found[:, :, i]
-        return own
+            independent[:, :, k] += ratio * slopes[:, :, i]
+        return independent
 
     def frame(self, x: Any, frame: Any, *, speeds: bool = False) -> Moving:
         """A `frame` of the plant at the state x (nx,); without `speeds` as if at rest, which is less to trace."""
@@ -181,8 +181,8 @@ class ForwardKinematics:
         while link >= 0:
             carrier, start = self.links[link], self.links[link].joint.q_start
             if carrier.free:
-                own = q[start : start + 4]
-                turned = product(own / np.sqrt(own.dot(own)), turned)
+                w_xyz = q[start : start + 4]
+                turned = product(w_xyz / np.sqrt(w_xyz.dot(w_xyz)), turned)
             elif carrier.joint.kind == "revolute":
                 turned = product(np.array([np.cos(q[start] / 2), *(carrier.axis * np.sin(q[start] / 2))]), turned)
             turned = product(_quaternion_of(_without_rounding(carrier.on_parent)[0]), turned)
@@ -253,16 +253,16 @@ def forward_kinematics(model: Model) -> ForwardKinematics | Refusal:
                 )
         whole = read_links(model.plant, {})
         rpy = {link.joint for link in whole if link.kind in RPY}
-        single = [part for link in whole for part in _chain(link)]
+        single = [item for link in whole for item in _chain(link)]
         links, on, _ = without_welds(single)
         known = {"world", *labelled(bodies(model.plant))}
         between = frozenset(i for i, link in enumerate(links) if link.joint.body not in known)
-        on = {body: place for body, place in on.items() if body in known}
+        on = {body: where for body, where in on.items() if body in known}
         carried = np.eye(len(links), dtype=bool)
         for i, link in enumerate(links):
             if link.parent >= 0:
                 carried[i] |= carried[link.parent]
-        turning = {part.body for part in single if part.joint in rpy and part.v_start >= 0 and part.kind == "revolute"}
+        turning = {item.body for item in single if item.joint in rpy and item.v_start >= 0 and item.kind == "revolute"}
         spins = frozenset(i for i, link in enumerate(links) if link.joint.body in turning)
         labels = {int(index): label for index, label in names_of(model.plant)[0].items()}
         kinematics = ForwardKinematics(tuple(links), on, between, carried, spins, labels, model)
@@ -283,23 +283,25 @@ def _chain(link: Link) -> Iterator[Link]:
     parent, pose = link.parent, link.on_parent
     for i, (kind, axis, k) in enumerate(chain):
         last = i == len(chain) - 1
-        own: dict[str, Any] = {} if last else {"mass": 0.0, "inertia": np.zeros((3, 3)), "on_child": RigidTransform()}
+        massless: dict[str, Any] = (
+            {} if last else {"mass": 0.0, "inertia": np.zeros((3, 3)), "on_child": RigidTransform()}
+        )
         body = link.body if last else f"{link.body} behind {i + 1} of {len(chain)} coordinates"
         starts: dict[str, Any] = {"q_start": link.q_start + k, "v_start": link.v_start + k}
         if link.kind in RPY and kind == "revolute":  # the first has all of the angular velocity
             starts["v_start"] = link.v_start if axis is Z else -1
-        yield replace(link, body=body, parent=parent, kind=kind, axis=axis, on_parent=pose, **starts, **own)
+        yield replace(link, body=body, parent=parent, kind=kind, axis=axis, on_parent=pose, **starts, **massless)
         parent, pose = body, RigidTransform()
 
 
 def _is_same(model: Model, kinematics: ForwardKinematics, q: Array) -> bool:
     turns, places = kinematics(q)
     set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
-    for label, (place, pose) in kinematics.on.items():
+    for label, (carrier, pose) in kinematics.on.items():
         body = model.plant.world_body() if label == "world" else model.double.body(label)
         wanted = model.plant.EvalBodyPoseInWorld(model.double.context, body).GetAsMatrix34()
-        R = turns[place] @ pose.rotation().matrix()
-        found = np.column_stack([R, turns[place] @ pose.translation() + places[place]])
-        if not np.allclose(found, wanted, rtol=SAME_PLACE, atol=SAME_PLACE):
+        R = turns[carrier] @ pose.rotation().matrix()
+        ours = np.column_stack([R, turns[carrier] @ pose.translation() + places[carrier]])
+        if not np.allclose(ours, wanted, rtol=SAME_PLACE, atol=SAME_PLACE):
             return False
     return True

@@ -202,7 +202,7 @@ class ForwardDynamics:
         """
         by_q, by_v, inverse = np.empty((3, *v.shape, v.shape[1]))
         a = np.empty(v.shape)
-        q, v, force, armature = (own_array(each) for each in (q, v, force, self.armature))
+        q, v, force, armature = (own_array(values) for values in (q, v, force, self.armature))
         tree_kernel.differentiate_acceleration(self.tree.tables, q, v, force, armature, by_q, by_v, inverse, a)
         return by_q, by_v, inverse, a
 
@@ -233,8 +233,11 @@ class ForwardDynamics:
         size = SECOND_DIFFERENCE / np.maximum(np.max(np.abs(along), axis=1), np.finfo(float).tiny)
         points = np.concatenate([q[:, None], q[:, None] + steps[:, :, None] * np.eye(n)], axis=1)
         points = np.concatenate([points, (q + size[:, None] * along)[:, None]], axis=1)
-        at = self.tree(points.reshape(-1, n), np.repeat(v, n + 2, axis=0), np.repeat(a, n + 2, axis=0))
-        first = np.stack([each.reshape(count, n + 2, n, n) for each in (at.by_q, at.by_v, at.mass)], axis=2)
+        moved_tree = self.tree(points.reshape(-1, n), np.repeat(v, n + 2, axis=0), np.repeat(a, n + 2, axis=0))
+        first = np.stack(
+            [values.reshape(count, n + 2, n, n) for values in (moved_tree.by_q, moved_tree.by_v, moved_tree.mass)],
+            axis=2,
+        )
         rates = np.einsum("ki,kjbim->kjbm", along, first[:, : n + 1])
         moved = np.diagonal(points[:, 1 : n + 1] - points[:, :1], axis1=1, axis2=2)
         slopes = (rates[:, 1:] - rates[:, :1]) / moved[..., None, None]
@@ -309,6 +312,6 @@ def _is_same(model: Model, tree: Tree, x: Array, a: Array) -> bool:
     set_state(model.autodiff, InitializeAutoDiff(x).ravel())
     exact = model.autodiff.inverse_dynamics(np.array([AutoDiffXd(entry) for entry in a])).reshape(-1, 1)
     ours = tree(x[None, :n], x[None, n:], a[None])
-    found = np.column_stack([ours.tau[0], ours.by_q[0], ours.by_v[0]])
+    stacked = np.column_stack([ours.tau[0], ours.by_q[0], ours.by_v[0]])
     wanted = np.column_stack([ExtractValue(exact).ravel(), gradient_rows(exact, 2 * n)])
-    return bool(np.all(np.abs(found - wanted) <= SAME_TREE * max(1.0, float(np.abs(wanted).max()))))
+    return bool(np.all(np.abs(stacked - wanted) <= SAME_TREE * max(1.0, float(np.abs(wanted).max()))))

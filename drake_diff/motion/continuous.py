@@ -191,8 +191,8 @@ class ContinuousMotion:
             point = touch.part * np.asarray(pair.p_WCa) + (1 - touch.part) * np.asarray(pair.p_WCb)
             jacobian = np.zeros((3, self.model.nv))
             for sign, _, body in touch.bodies:
-                place = plant.CalcPointsPositions(context, world, point.reshape(3, 1), body.body_frame())
-                J = plant.CalcJacobianTranslationalVelocity(context, by_v, body.body_frame(), place, world, world)
+                local = plant.CalcPointsPositions(context, world, point.reshape(3, 1), body.body_frame())
+                J = plant.CalcJacobianTranslationalVelocity(context, by_v, body.body_frame(), local, world, world)
                 jacobian += sign * (J if self.model.coupling is None else J @ self.model.coupling.spread)
             names = " and ".join(inspector.GetName(geometry) for geometry in (pair.id_A, pair.id_B))
             yield names, touch.stiffness, touch.damping, jacobian @ np.linalg.solve(mass, jacobian.T)
@@ -259,11 +259,11 @@ class ContinuousMotion:
             if body.index() != plant.world_body().index():
                 bodies.append((sign, int(body.index()), body))
         (mu_a, k_a, d_a), (mu_b, k_b, d_b) = sides
-        part = k_a / (k_a + k_b)
-        both = d_a + d_b if self.law == KELVIN_VOIGT else (1 - part) * d_a + part * d_b
+        share = k_a / (k_a + k_b)
+        both = d_a + d_b if self.law == KELVIN_VOIGT else (1 - share) * d_a + share * d_b
         friction, stiffness = 2 * mu_a * mu_b / (mu_a + mu_b or 1.0), k_a * k_b / (k_a + k_b)
-        place = part if self.law == own_law(self.model) else 0.5  # Drake's continuous plant pushes in the middle
-        self._touches[a, b] = _Touch(friction, stiffness, both, place, tuple(bodies))
+        acting = share if self.law == own_law(self.model) else 0.5  # Drake's continuous plant pushes in the middle
+        self._touches[a, b] = _Touch(friction, stiffness, both, acting, tuple(bodies))
         return self._touches[a, b]
 
     def _advance(
@@ -307,7 +307,7 @@ class ContinuousMotion:
         if isinstance(steps, ExplicitSteps):
             looks = min(LOOKS, 1 + int(step / LOOK))
             parts = (i / looks for i in range(1, looks))
-            seen = next((part for part in parts if self.pushing(steps.within(part, ahead))), 1.0)
+            seen = next((share for share in parts if self.pushing(steps.within(share, ahead))), 1.0)
             low, high = (seen - 1 / looks) * step, seen * step
             if seen < 1:
                 ahead, _ = steps.take(high)
@@ -332,16 +332,16 @@ class ExplicitSteps:
 
     def take(self, h: float) -> tuple[Array, Array]:
         """The state after a step of `h` [s], and its error."""
-        slopes, at = [self.first], self.x
+        slopes, state = [self.first], self.x
         for weights in STAGES:
-            at = self.x + h * (np.array(weights) @ np.array(slopes))
-            slopes.append(self.rates(at))
+            state = self.x + h * (np.array(weights) @ np.array(slopes))
+            slopes.append(self.rates(state))
         self.last, self.length = slopes[-1], h
-        return at, h * (ERROR @ np.array(slopes))
+        return state, h * (ERROR @ np.array(slopes))
 
-    def within(self, part: float, ahead: Array) -> Array:
-        """The state at `part` of the last step, which led to `ahead`: by the cubic of both ends' slopes."""
-        s, h = part, self.length
+    def within(self, share: float, ahead: Array) -> Array:
+        """The state at a `share` of the last step, which led to `ahead`: by the cubic of both ends' slopes."""
+        s, h = share, self.length
         ends = (1 + 2 * s) * (1 - s) ** 2 * self.x + s * s * (3 - 2 * s) * ahead
         return np.asarray(ends + h * s * (1 - s) * ((1 - s) * self.first - s * self.last))
 
@@ -360,12 +360,12 @@ class ImplicitSteps:
     def take(self, h: float) -> tuple[Array, Array]:
         """The state after a step of `h` [s], and its error."""
         inverse = np.linalg.inv(np.eye(len(self.x)) / (ROSENBROCK_GAMMA * h) - self.slopes)
-        stages, at = np.empty((len(ROSENBROCK_STAGES), len(self.x))), self.x
+        stages, state = np.empty((len(ROSENBROCK_STAGES), len(self.x))), self.x
         for i, (weights, couplings) in enumerate(zip(ROSENBROCK_STAGES, ROSENBROCK_COUPLINGS, strict=True)):
-            at = self.x + weights @ stages[:i]
-            value = self.first if i == 0 else self.rates(at)
+            state = self.x + weights @ stages[:i]
+            value = self.first if i == 0 else self.rates(state)
             stages[i] = inverse @ (value + couplings @ stages[:i] / h)
-        return at + stages[-1], stages[-1]
+        return state + stages[-1], stages[-1]
 
 
 def _ratio(x: Array, ahead: Array, error: Array, tolerance: float) -> float:
@@ -423,8 +423,8 @@ class _WithWork(ContinuousMotion):
 
     def rates(self, force: Array, x: Array, only: Pairs | None = None) -> Array:
         self.push, v = self.still, x[self.model.nq : self.model.nx]
-        found = super().rates(force, x[: self.model.nx], only)
-        return np.concatenate([found, [v @ force, v @ (self.damping * v), v @ self.push]])
+        slopes = super().rates(force, x[: self.model.nx], only)
+        return np.concatenate([slopes, [v @ force, v @ (self.damping * v), v @ self.push]])
 
     def contact_force(self, only: Pairs | None = None) -> Array:
         self.push = super().contact_force(only)
@@ -434,19 +434,19 @@ class _WithWork(ContinuousMotion):
         return super().pushing(x[: self.model.nx])
 
     def _until_change(self, *given: Any) -> tuple[float, Array, Pairs]:
-        found = super()._until_change(*given)
-        self.seen.append(found[1])
-        return found
+        change = super()._until_change(*given)
+        self.seen.append(change[1])
+        return change
 
     def deepest(self) -> dict[tuple[str, str], ContactPoint]:
         """Of each two bodies that pushed each other since `follow` was called, where they were deepest."""
-        found: dict[tuple[str, str], ContactPoint] = {}
+        points: dict[tuple[str, str], ContactPoint] = {}
         for state in self.seen if self.touches else ():
             for point in self._points(state[: self.model.nx]):
                 names = point.body_a, point.body_b
-                if names not in found or point.depth > found[names].depth:
-                    found[names] = point
-        return found
+                if names not in points or point.depth > points[names].depth:
+                    points[names] = point
+        return points
 
     def _points(self, x: Array) -> Iterator[ContactPoint]:
         """Of the pairs that push at `x` (nx,)."""

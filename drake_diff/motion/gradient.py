@@ -75,7 +75,7 @@ class RolloutGradient(ShowsItsRepr):
             f"  {', '.join(sizes[:6])}{', ...' if len(sizes) > 6 else ''}\n"
             f"  |d loss / d x_k| from {first:.3g} at the start to {last:.3g} at the end, a factor of "
             f"{self.growth_rate:.3g} a step"
-            + (f"\n  undefined by {', '.join(one.column for one in self.undefined)}" if self.undefined else "")
+            + (f"\n  undefined by {', '.join(column.column for column in self.undefined)}" if self.undefined else "")
         )
 
     @property
@@ -231,14 +231,14 @@ def _in_continuous_time(
         linearization, feedback, inputs = beside.linearize(tolerance)
         value, totals = total_gradients(loss, x0, inputs, policy, linearization, feedback)
         undefined = undefined_columns(beside, totals)
-        if not any(one.missed for one in undefined):
+        if not any(column.missed for column in undefined):
             break
     if undefined:
         more = f", and {len(undefined) - NAMED} more" if len(undefined) > NAMED else ""
-        told = "; ".join(str(one) for one in undefined[:NAMED])
+        named = "; ".join(str(column) for column in undefined[:NAMED])
         warnings.warn(
             f"the loss has no slope in {len(undefined)} of its columns, the derivative there is that of a point alone: "
-            f"{told}{more}",
+            f"{named}{more}",
             GradientWarning,
             stacklevel=3,
         )
@@ -262,5 +262,5 @@ def _close_the_loop(
 
 
 def _last(where: NDArray[np.bool_]) -> int | None:
-    found = np.flatnonzero(where)
-    return int(found[-1]) if len(found) else None
+    indices = np.flatnonzero(where)
+    return int(indices[-1]) if len(indices) else None

@@ -220,7 +220,7 @@ class TVLQR:
             A, B = np.split(jacobians, [model.nx], axis=2)
         if self._space.quaternions:
             points = zip(self.xs[:-1], self.xs[1:], A, B, strict=True)
-            A, B = np.split(np.array([self._space.jacobian(*each) for each in points]), [self._space.size], axis=2)
+            A, B = np.split(np.array([self._space.jacobian(*point) for point in points]), [self._space.size], axis=2)
         gains, cost_to_go = list[Array](), [Q if Qf is None else _weight("Qf", Qf, self._space.size)]
         for A_k, B_k in zip(A[::-1], B[::-1], strict=True):
             P = cost_to_go[-1]

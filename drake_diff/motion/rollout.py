@@ -281,21 +281,21 @@ class Meter:
 
     def _contact_force(self) -> Array:
         """(nv,) the generalized force of all contacts in the last step."""
-        found = np.zeros(self.plant.num_velocities())
+        force_of_contact = np.zeros(self.plant.num_velocities())
         for i in instances(self.plant):
             if self.plant.num_velocities(i):
                 force = self.plant.get_generalized_contact_forces_output_port(i).Eval(self.context)
                 if not np.all(np.isfinite(force)):  # Drake 1.51 ends the process on it
                     raise SimulationError("the contact forces of the step are not finite")
-                self.plant.SetVelocitiesInArray(i, force, found)
-        return np.asarray(self.model.double.own_force(found))
+                self.plant.SetVelocitiesInArray(i, force, force_of_contact)
+        return np.asarray(self.model.double.own_force(force_of_contact))
 
     def _limit_force(self, x: Array, x_next: Array, contact: Array) -> Array:
         """(nv,) what joints near a limit needed for the step beyond all other forces: the limit alone gives it."""
         (i, j), (lower, upper) = self.limited, self.limits
         if not len(i):
             return self.still
-        nq, h, found = self.model.nq, self.model.time_step, np.zeros(self.model.nv)
+        nq, h, force = self.model.nq, self.model.time_step, np.zeros(self.model.nv)
         v, after = x[nq:], x_next[nq:]
         reach = 2 * h * np.maximum(np.abs(v[j]), np.abs(after[j]))  # Drake's limits act from two steps before on
         inside = (lower <= np.minimum(x[i], x_next[i]) - reach) & (np.maximum(x[i], x_next[i]) + reach <= upper)
@@ -305,16 +305,16 @@ class Meter:
             driven = self.actuation @ self.efforts[-1]
             if self.model.inputs.fed_actuators:  # which inverse dynamics has, too
                 driven += self.applied[-1] - self.model.double.systems_force()
-            found[near] = (needed - driven - contact)[near]
-        return found
+            force[near] = (needed - driven - contact)[near]
+        return force
 
     def result(self, xs: Array, us: Array) -> Rollout:
         """The rollout with states xs (N+1, nx) and us (N, nu)."""
-        at, kinetic, potential, deepest = (np.array(column) for column in zip(*self.states, strict=True))
+        states, kinetic, potential, deepest = (np.array(column) for column in zip(*self.states, strict=True))
         nq, h = self.model.nq, self.model.time_step
         efforts = np.array(self.efforts).reshape(len(us), self.actuation.shape[1])
         after = np.array(self.ends).reshape(len(us), self.model.nx)[:, nq:]
-        middle = (at[:-1, nq:] + after) / 2
+        middle = (states[:-1, nq:] + after) / 2
         applied = np.array(self.applied).reshape(len(us), self.model.nv)
         work = h * np.einsum("ki,ki->k", middle, efforts @ self.actuation.T + applied)
         dissipation = h * np.einsum("ki,ki->k", middle, self.damping * after)
@@ -332,7 +332,7 @@ class Meter:
             contact_work=frozen(np.append(0.0, np.cumsum(by_contact))),
             limit_work=frozen(np.append(0.0, np.cumsum(by_limits))),
             penetration=frozen(deepest),
-            constraint_violation=frozen(self.violations(at[:, :nq])),
+            constraint_violation=frozen(self.violations(states[:, :nq])),
             contacts=tuple(self.contacts),
         )
 
@@ -341,16 +341,16 @@ class Meter:
         if self.model.num_constraints:
             return np.full(len(qs), np.inf)  # pydrake does not tell where a coupler, ball, weld or distance should be
         lower, upper = self.model.position_limits
-        found = np.maximum(lower - qs, qs - upper).max(axis=1, initial=0.0)
+        violation = np.maximum(lower - qs, qs - upper).max(axis=1, initial=0.0)
         for start in tangent_space(self.model).quaternions:
-            found = np.maximum(found, np.abs(np.linalg.norm(qs[:, start : start + 4], axis=1) - 1))
-        return np.asarray(found)
+            violation = np.maximum(violation, np.abs(np.linalg.norm(qs[:, start : start + 4], axis=1) - 1))
+        return np.asarray(violation)
 
 
 def _single(model: Model) -> list[tuple[int, int]]:
     """The places in q and v of each joint of one degree of freedom."""
-    found = [model.places(joint) for joint in joints(model.plant)]
-    return [(q.start, v.start) for q, v in found if len(q) == len(v) == 1]
+    places = [model.places(joint) for joint in joints(model.plant)]
+    return [(q.start, v.start) for q, v in places if len(q) == len(v) == 1]
 
 
 def smooth_mean(series: Array) -> float:

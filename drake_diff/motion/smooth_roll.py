@@ -41,8 +41,8 @@ class SmoothRoll:
         xs, us = np.empty((count + 1, nx)), np.empty((count, nu))
         xs[0] = x0
         stepped(count)
-        old, gaps, wanted, gains = (np.array(part, float, order="C") for part in (old, gaps, wanted, gains))
-        limits = tree_kernel.Bounds(*(np.array(part, float, order="C") for part in bounds))
+        old, gaps, wanted, gains = (np.array(array, float, order="C") for array in (old, gaps, wanted, gains))
+        limits = tree_kernel.Bounds(*(np.array(array, float, order="C") for array in bounds))
         is_solved = tree_kernel.roll(self.tree, self.forces, limits, old, gaps, wanted, gains, xs, us)
         if not is_solved or not np.isfinite(xs).all():
             return None
@@ -82,5 +82,7 @@ def _make(model: Model) -> SmoothRoll | None:
         smooth.form.actuation,
         smooth.limit,
     )
-    forces = tree_kernel.Forces(float(model.time_step), *(own_array(np.asarray(part, dtype=float)) for part in arrays))
+    forces = tree_kernel.Forces(
+        float(model.time_step), *(own_array(np.asarray(array, dtype=float)) for array in arrays)
+    )
     return SmoothRoll(smooth, tree.tables, forces)

@@ -415,15 +415,15 @@ def _moments(
         cautious = variance + FARTHEST * np.maximum(high - mean, mean - low) ** 2 / samples**2
     if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(cautious))):
         raise GradientError("the mean or the variance of the samples is not finite: f or its derivative is too large")
-    found, names = (mean, variance, cautious), ("zeroth", "first", "bias", "corrected", "corrected bias")
-    shaped = zip(*(flat[rows:].reshape(-1, rows, size) for flat in found), strict=True)
+    statistics, names = (mean, variance, cautious), ("zeroth", "first", "bias", "corrected", "corrected bias")
+    shaped = zip(*(flat[rows:].reshape(-1, rows, size) for flat in statistics), strict=True)
     sums = {name: Sums(*kind) for name, kind in zip(names, shaped, strict=False)}
-    return sums | {"value": Sums(*(flat[:rows] for flat in found))}
+    return sums | {"value": Sums(*(flat[:rows] for flat in statistics))}
 
 
 def _evaluate(subject: str, function: Callable[[Array], Any], point: Array, shape: tuple[int | str, ...]) -> Array:
     """`function` at `point` as numbers of `shape`; missing leading dimensions are 1."""
-    at = point.copy()  # the function may change what it is given
+    given = point.copy()  # the function may change what it is given
     result = function(point)
     try:
         result = np.array(result, ndmin=len(shape))
@@ -433,5 +433,5 @@ def _evaluate(subject: str, function: Callable[[Array], Any], point: Array, shap
         raise InputError(f"{subject}(x)", got=repr(result)[:80], expected="an array of numbers") from error
     values = array_with_gaps(f"{subject}(x)", result, shape)
     if not np.isfinite(values).all():
-        raise GradientError(f"{subject}({at.tolist()}) is {values.tolist()}: it must be finite wherever noise leads")
+        raise GradientError(f"{subject}({given.tolist()}) is {values.tolist()}: it must be finite wherever noise leads")
     return values

@@ -312,8 +312,8 @@ def undefined_columns(beside: Beside, totals: Totals) -> tuple[Undefined, ...]:
     for group in np.array_split(order, min(GROUPS, len(lines))):
         if len(group) == 1 or not judge.follow(beside, [lines[j] for j in group]):
             suspects += group.tolist()
-    found = (judge.column(lines[j]) for j in sorted(suspects))
-    return tuple(one for one in found if one is not None)
+    verdicts = (judge.column(lines[j]) for j in sorted(suspects))
+    return tuple(verdict for verdict in verdicts if verdict is not None)
 
 
 @dataclass(frozen=True)
@@ -336,43 +336,43 @@ class _Judge:
 
     def column(self, line: Line) -> Undefined | None:
         """What is said of one column; None where it has a slope."""
-        found: dict[float, float] = {}
+        slopes_by_width: dict[float, float] = {}
         try:
-            reason = self._reason(line, found)
+            reason = self._reason(line, slopes_by_width)
             if reason == UNSETTLED and not line.touches:
-                reason = self._reason(line, found, SMOOTH)
+                reason = self._reason(line, slopes_by_width, SMOOTH)
                 reason = UNSETTLED if line.touches else reason
         except SimulationError as error:
             reason = f"a little away there is no motion: {error}"
         if not reason:
             return None
-        widths, slopes = tuple(w * line.unit for w in found), tuple(found.values())
+        widths, slopes = tuple(w * line.unit for w in slopes_by_width), tuple(slopes_by_width.values())
         return Undefined(line.column, line.slope, widths, slopes, reason, line)
 
-    def _reason(self, line: Line, found: dict[float, float], part: float = 1.0) -> str:
-        """Why the column has no slope over `part` of the widths, or nothing. Slopes are put into `found`."""
-        widest, tolerance = part * WIDE, COARSE if part == 1 else TOLERANCE
+    def _reason(self, line: Line, slopes: dict[float, float], scale: float = 1.0) -> str:
+        """Why the column has no slope over `scale` times the widths, or nothing. Puts them into `slopes`."""
+        widest, tolerance = scale * WIDE, COARSE if scale == 1 else TOLERANCE
 
         def same(a: float, b: float, share: float, width: float, tolerance: float = TOLERANCE) -> bool:
             size = max(abs(a), abs(b), self.least / line.unit)
-            return abs(a - b) <= share * size + self.noise * tolerance / (part * width * line.unit)
+            return abs(a - b) <= share * size + self.noise * tolerance / (scale * width * line.unit)
 
-        wide = found[widest] = line.over(widest, tolerance)
+        wide = slopes[widest] = line.over(widest, tolerance)
         if same(wide, line.slope, RIGHT, WIDE, tolerance):
             return ""
         if not same(wide, line.slope, FAR, WIDE, tolerance):
             return UNSETTLED
-        middle = found[part * MIDDLE] = line.over(part * MIDDLE, TOLERANCE)
+        middle = slopes[scale * MIDDLE] = line.over(scale * MIDDLE, TOLERANCE)
         is_right = same(middle, line.slope, RIGHT, MIDDLE)
         if not is_right and not same(wide, middle, RIGHT, MIDDLE):
             return UNSETTLED
-        narrow = found[part * NARROW] = line.over(part * NARROW, TOLERANCE)
+        narrow = slopes[scale * NARROW] = line.over(scale * NARROW, TOLERANCE)
         if not same(middle, narrow, SETTLED, NARROW):
             return UNSETTLED
         if not same(wide, middle, SETTLED, MIDDLE):
-            expected = middle + CURVE * (line.over(part * BETWEEN, TOLERANCE) - middle)
+            expected = middle + CURVE * (line.over(scale * BETWEEN, TOLERANCE) - middle)
             size = max(abs(middle), self.least / line.unit)
-            allowed = SETTLED * size + BENT * abs(wide - middle) + self.noise * TOLERANCE / (part * MIDDLE * line.unit)
+            allowed = SETTLED * size + BENT * abs(wide - middle) + self.noise * TOLERANCE / (scale * MIDDLE * line.unit)
             if abs(wide - expected) > allowed:
                 return UNSETTLED
         return "" if is_right else MISSED

@@ -60,13 +60,13 @@ class Stepper:
     def push(self, pushing: tuple[int, ...]) -> None:
         """Take the equations where the pairs `pushing` push."""
         if pushing not in self._parts:
-            part = self.plant.part(pushing)
+            equations = self.plant.part(pushing)
             given = self.u, self.materials
-            told = self.ahead, self.after, self._told
-            kept, explicit = on_arrays(part.step, (self.x, *given, self._h), told)
-            kept_too, rates = on_arrays(part.rates, (self._stage, *given), (self._rates,))
-            kept_last, slopes = on_arrays(part.slopes, (self._stage, *given), (self._rates, self._slopes))
-            self._parts[pushing] = _Part(explicit, rates, slopes, (kept, kept_too, kept_last))
+            results = self.ahead, self.after, self._told
+            buffer, explicit = on_arrays(equations.step, (self.x, *given, self._h), results)
+            kept_too, rates = on_arrays(equations.rates, (self._stage, *given), (self._rates,))
+            kept_last, slopes = on_arrays(equations.slopes, (self._stage, *given), (self._rates, self._slopes))
+            self._parts[pushing] = _Part(explicit, rates, slopes, (buffer, kept_too, kept_last))
         self._part = self._parts[pushing]
         self.is_stiff, self._hits = False, 0
         self.moved()
@@ -214,33 +214,33 @@ class Integrator:
         self.began = time.thread_time()
         return Flow([0.0], [np.array(x0, dtype=float)])
 
-    def advance(self, found: Flow, u: Array, interval: float, budget: float = BUDGET) -> Array:
+    def advance(self, flow: Flow, u: Array, interval: float, budget: float = BUDGET) -> Array:
         """(nx,) where a flow leads in `interval` [s] more under `u` (nu,); SimulationError where it has no end."""
-        if not found.hs or not np.array_equal(u, self.stepper.u):
+        if not flow.hs or not np.array_equal(u, self.stepper.u):
             self.stepper.u[:] = u
             self.stepper.moved()
             self._look()
-        self._settle(found)
-        now, end = found.times[-1], (len(found.ends) + 1) * interval
+        self._settle(flow)
+        now, end = flow.times[-1], (len(flow.ends) + 1) * interval
         near = SHORTEST * max(1.0, end)
         while end - now > near:
             if time.thread_time() - self.began > budget:
                 raise SimulationError(
-                    f"the flow is too stiff: {budget:g} s of work reached {now:.4g} s by {len(found.hs)} steps, not "
+                    f"the flow is too stiff: {budget:g} s of work reached {now:.4g} s by {len(flow.hs)} steps, not "
                     f"{end:.4g} s"
                 )
-            self.h_next = self._advance(found, now, min(self.h_next, end - now), self.h_next)
-            now = found.times[-1]
-        found.times[-1] = end
-        found.ends.append(len(found.hs))
-        return found.xs[-1]
+            self.h_next = self._advance(flow, now, min(self.h_next, end - now), self.h_next)
+            now = flow.times[-1]
+        flow.times[-1] = end
+        flow.ends.append(len(flow.hs))
+        return flow.xs[-1]
 
-    def _advance(self, found: Flow, now: float, length: float, wanted: float) -> float:
+    def _advance(self, flow: Flow, now: float, length: float, wanted: float) -> float:
         """One accepted step of at most `length` [s] from `now`; the length that would do next."""
         is_cut = length < wanted
         while True:
             ratio = self.stepper.attempt(length) / self.tolerance
-            found.tried += 1
+            flow.tried += 1
             change = factor(ratio)
             if ratio <= 1:
                 break
@@ -256,7 +256,7 @@ class Integrator:
             if dip is None:
                 break
             length, end = dip
-        self._accept(found, now + length, length, end)
+        self._accept(flow, now + length, length, end)
         return after
 
     def _switches_ahead(self) -> _Switches:
@@ -293,12 +293,12 @@ class Integrator:
         near, slow = max(ROOT * length, SHORTEST), 0
         while high - low > near:
             before = high - low
-            at = 0.5 * before if slow > 1 else _crossing(before, first, last, self._turned(last), near)
-            found = self._after(low + at)
-            if len(self._turned(found)):
-                high, last = low + at, found
+            middle = 0.5 * before if slow > 1 else _crossing(before, first, last, self._turned(last), near)
+            switches = self._after(low + middle)
+            if len(self._turned(switches)):
+                high, last = low + middle, switches
             else:
-                low, first = low + at, found
+                low, first = low + middle, switches
             slow = slow + 1 if high - low > before / 2 and slow <= 1 else 0
         return high, self._after(high)
 
@@ -314,33 +314,33 @@ class Integrator:
         for i in np.flatnonzero(falls).tolist():
             low, high, first, last = 0.0, length, self._start, end
             while high - low > SHORTEST:
-                at, least = _meeting(high - low, side[i], first, last, i)
+                middle, least = _meeting(high - low, side[i], first, last, i)
                 if least > -SHALLOW:
                     break
-                looked, found = True, self._after(low + at)
-                if len(self._turned(found)):
-                    return low + at, found
-                if side[i] * found.rates[i] < 0:
-                    low, first = low + at, found
+                looked, switches = True, self._after(low + middle)
+                if len(self._turned(switches)):
+                    return low + middle, switches
+                if side[i] * switches.rates[i] < 0:
+                    low, first = low + middle, switches
                 else:
-                    high, last = low + at, found
+                    high, last = low + middle, switches
         if looked:
             self.stepper.attempt(length)
         return None
 
-    def _accept(self, found: Flow, now: float, length: float, end: _Switches) -> None:
-        found.times.append(now)
-        found.hs.append(length)
-        found.us.append(self.stepper.u.copy())
-        found.modes.append(self.modes.copy())
+    def _accept(self, flow: Flow, now: float, length: float, end: _Switches) -> None:
+        flow.times.append(now)
+        flow.hs.append(length)
+        flow.us.append(self.stepper.u.copy())
+        flow.modes.append(self.modes.copy())
         self.stepper.accept(length)
-        found.xs.append(self.stepper.x.copy())
+        flow.xs.append(self.stepper.x.copy())
         self.plant.check(self.stepper.x)
         if (end.values[: self.count : 2] > self.plant.pairs.radius).any():
-            found.deep.append(len(found.hs) - 1)
+            flow.deep.append(len(flow.hs) - 1)
         self._start = end
         self._on[self.count :] = end.values[self.count :] > 0
-        self._settle(found)
+        self._settle(flow)
 
     def _look(self) -> None:
         """Where the step begins."""
@@ -349,7 +349,7 @@ class Integrator:
         self._start = _Switches(self._values.copy(), self._changes.copy())
         self._on[self.count :] = self._values[self.count :] > 0
 
-    def _settle(self, found: Flow) -> None:
+    def _settle(self, flow: Flow) -> None:
         """Set the modes to what the switches say at the state, and note what turns; of a pair apart nothing pushes."""
         on = self._start.values[: self.count] > 0
         if not (on != self._on[: self.count]).any():
@@ -361,7 +361,7 @@ class Integrator:
             switch = 2 * i + int(was[0] == now[0])
             if was[0] != now[0] or (now[0] and was[1] != now[1]):
                 both = float(now[0]), float(now[1])
-                found.events.append(FlowEvent(found.times[-1], len(found.hs), switch, both, self.stepper.x.copy()))
+                flow.events.append(FlowEvent(flow.times[-1], len(flow.hs), switch, both, self.stepper.x.copy()))
         pushed = pushing_of(self.modes)
         self._set(modes)
         if pushing_of(modes) != pushed:
@@ -376,7 +376,7 @@ def pushing_of(modes: Array) -> tuple[int, ...]:
 
 def _crossing(length: float, first: _Switches, last: _Switches, turned: Indices, near: float) -> float:
     """Where the first of the switches that turned is 0 by cubics through both ends, a little beyond the nearer end."""
-    at = length
+    crossing = length
     for i in turned:
         a, b, ra, rb = first.values[i], last.values[i], length * first.rates[i], length * last.rates[i]
         t = a / (a - b) if a != b else 0.5
@@ -384,16 +384,16 @@ def _crossing(length: float, first: _Switches, last: _Switches, turned: Indices,
             value = a + t * (ra + t * (3 * (b - a) - 2 * ra - rb + t * (2 * (a - b) + ra + rb)))
             slope = ra + t * (2 * (3 * (b - a) - 2 * ra - rb) + t * 3 * (2 * (a - b) + ra + rb))
             t = min(max(t - value / slope, 0.0), 1.0) if slope else 0.5
-        at = min(at, t * length)
-    beyond = max(0.4 * near, BEYOND * min(at, length - at))
-    at += beyond if 2 * at < length else -beyond
-    return min(max(at, 0.4 * near), length - 0.4 * near)
+        crossing = min(crossing, t * length)
+    beyond = max(0.4 * near, BEYOND * min(crossing, length - crossing))
+    crossing += beyond if 2 * crossing < length else -beyond
+    return min(max(crossing, 0.4 * near), length - 0.4 * near)
 
 
 def _meeting(length: float, side: float, first: _Switches, last: _Switches, i: int) -> tuple[float, float]:
     """Where the tangents at both ends of a switch meet, and how far from 0: below all between, where it is convex."""
     a, b = side * first.values[i], side * last.values[i]
     ra, rb = side * first.rates[i], side * last.rates[i]
-    at = (b - a - rb * length) / (ra - rb)
-    at = min(max(at, 0.0), length)
-    return min(max(at, 0.01 * length), 0.99 * length), min(a + ra * at, b)
+    meeting = (b - a - rb * length) / (ra - rb)
+    meeting = min(max(meeting, 0.0), length)
+    return min(max(meeting, 0.01 * length), 0.99 * length), min(a + ra * meeting, b)

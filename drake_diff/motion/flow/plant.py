@@ -88,11 +88,11 @@ def _from_faces(outside: Any, ways: Any, normals: Any) -> tuple[Any, Any]:
     beyond = square > 0
     length = ca.sqrt(ca.if_else(beyond, square, 1.0))
     least = ca.mmin(ways)
-    face, found = ca.SX.zeros(3), ca.SX(0)
+    face, taken = ca.SX.zeros(3), ca.SX(0)
     for j in range(ways.numel()):
-        nearest = ca.logic_and(ways[j] <= least, found < 0.5)
+        nearest = ca.logic_and(ways[j] <= least, taken < 0.5)
         face += ca.if_else(nearest, normals[:, j], ca.DM.zeros(3))
-        found += ca.if_else(nearest, 1.0, 0.0)
+        taken += ca.if_else(nearest, 1.0, 0.0)
     return ca.if_else(beyond, length, -least), ca.if_else(beyond, outside / length, face)
 
 
@@ -159,7 +159,7 @@ class FlowPlant:
     def _touch(self, i: int, material: Any) -> "_Touch":
         """Pair `i`, of `material` (4,)."""
         pairs, tree, names = self.pairs, self.tree, names_of(self.model.plant)[0]
-        mu, k, damping, part = (material[j] for j in range(4))
+        mu, k, damping, other_share = (material[j] for j in range(4))
         R, p, moves_sphere = tree.body(names[pairs.bodies[pairs.sphere_body[i]].index()])
         center = p + R @ ca.DM(pairs.center[i])
         R, p, moves_other = tree.body(names[pairs.bodies[pairs.other_body[i]].index()])
@@ -167,7 +167,7 @@ class FlowPlant:
         local = turn.T @ (center - origin)
         distance, normal = distance_of(pairs, i, local)
         normal, phi = turn @ normal, distance - pairs.radius[i]
-        point = center - (pairs.radius[i] + part * phi) * normal
+        point = center - (pairs.radius[i] + other_share * phi) * normal
         J = ca.SX.zeros(3, tree.nv)
         for sign, moves in ((1, moves_sphere), (-1, moves_other)):
             for j in moves:
@@ -220,9 +220,9 @@ class FlowPlant:
         except RuntimeError as error:
             raise SimulationError(f"Drake cannot tell which shapes overlap: {error}") from error
         known = {frozenset(ids) for ids in self.pairs.ids}
-        for each in overlaps:
-            if frozenset((each.id_A, each.id_B)) not in known:
-                names = " and ".join(query.inspector().GetName(i) for i in (each.id_A, each.id_B))
+        for pair in overlaps:
+            if frozenset((pair.id_A, pair.id_B)) not in known:
+                names = " and ".join(query.inspector().GetName(i) for i in (pair.id_A, pair.id_B))
                 raise SimulationError(
                     f"{names} touch, and are no sphere beside a sphere, box, capsule, cylinder or half space: their "
                     "motion in continuous time is not known here; see contact_geometry of load_model"
@@ -242,10 +242,10 @@ class FlowPlant:
         by_x = ca.SX(self.model.nv, self.model.nx)
         by_materials = [ca.SX(self.model.nv, 0)]
         for i in pushing:
-            touch, own = self.touches[i], self.materials[4 * i : 4 * i + 4]
+            touch, material = self.touches[i], self.materials[4 * i : 4 * i + 4]
             push += touch.force
             by_x += ca.jacobian(touch.force, self.x)
-            by_materials.append(ca.jacobian(touch.force, own))
+            by_materials.append(ca.jacobian(touch.force, material))
         rates = ca.vertcat(self.tree.position_rates, self._solve(force + push))
         by_x += self._force_slopes(self.x, rates[nq:])
         slopes = ca.vertcat(self._position_slopes, self._solve(ca.horzcat(by_x, self._by_u)))
@@ -287,10 +287,10 @@ def material_of(plant: FlowPlant) -> Material:
     return combine(np.array(sides, dtype=float).reshape(plant.num_pairs, 2, 4))
 
 
-def numbers_of(plant: FlowPlant, of: Material | MaterialChange) -> Array:
+def numbers_of(plant: FlowPlant, material: Material | MaterialChange) -> Array:
     """(4 P, ...) a material, or its change, as the functions take it."""
-    damping = of.time if plant.is_sap else of.dissipation
-    columns = np.stack([of.friction, of.stiffness, damping, of.other_part], axis=1)
+    damping = material.time if plant.is_sap else material.dissipation
+    columns = np.stack([material.friction, material.stiffness, damping, material.other_part], axis=1)
     return columns.reshape(4 * plant.num_pairs, *columns.shape[2:])
 
 
@@ -319,5 +319,5 @@ def _step_function(rates: Any) -> Any:
     size = ca.fmax(1.0, ca.fmax(ca.fabs(x), ca.fabs(ahead)))
     apart = ca.sumsqr(ahead - before)
     rate = ca.if_else(apart > 0, ca.sqrt(ca.sumsqr(slopes[-1] - slopes[-2]) / ca.fmax(apart, 1e-300)), 0.0)
-    told = ca.vertcat(ca.sqrt(ca.sumsqr(error / size) / x.numel()), rate)
-    return ca.Function("step", [x, u, materials, h], [ca.densify(ahead), slopes[-1], told])
+    summary = ca.vertcat(ca.sqrt(ca.sumsqr(error / size) / x.numel()), rate)
+    return ca.Function("step", [x, u, materials, h], [ca.densify(ahead), slopes[-1], summary])

@@ -45,15 +45,15 @@ class Slopes:
     `by_parameters` (4 pairs that push, n) is the derivative of their materials.
     """
 
-    def __init__(self, part: FlowPart, materials: Array, by_parameters: Array):
-        nx, nu = part.slopes.size1_in(0), part.slopes.size1_in(1)
+    def __init__(self, equations: FlowPart, materials: Array, by_parameters: Array):
+        nx, nu = equations.slopes.size1_in(0), equations.slopes.size1_in(1)
         self.by_parameters, self.width = by_parameters, nx + nu
         self._x, self._u = np.empty(nx), np.empty(nu)
         self._rates, self._slopes = np.empty(nx), np.empty((nx + nu, nx))
-        self._by_materials = np.empty((part.material_slopes.size2_out(0), nx))
+        self._by_materials = np.empty((equations.material_slopes.size2_out(0), nx))
         given = self._x, self._u, materials
-        self._kept, self._run = on_arrays(part.slopes, given, (self._rates, self._slopes))
-        self._kept_too, self._run_materials = on_arrays(part.material_slopes, given, (self._by_materials,))
+        self._kept, self._run = on_arrays(equations.slopes, given, (self._rates, self._slopes))
+        self._kept_too, self._run_materials = on_arrays(equations.material_slopes, given, (self._by_materials,))
 
     def __call__(self, xs: Array, us: Array) -> tuple[Array, Array]:
         """(M, nx) the rates at xs (M, nx), us (M, nu), and (M, nx, nx + nu + n) their slopes."""
@@ -72,26 +72,26 @@ class Slopes:
         """The same at the starts (M, nx) and the ends of steps; an end at which the next step starts is taken once."""
         points = np.concatenate([starts, ends])
         same = np.all(starts[1:] == ends[:-1], axis=1) & np.all(us[1:] == us[:-1], axis=1)
-        count, own = len(starts), np.ones(2 * len(starts), dtype=bool)
-        own[count:-1] = ~same
+        count, distinct = len(starts), np.ones(2 * len(starts), dtype=bool)
+        distinct[count:-1] = ~same
         where = np.empty(2 * count, dtype=int)
-        where[own] = np.arange(np.sum(own))
+        where[distinct] = np.arange(np.sum(distinct))
         where[count:-1][same] = where[1:count][same]
-        rates, slopes = self(points[own], np.concatenate([us, us])[own])
+        rates, slopes = self(points[distinct], np.concatenate([us, us])[distinct])
         first, last = where[:count], where[count:]
         return (rates[first], slopes[first]), (rates[last], slopes[last])
 
 
-def between(part: float, starts: Array, ends: Array, hs: Array, at_start: Any, at_end: Any) -> Array:
-    """(M, nx) at a `part` of steps of lengths hs (M,), from what `Slopes.at_ends` has there."""
-    c, d, h = part, 1 - part, hs[:, None]
+def between(share: float, starts: Array, ends: Array, hs: Array, at_start: Any, at_end: Any) -> Array:
+    """(M, nx) at a `share` of steps of lengths hs (M,), from what `Slopes.at_ends` has there."""
+    c, d, h = share, 1 - share, hs[:, None]
     (f0, A0), (f1, A1) = at_start, at_end
     j0, j1 = ((A[:, :, : f.shape[1]] @ f[:, :, None])[:, :, 0] for f, A in ((f0, A0), (f1, A1)))
     of_gap = c**3 * (10 - 15 * c + 6 * c**2)
     of_f0, of_f1 = c * d**3 * (1 + 3 * c), -(c**3) * d * (4 - 3 * c)
     of_j0, of_j1 = c**2 * d**3 / 2, c**3 * d**2 / 2
-    found = starts + of_gap * (ends - starts) + h * (of_f0 * f0 + of_f1 * f1) + h**2 * (of_j0 * j0 + of_j1 * j1)
-    return np.asarray(found)
+    states = starts + of_gap * (ends - starts) + h * (of_f0 * f0 + of_f1 * f1) + h**2 * (of_j0 * j0 + of_j1 * j1)
+    return np.asarray(states)
 
 
 ROOT_6 = np.sqrt(6.0)
@@ -121,25 +121,25 @@ def transitions(plant: FlowPlant, flow: Flow, materials: Array, by_parameters: A
     """The derivatives of the steps of `flow`, those of the materials by n parameters being `by_parameters` (4 P, n)."""
     xs, us, hs = np.array(flow.xs), np.array(flow.us), np.array(flow.hs)
     nx, nu = xs.shape[1], us.shape[1]
-    found = np.empty((len(hs), nx, nx + nu + by_parameters.shape[1]))
+    changes = np.empty((len(hs), nx, nx + nu + by_parameters.shape[1]))
     sets: dict[tuple[int, ...], list[int]] = {}
     for i, modes in enumerate(flow.modes):
         sets.setdefault(pushing_of(modes), []).append(i)
     for pushing, chosen in sets.items():
-        own = [4 * i + j for i in pushing for j in range(4)]
-        slopes = Slopes(plant.part(pushing), materials, by_parameters[own])
-        at_once = max(1, AT_ONCE // (9 * nx * found.shape[2]))
+        rows_of_materials = [4 * i + j for i in pushing for j in range(4)]
+        slopes = Slopes(plant.part(pushing), materials, by_parameters[rows_of_materials])
+        at_once = max(1, AT_ONCE // (9 * nx * changes.shape[2]))
         for first in range(0, len(chosen), at_once):
             rows = np.array(chosen[first : first + at_once])
-            found[rows] = _changes(slopes, plant.model.nq, xs[rows], xs[rows + 1], us[rows], hs[rows])
+            changes[rows] = _changes(slopes, plant.model.nq, xs[rows], xs[rows + 1], us[rows], hs[rows])
     for m in flow.deep:
         plant.check_normals(xs[m], xs[m + 1], pushing_of(flow.modes[m]))
     modes_now: dict[int, Array] = {}
     for event in flow.events:
         if event.step:  # one that it begins with is none on the way
             now = modes_now.setdefault(event.step, flow.modes[event.step - 1].copy())
-            _jump(plant, event, flow.us[event.step - 1], now, materials, by_parameters, found[event.step - 1])
-    return Transitions(found[:, :, :nx], found[:, :, nx : nx + nu], found[:, :, nx + nu :])
+            _jump(plant, event, flow.us[event.step - 1], now, materials, by_parameters, changes[event.step - 1])
+    return Transitions(changes[:, :, :nx], changes[:, :, nx : nx + nu], changes[:, :, nx + nu :])
 
 
 def _changes(slopes: Slopes, nq: int, starts: Array, ends: Array, us: Array, hs: Array) -> Array:
@@ -151,7 +151,7 @@ def _changes(slopes: Slopes, nq: int, starts: Array, ends: Array, us: Array, hs:
     at_start, at_end = slopes.at_ends(starts, ends, us)
     stiffness = np.max(np.abs(at_start[1][:, nq:, :nq]), axis=(1, 2), initial=0.0)
     parts = np.ceil(np.maximum(hs * np.sqrt(stiffness) / SWING, 1.0)).astype(int)
-    found = np.empty((count, nx, at_end[1].shape[2]))
+    changes = np.empty((count, nx, at_end[1].shape[2]))
     for number in np.unique(parts).tolist():
         rows = np.flatnonzero(parts == number)
         here = starts[rows], ends[rows], hs[rows]
@@ -162,11 +162,11 @@ def _changes(slopes: Slopes, nq: int, starts: Array, ends: Array, us: Array, hs:
             on_the_way += [near[1][1]] * (j + 1 == number)
             change = _collocated(np.stack(on_the_way, axis=1), hs[rows] / number)
             if j:
-                total = change[:, :, :nx] @ found[rows]
+                total = change[:, :, :nx] @ changes[rows]
                 total[:, :, nx:] += change[:, :, nx:]
                 change = total
-            found[rows] = change
-    return found
+            changes[rows] = change
+    return changes
 
 
 def _collocated(slopes: Array, hs: Array) -> Array:
@@ -250,19 +250,19 @@ class FlowSteps:
         if names:
             change = material_change(self.plant.pairs, self.material, self.vector, self.model.double)
             by_parameters = numbers_of(self.plant, change)
-        found = transitions(self.plant, flow, material, by_parameters)
+        changes = transitions(self.plant, flow, material, by_parameters)
         steps, begin = [], 0
         for end in flow.ends:
             A, B = np.eye(self.model.nx), np.zeros((self.model.nx, nu))
             C = np.zeros((self.model.nx, len(names)))
             for m in range(begin, end):
-                by_x = found.by_x[m]
-                A, B = by_x @ A, by_x @ B + found.by_u[m]
-                C = by_x @ C + found.by_parameters[m]
+                by_x = changes.by_x[m]
+                A, B = by_x @ A, by_x @ B + changes.by_u[m]
+                C = by_x @ C + changes.by_parameters[m]
             x_next = frozen(flow.xs[end])
-            told = f"the flow by {end - begin} steps"
+            reason = f"the flow by {end - begin} steps"
             steps.append(
-                StepDerivatives(x_next, frozen(A), frozen(B), frozen(C), names, (METHOD,) * len(names), METHOD, told)
+                StepDerivatives(x_next, frozen(A), frozen(B), frozen(C), names, (METHOD,) * len(names), METHOD, reason)
             )
             begin = end
         return steps
@@ -287,11 +287,11 @@ class FlowIntervals:
             flows.append(self._flow(begin, u))
         if all(np.array_equal(a.xs[-1], b.xs[0]) for a, b in pairwise(flows)):
             return self.steps.derivatives(_joined(flows))  # at once, which costs less
-        return [found for flow in flows for found in self.steps.derivatives(flow)]
+        return [by_interval for flow in flows for by_interval in self.steps.derivatives(flow)]
 
     def jacobians(self, xs: Array, us: Array, ends: Array | None = None) -> Array:
-        found = self.derivatives(xs[0], us, xs[: len(us)])
-        return np.array([np.hstack([d.A, d.B]) for d in found])
+        derivatives = self.derivatives(xs[0], us, xs[: len(us)])
+        return np.array([np.hstack([d.A, d.B]) for d in derivatives])
 
     def touching(self, x: Array, u: Array) -> tuple[tuple[str, str], ...]:
         pairs = self.steps.plant.pairs
@@ -345,8 +345,8 @@ def _depths(plant: FlowPlant, flow: Flow, materials: Array) -> Array:
     if not plant.num_pairs:
         return np.zeros(len(flow.xs))
     nothing = np.zeros(plant.model.nu)
-    found = [np.asarray(plant.switches(x, nothing, materials)).ravel()[::2] for x in flow.xs]
-    return np.maximum(np.max(found, axis=1), 0.0)
+    depths = [np.asarray(plant.switches(x, nothing, materials)).ravel()[::2] for x in flow.xs]
+    return np.maximum(np.max(depths, axis=1), 0.0)
 
 
 def _work(plant: FlowPlant, flow: Flow, materials: Array) -> Array:
@@ -361,10 +361,10 @@ def _work(plant: FlowPlant, flow: Flow, materials: Array) -> Array:
         slopes = Slopes(plant.part(pushing), materials, np.zeros((4 * len(pushing), 0)))
         starts, ends = xs[rows], xs[rows + 1]
         at_start, at_end = slopes.at_ends(starts, ends, us[rows])
-        for part, weight in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
-            states = between(part, starts, ends, hs[rows], at_start, at_end)
-            found = [np.asarray(powers(x, u, materials)).ravel() for x, u in zip(states, us[rows], strict=True)]
-            done[rows + 1] += weight * hs[rows, None] * np.array(found)
+        for share, weight in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
+            states = between(share, starts, ends, hs[rows], at_start, at_end)
+            watts = [np.asarray(powers(x, u, materials)).ravel() for x, u in zip(states, us[rows], strict=True)]
+            done[rows + 1] += weight * hs[rows, None] * np.array(watts)
     return np.asarray(np.cumsum(done, axis=0))
 
 
@@ -386,7 +386,7 @@ def _contacts(plant: FlowPlant, flow: Flow, materials: Array) -> tuple[tuple[Con
         return ((),) * len(flow.ends)
     of_all = [ca.horzcat(t.point, t.normal, t.push, ca.vertcat(t.depth, t.speed, 0)) for t in plant.touches]
     read = ca.Function("contacts", [plant.x, plant.u, plant.materials], [ca.horzcat(*of_all)])
-    nothing, found = np.zeros(plant.model.nu), []
+    nothing, contacts = np.zeros(plant.model.nu), []
     for begin, end in pairwise([0, *flow.ends]):
         deepest: dict[int, tuple[float, Array]] = {}
         for m in range(begin, end):
@@ -397,8 +397,8 @@ def _contacts(plant: FlowPlant, flow: Flow, materials: Array) -> tuple[tuple[Con
                     depth = float(values[0, i, 3])
                     if depth > deepest.get(i, (0.0,))[0]:
                         deepest[i] = depth, values[:, i]
-        found.append(tuple(_contact(plant, i, values) for i, (_, values) in sorted(deepest.items())))
-    return tuple(found)
+        contacts.append(tuple(_contact(plant, i, values) for i, (_, values) in sorted(deepest.items())))
+    return tuple(contacts)
 
 
 def _contact(plant: FlowPlant, i: int, values: Array) -> ContactPoint:
