@@ -103,6 +103,15 @@ def inverse_kinematics(
     return posture
 
 
+def miss(model: Model, targets: Sequence[Target]) -> float:
+    """[m] how far the points are from their targets in the twin's state beyond the tolerance, at most."""
+    off = [0.0]
+    for target in targets:
+        there = target.frame.CalcPoseInWorld(model.double.context).multiply(target.point)
+        off += np.nan_to_num(np.abs(there - target.position) - target.tolerance, neginf=0.0).tolist()
+    return max(off)
+
+
 def _nearness(model: Model, first: Array, wish: Wish) -> tuple[Array, Array]:
     """(nq,) twice: what each coordinate is to be near, a quaternion on the side of `first`, and how much it counts."""
     goal, starts = np.array(wish.q), tangent_space(model).quaternions

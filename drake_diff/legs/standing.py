@@ -17,7 +17,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.derivatives.step import linearize
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.legs.feet import GRAVITY, Legs, find_feet
-from drake_diff.legs.inverse_kinematics import Target, Wish, inverse_kinematics
+from drake_diff.legs.inverse_kinematics import Target, Wish, inverse_kinematics, miss
 from drake_diff.legs.motion import smooth
 from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.model import Model
@@ -52,7 +52,7 @@ SIZES = ((1.0, 1.0), (1.0, 0.2), (0.5, 0.2), (0.25, 0.1), (0.12, 0.0))  # of a r
 TURNED, SHIFTED, LOWERED = 0.1, 0.06, 0.12  # [rad], and shares of the height of the centre of mass: of the base
 MOVED = 0.1  # of the range of a joint that is no leg's
 ARRIVED, SLOW_ENOUGH = 0.01, 0.02  # [rad or m] off the rest that was to be reached, [rad/s or m/s] there
-FEET_STAY = 1e-3  # [m] how far a foot may be from where it stood
+FEET_STAY, STILL = 1e-3, 1e-7  # [m] how far a foot may be from where it stood, and from knot to knot: 4 mm/s^2
 FREE_BASE, FREE_JOINT, ALONG = 0.1, 0.3, 0.05  # [rad or m] that counts as 1, the last on the way
 BASE_TURN, BASE_PLACE = 0.003, 0.001  # the same of a base whose pose is asked for
 OVER_FEET = 0.02  # [m] the same of the centre of mass
@@ -309,7 +309,8 @@ def random_shift(legs: Legs, start: Rest, seed: Sequence[int], depth: Callable[[
     """
     random = np.random.default_rng([*seed, 4])
     model, q0, base = legs.model, start.x[: legs.model.nq], legs.base_v
-    deepest, feet = max(depth(q0), 1e-4), legs.points_in(q0)
+    deepest = max(depth(q0), 1e-4)
+    legs.put(q0)
     tall = float(legs.center_of_mass()[2])
     unit = np.full(model.nv, FREE_JOINT)
     unit[base : base + 6] = np.repeat([BASE_TURN, BASE_PLACE], 3)
@@ -322,10 +323,8 @@ def random_shift(legs: Legs, start: Rest, seed: Sequence[int], depth: Callable[[
         way[base + 3 : base + 5] = size * SHIFTED * tall * random.uniform(-1, 1, 2)
         way[base + 5] = -size * LOWERED * tall * random.uniform(0.5, 1)
         way[legs.joint_v[arms]] = of_arms * MOVED * random.uniform(-1, 1, len(ranges)) * ranges
-        legs.put(q0)
-        wish, targets = Wish(legs.moved(q0, way), unit), legs.at(feet, ON_GROUND)
-        q = inverse_kinematics(model, q0, targets, wish, legs.lower + margin, legs.upper - margin)
-        shift = _shift_to(legs, start, q, feet)
+        wish = Wish(legs.moved(q0, way), unit)
+        shift = _shift_to(legs, start, wish, legs.lower + margin, legs.upper - margin)
         if isinstance(shift, Refusal):
             why = shift
         elif max(depth(x[: model.nq]) for x in shift.xs[:: max(1, len(shift.us) // 20)]) > deepest:
@@ -347,10 +346,8 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
     for _ in range(CORRECTIONS + 1):
         lower, upper = legs.lower.copy(), legs.upper.copy()
         lower[indices] = upper[indices] = aimed
-        legs.put(q0)
         targets = [Target(origins[name], np.zeros(3), position, ON_GROUND) for name, position in places.items()]
-        q = inverse_kinematics(model, q0, [*legs.at(feet, ON_GROUND), *targets], wish, lower, upper)
-        shift = _shift_to(legs, start, q, feet)
+        shift = _shift_to(legs, start, wish, lower, upper, targets)
         if isinstance(shift, Refusal):
             return shift
         end = shift.xs[-1][: model.nq]
@@ -367,11 +364,17 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
     )
 
 
-def _shift_to(legs: Legs, start: Rest, q: Array, feet: Array) -> Shift | Refusal:
-    """From rest to posture q (nq,), if that is one in which the robot stands with its `feet` (n, 3) where they are."""
-    off = max(float(np.max(np.abs(legs.points_in(q) - feet))), -float(np.min(legs.on_lowest(q).points_in(q)[:, 2])))
+def _shift_to(
+    legs: Legs, start: Rest, wish: Wish, lower: Array, upper: Array, others: Sequence[Target] = ()
+) -> Shift | Refusal:
+    """From rest to the posture nearest to a wish in which the feet stand where they are, and `others` are kept."""
+    q0 = start.x[: legs.model.nq]
+    feet = legs.points_in(q0)
+    targets = [*legs.at(feet, ON_GROUND, rolls=range(len(feet))), *others]
+    q = inverse_kinematics(legs.model, q0, targets, wish, lower, upper)
+    off = max(miss(legs.model, targets), -float(np.min(legs.on_lowest(q).points_in(q)[:, 2])))
     if off > FEET_STAY:
-        return Refusal(f"its feet would have to move, or roll, by {off:.2g} m")
+        return Refusal(f"its feet would have to move by {off:.2g} m")
     stance = hold(legs, q)
     end = stance if isinstance(stance, Refusal) else settled(legs, stance)
     if isinstance(end, Refusal):
@@ -400,11 +403,10 @@ def _between(legs: Legs, start: Rest, end: Rest, duration: float) -> Shift | Ref
     moving, holding = round(duration / h), round(HOLDING / h)
     q0, q1 = start.x[: model.nq], end.x[: model.nq]
     s = smooth(np.linspace(0, 1, moving + 1))
-    feet = [legs.points_in(q) for q in (q0, q1)]
+    feet = [legs.points_in(q) for q in (q0, q1)]  # round ones roll as the legs turn
     way, unit, qs = legs.apart(q1, q0), np.full(model.nv, ALONG), [q0]
     for fraction in s[1:-1]:
-        legs.put(qs[-1])
-        targets = legs.at(feet[0] + fraction * (feet[1] - feet[0]), ON_GROUND)
+        targets = legs.at(feet[0] + fraction * (feet[1] - feet[0]), STILL)
         wish = Wish(legs.moved(q0, fraction * way), unit)
         qs.append(inverse_kinematics(model, qs[-1], targets, wish, legs.lower, legs.upper))
     qs += [q1] * (holding + 1)
