@@ -27,17 +27,11 @@ def _print_version(asked: bool) -> None:
     if not asked:
         return
     try:
-        typer.echo(f"drake-diff {version('drake-diff')}\n{_what_computes()}")
+        typer.echo(f"drake-diff {version('drake-diff')}")
+        typer.echo(f"Steps are differentiated by compiled functions (Numba {version('numba')})")
     except PackageNotFoundError as error:
         raise MissingDependencyError("drake-diff runs from a folder and is not installed: pip install -e .") from error
     raise typer.Exit
-
-
-def _what_computes() -> str:
-    """By what the derivatives of steps are computed."""
-    from importlib.metadata import version
-
-    return f"Steps are differentiated by compiled functions (Numba {version('numba')})"
 
 
 @app.callback()
