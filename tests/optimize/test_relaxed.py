@@ -14,8 +14,9 @@ from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize import Options
 from drake_diff.optimize.continuation import follow, read_relaxed_plant, relaxed_schedule
+from drake_diff.optimize.ilqr.riccati import slope_along
 from drake_diff.optimize.relaxed.plant import Softness, relaxed_plant
-from drake_diff.optimize.relaxed.search import Band, RelaxedSearch, between, slopes_of
+from drake_diff.optimize.relaxed.search import RelaxedSearch, between, slopes_of
 
 
 def softness(plant, reach=0.02, force=20.0):
@@ -121,28 +122,18 @@ def test_the_gradient_of_the_augmented_cost_is_that_of_differences():
     search, soft = RelaxedSearch(problem, plant), softness(plant)
     still = np.tile(x0[: model.nq], (N + 1, 1))
     search._start(search.motion(still, soft))
-    at = search._moved(still, 0.01 * random.standard_normal(N * model.nv))
+    step = 0.01 * random.standard_normal((N + 1, model.nv))
+    step[0] = 0.0
+    at = search._moved(still, step)
     search.rest_multipliers = 0.1 * random.standard_normal(search.rest_multipliers.shape)
-    gradient, _ = search._expand(search.motion(at, soft), soft)
-    d = random.standard_normal(len(gradient))
+    quadratic, _ = search._expand(search.motion(at, soft), soft)
+    dvs, moved = random.standard_normal((N, model.nv)), np.zeros((N + 1, 2 * model.nv))
+    for k, (F, dv) in enumerate(zip(quadratic.F, dvs, strict=True)):
+        moved[k + 1] = F @ np.concatenate([moved[k], dv])
+    d = moved[:, : model.nv]
     merits = [search._merit(search.motion(search._moved(at, s * 1e-7 * d), soft)) for s in (1, -1)]
-    assert gradient @ d == pytest.approx((merits[0] - merits[1]) / 2e-7, rel=1e-6)
-
-
-def test_a_band_of_blocks_is_solved_as_the_whole_matrix_is():
-    random, N, n = np.random.default_rng(0), 7, 3
-    root = np.zeros((N * n, N * n))
-    for k in range(N):
-        rows = slice(k * n, min(k + 3, N) * n)
-        root[rows, k * n : (k + 1) * n] = random.standard_normal(root[rows, :n].shape)
-    whole = root @ root.T + np.eye(N * n)
-    blocks = whole.reshape(N, n, N, n).swapaxes(1, 2)
-    below, beneath = random.standard_normal((2, N, n, n))  # the last of which are of no column
-    below[:-1], beneath[:-2] = (np.array([blocks[k + i, k] for k in range(N - i)]) for i in (1, 2))
-    band = Band(np.array([blocks[k, k] for k in range(N)]), below, beneath)
-    right = random.standard_normal((N, n))
-    assert band.solve(right) == pytest.approx(np.linalg.solve(whole, right.ravel()), rel=1e-9)
-    assert Band(band.diagonal - 100 * np.eye(n), below, beneath).solve(right) is None
+    slope, _ = slope_along(quadratic, moved, dvs)
+    assert slope == pytest.approx((merits[0] - merits[1]) / 2e-7, rel=1e-6)
 
 
 def test_least_effort_far_from_contact_is_the_closed_form(two_spheres):

@@ -45,6 +45,14 @@ class Limits:
     prices: Array  # (m,) per unit that a limit is passed by
     ranges: Array  # (m,) how far f ranges; a limit on both sides that is far narrower is one to be met
 
+    @classmethod
+    def unpriced(
+        cls, labels: tuple[str, ...], function: KnotFunction, first: int, lower: Array, upper: Array
+    ) -> "Limits":
+        """At prices of 1."""
+        has_lower, has_upper = (np.any(np.isfinite(side), axis=0) for side in (lower, upper))
+        return cls(labels, function, first, lower, upper, has_lower, has_upper, *np.ones((2, len(labels))))
+
     @property
     def knots(self) -> slice:
         return slice(self.first, self.first + len(self.lower))

@@ -8,21 +8,14 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import InputError
 from drake_diff.optimize.ilqr.riccati import least_regularized
-from drake_diff.optimize.knots import Costs, KnotFunction, Selected, Stage, knot_cost, knot_function
+from drake_diff.optimize.knots import Costs, Selected, Stage, knot_cost, knot_function
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST, GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.realtime.qp import Limits, SoftProgram
-from drake_diff.optimize.realtime.step import DEAR, NO_SLOPE, Stretch, expand
-
-# A price above a limit's multiplier keeps it wherever it can be kept. Where an end is stayed at, prices are this many
-# costs of the plan for a whole range of what is limited: ten times what staying costs that is off by as much. Elsewhere
-# they are so many times what the cost-to-go says that a unit is worth.
-DEAR_BESIDE_STAYING = 1e5
-HALF = 0.5  # of a goal's tolerance
-PERTURBED, SPREAD = 8, 0.3  # motions at which slopes are looked at, in ranges of the states beside the plan
+from drake_diff.optimize.realtime.step import OPTIONS, Stretch, expand
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,21 +26,6 @@ class Staying:
     running: QuadraticCost
     final: QuadraticCost
     unit: float  # the cost of the plan
-
-
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """Rows of one function; `limits` (m,) hold at the knots `at` of the problem, at all where None."""
-
-    labels: tuple[str, ...]
-    function: KnotFunction
-    takes_input: bool
-    lower: Array
-    upper: Array
-    at: frozenset[int] | None
-    special: dict[int, Array]  # (m,) values to be met at a knot, NaN where free
-    prices: Array
-    ranges: Array
 
 
 class Rolling:
@@ -70,12 +48,12 @@ class Rolling:
             self._stayed = knot_cost(staying.final, self.nx, 0, states)
         self.tails: tuple[CostToGo, ...] = ()  # of the states of a plan of the whole
         self._programs: dict[int, SoftProgram] = {}
-        self.groups = tuple(self._groups(probe))
+        self.limits = tuple(self._limits(probe))
         self._set_prices(xs, us)
 
     def stretch(self, begin: int, count: int) -> Stretch:
         """The steps `begin` ... `begin` + `count`."""
-        limits = tuple(self._limits(group, begin, count) for group in self.groups)
+        limits = tuple(self._select(every, begin, count) for every in self.limits)
         if count not in self._programs:
             self._programs[count] = SoftProgram(self.nx, self.nu, count, limits)
         costs = Costs(tuple(self._stages(begin, count)))
@@ -100,47 +78,31 @@ class Rolling:
             yield Stage(self._final, slice(last - begin, last - begin + 1), times[last - begin :][:1], 1.0, final=True)
         yield Stage(final, slice(count, count + 1), times[count:], 1.0, final=True)
 
-    def _groups(self, probe: Array) -> list[_Group]:
-        problem, b = self.problem, self.problem.bounds
-        limited = np.isfinite(b.x_lower) | np.isfinite(b.x_upper)
-        for wanted in problem.waypoints.values():
-            limited |= ~np.isnan(wanted)
-        which, ones = np.flatnonzero(limited), np.ones(int(np.sum(limited)))
-        groups = []
+    def _limits(self, probe: Array) -> Iterator[Limits]:
+        """At the knots 0 ... N of the problem, and in a last row at all that come after; without prices."""
+        problem, b, rows = self.problem, self.problem.bounds, (self.problem.num_steps + 2, 1)
+        lower, upper = np.tile(b.x_lower, rows), np.tile(b.x_upper, rows)
+        for k, wanted in problem.waypoints.items():
+            given = ~np.isnan(wanted)
+            lower[k, given] = upper[k, given] = wanted[given]
+        which = np.flatnonzero(np.any(np.isfinite(lower) | np.isfinite(upper), axis=0))
         if len(which):
-            labels = tuple(problem.state_names[i] for i in which)
-            special = {k: wanted[which] for k, wanted in problem.waypoints.items()}
-            lower, upper = b.x_lower[which], b.x_upper[which]
-            states = Selected(which, self.nx + self.nu)
-            groups.append(_Group(labels, states, False, lower, upper, None, special, ones, ones))
+            labels, states = tuple(problem.state_names[i] for i in which), Selected(which, self.nx + self.nu)
+            yield Limits.unpriced(labels, states, 1, lower[:, which], upper[:, which])
         for c in problem.kept:
             if self.staying is not None and isinstance(c, GoalConstraint) and c.knots == LAST:
                 continue  # the plan keeps it, and its end is stayed at
-            knots = None if c.knots is None else frozenset(problem.knots_of(c, input_at_end=False))
+            lower, upper = (np.tile(side, rows) for side in _wide(c))
+            if c.knots is not None:
+                away = np.setdiff1d(np.arange(rows[0]), problem.knots_of(c, input_at_end=False))
+                lower[away], upper[away] = -np.inf, np.inf
             function = knot_function(c, self.nx, self.nu, probe)
-            ones, (lower, upper) = np.ones(len(c.lower)), _wide(c)
-            groups.append(_Group(_labels(c), function, c.takes_input, lower, upper, knots, {}, ones, ones))
-        return groups
+            yield Limits.unpriced(_labels(c), function, 0 if c.takes_input else 1, lower, upper)
 
-    def _limits(self, group: _Group, begin: int, count: int) -> Limits:
-        first, last = (0, count - 1) if group.takes_input else (1, count)
-        knots, m = np.arange(begin + first, begin + last + 1), len(group.lower)
-        lower, upper = np.tile(group.lower, (len(knots), 1)), np.tile(group.upper, (len(knots), 1))
-        if group.at is not None:
-            away = np.array([k not in group.at for k in knots])
-            lower[away], upper[away] = -np.inf, np.inf
-        for knot, wanted in group.special.items():
-            if begin + first <= knot <= begin + last:
-                row = knot - begin - first
-                given = ~np.isnan(wanted)
-                lower[row, given] = upper[row, given] = wanted[given]
-        met = np.zeros(m, dtype=bool)
-        for wanted in group.special.values():
-            met |= ~np.isnan(wanted)
-        has_lower, has_upper = np.isfinite(group.lower) | met, np.isfinite(group.upper) | met
-        return Limits(
-            group.labels, group.function, first, lower, upper, has_lower, has_upper, group.prices, group.ranges
-        )
+    def _select(self, limits: Limits, begin: int, count: int) -> Limits:
+        """Those of the steps `begin` ... `begin` + `count`."""
+        knots = np.minimum(begin + limits.first + np.arange(count), len(limits.lower) - 1)
+        return replace(limits, lower=limits.lower[knots], upper=limits.upper[knots])
 
     def _set_prices(self, xs: Array, us: Array) -> None:
         """Prices by what a unit of each state and input is worth along the plan, and by the slopes of the rows."""
@@ -166,24 +128,24 @@ class Rolling:
         worth = np.concatenate([worth, np.max(curved, axis=0) * efforts])
         spans, random = np.concatenate([ranges, efforts]), np.random.default_rng(0)
         knots = np.hstack([xs[:-1], us])
-        near = [knots + SPREAD * spans * random.standard_normal(knots.shape) for _ in range(PERTURBED)]
+        near = [knots + OPTIONS.spread * spans * random.standard_normal(knots.shape) for _ in range(OPTIONS.perturbed)]
         looked = np.concatenate([knots, *near])
         unit = None if self.staying is None else self.staying.unit
-        self.groups = tuple(_priced(group, looked, worth, spans, unit) for group in self.groups)
+        self.limits = tuple(_priced(limits, looked, worth, spans, unit) for limits in self.limits)
 
 
-def _priced(group: _Group, knots: Array, worth: Array, spans: Array, unit: float | None) -> _Group:
+def _priced(limits: Limits, knots: Array, worth: Array, spans: Array, unit: float | None) -> Limits:
     with np.errstate(all="ignore"):
-        slopes = np.abs(group.function.linearize(knots)[1])
+        slopes = np.abs(limits.function.linearize(knots)[1])
     slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))]
     steepest = np.max(slopes, axis=0, initial=0.0)  # (m, n)
     squared = np.sum(steepest**2, axis=1)
-    flat = squared <= NO_SLOPE
+    flat = squared <= OPTIONS.no_slope
     ranges = np.where(flat, 1.0, steepest @ spans)
     if unit is not None:
-        return replace(group, prices=DEAR_BESIDE_STAYING * unit / ranges, ranges=ranges)
+        return replace(limits, prices=OPTIONS.dear_beside_staying * unit / ranges, ranges=ranges)
     prices = np.where(flat, np.sum(worth), steepest @ worth / np.where(flat, 1.0, squared))
-    return replace(group, prices=DEAR * prices, ranges=ranges)
+    return replace(limits, prices=OPTIONS.dear * prices, ranges=ranges)
 
 
 def _wide(c: Constraint) -> tuple[Array, Array]:
@@ -194,7 +156,7 @@ def _wide(c: Constraint) -> tuple[Array, Array]:
     if not isinstance(c, GoalConstraint):
         return c.lower, c.upper
     met, middle = ~np.isnan(c.wanted), np.nan_to_num(c.wanted)
-    half = HALF * c.tolerance / max(int(np.count_nonzero(met)), 1) ** (1 / c.norm)
+    half = OPTIONS.half * c.tolerance / max(int(np.count_nonzero(met)), 1) ** (1 / c.norm)
     lower = np.where(met, np.minimum(c.lower, middle - half), c.lower)
     return lower, np.where(met, np.maximum(c.upper, middle + half), c.upper)
 

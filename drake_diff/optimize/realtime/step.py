@@ -35,21 +35,40 @@ from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import CostToGo
 from drake_diff.optimize.realtime.qp import Limited, Limits, Moves, SoftProgram
 
-STEP_SIZES = (1.0, 0.5, 0.25, 0.125, 1 / 16, 1 / 32)
-ROLLED_SIZES = (1.0, 0.4, 0.1)  # each costs a rollout
-SUFFICIENT_DECREASE = 1e-4
-GAP_PRICE = 2.0  # over the largest multiplier of the dynamics
-ROUNDING = 1e-12  # of the merit: a change below this is lost in the sum
-SOLVED_TO = 1e-9  # the same of a quadratic program with limits that push
-# Of what a step moves the plant by: an error above it is looked at over a part of the step, where it has to shrink.
-SUSPECT, SHORT_PART, STILL = 0.1, 1e-2, 0.5
-UNSEEN = 1e-5  # of a state: Drake solves contact to 1e-6
-# Of a multiplier over its price: a row between the two parts holds the motion, others do not or give way.
-HOLDS, GIVES = 1e-6, 1 - 1e-6
-SLIGHT = 1e-6  # of a row's range: what a limit that gives way is passed by at least
-DEAR, NO_SLOPE = 10.0, 1e-12  # prices over what a unit is worth; slopes whose squares are taken for none
-NARROW = 0.1  # of the range of a row: limits on both sides that are nearer to each other are met, not kept
-STIFF = 1e4  # over a row's price, per its scale: the curvature of a row that holds, for gains and values
+
+@dataclass(frozen=True)
+class StepOptions:
+    """What tunes a step."""
+
+    step_sizes: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125, 1 / 16, 1 / 32)
+    rolled_sizes: tuple[float, ...] = (1.0, 0.4, 0.1)  # each costs a rollout
+    sufficient_decrease: float = 1e-4
+    gap_price: float = 2.0  # over the largest multiplier of the dynamics
+    rounding: float = 1e-12  # of the merit: a change below this is lost in the sum
+    solved_to: float = 1e-9  # the same of a quadratic program with limits that push
+    # Of what a step moves the plant by: an error above it is looked at over a part of the step, where it has to shrink.
+    suspect: float = 0.1
+    short_part: float = 1e-2
+    still: float = 0.5
+    unseen: float = 1e-5  # of a state: Drake solves contact to 1e-6
+    # Of a multiplier over its price: a row between the two holds the motion, others do not or give way.
+    holds: float = 1e-6
+    gives: float = 1 - 1e-6
+    slight: float = 1e-6  # of a row's range: what a limit that gives way is passed by at least
+    dear: float = 10.0  # prices over what a unit is worth
+    no_slope: float = 1e-12  # slopes whose squares are taken for none
+    narrow: float = 0.1  # of the range of a row: limits on both sides that are nearer to each other are met, not kept
+    stiff: float = 1e4  # over a row's price, per its scale: the curvature of a row that holds, for gains and values
+    # A price above a limit's multiplier keeps it wherever it can be kept. Where an end is stayed at, prices are this
+    # many costs of the plan for a whole range of what is limited: ten times what staying costs that is off by as much.
+    # Elsewhere they are `dear` times what the cost-to-go says that a unit is worth.
+    dear_beside_staying: float = 1e5
+    half: float = 0.5  # of a goal's tolerance
+    perturbed: int = 8  # motions at which slopes are looked at,
+    spread: float = 0.3  # in ranges of the states beside the plan
+
+
+OPTIONS = StepOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +168,7 @@ class Step:
     @property
     def is_reached(self) -> bool:
         """Whether a further step promises no more than what the program is solved to."""
-        return self.promised <= (ROUNDING if self.whole else SOLVED_TO) * (1 + abs(self.merit))
+        return self.promised <= (OPTIONS.rounding if self.whole else OPTIONS.solved_to) * (1 + abs(self.merit))
 
     @property
     def given_way(self) -> tuple[str, float, int] | None:
@@ -157,7 +176,7 @@ class Step:
         worst, passed = 0.0, None
         for rows, slack, force in zip(self.expansion.limited, self.moves.slacks, self.moves.multipliers, strict=True):
             limits = rows.limits
-            gives = (np.abs(force) >= GIVES * rows.prices) & (slack > SLIGHT * limits.ranges)
+            gives = (np.abs(force) >= OPTIONS.gives * rows.prices) & (slack > OPTIONS.slight * limits.ranges)
             paid = np.where(gives, slack * rows.prices, 0.0)
             if np.max(paid, initial=0.0) > worst:
                 k, i = np.unravel_index(int(np.argmax(paid)), paid.shape)
@@ -181,24 +200,24 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
     if isinstance(solved, Refusal):
         return solved
     expansion, moves = solved.expansion, solved.moves
-    gap_prices = GAP_PRICE * np.max(np.abs(moves.dynamics), axis=0)
+    gap_prices = OPTIONS.gap_price * np.max(np.abs(moves.dynamics), axis=0)
     before = merit(stretch, expansion, motion, gap_prices)
     slope, curvature = slope_along(expansion.quadratic, moves.dxs, moves.dus)
     slope -= float(np.sum(gap_prices * np.abs(motion.gaps)))
     for rows, slack in zip(expansion.limited, moves.slacks, strict=True):
         slope -= float(np.sum(rows.prices * (rows.beyond - slack)))
     promised = -(slope + curvature / 2)
-    rounding = ROUNDING * (1 + abs(before))
+    rounding = OPTIONS.rounding * (1 + abs(before))
     step = Step(stretch, motion, 0.0, promised, before, expansion, moves, solved.whole, True, solved.feedback)
     if stretch.rolls and not motion.is_rollout:
         return _first_rollout(step)
-    for size in ROLLED_SIZES if stretch.rolls else STEP_SIZES:
+    for size in OPTIONS.rolled_sizes if stretch.rolls else OPTIONS.step_sizes:
         try:
             tried = _moved(step, size)
             after = merit(stretch, expansion, tried, gap_prices)
         except SimulationError:
             continue
-        if after <= before + SUFFICIENT_DECREASE * size * min(slope, 0.0) + rounding:
+        if after <= before + OPTIONS.sufficient_decrease * size * min(slope, 0.0) + rounding:
             step = replace(step, motion=tried, size=size, merit=after)
             # The plant's own motion costs less: whatever the derivatives are, they led there.
             return replace(step, is_doubtful=not stretch.rolls and _is_doubtful(step, motion))
@@ -289,10 +308,10 @@ def _is_doubtful(step: Step, before: Motion) -> bool:
         return float(np.max(np.abs(motion.ends - before.ends - fraction * linear)))
 
     large = error(step.motion, 1.0)
-    if large <= max(SUSPECT * change, UNSEEN * (1 + float(np.max(np.abs(before.ends))))):
+    if large <= max(OPTIONS.suspect * change, OPTIONS.unseen * (1 + float(np.max(np.abs(before.ends))))):
         return False
-    short = step.stretch.motion(before.xs + SHORT_PART * dxs, before.us + SHORT_PART * dus)
-    return error(short, SHORT_PART) > STILL * SHORT_PART * large
+    short = step.stretch.motion(before.xs + OPTIONS.short_part * dxs, before.us + OPTIONS.short_part * dus)
+    return error(short, OPTIONS.short_part) > OPTIONS.still * OPTIONS.short_part * large
 
 
 def expand(stretch: Stretch, motion: Motion) -> Expansion:
@@ -350,8 +369,8 @@ def _dear_enough(limited: Sequence[Limited], forces: Array) -> tuple[Limited, ..
     for rows in limited:
         slopes = np.abs(rows.jacobians[:, :, : len(worth)])
         squared = np.sum(slopes**2, axis=2)
-        seen = squared > NO_SLOPE
-        wanted = DEAR * (slopes @ worth) / np.where(seen, squared, 1.0)
+        seen = squared > OPTIONS.no_slope
+        wanted = OPTIONS.dear * (slopes @ worth) / np.where(seen, squared, 1.0)
         factor = max(factor, float(np.max(np.where(seen, wanted / rows.prices, 0.0), initial=0.0)))
     return tuple(replace(rows, prices=factor * rows.prices) for rows in limited)
 
@@ -367,9 +386,9 @@ def _held(expansion: Expansion, moves: Moves, *, one_sided: bool) -> LinearQuadr
     for rows, forces in zip(expansion.limited, moves.multipliers, strict=True):
         limits, ratios = rows.limits, np.abs(forces) / rows.prices
         if one_sided:
-            stiff = np.where((ratios > HOLDS) & (ratios < GIVES), STIFF * rows.prices, 0.0)
+            stiff = np.where((ratios > OPTIONS.holds) & (ratios < OPTIONS.gives), OPTIONS.stiff * rows.prices, 0.0)
         else:
-            met = limits.upper - limits.lower < NARROW * limits.ranges
+            met = limits.upper - limits.lower < OPTIONS.narrow * limits.ranges
             stiff = np.where(met, rows.prices / limits.ranges, 0.0)
         gradients[limits.knots] += np.einsum("kr,kri->ki", forces, rows.jacobians)
         hessians[limits.knots] += np.einsum("kri,kr,krj->kij", rows.jacobians, stiff, rows.jacobians)

@@ -2,13 +2,13 @@
 
 The unknowns are q_1 ... q_N. Velocities are v_k = (q_k - q_(k-1)) / h, forces are those of `plant`, inputs what of them
 the motors give, and what they cannot give has to vanish. That, bounds, goals and constraints are an augmented
-Lagrangian. As each knot's cost knows three positions, the Hessian is a band, which one Cholesky factor solves
+Lagrangian. With v_(k+1) as the input that leads from q_k to q_(k+1), a step of Gauss and Newton's is Riccati's sweep
 (Kurtz and Lin, "Inverse dynamics trajectory optimization for contact-implicit model predictive control", 2023; there
 the forces that no motor gives cost a penalty). No motion is ever rolled out, so that any guess will do.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,60 +17,32 @@ from drake_diff._base.arrays import Array, skew
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import Motion, expand_costs
+from drake_diff.optimize.ilqr.riccati import LinearQuadratic, follow, slope_along, solve_riccati
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.relaxed.plant import RelaxedPlant, Softness
 
-PENALTY, GROWTH, LARGEST_PENALTY = 1.0, 5.0, 1e8
-SUFFICIENT = 1e-3  # of the decrease that the model promises
-SMALLEST = 1e-8  # of the Hessian's largest entry: what counts as its smallest
-LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
-ENOUGH = 1e-3  # of the merit: less than that is no gain
-RELENT = 25.0
-INNER = 20  # steps between two looks at the multipliers
-CLOSED = (
-    1e-3  # [m/s or rad/s], and in the units of bounds and goals: what a stage leaves is for the true plant to close
-)
-STALLED, PATIENCE = 0.7, 6  # of what was open: so often in a row no more than that was closed
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """What tunes the search of a stage."""
+
+    penalty: float = 1.0  # the first
+    growth: float = 5.0
+    largest_penalty: float = 1e8
+    relent: float = 25.0  # times the first penalty: the highest that a stage begins with
+    sufficient: float = 1e-3  # of the decrease that the model promises
+    smallest: float = 1e-8  # of the Hessian's largest entry: what counts as its smallest
+    least_damping: float = 1e-9
+    most_damping: float = 1e9
+    enough: float = 1e-3  # of the merit: less than that is no gain
+    inner: int = 20  # steps between two looks at the multipliers
+    # [m/s or rad/s], and in the units of bounds and goals: what a stage leaves is for the true plant to close.
+    closed: float = 1e-3
+    stalled: float = 0.7  # of what was open: where no more than that was closed
+    patience: int = 6  # times in a row, the search ends
 
 
-@dataclass(frozen=True, eq=False)
-class Band:
-    """A symmetric matrix of N by N blocks (n, n), 0 but for those on the diagonal, below it, and below that.
-
-    Of `below` and `beneath` the last, and the last two, are of no column and not looked at.
-    """
-
-    diagonal: Array  # (N, n, n)
-    below: Array  # (N, n, n) in row k + 1 of column k
-    beneath: Array  # (N, n, n) in row k + 2
-
-    def solve(self, right: Array) -> Array | None:
-        """(N n,) the solution for the right side (N, n); None where the matrix is not positive definite."""
-        N, n = right.shape
-        inverse, factors, y = np.empty((N, n, n)), np.zeros((N + 2, 2 * n, n)), np.zeros((N + 2, n))
-        y[:N] = right
-        columns = np.concatenate([self.below, self.beneath], axis=1)
-        diagonal = np.array(self.diagonal)
-        try:
-            for k in range(N):  # what column k adds to the columns and rows after it
-                inverted = np.linalg.inv(np.linalg.cholesky(diagonal[k]))
-                inverse[k] = inverted
-                y[k] = inverted.dot(y[k])
-                factors[k] = factor = columns[k].dot(inverted.T)
-                y[k + 1 : k + 3] -= factor.dot(y[k]).reshape(2, n)
-                if k + 1 < N:
-                    square = factor.dot(factor.T)
-                    diagonal[k + 1] -= square[:n, :n]
-                    columns[k + 1, :n] -= square[n:, :n]
-                if k + 2 < N:
-                    diagonal[k + 2] -= square[n:, n:]
-        except np.linalg.LinAlgError:
-            return None
-        y[N:] = 0.0
-        for k in range(N - 1, -1, -1):
-            y[k] = inverse[k].T.dot(y[k] - factors[k].T.dot(y[k + 1 : k + 3].ravel()))
-        solution = y[:N].ravel()
-        return solution if np.all(np.isfinite(solution)) else None
+OPTIONS = SearchOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +79,7 @@ class RelaxedSearch:
         self.lower, self.upper = problem.bounds.u_lower, problem.bounds.u_upper
         self.rest_multipliers = np.zeros((self.count, self.undriven.shape[1]))
         self.input_multipliers = np.zeros((self.count, problem.nu))
-        self.rest_penalty, self.input_penalty = PENALTY, 0.0
+        self.rest_penalty, self.input_penalty = OPTIONS.penalty, 0.0
         self.rest_scale, self.input_scale = self._scales()
         self.started = False
 
@@ -139,19 +111,19 @@ class RelaxedSearch:
                 break
             moved, gained, damping = self._improved(motion, merit, soft, damping)
             number, since = number + 1, since + 1
-            little = moved is None or gained < ENOUGH * (abs(merit) + self._size(motion))
+            little = moved is None or gained < OPTIONS.enough * (abs(merit) + self._size(motion))
             if moved is not None:
                 motion, merit = moved, merit - gained
-            if not little and since < INNER:
+            if not little and since < OPTIONS.inner:
                 continue
             now = self._gap(motion), self._violation(motion)
             cost = self.problem.objective(motion.xs, motion.us)
             tell(f"relaxed step {number}: cost {cost:.6g}, gap {now[0]:.2g}, violation {now[1]:.2g}")
-            if max(now) < CLOSED and little:
+            if max(now) < OPTIONS.closed and little:
                 ended = "solved"
                 break
-            stuck = stuck + 1 if max(now) > STALLED * max(before) else 0
-            if stuck >= PATIENCE:
+            stuck = stuck + 1 if max(now) > OPTIONS.stalled * max(before) else 0
+            if stuck >= OPTIONS.patience:
                 ended = "inaccurate"
                 break
             self._update(motion, before, now, grow=little)
@@ -163,14 +135,14 @@ class RelaxedSearch:
         self, motion: RelaxedMotion, merit: float, soft: Softness, damping: float
     ) -> tuple[RelaxedMotion | None, float, float]:
         """The motion after a step that lowers the merit, None where there is none; by how much; and the damping."""
-        gradient, band = self._expand(motion, soft)
-        while damping <= MOST_DAMPING:
-            step = self._step(gradient, band, damping)
+        model, size = self._expand(motion, soft)
+        while damping <= OPTIONS.most_damping:
+            step = self._step(model, damping * size)
             if step is not None:
-                trial = self.motion(self._moved(motion.q, step), soft)
-                gained, promised = merit - self._merit(trial), -float(gradient @ step) / 2
-                if np.isfinite(gained) and gained > SUFFICIENT * promised:
-                    return trial, gained, max(damping / (5 if gained > 0.5 * promised else 1.5), LEAST_DAMPING)
+                trial = self.motion(self._moved(motion.q, step[0][:, : self.nv]), soft)
+                gained, promised = merit - self._merit(trial), -slope_along(model, *step)[0] / 2
+                if np.isfinite(gained) and gained > OPTIONS.sufficient * promised:
+                    return trial, gained, max(damping / (5 if gained > 0.5 * promised else 1.5), OPTIONS.least_damping)
             damping *= 4
         return None, 0.0, damping
 
@@ -210,9 +182,9 @@ class RelaxedSearch:
 
     def _relent(self) -> None:
         """Penalties no higher than a few times the first: those of the stage before are too stiff for another law."""
-        most = RELENT * self.first_penalty
+        most = OPTIONS.relent * self.first_penalty
         self.rest_penalty, self.input_penalty = min(self.rest_penalty, most), min(self.input_penalty, most)
-        self.constraints.penalty = min(self.constraints.penalty, RELENT * self.first_weight)
+        self.constraints.penalty = min(self.constraints.penalty, OPTIONS.relent * self.first_weight)
 
     def _rest(self, motion: RelaxedMotion) -> Array:
         return (motion.tau @ self.undriven) * self.rest_scale
@@ -246,11 +218,11 @@ class RelaxedSearch:
         self.constraints.update(motion.xs, motion.us)
         if not grow:
             return
-        if now[0] > max(CLOSED, before[0] / GROWTH):
-            self.rest_penalty = min(GROWTH * self.rest_penalty, LARGEST_PENALTY)
-        if now[1] > max(CLOSED, before[1] / GROWTH):
-            self.input_penalty = min(GROWTH * self.input_penalty, LARGEST_PENALTY)
-            self.constraints.penalty = min(GROWTH * self.constraints.penalty, LARGEST_PENALTY)
+        if now[0] > max(OPTIONS.closed, before[0] / OPTIONS.growth):
+            self.rest_penalty = min(OPTIONS.growth * self.rest_penalty, OPTIONS.largest_penalty)
+        if now[1] > max(OPTIONS.closed, before[1] / OPTIONS.growth):
+            self.input_penalty = min(OPTIONS.growth * self.input_penalty, OPTIONS.largest_penalty)
+            self.constraints.penalty = min(OPTIONS.growth * self.constraints.penalty, OPTIONS.largest_penalty)
 
     def _gap(self, motion: RelaxedMotion) -> float:
         return float(np.max(np.abs(self._rest(motion)), initial=0.0))
@@ -261,37 +233,32 @@ class RelaxedSearch:
 
     # ------------------------------------------------------------------ its expansion
 
-    def _expand(self, motion: RelaxedMotion, soft: Softness) -> tuple[Array, Band]:
-        """The gradient (N nv,) and the Hessian by small motions of q_1 ... q_N."""
-        nv, n, N, h = self.nv, self.problem.model.nq, self.count, self.h
-        q, v = motion.q, motion.xs[:, n:]
+    def _expand(self, motion: RelaxedMotion, soft: Softness) -> tuple[LinearQuadratic, Array]:
+        """The cost by small motions of q and changes of v, v_(k+1) being the input of knot k; see `_sizes`."""
+        nv, nq, N, h = self.nv, self.problem.model.nq, self.count, self.h
+        q, v = motion.q, motion.xs[:, nq:]
         forces = self.plant.forces(q[:-1], v[:-1], v[1:], soft, slopes=True)
         g, H = self._of_knots(motion)  # by [dq_k, v_k, tau_k]
-        first, second = slopes_of(self.plant.coordinates, q[:-1], q[1:])
-        first, second = first / h, second / h
-        # Z_k = d [dq_k, v_k, tau_k] / d [dq_(k-1), dq_k, dq_(k+1)]
-        Z = np.zeros((N + 1, 3 * nv, 3 * nv))
-        a, b, c = slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, 3 * nv)
-        Z[:, a, b] = np.eye(nv)
-        Z[1:, b, a], Z[1:, b, b] = first, second
-        Z[:-1, c, b] = forces.by_motion + forces.by_next @ first
-        Z[1:-1, c, b] += forces.by_v[1:] @ second[:-1]
-        Z[1:-1, c, a] = forces.by_v[1:] @ first[:-1]
-        Z[:-1, c, c] = forces.by_next @ second
-        small = (Z.swapaxes(1, 2) @ g[..., None])[..., 0]
-        full = Z.swapaxes(1, 2) @ H @ Z
-        gradient = np.zeros((N + 3, nv))
-        for i in range(3):
-            gradient[i : i + N + 1] += small[:, i * nv : (i + 1) * nv]
-        diagonal, below, beneath = np.zeros((3, N + 3, nv, nv))
-        parts = full.reshape(N + 1, 3, nv, 3, nv)
-        for i in range(3):
-            diagonal[i : i + N + 1] += parts[:, i, :, i]
-        for i in range(2):
-            below[i : i + N + 1] += parts[:, i + 1, :, i]
-        beneath[: N + 1] += parts[:, 2, :, 0]
-        keep = slice(2, N + 2)  # q_1 ... q_N; that of index 0 is before the first, 1 is the first
-        return gradient[keep].ravel(), Band(diagonal[keep], below[keep], beneath[keep])
+        Z = np.tile(np.diag([1.0] * 2 * nv + [0.0] * nv), (N + 1, 1, 1))  # that by z_k = [dq_k, dv_k, dv_(k+1)]
+        Z[:-1, 2 * nv :] = np.concatenate([forces.by_motion, forces.by_v, forces.by_next], axis=2)
+        first, second = slopes_of(self.plant.coordinates, q[:-1], q[1:])  # of h v_(k+1)
+        F = np.zeros((N, 2 * nv, 3 * nv))
+        F[:, :nv, :nv], F[:, :nv, 2 * nv :] = -np.linalg.solve(second, first), h * np.linalg.inv(second)
+        F[:, nv:, 2 * nv :] = np.eye(nv)
+        gradients, hessians = (Z.swapaxes(1, 2) @ g[..., None])[..., 0], Z.swapaxes(1, 2) @ H @ Z
+        given, wide = np.zeros(2 * nv), np.full((N, nv), np.inf)
+        model = LinearQuadratic(F, np.zeros((N, 2 * nv)), gradients, hessians, -wide, wide, given, given)
+        return model, self._sizes(hessians, first / h, second / h)
+
+    def _sizes(self, hessians: Array, first: Array, second: Array) -> Array:
+        """(nv,) the mean curvature of the cost by one q_k alone, which changes v_k and v_(k+1) too."""
+        none, one = np.zeros_like(first), np.broadcast_to(np.eye(self.nv), first.shape)
+        after, beyond = np.concatenate([first[1:], none[:1]]), np.zeros((1, *hessians.shape[1:]))
+        moved = (none, none, second), (one, second, after), (none, after, none)
+        blocks = zip(moved, (hessians[:-1], hessians[1:], np.concatenate([hessians[2:], beyond])), strict=True)
+        parts = ((np.concatenate(by_q, axis=1), block) for by_q, block in blocks)
+        size = sum(np.einsum("kia,kij,kja->a", by_q, block, by_q, optimize=True) for by_q, block in parts) / self.count
+        return np.asarray(np.maximum(size, OPTIONS.smallest * np.max(size)) + np.finfo(float).tiny)
 
     def _of_knots(self, motion: RelaxedMotion) -> tuple[Array, Array]:
         """The gradients (N+1, 3 nv) and Hessians (N+1, 3 nv, 3 nv) of the augmented cost by [dq, v, tau]."""
@@ -314,21 +281,19 @@ class RelaxedSearch:
         H[:-1, 2 * nv :, 2 * nv :] += self.rest_penalty * U @ U.T
         return g, H
 
-    def _step(self, gradient: Array, band: Band, damping: float) -> Array | None:
-        """Gauss-Newton's step with a damping of how speeds change: a whole motion may shift, no knot alone."""
-        size = np.mean(np.einsum("kii->ki", band.diagonal), axis=0)
-        held = damping * np.diag(np.maximum(size, SMALLEST * np.max(size)) + np.finfo(float).tiny)
-        diagonal = band.diagonal + 2 * held
-        diagonal[-1] -= held
-        return Band(diagonal, band.below - held, band.beneath).solve(-gradient.reshape(self.count, self.nv))
+    def _step(self, model: LinearQuadratic, weights: Array) -> tuple[Array, Array] | None:
+        """Gauss-Newton's step, with `weights` (nv,) on how far q_k and q_(k+1) part: a whole motion may shift."""
+        apart, hessians = model.F[:, : self.nv] - np.eye(self.nv, 3 * self.nv), np.array(model.hessians)
+        hessians[:-1] += (apart.swapaxes(1, 2) * weights) @ apart
+        policy = solve_riccati(replace(model, hessians=hessians), 0.0)
+        return None if policy is None else follow(model, policy)
 
-    def _moved(self, q: Array, step: Array) -> Array:
-        d = step.reshape(self.count, self.nv)
-        moved = np.array(q)
+    def _moved(self, q: Array, d: Array) -> Array:
+        """q (N+1, nq) moved by d (N+1, nv)."""
         coordinates = self.plant.coordinates
-        moved[1:] += (coordinates.rate(q[1:]) @ d[..., None])[..., 0]
+        moved = q + (coordinates.rate(q) @ d[..., None])[..., 0]
         for i, _ in coordinates.free:
-            moved[1:, i : i + 4] /= np.linalg.norm(moved[1:, i : i + 4], axis=1, keepdims=True)
+            moved[:, i : i + 4] /= np.linalg.norm(moved[:, i : i + 4], axis=1, keepdims=True)
         return moved
 
 
