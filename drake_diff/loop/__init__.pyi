@@ -1,11 +1,11 @@
 from .mpc import MPC as MPC
-from .parts import Actuator as Actuator
-from .parts import Fallback as Fallback
-from .parts import Hold as Hold
-from .parts import Predictor as Predictor
-from .parts import Sensor as Sensor
+from .run import Actuator as Actuator
 from .run import ClosedLoop as ClosedLoop
+from .run import Fallback as Fallback
+from .run import Hold as Hold
 from .run import Loop as Loop
 from .run import OpenLoop as OpenLoop
+from .run import Predictor as Predictor
 from .run import Push as Push
+from .run import Sensor as Sensor
 from .run import closed_loop as closed_loop

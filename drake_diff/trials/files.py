@@ -19,8 +19,7 @@ from drake_diff._base.files import make_folder, write_whole
 from drake_diff._base.statistics import ENOUGH
 from drake_diff.logs.channels import TYPES, Shown, input_channel, motion_channels, nanoseconds, state_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
-from drake_diff.loop.parts import Hold
-from drake_diff.loop.run import OK, Loop
+from drake_diff.loop.run import OK, Hold, Loop
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.pages.html import Line, Plot, page_data, write_page

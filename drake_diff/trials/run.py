@@ -18,8 +18,7 @@ from drake_diff._base.values import ShowsItsRepr
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError
 from drake_diff.loop.mpc import MPC
-from drake_diff.loop.parts import Hold
-from drake_diff.loop.run import Loop
+from drake_diff.loop.run import Hold, Loop
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space

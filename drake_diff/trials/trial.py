@@ -34,8 +34,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
 from drake_diff.loop.mpc import MPC
-from drake_diff.loop.parts import Actuator, Hold, Sensor
-from drake_diff.loop.run import ClosedLoop, Controller, Loop, OpenLoop, Push, closed_loop
+from drake_diff.loop.run import Actuator, ClosedLoop, Controller, Hold, Loop, OpenLoop, Push, Sensor, closed_loop
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.model.tangent import tangent_space

@@ -11,8 +11,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
-from drake_diff.loop.parts import Actuator, Fallback, Predictor, Sensor
-from drake_diff.loop.run import Loop, Push, closed_loop
+from drake_diff.loop.run import Actuator, Fallback, Loop, Predictor, Push, Sensor, closed_loop
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion import LQR
 
