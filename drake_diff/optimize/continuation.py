@@ -36,8 +36,7 @@ from drake_diff.optimize.ilqr.through_contact import (
 )
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
-from drake_diff.optimize.relaxed.plant import RelaxedPlant, Softness, relaxed_plant
-from drake_diff.optimize.relaxed.search import RelaxedSearch
+from drake_diff.optimize.relaxed_contact import RelaxedPlant, RelaxedSearch, Softness, relaxed_plant
 
 
 @dataclass(frozen=True)

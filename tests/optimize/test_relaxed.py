@@ -15,8 +15,7 @@ from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize import Options
 from drake_diff.optimize.continuation import follow, read_relaxed_plant, relaxed_schedule
 from drake_diff.optimize.ilqr.riccati import slope_along
-from drake_diff.optimize.relaxed.plant import Softness, relaxed_plant
-from drake_diff.optimize.relaxed.search import RelaxedSearch, between, slopes_of
+from drake_diff.optimize.relaxed_contact import RelaxedSearch, Softness, between, relaxed_plant, slopes_of
 
 
 def softness(plant, reach=0.02, force=20.0):
