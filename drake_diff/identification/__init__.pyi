@@ -3,11 +3,10 @@ from .base import base_parameters as base_parameters
 from .excite import Excitation as Excitation
 from .excite import excite as excite
 from .explain import explain as explain
-from .identify import Identification as Identification
 from .identify import identify as identify
-from .impacts import ContactIdentification as ContactIdentification
 from .impacts import first_state as first_state
 from .impacts import identify_contact as identify_contact
-from .messages import Explanation as Explanation
 from .recorded_causes import cause_of as cause_of
+from .results import Explanation as Explanation
+from .results import Identification as Identification
 from .write_model import write_model as write_model

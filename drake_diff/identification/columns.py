@@ -18,9 +18,10 @@ from drake_diff.exceptions import DrakeDiffError
 from drake_diff.identification.fit import cut_segments
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import HOPELESS, likelihood_of, noise_of
-from drake_diff.identification.messages import Explanation, mistaken
+from drake_diff.identification.messages import mistaken
 from drake_diff.identification.motion import ContinuousMotion, EulerMotion, Law
 from drake_diff.identification.recordings import Chart, Piece, guess_states, noise_by_differences
+from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import Mask, Tree
 from drake_diff.identification.unknowns import Unknowns
 from drake_diff.model.model import Model

@@ -24,13 +24,26 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.values import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
-from drake_diff.identification.candidates import DELAY, LIMIT, LONGEST_DELAY, NO_PROMISE, Promise, View
+from drake_diff.identification.candidates import (
+    DELAY,
+    FALLS,
+    LIMIT,
+    LONGEST_DELAY,
+    LOOKED_AT,
+    NO_PROMISE,
+    STEPS,
+    Promise,
+    Race,
+    Runner,
+    View,
+)
 from drake_diff.identification.columns import mistaken_in_the_air
-from drake_diff.identification.contact import explain_contact, may_touch
+from drake_diff.identification.contact import Touching, may_touch
 from drake_diff.identification.identify import TOUCH, what_acts
-from drake_diff.identification.messages import Explanation, also_touching, changed_to, search_ended
-from drake_diff.identification.ranking import FALLS, LONGEST_SEARCH, LOOKED_AT, STEPS, Race, Runner, Tried
+from drake_diff.identification.messages import also_touching
+from drake_diff.identification.ranking import Tried
 from drake_diff.identification.recordings import Chart, given_noise, read_pieces
+from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import Dynamics, tree_for_identification
 from drake_diff.identification.unknowns import HELD_DAMPING, HELD_INERTIA, Unknown, Unknowns
 from drake_diff.mechanics.description import coordinates_of
@@ -101,17 +114,17 @@ def explain(
             return columns
     why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces) if motion == "auto" else ""
     if why == TOUCH:
-        return explain_contact(model, chart, pieces, given_noise(model, chart, noise))
+        return Touching(model, chart, pieces, given_noise(model, chart, noise)).explanation()
     if why or isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: causes are looked for in motions in continuous time only, and {why}")
-    explanation = _Search(model, tree, chart, pieces, given_noise(model, chart, noise)).found()
+    explanation = _Search(model, chart, pieces, given_noise(model, chart, noise), tree=tree).found()
     if explanation.explained or motion != "auto" or not may_touch(model, chart, pieces):
         return explanation
-    touched = explain_contact(model, chart, pieces, given_noise(model, chart, noise))
+    touched = Touching(model, chart, pieces, given_noise(model, chart, noise)).explanation()
     return touched if touched.explained else also_touching(explanation, touched)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class _Search(Race):
     """What is tried, one after the other."""
 
@@ -381,36 +394,12 @@ class _Search(Race):
             runners.append(self.searched(special, (name, special), self.of([name]), promise, value))
         return self.raced(runners, base)[0]
 
-    def named(self, named: Sequence[Tried]) -> Explanation:
-        texts = [" and ".join(self.changed(candidate, name) for name in candidate.names) for candidate in named]
-        both = "this explains" if len(named[0].names) == 1 else "these two explain"
-        tail = f": {both} the recording" if len(named) == 1 else ": the recording cannot tell"
-        return Explanation(
-            names=named[0].names,
-            values={name: value for candidate in reversed(named) for name, value in candidate.values.items()},
-            intervals={name: value for candidate in reversed(named) for name, value in candidate.intervals.items()},
-            alternatives=tuple(candidate.names for candidate in named[1:]),
-            explained=True,
-            sentence=f"{', or '.join(texts)}{tail}.{self.end}",
-            evidence=self.evidence,
-        )
-
-    def changed(self, candidate: Tried, name: str) -> str:
+    def of_model(self, name: str) -> tuple[Array, str]:
         label, quantity = name.rsplit(".", 1)
-        value, interval = np.atleast_1d(candidate.values[name]), np.atleast_2d(candidate.intervals[name])
         if quantity == LIMIT:
-            start, unit = self.tree.limits[[self.model.input_names.index(label)]], ""
-        else:
-            unknown = next(unknown for unknown in self.unknowns.each if unknown.name == name)
-            start, unit = unknown.start, unknown.unit
-        return changed_to(name, value, interval, start, unit)
-
-    @property
-    def end(self) -> str:
-        return search_ended(LONGEST_SEARCH) if self.ended_early else ""
-
-    def right(self) -> Explanation:
-        return Explanation((), {}, {}, (), True, "Nothing: the model explains it.", self.evidence)
+            return self.tree.limits[[self.model.input_names.index(label)]], ""
+        unknown = next(unknown for unknown in self.unknowns.each if unknown.name == name)
+        return unknown.start, unknown.unit
 
     def unexplained(self, base: Tried) -> Explanation:
         nearest = self.nearest or base

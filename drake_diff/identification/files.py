@@ -25,9 +25,10 @@ from drake_diff.comparison.recordings import (
     write_arrays,
 )
 from drake_diff.exceptions import ArtifactError, InputError
-from drake_diff.identification.identify import Asked, Identification, identify
+from drake_diff.identification.identify import identify
 from drake_diff.identification.page import joined
 from drake_diff.identification.recordings import hash_of
+from drake_diff.identification.results import Asked, Identification
 from drake_diff.logs.channels import input_channel, state_channel, transform_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.model.parameters import applied, list_parameters, select

@@ -26,6 +26,7 @@ from drake_diff.identification.recordings import LEAST, Chart, Piece
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
+from drake_diff.model.tangent import tangent_space
 
 SEGMENT_SAMPLES = 5  # of a segment at least
 GROWTH = 1e6  # of a small motion within a piece, beyond which its end says nothing of its start: it is cut in two
@@ -275,17 +276,12 @@ class Fit:
 
     def _bias_columns(self) -> list[tuple[int, int]]:
         """(column of z, entry of a small motion) of each bias."""
-        pairs = []
-        singles = dict(self.chart.coordinates.single)
-        names = (*self.model.position_names, *self.model.velocity_names)
-        for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
-            if unknown.quantity == BIAS and unknown.label in self.sensors.columns:
-                pairs.append((s.start, self.chart.size + self.sensors.columns.index(unknown.label)))
-            elif unknown.quantity == BIAS:
-                i = names.index(unknown.label)
-                entry = singles[i] if i < self.model.nq else self.model.nv + i - self.model.nq
-                pairs.append((s.start, entry))
-        return pairs
+        names = (*tangent_space(self.model).names, *self.sensors.columns)
+        return [
+            (s.start, names.index(unknown.label))
+            for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)
+            if unknown.quantity == BIAS
+        ]
 
     def _pull(self, z: Array) -> float:
         weak = np.sum(((z - self.unknowns.z_start) / self.unknowns.pulls) ** 2)

@@ -1,7 +1,7 @@
 """Which parameters of a model are wrong, and by how much, from recordings of its motion."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +9,14 @@ import numpy as np
 from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_int
-from drake_diff._base.values import Refusal, ShowsItsRepr
+from drake_diff._base.values import Refusal
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.fit import Fit, Solved, growth_cuts
-from drake_diff.identification.impacts import judged
+from drake_diff.identification.impacts import fit_through_impacts
 from drake_diff.identification.judge import (
     COLOURED,
+    FALSE_ALARM,
     Known,
     colour_of,
     freedom_of,
@@ -37,6 +38,7 @@ from drake_diff.identification.recordings import (
     read_given,
     read_pieces,
 )
+from drake_diff.identification.results import Asked, Followed, Identification
 from drake_diff.identification.sensors import Sensors, choose_sensors
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
@@ -52,65 +54,6 @@ STEP_ERROR = 1e-3  # of the noise: what a step of half the length may change ove
 ROUNDS = 5  # of estimating the noise
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0)  # of a time between samples: delays that are tried at first
 SAME_NOISE = 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class Asked:
-    """What `identify` was called with."""
-
-    model: Model
-    recordings: tuple[Recording, ...]
-    files: tuple[tuple[Path, str] | None, ...]  # of each, the file that it was read from and its hash
-    parameters: tuple[str, ...] | str
-    noise: Mapping[str, float]
-    held_out: float | str
-    motion: str
-    max_iterations: int
-    priors: Mapping[str, Any] = field(default_factory=dict)
-    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    sensors: Mapping[str, tuple[str, Sequence[float]]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class Followed:
-    """A stretch of a recording beside the model's motion."""
-
-    piece: Piece
-    xs: Array  # (n, nx) with the values that were found
-    xs_before: (
-        Array | None
-    )  # with the model's own, from a first state that fits best; None where that was not looked at
-
-
-@dataclass(frozen=True, eq=False)
-class Identification(ShowsItsRepr):
-    """What recordings say of a model's parameters; `dd.identify` makes one."""
-
-    values: Mapping[str, Any]  # by name, as the model's parameters take them; a number or an array
-    start: Mapping[str, Any]  # the model's own
-    intervals: Mapping[str, Array]  # (2,) or (k, 2): lower and upper, with 95 % of the probability
-    units: Mapping[str, str]
-    unidentifiable: tuple[str, ...]  # combinations that the recordings leave open, in words
-    explained: bool  # whether what is left looks like noise, and held-out samples are predicted
-    reason: str  # why
-    sentence: str
-    noise: Mapping[str, float]  # the standard deviation of each measured entry, given or from the residuals
-    error_before: float  # of the held-out samples (of all, where none are), in standard deviations of the noise
-    error_after: float
-    residuals: tuple[Array, ...]  # of each fitted piece (n, 2 nv + m), in standard deviations; NaN where unmeasured
-    columns: tuple[str, ...]  # (np,) a name for each entry of the values
-    entries: tuple[str, ...]  # (2 nv + m,) a name for each column of the residuals
-    covariance: Array  # (np, np) of the values; infinite where nothing is known
-    score: float  # -2 log of the likelihood, up to a constant of the data
-    count: int  # how many numbers were measured
-    converged: bool
-    steps: int
-    motion: str  # which motion was fitted
-    motions: tuple[Followed, ...]  # of what was fitted, then of what was held out
-    asked: Asked | None = None  # what was asked: `dd.save` writes it, and `dd.verify` asks it again
-
-    def __repr__(self) -> str:
-        return self.sentence
 
 
 def identify(
@@ -195,7 +138,7 @@ def identify(
     if motion == "impacts":
         if priors or bounds:
             raise InputError("priors and bounds", got="some", expected='none with motion="impacts"')
-        identification = _through_impacts(problem, parameters)
+        identification = fit_through_impacts(model, pieces, parameters, problem.first_noise)
     else:
         law: Law = (
             discrete_motion(model, unknowns, pieces)
@@ -249,6 +192,7 @@ class Problem:
     stated: Array  # (2 nv + m,) the noise as it was given, NaN where it was not
     scatter: Array  # (2 nv + m,) that of neighbouring samples
     sensors: Sensors | None = None
+    jumps: bool = False  # whether the motion does, as through impacts
 
     @property
     def entries(self) -> tuple[str, ...]:
@@ -445,51 +389,9 @@ class Problem:
                 ratio = float(size[j] / self.stated[j])
                 if ratio**2 > stats.chi2.ppf(0.9999, numbers[j]) / numbers[j]:
                     return f"what is left of {name} is {ratio:.3g} times the noise that was given"
-            elif numbers[j] and size[j] > most_scatter(int(numbers[j]), len(names)) * self.scatter[j]:
+            elif numbers[j] and size[j] > most_scatter(int(numbers[j]), len(names), jumps=self.jumps) * self.scatter[j]:
                 return f"what is left of {name} is {size[j] / self.scatter[j]:.3g} times the scatter of its samples"
         name, p = colour_of(solved.reduced.residuals, names)
-        if p < COLOURED:
+        if p < (FALSE_ALARM if self.jumps else COLOURED):
             return f"what is left of {name} is not noise: it hangs together over time (probability {p:.1g})"
         return why_not
-
-
-def _through_impacts(problem: Problem, names: Sequence[str] | str) -> Identification:
-    """What the search through impacts finds, with its intervals."""
-    nv, noise = problem.model.nv, problem.first_noise
-    j = judged(problem.model, problem.pieces, names, noise[: 2 * nv])
-    search, solution, h = j.search, j.found, j.search.law.model.time_step
-    without = "" if solution.half is not None else "; intervals leave out what the step does: the model has but one"
-    unknowns, values, intervals = search.unknowns, search.values(solution.w), search.intervals(solution)
-    limits = np.concatenate([np.reshape(intervals[unknown.name], (-1, 2)) for unknown in unknowns.each])
-    deviations = (limits[:, 1] - limits[:, 0]) / (2 * 1.96)
-    known = np.isfinite(deviations)
-    covariance = np.where(np.outer(known, known), solution.correlation * np.outer(deviations, deviations), 0.0)
-    covariance[~known, ~known] = np.inf
-    every = np.concatenate(j.fitted)[:, :nv]
-    motions = [Followed(p, frozen(a), frozen(b)) for p, a, b in zip(problem.pieces, j.after, j.before, strict=True)]
-    why, open_ = j.reason or NOISE_IS_LEFT, search.open(solution)
-    return Identification(
-        values=unknowns.named(values),
-        start=unknowns.named(unknowns.start),
-        intervals=intervals,
-        units={unknown.name: unknown.unit for unknown in unknowns.each},
-        unidentifiable=open_,
-        explained=not j.reason,
-        reason=why,
-        sentence=identification_sentence(
-            unknowns, values, limits, open_, (j.error_before, j.error_after), explained=not j.reason, reason=why
-        ),
-        noise={name: float(s) for name, s in zip(problem.entries[:nv], noise[:nv], strict=True)},
-        error_before=j.error_before,
-        error_after=j.error_after,
-        residuals=tuple(frozen(rows) for rows in j.fitted),
-        columns=unknowns.columns,
-        entries=problem.entries,
-        covariance=frozen(covariance),
-        score=float(np.sum(every**2)) + 2 * len(every) * float(np.sum(np.log(noise[:nv]))),
-        count=every.size,
-        converged=solution.converged,
-        steps=solution.rounds,
-        motion=f"the model's own steps of {1e3 * h:.4g} ms through impacts, slopes from clouds of values" + without,
-        motions=tuple(sorted(motions, key=lambda motion: motion.piece.held_out)),
-    )

@@ -23,14 +23,15 @@ import numpy as np
 from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_float
-from drake_diff._base.values import ShowsItsRepr
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE, Recording
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.identification.judge import SCATTER
+from drake_diff.identification.messages import NOISE_IS_LEFT, identification_sentence
 from drake_diff.identification.motion import DiscreteMotion, discrete_motion
-from drake_diff.identification.recordings import Chart, Piece, read_pieces
-from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, Unknowns, choose_unknowns
+from drake_diff.identification.recordings import Chart, Piece, noise_by_differences, read_pieces
+from drake_diff.identification.results import Followed, Identification
+from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, Unknown, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
@@ -242,27 +243,6 @@ LOST = 1000.0  # times the unit: the residual of a motion that Drake cannot step
 Build = Callable[..., Model]
 
 
-@dataclass(frozen=True, eq=False)
-class ContactIdentification(ShowsItsRepr):
-    """What motions through impacts say of a model's parameters; `identify_contact` makes one."""
-
-    values: Mapping[str, float | Array]  # by name
-    start: Mapping[str, float | Array]
-    intervals: Mapping[str, Array]  # (2,) or (k, 2), by the scatter between recordings and by `at_half_step`
-    at_half_step: Mapping[str, float | Array] | None  # values by half the time step; None: it cannot be loaded so
-    unidentifiable: tuple[str, ...]  # entries whose interval is wider than a factor of 3, or than 10 mm or 10 mrad
-    cost_before: float  # soft-L1 mean over whole recordings, in units of the motion of a millisecond
-    cost_after: float
-    flights: int  # segments whose first state is that of a flight; where 0, all start at measured states
-    steps: int  # simulated steps of the fit
-    time_step: float  # [s] of the steps that were fitted
-
-    def __repr__(self) -> str:
-        text = ", ".join(f"{name} {np.round(value, 7).tolist()}" for name, value in self.values.items())
-        left = f"; not determined: {', '.join(self.unidentifiable)}" if self.unidentifiable else ""
-        return f"{text}; the loss falls from {self.cost_before:.3g} to {self.cost_after:.3g}{left}"
-
-
 @dataclass(frozen=True)
 class Segment:
     """A stretch of a recording, and where its motion begins."""
@@ -274,15 +254,13 @@ class Segment:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Solution:
     """Where a search ended."""
 
     w: Array  # (n,)
     spread: Array  # (n,) half widths of 95 % intervals
     half: Array | None  # (n,) where steps of half the length lead; None where the model cannot be had with them
     correlation: Array  # (n, n); NaN where nothing is known
-    costs: tuple[float, float]  # soft-L1 mean over whole recordings, before and after
-    flights: int
     converged: bool
     rounds: int  # planes that were laid
 
@@ -304,12 +282,12 @@ class Search:
         for piece in self.pieces:
             if np.any(np.isnan(piece.ys)):
                 raise InputError(f"recording {piece.name}", got="NaN", expected="every position and velocity measured")
-        self.unknowns: Unknowns = choose_unknowns(self.model, None, names)
-        self.law: DiscreteMotion = discrete_motion(self.model, self.unknowns, self.pieces)
-        self.begin = np.concatenate([self.unknowns.start, list(self.lengths.values())])
+        chosen = choose_unknowns(self.model, None, names)
+        self.law: DiscreteMotion = discrete_motion(self.model, chosen, self.pieces)
+        of_lengths = (Unknown(name, "m", np.array([value]), 0.0, value) for name, value in self.lengths.items())
+        self.unknowns = Unknowns((*chosen.each, *of_lengths))
         self.scale, self.by_log = self._scales()
         self.unit = millisecond(self.chart, [piece for piece in self.pieces if not piece.held_out])
-        self.taken = 0
 
     def _scales(self) -> tuple[Array, Array]:
         scales, logs = [], []
@@ -318,57 +296,48 @@ class Search:
                 raise InputError(
                     unknown.name, got="a quantity of smooth motion", expected="one of contact; see dd.identify"
                 )
-            by_log = unknown.quantity not in (BIAS, CENTER)
+            by_log = unknown.quantity not in (BIAS, CENTER) and unknown.name not in self.lengths
             if by_log and not np.all(unknown.start > 0):
                 raise InputError(unknown.name, got=unknown.start, expected="a value above 0 to begin from")
-            size = LOG_SCALE if by_log else LENGTH_SCALE if unknown.quantity == BIAS else CENTER_SCALE * unknown.size
+            size = LOG_SCALE if by_log else CENTER_SCALE * unknown.size if unknown.quantity == CENTER else LENGTH_SCALE
             if unknown.quantity == "radius":
                 size = LENGTH_SCALE / unknown.size
             scales += [size] * len(unknown.start)
             logs += [by_log] * len(unknown.start)
-        extra = len(self.lengths)
-        return np.array(scales + [LENGTH_SCALE] * extra), np.array(logs + [False] * extra)
+        return np.array(scales), np.array(logs)
 
     def values(self, w: Array) -> Array:
         """(n,) of the parameters, then of the lengths."""
         moved = self.scale * w
-        return np.asarray(self.begin * np.exp(np.where(self.by_log, moved, 0)) + np.where(self.by_log, 0, moved))
+        return np.asarray(
+            self.unknowns.start * np.exp(np.where(self.by_log, moved, 0)) + np.where(self.by_log, 0, moved)
+        )
 
-    def named(self, values: Array) -> dict[str, float | Array]:
-        count = len(self.unknowns.start)
-        return self.unknowns.named(values[:count]) | dict(zip(self.lengths, values[count:].tolist(), strict=True))
+    def intervals(self, solution: Solution) -> Array:
+        """(n, 2) of the values."""
+        return np.stack([self.values(solution.w + sign * solution.spread) for sign in (-1, 1)], axis=1)
 
-    def intervals(self, solution: Found) -> dict[str, Array]:
-        """By name (2,) or (k, 2)."""
-        wide = np.stack([self.values(solution.w + s * solution.spread) for s in (-1, 1)], axis=1)
-        of_parameters = {
-            unknown.name: frozen(wide[s][0] if len(unknown.start) == 1 else wide[s])
-            for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)
-        }
-        return of_parameters | dict(zip(self.lengths, map(frozen, wide[len(self.unknowns.start) :]), strict=True))
-
-    def open(self, solution: Found) -> tuple[str, ...]:
+    def open(self, solution: Solution) -> tuple[str, ...]:
         """What the recordings leave open: entries whose interval is wider than a factor of 3, 10 mm or 10 mrad."""
         wide = np.where(self.by_log, self.scale * solution.spread > np.log(3.0), self.scale * solution.spread > 0.01)
-        columns = [*self.unknowns.columns, *self.lengths]
-        return tuple(column for column, open_ in zip(columns, wide, strict=True) if open_)
+        return tuple(column for column, is_open in zip(self.unknowns.columns, wide, strict=True) if is_open)
 
     def vector(self, values: Array) -> ParameterVector:
         """The model's parameters at values (n,), of a model of its own where there are lengths."""
         parameters = values[self.law.own]
         if self.build is None:
             return self.law.vector.at(parameters)
-        model = self.build(**dict(zip(self.lengths, values[len(self.unknowns.start) :].tolist(), strict=True)))
+        model = self.build(**dict(zip(self.lengths, values[len(values) - len(self.lengths) :].tolist(), strict=True)))
         if model.time_step != self.law.model.time_step:
             model = model.at_time_step(self.law.model.time_step)
         return select(model, self.law.vector.to_dict()).at(parameters)
 
-    def segments(self, w: Array, length: float) -> tuple[list[Segment], int]:
-        """From the first sample of each fitted recording and the start of each flight; how many start by a flight.
+    def segments(self, w: Array, length: float) -> list[Segment]:
+        """From the first sample of each fitted recording and the start of each flight.
 
         Each goes on for `length` [s] after its flight. The end of each recording is one more.
         """
-        segments, known, vector = [], 0, self.vector(self.values(w))
+        segments, vector = [], self.vector(self.values(w))
         with applied(vector) as model:
             for p, piece in enumerate(self.pieces):
                 if piece.held_out:
@@ -376,7 +345,6 @@ class Search:
                 last, period = len(piece.times) - 1, float(np.median(np.diff(piece.times)))
                 count = last if np.isinf(length) else max(5, round(length / period))
                 flights = flights_of(model, piece.ys)
-                known += len(flights) if np.isfinite(length) else bool(flights and flights[0][0] == 0)
                 if not flights or flights[0][0] > 0:
                     segments.append(Segment(p, 0, min(count, last), piece.ys[0]))
                 for a, b in flights:
@@ -385,7 +353,7 @@ class Search:
                         segments.append(Segment(p, a, min(b + count, last), start.x))
                 rest = max(0, last - max(5, round(REST / period)))
                 segments.append(Segment(p, rest, last, piece.ys[rest]))
-        return segments, known
+        return segments
 
     def starts(self, w: Array, noise: Array) -> list[Start]:
         """Of each recording, those held out too, by its first flight; else as measured, with `noise` (2 nv,)."""
@@ -417,7 +385,6 @@ class Search:
             for segment in segments:
                 piece = self.pieces[segment.piece].part(segment.first, segment.last)
                 stride = steps_between(model, piece)
-                self.taken += stride * len(piece.us)
                 try:
                     motions.append(_sampled(model, segment.x0 - shift, piece.us, stride) + shift)
                 except SimulationError:
@@ -433,12 +400,11 @@ class Search:
         r = np.concatenate(residuals)
         return np.asarray(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
 
-    def run(self, seed: int) -> Found:
+    def run(self, seed: int) -> Solution:
         """Through all `STAGES`, with clouds drawn by `seed`."""
-        w, random, flights, rounds, converged = np.zeros(len(self.scale)), np.random.default_rng(seed), 0, 0, True
+        w, random, rounds, converged = np.zeros(len(self.scale)), np.random.default_rng(seed), 0, True
         for length, widths in STAGES:
-            segments, known = self.segments(w, length)
-            flights = max(flights, known)
+            segments = self.segments(w, length)
 
             def residual(w: Array, segments: list[Segment] = segments) -> Array:
                 return self.residual(w, segments)
@@ -450,10 +416,7 @@ class Search:
         half = self.by_half(w, random)
         if half is not None:
             spread = np.hypot(spread, BY_HALF * (half - w))
-        taken = self.taken
-        before, after = (float(np.mean(2 * (np.sqrt(1 + residual(point) ** 2) - 1))) for point in (np.zeros(len(w)), w))
-        self.taken = taken
-        return Found(w, spread, half, correlation, (before, after), flights, converged, rounds + 1)
+        return Solution(w, spread, half, correlation, converged, rounds + 1)
 
     def by_half(self, w: Array, random: np.random.Generator) -> Array | None:
         """(n,) where the search leads from w (n,) over whole recordings by steps of half the length."""
@@ -462,10 +425,8 @@ class Search:
             return None  # a diagram, or a file that is gone, as a function that makes models may have it
         model = self.law.model.at_time_step(self.law.model.time_step / 2)
         finer = Search(model, self.pieces, self.names, self.lengths, self.build)
-        segments, _ = finer.segments(w, np.inf)
-        shrunk = shrink_to(lambda point: finer.residual(point, segments), w, HALF, random)
-        self.taken += finer.taken
-        return shrunk.w
+        segments = finer.segments(w, np.inf)
+        return shrink_to(lambda point: finer.residual(point, segments), w, HALF, random).w
 
 
 def identify_contact(
@@ -475,7 +436,7 @@ def identify_contact(
     *,
     lengths: Mapping[str, float] | None = None,
     seed: int = 0,
-) -> ContactIdentification:
+) -> Identification:
     """Estimate friction, stiffness, dissipation, radii and centres of mass from motions through impacts.
 
     Args:
@@ -489,8 +450,9 @@ def identify_contact(
         seed: Of the clouds of values from which slopes are taken.
 
     Returns:
-        `.values`, and `.intervals` (95 %): by the scatter between recordings, and by six times what half the time
-        step changes, as in the grid convergence index. Where that is most of it, a shorter time step helps.
+        As `dd.identify` with motion="impacts" does. `.intervals` (95 %) are by the scatter between recordings, and by
+        six times what half the time step changes, as in the grid convergence index. Where that is most of it, a shorter
+        time step helps.
 
     Raises:
         InputError, UnknownNameError: A recording or a name that cannot be taken; says why.
@@ -517,20 +479,9 @@ def identify_contact(
         raise InputError("model", got=got, expected=expected)
     begin = {name: positive_float(name, value) for name, value in (lengths or {}).items()}
     first_model, build = (model, None) if isinstance(model, Model) else (model(**begin), model)
-    search = Search(first_model, read_pieces(first_model, recordings, 0.0), parameters, begin, build)
-    solution = search.run(seed)
-    return ContactIdentification(
-        values=search.named(search.values(solution.w)),
-        start=search.named(search.begin),
-        intervals=search.intervals(solution),
-        at_half_step=None if solution.half is None else search.named(search.values(solution.half)),
-        unidentifiable=search.open(solution),
-        cost_before=solution.costs[0],
-        cost_after=solution.costs[1],
-        flights=solution.flights,
-        steps=search.taken,
-        time_step=search.law.model.time_step,
-    )
+    pieces, chart = read_pieces(first_model, recordings, 0.0), Chart(coordinates_of(first_model))
+    noise = noise_by_differences(chart, pieces)
+    return fit_through_impacts(first_model, pieces, parameters, noise, lengths=begin, build=build, seed=seed)
 
 
 def _sampled(model: Model, x0: Array, us: Array, count: int) -> Array:
@@ -571,39 +522,71 @@ SEED = 0  # of clouds and other first states: the same recordings give the same 
 OTHERS = 8  # first states of each recording
 
 
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """What a search found, and what it leaves of every recording, in units of what noise explains."""
-
-    search: Search
-    found: Found
-    after: list[Array]  # of each piece (n, nx), with the values that were found
-    before: list[Array]  # with the model's own
-    fitted: list[Array]  # (n, 2 nv) what is left of each piece that was fitted; NaN of velocities
-    error_before: float  # of what was held out; of all, where nothing was
-    error_after: float
-    reason: str  # why the recordings are not explained; empty where they are
-
-
-def judged(model: Model, pieces: Sequence[Piece], names: Sequence[str] | str, noise: Array) -> Judged:
-    """The search through impacts over the pieces; those held out are predicted from their first flight.
+def fit_through_impacts(
+    model: Model,
+    pieces: Sequence[Piece],
+    names: Sequence[str] | str,
+    noise: Array,
+    *,
+    lengths: Mapping[str, float] | None = None,
+    build: Build | None = None,
+    seed: int = SEED,
+) -> Identification:
+    """Fit the pieces through impacts; those held out are predicted from their first flight.
 
     Positions alone are judged, by their `noise` (2 nv,). InputError or UnknownNameError for a recording or a name that
     cannot be taken.
     """
-    search = Search(model, pieces, names)
-    solution = search.run(SEED)
+    search, nv, noise = Search(model, pieces, names, lengths, build), model.nv, noise[: 2 * model.nv]
+    solution = search.run(seed)
     after, left = _followed(search, solution.w, noise)
     before, was = _followed(search, np.zeros(len(solution.w)), noise)
     fitted, held = ([r for r, p in zip(left, pieces, strict=True) if p.held_out == h] for h in (False, True))
     was_held = [r for r, piece in zip(was, pieces, strict=True) if piece.held_out]
     entries = tangent_space(model).names
+    converged = "" if solution.converged else "the search did not converge: its last step was longer than the cloud"
     reason = (
-        "" if solution.converged else "the search did not converge: its last step was longer than the cloud is wide"
+        converged
+        or _doubt(entries, fitted, "what is left of {} is {:.3g} times what noise explains")
+        or _doubt(entries, held, "{} of what was held out is missed by {:.3g} times the noise")
     )
-    reason = reason or _doubt(entries, fitted, "what is left of {} is {:.3g} times what noise explains")
-    reason = reason or _doubt(entries, held, "{} of what was held out is missed by {:.3g} times the noise")
-    return Judged(search, solution, after, before, fitted, _size(was_held or was), _size(held or left), reason)
+    unknowns, values, limits = search.unknowns, search.values(solution.w), search.intervals(solution)
+    deviations = (limits[:, 1] - limits[:, 0]) / (2 * 1.96)
+    known = np.isfinite(deviations)
+    covariance = np.where(np.outer(known, known), solution.correlation * np.outer(deviations, deviations), 0.0)
+    covariance[~known, ~known] = np.inf
+    every = np.concatenate(fitted)[:, :nv]
+    motions = [Followed(p, frozen(a), frozen(b)) for p, a, b in zip(pieces, after, before, strict=True)]
+    why, open_, errors = reason or NOISE_IS_LEFT, search.open(solution), (_size(was_held or was), _size(held or left))
+    without = "" if solution.half is not None else "; intervals leave out what the step does: the model has but one"
+    steps = f"the model's own steps of {1e3 * search.law.model.time_step:.4g} ms through impacts"
+    return Identification(
+        values=unknowns.named(values),
+        start=unknowns.named(unknowns.start),
+        intervals={
+            unknown.name: frozen(limits[s][0] if len(unknown.start) == 1 else limits[s])
+            for unknown, s in zip(unknowns.each, unknowns.slices, strict=True)
+        },
+        units={unknown.name: unknown.unit for unknown in unknowns.each},
+        unidentifiable=open_,
+        explained=not reason,
+        reason=why,
+        sentence=identification_sentence(unknowns, values, limits, open_, errors, explained=not reason, reason=why),
+        noise={name: float(s) for name, s in zip(entries[:nv], noise[:nv], strict=True)},
+        error_before=errors[0],
+        error_after=errors[1],
+        residuals=tuple(frozen(rows) for rows in fitted),
+        columns=unknowns.columns,
+        entries=entries,
+        covariance=frozen(covariance),
+        score=float(np.sum(every**2)) + 2 * len(every) * float(np.sum(np.log(noise[:nv]))),
+        count=every.size,
+        converged=solution.converged,
+        steps=solution.rounds,
+        motion=f"{steps}, slopes from clouds of values{without}",
+        motions=tuple(sorted(motions, key=lambda motion: motion.piece.held_out)),
+        at_half_step=None if solution.half is None else unknowns.named(search.values(solution.half)),
+    )
 
 
 def _followed(search: Search, w: Array, noise: Array) -> tuple[list[Array], list[Array]]:

@@ -1,35 +1,19 @@
 """What identification says in words: of parameters, of what recordings leave open, of causes and of motions."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.values import ShowsItsRepr
+from drake_diff.identification.results import Explanation
 from drake_diff.identification.unknowns import Unknowns
 
 PART = 0.03  # of the largest change in a combination: what is not told
 COMBINED = ("friction", "stiffness")  # of two bodies that touch, which Drake makes one of: 2 a b / (a + b), half of it
 NOISE_IS_LEFT = "what is left is like noise, and what was held out is predicted"
 NO_CHANGE = "Not explained: no change that was tried explains the recording"
-
-
-@dataclass(frozen=True, eq=False)
-class Explanation(ShowsItsRepr):
-    """The smallest change of a model that explains recordings; `dd.explain` makes one."""
-
-    names: tuple[str, ...]  # what is changed: one name, or two; empty where nothing is, or nothing explains
-    values: Mapping[str, Any]  # by name, of the alternatives too
-    intervals: Mapping[str, Array]  # (2,) or (k, 2): lower and upper, with 95 % of the probability
-    alternatives: tuple[tuple[str, ...], ...]  # other changes that the recordings cannot tell from this one
-    explained: bool  # whether the model explains the recordings: as it is, or with the change
-    sentence: str
-    evidence: Mapping[str, float]  # by what was fitted: by how much it lowers -2 log of the likelihood
-
-    def __repr__(self) -> str:
-        return self.sentence
 
 
 def search_ended(seconds: float) -> str:

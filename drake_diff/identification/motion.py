@@ -37,6 +37,7 @@ from drake_diff.model.step import advance
 LONGEST = 0.02  # [s] of a step in continuous time
 CHUNK = 128  # steps whose exponentials are taken in one call
 ORDER = 8  # of the series of phi
+FINITE_DIFFERENCE, DIFFERENCE = "finite_difference", 1e-5  # of a parameter, relative
 SMALL = 0.5  # the norm of X up to which it is summed; 0.5^9 / 10! is 5e-10
 
 
@@ -251,25 +252,48 @@ class DiscreteMotion:
                 xs[k, count + 1 :] = xs[k, count]
         return xs
 
-    def derivatives(self, model: Model, vector: ParameterVector, xs: Array, us: Array) -> Sequence[StepDerivatives]:
-        """Of steps from each of xs (N, nx) under us (N, nu), by the vector's parameters; those applied act."""
-        try:
-            return derivatives_along(model, xs[0], us, vector=vector, xs=xs)
-        except GradientError:
-            self.differenced.append("some derivatives by differences")
-            return derivatives_along(model, xs[0], us, vector=vector, xs=xs, method="finite_difference")
-
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
         vector, by_z = self.vector.at(self.unknowns.values(z)[self.own]), self.unknowns.by_z(z)[self.own]
         K, M, nx = *hs.shape, xs.shape[2]
         by_x, by = np.tile(np.eye(nx), (K, M, 1, 1)), np.zeros((K, M, nx, len(z)))
         taken = hs > 0
+        starts, inputs = xs[:, :-1][taken], us[taken]
+        exact = {p.name: vector.values[s] for p, s in vector.pairs if p.kind.source != FINITE_DIFFERENCE}
         with applied(vector) as model:
-            derivatives = self.derivatives(model, vector, xs[:, :-1][taken], us[taken])
-        by_x[taken] = np.array([step.A for step in derivatives])
-        by[taken] = np.array([step.C for step in derivatives]) @ by_z
+            steps = self._derivatives(model, select(model, exact), starts, inputs)
+        by_values, column = np.empty((len(starts), nx, len(vector.values))), 0
+        for p, s in vector.pairs:
+            if p.name in exact:
+                count = s.stop - s.start
+                by_values[..., s] = np.array([step.C[:, column : column + count] for step in steps])
+                column += count
+            else:
+                by_values[..., s] = _differences(vector, s, starts, inputs)
+        by_x[taken] = np.array([step.A for step in steps])
+        by[taken] = by_values @ by_z
         return by_x, by
+
+    def _derivatives(self, model: Model, vector: ParameterVector, xs: Array, us: Array) -> Sequence[StepDerivatives]:
+        """Of steps from each of xs (N, nx) under us (N, nu), by the vector's parameters; those applied act."""
+        try:
+            return derivatives_along(model, xs[0], us, vector=vector, xs=xs)
+        except GradientError:
+            self.differenced.append("some derivatives by differences")
+            return derivatives_along(model, xs[0], us, vector=vector, xs=xs, method=FINITE_DIFFERENCE)
+
+
+def _differences(vector: ParameterVector, entries: slice, xs: Array, us: Array) -> Array:
+    """(N, nx, k) of steps from xs (N, nx) under us (N, nu) by the vector's entries, which Drake takes as floats."""
+    scale = vector.difference_scale(entries)
+    columns = []
+    for i, size in zip(range(entries.start, entries.stop), DIFFERENCE * scale, strict=True):
+        ends = []
+        for values in (vector.values + sign * size * np.eye(len(vector.values))[i] for sign in (1, -1)):
+            with applied(vector.at(values)) as model:
+                ends.append(np.array([advance(model.double, x, u) for x, u in zip(xs, us, strict=True)]))
+        columns.append((ends[0] - ends[1]) / (2 * size))
+    return np.stack(columns, axis=-1)
 
 
 Law = ContinuousMotion | DiscreteMotion

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.identification.identify import Followed, Identification
+from drake_diff.identification.results import Followed, Identification
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 
 

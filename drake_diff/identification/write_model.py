@@ -15,7 +15,7 @@ from pydrake.multibody.parsing import LoadModelDirectives, PackageMap
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
-from drake_diff.identification.identify import Asked, Identification
+from drake_diff.identification.results import Asked, Identification
 from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, INERTIA, MASS, STRENGTH
 from drake_diff.model.load_file import add_packages
 from drake_diff.model.model import Model, load_model

@@ -24,7 +24,7 @@ from cube_tosses_axes import axes_of, rotations, turned
 
 import drake_diff as dd
 from drake_diff._base.arrays import Array
-from drake_diff.identification import ContactIdentification, first_state, identify_contact
+from drake_diff.identification import Identification, first_state, identify_contact
 from drake_diff.identification.impacts import flights_of
 
 RATE, WIDTH, MASS, INERTIA = 148.0, 0.1048, 0.37, 0.00081  # [Hz, m, kg, kg m^2] as published with the tosses
@@ -158,8 +158,8 @@ def told(name: str, each: Array) -> str:
     return f"{name}: mean {np.mean(each):.1f} %, median {np.median(each):.1f} %, {below}"
 
 
-def tell(found: ContactIdentification) -> None:
-    print(f"{found}\n{found.steps} simulated steps")
+def tell(found: Identification) -> None:
+    print(found)
     for name, interval in found.intervals.items():
         print(f"  {name}: {np.round(found.values[name], 6)} in {np.round(interval, 6).tolist()}")
     half = float(str(found.values["half_width"]))

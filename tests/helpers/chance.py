@@ -3,7 +3,7 @@
 import numpy as np
 
 from drake_diff.comparison.recordings import Recording
-from drake_diff.identification.ranking import Ranking
+from drake_diff.identification.candidates import Candidates
 from drake_diff.identification.recordings import Chart, given_noise, read_pieces
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.mechanics.description import coordinates_of
@@ -16,13 +16,8 @@ def chance_of_a_name(model, recording: Recording, draws: int, seed: int = 0) -> 
     and a change alone lowers them by what b has in its own columns.
     """
     chart = Chart(coordinates_of(model))
-    setting = Ranking(
-        model,
-        tree_for_identification(model),
-        chart,
-        read_pieces(model, recording, 0.0),
-        given_noise(model, chart, None),
-    )
+    pieces, noise = read_pieces(model, recording, 0.0), given_noise(model, chart, None)
+    setting = Candidates(model, chart, pieces, noise, tree=tree_for_identification(model))
     setting.prepare()
     view = setting.view(setting.cut, setting.unknowns.z_start, setting.starts)
     pulled = np.random.default_rng(seed).standard_normal((draws, len(view.reduced.b))) @ view.reduced.R

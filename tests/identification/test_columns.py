@@ -1,8 +1,5 @@
 """Mistaken columns of a recording are named: exchanged, with the other sign, or in degrees. The truth is hidden."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,7 +8,6 @@ from drake_diff.identification.columns import side_by_side
 
 pytestmark = pytest.mark.solve
 
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 PERIOD = 0.01
 
 

@@ -1,22 +1,14 @@
 """What is wrong in a model whose bodies touch, by name: Drake's motions of a model that is changed, with noise."""
 
-import sys
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from helpers.table import each_row
+from helpers.contact_recordings import recorded
 
 import drake_diff as dd
-from drake_diff.identification import contact
-from drake_diff.identification.contact import Fitted, Point, WholeMotions
-from drake_diff.identification.recordings import Chart, read_pieces
-from drake_diff.identification.unknowns import Unknown, choose_unknowns
-from drake_diff.mechanics.description import coordinates_of
-
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
-import identify_contact_causes
+from drake_diff.identification import contact, ranking
+from drake_diff.identification.motion import discrete_motion
+from drake_diff.identification.recordings import read_pieces
+from drake_diff.identification.unknowns import Unknowns, choose_unknowns
 
 pytestmark = pytest.mark.solve
 
@@ -49,7 +41,7 @@ def test_of_a_right_model_nothing_is_said(ball):
 @pytest.mark.slow
 def test_a_right_model_is_not_blamed_where_its_motion_is_hard_to_find():
     """Steps from the measured first state of this block end at twice the noise, from which stiffness looked wrong."""
-    model, log, name, _ = identify_contact_causes.recorded("sliding_block", 0.005, False, 50009)
+    model, log, name, _ = recorded("sliding_block", 0.005, False, 50009)
     w = dd.explain(model, log)
     assert not name
     assert w.names == ()
@@ -60,7 +52,7 @@ def test_a_right_model_is_not_blamed_where_its_motion_is_hard_to_find():
 def contact_alone(monkeypatch):
     """Masses and gravity are not tried, which takes half of the time; a busy machine says the same."""
     monkeypatch.setattr(contact, "OF_MOTION", ())
-    monkeypatch.setattr(contact, "LONGEST_SEARCH", np.inf)
+    monkeypatch.setattr(ranking, "LONGEST_SEARCH", np.inf)
 
 
 @pytest.mark.slow
@@ -78,54 +70,15 @@ def test_a_change_of_a_ball_is_named(ball, quantity, value, contact_alone):
     assert w.sentence.endswith("by the model's own steps of 5 ms.")
 
 
-def test_slopes_are_those_of_differences_of_motions():
-    """A hopper that lands, with a ground that is higher than was recorded; differences of 1e-7 of what is left."""
-    model, log, _, _ = identify_contact_causes.recorded("hopper", 0.005, True, 4)
-    chart = Chart(coordinates_of(model))
-    motions = WholeMotions(model, chart, read_pieces(model, log, 0.0), np.full(chart.size, np.nan))
-    (height,) = choose_unknowns(model, None, ["z_x.bias"]).each
-    point = motions.at(height, np.array([0.1]), (log.xs[0],), 0.5)
-    slopes = motions.slopes(height, point, 0.5)
-    for column, step in zip(slopes.T, 1e-7 * np.eye(len(slopes.T)), strict=True):
-        by_differences = (motions.moved(height, point, step, 0.5).r - point.r) / 1e-7
-        np.testing.assert_allclose(column, by_differences, rtol=0, atol=1e-3 * np.linalg.norm(by_differences))
-
-
-@each_row(
-    "start, value, half, nothing",
-    [(1.0, 1.0005, 1e-6, True), (1.0, 1.3, 0.01, False), (1.0, 1.3, 0.4, True), (1.0, 1.3, np.inf, False)],
-)
-def test_a_change_that_is_none_is_told_from_one(start, value, half, nothing):
-    own, each = mass_of(start, value, half, 0.0)
-    assert contact.is_nothing(own, each) == nothing
-
-
-def mass_of(start, value, half, score, name="ball.mass"):
-    """A mass with how a change of it fits."""
-    own = Unknown(name, "kg", np.array([start]), 0.0, start)
-    point = Point(np.log([value / start]), (), np.zeros(1))
-    interval = np.array([[value - half, value + half]])
-    return own, Fitted(name, score, 1, True, "", np.array([value]), interval, point, np.array([half]))
-
-
-@each_row("other, names", [(None, ()), (45.0, ()), (10.0, ("box.mass",))])
-def test_a_change_that_is_none_blames_no_model(other, names):
-    """It finds a better motion than the model's own search; a real change must leave clearly less than that one."""
-    own, none = mass_of(1.0, 1.0005, 1e-6, 50.0)
-    tried, fitted = [own], [none]
-    if other is not None:
-        real = mass_of(1.0, 1.3, 0.01, other, "box.mass")
-        tried.append(real[0])
-        fitted.append(real[1])
-    base = none._replace(name="", score=100.0)
-    search = SimpleNamespace(
-        ended_early=False,
-        model=SimpleNamespace(time_step=0.001),
-        motions=SimpleNamespace(widened=lambda _, one: one),
-        bic=lambda one: one.score,
-        limit=lambda *_: 20.0,
-        words=contact._Search.words,
-    )
-    w = contact._Search.said(search, base, fitted, tried)
-    assert w.explained
-    assert w.names == names
+def test_slopes_by_a_parameter_that_drake_takes_as_a_float_are_those_of_the_steps(ball):
+    """Of a ball in contact: differences of one step by 1e-7 of the radius, which lose half of all digits."""
+    (radius,) = choose_unknowns(ball, None, ["ball.radius"]).each
+    pieces = read_pieces(ball, thrown(ball), 0.0)
+    law = discrete_motion(ball, Unknowns((radius,)), pieces)
+    x = np.array([[1.0, 0, 0, 0, 0, 0, 0.099, 0, 0, 1.0, 1.0, 0.1, -0.4]])
+    h, u = np.full((1, 1), 0.005), np.zeros((1, 1, 0))
+    xs = law.run(radius.start, x, h, u)
+    step = 1e-7 * radius.start
+    by_differences = (law.run(radius.start + step, x, h, u) - law.run(radius.start - step, x, h, u))[0, 1] / (2 * step)
+    _, by_radius = law.slopes(radius.start, xs, h, u)
+    np.testing.assert_allclose(by_radius[0, 0, :, 0], by_differences, rtol=0, atol=1e-3 * np.abs(by_differences).max())

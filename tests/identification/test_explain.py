@@ -1,7 +1,6 @@
 """What is wrong in a model, by name: recordings of equations of motion that SciPy integrates."""
 
 import html
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -28,8 +27,6 @@ from drake_diff.mechanics.description import coordinates_of
 from drake_diff.runs.directory import load_record
 
 pytestmark = pytest.mark.solve
-
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 
 @pytest.fixture
@@ -123,9 +120,8 @@ def test_beside_a_mass_the_motion_is_that_of_the_mass_with_its_inertia():
     xs = 0.1 * random.standard_normal((20, model.nx))
     log = dd.Recording("lab", "1", times, xs, np.full((19, model.nu), 5.0))
     chart = Chart(coordinates_of(model))
-    setting = Candidates(
-        model, tree_for_identification(model), chart, read_pieces(model, log, 0.0), given_noise(model, chart, None)
-    )
+    pieces, noise = read_pieces(model, log, 0.0), given_noise(model, chart, None)
+    setting = Candidates(model, chart, pieces, noise, tree=tree_for_identification(model))
     every, alone = setting.unknowns, setting.of(["forearm_link.mass"])
     i = [one.name for one in every.each].index("forearm_link.mass")
     z = setting.with_one(i, alone.z_start + 0.4)

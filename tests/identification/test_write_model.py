@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.identification import Identification, write_model
-from drake_diff.identification.identify import Asked
+from drake_diff.identification.results import Asked
 
 ARM = """<?xml version="1.0"?>
 <!-- an arm -- of one link -->

@@ -10,14 +10,6 @@ pytestmark = pytest.mark.solve
 TESTS = Path(__file__).parents[1]
 BENCHMARKS = TESTS / "benchmarks"
 PROGRAMS = {path.stem for path in BENCHMARKS.glob("*.py")} - {"__main__"}
-# They import a benchmark until their owner has changed them.
-PENDING = {
-    "test_columns.py": {"identify"},
-    "test_contact_causes.py": {"identify_contact_causes"},
-    "test_dry_friction.py": {"identify"},
-    "test_explain.py": {"identify"},
-    "test_identify_contact.py": {"cube_tosses"},
-}
 
 
 def imported(text):
@@ -51,6 +43,6 @@ def test_no_module_imports_a_test_module_or_conftest():
 @pytest.mark.slow
 def test_no_test_imports_a_benchmark():
     paths = [path for path in TESTS.rglob("*.py") if BENCHMARKS not in path.parents]
-    found = {path.name: imported_benchmarks(path.read_text()) - PENDING.get(path.name, set()) for path in paths}
+    found = {path.name: imported_benchmarks(path.read_text()) for path in paths}
     assert len(PROGRAMS) > 3
     assert not {path: names for path, names in found.items() if names}
