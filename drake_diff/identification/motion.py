@@ -18,6 +18,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
+from drake_diff.derivatives.contact.laws import QUANTITIES
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.identification.recordings import Piece
@@ -31,7 +32,7 @@ from drake_diff.identification.unknowns import (
     set_numbers,
 )
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import ParameterVector, applied, select
+from drake_diff.model.parameters import Parameter, ParameterVector, applied, select
 from drake_diff.model.step import advance
 
 LONGEST = 0.02  # [s] of a step in continuous time
@@ -259,7 +260,8 @@ class DiscreteMotion:
         by_x, by = np.tile(np.eye(nx), (K, M, 1, 1)), np.zeros((K, M, nx, len(z)))
         taken = hs > 0
         starts, inputs = xs[:, :-1][taken], us[taken]
-        exact = {p.name: vector.values[s] for p, s in vector.pairs if p.kind.source != FINITE_DIFFERENCE}
+        analytic = all(p.kind.quantity in QUANTITIES and np.all(vector.values[s] > 0) for p, s in vector.pairs)
+        exact = {p.name: vector.values[s] for p, s in vector.pairs if analytic or p.kind.source != FINITE_DIFFERENCE}
         with applied(vector) as model:
             steps = self._derivatives(model, select(model, exact), starts, inputs)
         by_values, column = np.empty((len(starts), nx, len(vector.values))), 0
@@ -269,7 +271,7 @@ class DiscreteMotion:
                 by_values[..., s] = np.array([step.C[:, column : column + count] for step in steps])
                 column += count
             else:
-                by_values[..., s] = _differences(vector, s, starts, inputs)
+                by_values[..., s] = _differences(vector, p, s, starts, inputs)
         by_x[taken] = np.array([step.A for step in steps])
         by[taken] = by_values @ by_z
         return by_x, by
@@ -283,16 +285,19 @@ class DiscreteMotion:
             return derivatives_along(model, xs[0], us, vector=vector, xs=xs, method=FINITE_DIFFERENCE)
 
 
-def _differences(vector: ParameterVector, entries: slice, xs: Array, us: Array) -> Array:
-    """(N, nx, k) of steps from xs (N, nx) under us (N, nu) by the vector's entries, which Drake takes as floats."""
-    scale = vector.difference_scale(entries)
+def _differences(vector: ParameterVector, parameter: Parameter, entries: slice, xs: Array, us: Array) -> Array:
+    """(N, nx, k) of steps from xs (N, nx) under us (N, nu) by a parameter that Drake takes as a float."""
     columns = []
-    for i, size in zip(range(entries.start, entries.stop), DIFFERENCE * scale, strict=True):
-        ends = []
-        for values in (vector.values + sign * size * np.eye(len(vector.values))[i] for sign in (1, -1)):
+    for i in range(entries.start, entries.stop):
+        value = vector.values[i]
+        size = DIFFERENCE * max(abs(value), float(np.max(np.abs(parameter.value))), DIFFERENCE)
+        low, high, ends = max(value - size, parameter.lower), value + size, []
+        for moved in (low, high):
+            values = vector.values.copy()
+            values[i] = moved
             with applied(vector.at(values)) as model:
                 ends.append(np.array([advance(model.double, x, u) for x, u in zip(xs, us, strict=True)]))
-        columns.append((ends[0] - ends[1]) / (2 * size))
+        columns.append((ends[1] - ends[0]) / (high - low))
     return np.stack(columns, axis=-1)
 
 
