@@ -98,8 +98,11 @@ class Touching(Ranking):
             candidate = None if self.is_late else self.tried(unknown, begin, points)
             tried += [] if candidate is None else [candidate]
         base = self.from_best(base, tried)
+        none = [candidate for candidate in tried if candidate.explains and self.is_nothing(candidate)]
+        base = min([base, *none], key=lambda fitted: (not fitted.explains, fitted.score))
         self.evidence.update({candidate.names[0]: base.score - candidate.score for candidate in tried})
-        named = self.enough(base, tried, len(self.changes))
+        changed = [candidate for candidate in tried if not any(candidate is other for other in none)]
+        named = self.enough(base, changed, len(self.changes))
         if named:
             explanation = self.named(named)
             before = explanation.sentence.removesuffix(self.end).removesuffix(".")
@@ -119,6 +122,13 @@ class Touching(Ranking):
         nothing = Unknowns(())
         end = self.to_end(nothing, len(self.stages) - 1, np.zeros(0), best.starts)
         return base if end is None else min(base, self.judged((), nothing, end), key=lambda fitted: fitted.score)
+
+    def is_nothing(self, candidate: Tried) -> bool:
+        """Whether the model's own value is within the interval: the search led the model to a better motion."""
+        (name,) = candidate.names
+        start, _ = self.of_model(name)
+        low, high = np.atleast_2d(candidate.intervals[name]).T
+        return bool(np.all(np.isfinite(high - low) & (low <= start) & (start <= high)))
 
     @property
     def stages(self) -> list[float]:
@@ -151,11 +161,17 @@ class Touching(Ranking):
                 followed = min(every, key=lambda end: end.left, default=None)
             if followed is None:
                 return
+            if self.is_behind(followed):
+                followed = self.solved(fit, stage, followed.solved.z, followed.solved.starts, STEPS) or followed
             z, starts, before = followed.solved.z, followed.solved.starts, followed
             yield followed
-            best = self.least_left.get(stage, np.inf)
-            if followed.left > HOPELESS**2 or (followed.left - best) * fit.count > TOLD_APART * max(best, 1.0):
+            if followed.left > HOPELESS**2 or self.is_behind(followed):
                 return
+
+    def is_behind(self, followed: Followed) -> bool:
+        """Whether a change leaves clearly more in a stage than one that explains."""
+        best = self.least_left.get(followed.stage, np.inf)
+        return (followed.left - best) * followed.fit.count > TOLD_APART * max(best, 1.0)
 
     @staticmethod
     def solved(fit: Fit, stage: int, z: Array, starts: Array, most: int) -> Followed | None:
