@@ -1,11 +1,8 @@
 """Dry friction that holds joints still, in `dd.identify`: closed forms first, then motions that MuJoCo made."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-from helpers.models import robot_file
+from helpers.mujoco_arm import MuJoCoArm, bare_arm, drakes, shaken
 from scipy import stats
 from scipy.integrate import solve_ivp
 
@@ -200,32 +197,25 @@ def test_a_step_in_which_a_block_stops_has_no_motion_after_it(write_urdf):
 
 
 @pytest.mark.slow
-def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(monkeypatch):
+def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(tmp_path):
     """MuJoCo's `frictionloss`, which stops a joint within two of its steps.
 
     So these are short: by steps of 0.25 ms 0.05 % less than its friction is found.
     """
-    pytest.importorskip("mujoco")
-    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-    import identify
-
-    monkeypatch.setattr(identify.base, "STEP", 2e-5)
-    random = np.random.default_rng(7)
-    root = identify.base.bare(robot_file("ur5_robot.urdf"))
-    model = identify.loaded(root, "ur5_robot")
-    joints = [name.removesuffix("_q") for name in model.position_names]
-    q0, command, push = identify.led(model, random)
-    truth = identify.Truth(root, joints, model.nu)
-    truth.friction[:3] = random.uniform(0.1, 0.3, 3) * push[:3]
-    qs, us = truth.run(model, q0, command)
-    xs = np.full((len(qs), model.nx), np.nan)
-    xs[:, : model.nq] = qs + identify.base.NOISE * random.standard_normal(qs.shape)
-    log = dd.Recording("MuJoCo", "3", identify.base.PERIOD * np.arange(len(qs)), xs, us)
-    names = [f"{joint}.coulomb_friction" for joint in joints[:3]]
+    mujoco = pytest.importorskip("mujoco")
+    path = bare_arm(tmp_path)
+    model, random, noise = drakes(path), np.random.default_rng(7), 2e-4
+    q0 = np.array([0.3, -1.2, 1.0, -0.5, 0.4, 0.2])
+    us = shaken(model, q0, 150, 0.01, random)
+    friction = np.append(random.uniform(0.1, 0.3, 3) * np.std(us, axis=0)[:3], np.zeros(3))
+    q, v = MuJoCoArm(mujoco, path).move(q0, us, 0.01, friction=friction, step=2e-5)
+    xs = np.hstack([q + noise * random.standard_normal(q.shape), np.full_like(v, np.nan)])
+    log = dd.Recording("MuJoCo", mujoco.__version__, 0.01 * np.arange(151), xs, us)
+    names = [f"{name.removesuffix('_q')}.coulomb_friction" for name in model.position_names[:3]]
     e = dd.identify(model, log, names, motion="continuous")
     assert e.explained, e.reason
     off = []
-    for name, value in zip(names, truth.friction, strict=False):
+    for name, value in zip(names, friction, strict=False):
         low, high = e.intervals[name]
         assert high - low < 0.01 * value
         off.append((e.values[name] - value) / ((high - low) / (2 * 1.96)))
