@@ -15,8 +15,8 @@ ROBOTS = ["panda.urdf", "ur5_robot.urdf", "solo12.urdf", "double_pendulum_contin
 G = 9.81
 
 
-# The modules that an engine or a reader of files needs, and the extra that has them. Importing them to see whether they
-# are there takes seconds of the collection.
+# The modules that an engine needs, and the extra that has them. Importing them to see whether they are there takes
+# seconds of the collection.
 NEEDED = {
     "mujoco": (["mujoco"], "engines"),
     "pinocchio": (["pinocchio"], "engines"),
@@ -25,15 +25,13 @@ NEEDED = {
     "newton": (["newton"], "forward"),
     "sapien": (["sapien"], "forward"),
     "pybullet": (["pybullet"], "forward"),
-    "ray": (["ray"], "cluster"),
-    "rosbags": (["rosbags"], "ros2"),
-    "usd": (["pxr"], "usd"),
 }
+BESIDE = {"ray": (["ray"], "cluster"), "rosbags": (["rosbags"], "ros2"), "usd": (["pxr"], "usd")}  # no engines
 
 
 def needs(engine):
-    """Skip the test, or the module that calls this, where the engine is not installed."""
-    modules, extra = NEEDED.get(engine, ([], ""))
+    """Skip the test, or the module that calls this, where the engine or what is beside it is not installed."""
+    modules, extra = (NEEDED | BESIDE).get(engine, ([], ""))
     if any(find_spec(module.split(".")[0]) is None or find_spec(module) is None for module in modules):
         pytest.skip(f"{engine} is not installed: pip install 'drake-diff[{extra}]'", allow_module_level=True)
 
