@@ -17,13 +17,10 @@ import drake_diff as dd
 
 MODEL = Path(__file__).parent.parent / "models" / "two_spheres.sdf"
 TIME_STEP, NUM_STEPS, GAP, DIAMETER, GOAL = 0.02, 50, 0.3, 0.2, 1.0
-PUSHER, BALL = 0, 1  # in Drake's state: both positions, both velocities
+BALL = 1  # in Drake's state: the positions of pusher and ball, their velocities
+CONTINUED = dd.optimize.Options(continuation="auto")
 
-solve_options: dict[str, Any] = {
-    "method": "ilqr",
-    "max_iterations": 100,
-    "options": dd.optimize.Options(continuation="auto"),
-}
+solve_options: dict[str, Any] = {"method": "ilqr", "max_iterations": 100, "options": CONTINUED}
 
 
 def problem() -> dd.Problem:
@@ -45,9 +42,8 @@ def main() -> None:
     print(f"without a continuation: {blind.status.value}\n  {blind.message}\nwith one:")
     solution = dd.solve(task, **solve_options)
     for stage in solution.options["continuation"]:
-        contact = "the true plant"
-        if stage["distance"] is not None:
-            contact = f"{stage['distance']:.4f} m, {stage['stiffness']:7.1f} N/m"
+        soft = stage["distance"] is not None
+        contact = f"{stage['distance']:.4f} m, {stage['stiffness']:7.1f} N/m" if soft else "the true plant"
         print(
             f"  stage {stage['number']}  {contact:22s}  {stage['status']:16s} {stage['iterations']:3d} steps  "
             f"cost {stage['cost']:.6f}  goal error {stage['goal_error']:.1e}"

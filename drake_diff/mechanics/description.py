@@ -262,8 +262,12 @@ def springs_of(plant: Any) -> dict[Any, tuple[float, float]] | Refusal:
     return springs
 
 
-def read_links(plant: Any, springs: dict[Any, tuple[float, float]]) -> list[Link]:
-    """Every link of a plant, parents before their children."""
+def read_links(plant: Any, springs: dict[Any, tuple[float, float]], *, backwards: bool = False) -> list[Link]:
+    """Every link of a plant, parents before their children.
+
+    With `backwards`, a weld, hinge or slide whose child is nearer to the world than its parent is turned around: the
+    link then moves the joint's parent, and its mass and inertia are not that body's.
+    """
     body_names, joint_names = names_of(plant)
     rotors = dict.fromkeys(joint_names, 0.0)
     for a in actuators(plant):
@@ -274,12 +278,17 @@ def read_links(plant: Any, springs: dict[Any, tuple[float, float]]) -> list[Link
     placed, ordered = {"world"}, []
     while waiting:
         link = next((x for x in waiting if x.parent in placed), None)
+        if link is None and backwards:
+            link = next((x for x in waiting if x.body in placed and x.kind in ("weld", "revolute", "prismatic")), None)
         if link is None:
             names = ", ".join(x.joint for x in waiting)
             raise ModelError(f"the child of a joint is nearer to the world than its parent: {names}")
+        waiting.remove(link)
+        if link.parent not in placed:
+            ends = {"body": link.parent, "parent": link.body, "on_parent": link.on_child, "on_child": link.on_parent}
+            link = replace(link, axis=-link.axis, **ends)
         placed.add(link.body)
         ordered.append(link)
-        waiting.remove(link)
     return ordered
 
 

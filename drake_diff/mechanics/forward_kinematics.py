@@ -251,7 +251,7 @@ def forward_kinematics(model: Model) -> ForwardKinematics | Refusal:
                     f"joint {joint.name()} is a {joint.type_name()} joint, and where that leads is not written out: "
                     "replace it by hinges and slides"
                 )
-        whole = read_links(model.plant, {})
+        whole = read_links(model.plant, {}, backwards=True)
         rpy = {link.joint for link in whole if link.kind in RPY}
         single = [item for link in whole for item in _chain(link)]
         links, on, _ = without_welds(single)

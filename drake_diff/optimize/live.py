@@ -76,7 +76,9 @@ class LiveSearch:
             if report.plan is not None:
                 report.plan(plan)
 
-        return Report(line, row, plan, self.is_due if report.callback is None else report.looks)
+        shown = Report(line, row, plan, self.is_due if report.callback is None else report.looks)
+        shown.asked = report.asked
+        return shown
 
     def is_due(self) -> bool:
         """Whether it is time to draw again."""

@@ -180,8 +180,8 @@ def test_distances_of_a_robot_have_exact_derivatives(robot):
 def test_where_links_are_is_refused_where_the_tree_is_another(monkeypatch):
     model = example_robot("ur5_robot.urdf", 0.02)
 
-    def one_axis_turned_around(plant, springs):
-        links = read_links(plant, springs)
+    def one_axis_turned_around(plant, springs, **options):
+        links = read_links(plant, springs, **options)
         hinge = next(link for link in links if link.joint == "elbow_joint")
         hinge.axis[:] = -hinge.axis
         return links

@@ -107,7 +107,7 @@ CONSTANTS = {
     "docs/index.md": {"60": "drake_diff.runs.verify:WAITED"},
     "docs/certificates.md": {
         **dict.fromkeys(("13", "1e-2", "1e-8"), "drake_diff.certificates.differences:DIFFERENCES.steps"),
-        "1e-9": "drake_diff.certificates.certificate:JITTER",
+        "1e-9": "drake_diff.certificates.certificate:VerdictOptions.jitter",
         "1": "drake_diff.certificates.certificate:VerdictOptions.power",
         "1e-4": "drake_diff.certificates.certificate:VerdictOptions.negligible",
         "1e-6": SAP,
