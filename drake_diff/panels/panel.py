@@ -43,6 +43,7 @@ from drake_diff.panels.results import (
 from drake_diff.runs.provenance import provenance_of
 
 ENGINES = ("local", "ray")
+WAVE = 8  # trials for each process that may end before their rows are written: a kill loses no more
 CHECK_PARENT = 0.5  # seconds between two checks of a worker that its parent lives
 # A worker has one core: its libraries start no threads.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -154,7 +155,7 @@ def evaluate(
                 started: dict[str, PanelTrial] = {}
                 done: set[str] = set()
                 try:
-                    for trial, row in _answers(parallel, left, function, started):
+                    for trial, row in _answers(parallel, left[: WAVE * count], function, started):
                         done.add(trial.id)
                         yield trial, row
                 except crash:

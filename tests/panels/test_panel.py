@@ -179,8 +179,8 @@ def test_a_thousand_trials_killed_three_times_at_random_give_the_same_bytes(thou
     trials = [trial for _, trial in logged(thousand)]
     assert not {names[id] for id in done} & set(trials[begun:])  # what was finished is not evaluated again
     assert set(trials) == set(names.values())
-    # joblib starts the next trial before the row of the last is written: what was not written is evaluated again.
-    assert len(trials) <= 1000 + 3 * 50
+    # Two workers start at most eight trials each before the rows of these are written.
+    assert len(trials) <= 1000 + 3 * 16
 
 
 def test_one_and_two_workers_give_the_same_bytes(write, tmp_path):

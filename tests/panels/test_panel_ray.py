@@ -45,7 +45,7 @@ PANEL = 'evaluate = "trials.py:{}"\nseeds = 50\n[fixed]\nseconds = {}\n[axes]\nl
 # In a process of its own: Ray can be made to listen on loopback only where nothing has imported it before.
 KILLED = """
 import os, signal, sys, time
-import drake_diff as dd
+from drake_diff.panels import run_panel
 
 def kill(finished, count, errors):
     if os.path.exists("victim") and not os.path.exists("killed"):
