@@ -21,6 +21,12 @@ TAKEN_BY = {
     "refine": ("collocation",),
     "error_tolerance": ("collocation",),
     "max_num_steps": ("collocation",),
+    "mesh_rounds": ("collocation",),
+    "other_guesses": ("collocation",),
+    "other_iterations": ("collocation",),
+    "guess_iterations": ("auto",),
+    "sweeps": ("shooting",),
+    "clearance_parts": ("ilqr", "shooting"),
 }
 NAMED = ("scheme", "solver", "continuation", "refine")
 
@@ -114,7 +120,7 @@ class Options:
             methods = TAKEN_BY.get(name, (method,))
             if value is not False and method not in ("auto", *methods):
                 taken = " and ".join(f'method="{other}"' for other in methods)
-                expected = f'none for method="{method}": {taken} takes it'
+                expected = f'none for method="{method}": it is an option of {taken}'
                 raise InputError(name, got=f"{value!r:.80}", expected=expected)
 
     def of_method(self, method: str) -> "Options":
