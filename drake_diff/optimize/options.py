@@ -28,7 +28,6 @@ TAKEN_BY = {
     "sweeps": ("shooting",),
     "clearance_parts": ("ilqr", "shooting"),
 }
-NAMED = ("scheme", "solver", "continuation", "refine")
 
 
 @dataclass(frozen=True, repr=False)
@@ -96,8 +95,7 @@ class Options:
         for name in ("mesh_rounds", "other_guesses"):
             self._set(name, count(name, getattr(self, name), 0))
         if not isinstance(self.clearance_parts, (tuple, list)):
-            expected = "whole numbers above 1"
-            raise InputError("clearance_parts", got=repr(self.clearance_parts), expected=expected)
+            raise InputError("clearance_parts", got=repr(self.clearance_parts), expected="whole numbers above 1")
         self._set("clearance_parts", tuple(count("clearance_parts", parts, 2) for parts in self.clearance_parts))
         for name in HOOKS:
             if not (getattr(self, name) is None or callable(getattr(self, name))):
@@ -124,8 +122,9 @@ class Options:
                 raise InputError(name, got=f"{value!r:.80}", expected=expected)
 
     def of_method(self, method: str) -> "Options":
-        """These options with those that `method` does not take at their defaults."""
-        left_out: dict[str, Any] = {name: None for name in NAMED if method not in TAKEN_BY[name]}
+        """These options without the scheme, solver, continuation and refinement that `method` does not take."""
+        others = {name for name, methods in TAKEN_BY.items() if method not in methods}
+        left_out: dict[str, Any] = {f.name: None for f in fields(self) if f.default is None and f.name in others}
         return replace(self, **left_out)
 
     def to_dict(self) -> dict[str, Any]:

@@ -118,9 +118,7 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
     if method not in METHODS:
         raise UnknownNameError("method", got=method, known=METHODS)
     if not (options is None or isinstance(options, Options)):
-        raise InputError(
-            "options", got=f"{options!r:.80}", expected="an optimize.Options, such as Options(refine=True)"
-        )
+        raise InputError("options", got=f"{options!r:.80}", expected="an optimize.Options")
     chosen = Options() if options is None else options
     chosen.check_method(method)
     limits = Limits(

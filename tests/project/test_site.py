@@ -1,8 +1,9 @@
 """The code of the documentation site runs and prints what stands below it. `.ci/run` builds the site."""
 
-import importlib.util
 import re
+import runpy
 import shutil
+from types import SimpleNamespace
 
 import numpy
 import pytest
@@ -23,6 +24,10 @@ PAGES = [
 
 
 @pytest.mark.solve
+def script(name):
+    return SimpleNamespace(**runpy.run_path(str(DOCS / f"{name}.py")))
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_the_code_of_a_page_runs_and_prints_what_stands_below_it(page, tmp_path, monkeypatch, capsys):
     """All blocks of a page in one go, in a folder with the models of the package and a recording."""
@@ -38,9 +43,7 @@ def test_the_code_of_a_page_runs_and_prints_what_stands_below_it(page, tmp_path,
 
 def test_a_link_that_leads_nowhere_and_what_would_be_fetched_are_found(tmp_path):
     """A site of two pages: one link holds, and each of the others is told."""
-    spec = importlib.util.spec_from_file_location("links", DOCS / "links.py")
-    links = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(links)
+    links = script("links")
     (tmp_path / "a.html").write_text('<a href="sub/b.html#here">b</a> <a href="https://drake.mit.edu">Drake</a>')
     (tmp_path / "sub").mkdir()
     page = '<h1 id="here">b</h1><a href="../a.html"></a><link rel="next" href="../a.html"><img src="data:x">'
@@ -70,9 +73,7 @@ def test_a_link_that_leads_nowhere_and_what_would_be_fetched_are_found(tmp_path)
 @pytest.mark.solve
 def test_the_pictures_of_contact_models_are_those_that_the_command_draws(tmp_path):
     pytest.importorskip("matplotlib")
-    spec = importlib.util.spec_from_file_location("pictures", DOCS / "pictures.py")
-    pictures = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(pictures)
+    pictures = script("pictures")
     shown = re.findall(r"\(pictures/(\w+)\.svg\)", (DOCS / "contact_models.md").read_text())
     assert shown == list(pictures.PICTURES)
     assert all((DOCS / f"pictures/{name}.svg").is_file() for name in shown)
@@ -82,8 +83,6 @@ def test_the_pictures_of_contact_models_are_those_that_the_command_draws(tmp_pat
 
 def test_every_page_of_the_reference_is_in_the_navigation():
     pytest.importorskip("mkdocs")
-    spec = importlib.util.spec_from_file_location("site_pages", DOCS / "site.py")
-    site = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(site)
+    site = script("site")
     listed = re.findall(r"^ +- (reference/\w+\.md)$", (ROOT / ".mkdocs.yml").read_text(), re.MULTILINE)
     assert sorted(listed) == sorted(site.reference())
