@@ -1,4 +1,4 @@
-"""Postures by Drake's `InverseKinematics`: points where they are to be, all else as near as may be to a posture."""
+"""Inverse kinematics with Drake's kinematic constraints and SNOPT."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,10 +27,10 @@ OPTIONS.SetOption(SnoptSolver.id(), "Major feasibility tolerance", 1e-9)
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Where a point (3,) [m] of a frame of the twin's plant is to be: `position` (3,) [m], NaN where anywhere will do.
+    """The wanted position (3,) [m] in the world of a point (3,) [m] of a frame; a NaN leaves that coordinate free.
 
-    `tolerance` [m] is how far it may be from there, a number or (3,), infinite where it is only to be near; `unit` [m]
-    of what is off counts as 1, infinite where nothing counts.
+    `tolerance` [m], a number or (3,), bounds the distance; infinity bounds nothing. The cost is (distance / `unit`)^2,
+    with `unit` in [m]; infinity means no cost.
     """
 
     frame: Any
@@ -42,13 +42,13 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Wish:
-    """What a posture is to be near, where that is possible.
+    """The cost of a posture: the squared distance from a nominal posture, and of the centre of mass from a position.
 
     Attributes:
-        q: (nq,) a posture.
-        unit: (nv,) of the tangent space, how far from q counts as 1 of each coordinate; infinite where it is free.
-        center_of_mass: (3,) [m] where the centre of mass is to be, NaN where anywhere will do; None everywhere.
-        balance: [m] how far from there counts as 1.
+        q: (nq,) the nominal posture.
+        unit: (nv,) in the tangent space, the distance from q that costs 1; infinite for a free coordinate.
+        center_of_mass: (3,) [m] its wanted position, NaN for a free coordinate; None for no such cost.
+        balance: [m] the distance from there that costs 1.
     """
 
     q: Array
@@ -60,11 +60,11 @@ class Wish:
 def inverse_kinematics(
     model: Model, first: Array, targets: Sequence[Target], wish: Wish, lower: Array, upper: Array
 ) -> Array:
-    """The posture (nq,) that has the points at their targets and is nearest to a wish, by SNOPT from `first` (nq,).
+    """The posture (nq,) of least cost with the points at their targets, by SNOPT from the posture `first` (nq,).
 
-    It is within the limits of the plant and `lower` and `upper` (nq,), and keeps the constraints of the plant: loops
-    that are closed, joints that follow others. Where there is none, it is what the search ended at: look how far its
-    points are off. The twin is left in it.
+    It keeps joint limits, `lower` and `upper` (nq,), closed loops and mimic joints. If no such posture exists, the last
+    iterate is returned, and `miss` measures it. The double plant of the model is left in this posture. ModelError if
+    Drake cannot express a constraint of the plant.
     """
     twin, program = model.double, MathematicalProgram()
     plant, context, world, coupling = twin.plant, twin.context, twin.plant.world_frame(), twin.coupling
@@ -104,7 +104,7 @@ def inverse_kinematics(
 
 
 def miss(model: Model, targets: Sequence[Target]) -> float:
-    """[m] how far the points are from their targets in the twin's state beyond the tolerance, at most."""
+    """The largest distance [m] of a point from its target beyond the tolerance, in the state of the double plant."""
     off = [0.0]
     for target in targets:
         there = target.frame.CalcPoseInWorld(model.double.context).multiply(target.point)

@@ -1,4 +1,4 @@
-"""How `solve` searches: what its algorithms are told beside the problem, the method and the limits."""
+"""Options of the algorithms of `solve`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -38,7 +38,7 @@ class Options:
         scheme: of collocation: "hermite_simpson" (order 4, the default), "trapezoid" (order 2), or "drake", which is
             what Drake's DirectCollocation transcribes.
         solver: "ipopt", or "snopt" with scheme="drake", which then is Drake's own DirectCollocation.
-        tolerance: the solver's, on feasibility and optimality.
+        tolerance: the solver's tolerance of feasibility and optimality.
         continuation: finds contact that the guess does not make, by stages of a force at a distance before the true
             plant: "auto" or a sequence of SoftContacts, with method="ilqr"; or "relaxed": by inverse dynamics over the
             positions of the guess, with contact and friction at a distance, of hinges, slides and free bodies that
@@ -49,15 +49,15 @@ class Options:
         error_tolerance: of an interval, against an accurate integration, in the states' units; and of its part of
             the cost, relative to the whole.
         max_num_steps: the most intervals of a refined mesh.
-        mesh_rounds: how often a mesh is refined whose plan does not hold.
-        other_guesses: how many random first guesses follow a straight line from which no motion is found.
-        other_iterations: of the solver, from each of these.
-        guess_iterations: of an attempt of "auto" that is to find a guess for the next.
-        sweeps: iterations of iLQR before shooting that has no guess.
-        clearance_parts: into how many parts a step is divided where a plan in steps comes too near to an obstacle
-            between two of them; one round for each entry.
-        on_start: called once, when all input has been checked and the work begins. Not recorded.
-        on_plan: gets what each search comes to, a `Solution` that is not measured yet. Not recorded.
+        mesh_rounds: the most refinements of a mesh whose plan does not hold.
+        other_guesses: the number of random initial guesses after a straight line from which no motion is found.
+        other_iterations: the solver's iteration limit from each of these guesses.
+        guess_iterations: the iteration limit of an iLQR attempt of "auto" that makes a guess for the next attempt.
+        sweeps: the most iterations of iLQR that make the guess of shooting.
+        clearance_parts: the numbers of parts of a step at which obstacles are checked, one for each further search of
+            shooting or iLQR whose plan comes too near to an obstacle within a step.
+        on_start: called once, after all input is checked and before the search. Not recorded.
+        on_plan: called with each unverified `Solution` that a search ends with. Not recorded.
 
     Raises:
         InputError: a value does not fit; UnknownNameError for an unknown solver.
