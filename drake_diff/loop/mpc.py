@@ -390,7 +390,7 @@ def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
         if not plan.success:
             expected = "a problem that `solve` solves, or a plan"
             raise InputError("problem", got=f"solve: {plan.message}", expected=expected)
-    if isinstance(plan, Solution):
+    if type(plan) is Solution:
         plan = _sampled(problem, plan)
     if not (isinstance(plan, (tuple, list)) and len(plan) == 2):
         raise InputError("plan", got=type(plan).__name__, expected="None, (xs, us) or a Solution")

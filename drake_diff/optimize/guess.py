@@ -50,7 +50,7 @@ def first_guess(problem: Problem, method: str, given: Any, seed: int) -> Guess:
     continuous = method == "collocation"
     if given is None:
         return _line(problem, method, seed)
-    if isinstance(given, Solution):
+    if type(given) is Solution:
         same = problem.optimizes_parameters and given.vector.names == problem.parameters.names
         values = np.asarray(given.vector.values) if same else None
         horizon = given.horizon if problem.horizon is not None else None

@@ -12,7 +12,6 @@ from drake_diff.exceptions import DrakeDiffError, InputError
 from drake_diff.model.parameters import applied
 from drake_diff.motion.rollout import STEPS, Rollout
 from drake_diff.optimize.goal_markers import colours_of, drawn_goals, meaning_of
-from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iterate, Iteration, Report
 from drake_diff.optimize.solution import Solution, Status
@@ -142,9 +141,9 @@ class LiveSearch:
             self._told(state="ended by an error", verdict="fail", message=f"{type(error).__name__}: {error}")
             raise
 
-    def end(self, solution: Solution | PhasedSolution) -> None:
+    def end(self, solution: Solution) -> None:
         """Show the motion of the plan, and what became of it."""
-        if self.page is None or not isinstance(solution, Solution):
+        if self.page is None:
             return
         self._show(lambda: self._scene_at_the_end(solution), end=True)
         state = solution.status

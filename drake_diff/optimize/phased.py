@@ -7,7 +7,7 @@ closes, by Drake's mass matrix, and the cost to go is led back through its salta
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,9 +15,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.clock import now
-from drake_diff._base.values import PicklesItsFields, ShowsItsRepr
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
-from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
+from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError, UnknownNameError
 from drake_diff.optimize.checks import Check, Checks, check
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.measure import INTEGRATION_TOLERANCE, certify_equations, derivative_check
@@ -26,10 +25,10 @@ from drake_diff.optimize.options import Options
 from drake_diff.optimize.problem.fixed_contacts import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report
-from drake_diff.optimize.replay import FEEDBACK, OPEN_LOOP
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Limits, NlpResult, Report
+from drake_diff.optimize.replay import FEEDBACK, OPEN_LOOP, Replay
 from drake_diff.optimize.run import PLANS, Run, SoFar, arrays_of
-from drake_diff.optimize.solution import Search, Solution, Status
+from drake_diff.optimize.solution import Solution, Status, Trajectories
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
     FOUND,
@@ -50,22 +49,16 @@ HALVES = 50  # of a step in which a gap closes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PhasedSolution(PicklesItsFields, ShowsItsRepr):
+class PhasedSolution(Solution):
     """The motion that `solve` found for a `PhasedProblem`, and what it measures.
 
-    Each phase is a `Solution` with its own measures and status. `link_errors` and `chain` are computed from the states
-    when they are first asked for, and never taken from the solver. `success` holds where the solver converged and all
-    of that holds.
+    Every phase is a `Solution` with measures and a status of its own. The measures of all are the sum of the phases'
+    costs and horizons, and the largest of their errors; `link_errors` and `chain` are of the resets between them, and
+    `certificates` of the resets' derivatives. `xs` and `us` have the rows of all phases, NaN where a phase has fewer
+    states or inputs than another. `success` holds where the solver converged and all of that holds.
 
     Attributes:
-        problem: What was asked.
-        status, message: How it ended, as a `Status` and in words.
         phases: A `Solution` of each phase, from its own time 0 on.
-        iterations: The solver's own table.
-        link_certificates: Of the derivatives of the resets, at the states of the plan.
-        options: What was asked of the solver, and what it chose.
-        wall_time: [s] what the solve took.
-        search: The arguments of `solve`.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -77,19 +70,23 @@ class PhasedSolution(PicklesItsFields, ShowsItsRepr):
         ('converged', 12.0, [0.0, 0.5])
     """
 
-    problem: PhasedProblem
-    status: Status
-    message: str
-    phases: tuple[Solution, ...]
-    iterations: tuple[Iteration, ...] = ()
-    link_certificates: tuple[Certificate, ...] = ()
-    options: dict[str, Any] = field(default_factory=dict)
-    solver_message: str = ""
-    wall_time: float = 0.0
-    search: Search | None = None
+    problem: Any  # a PhasedProblem
+    phases: tuple[Solution, ...] = ()
 
-    def __str__(self) -> str:
-        return f"{self.problem.name} in {len(self.phases)} phases: {self.status.value}, cost {self.cost:.6g}"
+    @classmethod
+    def joined(cls, problem: PhasedProblem, phases: Sequence[Solution], **fields: Any) -> "PhasedSolution":
+        """The solution of `problem` by its phases'."""
+        first, rows = phases[0], ([phase.xs for phase in phases], [phase.us for phase in phases])
+        whole: dict[str, Any] = {"status": Status.FAILED, "message": "", "scheme": first.scheme} | fields
+        return cls(
+            problem,
+            first.method,
+            first.solver,
+            xs=_stacked(rows[0]),
+            us=_stacked(rows[1]),
+            phases=tuple(phases),
+            **whole,
+        )
 
     def __repr__(self) -> str:
         lines = [f"PhasedSolution of {self.problem.name}: {self.status.value}", self.message]
@@ -101,25 +98,47 @@ class PhasedSolution(PicklesItsFields, ShowsItsRepr):
 
     def told(self, **fields: Any) -> "PhasedSolution":
         """The same motion with other `fields`; a status is that of the phases too of which nothing was said yet."""
-        changed = replace(self, **fields)
         news = {name: fields[name] for name in ("status", "message") if name in fields}
-        phases = (p if p.message or "status" not in news else p.told(**news) for p in changed.phases)
-        return replace(changed, phases=tuple(phases))
+        phases = (p if p.message or "status" not in news else p.told(**news) for p in self.phases)
+        changed: Any = super().told(**fields)
+        vars(changed)["phases"] = tuple(phases)
+        return changed
+
+    transcribed = None  # as every phase has its own motion
+
+    def trajectory(self) -> Trajectories:
+        """ModelError: every one of `phases` has its own."""
+        raise ModelError(f"{self.problem.name}: no trajectory of all phases: each of `phases` has its own")
 
     @property
-    def success(self) -> bool:
-        """Whether the solver converged and everything measured again holds."""
-        return self.status is Status.CONVERGED
+    def defects(self) -> Array:
+        """The phases' defects, and then the distance of every link from its reset."""
+        return np.concatenate([*(phase.defects for phase in self.phases), *self.link_errors.values()])
 
     @property
-    def defect(self) -> float:
-        """The largest distance of a phase from its dynamics, or of a link from its reset."""
-        return max(self.link_error, *(phase.defect for phase in self.phases))
+    def integration_errors(self) -> Array:
+        """Those of the phases, one after the other."""
+        return np.concatenate([phase.integration_errors for phase in self.phases])
 
     @property
     def goal_error(self) -> float:
         """The largest distance of a phase's last state from its goal."""
         return max(phase.goal_error for phase in self.phases)
+
+    @property
+    def initial_state_error(self) -> float:
+        """The distance of the first state of all from what is given of it."""
+        return self.phases[0].initial_state_error
+
+    @property
+    def bound_excess(self) -> dict[str, tuple[float, int]]:
+        """That of all phases, with their names."""
+        return {f"{name}: {key}": row for name, phase in self._named for key, row in phase.bound_excess.items()}
+
+    @property
+    def constraint_excess(self) -> dict[str, tuple[float, int]]:
+        """That of all phases, with their names."""
+        return {f"{name}: {key}": row for name, phase in self._named for key, row in phase.constraint_excess.items()}
 
     @property
     def cost(self) -> float:
@@ -135,6 +154,11 @@ class PhasedSolution(PicklesItsFields, ShowsItsRepr):
     def starts(self) -> Array:
         """(P,) [s] when each phase begins, or steps."""
         return np.cumsum([0.0, *(phase.horizon for phase in self.phases[:-1])])
+
+    @property
+    def times(self) -> Array:
+        """[s] of the rows of `xs`."""
+        return np.concatenate([start + phase.times for start, phase in zip(self.starts, self.phases, strict=True)])
 
     @cached_property
     def link_errors(self) -> dict[str, Array]:
@@ -159,17 +183,43 @@ class PhasedSolution(PicklesItsFields, ShowsItsRepr):
         """
         return _chain_check(self)
 
+    @property
+    def following(self) -> list[Check]:
+        """The chain."""
+        return [self.chain]
+
     @cached_property
     def link_checks(self) -> Checks:
         """What is checked of resets, their derivatives and the sum of all durations."""
         return Checks(_link_checks(self))
 
     @property
+    def plan_checks(self) -> Checks:
+        """What is checked of the states and inputs of all phases, and of the links."""
+        rows = [replace(c, where=f"{name}: {c.where}") for name, phase in self._named for c in phase.plan_checks]
+        return Checks([*rows, *self.link_checks])
+
+    @property
+    def replays(self) -> tuple[Replay, ...]:
+        """Those of the phases, one after the other."""
+        return tuple(replay for phase in self.phases for replay in phase.replays)
+
+    @property
     def checks(self) -> Checks:
         """Everything that was checked, the worst first: of each phase, the links and the chain."""
-        named = zip(self.problem.names, self.phases, strict=True)
-        rows = [replace(c, where=f"{name}: {c.where}") for name, phase in named for c in phase.checks]
+        rows = [replace(c, where=f"{name}: {c.where}") for name, phase in self._named for c in phase.checks]
         return Checks([*rows, *self.link_checks, self.chain])
+
+    @property
+    def _named(self) -> list[tuple[str, Solution]]:
+        return list(zip(self.problem.names, self.phases, strict=True))
+
+
+def _stacked(arrays: Sequence[Array]) -> Array:
+    """The rows of all, with NaN in the columns that one does not have."""
+    width = max(array.shape[1] for array in arrays)
+    rows = [np.pad(a, ((0, 0), (0, width - a.shape[1])), constant_values=np.nan) for a in arrays]
+    return frozen(np.vstack(rows))
 
 
 def _chain_check(solution: PhasedSolution) -> Check:
@@ -305,7 +355,7 @@ def may_mend(solution: PhasedSolution, refine: bool | None) -> bool:
     """Whether another first guess may do better: nothing was found, or a plan that no mesh made hold."""
     if solution.status is not Status.CONVERGED_NOT_VERIFIED or refine is False:
         return solution.status in NOT_FOUND
-    certificates = [*solution.link_certificates, *(c for phase in solution.phases for c in phase.certificates)]
+    certificates = [*solution.certificates, *(c for phase in solution.phases for c in phase.certificates)]
     return all(c.verdict == "agree" for c in certificates)
 
 
@@ -490,7 +540,7 @@ class PhasedRun(Run):
 
     def _joined(self, phases: Sequence[Solution], **fields: Any) -> Any:
         fields |= {"options": self.options, "wall_time": time.monotonic() - self.begun}
-        return PhasedSolution(self.problem, Status.FAILED, "", tuple(phases), **fields)
+        return PhasedSolution.joined(self.problem, phases, **fields)
 
     def _judge_collocated(self, transcription: Any, motion: Any, certificates: tuple[Certificate, ...]) -> Any:
         self.options["derivatives"] = motion.phases[0].derivatives
@@ -508,7 +558,7 @@ class PhasedRun(Run):
             links = _certified_links(transcription, motion.phases)
         except (GradientError, SimulationError) as refusal:
             error = refusal
-        solution = self._judge(self._joined(drafts, link_certificates=links), motion.result)
+        solution = self._judge(self._joined(drafts, certificates=links), motion.result)
         if error is not None and solution.status in PLANS:
             return ended(solution, Status.NO_GRADIENT, str(error))
         return solution
@@ -592,6 +642,6 @@ def _link_checks(draft: PhasedSolution) -> Iterator[Check]:
         lower, upper = draft.problem.horizon
         beyond = max(lower - draft.horizon, draft.horizon - upper, 0.0)
         yield check("horizon", "all phases", beyond, FEASIBILITY_TOLERANCE, "s")
-    for certificate in draft.link_certificates:
+    for certificate in draft.certificates:
         row = derivative_check(certificate)
         yield replace(row, where=f"{certificate.subject}: {row.where}")

@@ -125,7 +125,7 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         >>> found.verdict, found.columns, found.cost.round(3)  # the cost is 12 x^2 - 12 x v + 4 v^2
         ('agree', ('x0', 'x1'), array([ 24., -12.]))
     """
-    if not isinstance(solution, Solution):
+    if type(solution) is not Solution:
         raise InputError("solution", got=type(solution).__name__, expected="a Solution")
     if not solution.success:
         raise InputError("solution", got=solution.status.value, expected="one that is a success: its message says why")

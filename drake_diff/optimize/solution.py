@@ -178,6 +178,11 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         return changed
 
     @property
+    def phases(self) -> tuple["Solution", ...]:
+        """Itself: a problem that is not a `PhasedProblem` is one phase."""
+        return (self,)
+
+    @property
     def success(self) -> bool:
         """Whether the solver converged and everything measured again holds."""
         return self.status is Status.CONVERGED

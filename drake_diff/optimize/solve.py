@@ -159,8 +159,7 @@ def _with_compilation(solution: Solution | PhasedSolution, seconds: float, repor
     report.say(note)
     if solution.status is not Status.TIME_LIMIT:
         return solution
-    message = f"{solution.message}; {note}"
-    return solution.told(message=message) if isinstance(solution, Solution) else replace(solution, message=message)
+    return solution.told(message=f"{solution.message}; {note}")
 
 
 def _print_address(address: str) -> None:

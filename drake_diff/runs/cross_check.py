@@ -86,8 +86,8 @@ def cross_check(solution: Solution, engines: Sequence[str] = SIMULATORS) -> Solu
         >>> cross_check(dd.solve(problem, method="ilqr"), engines=()).cross_checks
         (Replay in continuous time, TVLQR: holds,)
     """
-    if not isinstance(solution, Solution) or not solution.problem.has_model:
-        got = f"{type(solution).__name__} of plain dynamics" if isinstance(solution, Solution) else type(solution)
+    if type(solution) is not Solution or not solution.problem.has_model:
+        got = f"{type(solution).__name__} of plain dynamics" if type(solution) is Solution else type(solution)
         raise InputError("solution", got=got, expected="the Solution of a problem with a model")
     follower = Follower(solution.plan, solution.replays if solution.transcribed is not None else ())
     rows = [*follower.in_continuous_time(), *(row for name in engines for row in _in_simulator(follower, name))]

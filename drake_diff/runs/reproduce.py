@@ -372,7 +372,7 @@ def _solved_in_phases(
     Where the search ends elsewhere, the plan is as the record says.
     """
     status = Status(record.solver.status if record.solver else "")
-    recorded = PhasedSolution(problem, status, record.sentence, phases)
+    recorded = PhasedSolution.joined(problem, phases, status=status, message=record.sentence)
     if section.search is None or section.initial_guess is not None:
         return recorded, 0.0, ("it began from a guess that the directory does not have",)
     arguments: dict[str, Any] = {name: value for name, value in section.search.items() if name != "time_limit"}

@@ -137,7 +137,7 @@ def record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
 
 
 def _link(solution: PhasedSolution, i: int, switch: Switch) -> LinkEvidence:
-    certificates = {c.subject: gradient_evidence(c) for c in solution.link_certificates}
+    certificates = {c.subject: gradient_evidence(c) for c in solution.certificates}
     return evidence(
         LinkEvidence,
         switch,
@@ -214,7 +214,7 @@ def save(solution: Any, directory: str | Path) -> PlanRecord | FitRecord:
         >>> record.verdict, sorted(record.files)
         ('pass', ['plan.npz', 'record.schema.json', 'replay.html', 'report.html', 'trace.mcap'])
     """
-    if not isinstance(solution, (Solution, PhasedSolution)):
+    if not isinstance(solution, Solution):
         return _save_other(solution, directory)
     with plan_kept(solution, Path(directory).resolve().name), written_whole(directory) as folder:
         return write_run(solution, folder)

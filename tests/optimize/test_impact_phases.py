@@ -80,7 +80,7 @@ def test_a_ball_bounces_into_its_target(thrown):
     np.testing.assert_allclose(rise.y[:2, -1], [1.2, 0.9], atol=1e-5)
     assert np.min(rise.y[1]) > 0.0999
     assert "open loop through all phases" in thrown.message
-    assert [c.verdict for c in thrown.link_certificates] == ["agree"]
+    assert [c.verdict for c in thrown.certificates] == ["agree"]
 
 
 class HopperByHand:

@@ -113,7 +113,7 @@ def test_the_simplest_walker_walks_its_known_gait(walked):
     assert walked.horizon == pytest.approx(3.882, abs=1e-3)
     assert walked.cost == pytest.approx(0.0, abs=1e-12)
     assert "exact Hessian" in walked.options["derivatives"]
-    assert [c.verdict for c in walked.link_certificates] == ["agree"]
+    assert [c.verdict for c in walked.certificates] == ["agree"]
 
 
 def test_a_load_that_is_dropped_leaves_with_its_states():
@@ -240,7 +240,7 @@ def test_a_wrong_derivative_of_a_reset_is_found(bounced):
     wrong = np.hstack([-np.diag([1.0, -0.81]), np.eye(2)])
     certificate = certify_jacobian(lambda z: switch.link(z[:2], z[2:]), at, wrong)
     assert certificate.verdict == "disagree"
-    again = rejudged(replace(bounced, link_certificates=(certificate,)), bounced.phases)
+    again = rejudged(replace(bounced, certificates=(certificate,)), bounced.phases)
     assert again.status is dd.Status.CONVERGED_NOT_VERIFIED
     assert "certificate" in again.message
 
