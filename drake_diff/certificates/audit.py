@@ -1,64 +1,52 @@
 """Before anything runs: what in a model cannot be differentiated, or would be differentiated wrongly, and what to do.
 
-`audit` runs a list of checks, each a function of a `Place` (the model at a point) that yields its findings. The checks
-of contact come after the others; every number in them was measured on the Drake that this package is tested with.
+`audit` runs a list of checks, each a function of a `Point` that yields its findings: of the step, of contact
+(`contact_checks`), and of what a robot file says. A stranger's file loads, and then cannot be driven, falls through the
+floor, or has masses that nobody wrote.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.geometry import Box, Cylinder, Sphere
-from pydrake.multibody.plant import ContactModel, DiscreteContactApproximation
 from pydrake.multibody.tree import FixedOffsetFrame, WeldJoint
 
-from drake_diff._base.arrays import Array
-from drake_diff.certificates.finding import (
-    FILE_CHECKS,
-    PARALLEL,
-    SEVERITIES,
-    Collider,
-    Finding,
-    Findings,
-    Pair,
-    Place,
-    Severity,
+from drake_diff.certificates.contact_checks import (
+    aligned_faces,
+    contact_defaults,
+    corners_on_both_sides,
+    inseparable,
+    pairs_at_touch,
+    refused_pairs,
+    short,
+    spheres_on_axes,
+    unread_compliance,
 )
-from drake_diff.derivatives.step import StepDerivatives, differentiate_step
-from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
-from drake_diff.model.contact_geometry import MEETS_A_SPHERE
-from drake_diff.model.file_facts import Mimic
+from drake_diff.certificates.finding import SEVERITIES, Finding, Findings, Point, Severity, listed
+from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
+from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import IDENTITY_OFFSET
-from drake_diff.model.plant import PROXIMITY, actuators, instances, joints
+from drake_diff.model.plant import FLOATING, actuators, bodies, instances, joints
 from drake_diff.model.step import advance, check_point, set_state
 
-
-@dataclass(frozen=True)
-class AuditOptions:
-    """What an audit takes for near, large and many."""
-
-    pairs_told: int = 6  # of links, each with a finding of its own; a humanoid has hundreds
-    at_limit: float = 1e-6  # [m or rad] from a joint's limit
-    huge: float = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
-    nearly_parallel: float = 1e-2  # [rad]: jumps were measured up to 1e-3 and beyond
-    in_plane: float = 1e-6  # [m] from a plane of symmetry
-    reach: float = 1e-3  # [m] faces nearer than this count as touching
-    on_axis: float = 1e-9  # [m] from a sphere's centre to a cylinder's axis
-    touch: float = 1e-9  # [m] of signed distance, where Drake computes it exactly
-    rough_touch: float = 1e-6  # [m] where it iterates (measured: 1e-7 off for an ellipsoid)
-
-
-AUDIT = AuditOptions()
-
-ROUND = ("Sphere", "Ellipsoid", "Capsule")
-
-UNITS = dict(zip(PROXIMITY, ("", " N/m", " s/m", " s", " Pa"), strict=True))
+AT_LIMIT = 1e-6  # [m or rad] from a joint's limit
+HUGE = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
+SAME_MASS = 1e-6  # relative: a file's mass and trace of inertia against the plant's
+NO_MASS = 1e-12  # [kg or kg m^2] of a joint's own entry of the mass matrix
+IGNORED = re.compile(r"ignored|not currently support|only supports|unsupported|Skipping transmission", re.IGNORECASE)
+SKIPPED = re.compile(r"\d+ collision meshes skipped")  # those that exist and that Drake cannot use
+HARMLESS = (
+    *("safety_controller", "calibration", "found in a 'link'", "fixed joint", "texture", "material", "transmission'"),
+    *("only Gazebo reads", "camera", "light", "visual", "'site'", "sensor", "statistic", "timestep", "integrator"),
+    *("keyframe", "'user'", "'cone'", "iterations", "custom", "'size'"),
+)
 
 
 def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Findings:
@@ -82,7 +70,7 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
           -> stay inside the limit (the bounds of a Problem do), or raise it in the file
     """
     x = model.default_state if x is None else x
-    point = Place(model, *check_point(model, x, np.zeros(model.nu) if u is None and model.nu else u))
+    point = Point(model, *check_point(model, x, np.zeros(model.nu) if u is None and model.nu else u))
     checks = _CHECKS if point.has_poses else _CHECKS_WITHOUT_POSES
     findings = [finding for check in checks for finding in check(point)]
     if not model.can_rebuild:  # a diagram has no arguments
@@ -93,34 +81,31 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
 Found = Iterator[Finding]
 
 
-def _no_step(point: Place) -> Found:
+def _no_step(point: Point) -> Found:
     if point.step_error is not None:
         remedy = "choose x and u that `step` can take; if it names contact, see the finding pair_refused"
-        yield Finding("error", "no_step", "step", f"the double step fails here: {_short(point.step_error)}", remedy)
+        yield Finding("error", "no_step", "step", f"the double step fails here: {short(point.step_error)}", remedy)
 
 
-def _pd_gains(point: Place) -> Found:
+def _pd_gains(point: Point) -> Found:
     plant = point.model.plant
     for instance in instances(plant):
-        with_gains = [a for a in actuators(plant) if a.model_instance() == instance and a.has_controller()]
-        if not with_gains:
+        names = [a.name() for a in actuators(plant) if a.model_instance() == instance and a.has_controller()]
+        if not names:
             continue
-        message = "Drake's conversion to AutoDiffXd drops these PD gains; drake_diff puts them back"
-        if point.model.feeds(plant.get_desired_state_input_port(instance)):
-            message += "; their target is what your diagram feeds the desired state port"
-        else:
-            target = ", ".join(f"{value:g}" for value in point.model.pd_targets[instance])
-            message += f"; their target [q; v] is fixed at ({target}), the default position at rest"
+        target = "what your diagram feeds the desired state port"
+        if not point.model.feeds(plant.get_desired_state_input_port(instance)):
+            values = ", ".join(f"{value:g}" for value in point.model.pd_targets[instance])
+            target = f"[q; v] fixed at ({values}), the default position at rest"
+        message = f"Drake's conversion to AutoDiffXd drops these PD gains; drake_diff puts them back; target: {target}"
         remedy = "set the joints' default positions to move the target, or put the PD law in a policy of the rollout"
-        yield Finding("info", "pd_gains", ", ".join(a.name() for a in with_gains), message, remedy)
+        yield Finding("info", "pd_gains", ", ".join(names), message, remedy)
 
 
-def _identity_frame(point: Place) -> Found:
-    names = []
-    for joint in joints(point.model.plant):
-        frame = joint.frame_on_parent()
-        if isinstance(frame, FixedOffsetFrame) and not isinstance(joint, WeldJoint):
-            names += [joint.name()] if frame.GetFixedPoseInBodyFrame().IsExactlyIdentity() else []
+def _identity_frame(point: Point) -> Found:
+    movable = [joint for joint in joints(point.model.plant) if not isinstance(joint, WeldJoint)]
+    offsets = [(j.name(), j.frame_on_parent()) for j in movable if isinstance(j.frame_on_parent(), FixedOffsetFrame)]
+    names = [name for name, frame in offsets if frame.GetFixedPoseInBodyFrame().IsExactlyIdentity()]
     if names:
         message = (
             "the frame on the parent is exactly the identity, where Drake drops the derivative by the joint's offset; "
@@ -130,36 +115,34 @@ def _identity_frame(point: Place) -> Found:
         yield Finding("info", "identity_frame", ", ".join(names), message, remedy)
 
 
-def _joint_limit(point: Place) -> Found:
+def _joint_limit(point: Point) -> Found:
     names, limits = point.model.position_names, zip(*point.model.position_limits, strict=True)
     for name, q, (low, high) in zip(names, point.x[: point.model.nq], limits, strict=True):
-        if q <= low + AUDIT.at_limit or q >= high - AUDIT.at_limit:
+        if q <= low + AT_LIMIT or q >= high - AT_LIMIT:
             message = f"{q:.9g} is at or beyond its limits [{low:g}, {high:g}]: the derivative is that of one side"
             remedy = "start inside the limits, or use `smooth_step`, which averages over both sides"
             yield Finding("warning", "joint_limit", name, message, remedy)
 
 
-def _saturated_effort(point: Place) -> Found:
+def _saturated_effort(point: Point) -> Found:
     model, plant, twin = point.model, point.model.plant, point.model.double
     remedy = "stay inside the limit (the bounds of a Problem do), or raise it in the file"
-    yield from _left_out_actuators(model)
     if not model.nu:
         return
-    driven = [actuators(plant)[i] for i in model.inputs.actuator[model.inputs.actuator >= 0]]
-    u_own = point.u[model.inputs.actuator >= 0]
-    effort = u_own  # [N or N m] what the actuators apply: u with PD control, clamped; u alone if no step succeeds
+    is_effort = model.inputs.actuator >= 0
+    index = model.inputs.actuator[is_effort]
+    efforts = point.u[is_effort]  # [N or N m] with PD control, clamped; u alone if no step succeeds
     if point.step_error is None:
         advance(twin, point.x, point.u)
-        net = np.array(plant.get_net_actuation_output_port().Eval(twin.context))
-        effort = net[model.inputs.actuator[model.inputs.actuator >= 0]]
+        efforts = np.array(plant.get_net_actuation_output_port().Eval(twin.context))[index]
     set_state(twin, np.concatenate([point.x[: model.nq], np.zeros(model.nv)]))
     twin.set_input(point.u)
-    # The effort nearest to what no acceleration at rest takes.
-    B = model.actuation[:, model.inputs.actuator >= 0]
-    hold = np.linalg.lstsq(B, twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
-    for actuator, u, now, rest in zip(driven, u_own, effort, hold, strict=True):
+    # The efforts nearest to what no acceleration at rest takes.
+    hold = np.linalg.lstsq(model.actuation[:, is_effort], twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
+    for i, u, effort, rest in zip(index, point.u[is_effort], efforts, hold, strict=True):
+        actuator = actuators(plant)[i]
         limit = float(actuator.effort_limit())
-        if abs(now) >= limit:
+        if abs(effort) >= limit:
             corner = abs(u) == limit and not actuator.has_controller()
             slope = "that of the inside, and 0 outside" if corner else "exactly 0"
             message = f"its effort is at the limit {limit:g} (u is {u:.6g}): there the derivative by u is {slope}"
@@ -169,45 +152,38 @@ def _saturated_effort(point: Place) -> Found:
             yield Finding("warning", "saturated_effort", actuator.name(), message, remedy)
 
 
-def _left_out_actuators(model: Model) -> Found:
-    driven = {actuator.joint().name() for actuator in actuators(model.plant)}
-    for note in model.notes:
+def _zero_effort(point: Point) -> Found:
+    driven = {row.joint.name() for row in point.joints if row.driven}
+    for note in point.model.notes:
         joint = re.search(r'joint "([^"]+)" which has a zero effort limit', note)
         if joint and joint[1] not in driven:
             message = f"Drake leaves out actuators with an effort limit of 0, so there is no input: {note}"
-            remedy = (
-                "load_model(..., actuators=) drives the joint all the same, or give it an effort above 0 in the file"
-            )
+            remedy = "load_model(..., actuators=) drives the joint all the same, or give it an effort above 0"
             yield Finding("error", "saturated_effort", joint[1], message, remedy, {"actuators": [joint[1]]})
 
 
-def _jacobian(point: Place) -> Found:
+def _jacobian(point: Point) -> Found:
     if point.step_error is not None:
         return
-    result: StepDerivatives | DrakeDiffError = point.by_autodiff
+    result = point.by_autodiff
     if isinstance(result, ModelError):
         remedy = "give that system a scalar conversion (TemplateSystem), take it out, or accept differences"
         yield Finding("error", "autodiff_refused", "diagram", str(result), remedy)
     elif isinstance(result, SimulationError) and not any(pair.refused for pair in point.pairs):
         remedy = "leave out what it names, or accept differences (method finite_difference)"
-        yield Finding("error", "autodiff_refused", "step", f"the AutoDiffXd step throws: {_short(result)}", remedy)
+        yield Finding("error", "autodiff_refused", "step", f"the AutoDiffXd step throws: {short(result)}", remedy)
     if isinstance(result, ModelError | SimulationError):
-        try:
-            result = differentiate_step(point.model, point.x, point.u, method="finite_difference")
-        except (GradientError, SimulationError) as error:
-            result = error
+        result = point.differentiate("finite_difference")
     if isinstance(result, DrakeDiffError):
         remedy = "move x off the singular pose; `certify` shows which entry is wrong, `smooth_step` averages over it"
         yield Finding("error", "gradient_refused", "step", str(result), remedy)
         return
     jacobian = np.abs(np.hstack([result.A, result.B]))
     row, column = np.unravel_index(int(np.argmax(jacobian)), jacobian.shape)
-    if jacobian[row, column] > AUDIT.huge:
-        names, count = point.model.state_names, int(np.sum(jacobian > AUDIT.huge))
+    if jacobian[row, column] > HUGE:
+        names, count = point.model.state_names, int(np.sum(jacobian > HUGE))
         entry = f"d {names[row]} / d {(*names, *point.model.input_names)[column]}"
-        message = (
-            f"{entry} is {jacobian[row, column]:.3g} (by {result.method}), {count} entries are above {AUDIT.huge:g}"
-        )
+        message = f"{entry} is {jacobian[row, column]:.3g} (by {result.method}), {count} entries are above {HUGE:g}"
         remedy = (
             "contact_approximation sap has the tamest Jacobians; otherwise a shorter time step, softer contact or a "
             "longer relaxation time, lighter inertia ratios, or `smooth_step`"
@@ -215,229 +191,230 @@ def _jacobian(point: Place) -> Found:
         yield Finding("warning", "huge_jacobian", entry, message, remedy)
 
 
-def _mechanism(point: Place) -> Found:
-    plant, context = point.model.plant, point.model.double.context
-    mimics = () if point.model.coupling is not None else _mimics(point.model)
-    if mimics:
-        listed = "; ".join(map(str, mimics))
-        message = f"joints follow others, and stay in the state, held by constraints: {listed}"
-        if not all(m.in_drake for m in mimics):
-            message = f"joints should follow others, but Drake does not read that, and they move freely: {listed}"
+def _mimics(point: Point) -> Found:
+    moving = {joint.name() for joint in joints(point.model.plant) if joint.num_velocities()}
+    mimics = [m for m in point.model.file_facts.followers.values() if m.follower in moving]
+    if mimics and point.model.coupling is None:
+        says = "joints should follow others, but Drake does not read that, and they move freely"
+        if all(m.in_drake for m in mimics):
+            says = "joints follow others, and stay in the state, held by constraints"
         remedy = 'mimic="reduce" takes them out of the state, "fix" welds them; collocation and other engines need that'
-        followers = ", ".join(m.follower for m in mimics)
-        yield Finding("warning", "mimic_joint", followers, message, remedy, {"mimic": "reduce"})
+        subject, message = ", ".join(m.follower for m in mimics), f"{says}: {'; '.join(map(str, mimics))}"
+        yield Finding("warning", "mimic_joint", subject, message, remedy, {"mimic": "reduce"})
+
+
+def _constraints(point: Point) -> Found:
+    plant, context = point.model.plant, point.model.double.context
     if point.model.num_constraints:
         message = f"constraints in every step ({plant.num_constraints()}), which the implicit method cannot handle"
         remedy = "nothing to do: method auto takes autodiff; `certify` one state, as a few kinds have no AutoDiffXd"
         yield Finding("info", "constraints", "plant", message, remedy)
-    locked = [joint.name() for joint in joints(plant) if joint.is_locked(context)]
-    if locked:
-        message = (
-            "locked in the double context, which the AutoDiffXd twin does not know: where it would move there, the "
-            "derivative is refused"
-        )
+    if locked := [joint.name() for joint in joints(plant) if joint.is_locked(context)]:
+        message = "locked in the double context, of which the AutoDiffXd twin knows nothing: its derivative is refused"
         remedy = "weld it in the plant instead (WeldFrames), or joint.Unlock(model.double.context)"
         yield Finding("info", "locked_joint", ", ".join(locked), message, remedy)
 
 
-def _mimics(model: Model) -> tuple[Mimic, ...]:
-    """What the model's file says of joints that follow others and still can move."""
-    moving = {joint.name() for joint in joints(model.plant) if joint.num_velocities()}
-    return tuple(mimic for mimic in model.file_facts.followers.values() if mimic.follower in moving)
+def _undriven(point: Point) -> Found:
+    if point.model.source is None:
+        return
+    driven = sum(row.driven for row in point.joints)
+    undriven = [r for r in point.joints if not (r.driven or r.follows or (r.says is not None and r.says.passive))]
+    meant = [row.name for row in undriven if row.says is not None and (row.says.effort or 0) > 0]
+    remedy = 'load_model(..., actuators="all"), names of joints, or {joint: effort limit}; nothing if it is passive'
+    if undriven and not driven:
+        message = f"none of its {len(undriven)} joints has an actuator in the file, so that there is no input"
+        names, all_joints = listed(row.name for row in undriven), {"actuators": "all"}
+        yield Finding("warning", "no_actuator", names, message, remedy, all_joints)
+    elif meant:
+        message = f"{len(meant)} joints have an effort limit in the file and no actuator; {driven} others have one"
+        yield Finding("info", "undriven", listed(meant), message, remedy, {"actuators": meant})
 
 
-def _pair_refused(point: Place) -> Found:
-    severity: Severity = "error"
-    remedy = (
-        'load_model(..., contact_geometry="corner_spheres") replaces boxes, cylinders and capsules by spheres, '
-        '"hydroelastic" gives every geometry a mesh, "differences" differences the step by choice; or filter the pair '
-        "(CollisionFilterDeclaration, or <drake:collision_filter_group> in the file) if it never touches"
-    )
-    if point.model.contact_geometry == "differences":
-        severity = "info"
-        remedy = "nothing to do: it is differenced by choice, which needs method auto or finite_difference"
-    groups: dict[tuple[str, str], list[Pair]] = {}
-    for pair in point.pairs:
-        if pair.refused:
-            groups.setdefault(pair.bodies, []).append(pair)
-    by_choice = severity == "info"
-    named, rest = list(groups)[: AUDIT.pairs_told], list(groups)[AUDIT.pairs_told :]
-    for bodies in named:
-        arguments = {} if by_choice else _route(point.model, groups[bodies])
-        advice = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
-        message = _refusal(point, groups[bodies])
-        yield Finding(severity, "pair_refused", " - ".join(bodies), message, advice, arguments)
-    if rest:
-        pairs = [pair for bodies in rest for pair in groups[bodies]]
-        arguments = {} if by_choice else _route(point.model, pairs)
-        advice = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
-        listed = ", ".join(" - ".join(bodies) for bodies in rest[: AUDIT.pairs_told])
-        message = f"of such shapes, too: {listed}" + (" ..." if len(rest) > AUDIT.pairs_told else "")
-        yield Finding(severity, "pair_refused", f"{len(rest)} more pairs of links", message, advice, arguments)
+def _lost_armature(point: Point) -> Found:
+    lost = [row.name for row in point.joints if not row.driven and row.says is not None and row.says.armature]
+    if lost:
+        message = "Drake has the armature of a joint only with an actuator on it: here their inertia is too small"
+        remedy = "load_model(..., actuators=) with these joints"
+        yield Finding("warning", "lost_armature", listed(lost), message, remedy, {"actuators": lost})
 
 
-def _route(model: Model, pairs: list[Pair]) -> dict[str, Any]:
-    """The arguments with which these pairs are differentiated."""
-    if model.plant.get_contact_model() != ContactModel.kPoint:
-        return {"contact_geometry": "hydroelastic"}
-    kinds = {collider.kind for pair in pairs for collider in (pair.a, pair.b)}
-    if kinds <= MEETS_A_SPHERE:
-        return {"contact_geometry": "corner_spheres"}
-    from_meshes = model.source is not None and model.source.suffix in (".urdf", ".sdf")
-    if from_meshes and kinds <= MEETS_A_SPHERE | {"Mesh", "Convex"}:
-        return {"meshes": "spheres", "contact_geometry": "corner_spheres"}
-    return {"contact_geometry": "differences"}
+def _left_out_actuators(point: Point) -> Found:
+    missing = [row.name for row in point.joints if row.left_out and not row.driven]
+    others = any(not joint for _, joint in point.model.file_facts.left_out)  # of tendons and sites
+    for note in point.model.notes:
+        match = re.match(r"(\d+ actuators left out)[^:]*: (.*)\.$", note)
+        if match and (missing or others):
+            message = f"{match[1]}, of kinds or transmissions that Drake does not read: {match[2]}"
+            remedy = "drive joints with a torque, load_model(..., actuators=), or write the file with motors"
+            arguments = {"actuators": missing} if missing and not others else {}
+            yield Finding("warning", "left_out", "actuators", message, remedy, arguments)
 
 
-def _refusal(point: Place, pairs: list[Pair]) -> str:
-    sides = (dict.fromkeys(p.a.label for p in pairs), dict.fromkeys(p.b.label for p in pairs))
-    names, error = " against ".join(", ".join(side) for side in sides), point.by_autodiff
-    if any(pair.contact == "none" for pair in pairs):
-        why = "hydroelastic contact alone needs properties on both, one of them not rigid; the double step throws too"
-    else:
-        why = "AutoDiffXd has no point contact between these shapes, and throws once their bounding boxes meet"
-    if any("HalfSpace" in (p.a.kind, p.b.kind) for p in pairs):
-        why += ", and that of a tilted half space is infinite: it throws without touching"
-    if not isinstance(error, SimulationError):
-        return f"{names}: {why}. The AutoDiffXd step does not throw at x."
-    if any(p.a.kind.lower() in str(error).lower() and p.b.kind.lower() in str(error).lower() for p in pairs):
-        return f"{names}: {why}. The AutoDiffXd step throws at x over such shapes: {_short(error)}."
-    return f"{names}: {why}. At x the AutoDiffXd step throws over another pair: {_short(error)}."
+def _switched_off(point: Point) -> Found:
+    off, gravity = point.model.file_facts.disabled, point.model.plant.gravity_field().gravity_vector()
+    message = "the file switches it off, and Drake has it all the same"
+    if off & {"contact", "constraint"} and point.pairs:
+        remedy = "load_model(..., contact=False)"
+        yield Finding("warning", "switched_off", "contact", message, remedy, {"contact": False})
+    if "gravity" in off and np.any(gravity):
+        remedy = "load_model(..., gravity=[0, 0, 0])"
+        yield Finding("warning", "switched_off", "gravity", message, remedy, {"gravity": [0.0, 0.0, 0.0]})
 
 
-def _aligned_faces(point: Place) -> Found:
-    remedy = (
-        'load_model(..., contact_model="point", contact_geometry="corner_spheres") replaces one of them by spheres; '
-        "or start tilted by 0.03 rad or more and `certify` the "
-        "poses in contact: near the aligned pose too (measured: up to 1e-3 rad, cylinder on cylinder up to 0.04) the "
-        "meshes' edges make the step jump"
-    )
-    for pair in point.pairs:
-        angle, gap = _alignment(pair) if pair.contact == "hydroelastic" else (None, np.inf)
-        if angle is None:
-            continue
-        severity: Severity = "info"
-        consequence = "tilted now; if they come to lie flat the hydroelastic step jumps"
-        if angle <= PARALLEL and gap <= AUDIT.reach:
-            severity = "error"
-            consequence = "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
-        elif angle <= AUDIT.nearly_parallel:
-            severity, consequence = "warning", "if they meet like this the hydroelastic step jumps"
-        message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: {consequence}"
-        arguments = {} if severity == "info" else {"contact_model": "point", "contact_geometry": "corner_spheres"}
-        yield Finding(severity, "aligned_faces", pair.label, message, remedy, arguments)
-
-
-def _alignment(pair: Pair) -> tuple[float | None, float]:
-    """The angle [rad] between the two nearest face normals, and the gap [m] along them; None without flat faces.
-
-    The gap is negative where the boxes overlap. Drake's mesh of a round shape counts as flat too, where its centre
-    lies in a plane of symmetry of a box's mesh or in an upright one of a cylinder's.
-    """
-    for first, other in ((pair.a, pair.b), (pair.b, pair.a)):
-        if first.kind in ROUND and other.kind in ("Box", "Cylinder"):
-            offset = other.pose.inverse() @ first.pose.translation()
-            if np.min(np.abs(offset[: 3 if other.kind == "Box" else 2])) > AUDIT.in_plane:
-                return None, np.inf
-    faces = [(n, m) for n in _normals(pair.a, pair.b) for m in _normals(pair.b, pair.a)]
-    if not faces:
-        return None, np.inf
-    gaps = []
-    for direction in (n for both in faces for n in both):
-        (low_a, high_a), (low_b, high_b) = pair.a.extent(direction), pair.b.extent(direction)
-        gaps.append(max(low_a - high_b, low_b - high_a))
-    return min(float(np.linalg.norm(np.cross(n, m))) for n, m in faces), max(gaps)
-
-
-def _normals(collider: Collider, other: Collider) -> list[Array]:
-    """The normals of its flat faces, or of the planes that its mesh lines up with."""
-    meshed = other.kind in ("Box", "Cylinder")
-    if collider.kind == "Box" or (collider.kind in ("Sphere", "Ellipsoid") and meshed):
-        return [collider.axis(i) for i in range(3)]
-    upright = collider.kind in ("Cylinder", "HalfSpace") or (collider.kind == "Capsule" and meshed)
-    return [collider.axis(2)] if upright else []
-
-
-def _cylinder_axis(point: Place) -> Found:
-    beside: dict[str, float] = {}  # [m]
-    remedy = "move the sphere off the axis by 1e-6 m or more, or replace the cylinder by a box"
-    for pair in point.pairs:
-        both = pair.of_kinds(Sphere, Cylinder)
-        if both is None or pair.contact != "point":
-            continue
-        offset = both[0].pose.translation() - both[1].pose.translation()
-        distance = float(np.linalg.norm(np.cross(both[1].axis(2), offset)))
-        if distance >= AUDIT.on_axis:
-            beside[pair.label] = distance
-            continue
-        consequence = "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
-        message = f"the sphere's centre is {distance:.3g} m from the cylinder's axis: {consequence}"
-        yield Finding("error", "cylinder_axis", pair.label, message, remedy)
-    if beside:
-        subject = next(iter(beside)) if len(beside) == 1 else f"{len(beside)} pairs"
-        consequence = "exactly on it AutoDiffXd would be singular"
-        message = f"the sphere's centre is {min(beside.values()):.3g} m from the cylinder's axis: {consequence}"
-        yield Finding("info", "cylinder_axis", subject, message, remedy)
-
-
-def _default_decides(point: Place) -> Found:
-    sap = point.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
-    groups: dict[tuple[str, ...], list[Collider]] = {}
-    for collider in point.colliders.values():
-        contacts = {pair.contact for pair in point.pairs if collider in (pair.a, pair.b)}
-        read = ["friction", "relaxation_time" if sap else "dissipation"]  # by the step
-        read += ["stiffness"] * ("point" in contacts)
-        read += ["hydroelastic_modulus"] * ("hydroelastic" in contacts and collider.compliance == "compliant")
-        missing = tuple(name for name in read if not collider.own.HasProperty(*PROXIMITY[name]))
-        if missing:
-            groups.setdefault(missing, []).append(collider)
-    for missing, colliders in groups.items():
-        values = {name: _value(colliders[0], name) for name in missing}
-        defaults = ", ".join(f"{PROXIMITY[name][1]} {value}" for name, value in values.items())
-        message = f"not given, so the scene graph's default decides: {defaults}"
-        if values.get("relaxation_time") == "0.1 s":
-            message += " (with which a ball hardly bounces)"
-        tags = ", ".join(f"drake:{'mu_dynamic' if name == 'friction' else PROXIMITY[name][1]}" for name in missing)
-        remedy = f"give them in <drake:proximity_properties> ({tags}) or in the geometry's ProximityProperties"
-        yield Finding("warning", "default_decides", ", ".join(c.label for c in colliders), message, remedy)
-
-
-def _value(collider: Collider, name: str) -> str:
-    """The number that Drake uses, with its unit."""
-    if not collider.all.HasProperty(*PROXIMITY[name]):
-        return "(Drake's own)"
-    value = collider.all.GetProperty(*PROXIMITY[name])
-    return f"{value.dynamic_friction() if name == 'friction' else value:g}{UNITS[name]}"
-
-
-def _touching(point: Place) -> Found:
+def _massless(point: Point) -> Found:
+    plant = point.model.plant
+    for base in sorted(plant.GetFloatingBaseBodies()):
+        welded = plant.GetBodiesWeldedTo(plant.get_body(base))
+        if sum(body.default_mass() for body in welded) == 0:
+            message = "it has no mass and floats, so that nothing holds up what hangs on it and the step is singular"
+            carries = any(joint.num_velocities() and joint.parent_body() in welded for joint in joints(plant))
+            remedy = 'load_model(..., base="weld") if it stands fixed, else ' if carries else ""
+            remedy, arguments = f"{remedy}give it a mass in the file", {"base": "weld"} if carries else {}
+            yield Finding("error", "massless_root", plant.get_body(base).name(), message, remedy, arguments)
     set_state(point.model.double, point.x)
-    unmeasured = []
-    for pair in point.pairs:
-        try:
-            distance = point.query.ComputeSignedDistancePairClosestPoints(pair.a.id, pair.b.id).distance
-        except RuntimeError:  # no such distance between these shapes
-            unmeasured.append(pair.label)
+    mass = np.diag(plant.CalcMassMatrix(point.model.double.context))
+    light = [row.name for row in point.joints if mass[row.joint.velocity_start()] < NO_MASS]
+    if light:
+        message = "nothing that they move has a mass or an inertia, so that the step is singular"
+        fixed = _fixed(point, light)
+        remedy = "load_model(..., fix_joints=) fixes them, or give the links a mass in the file"
+        remedy = remedy if fixed else "give the links a mass in the file"
+        yield Finding("error", "massless_joint", listed(light), message, remedy, fixed)
+
+
+def _fixed(point: Point, names: list[str]) -> dict[str, Any]:
+    """The argument that fixes these joints, none where nothing could move then."""
+    return {"fix_joints": names} if len(names) < point.model.plant.num_velocities() else {}
+
+
+def _skipped_meshes(point: Point) -> Found:
+    for note in point.model.notes:
+        if re.search(r"\bmeshes skipped", note):
+            remedy = 'load_model(..., meshes="convex") or "spheres" takes collision meshes; packages= says where'
+            summary = note.split(":")[0].split("; ")[0]
+            arguments = {"meshes": "spheres"} if SKIPPED.match(note) else {}
+            severity: Severity = "warning" if "collision" in note else "info"
+            yield Finding(severity, "meshes_skipped", "meshes", summary, remedy, arguments)
+
+
+def _lost_shapes(point: Point) -> Found:
+    model, scene_graph = point.model, point.model.double.scene_graph
+    if scene_graph is None or (model.options or {}).get("contact") is False:
+        return
+    with_shapes = {body.index() for body, _ in collision_geometries(model.plant, scene_graph)}
+    given = [b for b in bodies(model.plant) if (says := point.link_says(b)) is not None and says.collisions]
+    lost = [body.name() for body in given if body.index() not in with_shapes]
+    if lost:
+        much = "no collision shape of the file is left" if len(lost) == len(given) else "they have lost all shapes"
+        remedy = 'load_model(..., meshes="convex") or "spheres"; contact=False says that nothing is to touch'
+        arguments = {"meshes": "spheres"} if _has_usable_meshes(point) else {"contact": False}
+        message = f"{much}, so that they pass through things"
+        yield Finding("warning", "collision_gone", listed(lost), message, remedy, arguments)
+
+
+def _has_usable_meshes(point: Point) -> bool:
+    """Whether collision meshes were left out that `meshes="convex"` would take."""
+    return any(SKIPPED.match(note) for note in point.model.notes)
+
+
+def _falls(point: Point) -> Found:
+    plant, scene_graph = point.model.plant, point.model.double.scene_graph
+    if not np.any(plant.gravity_field().gravity_vector()) or scene_graph is None:
+        return
+    fixed = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    floating = {joint.child_body().index(): joint for joint in joints(plant) if joint.type_name() in FLOATING}
+    shapes = {body.name() for body, _ in collision_geometries(plant, scene_graph)}
+    for base in sorted(plant.GetFloatingBaseBodies()):
+        affected = plant.GetBodiesKinematicallyAffectedBy([floating[base].index()])
+        tree = {plant.get_body(index).name() for index in affected}
+        moves = sum(j.num_velocities() > 0 and j.child_body().name() in tree for j in joints(plant)) > 1
+        stands = any(set(pair.bodies) & tree and set(pair.bodies) & fixed for pair in point.pairs)
+        if stands or not (moves or shapes & tree):
             continue
-        exact = {pair.a.kind, pair.b.kind} <= MEETS_A_SPHERE and pair.of_kinds(Sphere, object) is not None
-        if abs(distance) < (AUDIT.touch if exact or pair.of_kinds(Box, Box) else AUDIT.rough_touch):
-            message = f"exactly at touch (signed distance {distance:.2g} m): the derivative is that of one side"
-            remedy = "start a little apart or a little in contact, or use `smooth_step`"
-            yield Finding("warning", "touching", pair.label, message, remedy)
-    if unmeasured:
-        message = "Drake computes no distance between these, so whether they are exactly at touch is not known"
-        remedy = "compare x with x moved by 1e-6 m yourself, or replace one of them by spheres (corner_spheres)"
-        yield Finding("info", "not_measured", ", ".join(unmeasured), message, remedy)
+        why, arguments = "there is nothing fixed below it that it could touch", dict[str, Any](ground=True)
+        if not shapes & tree:
+            why = "nothing of it can touch, as it has no collision shapes"
+            arguments = {"meshes": "spheres", "ground": True} if _has_usable_meshes(point) else {"base": "weld"}
+        message = f"it floats and falls for ever: {why}"
+        remedy = (
+            'load_model(..., ground=True), with meshes="convex" or "spheres" if it has no shapes; base="weld" if it '
+            "stands fixed, or nothing if it flies"
+        )
+        yield Finding("warning", "falls", plant.get_body(base).name(), message, remedy, arguments)
 
 
-def _short(error: DrakeDiffError) -> str:
-    return str(error).removeprefix("Drake cannot take this step: ").split(". ")[0].rstrip(".")
+def _invented_inertia(point: Point) -> Found:
+    plant = point.model.plant
+    fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    kinds: dict[tuple[Severity, str], list[str]] = {}
+    for body in bodies(plant):
+        says = point.link_says(body)
+        if says is not None and int(body.index()) not in fixed and (kind := _invention(body, says)):
+            kinds.setdefault(kind, []).append(body.name())
+    for (severity, message), names in kinds.items():
+        remedy = "give a mass above 0, and an inertia whose moments each are at most the sum of the other two"
+        yield Finding(severity, "invented_inertia", listed(names), message, remedy)
 
 
-_CHECKS_WITHOUT_POSES: tuple[Callable[[Place], Found], ...] = (_no_step, _pd_gains, _identity_frame, _joint_limit)
+def _invention(body: Any, says: Any) -> tuple[Severity, str] | None:
+    inertia = body.default_spatial_inertia()
+    mass, about_center = inertia.get_mass(), inertia.Shift(inertia.get_com()).CalcRotationalInertia()
+    trace = float(np.trace(about_center.CopyToFullMatrix3()))
+    if says.mass is None and says.defaults:
+        return "warning", "the file gives no mass, so that it is the format's own, 1 kg"
+    if says.mass is not None and not np.isclose(mass, says.mass, rtol=SAME_MASS, atol=0):
+        message = f"the file's mass {says.mass:g} kg goes with no inertia; Drake takes {mass:g} kg, a ball of water"
+        return "error", message
+    if says.trace is None and says.defaults:
+        return "warning", "the file gives no inertia, so that it is the format's own, 1 kg m^2 about each axis"
+    if says.trace is not None and not np.isclose(trace, says.trace, rtol=SAME_MASS, atol=1e-12):
+        return "warning", "no body can have the file's inertia; Drake takes that of a ball of water of the same mass"
+    return None
+
+
+def _ignored(point: Point) -> Found:
+    kinds = Counter[str]()
+    for note in point.model.notes:
+        first = re.sub(r"^.*?warning: ", "", note.splitlines()[0])
+        first = re.sub(r"(Skipping transmission since it's attached to a fixed joint).*", r"\1", first)
+        if IGNORED.search(first) and "meshes skipped" not in first:
+            kinds[re.sub(r"(joint|link|geom) '?[\w/.:-]+'?(?= has)|'-?[\d.eE+-]+'", r"\1 ...", first)] += 1
+    for kind, count in kinds.items():
+        quoted = re.search(r"'([^']+)'", kind)
+        severity: Severity = "info" if any(word in kind for word in HARMLESS) else "warning"
+        message = f"{count} times in the file, and Drake does not read it: {kind}"
+        remedy = "nothing if it does not matter, else say it in a way that Drake reads, or change the plant"
+        yield Finding(severity, "ignored", quoted[1] if quoted else "file", message, remedy)
+
+
+def _zero_limits(point: Point) -> Found:
+    kinds: dict[tuple[str, str], list[str]] = {}
+    for row in point.joints:
+        joint, mended = row.joint, "mimic" if row.follows else "" if row.driven else "actuators"
+        low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
+        if joint.velocity_lower_limits()[0] == 0 == joint.velocity_upper_limits()[0]:
+            kinds.setdefault(("the velocity limit is 0", mended), []).append(row.name)
+        if low == high:
+            mended = "" if mended == "actuators" and low else mended
+            kinds.setdefault((f"the position limits are both {low:g}", mended), []).append(row.name)
+    for (kind, mended), names in kinds.items():
+        arguments = _fixed(point, names)
+        remedy = "load_model(..., fix_joints=) fixes such joints there" if arguments else "give it limits in the file"
+        if mended == "actuators":
+            arguments = {"actuators": names}
+            remedy = "load_model(..., actuators=) takes limits of 0 of joints that it drives as none; or fix_joints="
+        elif mended == "mimic":
+            remedy, arguments = 'load_model(..., mimic="fix") welds joints that follow others', {"mimic": "fix"}
+        yield Finding("error", "zero_limit", listed(names), f"{kind}: no plan can move what has it", remedy, arguments)
+
+
+_CHECKS_WITHOUT_POSES: tuple[Callable[[Point], Found], ...] = (_no_step, _pd_gains, _identity_frame, _joint_limit)
 _CHECKS = (
     *_CHECKS_WITHOUT_POSES,
-    *(_pair_refused, _aligned_faces, _cylinder_axis, _default_decides, _touching),
-    *(_saturated_effort, _jacobian, _mechanism),
-    *FILE_CHECKS,
+    *(refused_pairs, aligned_faces, spheres_on_axes, contact_defaults, unread_compliance, pairs_at_touch),
+    *(inseparable, corners_on_both_sides),
+    *(_saturated_effort, _zero_effort, _jacobian, _mimics, _constraints),
+    *(_undriven, _lost_armature, _left_out_actuators, _switched_off, _massless, _skipped_meshes, _lost_shapes),
+    *(_falls, _invented_inertia, _ignored, _zero_limits),
 )

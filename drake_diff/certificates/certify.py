@@ -295,21 +295,6 @@ def solver_tolerance(model: Model, x: Array, u: Array) -> float:
     return SAP_RELATIVE_TOLERANCE if solves else 0.0
 
 
-def unsolved(model: Model, x_next: Array) -> Array:
-    """(size,) how wrong a step that ends at `x_next` (nx,) may be because SAP stopped at 1e-6 of the momentum.
-
-    Velocities in the norm by which SAP compares momenta, positions by what these do in a step. The double twin is at
-    the step; the momentum that gravity gives in it is among what SAP compares with.
-    """
-    plant, context = model.plant, model.double.context
-    mass, v = model.double.mass_matrix(), x_next[model.nq :]
-    weight = np.sqrt(np.diag(mass))
-    given = model.time_step * model.double.own_force(np.asarray(plant.CalcGravityGeneralizedForces(context)))
-    momentum = max(float(np.linalg.norm(p / weight)) for p in (mass @ v, given))
-    speed = SAP_RELATIVE_TOLERANCE * momentum / weight
-    return np.concatenate([model.time_step * speed, speed])
-
-
 def in_steps(model: Model, space: TangentSpace, n: int) -> tuple[Array, Array]:
     """The units of the state (size,), and of `n` columns that begin with it, where time is counted in steps."""
     state = np.where(np.arange(space.size) < space.size - model.nv, 1.0, 1 / model.time_step)

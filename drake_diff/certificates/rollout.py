@@ -26,14 +26,7 @@ from drake_diff.certificates.displaced import (
     stairs_of_policy,
     wrong_derivative,
 )
-from drake_diff.certificates.truth import (
-    SECONDS,
-    Refinement,
-    Truth,
-    by_truth,
-    refine_by_time_step,
-    truth_of,
-)
+from drake_diff.certificates.truth import SECONDS, Refinement, Truth, by_truth, refine_by_time_step, truth_of
 from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import CertificateError, GradientWarning, InputError, ModelError, SimulationError
 from drake_diff.model.model import Model
@@ -307,11 +300,7 @@ def certify_rollout(
 
 
 def _check_arguments(
-    us: ArrayLike | None,
-    policy: Policy | None,
-    refine: bool,
-    sampled: bool,
-    is_continuous: bool,
+    us: ArrayLike | None, policy: Policy | None, refine: bool, sampled: bool, is_continuous: bool
 ) -> None:
     """Raise InputError where two of them do not go together."""
     if us is not None and policy is not None:

@@ -192,12 +192,7 @@ class RefinedSteps:
 
 
 def refine_steps(
-    model: Model,
-    vector: ParameterVector,
-    xs: Array,
-    us: Array,
-    values: Array | None = None,
-    held: Array | None = None,
+    model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None = None, held: Array | None = None
 ) -> RefinedSteps:
     """The steps from each of xs (N, nx) under each of us (N, nu); many in one call cost far less than one by one.
 

@@ -126,14 +126,7 @@ TRAPS = [
         {"contact": False},
     ),
     ("falls", "warning", FREE, {}, r"base\): it floats and falls for ever: there is nothing fixed", {"ground": True}),
-    (
-        "falls",
-        "warning",
-        FREE.replace(BOX, ""),
-        {"ground": True},
-        "as it has no collision shapes",
-        {"base": "weld"},
-    ),
+    ("falls", "warning", FREE.replace(BOX, ""), {"ground": True}, "as it has no collision shapes", {"base": "weld"}),
     (
         "invented_inertia",
         "error",
@@ -291,14 +284,7 @@ TRAPS = [
         r"wrist\): joints follow others",
         {"mimic": "reduce"},
     ),
-    (
-        "pair_refused",
-        "error",
-        FREE,
-        {"ground": True},
-        r"ground \(HalfSpace\)",
-        {"contact_geometry": "corner_spheres"},
-    ),
+    ("pair_refused", "error", FREE, {"ground": True}, r"ground \(HalfSpace\)", {"contact_geometry": "corner_spheres"}),
     (
         "pair_refused",
         "error",
@@ -369,7 +355,7 @@ TRAPS += [
         {},
         r"wrist\): the velocity limit is 0",
         {"mimic": "fix"},
-    ),
+    )
 ]
 SWING = '<body name="a"><joint name="j" axis="0 1 0" {}/><geom size="0.1" mass="1"/></body>'
 MJCF = f'<mujoco model="m">{{}}<worldbody><geom type="plane" size="9 9 1"/>{SWING}</worldbody>{{}}</mujoco>'
@@ -414,14 +400,7 @@ TRAPS += [
         r"gravity\): the file switches it off",
         {"gravity": [0.0, 0.0, 0.0]},
     ),
-    (
-        "never_apart",
-        "warning",
-        sdf(""),
-        {},
-        r"a - b\): they overlap wherever the joints are",
-        {"contact": "separable"},
-    ),
+    ("never_apart", "warning", sdf(""), {}, r"a - b\): they overlap wherever the joints are", {"contact": "separable"}),
 ]
 
 

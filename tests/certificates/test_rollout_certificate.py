@@ -268,10 +268,7 @@ def rounded(values, step):
 def test_a_staircase_in_the_loss_is_discontinuous(load, step):
     """Its derivative by AutoDiffXd is 0, or that of the line through the stairs; both are told from the loss alone."""
     model, us = load("cart_pole.urdf"), np.zeros((3, 1))
-    for loss in (
-        lambda x: x @ x + rounded(x, step)[1],
-        lambda x: x @ x + x[1] + rounded(x, step)[1] - plain(x)[1],
-    ):
+    for loss in (lambda x: x @ x + rounded(x, step)[1], lambda x: x @ x + x[1] + rounded(x, step)[1] - plain(x)[1]):
         for sampled in (False, True):
             found = dd.certify_rollout(model, X0, us, loss, sampled=sampled)
             assert found.verdict == "discontinuous"

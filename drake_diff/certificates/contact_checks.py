@@ -1,0 +1,273 @@
+"""The checks of an audit that concern contact; their numbers were measured on the Drake of this package's tests."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.multibody.plant import ContactModel
+
+from drake_diff._base.arrays import Array
+from drake_diff.certificates.finding import PARALLEL, Collider, ColliderPair, Finding, Point, Severity, listed
+from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
+from drake_diff.model.contact_geometry import MEETS_A_SPHERE, inseparable_pairs, links_of
+from drake_diff.model.plant import PROXIMITY, bodies, joints
+from drake_diff.model.step import set_state
+
+
+@dataclass(frozen=True)
+class ContactCheckOptions:
+    """What the checks of contact take for near and many."""
+
+    pairs: int = 6  # of links, each with a finding of its own; a humanoid has hundreds
+    nearly_parallel: float = 1e-2  # [rad]: jumps were measured up to 1e-3 and beyond
+    in_plane: float = 1e-6  # [m] from a plane of symmetry
+    reach: float = 1e-3  # [m] faces nearer than this count as touching
+    on_axis: float = 1e-9  # [m] from a sphere's centre to a cylinder's axis
+    touch: float = 1e-9  # [m] of signed distance, where Drake computes it exactly
+    rough_touch: float = 1e-6  # [m] where it iterates (measured: 1e-7 off for an ellipsoid)
+
+
+OPTIONS = ContactCheckOptions()
+ROUND = ("Sphere", "Ellipsoid", "Capsule")
+UNITS = dict(zip(PROXIMITY, ("", " N/m", " s/m", " s", " Pa"), strict=True))
+CORNER = re.compile(r"_corner_\d+ \(Sphere\)$")  # what replace_collision_geometry calls its spheres
+
+
+def short(error: DrakeDiffError) -> str:
+    """The first sentence of an error of a step."""
+    return str(error).removeprefix("Drake cannot take this step: ").split(". ")[0].rstrip(".")
+
+
+def refused_pairs(point: Point) -> Iterator[Finding]:
+    """Pairs that AutoDiffXd refuses, by their links."""
+    by_choice = point.model.contact_geometry == "differences"
+    groups: dict[tuple[str, str], list[ColliderPair]] = {}
+    for pair in point.pairs:
+        if pair.refused:
+            groups.setdefault(pair.bodies, []).append(pair)
+    rows = [
+        (" - ".join(links), _refusal(point, pairs), pairs) for links, pairs in list(groups.items())[: OPTIONS.pairs]
+    ]
+    if rest := list(groups)[OPTIONS.pairs :]:
+        message = f"of such shapes, too: {listed(' - '.join(links) for links in rest)}"
+        rows.append((f"{len(rest)} more pairs of links", message, [pair for links in rest for pair in groups[links]]))
+    for subject, message, pairs in rows:
+        arguments = {} if by_choice else _route(point, pairs)
+        remedy = (
+            'load_model(..., contact_geometry="corner_spheres") replaces boxes, cylinders and capsules by spheres, '
+            '"hydroelastic" gives every geometry a mesh, "differences" differences the step by choice; or filter the '
+            "pair (CollisionFilterDeclaration, or <drake:collision_filter_group> in the file) if it never touches"
+        )
+        if by_choice:
+            remedy = "nothing to do: it is differenced by choice, which needs method auto or finite_difference"
+        elif "meshes" in arguments:
+            remedy = f'meshes="spheres" and {remedy}'
+        yield Finding("info" if by_choice else "error", "pair_refused", subject, message, remedy, arguments)
+
+
+def _route(point: Point, pairs: list[ColliderPair]) -> dict[str, Any]:
+    """The arguments with which these pairs are differentiated."""
+    kinds, source = {kind for pair in pairs for kind in pair.kinds}, point.model.source
+    if point.model.plant.get_contact_model() != ContactModel.kPoint:
+        return {"contact_geometry": "hydroelastic"}
+    if kinds <= MEETS_A_SPHERE:
+        return {"contact_geometry": "corner_spheres"}
+    if source is not None and source.suffix in (".urdf", ".sdf") and kinds <= MEETS_A_SPHERE | {"Mesh", "Convex"}:
+        return {"meshes": "spheres", "contact_geometry": "corner_spheres"}
+    return {"contact_geometry": "differences"}
+
+
+def _refusal(point: Point, pairs: list[ColliderPair]) -> str:
+    sides = (dict.fromkeys(p.a.label for p in pairs), dict.fromkeys(p.b.label for p in pairs))
+    names, error = " against ".join(", ".join(side) for side in sides), point.by_autodiff
+    why = "AutoDiffXd has no point contact between these shapes, and throws once their bounding boxes meet"
+    if any(pair.contact == "none" for pair in pairs):
+        why = "hydroelastic contact alone needs properties on both, one of them not rigid; the double step throws too"
+    if any("HalfSpace" in pair.kinds for pair in pairs):
+        why += ", and that of a tilted half space is infinite: it throws without touching"
+    if not isinstance(error, SimulationError):
+        return f"{names}: {why}. The AutoDiffXd step does not throw at x."
+    named = any(all(kind.lower() in str(error).lower() for kind in pair.kinds) for pair in pairs)
+    over = "over such shapes" if named else "over another pair"
+    return f"{names}: {why}. The AutoDiffXd step throws at x {over}: {short(error)}."
+
+
+def aligned_faces(point: Point) -> Iterator[Finding]:
+    """Flat faces that meet in hydroelastic contact, where the step jumps."""
+    remedy = (
+        'load_model(..., contact_model="point", contact_geometry="corner_spheres") replaces one of them by spheres; or '
+        "start tilted by 0.03 rad or more (cylinder on cylinder 0.04) and `certify` the poses in contact"
+    )
+    for pair in point.pairs:
+        angle, gap = _alignment(pair) if pair.contact == "hydroelastic" else (None, np.inf)
+        if angle is None:
+            continue
+        severity: Severity = "info"
+        consequence = "tilted now; if they come to lie flat the hydroelastic step jumps"
+        if angle <= PARALLEL and gap <= OPTIONS.reach:
+            severity = "error"
+            consequence = "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
+        elif angle <= OPTIONS.nearly_parallel:
+            severity, consequence = "warning", "if they meet like this the hydroelastic step jumps"
+        message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: {consequence}"
+        arguments = {} if severity == "info" else {"contact_model": "point", "contact_geometry": "corner_spheres"}
+        yield Finding(severity, "aligned_faces", pair.label, message, remedy, arguments)
+
+
+def _alignment(pair: ColliderPair) -> tuple[float | None, float]:
+    """The angle [rad] between the two nearest face normals, and the gap [m] along them; None without flat faces.
+
+    The gap is negative where the boxes overlap. Drake's mesh of a round shape counts as flat too, where its centre
+    lies in a plane of symmetry of a box's mesh or in an upright one of a cylinder's.
+    """
+    for first, other in ((pair.a, pair.b), (pair.b, pair.a)):
+        if first.kind in ROUND and other.kind in ("Box", "Cylinder"):
+            offset = other.pose.inverse() @ first.pose.translation()
+            if np.min(np.abs(offset[: 3 if other.kind == "Box" else 2])) > OPTIONS.in_plane:
+                return None, np.inf
+    faces = [(n, m) for n in _normals(pair.a, pair.b) for m in _normals(pair.b, pair.a)]
+    if not faces:
+        return None, np.inf
+    gaps = []
+    for direction in (n for both in faces for n in both):
+        (low_a, high_a), (low_b, high_b) = pair.a.extent(direction), pair.b.extent(direction)
+        gaps.append(max(low_a - high_b, low_b - high_a))
+    return min(float(np.linalg.norm(np.cross(n, m))) for n, m in faces), max(gaps)
+
+
+def _normals(collider: Collider, other: Collider) -> list[Array]:
+    """The normals of its flat faces, or of the planes that its mesh lines up with."""
+    meshed = other.kind in ("Box", "Cylinder")
+    if collider.kind == "Box" or (collider.kind in ("Sphere", "Ellipsoid") and meshed):
+        return [collider.axis(i) for i in range(3)]
+    upright = collider.kind in ("Cylinder", "HalfSpace") or (collider.kind == "Capsule" and meshed)
+    return [collider.axis(2)] if upright else []
+
+
+def spheres_on_axes(point: Point) -> Iterator[Finding]:
+    """Spheres on a cylinder's axis, where AutoDiffXd is singular."""
+    distances: dict[str, float] = {}  # [m]
+    for pair in point.pairs:
+        both = pair.in_order("Sphere", "Cylinder")
+        if both is not None and pair.contact == "point":
+            offset = both[0].pose.translation() - both[1].pose.translation()
+            distances[pair.label] = float(np.linalg.norm(np.cross(both[1].axis(2), offset)))
+    consequences: dict[bool, tuple[Severity, str]] = {
+        True: ("error", "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"),
+        False: ("info", "exactly on it AutoDiffXd would be singular"),
+    }
+    for on_axis, (severity, consequence) in consequences.items():
+        labels = [label for label, distance in distances.items() if (distance < OPTIONS.on_axis) == on_axis]
+        if labels:
+            nearest = min(distances[label] for label in labels)
+            message = f"the sphere's centre is {nearest:.3g} m from the cylinder's axis: {consequence}"
+            remedy = "move the sphere off the axis by 1e-6 m or more, or replace the cylinder by a box"
+            yield Finding(severity, "cylinder_axis", listed(labels), message, remedy)
+
+
+def contact_defaults(point: Point) -> Iterator[Finding]:
+    """Contact numbers that nobody gave."""
+    groups: dict[tuple[str, ...], list[Collider]] = {}
+    for collider in point.colliders:
+        contacts = {pair.contact for pair in point.pairs if collider in (pair.a, pair.b)}
+        read = ["friction", "relaxation_time" if point.is_sap else "dissipation"]  # by the step
+        read += ["stiffness"] * ("point" in contacts)
+        read += ["hydroelastic_modulus"] * ("hydroelastic" in contacts and collider.compliance == "compliant")
+        if missing := tuple(name for name in read if not collider.has(name)):
+            groups.setdefault(missing, []).append(collider)
+    for missing, colliders in groups.items():
+        values = {name: _value(colliders[0], name) for name in missing}
+        defaults = ", ".join(f"{PROXIMITY[name][1]} {value}" for name, value in values.items())
+        message = f"not given, so the scene graph's default decides: {defaults}"
+        if values.get("relaxation_time") == "0.1 s":
+            message += " (with which a ball hardly bounces)"
+        tags = ", ".join(f"drake:{'mu_dynamic' if name == 'friction' else PROXIMITY[name][1]}" for name in missing)
+        remedy = f"give them in <drake:proximity_properties> ({tags}) or in the geometry's ProximityProperties"
+        yield Finding("warning", "default_decides", ", ".join(c.label for c in colliders), message, remedy)
+
+
+def _value(collider: Collider, name: str) -> str:
+    """The number that Drake uses, with its unit."""
+    if not collider.used.HasProperty(*PROXIMITY[name]):
+        return "(Drake's own)"
+    value = collider.used.GetProperty(*PROXIMITY[name])
+    return f"{value.dynamic_friction() if name == 'friction' else value:g}{UNITS[name]}"
+
+
+def unread_compliance(point: Point) -> Iterator[Finding]:
+    """A dissipation that the contact approximation does not read."""
+    given, read = ("dissipation", "relaxation_time") if point.is_sap else ("relaxation_time", "dissipation")
+    names = [collider.label for collider in point.colliders if collider.has(given) and not collider.has(read)]
+    if names:
+        by, other = ("sap", "similar") if point.is_sap else ("similar and lagged", "sap")
+        message = f"{PROXIMITY[given][1]} is given, and {by} read {PROXIMITY[read][1]}, which is not"
+        remedy = f'give drake:{PROXIMITY[read][1]} too, or load_model(..., contact_approximation="{other}")'
+        yield Finding("warning", "unread_compliance", listed(names), message, remedy, {"contact_approximation": other})
+
+
+def pairs_at_touch(point: Point) -> Iterator[Finding]:
+    """Pairs exactly at touch, where the derivative is that of one side."""
+    set_state(point.model.double, point.x)
+    unmeasured = []
+    for pair in point.pairs:
+        try:
+            distance = point.query.ComputeSignedDistancePairClosestPoints(pair.a.id, pair.b.id).distance
+        except RuntimeError:  # no such distance between these shapes
+            unmeasured.append(pair.label)
+            continue
+        exact = (pair.kinds <= MEETS_A_SPHERE and "Sphere" in pair.kinds) or pair.kinds == {"Box"}
+        if abs(distance) < (OPTIONS.touch if exact else OPTIONS.rough_touch):
+            message = f"exactly at touch (signed distance {distance:.2g} m): the derivative is that of one side"
+            remedy = "start a little apart or a little in contact, or use `smooth_step`"
+            yield Finding("warning", "touching", pair.label, message, remedy)
+    if unmeasured:
+        message = "Drake computes no distance between these, so whether they are exactly at touch is not known"
+        remedy = "compare x with x moved by 1e-6 m yourself, or replace one of them by spheres (corner_spheres)"
+        yield Finding("info", "not_measured", ", ".join(unmeasured), message, remedy)
+
+
+def inseparable(point: Point) -> Iterator[Finding]:
+    """Pairs that overlap wherever the joints are."""
+    model = point.model
+    if model.double.scene_graph is None or not model.contract.contact.collision_pairs:
+        return
+    try:
+        pairs = inseparable_pairs(model.plant, model.diagram)
+    except ModelError:
+        return  # as no step of it can be taken then, which is a finding of its own
+    if pairs:
+        message = (
+            f"they overlap wherever the joints are (pairs of shapes: {len(pairs)}), and push each other apart in every "
+            "step; of deep overlaps Drake's point of contact jumps, and has no derivative"
+        )
+        remedy = 'load_model(..., contact="separable") lets these pairs alone pass through each other'
+        subject = links_of(model.plant, model.double.scene_graph, pairs)
+        yield Finding("warning", "never_apart", subject, message, remedy, {"contact": "separable"})
+
+
+def corners_on_both_sides(point: Point) -> Iterator[Finding]:
+    """Two trees that touch by the spheres in their corners alone."""
+    plant = point.model.plant
+    fixed = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    above = {joint.child_body().name(): joint.parent_body().name() for joint in joints(plant)}
+
+    def root(name: str) -> str:
+        while name in above and above[name] not in fixed:
+            name = above[name]
+        return name
+
+    roots = {body.name(): root(body.name()) for body in [plant.world_body(), *bodies(plant)]}
+    links = [
+        " - ".join(sorted(pair.bodies))
+        for pair in point.pairs
+        if CORNER.search(pair.a.label) and CORNER.search(pair.b.label) and roots[pair.a.body] != roots[pair.b.body]
+    ]
+    if links:
+        message = "both are spheres in their corners alone, which miss each other: what one holds falls out of it"
+        remedy = (
+            'contact_geometry="hydroelastic" with contact_model="hydroelastic_with_fallback", or "differences"; or '
+            "give one of them spheres over the face that touches, in the file"
+        )
+        yield Finding("warning", "corners_miss", listed(links), message, remedy, {"contact_geometry": "differences"})
