@@ -143,7 +143,7 @@ def robustness(
     from drake_diff.runs.directory import written_whole
     from drake_diff.runs.verify import recalled
     from drake_diff.trials.files import PAGE, write_robustness
-    from drake_diff.trials.run import levels_named
+    from drake_diff.trials.perturbation import levels_named
     from drake_diff.trials.run import robustness as try_plan
 
     names, whole = names_in(perturbations), run.resolve()

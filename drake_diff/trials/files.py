@@ -37,8 +37,9 @@ from drake_diff.runs.plan_record import (
     TrialEvidence,
 )
 from drake_diff.runs.provenance import header
+from drake_diff.trials.perturbation import Setup, perturbation_for, perturbed
 from drake_diff.trials.run import Cell, Robustness, agrees, sized
-from drake_diff.trials.trial import Setup, Task, Trial, perturbation_named, perturbed, result_of
+from drake_diff.trials.trial import Task, Trial, result_of
 
 LATENCY = "latency"  # the perturbation whose levels are steps of the controller
 PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
@@ -84,54 +85,51 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
 
 def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -> PlanRecord:
     """Write what `save_robustness` does into `folder`, which `written_whole` gave."""
-    task = result.task
+    task, name = result.task, name_of(folder)
     source = None if run is None else RunEvidence(path=str(run), record_sha256=load_plan_record(run).record_sha256)
     sentence = "the trials are still being written, or that was killed or broke off"
-    _record(name_of(folder), task.model, "incomplete", sentence).begin(folder)
-    record = record_of(result, name_of(folder), source)
-    # A trial can be run again from what trial.json says where nothing in the loop is a user's own.
-    loop, named = task.loop, ("sensor", "actuator", "fallback", "substeps")
-    usual = all(repr(getattr(loop, name)) == repr(getattr(PLAIN, name)) for name in named)
-    usual = usual and isinstance(task.controller, str) and type(loop.estimator) is Hold and not loop.pushes
-    again = str(run) if run is not None and usual else None
-    for name in result.names:
-        write_trial(folder / _place(result.worst(name)), task, result.worst(name).worst, again)
-    write_whole(folder / TABLE, _table(result).encode())
-    write_robustness_page(folder / PAGE, result, record, folder / _place(result.worst(result.weakest)) / REPLAY)
-    return record.write(folder)
-
-
-def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> PlanRecord:
-    """The record of `result`, but for the files."""
-    task, nominal = result.task, result.task.nominal
+    _record(name, task.model, "incomplete", sentence).begin(folder)
     record = _record(
         name,
         task.model,
         "pass" if result.success else "fail",
         result.sentence,
-        run=run,
+        run=source,
         trials=result.trials,
         seed=result.seed,
         loop=_loop(task),
-        nominal=evidence(Nominal, nominal, ended=nominal.run.ended),
+        nominal=evidence(Nominal, task.nominal, ended=task.nominal.run.ended),
         perturbations=[
             evidence(
                 PerturbationEvidence,
-                perturbation_named(name),
+                perturbation_for(name),
                 margin=result.margins[name],
                 cells=[_cell(c) for c in result.of(name)],
-                worst=_place(result.worst(name)),
+                worst=_folder_of(result.worst(name)),
             )
             for name in result.names
         ],
     )
-    sections = {"panel": _panel(result), "data": _data(result, run), "wall_clock": _times(result, record.wall_clock)}
-    return record.model_copy(update=sections)
+    sections = {"panel": _panel(result), "data": _data(result, source), "wall_clock": _times(result, record.wall_clock)}
+    record = record.model_copy(update=sections)
+    for name in result.names:
+        worst = result.worst(name)
+        write_trial(folder / _folder_of(worst), task, worst.worst, str(run) if run and _is_repeatable(task) else None)
+    write_whole(folder / TABLE, _table(result).encode())
+    worst = result.worst(result.weakest)
+    write_robustness_page(folder / PAGE, result, record, folder / _folder_of(worst) / REPLAY)
+    return record.write(folder)
+
+
+def _is_repeatable(task: Task) -> bool:
+    """Whether a trial can be run again from what trial.json says: nothing in its loop is a user's."""
+    loop, named = task.loop, ("sensor", "actuator", "fallback", "substeps")
+    plain_loop = all(repr(getattr(loop, name)) == repr(getattr(PLAIN, name)) for name in named)
+    return plain_loop and isinstance(task.controller, str) and type(loop.estimator) is Hold and not loop.pushes
 
 
 def _panel(result: Robustness) -> EvaluationPanel:
-    """Every level of every perturbation, and the latencies among them."""
-    units = {name: perturbation_named(name).unit for name in result.names}
+    units = {name: perturbation_for(name).unit for name in result.names}
     period = result.task.loop.substeps * result.task.model.time_step
     late = [0.0, *(c.level * period for name in result.names if name == LATENCY for c in result.of(name))]
     statement = f"the plan under the controller {result.task.controller_name}, each level by itself, seed {result.seed}"
@@ -158,7 +156,7 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **trials: Any)
     return PlanRecord(verdict=verdict, sentence=sentence, robustness=section, **header(name, model))
 
 
-def _place(cell: Cell) -> str:
+def _folder_of(cell: Cell) -> str:
     return f"{WORST}/{cell.perturbation}_{cell.level:g}"
 
 
@@ -200,17 +198,17 @@ def _loop(task: Task) -> LoopEvidence:
 
 def _times(result: Robustness, clock: WallClock) -> WallClock:
     runs = [result.task.nominal.run, *(c.worst.outcome.run for c in result.cells)]
-    taken = np.concatenate([run.latencies for run in runs])
-    if not len(taken):
+    latencies = np.concatenate([run.latencies for run in runs])
+    if not len(latencies):
         return clock
-    latencies = {
-        "latency_median_s": float(np.median(taken)),
-        "latency_99_percent_s": float(np.quantile(taken, 0.99)),
-        "latency_largest_s": float(np.max(taken)),
-        "late": int(np.sum(taken > _loop(result.task).latency_budget_s)),
-        "controller_steps": len(taken),
+    changes = {
+        "latency_median_s": float(np.median(latencies)),
+        "latency_99_percent_s": float(np.quantile(latencies, 0.99)),
+        "latency_largest_s": float(np.max(latencies)),
+        "late": int(np.sum(latencies > _loop(result.task).latency_budget_s)),
+        "controller_steps": len(latencies),
     }
-    return clock.model_copy(update=latencies)
+    return clock.model_copy(update=changes)
 
 
 def _table(result: Robustness) -> str:
@@ -258,42 +256,38 @@ def robustness_data(result: Robustness) -> dict[str, Any]:
 
 def _trial_plots(task: Task, trial: Trial) -> Iterator[Plot]:
     """Of one trial: each coordinate as it was, seen, estimated and planned; the inputs; the controller's status."""
-    run, model, problem = trial.outcome.run, task.model, task.plan.problem
+    run, contract, bounds = trial.outcome.run, task.model.contract, task.plan.problem.bounds
     setup = perturbed(task.setup, trial.levels, trial.seed)
     planned = planned_states(task, setup)
     count = len(planned)
     times = setup.model.time_step * np.arange(count)
 
-    def held(rows: Array) -> Array:
+    def of_plant(rows: Array) -> Array:
         """Rows of the controller's steps as rows of the plant's."""
         return _padded(np.repeat(rows, setup.loop.substeps, axis=0), count)
 
-    true, seen, taken = _padded(run.motion.xs, count), held(run.observations), held(run.estimates)
-    apart = np.nanmax(np.abs(true - planned), axis=0) / task.plan.scale
-    units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
-    for i in sorted(np.argsort(-apart, kind="stable")[:MOST_PLOTS]):
-        lines = [
-            Line("true", true[:, i]),
-            Line("observed", seen[:, i], held=True),
-            Line("estimated", taken[:, i], held=True),
-            Line("plan", planned[:, i], dashed=True),
-        ]
-        limits = (problem.bounds.x_lower[i], problem.bounds.x_upper[i])
-        yield Plot(model.state_names[i], units[i], times, lines, limits=limits, group="States")
+    def lines(i: int, rows: Sequence[tuple[str, Array]], plan: Array, **options: Any) -> list[Line]:
+        made = [Line(label, values[:, i], held=label != "true") for label, values in rows]
+        return [*made, Line("plan", plan[:, i], dashed=True, **options)]
+
+    true = _padded(run.motion.xs, count)
+    states = ("true", true), ("observed", of_plant(run.observations)), ("estimated", of_plant(run.estimates))
+    off = np.nanmax(np.abs(true - planned), axis=0) / task.plan.scale
+    units = [c.unit for c in (*contract.positions, *contract.velocities)]
+    for i in sorted(np.argsort(-off, kind="stable")[:MOST_PLOTS]):
+        limits = (bounds.x_lower[i], bounds.x_upper[i])
+        name = task.model.state_names[i]
+        yield Plot(name, units[i], times, lines(i, states, planned), limits=limits, group="States")
     planned_us = _padded(np.repeat(task.us, (count - 1) // len(task.us), axis=0), count)
-    commands, applied = held(run.commands), held(run.applied)
-    for i, c in enumerate(model.contract.inputs):
-        lines = [
-            Line("command", commands[:, i], held=True),
-            Line("applied", applied[:, i], held=True),
-            Line("plan", planned_us[:, i], dashed=True, held=True),
-        ]
-        limits = (problem.bounds.u_lower[i], problem.bounds.u_upper[i])
-        yield Plot(f"input {c.name}", c.unit, times, lines, limits=limits, percent=True, group="Inputs")
-    others = list(dict.fromkeys(status for status in run.controller_status if status != "ok"))
+    inputs = ("command", of_plant(run.commands)), ("applied", of_plant(run.applied))
+    for i, c in enumerate(contract.inputs):
+        limits = (bounds.u_lower[i], bounds.u_upper[i])
+        rows = lines(i, inputs, planned_us, held=True)
+        yield Plot(f"input {c.name}", c.unit, times, rows, limits=limits, percent=True, group="Inputs")
+    others = list(dict.fromkeys(status for status in run.controller_status if status != OK))
     events = [f"{e.t:.4g} s: {e.message}" for e in run.events]
     note = "; ".join([*others[:3], *events[:6]]) or "nothing happened"
-    ok = held(np.array([[float(status == "ok")] for status in run.controller_status]).reshape(-1, 1))
+    ok = of_plant(np.array([[float(status == OK)] for status in run.controller_status]).reshape(-1, 1))
     status = [Line("status", ok[:, 0], held=True)]
     yield Plot("controller status", "1: ok", times, status, range=[-0.1, 1.1], note=note, group="Inputs")
 
@@ -350,35 +344,9 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
     from drake_diff.pages.scene import BLUE, scene_of
 
     make_folder(folder)
-    record = trial_evidence(task, trial, run)
-    write_whole(folder / TRIAL, canonical(record.model_dump(mode="json")).encode())
-    latencies = {"budget_s": trial.outcome.run.latency_budget, "latencies_s": trial.outcome.run.latencies.tolist()}
-    write_whole(folder / LATENCIES, canonical(latencies).encode())
-    setup, motion = perturbed(task.setup, trial.levels, trial.seed), trial.outcome.run.motion
-    planned = planned_states(task, setup)
-    with applied(select(setup.model, setup.parameters)) as model:
-        write_trial_trace(folder / TRACE, Shown(model, model.time_step, planned, motion), trial)
-        xs, ghost = (np.clip(states, -FURTHEST, FURTHEST) for states in (motion.xs, planned))
-        xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # it broke off at once
-        times = np.asarray(model.time_step * np.arange(len(xs)), dtype=float)
-        contacts = motion.contacts if len(motion.contacts) == len(xs) - 1 else ()
-        scene = scene_of(model, times, xs, us=motion.us, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
-        far = f", drawn up to {FURTHEST:g} only" if np.any(np.abs(motion.xs) > FURTHEST) else ""
-        title = f"{record.perturbation} {record.level:g}: {trial.label or 'success'}{far}"
-        write_replay(folder / REPLAY, scene, title=title)
-
-
-def planned_states(task: Task, setup: Setup) -> Array:
-    """(n+1, nx) of the plan at each step of the plant of `setup`."""
-    finer = round(task.model.time_step / setup.model.time_step)
-    return np.asarray(task.plan.sample(task.parts * finer)[0])
-
-
-def trial_evidence(task: Task, trial: Trial, run: str | None) -> TrialEvidence:
-    """What trial.json says."""
-    (name, level), *_ = trial.levels.items()
-    setup = perturbed(task.setup, trial.levels, trial.seed)
-    return TrialEvidence(
+    ((name, level),), loop_run = trial.levels.items(), trial.outcome.run
+    setup, motion = perturbed(task.setup, trial.levels, trial.seed), loop_run.motion
+    record = TrialEvidence(
         run=run,
         controller=task.controller_name,
         perturbation=name,
@@ -390,31 +358,42 @@ def trial_evidence(task: Task, trial: Trial, run: str | None) -> TrialEvidence:
         controller_period_s=setup.loop.substeps * setup.model.time_step,
         parameters={key: np.asarray(value).tolist() for key, value in setup.parameters.items()},
         start=setup.x0.tolist(),
-        events=[EventEvidence(t_s=e.t, kind=e.kind, message=e.message) for e in trial.outcome.run.events],
+        events=[EventEvidence(t_s=e.t, kind=e.kind, message=e.message) for e in loop_run.events],
     )
+    latencies = {"budget_s": loop_run.latency_budget, "latencies_s": loop_run.latencies.tolist()}
+    write_whole(folder / TRIAL, canonical(record.model_dump(mode="json")).encode())
+    write_whole(folder / LATENCIES, canonical(latencies).encode())
+    planned = planned_states(task, setup)
+    with applied(select(setup.model, setup.parameters)) as model:
+        _write_trace(folder / TRACE, Shown(model, model.time_step, planned, motion), trial)
+        xs, ghost = (np.clip(states, -FURTHEST, FURTHEST) for states in (motion.xs, planned))
+        xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # it broke off at once
+        times = np.asarray(model.time_step * np.arange(len(xs)), dtype=float)
+        contacts = motion.contacts if len(motion.contacts) == len(xs) - 1 else ()
+        scene = scene_of(model, times, xs, us=motion.us, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
+        far = f", drawn up to {FURTHEST:g} only" if np.any(np.abs(motion.xs) > FURTHEST) else ""
+        write_replay(folder / REPLAY, scene, title=f"{name} {level:g}: {trial.label or 'success'}{far}")
 
 
-def write_trial_trace(path: Path, shown: Shown, trial: Trial) -> None:
-    """Write the trace of `trial`; `shown` has its motion and plan. Latencies differ each time and are not in it."""
-    metadata = {
-        "model": shown.model.name,
-        "time_axis": "simulated",
-        "perturbation": json.dumps(dict(trial.levels), sort_keys=True),
-        "label": trial.label or "success",
-    }
-    run, contract = trial.outcome.run, shown.model.contract
+def planned_states(task: Task, setup: Setup) -> Array:
+    """(n+1, nx) of the plan at each step of the plant of `setup`."""
+    finer = round(task.model.time_step / setup.model.time_step)
+    return np.asarray(task.plan.sample(task.parts * finer)[0])
+
+
+def _write_trace(path: Path, shown: Shown, trial: Trial) -> None:
+    """`shown` has the motion of the trial and the plan. Latencies differ each time and are not in it."""
+    run, contract, event = trial.outcome.run, shown.model.contract, TYPES["Event"].cls
     states, planned = (contract.positions, contract.velocities), shown.planned_xs
     seen = ~np.isnan(run.observations).any(axis=1)
-    kind = TYPES["Event"]
     statuses = [
-        kind.cls(time=t, kind="controller", code=OK if status == OK else "other", message=status)
+        event(time=t, kind="controller", code=OK if status == OK else "other", message=status)
         for t, status in zip(run.times.tolist(), run.controller_status, strict=True)
     ]
-    events = [kind.cls(time=e.t, kind=e.kind, message=e.message) for e in run.events]
-    end = shown.time_step * (len(shown.xs) - 1)
+    events = [event(time=e.t, kind=e.kind, message=e.message) for e in run.events]
     if trial.label is not None:
-        last = kind.cls(time=end, kind="failure", failure_label=trial.label, code=trial.label, message=trial.reason)
-        events.append(last)
+        code, end = trial.label, shown.time_step * (len(shown.xs) - 1)
+        events.append(event(time=end, kind="failure", failure_label=code, code=code, message=trial.reason))
     channels = [
         *motion_channels(shown),
         state_channel("/planned/state", shown.times(len(planned)), planned, *states),
@@ -425,6 +404,12 @@ def write_trial_trace(path: Path, shown: Shown, trial: Trial) -> None:
         _events("/controller/status", statuses),
         _events("/events", events),
     ]
+    metadata = {
+        "model": shown.model.name,
+        "time_axis": "simulated",
+        "perturbation": json.dumps(dict(trial.levels), sort_keys=True),
+        "label": trial.label or "success",
+    }
     write_mcap(path, channels, metadata, {})
 
 

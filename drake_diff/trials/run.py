@@ -19,29 +19,20 @@ from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError
 from drake_diff.loop.mpc import MPC
 from drake_diff.loop.run import Hold, Loop
-from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs.fields import Label
-from drake_diff.trials.trial import (
-    PERTURBATIONS,
-    MakeController,
-    Task,
-    Trial,
-    parameters_of,
-    perturbation_named,
-    run_trial,
-)
+from drake_diff.trials.perturbation import PERTURBATIONS, Levels, levels_named, parameters_of, perturbation_for
+from drake_diff.trials.trial import MakeController, Task, Trial, run_trial
 
 AGREE = 2.0  # a prediction within this factor of what is measured counts as right
 UNIFORM = 1 / np.sqrt(3)  # the standard deviation of a number that is uniform in [-1, 1]
 # Step of the central differences of the controller's answer: about the cube root of rounding, which is best for them.
 DIFFERENCE = 1e-5
 FACTORS = ("inertia", "mass", "friction", "stiffness", "damping", "gravity")
-TOLD = ("initial_state", "sensor_noise", "sensor_bias", "actuator_strength", *FACTORS)
-Levels = Mapping[str, Sequence[float]]
+PREDICTED = ("initial_state", "sensor_noise", "sensor_bias", "actuator_strength", *FACTORS)
 
 
 def robustness(
@@ -187,7 +178,7 @@ class Robustness(ShowsItsRepr):
 
         def rank(name: str) -> tuple[float, float]:
             rates = [c.rate.value for c in self.of(name)]
-            return self.margins[name] / perturbation_named(name).levels[-1], sum(rates) / len(rates)
+            return self.margins[name] / perturbation_for(name).levels[-1], sum(rates) / len(rates)
 
         return min(self.names, key=rank)
 
@@ -203,9 +194,30 @@ class Robustness(ShowsItsRepr):
     @property
     def sentence(self) -> str:
         """The verdict in a paragraph: what fails first, whose fault it is, and what the gradients knew."""
-        nominal = self.task.nominal
-        first = "Unperturbed it succeeds." if nominal.success else f"Unperturbed it fails: {nominal.failures[0]}."
-        return " ".join(filter(None, (first, _weakest_point(self), _blame(self), _gradients(self))))
+        nominal, name = self.task.nominal, self.weakest
+        cell, margin, labels = (
+            self.worst(name),
+            self.margins[name],
+            sum((Counter(c.labels) for c in self.cells), Counter()),
+        )
+        known = [agrees(c.ratio) for c in self.cells if c.ratio is not None]
+        sentences = ["Unperturbed it succeeds." if nominal.success else f"Unperturbed it fails: {nominal.failures[0]}."]
+        if not labels:
+            sentences += [
+                f"No trial fails: each of {len(self.names)} perturbations is survived up to its largest level."
+            ]
+        else:
+            much = f"with a margin of {sized(name, margin)}" if margin else "with no margin"
+            rate = f"at {sized(name, cell.level)} {cell.rate.successes} of {cell.rate.trials} succeed"
+            causes = ", ".join(f"{count} {label.replace('_', ' ')}" for label, count in labels.most_common())
+            sentences += [f"Weakest point: {name}, {much}: {rate}. What fails first: {cell.worst.reason}."]
+            sentences += [f"Failed trials: {causes}."]
+        if raised := sum((Counter(c.controller_errors) for c in self.cells), Counter()):
+            (error, most), total = raised.most_common(1)[0], sum(raised.values())
+            sentences += [f"In {total} of them the controller itself failed, in {most} with {error}."]
+        within = f"Gradients predict how far the last state moves within a factor of {AGREE:g} in"
+        sentences += [f"{within} {sum(known)} of {len(known)} cells." if known else "Gradients predict none of it."]
+        return " ".join(sentences)
 
     def __repr__(self) -> str:
         name = self.task.controller_name
@@ -226,19 +238,6 @@ class Robustness(ShowsItsRepr):
 def trial_seed(seed: int, index: int) -> int:
     """Of the `index`-th trial: the same in every cell, so that levels are compared under the same draws."""
     return int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
-
-
-def levels_named(model: Model, perturbations: Levels | Sequence[str] | None) -> dict[str, tuple[float, ...]]:
-    """By name the levels to try, in increasing order. UnknownNameError; InputError for what cannot be tried."""
-    if perturbations is None:
-        return {name: kind.levels for name, kind in PERTURBATIONS.items() if kind.is_of(model)}
-    if not isinstance(perturbations, Mapping):
-        perturbations = {name: perturbation_named(name).levels for name in perturbations}
-    for name, values in perturbations.items():
-        perturbation_named(name).check_is_of(model)
-        if not len(values) or not all(np.isfinite(v) and v > 0 for v in values):
-            raise InputError(f"levels of {name}", got=values, expected="numbers above 0")
-    return {name: tuple(sorted(values)) for name, values in perturbations.items()}
 
 
 def cell_of(name: str, level: float, trials: Sequence[Trial], predicted: float | None) -> Cell:
@@ -275,46 +274,7 @@ def agrees(ratio: float | None) -> bool:
 
 def sized(name: str, level: float) -> str:
     """A level with its unit."""
-    unit = perturbation_named(name).unit
-    return f"{level:g}" + ("" if unit == "1" else f" {unit}")
-
-
-def _weakest_point(result: Robustness) -> str:
-    if not any(c.fails for c in result.cells):
-        return f"No trial fails: each of {len(result.names)} perturbations is survived up to its largest level."
-    name = result.weakest
-    held, cell = result.margins[name], result.worst(name)
-    much = f"with a margin of {sized(name, held)}" if held else "with no margin"
-    rate = f"at {sized(name, cell.level)} {cell.rate.successes} of {cell.rate.trials} succeed"
-    return f"Weakest point: {name}, {much}: {rate}. What fails first: {cell.worst.reason}."
-
-
-def _blame(result: Robustness) -> str:
-    labels = sum((Counter(c.labels) for c in result.cells), Counter())
-    if not labels:
-        return ""
-    causes = ", ".join(f"{count} {label.replace('_', ' ')}{'s' * (count > 1)}" for label, count in labels.most_common())
-    count = sum(labels.values())
-    sentences = f"Of {count} failed trial{'s' * (count > 1)}: {causes}."
-    raised = sum((Counter(c.controller_errors) for c in result.cells), Counter())
-    if raised:
-        (error, most), count = raised.most_common(1)[0], sum(raised.values())
-        sentences += f" In {count} of them the controller itself failed, in {most} with {error}."
-    return sentences
-
-
-def _gradients(result: Robustness) -> str:
-    cells = [c for c in result.cells if c.ratio is not None]
-    if not cells:
-        return "Gradients predict none of it."
-    right = sum(agrees(c.ratio) for c in cells)
-    name = result.weakest
-    known = [agrees(c.ratio) for c in result.of(name) if c.ratio is not None]
-    about = f"of {name} in {sum(known)} of {len(known)}" if known else f"they say nothing about {name}"
-    return (
-        f"Gradients predict the displacement of the last state within a factor of {AGREE:g} in {right} of the "
-        f"{len(cells)} cells that they cover; {about}."
-    )
+    return perturbation_for(name).with_unit(level)
 
 
 class Sensitivity:
@@ -325,8 +285,8 @@ class Sensitivity:
 
         d_(k+1) = (A_k + B_k K_k) d_k + C_k dp + B_k K_k n_k
 
-    so the last displacement is linear in the first one d_0, a change dp of the parameters and the noise n_k. What is
-    told is its root mean square, sqrt(E |d_N|^2), for independent perturbations as `trials.trial` draws them.
+    so the last displacement is linear in the first one d_0, a change dp of the parameters and the noise n_k. Its root
+    mean square, sqrt(E |d_N|^2), is for independent perturbations as `trials.perturbation` draws them.
 
     Known only in an ideal loop: None with a delay, a lag, lost samples, another estimator, a fallback in charge, or a
     controller with a memory (one with `start`, as MPC), whose answer is no function of what it sees.
@@ -336,11 +296,8 @@ class Sensitivity:
         self.task, self.space = task, tangent_space(task.model)
         loop = task.loop
         self.is_known = (
-            loop.substeps == 1
-            and loop.sensor.delay == loop.actuator.delay == 0
-            and loop.sensor.every == loop.actuator.every == 1
-            and loop.actuator.lag == 0
-            and loop.sensor.dropout == 0
+            loop.substeps == loop.sensor.every == loop.actuator.every == 1
+            and loop.sensor.delay == loop.actuator.delay == loop.actuator.lag == loop.sensor.dropout == 0
             and type(loop.estimator) is Hold
             and not task.nominal.run.ended
             and not any(event.kind == "fallback" for event in task.nominal.run.events)
@@ -350,67 +307,56 @@ class Sensitivity:
 
     def predicted(self, name: str, level: float) -> float | None:
         """The root mean square of the last state's displacement; None where gradients say nothing."""
-        known = self.is_known and name in TOLD and PERTURBATIONS[name].is_of(self.task.model)
-        if not known or self._gains is None:
+        applies = name in PREDICTED and PERTURBATIONS[name].applies_to(self.task.model)
+        effects = self._effects if applies and self.is_known else None
+        if effects is None:
             return None
-        # The last state's derivative by what a perturbation of level 1 draws, times its spread.
-        start, _, noise, factor = self._effects
-        if name == "initial_state":
-            effect = start
-        elif name == "sensor_noise":
-            effect = noise
-        elif name == "sensor_bias":  # the same at every step
-            effect = UNIFORM * noise.reshape(self.space.size, -1, self.space.size).sum(axis=1)
-        else:
-            effect = UNIFORM * (factor if name == "actuator_strength" else self._by_factor(name))
-        displacement = float(level * np.linalg.norm(effect))
+        displacement = float(level * np.linalg.norm(effects[name]))
         return displacement if np.isfinite(displacement) else None
 
-    def _by_factor(self, quantity: str) -> Array:
-        """(nt, n) the derivative by a factor of each parameter of a quantity."""
-        columns, offset = [], 0
-        for name in FACTORS:
-            for value in self.parameters[name].values():
-                width = len(np.atleast_1d(value))
-                if name == quantity:
-                    columns.append(self._effects[1][:, offset : offset + width] @ np.atleast_1d(value))
-                offset += width
-        return np.array(columns).T
-
     @cached_property
-    def _effects(self) -> tuple[Array, Array, Array, Array]:
-        """(nt, .) of the start, the parameters, every step's noise, and a factor of each input."""
-        task, size = self.task, self.space.size
-        xs, us = task.nominal.run.motion.xs, task.nominal.run.applied
-        start, noise, factor = np.eye(size), np.zeros((size, 0)), np.zeros((size, task.model.nu))
-        by_parameter: Array | None = None
-        # The inertia apart: a mass that is changed alone takes it along, one that is set beside it does not.
+    def _effects(self) -> dict[str, Array] | None:
+        """(nt, .) the last state's derivative by what a perturbation of level 1 draws, times its spread."""
+        gains = self._gains()
+        if gains is None:
+            return None
+        task, size, xs = self.task, self.space.size, self.task.nominal.run.motion.xs
+        # The inertia by itself: a mass that is changed alone takes it along, one that is set beside it does not.
         inertia, others = list(self.parameters["inertia"]), [n for q in FACTORS[1:] for n in self.parameters[q]]
         groups = [inertia, others] if inertia else [others]
-        along = []
+        us, along = task.nominal.run.applied, []
         with applied(select(task.setup.model, task.setup.parameters)) as model:
-            for names in groups:
-                vector = select(model, names)
+            for group in groups:
+                vector = select(model, group)
                 with applied(vector) as same:
                     along.append(derivatives_along(same, xs[0], us, vector=vector, xs=xs[:-1]))
-        for k, (u, K) in enumerate(zip(us, self._gains or (), strict=True)):
+        start, noise, factor = np.eye(size), np.zeros((size, 0)), np.zeros((size, task.model.nu))
+        by_parameter = np.zeros((size, sum(derivatives[0].C.shape[1] for derivatives in along)))
+        for k, (u, K) in enumerate(zip(us, gains, strict=True)):
             steps = [derivatives[k] for derivatives in along]
             jacobian = self.space.jacobian(xs[k], xs[k + 1], steps[0].A, steps[0].B, *(step.C for step in steps))
             A, B, C = np.split(jacobian, [size, size + task.model.nu], axis=1)
             loop = A + B @ K
             start, noise = loop @ start, np.hstack([loop @ noise, B @ K])
-            factor = loop @ factor + B * u
-            by_parameter = C if by_parameter is None else loop @ by_parameter + C
-        return start, np.zeros((size, 0)) if by_parameter is None else by_parameter, noise, factor
+            factor, by_parameter = loop @ factor + B * u, loop @ by_parameter + C
+        bias = noise.reshape(size, -1, size).sum(axis=1)  # the same at every step
+        effects = {"initial_state": start, "sensor_noise": noise}
+        effects |= {"sensor_bias": UNIFORM * bias, "actuator_strength": UNIFORM * factor}
+        offset = 0
+        for quantity, parameters in self.parameters.items():
+            columns = []
+            for value in map(np.atleast_1d, parameters.values()):
+                columns.append(by_parameter[:, offset : offset + len(value)] @ value)
+                offset += len(value)
+            effects[quantity] = UNIFORM * np.array(columns).T
+        return effects
 
-    @cached_property
     def _gains(self) -> list[Array] | None:
         """N times (nu, nt), the derivative of the controller's answer by what it sees, by central differences.
 
         None where it raises beside the motion, as a user's code may: then it has no derivative.
         """
-        task, shape = self.task, (self.task.model.nu, self.space.size)
-        gains = []
+        task, gains = self.task, []
         for k, x in enumerate(task.nominal.run.motion.xs[:-1]):
             columns = []
             for e in DIFFERENCE * np.eye(self.space.size):
@@ -419,5 +365,5 @@ class Sensitivity:
                 except Exception:
                     return None
                 columns.append((np.asarray(ahead, dtype=float) - np.asarray(behind, dtype=float)) / (2 * DIFFERENCE))
-            gains.append(np.array(columns).T.reshape(shape))
+            gains.append(np.array(columns).T.reshape(task.model.nu, self.space.size))
         return gains

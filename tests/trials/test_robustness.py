@@ -14,8 +14,9 @@ from drake_diff._base.statistics import margin, success_rate
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.parameters import list_parameters
 from drake_diff.optimize.replay import track
-from drake_diff.trials.run import TOLD, Sensitivity, levels_named, trial_seed
-from drake_diff.trials.trial import Setup, Task, parameters_of, perturbed, run_trial
+from drake_diff.trials.perturbation import Setup, levels_named, parameters_of, perturbed
+from drake_diff.trials.run import PREDICTED, Sensitivity, trial_seed
+from drake_diff.trials.trial import Task, run_trial
 
 pytestmark = pytest.mark.solve
 
@@ -474,7 +475,7 @@ def test_nothing_is_predicted_of_what_no_gradient_tells(regulator):
         dd.loop.Loop(estimator=dd.loop.Predictor(regulator.model, 2)),
     ):
         unknown = Sensitivity(Task(regulator.plan, feedback, loop))
-        assert all(unknown.predicted(name, 0.1) is None for name in TOLD)
+        assert all(unknown.predicted(name, 0.1) is None for name in PREDICTED)
 
 
 # ---- the whole of it
