@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import joblib
@@ -63,33 +62,23 @@ class TrialFunction:
     evaluate: str
     directory: str
 
-    def load(self) -> Function:
-        """The function; InputError where there is none."""
-        function = getattr(self._module(), self.evaluate.rpartition(":")[2], None)
-        if not callable(function):
-            raise InputError("evaluate", got=f"{self.evaluate}, which is not one", expected="a function")
-        return function
-
-    def sha256(self) -> str | None:
-        """The hash of the function's file; what that file imports is not covered."""
-        source = self.evaluate.rpartition(":")[0]
-        path = Path(self.directory, source) if source.endswith(".py") else getattr(self._module(), "__file__", None)
-        return sha256(Path(path).read_bytes()).hexdigest() if path else None
-
-    def _module(self) -> ModuleType:
-        source = self.evaluate.rpartition(":")[0]
+    def load(self) -> tuple[Function, str | None]:
+        """The function, and the hash of its file, which does not cover what that imports. InputError without one."""
+        source, _, name = self.evaluate.rpartition(":")
         try:
-            if not source.endswith(".py"):
-                return importlib.import_module(source)
-            spec = importlib.util.spec_from_file_location("drake_diff_trials", Path(self.directory, source))
-            if spec is None or spec.loader is None:
-                raise ImportError(f"{source} is not a Python file")
-            module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
-            return module
+            if source.endswith(".py"):
+                spec: Any = importlib.util.spec_from_file_location("drake_diff_trials", Path(self.directory, source))
+                module = importlib.util.module_from_spec(spec)
+                spec.loader.exec_module(module)
+            else:
+                module = importlib.import_module(source)
         except Exception as error:
             got = f"{self.evaluate}: {type(error).__name__}: {error}"
             raise InputError("evaluate", got=got, expected="a file or module that can be imported") from error
+        function, file = getattr(module, name, None), getattr(module, "__file__", None)
+        if not callable(function):
+            raise InputError("evaluate", got=f"{self.evaluate}, which is not one", expected="a function")
+        return function, sha256(Path(file).read_bytes()).hexdigest() if file else None
 
 
 def row_of(function: Function, fields: Mapping[str, Any]) -> Row:
@@ -126,14 +115,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return {key: _plain(item) for key, item in value.items()}
     raise InputError("row", got=f"{type(value).__name__} {value!r:.80}", expected="numbers, words, lists and mappings")
-
-
-def check_engine(engine: str, address: str | None) -> None:
-    """Refuse an unknown engine, and an address for an engine that takes none."""
-    if engine not in ENGINES:
-        raise UnknownNameError("engine", got=engine, known=ENGINES)
-    if address is not None and engine != "ray":
-        raise InputError("address", got=address, expected='none for engine="local"; engine="ray" takes it')
 
 
 def evaluate(
@@ -201,7 +182,7 @@ def _answer(function: TrialFunction, trial: PanelTrial) -> tuple[PanelTrial, Row
 def _entered(function: TrialFunction) -> Function:
     """The function, loaded in the directory of its panel."""
     os.chdir(function.directory)
-    return function.load()
+    return function.load()[0]
 
 
 @contextmanager
@@ -326,17 +307,20 @@ def run_panel(
     """
     path = Path(path)
     count = None if workers is None else positive_int("workers", workers)
-    check_engine(engine, address)
+    if engine not in ENGINES:
+        raise UnknownNameError("engine", got=engine, known=ENGINES)
+    if address is not None and engine != "ray":
+        raise InputError("address", got=address, expected='none for engine="local"; engine="ray" takes it')
     panel = load_panel(path)
     trials = expand(panel)
     function = TrialFunction(panel.evaluate, str(path.resolve().parent))
-    function.load()
+    _, function_sha256 = function.load()
     used = provenance_of()
     # What must be the same for two trials to stand in one table.
     made = {
         "sha256": panel.sha256,
         "evaluate": panel.evaluate,
-        "function_sha256": function.sha256(),
+        "function_sha256": function_sha256,
         "fixed": panel.fixed,
         "python": used.python,
         "platform": used.platform,

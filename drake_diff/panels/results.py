@@ -42,7 +42,7 @@ from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.pages.html import page_data, write_page
 from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import is_taken, load_record, read_checked, writing
-from drake_diff.runs.fields import FiniteTable, read_fields
+from drake_diff.runs.fields import FiniteTable, SealedRecord, read_fields
 from drake_diff.runs.other_records import TRIALS, ComparisonRecord, PanelSection, TrialSection, trial_record
 from drake_diff.runs.provenance import header, provenance_of
 
@@ -129,18 +129,9 @@ def load_panel(path: Path) -> Panel:
     try:
         return Panel.model_validate(document)
     except ValidationError as error:
-        wrong = []
-        for issue in error.errors():
-            location = ".".join(str(key) for key in issue["loc"])
-            if issue["type"] == "extra_forbidden":
-                wrong.append(f"{location}, which is not one of them")
-            elif issue["type"] == "missing":
-                wrong.append(f"no {location}")
-            else:
-                got = "" if issue["type"] == "value_error" else f", got {issue['input']!r:.80}"
-                wrong.append(f"{location or 'panel'}: {issue['msg'].removeprefix('Value error, ')}{got}")
-        expected = f"the fields {', '.join(Panel.model_fields)}"
-        raise InputError(str(path), got="; ".join(wrong), expected=expected) from error
+        issues = [(".".join(map(str, issue["loc"])) or "panel", issue["msg"]) for issue in error.errors()]
+        wrong = "; ".join(f"{location}: {message.removeprefix('Value error, ')}" for location, message in issues)
+        raise InputError(str(path), got=wrong, expected=f"the fields {', '.join(Panel.model_fields)}") from error
 
 
 def expand(panel: Panel) -> tuple[PanelTrial, ...]:
@@ -185,10 +176,10 @@ class Finished:
 
     def _read(self, path: Path) -> Row:
         trial, problems = _read_trial(path)
+        if trial.conditions != self.conditions:
+            problems = (*problems, "it is of another panel; remove it")
         if problems:
             raise ArtifactError(f"{path}: {problems[0]}")
-        if trial.conditions != self.conditions:
-            raise ArtifactError(f"{path}: it is of another panel; remove it")
         return trial.result
 
 
@@ -216,10 +207,9 @@ def _check_same_panel(directory: Path, conditions: Mapping[str, Any]) -> None:
     old = record.panel.conditions
     for key in sorted({*old, *conditions}):
         if old.get(key) != conditions.get(key):
-            raise ArtifactError(
-                f"{directory} is of another panel: {key}: expected {conditions.get(key)}, got {old.get(key)}; "
-                "choose another directory, or remove this one to start over"
-            )
+            differs = f"{key}: expected {conditions.get(key)}, got {old.get(key)}"
+            advice = "choose another directory, or remove this one to start over"
+            raise ArtifactError(f"{directory} is of another panel: {differs}; {advice}")
 
 
 def _read_trial(path: Path) -> tuple[TrialSection, tuple[str, ...]]:
@@ -228,11 +218,22 @@ def _read_trial(path: Path) -> tuple[TrialSection, tuple[str, ...]]:
     trial = record.trial if isinstance(record, ComparisonRecord) else None
     if trial is None:
         raise ArtifactError(f"{path}: expected the record of a trial")
+    if not problems and not _follows(path, record, trial):
+        problems = (f"{path.name}: it is not what the panel writes of these inputs and this result",)
+    return trial, problems
+
+
+def _follows(path: Path, record: SealedRecord, trial: TrialSection) -> bool:
+    """Whether all of a trial's record follows from its inputs, its result and the panel's conditions."""
+    if not trial.cell.items() <= trial.inputs.items() or not {"repeat", "seed"} <= trial.inputs.keys():
+        return False
     made = PanelTrial(trial.cell, trial.inputs)
-    if trial.id != made.id or path.stem != made.id:
-        return trial, (*problems, f"{path.name}: id {trial.id}, but its inputs are those of trial {made.id}")
-    wrong = [name for name, value in trial.cell.items() if trial.inputs.get(name) != value]
-    return trial, (*problems, *(f"{path.name}: {name} of its cell is not that of its inputs" for name in wrong))
+    same_name = sorted(made.name.split()) == sorted(record.name.split())  # records sort the names of a cell
+    if not (same_name and path.stem == made.id and {"python", "platform"} <= trial.conditions.keys()):
+        return False
+    again = trial_record(made.id, record.name, trial.cell, trial.inputs, trial.result, trial.conditions)
+    written, wanted = record.model_dump(mode="json"), again.model_dump(mode="json")
+    return all(written[name] == wanted[name] for name in wanted.keys() - {"schema_version", "record_sha256"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,17 +328,21 @@ def ranked(summary: Mapping[str, Any]) -> tuple[str, list[dict[str, Any]]]:
     cells = summary["cells"]
     judged = all("success" in cell for cell in cells)
 
-    def key(cell: Mapping[str, Any]) -> tuple[float, ...]:
+    def key(cell: Mapping[str, Any]) -> tuple[float, float]:
         cost = cell["numbers"].get(COST, {}).get("mean", float("inf"))
-        rate = cell["success"]["low"] if judged else 0.0
-        return (-rate, 0.0 if judged else cell["errors"], cost)
+        return (-cell["success"]["low"] if judged else cell["errors"], cost)
 
     ordered = sorted(cells, key=key)  # equals stay in the panel's order
-    rows: list[dict[str, Any]] = []
-    for i, cell in enumerate(ordered):
-        rank = i + 1 if not rows or key(ordered[i - 1]) != key(cell) else rows[-1]["place"]
-        apart = cell["success"]["high"] < ordered[0]["success"]["low"] if judged else None
-        rows.append({"place": rank, "name": cell_name(cell["cell"]), "apart": apart, **cell})
+    keys = [key(cell) for cell in ordered]
+    rows = [
+        {
+            "place": keys.index(key(cell)) + 1,
+            "name": cell_name(cell["cell"]),
+            "apart": cell["success"]["high"] < ordered[0]["success"]["low"] if judged else None,
+            **cell,
+        }
+        for cell in ordered
+    ]
     if judged:
         return "the lower end of the 95 % interval of the success rate, then the mean cost", rows
     if any(COST in cell["numbers"] for cell in cells):
@@ -362,13 +367,10 @@ def write_ranking(path: Path, summary: Mapping[str, Any]) -> None:
 def _csv(rows: Sequence[Row], answered: set[str]) -> bytes:
     """RFC 4180: the cells' columns before the function's, each in the order in which it first appears; error last."""
     names = list(dict.fromkeys(name for row in rows for name in row))
-    ours = [name for name in names if name not in answered and name not in ("repeat", "seed")]
-    theirs = [name for name in names if name in answered and name != "error"]
+    given = [name for name in names if name not in {*answered, "repeat", "seed"}]
+    columns = [*given, "repeat", "seed", *(name for name in names if name in answered - {"error"}), "error"]
     text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    columns = [*ours, "repeat", "seed", *theirs, "error"]
-    writer.writerow(columns)
-    writer.writerows([_text(row.get(name)) for name in columns] for row in rows)
+    csv.writer(text).writerows([columns, *([_text(row.get(name)) for name in columns] for row in rows)])
     return text.getvalue().encode()
 
 
@@ -380,15 +382,13 @@ def _text(value: Any) -> str:
 def _cell(cell: dict[str, Any], rows: Sequence[Row], judged: bool) -> dict[str, Any]:
     """One cell: a trial that ended in an error is no success."""
     numbers: dict[str, list[float]] = {}
-    for row in rows:
-        for name, value in row.items():
-            if isinstance(value, (int, float)) and not isinstance(value, bool):
-                numbers.setdefault(name, []).append(float(value))
+    for name, value in (item for row in rows for item in row.items()):
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            numbers.setdefault(name, []).append(float(value))
     summary: dict[str, Any] = {"cell": cell, "trials": len(rows), "errors": sum("error" in row for row in rows)}
     if judged:
-        successes = sum(row.get("success") is True for row in rows)
-        rate = success_rate(successes, len(rows))
-        summary["success"] = {"count": successes, "rate": rate.value, "low": rate.lower, "high": rate.upper}
+        rate = success_rate(sum(row.get("success") is True for row in rows), len(rows))
+        summary["success"] = {"count": rate.successes, "rate": rate.value, "low": rate.lower, "high": rate.upper}
     summary["numbers"] = {
         name: {
             "count": len(values),
@@ -428,31 +428,25 @@ def _odd_panel(folder: Path, record: ComparisonRecord) -> list[str]:
     panel, table, summary = record.panel.conditions, _read_table(folder / TABLE), read_fields(folder / SUMMARY)
     listed = {Path(name).stem for name in record.files if name.startswith(f"{TRIALS}/")}
     result = [f"{TABLE} and {TRIALS}: only one of them has trial {name}" for name in sorted(listed ^ table.keys())]
+    if result:
+        return result
     # Records sort names; the summary has those of a cell in the panel's order.
-    cells = summary.get("cells")
-    ordered: dict[bytes, Any] = {canonical(entry["cell"]): entry["cell"] for entry in cells} if cells else {}
+    ordered = {canonical(entry["cell"]): entry["cell"] for entry in summary.get("cells") or ()}
     trials, rows = [], {}
-    for name in () if result else table:
+    for name in table:
         item, problems = _read_trial(folder / TRIALS / f"{name}.json")
-        trial = PanelTrial(ordered.get(canonical(item.cell), item.cell), item.inputs)
-        made = trial_record(trial.id, trial.name, trial.cell, trial.fields, item.result, panel)
-        written = read_fields(folder / TRIALS / f"{name}.json")
-        apart = ("schema_version", "record_sha256")
-        fields = {**made.model_dump(mode="json"), **{key: written.get(key) for key in apart}}
-        result += problems or [f"{name}.json: it is not what the panel writes of its result"] * (fields != written)
-        trials.append(trial)
+        result += [*problems, *([f"{name}.json: it is of another panel"] if item.conditions != panel else [])]
+        trials.append(PanelTrial(ordered.get(canonical(item.cell), item.cell), item.inputs))
         rows[name] = item.result
     if result:
         return result
     with TemporaryDirectory() as location:
-        made_again = write_table(Path(location), trials, rows, panel)
-        for name, old, new in (
-            (TABLE, table, _read_table(Path(location) / TABLE)),
-            (SUMMARY, summary, read_fields(Path(location) / SUMMARY)),
-        ):
-            result += [f"{name}: it does not come out of {TRIALS} again"] * (old != new)
+        made = write_table(Path(location), trials, rows, panel)
+        again = _read_table(Path(location) / TABLE), read_fields(Path(location) / SUMMARY)
+    for name, old, new in zip((TABLE, SUMMARY), (table, summary), again, strict=True):
+        result += [f"{name}: it does not come out of {TRIALS} again"] * (old != new)
     begun = record.panel.model_copy(update={"trials": len(trials)})
-    ended = ended_record(record.model_copy(update={"panel": begun}), made_again, 0.0)
+    ended = ended_record(record.model_copy(update={"panel": begun}), made, 0.0)
     wrong = [name for name in STATED if getattr(ended, name) != getattr(record, name)]
     return [*result, *(f"{record.FILE}: {name} is not what the table says" for name in wrong)]
 

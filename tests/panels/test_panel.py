@@ -70,6 +70,7 @@ def fails(trial):
         raise ValueError("no, that one not")
     return {"cost": trial["level"], "threads": os.environ["OPENBLAS_NUM_THREADS"]}
 """
+TRIALS = 300
 PANEL = """
 evaluate = "trials.py:{function}"
 seed = 7
@@ -145,42 +146,42 @@ def no_worker_lives(path):
 
 
 @pytest.fixture(scope="module")
-def thousand(tmp_path_factory):
-    """1,000 trials and their table, evaluated by one worker without interruption."""
-    folder = tmp_path_factory.mktemp("thousand")
+def uninterrupted(tmp_path_factory):
+    """TRIALS trials and their table, evaluated by one worker without interruption."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
     (folder / "trials.py").write_text(FUNCTIONS)
     path = folder / "panel.toml"
-    path.write_text(PANEL.format(function="cheap", seeds=100, seconds=0.002, methods='["ilqr", "b,c"]'))
+    path.write_text(PANEL.format(function="cheap", seeds=TRIALS // 10, seconds=0.002, methods='["ilqr", "b,c"]'))
     run_panel(path, out=folder / "one", workers=1)
-    assert len(logged(path)) == 1000
+    assert len(logged(path)) == TRIALS
     return path
 
 
 @pytest.mark.slow
-def test_a_thousand_trials_killed_three_times_at_random_give_the_same_bytes(thousand):
-    out = thousand.parent / "killed"
+def test_trials_killed_twice_at_random_give_the_same_bytes(uninterrupted):
+    out = uninterrupted.parent / "killed"
     names = {trial.id: f"{trial.cell['method']} {trial.cell['level']} {trial.fields['repeat']}" for trial in
-             expand(load_panel(thousand))}  # fmt: skip
-    (thousand.parent / "log").unlink()
+             expand(load_panel(uninterrupted))}  # fmt: skip
+    (uninterrupted.parent / "log").unlink()
     drawn = random.Random()
-    for least in sorted(drawn.sample(range(1, 950), 3)):
-        process = start(thousand, out, "--workers", 2)
+    for least in sorted(drawn.sample(range(1, TRIALS - 50), 2)):
+        process = start(uninterrupted, out, "--workers", 2)
         wait_for(lambda least=least: len(finished(out)) >= least)
         time.sleep(drawn.uniform(0, 0.01))
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()
-        wait_for(lambda: no_worker_lives(thousand), seconds=5)
-        done, begun = finished(out), len(logged(thousand))
-        assert least <= len(done) < 1000
+        wait_for(lambda: no_worker_lives(uninterrupted), seconds=5)
+        done, begun = finished(out), len(logged(uninterrupted))
+        assert least <= len(done) < TRIALS
         assert not (out / "table.csv").exists()
-    output = start(thousand, out, "--workers", 2).communicate()[0]
-    assert "1000 trials, 0 errors" in output
-    assert files(out) == files(thousand.parent / "one")
-    trials = [trial for _, trial in logged(thousand)]
+    output = start(uninterrupted, out, "--workers", 2).communicate()[0]
+    assert f"{TRIALS} trials, 0 errors" in output
+    assert files(out) == files(uninterrupted.parent / "one")
+    trials = [trial for _, trial in logged(uninterrupted)]
     assert not {names[id] for id in done} & set(trials[begun:])  # what was finished is not evaluated again
     assert set(trials) == set(names.values())
     # Two workers start at most eight trials each before the rows of these are written.
-    assert len(trials) <= 1000 + 3 * 16
+    assert len(trials) <= TRIALS + 2 * 16
 
 
 def test_one_and_two_workers_give_the_same_bytes(write, tmp_path):
@@ -278,7 +279,7 @@ def test_a_changed_byte_in_a_record_is_refused(write, tmp_path):
     run_panel(path, out=out, workers=1)
     trial, drawn = max((out / "trials").iterdir()), random.Random(0)
     whole = trial.read_bytes()
-    for place in drawn.sample(range(len(whole)), 40):
+    for place in drawn.sample(range(len(whole)), 20):
         changed = bytes([*whole[:place], whole[place] ^ 1 << drawn.randrange(7), *whole[place + 1 :]])
         trial.write_bytes(changed)
         with pytest.raises(ArtifactError, match=trial.stem):
@@ -361,14 +362,17 @@ def test_the_summary_of_a_cell_by_hand(tmp_path):
     "text, message",
     [
         ("evaluate =", "expected a panel in TOML, got TOMLDecodeError"),
-        ("[axes]\nx = [1]", "expected the fields evaluate, seed, seeds, axes, fixed, cells, got no evaluate"),
+        (
+            "[axes]\nx = [1]",
+            "expected the fields evaluate, seed, seeds, axes, fixed, cells, got evaluate: Field required",
+        ),
         (
             'evaluate = "a:b"\ncolour = 1\nsize = 2\n[axes]\nx = [1]',
-            "got colour, which is not one of them; size, which",
+            "got colour: Extra inputs are not permitted; size: Extra",
         ),
         ('evaluate = "a"\n[axes]\nx = [1]', "evaluate: String should match pattern"),
-        ('evaluate = "a:b"\nseeds = 0\n[axes]\nx = [1]', "seeds: Input should be greater than or equal to 1, got 0"),
-        ('evaluate = "a:b"\nseeds = "3"\n[axes]\nx = [1]', "seeds: Input should be a valid integer, got '3'"),
+        ('evaluate = "a:b"\nseeds = 0\n[axes]\nx = [1]', "seeds: Input should be greater than or equal to 1"),
+        ('evaluate = "a:b"\nseeds = "3"\n[axes]\nx = [1]', "seeds: Input should be a valid integer"),
         ('evaluate = "a:b"', "expected at least one axis or one of .*, got neither"),
         ('evaluate = "a:b"\n[axes]\nx = []', "axis x: expected a list of at least one value"),
         ('evaluate = "a:b"\n[axes]\nx = [nan]', "expected finite numbers"),
@@ -471,11 +475,11 @@ def test_a_panel_whose_files_do_not_follow_from_its_trials_is_broken(write, tmp_
     broken(lambda d: sealed_again(d / in_trials, **better), "table.csv: it does not come out")
     broken(lambda d: sealed_again(d / in_trials, **better), "is not that of table.csv", of=in_trials)
     platform = {**one["trial"]["conditions"], "platform": "another"}
-    broken(lambda d: sealed_again(d / in_trials, conditions=platform), "is not what the panel writes")
+    broken(lambda d: sealed_again(d / in_trials, conditions=platform), "of another panel|not what the panel writes")
     broken(lambda d: sealed_again(d / in_trials, conditions=platform), "its result or its panel", of=in_trials)
     broken(lambda d: sealed_again(d / in_trials, name="another"), "is not what the panel writes")
     other = {**one["trial"]["inputs"], "seed": 1}
-    broken(lambda d: sealed_again(d / in_trials, inputs=other), "its inputs are those of trial", of=in_trials)
+    broken(lambda d: sealed_again(d / in_trials, inputs=other), "is not what the panel writes", of=in_trials)
     wrong = (made / "table.csv").read_text().replace("ValueError", "Nothing")
     broken(lambda d: (d / "table.csv").write_text(wrong), "table.csv: it does not come out")
     broken(lambda d: (d / in_trials).write_text(trial.read_text().replace("a level", "b level")), "record_sha256",
