@@ -81,7 +81,7 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return pose.translation() + pose.rotation().matrix() @ p
 
-    return _recorded(position, "frame_position", frame=frame, point=p.tolist(), relative_to=relative_to)
+    return recorded(position, "frame_position", frame=frame, point=p.tolist(), relative_to=relative_to)
 
 
 def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_to: str = "world") -> OfState:
@@ -127,7 +127,7 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return 2 * _quaternion(pose.rotation().matrix() @ goal.T)[1:]
 
-    return _recorded(error, "frame_rotation_error", frame=frame, R_goal=goal.tolist(), relative_to=relative_to)
+    return recorded(error, "frame_rotation_error", frame=frame, R_goal=goal.tolist(), relative_to=relative_to)
 
 
 def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfState:
@@ -161,7 +161,7 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
         arm = moving.CalcPose(twin.context, world).rotation().matrix() @ p
         return moving.CalcSpatialVelocity(twin.context, world, world).Shift(arm).translational()
 
-    return _recorded(velocity, "frame_velocity", frame=frame, point=p.tolist())
+    return recorded(velocity, "frame_velocity", frame=frame, point=p.tolist())
 
 
 def frame_angular_velocity(model: Model, frame: str) -> OfState:
@@ -191,7 +191,7 @@ def frame_angular_velocity(model: Model, frame: str) -> OfState:
         twin, _ = _at(model, PLACE, x)
         return twin.plant.get_frame(here).CalcSpatialVelocityInWorld(twin.context).rotational()
 
-    return _recorded(velocity, "frame_angular_velocity", frame=frame)
+    return recorded(velocity, "frame_angular_velocity", frame=frame)
 
 
 def frame_tilt(model: Model, frame: str, axis: ArrayLike = UP) -> OfState:
@@ -234,7 +234,7 @@ def frame_tilt(model: Model, frame: str, axis: ArrayLike = UP) -> OfState:
         pointing = R @ a
         return pointing[:2] / np.sqrt((1 + pointing[2]) / 2)
 
-    return _recorded(tilt, "frame_tilt", frame=frame, axis=a.tolist())
+    return recorded(tilt, "frame_tilt", frame=frame, axis=a.tolist())
 
 
 def center_of_mass(model: Model) -> OfState:
@@ -263,7 +263,7 @@ def center_of_mass(model: Model) -> OfState:
         twin, _ = _at(model, BALANCE, x)
         return np.array(twin.plant.CalcCenterOfMassPositionInWorld(twin.context))
 
-    return _recorded(center, "center_of_mass")
+    return recorded(center, "center_of_mass")
 
 
 def contact_force(model: Model, body: str) -> OfStateAndInput:
@@ -304,10 +304,10 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
             total = total + sign * on_a
         return total
 
-    return _recorded(force, "contact_force", body=body)
+    return recorded(force, "contact_force", body=body)
 
 
-def _recorded(function: Any, name: str, **arguments: Any) -> Any:
+def recorded(function: Any, name: str, **arguments: Any) -> Any:
     """`function` with what made it, so that a record can tell it and make it again: see `made_from`."""
     setattr(function, RECORDED, (function, {name: arguments}))
     return function

@@ -22,14 +22,7 @@ from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost, SumOfCosts, TrackingCost
 from drake_diff.optimize.problem.coupling import InputRate, Jerk, Periodic
 from drake_diff.optimize.problem.dynamics import units_of
-from drake_diff.optimize.problem.fixed_contacts import (
-    IMPACT_QUANTITIES,
-    QUANTITIES,
-    FixedContactQuantity,
-    FixedContacts,
-    fixed_contact_quantity,
-    impact_quantity,
-)
+from drake_diff.optimize.problem.fixed_contacts import QUANTITIES, FixedContacts, recorded_quantity
 from drake_diff.optimize.problem.goals import (
     CenterOfMassGoal,
     Dwell,
@@ -197,7 +190,7 @@ def _given_data(problem: Problem) -> Iterator[DataUse]:
             elif isinstance(_cost(piece), str):
                 yield DataUse(name=f"{name} {i}", what=f"{_cost(piece)}, a function: what it knows is not recorded")
     for c in problem.constraints:
-        if _quantity(c.function) is None:
+        if description_of(c.function) is None:
             yield DataUse(name=f"constraint {c.label}", what="a function: what it knows is not recorded")
 
 
@@ -358,7 +351,7 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
                 "upper": plain(c.upper),
                 "knots": position,
                 "every_knot": c.knots is None,
-                "quantity": _quantity(c.function),  # null: a user's function
+                "quantity": description_of(c.function),  # null: a user's function
             }
             for c, position in zip(problem.constraints, knots, strict=True)
         ],
@@ -373,11 +366,6 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
         **({} if problem.motion == STEPS else {"motion": problem.motion}),
         **({"fixed_contacts": problem.system.to_dict()} if isinstance(problem.system, FixedContacts) else {}),
     }
-
-
-def _quantity(function: Any) -> dict[str, Any] | None:
-    """What made a constraint's function; None of a user's own."""
-    return function.to_dict() if isinstance(function, FixedContactQuantity) else description_of(function)
 
 
 def _cost(cost: Any) -> Any:
@@ -452,14 +440,12 @@ def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array
 
 
 def _rebuild_constraint(c: dict[str, Any], system: Model | FixedContacts) -> Constraint:
-    content, model = c["quantity"], system if isinstance(system, Model) else system.plant.model
-    kind = next(iter(content))
-    if kind in IMPACT_QUANTITIES:
-        function: Any = impact_quantity(model, content)
-    elif kind in QUANTITIES and isinstance(system, FixedContacts):
-        function = fixed_contact_quantity(system, content)
+    content = c["quantity"]
+    ((kind, values),) = content.items()
+    if kind in QUANTITIES:
+        function = recorded_quantity(system, kind, values)
     else:
-        function = made_from(model, content)
+        function = made_from(system if isinstance(system, Model) else system.plant.model, content)
     lower, upper = (_numbers(c[side], gap) for side, gap in GAPS.items())
     knots = None if c["every_knot"] else c["knots"]
     return Constraint(function, lower=lower, upper=upper, knots=knots, name=c["name"])

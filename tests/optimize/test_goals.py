@@ -71,7 +71,7 @@ KINDS = {
         ("frame", {"position": [None, None, np.nan]}, InputError, "no position"),
         ("frame", {"position": [0.0, 1.0]}, ShapeError, "position"),
         ("frame", {"position": [0.0, 1.0, np.inf]}, InputError, "finite"),
-        ("frame", {"position": 3.0}, InputError, "3 numbers"),
+        ("frame", {"position": 3.0}, ShapeError, "position"),
         ("frame", {"frame": 3}, InputError, "a name"),
         ("frame", {"tolerance": 0.0}, InputError, "above 0"),
         ("frame", {"knots": 0.5}, InputError, "whole numbers"),

@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,45 @@ from drake_diff.model.model import Model
 FORM = "a function of x, or of x and u, in ordinary arithmetic that gives a number or numbers (m,)"
 
 
+class ShowsArrays:
+    """Shows the fields that are given, long arrays by their shapes."""
+
+    def __repr__(self) -> str:
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        return f"{type(self).__name__}({', '.join(f'{name}={short(value)}' for name, value in given.items())})"
+
+
+class Described:
+    """The base of frozen dataclasses of plain values, which a record keeps: `Kind(**values)` makes one again."""
+
+    def given(self) -> dict[str, Any]:
+        """The values that are not the defaults, as JSON has them."""
+        pairs = ((f, plain_value(getattr(self, f.name))) for f in fields(self))  # type: ignore[arg-type]  # dataclasses
+        return {f.name: value for f, value in pairs if f.default is MISSING or value != plain_value(f.default)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The kind and the values that are not the defaults, for a record."""
+        return {type(self).__name__: self.given()}
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self.given().items())})"
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+
+def plain_value(value: Any) -> Any:
+    """Tuples and arrays as lists, so that what is written to JSON is what is read again."""
+    if isinstance(value, Described):
+        return value.to_dict()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [plain_value(v) for v in value] if isinstance(value, (tuple, list)) else value
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Bounds:
+class Bounds(ShowsArrays):
     """Lower and upper limits of the states and inputs of a `Problem`.
 
     Where a whole array is None, or one entry is NaN, the limit of the model (its positions, velocities and efforts)
@@ -39,28 +76,24 @@ class Bounds:
     u_lower: Any = None
     u_upper: Any = None
 
-    def __repr__(self) -> str:
-        given = {name: value for name, value in vars(self).items() if value is not None}
-        return f"Bounds({', '.join(f'{name}={short(value)}' for name, value in given.items())})"
-
 
 class StateFunction:
-    """A function x (nx,) -> (m,) that tells its values and slopes at many states at once."""
+    """A function x (nx,) -> (m,) with exact derivatives at many states at once."""
 
     def values(self, xs: Array) -> Array:
         """(K, m) at states (K, nx)."""
         raise NotImplementedError
 
-    def slopes(self, xs: Array) -> Array:
-        """(K, m, nx) at states (K, nx)."""
+    def linearize(self, xs: Array) -> tuple[Array, Array]:
+        """(K, m), and the derivatives (K, m, nx), at states (K, nx)."""
         raise NotImplementedError
 
     def __call__(self, x: Any) -> Any:
         """(m,) at one state, floats or AutoDiffXd."""
         if x.dtype == float:
             return self.values(x[None])[0]
-        states = ExtractValue(x.reshape(-1, 1)).T
-        return chain_rows(self.values(states)[0], self.slopes(states)[0], x)
+        values, slopes = self.linearize(ExtractValue(x.reshape(-1, 1)).T)
+        return chain_rows(values[0], slopes[0], x)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -123,9 +156,7 @@ class Constraint:
     @property
     def takes_input(self) -> bool:
         """Whether the function has an argument u."""
-        kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        parameters = inspect.signature(self.function).parameters.values()
-        return len([p for p in parameters if p.kind in kinds and p.default is p.empty]) > 1
+        return arguments_of(self.function) > 1
 
     @property
     def whole(self) -> bool:
@@ -151,6 +182,8 @@ class Constraint:
 
     def differentiate(self, x: Array, u: Array) -> tuple[Array, Array]:
         """(values (m,), Jacobian (m, nx + nu)); GradientError where it is lost or not finite."""
+        if hasattr(self.function, "linearize"):
+            return self.along(x[None], u[None])[0], self.slopes(x[None], u[None])[0]
         z = InitializeAutoDiff(np.concatenate([x, u])).ravel()
         with np.errstate(all="ignore"):  # what is not finite is refused below
             result = self._call(z[: len(x)], z[len(x) :])
@@ -161,15 +194,15 @@ class Constraint:
 
     def along(self, xs: Array, us: Array) -> Array:
         """(K, m) the function's values at xs (K, nx), us (K, nu)."""
-        if isinstance(self.function, StateFunction):
-            return self.function.values(xs)
+        if hasattr(self.function, "linearize"):
+            return np.asarray(self.function.values(xs))  # type: ignore[attr-defined]
         return np.array([self(x, u) for x, u in zip(xs, us, strict=True)])
 
     def slopes(self, xs: Array, us: Array) -> Array:
         """(K, m, nx + nu) the function's Jacobians at xs (K, nx), us (K, nu); GradientError as by `differentiate`."""
-        if not isinstance(self.function, StateFunction):
+        if not hasattr(self.function, "linearize"):
             return np.array([self.differentiate(x, u)[1] for x, u in zip(xs, us, strict=True)])
-        by_x = self.function.slopes(xs)
+        by_x = self.function.linearize(xs)[1]
         bad = ~np.all(np.isfinite(by_x), axis=(1, 2))
         if bad.any():
             raise GradientError(f"the derivative of constraint {self.label} is not finite at x = {xs[bad][0].tolist()}")
@@ -202,6 +235,16 @@ class Constraint:
         if result.ndim > 1:
             raise InputError(f"constraint {self.label}", got=f"shape {result.shape}", expected="a number or shape (m,)")
         return np.atleast_1d(result)
+
+
+def arguments_of(function: Any) -> int:
+    """How many arguments without a default a function takes; 0 of one that does not say."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # some that are built in
+        return 0
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in kinds and p.default is p.empty for p in parameters)
 
 
 def carried(result: Array, width: int, subject: str, form: str) -> tuple[Array, Array]:

@@ -6,7 +6,6 @@ in continuous time, the slopes of its input and of x' within each interval. Held
 next, and a discrete motion accelerates by (v_(k+1) - v_k) / h.
 """
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,13 +16,13 @@ from drake_diff._base.arrays import Array, Indices, finite_array, positive_float
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints, labelled
-from drake_diff.optimize.problem.constraint import Constraint, short
+from drake_diff.optimize.problem.constraint import Constraint, Described, arguments_of, short
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics
 
 FORM = "a function of the states at its knots, or of these and of the inputs there, that gives numbers (m,)"
 
 
-class Couples:
+class Couples(Described):
     """The base of all that joins several knots: plain values and functions, which hold no problem."""
 
     name: str
@@ -32,10 +31,6 @@ class Couples:
     def label(self) -> str:
         """What it is called in messages."""
         return self.name
-
-    def to_dict(self) -> dict[str, Any]:
-        """The kind and its values, for a record; a user's function is told by its name."""
-        raise NotImplementedError
 
 
 class Joins(Couples):
@@ -140,12 +135,10 @@ class Coupling(Joins):
         knots = np.asarray(self.knots)
         if knots.ndim != 1 or len(knots) < 2 or not np.issubdtype(knots.dtype, np.integer):
             raise InputError("Coupling.knots", got=repr(self.knots), expected="two or more whole numbers")
-        object.__setattr__(self, "knots", tuple(knots.tolist()))
         limits = Constraint(lambda x: x, self.lower, self.upper, name=self.label)  # checks them
-        object.__setattr__(self, "lower", limits.lower)
-        object.__setattr__(self, "upper", limits.upper)
-        if self._arguments() not in (len(self.knots), 2 * len(self.knots)):
-            got = f"{self._arguments()} arguments for {len(self.knots)} knots"
+        self._set(knots=tuple(knots.tolist()), lower=limits.lower, upper=limits.upper)
+        if arguments_of(self.function) not in (0, len(knots), 2 * len(knots)):  # 0: *states
+            got = f"{arguments_of(self.function)} arguments for {len(knots)} knots"
             raise InputError(f"coupling {self.label}", got=got, expected=FORM)
 
     def __repr__(self) -> str:
@@ -160,14 +153,7 @@ class Coupling(Joins):
     @property
     def takes_input(self) -> bool:
         """Whether the function takes the inputs too."""
-        return self._arguments() == 2 * len(self.knots)
-
-    def _arguments(self) -> int:
-        kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        parameters = list(inspect.signature(self.function).parameters.values())
-        if any(p.kind is inspect.Parameter.VAR_POSITIONAL for p in parameters):
-            return len(self.knots)
-        return sum(p.kind in kinds and p.default is p.empty for p in parameters)
+        return arguments_of(self.function) == 2 * len(self.knots)
 
     def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> BoundCoupling:
         last = num_steps - 1 if self.takes_input and not input_at_end else num_steps
@@ -188,8 +174,9 @@ class Coupling(Joins):
         return BoundCoupling(rows.resolved(np.zeros(count * nx), np.zeros(count * nu)), np.array([knots]))
 
     def to_dict(self) -> dict[str, Any]:
-        lower, upper = ([float(v) if np.isfinite(v) else None for v in side] for side in (self.lower, self.upper))
-        return {"Coupling": {"name": self.label, "knots": list(self.knots), "lower": lower, "upper": upper}}
+        sides = ([float(v) if np.isfinite(v) else None for v in side] for side in (self.lower, self.upper))
+        values = dict(zip(("lower", "upper"), sides, strict=True))
+        return {"Coupling": {"name": self.label, "knots": list(self.knots), **values}}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -238,13 +225,7 @@ class Periodic(Joins):
         offset = None if self.offset is None else finite_array("Periodic.offset", self.offset, (size,))
         size = size if offset is None else len(offset)
         M = None if self.M is None else finite_array("Periodic.M", self.M, (size, "nx"))
-        for field, value in (("M", M), ("offset", offset), ("entries", entries)):
-            object.__setattr__(self, field, value)
-
-    def __repr__(self) -> str:
-        given = {"M": self.M, "offset": self.offset, "entries": self.entries}
-        arguments = ", ".join(f"{name}={short(value)}" for name, value in given.items() if value is not None)
-        return f"Periodic({arguments})"
+        self._set(M=M, offset=offset, entries=entries)
 
     def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> BoundCoupling:
         entries = np.arange(nx) if self.entries is None else np.array(self.entries)
@@ -260,11 +241,6 @@ class Periodic(Joins):
 
         coupling = Coupling(apart, lower=0.0, upper=0.0, name=self.label)
         return coupling.bound(num_steps, nx, nu, input_at_end=input_at_end)
-
-    def to_dict(self) -> dict[str, Any]:
-        name = None if self.name == "periodic" else self.name
-        given = {"M": self.M, "offset": self.offset, "entries": self.entries, "name": name}
-        return {"Periodic": {name: np.asarray(value).tolist() for name, value in given.items() if value is not None}}
 
 
 def checked_couplings(given: Any) -> tuple[Couples, ...]:
@@ -296,9 +272,14 @@ class RateLimit(Couples):
     limit: Any
     of_inputs: bool
 
-    def __repr__(self) -> str:
-        limit = self.limit if isinstance(self.limit, dict) else f"{self.limit:g}"
-        return f"{type(self).__name__}({limit})"
+    def __post_init__(self) -> None:
+        subject, limit = f"{type(self).__name__}.limit", self.limit
+        if not isinstance(limit, Mapping):
+            self._set(limit=positive_float(f"{subject} [per s]", limit))
+        elif not limit:
+            raise InputError(subject, got="no names", expected="a limit for each name")
+        else:  # in the order that a record has
+            self._set(limit={str(name): positive_float(f"{subject} of {name}", limit[name]) for name in sorted(limit)})
 
     def entries(self, system: System) -> tuple[Indices, Array]:
         """The inputs, or the entries of the state whose x' changes, that have a limit, and the limits."""
@@ -311,7 +292,7 @@ class RateLimit(Couples):
                 raise InputError(kind, got="one limit", expected="limits by name: plain dynamics have no velocities")
             places = sorted(set(known.values()))
             return np.array(places), np.full(len(places), self.limit)
-        limits = {}
+        limits = dict[int, float]()
         for name, limit in self.limit.items():
             if name not in known:
                 raise UnknownNameError(kind, got=name, known=known)
@@ -337,22 +318,8 @@ class RateLimit(Couples):
         rows = Constraint(function, -limits, limits, name=self.label)
         return BoundCoupling(rows, np.arange(max(count - knots + 1, 0))[:, None] + np.arange(knots))
 
-    def to_dict(self) -> dict[str, Any]:
-        name = {} if self.name == type(self).name else {"name": self.name}
-        return {type(self).__name__: {"limit": self.limit, **name}}
-
     def _known(self, system: System) -> dict[str, int]:
         raise NotImplementedError
-
-    def _check(self) -> None:
-        kind = type(self).__name__
-        if isinstance(self.limit, Mapping):
-            if not self.limit:
-                raise InputError(f"{kind}.limit", got="no names", expected="a limit for each name")
-            given = {str(name): positive_float(f"{kind}, {name}", limit) for name, limit in self.limit.items()}
-            object.__setattr__(self, "limit", dict(sorted(given.items())))  # the order that a record has
-        else:
-            object.__setattr__(self, "limit", positive_float(f"{kind}.limit [per s]", self.limit))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -382,9 +349,6 @@ class InputRate(RateLimit):
     limit: Any
     name: str = "input rate"
     of_inputs = True
-
-    def __post_init__(self) -> None:
-        self._check()
 
     def _known(self, system: System) -> dict[str, int]:
         return {name: i for i, name in enumerate(system.input_names)}
@@ -418,9 +382,6 @@ class Jerk(RateLimit):
     limit: Any
     name: str = "jerk"
     of_inputs = False
-
-    def __post_init__(self) -> None:
-        self._check()
 
     def _known(self, system: System) -> dict[str, int]:
         if not isinstance(system, Model):

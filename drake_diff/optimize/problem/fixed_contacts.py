@@ -1,7 +1,7 @@
 """A model whose points the world holds while a phase lasts: a foot that stands, a hand that holds on."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from drake_diff._base.arrays import Array, finite_array, frozen, positive_float
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError
-from drake_diff.mechanics.quantities import frame_position, frame_velocity
+from drake_diff.mechanics.quantities import frame_position, frame_velocity, recorded
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Constraint, plant_limits
 from drake_diff.optimize.problem.dynamics import Dynamics
@@ -125,14 +125,13 @@ class FixedContacts(Dynamics):
         """
         reach = positive_float("tolerance [m]", tolerance)
         zero = np.zeros(len(self.rows))
-        constraints = [Constraint(FixedSpeeds(self), zero, zero, knots=0, name="fixed points at rest")]
+        constraints = [Constraint(quantity(self, "FixedSpeeds"), zero, zero, knots=0, name="fixed points at rest")]
         where = self._where(at)
         if not np.all(np.isnan(where)):
             given = np.flatnonzero(~np.isnan(where))
+            places = quantity(self, "FixedPositions", rows=given.tolist())
             lower, upper = where[given] - reach, where[given] + reach
-            constraints.append(
-                Constraint(FixedPositions(self, given.tolist()), lower, upper, name="fixed points in place")
-            )
+            constraints.append(Constraint(places, lower, upper, name="fixed points in place"))
         if friction is not None:
             constraints += self._pushing(positive_float("friction", friction))
         return constraints
@@ -149,9 +148,9 @@ class FixedContacts(Dynamics):
 
     def _pushing(self, friction: float) -> Iterator[Constraint]:
         for name, z, along in self.normals():
-            yield Constraint(FixedForce(self, z), lower=0.0, name=f"{name} pushes")
+            yield Constraint(quantity(self, "FixedForce", row=z), lower=0.0, name=f"{name} pushes")
             if along:
-                cone = FrictionCone(self, z, along, friction)
+                cone = quantity(self, "FrictionCone", z=z, along=along, friction=friction)
                 yield Constraint(cone, lower=cone_limits(along), name=f"{name} does not slide")
 
     def normals(self) -> Iterator[tuple[str, int, list[int]]]:
@@ -297,14 +296,15 @@ class Impact:
         constraints, zero = [], np.zeros(len(self.gap_rows))
         if self.has_gap:
             names = " and ".join(self.contacts.rows[i] for i in self.gap_rows)
-            constraints.append(Constraint(ImpactGaps(self), zero, zero, knots=-1, name=f"{names} touches"))
-        if self.friction is not None:
-            for name, z, along in self.contacts.normals():
-                constraints.append(Constraint(ImpactPush(self, z), lower=0.0, knots=-1, name=f"{name} is pushed"))
-                if along:
-                    cone = ImpactCone(self, z, along, self.friction)
-                    label = f"{name} does not slide in the impact"
-                    constraints.append(Constraint(cone, lower=cone_limits(along), knots=-1, name=label))
+            gaps = quantity(self, "ImpactGaps")
+            constraints.append(Constraint(gaps, zero, zero, knots=-1, name=f"{names} touches"))
+        for name, z, along in self.contacts.normals() if self.friction is not None else ():
+            push = quantity(self, "ImpactPush", row=z)
+            constraints.append(Constraint(push, lower=0.0, knots=-1, name=f"{name} is pushed"))
+            if along:
+                cone = quantity(self, "ImpactCone", z=z, along=along, friction=self.friction)
+                label = f"{name} does not slide in the impact"
+                constraints.append(Constraint(cone, lower=cone_limits(along), knots=-1, name=label))
         return constraints
 
     def to_dict(self) -> dict[str, Any]:
@@ -323,61 +323,8 @@ class Impact:
             raise InputError("impact", got=repr(values)[:80], expected="what Impact.to_dict tells") from error
 
 
-class FixedContactQuantity:
-    """The base of the functions that a stance's constraints are of; a record tells them by `to_dict`."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """The kind and its values."""
-        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "contacts"}  # type: ignore[arg-type]
-        return {type(self).__name__: values}
-
-
-@dataclass(frozen=True, eq=False)
-class FixedSpeeds(FixedContactQuantity):
-    """The velocities of the fixed coordinates."""
-
-    contacts: FixedContacts
-
-    def __call__(self, x: Any) -> Any:
-        return self.contacts.speeds(x)
-
-
-@dataclass(frozen=True, eq=False)
-class FixedPositions(FixedContactQuantity):
-    """Some of the fixed coordinates."""
-
-    contacts: FixedContacts
-    rows: list[int]
-
-    def __call__(self, x: Any) -> Any:
-        return self.contacts.places(x)[self.rows]
-
-
-@dataclass(frozen=True, eq=False)
-class FixedForce(FixedContactQuantity):
-    """One of the forces."""
-
-    contacts: FixedContacts
-    row: int
-
-    def __call__(self, x: Any, u: Any) -> Any:
-        return self.contacts.forces(x, u)[self.row]
-
-
-@dataclass(frozen=True, eq=False)
-class FrictionCone(FixedContactQuantity):
+def friction_cone(f: Any, z: int, along: list[int], friction: float) -> Any:
     """friction f_z - f_t and friction f_z + f_t, or of two directions friction^2 f_z^2 - f_x^2 - f_y^2."""
-
-    contacts: FixedContacts
-    z: int
-    along: list[int]
-    friction: float
-
-    def __call__(self, x: Any, u: Any) -> Any:
-        return _within_cone(self.contacts.forces(x, u), self.z, self.along, self.friction)
-
-
-def _within_cone(f: Any, z: int, along: list[int], friction: float) -> Any:
     if len(along) == 1:
         most, t = friction * f[z], f[along[0]]
         return np.array([most - t, most + t])
@@ -389,69 +336,30 @@ def cone_limits(along: list[int]) -> Any:
     return np.zeros(2) if len(along) == 1 else 0.0
 
 
-class ImpactQuantity(FixedContactQuantity):
-    """The base of the functions that an impact's constraints are of, each of the state before it."""
-
-    impact: Impact
-
-    def to_dict(self) -> dict[str, Any]:
-        """The kind, the impact and the values."""
-        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "impact"}  # type: ignore[arg-type]
-        return {type(self).__name__: {"impact": self.impact.to_dict(), **values}}
-
-
-@dataclass(frozen=True, eq=False)
-class ImpactGaps(ImpactQuantity):
-    """The gaps that close."""
-
-    impact: Impact
-
-    def __call__(self, x: Any) -> Any:
-        return self.impact.gaps(x)
+# What the constraints of a stance and, of the state before, of an impact limit; by the names that a record has.
+QUANTITIES: dict[str, Any] = {
+    "FixedSpeeds": lambda contacts: lambda x: contacts.speeds(x),
+    "FixedPositions": lambda contacts, rows: lambda x: contacts.places(x)[rows],
+    "FixedForce": lambda contacts, row: lambda x, u: contacts.forces(x, u)[row],
+    "FrictionCone": lambda contacts, z, along, friction: (
+        lambda x, u: friction_cone(contacts.forces(x, u), z, along, friction)
+    ),
+    "ImpactGaps": lambda impact: lambda x: impact.gaps(x),
+    "ImpactPush": lambda impact, row: lambda x: impact.impulses(x)[row],
+    "ImpactCone": lambda impact, z, along, friction: lambda x: friction_cone(impact.impulses(x), z, along, friction),
+}
 
 
-@dataclass(frozen=True, eq=False)
-class ImpactPush(ImpactQuantity):
-    """One of the impulses."""
-
-    impact: Impact
-    row: int
-
-    def __call__(self, x: Any) -> Any:
-        return self.impact.impulses(x)[self.row]
+def quantity(source: FixedContacts | Impact, kind: str, **values: Any) -> Any:
+    """One of the QUANTITIES, which a record knows by its `kind` and `values`."""
+    described = {"impact": source.to_dict()} if isinstance(source, Impact) else {}
+    return recorded(QUANTITIES[kind](source, **values), kind, **described, **values)
 
 
-@dataclass(frozen=True, eq=False)
-class ImpactCone(ImpactQuantity):
-    """What `FrictionCone` is of forces, of impulses."""
-
-    impact: Impact
-    z: int
-    along: list[int]
-    friction: float
-
-    def __call__(self, x: Any) -> Any:
-        return _within_cone(self.impact.impulses(x), self.z, self.along, self.friction)
-
-
-QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (FixedSpeeds, FixedPositions, FixedForce, FrictionCone)}
-IMPACT_QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (ImpactGaps, ImpactPush, ImpactCone)}
-
-
-def impact_quantity(model: Model, record: dict[str, Any]) -> ImpactQuantity:
-    """The function that `ImpactQuantity.to_dict` told of, on `model`; InputError where that is none."""
-    ((kind, values),) = record.items()
-    impact = Impact.from_dict(values["impact"], model)
-    quantity: ImpactQuantity = IMPACT_QUANTITIES[kind](
-        impact, **{name: value for name, value in values.items() if name != "impact"}
-    )
-    return quantity
-
-
-def fixed_contact_quantity(contacts: FixedContacts, record: dict[str, Any]) -> FixedContactQuantity:
-    """The function that `FixedContactQuantity.to_dict` told of, of `contacts`; InputError where that is none."""
-    if not (len(record) == 1 and next(iter(record)) in QUANTITIES):
-        raise InputError("quantity", got=repr(record)[:80], expected=f"one of {', '.join(QUANTITIES)} with its values")
-    ((kind, values),) = record.items()
-    quantity: FixedContactQuantity = QUANTITIES[kind](contacts, **values)
-    return quantity
+def recorded_quantity(system: Any, kind: str, values: dict[str, Any]) -> Any:
+    """The quantity that a record has, on a model or on fixed contacts."""
+    given = dict(values)
+    if "impact" in given:
+        model = system.plant.model if isinstance(system, FixedContacts) else system
+        system = Impact.from_dict(given.pop("impact"), model)
+    return quantity(system, kind, **given)

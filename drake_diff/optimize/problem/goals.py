@@ -9,14 +9,15 @@ steps of another length end a little elsewhere.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, MISSING, dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import KW_ONLY, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, array_with_gaps, finite_array, positive_float
+from drake_diff._base.arrays import Array, array_with_gaps, count, finite_array, positive_float
 from drake_diff.exceptions import InputError
+from drake_diff.mechanics.coordinates import rotation
 from drake_diff.mechanics.quantities import (
     UP,
     center_of_mass,
@@ -27,7 +28,7 @@ from drake_diff.mechanics.quantities import (
     frame_velocity,
 )
 from drake_diff.model.model import Model
-from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.constraint import Constraint, Described
 from drake_diff.optimize.problem.dynamics import coordinates
 
 LAST = (-1,)
@@ -39,7 +40,7 @@ SAME_ROTATION = 1e-3  # of a quaternion's norm from 1: typed by hand, it is made
 SMALLEST_BALL = 0.015  # [m] the radius of what is drawn
 GREEN = (0.18, 0.49, 0.2, 0.8)  # red, green, blue, opacity
 
-Numbers = tuple[float | None, ...]  # None where free
+FREE = (None, None, None)
 
 
 @dataclass(frozen=True)
@@ -83,19 +84,25 @@ class GoalConstraint(Constraint):
         both = np.isfinite(self.lower) & np.isfinite(self.upper)
         return np.where(both, np.where(both, self.lower, 0.0) / 2 + np.where(both, self.upper, 0.0) / 2, np.nan)
 
+    def residuals(self, x: Any) -> Any:
+        """What is missed at x (nx,), of floats, AutoDiffXd or symbols, where something in the middle is wanted."""
+        if self.measured is not None:
+            return self.measured(x)
+        return (np.asarray(self.function(x)) - self.wanted)[~np.isnan(self.wanted)]
+
     def miss(self, x: Array) -> float:
         """How far x (nx,) is from what is wanted; inf where it is no number.
 
         The distance from the middle of the bounds, and from the one that there is where there is one.
         """
         if self.measured is not None:
-            off = float(np.linalg.norm(self.measured(x)))
-            return off if np.isfinite(off) else float("inf")
-        values, wanted = np.asarray(self.function(x), dtype=float), self.wanted
-        excess = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
-        apart = np.where(np.isnan(wanted), excess, values - wanted)
-        off = float(np.linalg.norm(apart, ord=self.norm))
-        return off if np.isfinite(off) else float("inf")
+            off = self.measured(x)
+        else:
+            values = self(x, None)
+            excess = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
+            off = np.where(np.isnan(self.wanted), excess, values - self.wanted)
+        size = float(np.linalg.norm(off, ord=self.norm))
+        return size if np.isfinite(size) else float("inf")
 
     def told(self, miss: float) -> str:
         """A clause about a motion whose largest `miss` this is: "hand position is 0.3 mm off"."""
@@ -109,18 +116,36 @@ def in_words(value: float, unit: str) -> str:
     return f"{value:.2g} {unit}"
 
 
-class Goal:
-    """The base of all goals: frozen dataclasses of plain values, which a `Problem` binds to its model.
+class Goal(Described):
+    """The base of all goals, which a `Problem` binds to its model.
 
     One that has a `weight` is not kept: the weighted square of what it misses is added to the cost instead.
     """
 
-    weight: float | None
-    knots: Any
+    weight: float | None = None
+    knots: Any = None
+
+    def __post_init__(self) -> None:
+        kind = type(self).__name__
+        for f in fields(self):  # type: ignore[arg-type]  # all are dataclasses
+            value = getattr(self, f.name)
+            if f.name in CHECKS and not (value is None and f.default is None):
+                self._set(**{f.name: CHECKS[f.name](f"{kind}.{f.name}", value)})
+        if self.weight is not None and self.knots not in (None, LAST):
+            expected = "the last one, -1, or None: all"
+            raise InputError(f"{kind}.knots with a weight", got=list(self.knots), expected=expected)
+        self._check()
+
+    def _check(self) -> None:
+        """Refuse values that do not go together."""
+
+    def targets(self, model: Model) -> Iterator["Target"]:
+        """What has to be where; UnknownNameError where a model has no such frame or joint."""
+        raise NotImplementedError
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        """What has to hold of a motion of `model`; UnknownNameError where it has no such frame or joint."""
-        raise NotImplementedError
+        """What has to hold of a motion of `model`."""
+        return tuple(target.constraint(self.knots) for target in self.targets(model))
 
     def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
         """The same of a motion that a `Problem` asks for, where more than its model matters."""
@@ -130,29 +155,27 @@ class Goal:
         """What a page draws of it."""
         return ()
 
-    def to_dict(self) -> dict[str, Any]:
-        """The kind and the values that are not the defaults, for a record: `Kind(**values)` is the goal again."""
-        return {type(self).__name__: {name: _plain(value) for name, value in self._given()}}
 
-    def __repr__(self) -> str:
-        arguments = ", ".join(f"{name}={_plain(value)!r}" for name, value in self._given())
-        return f"{type(self).__name__}({arguments})"
+@dataclass(frozen=True)
+class Target:
+    """`function` (m,) of the state within `tolerance` of `wanted` (m,), None or NaN where free, by a `norm`.
 
-    def _given(self) -> list[tuple[str, Any]]:
-        pairs = [(f, getattr(self, f.name)) for f in fields(self)]  # type: ignore[arg-type]  # all are dataclasses
-        return [(f.name, value) for f, value in pairs if f.default is MISSING or value != f.default]
+    A plan uses a part of it (AIMED): its rows have bounds of their own, the largest cube within that distance.
+    """
 
-    def _set(self, **values: Any) -> None:
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+    function: Callable[[Any], Any]
+    wanted: Any
+    tolerance: float
+    unit: str
+    name: str
+    norm: float = 2.0
 
-    def _check(self, **values: Any) -> None:
-        """Check the fields that goals have in common, and set these and the `values` of the others."""
-        given, kind = vars(self), type(self).__name__
-        for name in given:
-            if name in CHECKS and name not in values:
-                values[name] = CHECKS[name](f"{kind}.{name}", given[name])
-        self._set(**values, weight=checked_weight(kind, self.weight, self.knots))
+    def constraint(self, knots: Any) -> GoalConstraint:
+        wanted = np.array(self.wanted, dtype=float)
+        half = AIMED * self.tolerance / np.count_nonzero(np.isfinite(wanted)) ** (1 / self.norm)
+        lower, upper = (np.where(np.isnan(wanted), np.sign(side) * np.inf, wanted + side) for side in (-half, half))
+        options: dict[str, Any] = {"tolerance": self.tolerance, "unit": self.unit, "norm": self.norm}
+        return GoalConstraint(self.function, lower, upper, knots, self.name, **options)
 
 
 @dataclass(frozen=True, repr=False)
@@ -189,7 +212,7 @@ class FrameGoal(Goal):
     """
 
     frame: str
-    position: Any = None  # becomes Numbers
+    position: Any = None
     rotation: Any = None  # becomes a tuple of rows
     _: KW_ONLY
     point: Any = (0.0, 0.0, 0.0)
@@ -198,32 +221,22 @@ class FrameGoal(Goal):
     knots: Any = LAST
     weight: float | None = None
 
-    def __post_init__(self) -> None:
-        position = None if self.position is None else with_gaps("FrameGoal.position", self.position, 3)
-        if self.rotation is None and (position is None or not any(p is not None for p in position)):
+    def _check(self) -> None:
+        if self.rotation is None and self.position in (None, FREE):
             raise InputError("FrameGoal", got="no position and no rotation", expected="one of them, or both")
-        rotation = None if self.rotation is None else rotation_of("FrameGoal.rotation", self.rotation)
-        self._check(position=position, rotation=rotation)
 
-    def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        constraints = []
+    def targets(self, model: Model) -> Iterator[Target]:
         if self.position is not None:
-            where, name = frame_position(model, self.frame, self.point), f"{self.frame} position"
-            constraints.append(within(where, _gaps(self.position), self.tolerance, "m", name, self.knots))
+            where = frame_position(model, self.frame, self.point)
+            yield Target(where, self.position, self.tolerance, "m", f"{self.frame} position")
         if self.rotation is not None:
             turned = frame_rotation_error(model, self.frame, np.array(self.rotation))
-            name = f"{self.frame} rotation"
-            constraints.append(within(turned, np.zeros(3), self.rotation_tolerance, "rad", name, self.knots))
-        return tuple(constraints)
+            yield Target(turned, np.zeros(3), self.rotation_tolerance, "rad", f"{self.frame} rotation")
 
     def marks(self) -> tuple[Mark, ...]:
-        label, marks = f"target of {self.frame}", tuple[Mark, ...]()
-        if self.position is not None:
-            marks = _place(label, self.position, self.tolerance)
-        if self.rotation is not None:
-            position = tuple(p or 0.0 for p in self.position or (0.0,) * 3)
-            marks = (*marks, Mark(label, "axes", (0.1,), position, self.rotation))
-        return marks
+        label, centre = f"target of {self.frame}", _filled(self.position or FREE)
+        axes = () if self.rotation is None else (Mark(label, "axes", (0.1,), centre, self.rotation),)
+        return axes if self.position is None else (*_place(label, self.position, self.tolerance), *axes)
 
 
 @dataclass(frozen=True, repr=False)
@@ -250,40 +263,31 @@ class FrameVelocityGoal(Goal):
     """
 
     frame: str
-    velocity: Any = (0.0, 0.0, 0.0)  # becomes Numbers
+    velocity: Any = (0.0, 0.0, 0.0)
     _: KW_ONLY
-    angular_velocity: Any = (None, None, None)  # becomes Numbers
+    angular_velocity: Any = FREE
     point: Any = (0.0, 0.0, 0.0)
     tolerance: float = 1e-2
     angular_tolerance: float = 5e-2
     knots: Any = LAST
     weight: float | None = None
 
-    def __post_init__(self) -> None:
-        free = (None, None, None)
-        velocity, turning = (free if v is None else v for v in (self.velocity, self.angular_velocity))
-        self._check(
-            velocity=with_gaps("FrameVelocityGoal.velocity", velocity, 3),
-            angular_velocity=with_gaps("FrameVelocityGoal.angular_velocity", turning, 3),
-        )
-        if all(v is None for v in (*self.velocity, *self.angular_velocity)):
+    def _check(self) -> None:
+        if self.velocity == self.angular_velocity == FREE:
             raise InputError("FrameVelocityGoal", got="nothing but free entries", expected="a velocity")
 
-    def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        constraints = []
-        if any(v is not None for v in self.velocity):
-            moving, name = frame_velocity(model, self.frame, self.point), f"{self.frame} velocity"
-            constraints.append(within(moving, _gaps(self.velocity), self.tolerance, "m/s", name, self.knots))
-        if any(v is not None for v in self.angular_velocity):
+    def targets(self, model: Model) -> Iterator[Target]:
+        if self.velocity != FREE:
+            moving = frame_velocity(model, self.frame, self.point)
+            yield Target(moving, self.velocity, self.tolerance, "m/s", f"{self.frame} velocity")
+        if self.angular_velocity != FREE:
             turning, name = frame_angular_velocity(model, self.frame), f"{self.frame} angular velocity"
-            wanted = _gaps(self.angular_velocity)
-            constraints.append(within(turning, wanted, self.angular_tolerance, "rad/s", name, self.knots))
-        return tuple(constraints)
+            yield Target(turning, self.angular_velocity, self.angular_tolerance, "rad/s", name)
 
     def marks(self) -> tuple[Mark, ...]:
         if not any(self.velocity):
             return ()
-        along = tuple(v or 0.0 for v in self.velocity)
+        along = _filled(self.velocity)
         return (Mark(f"velocity of {self.frame}", "arrow", along, self.point, frame=self.frame, in_world=True),)
 
 
@@ -315,25 +319,21 @@ class JointGoal(Goal):
     knots: Any = LAST
     weight: float | None = None
 
-    def __post_init__(self) -> None:
+    def _check(self) -> None:
         if not isinstance(self.values, Mapping) or not self.values:
             raise InputError("JointGoal", got=repr(self.values)[:80], expected="a value for each name")
         values = sorted(self.values.items(), key=lambda item: str(item[0]))  # a record has them so
-        self._check(values={name_of("JointGoal", n): float(finite_array(f"JointGoal {n}", v, ())) for n, v in values})
+        self._set(values={name_of("JointGoal", n): float(finite_array(f"JointGoal {n}", v, ())) for n, v in values})
 
-    def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
+    def targets(self, model: Model) -> Iterator[Target]:
         wanted, contract = coordinates(model, "JointGoal", self.values), model.contract
         units = [coordinate.unit for coordinate in contract.positions + contract.velocities]
-        constraints = []
         for unit in dict.fromkeys(units[i] for i in wanted):
             here = [i for i in wanted if units[i] == unit]
             names = [model.state_names[i] for i in here]
             label = ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} more"
-            target = np.array([wanted[i] for i in here])
-            constraints.append(
-                within(_Entries(tuple(here)), target, self.tolerance, unit, label, self.knots, norm=np.inf)
-            )
-        return tuple(constraints)
+            values = [wanted[i] for i in here]
+            yield Target(_Entries(tuple(here)), values, self.tolerance, unit, label, norm=np.inf)
 
 
 @dataclass(frozen=True, repr=False)
@@ -355,21 +355,18 @@ class CenterOfMassGoal(Goal):
         CenterOfMassGoal(position=[0.0, None, None], knots=None)
     """
 
-    position: Any  # becomes Numbers
+    position: Any
     _: KW_ONLY
     tolerance: float = 5e-3
     knots: Any = LAST
     weight: float | None = None
 
-    def __post_init__(self) -> None:
-        position = with_gaps("CenterOfMassGoal.position", self.position, 3)
-        if not any(p is not None for p in position):
+    def _check(self) -> None:
+        if self.position == FREE:
             raise InputError("CenterOfMassGoal", got="nothing but free entries", expected="a position")
-        self._check(position=position)
 
-    def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        wanted = _gaps(self.position)
-        return (within(center_of_mass(model), wanted, self.tolerance, "m", "centre of mass", self.knots),)
+    def targets(self, model: Model) -> Iterator[Target]:
+        yield Target(center_of_mass(model), self.position, self.tolerance, "m", "centre of mass")
 
     def marks(self) -> tuple[Mark, ...]:
         return _place("target of the centre of mass", self.position, self.tolerance)
@@ -402,11 +399,9 @@ class KeepLevel(Goal):
     knots: Any = None
     weight: float | None = None
 
-    def __post_init__(self) -> None:
-        axis = tuple(finite_array("KeepLevel.axis", self.axis, (3,)).tolist())
-        if not any(axis):
-            raise InputError("KeepLevel.axis", got=list(axis), expected="a direction")
-        self._check(axis=axis)
+    def _check(self) -> None:
+        if not any(self.axis):
+            raise InputError("KeepLevel.axis", got=list(self.axis), expected="a direction")
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         leans = frame_tilt(model, self.frame, self.axis)
@@ -423,7 +418,8 @@ class KeepLevel(Goal):
         )
 
     def marks(self) -> tuple[Mark, ...]:
-        return (Mark(f"{self.frame} level", "arrow", tuple(0.15 * a for a in _unit(self.axis)), frame=self.frame),)
+        length = float(np.linalg.norm(self.axis))
+        return (Mark(f"{self.frame} level", "arrow", tuple(0.15 * a / length for a in self.axis), frame=self.frame),)
 
 
 @dataclass(frozen=True, repr=False)
@@ -458,16 +454,13 @@ class Dwell(Goal):
     _: KW_ONLY
     end: int = -1
 
-    weight = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.goal, Goal) or "knots" not in {f.name for f in fields(self.goal)}:  # type: ignore[arg-type]
-            raise InputError("Dwell.goal", got=repr(self.goal)[:80], expected="a goal of a state, such as a FrameGoal")
-        if self.goal.weight is not None or self.goal.knots not in (None, LAST):
-            raise InputError("Dwell.goal", got=repr(self.goal)[:80], expected="a goal without knots and weight")
-        if isinstance(self.end, bool) or not isinstance(self.end, (int, np.integer)):
-            raise InputError("Dwell.end", got=repr(self.end), expected="a whole number")
-        self._set(seconds=positive_float("Dwell.seconds [s]", self.seconds), end=int(self.end))
+    def _check(self) -> None:
+        goal = self.goal
+        if not isinstance(goal, Goal) or "knots" not in {f.name for f in fields(goal)}:  # type: ignore[arg-type]
+            raise InputError("Dwell.goal", got=repr(goal)[:80], expected="a goal of a state, such as a FrameGoal")
+        if goal.weight is not None or goal.knots not in (None, LAST):
+            raise InputError("Dwell.goal", got=repr(goal)[:80], expected="a goal without knots and weight")
+        self._set(seconds=positive_float("Dwell.seconds [s]", self.seconds), end=count("Dwell.end", self.end, -(10**9)))
 
     def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
         knots = self.knots_in(problem)
@@ -490,14 +483,6 @@ class Dwell(Goal):
 
     def marks(self) -> Any:
         return self.goal.marks()
-
-    def to_dict(self) -> dict[str, Any]:
-        end = {} if self.end == -1 else {"end": self.end}
-        return {"Dwell": {"goal": self.goal.to_dict(), "seconds": self.seconds, **end}}
-
-    def __repr__(self) -> str:
-        end = "" if self.end == -1 else f", end={self.end}"
-        return f"Dwell({self.goal!r}, {self.seconds:g}{end})"
 
 
 def _held(c: GoalConstraint) -> GoalConstraint:
@@ -542,70 +527,31 @@ class WithGoals:
     def __call__(self, x: Any, *u: Any) -> Any:
         total = 0.0 * x[0] if self.own is None else self.own(x, *u)
         for weight, goal in self.goals:
-            if goal.measured is None:
-                off = (np.asarray(goal.function(x)) - goal.wanted)[~np.isnan(goal.wanted)]
-            else:
-                off = goal.measured(x)
+            off = goal.residuals(x)
             total = total + weight * (off @ off)
         return total
 
 
-def within(
-    function: Callable[[Any], Any],
-    wanted: Array,
-    tolerance: float,
-    unit: str,
-    name: str,
-    knots: Any,
-    *,
-    fraction: float = AIMED,
-    norm: float = 2.0,
-) -> GoalConstraint:
-    """`function` (m,) of the state within `tolerance` of `wanted` (m,), NaN where free; a plan uses a `fraction` of it.
-
-    Its rows then have bounds of their own, the largest cube within that distance.
-    """
-    sides = np.count_nonzero(np.isfinite(wanted)) ** (1 / norm)
-    half = fraction * tolerance / sides
-    lower, upper = (np.where(np.isnan(wanted), np.sign(side) * np.inf, wanted + side) for side in (-half, half))
-    return GoalConstraint(function, lower, upper, knots, name, tolerance=tolerance, unit=unit, norm=norm)
-
-
 def _place(label: str, position: Any, tolerance: float) -> tuple[Mark, ...]:
     """A ball at a position, or a slab where some of its entries are free."""
-    centre, free = tuple(p or 0.0 for p in position), [p is None for p in position]
+    centre, free = _filled(position), [p is None for p in position]
     if any(free):
         return (Mark(label, "box", tuple(1.0 if f else 2 * tolerance for f in free), centre),)
     return (Mark(label, "sphere", (max(tolerance, SMALLEST_BALL),), centre),)
 
 
-def _gaps(numbers: Any) -> Array:
-    return np.array([np.nan if v is None else v for v in numbers], dtype=float)
+def _filled(numbers: Any) -> tuple[float, ...]:
+    return tuple(v or 0.0 for v in numbers)
 
 
-def _unit(axis: Any) -> list[float]:
-    return (np.array(axis) / np.linalg.norm(axis)).tolist()
+def vector(subject: str, values: Any) -> tuple[float, ...]:
+    """(3,) finite numbers as a tuple."""
+    return tuple(finite_array(subject, values, (3,)).tolist())
 
 
-def checked_weight(subject: str, weight: Any, knots: Any) -> float | None:
-    """`weight` where it is None or above 0, and the goal is one of the last knot or of all."""
-    if weight is None:
-        return None
-    goal_knots = checked_knots(f"{subject}.knots", knots)
-    if goal_knots not in (None, LAST):
-        raise InputError(
-            f"{subject}.knots with a weight", got=list(goal_knots or ()), expected="the last one, -1, or None: all"
-        )
-    return positive_float(f"{subject}.weight", weight)
-
-
-def with_gaps(subject: str, values: Any, size: int) -> Numbers:
-    """`values` (size,) as a tuple of floats, None where they are None or NaN; InputError where one is infinite."""
-    try:
-        given = [np.nan if v is None else v for v in values]
-    except TypeError as error:
-        raise InputError(subject, got=repr(values)[:80], expected=f"{size} numbers, None where free") from error
-    array = array_with_gaps(subject, given, (size,))
+def _with_gaps(subject: str, values: Any) -> tuple[float | None, ...]:
+    """(3,) finite numbers as a tuple, None where they are None or NaN; None is nothing but gaps."""
+    array = array_with_gaps(subject, FREE if values is None else values, (3,))
     if np.any(np.isinf(array)):
         raise InputError(subject, got=array.tolist(), expected="finite numbers, None where free")
     return tuple(None if np.isnan(v) else float(v) for v in array)
@@ -618,16 +564,14 @@ def name_of(subject: str, given: Any) -> str:
     return given
 
 
-def names_of(subject: str, given: Any) -> tuple[str, ...] | None:
-    """Names of bodies as a tuple; None, which is all of them, as it is."""
-    if given is None:
-        return None
+def names_of(subject: str, given: Any) -> tuple[str, ...]:
+    """Names of bodies as a tuple."""
     if isinstance(given, str) or not len(given):
         raise InputError(subject, got=repr(given)[:80], expected="names of bodies, or None for all")
     return tuple(name_of(subject, name) for name in given)
 
 
-def checked_knots(subject: str, given: Any) -> tuple[int, ...] | None:
+def _knots(subject: str, given: Any) -> tuple[int, ...] | None:
     """Whole numbers as a tuple; None, which is all knots, as it is."""
     if given is None:
         return None
@@ -637,35 +581,37 @@ def checked_knots(subject: str, given: Any) -> tuple[int, ...] | None:
     return tuple(int(k) for k in array)
 
 
-def rotation_of(subject: str, given: Any) -> tuple[tuple[float, ...], ...]:
+def _rotation(subject: str, given: Any) -> tuple[tuple[float, ...], ...]:
     """The rows of a rotation that is given as a matrix (3, 3) or as a quaternion w, x, y, z."""
     if np.shape(given) != (4,):
-        matrix = finite_array(subject, given, (3, 3))
-        return tuple(tuple(row) for row in matrix.tolist())
+        return tuple(map(tuple, finite_array(subject, given, (3, 3)).tolist()))
     quaternion = finite_array(subject, given, (4,))
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > SAME_ROTATION:
         raise InputError(subject, got=f"a quaternion of norm {norm:.6g}", expected="norm 1")
-    w, x, y, z = (quaternion / norm).tolist()
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
+    return tuple(map(tuple, rotation(quaternion / norm).tolist()))
+
+
+def _not_negative(subject: str, value: Any) -> float:
+    return 0.0 if type(value) in (int, float) and not value else positive_float(subject, value)
+
+
+def _size(subject: str, given: Any) -> tuple[float, ...]:
+    size = vector(subject, given)
+    if min(size) <= 0:
+        raise InputError(f"{subject} [m]", got=list(size), expected="three numbers above 0")
+    return size
 
 
 CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "frame": name_of,
-    "knots": checked_knots,
+    "knots": _knots,
     "links": names_of,
-    "margin": lambda subject, value: (
-        0.0 if type(value) in (int, float) and not value else positive_float(subject, value)
-    ),
-    "point": lambda subject, value: tuple(finite_array(subject, value, (3,)).tolist()),
-    **dict.fromkeys(("tolerance", "rotation_tolerance", "angular_tolerance"), positive_float),
+    "margin": _not_negative,
+    "rotation": _rotation,
+    "size": _size,
+    **dict.fromkeys(("point", "axis", "center"), vector),
+    **dict.fromkeys(("position", "velocity", "angular_velocity"), _with_gaps),
+    **dict.fromkeys(("tolerance", "rotation_tolerance", "angular_tolerance", "radius", "weight"), positive_float),
+    **dict.fromkeys(("clearance", "slip", "touch"), positive_float),
 }
-
-
-def _plain(value: Any) -> Any:
-    """Tuples as lists, so that what is written to JSON is what is read again."""
-    return [_plain(v) for v in value] if isinstance(value, tuple) else value

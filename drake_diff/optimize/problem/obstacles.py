@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, finite_array, positive_float
+from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.mechanics.clearance import Clearance, FromBall, FromBox, OfPairs, Swept
@@ -24,7 +24,7 @@ from drake_diff.model.plant import bodies, labelled
 from drake_diff.model.tangent import any_state
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, names_of, rotation_of
+from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, names_of
 
 MARGIN = 0.01  # [m]
 TOLERANCE_PART, SMALLEST_TOLERANCE = 0.1, 1e-4  # of the margin, and [m]: what a plan may be nearer between its knots
@@ -60,14 +60,6 @@ class ClearanceConstraint(GoalConstraint):
     def between(self) -> float:
         """[m] how much nearer than the margin a plan may be between its knots."""
         return max(TOLERANCE_PART * self.margin, SMALLEST_TOLERANCE)
-
-    def miss(self, x: Array) -> float:
-        """[m] how much of the margin is used at x (nx,)."""
-        return max(0.0, float(self.lacking(x[None])[0]))
-
-    def differentiate(self, x: Array, u: Array) -> tuple[Array, Array]:
-        values, rows = self.clearance.linearize(x[None])
-        return values[0], np.hstack([rows[0], np.zeros((len(values[0]), len(u)))])
 
     def seen(self, times: Array, motion: Motion, allowed: float) -> tuple[Array, Array]:
         """`times` (K,) [s], and as many between them that nothing of a motion that lacks more than `allowed` is missed.
@@ -122,33 +114,23 @@ class ClearanceConstraint(GoalConstraint):
 
 
 class Obstacle(Goal):
-    """The base of what is kept clear of."""
+    """The base of what is kept clear of, at all knots."""
 
     margin: float
     links: Any
-    knots = None  # all of them
 
-    def constraints(
-        self, clearance: Clearance, margin: float, name: str, thing: str
-    ) -> tuple[ClearanceConstraint, ...]:
-        """That `clearance` is at least `margin`; nothing where it has no row."""
+    def kept_clear(self, clearance: Clearance, name: str, thing: str = "") -> tuple[ClearanceConstraint, ...]:
+        """That `clearance` is at least the margin; nothing where it has no row."""
         if not clearance.labels:
             return ()
 
         def used(x: Any) -> Any:
-            lacking = margin - clearance(x)
+            lacking = self.margin - clearance(x)
             return (lacking + np.abs(lacking)) / 2
 
-        constraint = ClearanceConstraint(
-            clearance,
-            np.full(len(clearance.labels), margin),
-            name=name,
-            tolerance=max(margin, SMALLEST_TOLERANCE),
-            unit="m",
-            measured=used,
-            thing=thing,
-        )
-        return (constraint,)
+        tolerance, lower = max(self.margin, SMALLEST_TOLERANCE), np.full(len(clearance.labels), self.margin)
+        options: dict[str, Any] = {"tolerance": tolerance, "norm": np.inf, "measured": used, "thing": thing}
+        return (ClearanceConstraint(clearance, lower, name=name, **options),)
 
 
 class _Solid(Obstacle):
@@ -163,12 +145,20 @@ class _Solid(Obstacle):
         """The name, or where it is."""
         return repr(self.name) if self.name else f"{self.shape} at " + ", ".join(f"{c:g}" for c in self.center)
 
-    def _kept_from(self, model: Model, radius: float, distance: Callable[..., Clearance]) -> Any:
-        """What keeps away all that may come within `radius` [m] and the margin, by its `distance`."""
+    @property
+    def extent(self) -> float:
+        """[m] how far it reaches from its center."""
+        raise NotImplementedError
+
+    def clearance(self, model: Model, kinematics: ForwardKinematics, pieces: list[Piece], center: Array) -> Clearance:
+        """The distances of the pieces of a robot from it."""
+        raise NotImplementedError
+
+    def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
         kinematics, center = _kinematics(model), np.array(self.center)
-        pieces = _near(kinematics, _pieces(model, kinematics, self.links), center, radius + self.margin)
-        clearance = distance(model, kinematics, pieces, center)
-        return self.constraints(clearance, self.margin, f"clear of {self.label}", f"obstacle {self.label}")
+        pieces = _near(kinematics, _pieces(model, kinematics, self.links), center, self.extent + self.margin)
+        clearance = self.clearance(model, kinematics, pieces, center)
+        return self.kept_clear(clearance, f"clear of {self.label}", f"obstacle {self.label}")
 
 
 @dataclass(frozen=True, repr=False)
@@ -210,12 +200,12 @@ class SphereObstacle(_Solid):
 
     shape = "sphere"
 
-    def __post_init__(self) -> None:
-        center = tuple(finite_array("SphereObstacle.center", self.center, (3,)).tolist())
-        self._check(center=center, radius=positive_float("SphereObstacle.radius [m]", self.radius))
+    @property
+    def extent(self) -> float:
+        return self.radius
 
-    def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        return self._kept_from(model, self.radius, lambda m, p, near, c: FromBall(m, p, near, c, self.radius))
+    def clearance(self, model: Model, kinematics: ForwardKinematics, pieces: list[Piece], center: Array) -> Clearance:
+        return FromBall(model, kinematics, pieces, center, self.radius)
 
     def marks(self) -> tuple[Mark, ...]:
         return (Mark(f"obstacle {self.label}", "sphere", (self.radius,), self.center, colour=RED),)
@@ -259,18 +249,12 @@ class BoxObstacle(_Solid):
 
     shape = "box"
 
-    def __post_init__(self) -> None:
-        size = finite_array("BoxObstacle.size", self.size, (3,))
-        if np.any(size <= 0):
-            raise InputError("BoxObstacle.size [m]", got=size.tolist(), expected="three numbers above 0")
-        center = tuple(finite_array("BoxObstacle.center", self.center, (3,)).tolist())
-        rotation = rotation_of("BoxObstacle.rotation", self.rotation)
-        self._check(center=center, size=tuple(size.tolist()), rotation=rotation)
+    @property
+    def extent(self) -> float:
+        return float(np.linalg.norm(self.size)) / 2
 
-    def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        rotation, half = np.array(self.rotation), np.array(self.size) / 2
-        radius = float(np.linalg.norm(half))
-        return self._kept_from(model, radius, lambda m, p, near, c: FromBox(m, p, near, c, rotation, half))
+    def clearance(self, model: Model, kinematics: ForwardKinematics, pieces: list[Piece], center: Array) -> Clearance:
+        return FromBox(model, kinematics, pieces, center, np.array(self.rotation), np.array(self.size) / 2)
 
     def marks(self) -> tuple[Mark, ...]:
         return (Mark(f"obstacle {self.label}", "box", self.size, self.center, self.rotation, colour=RED),)
@@ -304,28 +288,24 @@ class SelfCollision(Obstacle):
     ignore: Any = ()
     weight: float | None = None
 
-    def __post_init__(self) -> None:
-        self._check(ignore=tuple(_pair("SelfCollision.ignore", pair) for pair in self.ignore))
+    def _check(self) -> None:
+        self._set(ignore=tuple(_pair("SelfCollision.ignore", pair) for pair in self.ignore))
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        return self._apart(model, *self._pairs(model))
+        return self._kept_but(model, self._pairs(model)[1])
 
     def apart_but_at(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
         """What keeps all pairs of `model` apart but those that are nearer than the margin at one of xs (K, nx).
 
         What stands for a link contains its shapes and sticks out of some: what is near there need not touch.
         """
-        kinematics, (pairs, _) = _kinematics(model), self._pairs(model)
-        if not pairs:
-            return ()
-        near = np.any(OfPairs(model, kinematics, pairs).values(xs) < self.margin, axis=0)
-        touching = {frozenset((a.body, b.body)) for (a, b), close in zip(pairs, near, strict=True) if close}
-        return self._apart(model, pairs, touching)
+        pairs = self._pairs(model)[0]
+        near = np.any(OfPairs(model, _kinematics(model), pairs).values(xs) < self.margin, axis=0) if pairs else ()
+        return self._kept_but(model, {_bodies(pair) for pair, close in zip(pairs, near, strict=True) if close})
 
-    def _apart(self, model: Model, pairs: list[tuple[Piece, Piece]], touching: set[frozenset[str]]) -> Any:
-        """What keeps the pairs apart but those of `touching` bodies."""
-        free_pairs = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
-        return self.constraints(OfPairs(model, _kinematics(model), free_pairs), self.margin, "clear of itself", "")
+    def _kept_but(self, model: Model, touching: set[frozenset[str]]) -> tuple[ClearanceConstraint, ...]:
+        pairs = [pair for pair in self._pairs(model)[0] if _bodies(pair) not in touching]
+        return self.kept_clear(OfPairs(model, _kinematics(model), pairs), "clear of itself")
 
     def left_out(self, model: Model) -> tuple[str, ...]:
         """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b"."""
@@ -333,39 +313,30 @@ class SelfCollision(Obstacle):
 
     def _pairs(self, model: Model) -> tuple[list[tuple[Piece, Piece]], set[frozenset[str]]]:
         """The pairs of pieces that may touch, and the pairs of bodies among them that always do."""
-        kinematics = _kinematics(model)
-        known = labelled(bodies(model.plant))
-        for name in (body for pair in self.ignore for body in pair):
-            if name not in known:
-                raise UnknownNameError("SelfCollision.ignore", got=name, known=known)
-        pieces, left = _pieces(model, kinematics, self.links, fixed=True), {frozenset(pair) for pair in self.ignore}
+        kinematics, ignored = _kinematics(model), {frozenset(pair) for pair in self.ignore}
+        _check_bodies(model, "SelfCollision.ignore", [name for pair in self.ignore for name in pair])
         pairs = [
-            (a, b)
-            for a, b in combinations(pieces, 2)
-            if not _are_neighbours(kinematics, a, b) and frozenset((a.body, b.body)) not in left
+            pair
+            for pair in combinations(_pieces(model, kinematics, self.links, fixed=True), 2)
+            if not _are_neighbours(kinematics, *pair) and _bodies(pair) not in ignored
         ]
-        return pairs, _touching(model, kinematics, pairs)
+        key = ("touching", tuple((a.body, b.body) for a, b in pairs))
+        return pairs, model.cache(key, lambda: _touching(model, kinematics, pairs))
+
+
+def _bodies(pair: tuple[Piece, Piece]) -> frozenset[str]:
+    return frozenset(piece.body for piece in pair)
 
 
 def _touching(model: Model, kinematics: ForwardKinematics, pairs: Sequence[tuple[Piece, Piece]]) -> set[frozenset[str]]:
     """The pairs of bodies of which some pieces overlap in the default posture, or in all of many random ones."""
     if not pairs:
         return set()
-    key = ("touching", tuple((a.body, b.body) for a, b in pairs))
-
-    def found() -> set[frozenset[str]]:
-        random = np.random.default_rng(0)
-        xs = np.array([model.default_state, *(any_state(model, random) for _ in range(LOOKED_AT))])
-        overlaps = OfPairs(model, kinematics, pairs).values(xs) < 0
-        names = np.array([" ".join(sorted((a.body, b.body))) for a, b in pairs])
-        touching = set()
-        for name in dict.fromkeys(names.tolist()):
-            overlap = np.any(overlaps[:, names == name], axis=1)
-            if overlap[0] or np.all(overlap[1:]):
-                touching.add(frozenset(p.body for p in pairs[int(np.argmax(names == name))]))
-        return touching
-
-    return model.cache(key, found)
+    random, overlaps = np.random.default_rng(0), dict[frozenset[str], Any]()
+    xs = np.array([model.default_state, *(any_state(model, random) for _ in range(LOOKED_AT))])
+    for pair, overlap in zip(pairs, (OfPairs(model, kinematics, pairs).values(xs) < 0).T, strict=True):
+        overlaps[_bodies(pair)] = overlap | overlaps.get(_bodies(pair), False)
+    return {names for names, overlap in overlaps.items() if overlap[0] or np.all(overlap[1:])}
 
 
 def _are_neighbours(kinematics: ForwardKinematics, a: Piece, b: Piece) -> bool:
@@ -385,16 +356,20 @@ def _pieces(
     model: Model, kinematics: ForwardKinematics, links: Sequence[str] | None, *, fixed: bool = False
 ) -> list[Piece]:
     """Those of the named bodies, or of all; without those that are `fixed` to the world, or with them."""
-    known = labelled(bodies(model.plant))
-    for name in links or ():
-        if name not in known:
-            raise UnknownNameError("links", got=name, known=known)
+    _check_bodies(model, "links", links or ())
     cover = cover_of(model, kinematics)
     chosen = [p for p in cover.pieces if (links is None or p.body in links) and (fixed or p.link >= 0)]
     for name in links or ():
         if all(p.body != name for p in cover.pieces):
             raise InputError("links", got=name, expected="a body with a shape, with mass, or with a next joint")
     return chosen
+
+
+def _check_bodies(model: Model, subject: str, names: Sequence[str]) -> None:
+    known = labelled(bodies(model.plant))
+    for name in names:
+        if name not in known:
+            raise UnknownNameError(subject, got=name, known=known)
 
 
 def _near(kinematics: ForwardKinematics, pieces: Sequence[Piece], center: Array, reach: float) -> list[Piece]:
@@ -416,7 +391,7 @@ def _near(kinematics: ForwardKinematics, pieces: Sequence[Piece], center: Array,
 
 
 def _pair(subject: str, given: Any) -> tuple[str, str]:
-    names = names_of(subject, given) or ()
+    names = names_of(subject, given)
     if len(names) != 2:
         raise InputError(subject, got=repr(given)[:80], expected="pairs of names of bodies")
     return names[0], names[1]

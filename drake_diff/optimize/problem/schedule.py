@@ -1,7 +1,7 @@
 """Which foot stands when: a goal that a plan keeps, and the guess that it begins with."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
@@ -59,10 +59,7 @@ class ContactSchedule(Goal):
     slip: float = 0.2
     touch: float = 5e-3
 
-    weight = None
-    knots = None
-
-    def __post_init__(self) -> None:
+    def _check(self) -> None:
         if not isinstance(self.phases, (list, tuple)) or not self.phases:
             raise InputError("ContactSchedule.phases", got=repr(self.phases)[:80], expected="(steps, feet) of each")
         phases = tuple(_phase(phase) for phase in self.phases)
@@ -71,13 +68,7 @@ class ContactSchedule(Goal):
         if not feet or set(named) - set(feet):
             got = f"phases of {', '.join(named) or 'none'}"
             raise InputError("ContactSchedule.feet", got=got, expected=f"some of {', '.join(feet) or 'the feet'}")
-        self._set(
-            phases=phases,
-            feet=feet,
-            clearance=positive_float("ContactSchedule.clearance [m]", self.clearance),
-            slip=positive_float("ContactSchedule.slip [m/s]", self.slip),
-            touch=positive_float("ContactSchedule.touch [m]", self.touch),
-        )
+        self._set(phases=phases, feet=feet)
 
     @property
     def num_steps(self) -> int:
@@ -107,7 +98,9 @@ class ContactSchedule(Goal):
         constraints, most = list[GoalConstraint](), USED * self.slip
         for those in alike.values():
             name, down = ", ".join(self.feet[i] for i in those), on[:, those[0]]
-            heights, slides = soles.of("heights", those), soles.of("slides", those)
+            points = np.flatnonzero(np.isin(soles.legs.owners, those))
+            heights = _OfFeet(soles, False, points)
+            slides = _OfFeet(soles, True, np.concatenate([2 * points, 2 * points + 1]))
             carries = stands[:, those[0]]
             standing = np.flatnonzero(carries) + 1  # not where it lands: longer steps fly a little longer
             still = np.flatnonzero(carries & np.concatenate([carries[:1], carries[:-1]])) + 1
@@ -240,65 +233,58 @@ class ContactSchedule(Goal):
 
 
 class _Soles:
-    """What a schedule asks of the points that feet stand on; what was found of the last KEPT states is kept."""
+    """Heights and slides of the points that feet stand on; those of the last KEPT states are remembered."""
 
     def __init__(self, legs: Legs):
-        self.legs, self.known = legs, dict[bytes, dict[str, Array]]()
-        self.read = dict[bytes, tuple[Array, Array]]()  # of the plant, which is slow to ask
+        self.legs, self.read = legs, dict[bytes, tuple[Array, Array]]()  # of the plant, which is slow to ask
+        self.known: dict[Any, dict[bytes, tuple[Array, Array]]] = {self._values: {}, self._slopes: {}}
 
-    def of(self, what: str, feet: Sequence[int]) -> "_OfFeet":
-        """x (nx,) -> "heights" (n,) [m] of these feet's points over the ground; or "slides" (2 n,) [m/s] along it."""
-        points = np.flatnonzero(np.isin(self.legs.owners, feet))
-        rows = points if what == "heights" else np.concatenate([2 * points, 2 * points + 1])
-        return _OfFeet(self, what, rows)
+    def values(self, xs: Array) -> list[tuple[Array, Array]]:
+        """Heights (n,) [m] over the ground and slides (2 n,) [m/s] along it at each of xs (K, nx)."""
+        return self._at(xs, self._values)
 
-    def at(self, xs: Array, what: str) -> Array:
-        """(K, ...) of all points at states (K, nx)."""
-        keys = [x.tobytes() for x in xs]
-        if len(self.known) > KEPT:
-            self.known, self.read = {}, {}
-        new = {key: x for key, x in zip(keys, xs, strict=True) if what not in self.known.get(key, {})}
+    def slopes(self, xs: Array) -> list[tuple[Array, Array]]:
+        """(n, nx) and (2 n, nx) the derivatives of the same."""
+        return self._at(xs, self._slopes)
+
+    def _at(self, xs: Array, evaluate: Callable[[Array, Soles], tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+        known = self.known[evaluate]
+        for memory in (known, self.read):
+            if len(memory) > KEPT:
+                memory.clear()
+        new = {x.tobytes(): x for x in xs if x.tobytes() not in known}
         if new:
-            states = np.array(list(new.values()))
-            for key, x in new.items():
-                if key not in self.read:
-                    self.read[key] = self.legs.read(x)
-            soles = self.legs.soles([self.read[key] for key in new])
-            readings = self._slopes(states, soles) if what.endswith("by x") else self._values(states, soles)
-            for name, values in readings.items():
-                for key, value in zip(new, values, strict=True):
-                    self.known.setdefault(key, {})[name] = value
-        return np.array([self.known[key][what] for key in keys])
+            self.read.update({key: self.legs.read(x) for key, x in new.items() if key not in self.read})
+            pair = evaluate(np.array(list(new.values())), self.legs.soles([self.read[key] for key in new]))
+            known.update(zip(new, zip(*pair, strict=True), strict=True))
+        return [known[x.tobytes()] for x in xs]
 
-    def _values(self, xs: Array, soles: Soles) -> dict[str, Array]:
+    def _values(self, xs: Array, soles: Soles) -> tuple[Array, Array]:
         slides = soles.velocities(xs[:, self.legs.model.nq :])[..., :2].reshape(len(xs), -1)
-        return {"heights": soles.places[..., 2], "slides": slides}
+        return soles.places[..., 2], slides
 
-    def _slopes(self, xs: Array, soles: Soles) -> dict[str, Array]:
+    def _slopes(self, xs: Array, soles: Soles) -> tuple[Array, Array]:
         v, (count, nv) = xs[:, self.legs.model.nq :], (len(xs), self.legs.model.nv)
         moves, turned = soles.moves.swapaxes(2, 3), soles.slopes(v).swapaxes(2, 3)
         tangent = np.array([self.legs.space.derivative_of_minus(x) for x in xs])
         heights, by_v = moves[:, :, 2], moves[:, :, :2].reshape(count, -1, nv)
         by_q = turned[:, :, :2].reshape(count, -1, nv)
-        return {
-            "heights by x": heights @ tangent[:, :nv],
-            "slides by x": by_q @ tangent[:, :nv] + by_v @ tangent[:, nv:],
-        }
+        return heights @ tangent[:, :nv], by_q @ tangent[:, :nv] + by_v @ tangent[:, nv:]
 
 
 @dataclass(frozen=True, eq=False)
 class _OfFeet(StateFunction):
-    """Some `rows` of what `soles` tell."""
+    """Some `rows` of the heights, or of the slides, that `soles` give."""
 
     soles: _Soles
-    what: str
+    slides: bool
     rows: Indices
 
     def values(self, xs: Array) -> Array:
-        return self.soles.at(xs, self.what)[:, self.rows]
+        return np.array([pair[self.slides][self.rows] for pair in self.soles.values(xs)])
 
-    def slopes(self, xs: Array) -> Array:
-        return self.soles.at(xs, f"{self.what} by x")[:, self.rows]
+    def linearize(self, xs: Array) -> tuple[Array, Array]:
+        return self.values(xs), np.array([pair[self.slides][self.rows] for pair in self.soles.slopes(xs)])
 
 
 def _rows(

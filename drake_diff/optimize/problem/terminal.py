@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, finite_array, positive_int
+from drake_diff._base.arrays import Array, count, finite_array, positive_float, positive_int
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import InputError, ModelError, SimulationError
 from drake_diff.model.model import Model
@@ -122,30 +122,24 @@ class TerminalSet(Goal):
         (True, True)
     """
 
-    x_goal: Any  # becomes a tuple
-    Q: Any = None  # becomes a tuple of rows
+    x_goal: Any
+    Q: Any = None
     R: Any = None
     _: KW_ONLY
     level: float | None = None
     samples: int = 200
     seed: int = 0
 
-    weight = None
-
-    def __post_init__(self) -> None:
+    def _check(self) -> None:
         x_goal = finite_array("TerminalSet.x_goal", self.x_goal, ("nx",))
-        weights = {
-            name: None
-            if value is None
-            else tuple(map(tuple, finite_array(f"TerminalSet.{name}", value, ("n", "n")).tolist()))
-            for name, value in (("Q", self.Q), ("R", self.R))
-        }
-        if self.level is not None and not (np.isfinite(self.level) and self.level > 0):
-            raise InputError("TerminalSet.level", got=self.level, expected="a number above 0")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
-            raise InputError("TerminalSet.seed", got=repr(self.seed), expected="a whole number of at least 0")
-        samples = positive_int("TerminalSet.samples", self.samples)
-        self._set(x_goal=tuple(x_goal.tolist()), samples=samples, seed=int(self.seed), **weights)
+        for name in ("Q", "R"):
+            if getattr(self, name) is not None:
+                weights = finite_array(f"TerminalSet.{name}", getattr(self, name), ("n", "n"))
+                self._set(**{name: tuple(map(tuple, weights.tolist()))})
+        if self.level is not None:
+            positive_float("TerminalSet.level", self.level)
+        samples, seed = positive_int("TerminalSet.samples", self.samples), count("TerminalSet.seed", self.seed, 0)
+        self._set(x_goal=tuple(x_goal.tolist()), samples=samples, seed=seed)
 
     def region(self, model: Model, bounds: Bounds, parameters: Parameters = ()) -> Region:
         """The set on a `model` within resolved `bounds`, as a `Problem` has them; looked for once.
