@@ -19,14 +19,14 @@ from drake_diff.mechanics.casadi_tree import agrees
 from drake_diff.mechanics.symbol import Symbol, symbols
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import (
-    ConstantCost,
-    CostToGo,
     QuadraticCost,
+    QuadraticForm,
     SumOfCosts,
     TimedCost,
     TrackingCost,
     differentiate_final_cost,
     final_cost_hessian,
+    quadratic_form,
 )
 from drake_diff.optimize.problem.goals import GoalConstraint, WithGoals
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
@@ -79,8 +79,10 @@ def knot_cost(cost: Any, nx: int, nu: int, probe: Array, *, gauss_newton: bool =
     if isinstance(cost, WithGoals) and gauss_newton:
         squares = [_WeightedGoal(weight, goal, nx, nu, probe) for weight, goal in cost.goals]
         return _Sum([knot_cost(cost.own, nx, nu, probe), *squares])
-    if isinstance(cost, (QuadraticCost, TrackingCost, CostToGo, ConstantCost)):
-        return _quadratic(cost, nx, nu)
+    tracking = cost if isinstance(cost, TrackingCost) else None
+    form = quadratic_form(cost if tracking is None else QuadraticCost(Q=tracking.Q, R=tracking.R), nx, nu)
+    if form is not None:
+        return _Quadratic(form, tracking)
     return _Function(cost, nx, nu, probe)
 
 
@@ -103,67 +105,38 @@ class _Sum:
 
 @dataclass(frozen=True, eq=False)
 class _Quadratic:
-    """constant + slope' d + d' weight d, d being the distance of a knot from `reference` (n,) or that at its time."""
+    """A quadratic form, from whose knots the references of `tracking` at their times are subtracted."""
 
-    weight: Array  # (n, n)
-    reference: Array
-    slope: Array  # (n,)
-    constant: float = 0.0
+    form: QuadraticForm
     tracking: TrackingCost | None = None
 
-    def _distances(self, knots: Array, times: Array) -> Array:
-        distances = knots - self.reference
-        if self.tracking is not None:
-            known = self.tracking.known_at(times)
-            distances[:, : known.shape[1]] -= known
-        return distances
+    def _knots(self, knots: Array, times: Array) -> Array:
+        if self.tracking is None:
+            return knots
+        known = self.tracking.known_at(times)
+        return np.hstack([knots[:, : known.shape[1]] - known, knots[:, known.shape[1] :]])
 
     def values(self, knots: Array, times: Array) -> Array:
-        d = self._distances(knots, times)
-        return np.asarray(self.constant + d @ self.slope + np.einsum("ki,ki->k", d, d @ self.weight))
+        return self.form.values(self._knots(knots, times))
 
     def expand(self, knots: Array, times: Array) -> tuple[Array, Array]:
-        hessian = 2 * self.weight
-        gradients = self.slope + self._distances(knots, times) @ hessian
-        return gradients, np.broadcast_to(hessian, (len(knots), *hessian.shape))
-
-
-def _quadratic(cost: Any, nx: int, nu: int) -> _Quadratic:
-    n = nx + nu
-    weight, reference = np.zeros((n, n)), np.zeros(n)
-    if isinstance(cost, ConstantCost):
-        return _Quadratic(weight, reference, np.zeros(n), cost.rate)
-    if isinstance(cost, CostToGo):
-        return _Quadratic(cost.hessian / 2, cost.x_ref, cost.gradient)
-    tracking = cost if isinstance(cost, TrackingCost) else None
-    references = (None, None) if tracking is not None else (cost.x_ref, cost.u_ref)
-    sides = zip((slice(0, nx), slice(nx, n)), (cost.Q, cost.R if nu else None), references, strict=True)
-    for columns, part, known in sides:
-        weight[columns, columns] = 0.0 if part is None else part
-        reference[columns] = 0.0 if part is None or known is None else known
-    return _Quadratic(weight, reference, np.zeros(n), tracking=tracking)
+        hessian = 2 * self.form.weight
+        return self.form.gradients(self._knots(knots, times)), np.broadcast_to(hessian, (len(knots), *hessian.shape))
 
 
 class _WeightedGoal:
     """The weighted square of what a goal misses, with Gauss and Newton's curvature."""
 
     def __init__(self, weight: float, goal: GoalConstraint, nx: int, nu: int, probe: Array):
-        self.weight = weight
-        f, wanted = goal.function, goal.wanted
-        if goal.measured is not None:
-            f, wanted = goal.measured, np.zeros(len(np.atleast_1d(goal.measured(probe[0, :nx]))))
-        self.rows = np.flatnonzero(~np.isnan(wanted))
-        self.wanted = wanted[self.rows]
-        constraint = Constraint(f, lower=np.zeros(len(wanted)), name=goal.label)
+        self.weight, size = weight, len(goal.residuals(probe[0, :nx]))
+        constraint = Constraint(goal.residuals, lower=np.zeros(size), name=goal.label)
         self.function = knot_function(constraint, nx, nu, probe)
 
     def values(self, knots: Array, times: Array) -> Array:
-        off = self.function.values(knots)[:, self.rows] - self.wanted
-        return self.weight * np.sum(off**2, axis=1)
+        return self.weight * np.sum(self.function.values(knots) ** 2, axis=1)
 
     def expand(self, knots: Array, times: Array) -> tuple[Array, Array]:
-        values, jacobians = self.function.linearize(knots)
-        off, jacobians = values[:, self.rows] - self.wanted, jacobians[:, self.rows]
+        off, jacobians = self.function.linearize(knots)
         doubled = 2 * self.weight * jacobians
         return np.einsum("kr,kri->ki", off, doubled), np.einsum("kri,krj->kij", jacobians, doubled)
 

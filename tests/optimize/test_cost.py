@@ -122,4 +122,4 @@ def test_a_quadratic_cost_along_a_motion_is_the_sum_of_its_calls():
     for parts in ({"Q": Q}, {"R": R, "u_ref": u_ref}, {"Q": Q, "R": R, "x_ref": x_ref}, {}):
         cost = dd.QuadraticCost(**parts)
         expected = [cost(x, u) for x, u in zip(xs, us, strict=True)]
-        np.testing.assert_allclose(cost.along(xs, us), expected, rtol=1e-14)
+        np.testing.assert_allclose(cost(xs, us), expected, rtol=1e-14)

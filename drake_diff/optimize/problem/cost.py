@@ -6,7 +6,6 @@ p. A solver that visits many knots at once asks for the numbers of all of them; 
 """
 
 import copy
-import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,14 +17,14 @@ from drake_diff._base.arrays import Array, finite_array
 from drake_diff._base.autodiff import gradient_of
 from drake_diff._base.differences import central_differences
 from drake_diff.exceptions import InputError, ShapeError
-from drake_diff.optimize.problem.constraint import short
+from drake_diff.optimize.problem.constraint import ShowsArrays, arguments_of
 
 RunningCost = Callable[[Any, Any], Any]  # (x, u) -> scalar
 FinalCost = Callable[[Any], Any]  # (x) -> scalar
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class QuadraticCost:
+class QuadraticCost(ShowsArrays):
     """The cost (x - x_ref)' Q (x - x_ref) + (u - u_ref)' R (u - u_ref), without a factor of one half.
 
     It serves as a running cost, called with x and u, and as a final cost, called with x alone. What is not given
@@ -71,10 +70,6 @@ class QuadraticCost:
                 size = "n" if weight is None else len(weight)
                 object.__setattr__(self, name, finite_array(name, getattr(self, name), (size,)))
 
-    def __repr__(self) -> str:
-        given = {name: value for name, value in vars(self).items() if value is not None}
-        return f"QuadraticCost({', '.join(f'{name}={short(value)}' for name, value in given.items())})"
-
     def check_sizes(self, name: str, nx: int, nu: int) -> None:
         """Raise ShapeError where a part has not the size of the states (nx,) or inputs (nu,); `name` is the cost's."""
         for field, size in (("Q", nx), ("R", nu), ("x_ref", nx), ("u_ref", nu)):
@@ -83,21 +78,12 @@ class QuadraticCost:
                 raise ShapeError(f"{name}.{field}", got=value.shape, expected=(size,) * value.ndim)
 
     def __call__(self, x: Any, u: Any = None) -> Any:
-        """The cost of x (nx,) and u (nu,): floats or AutoDiffXd."""
-        total = 0.0 * x[0]
+        """The cost of x (nx,) and u (nu,), floats or AutoDiffXd; of floats also the costs (K,) of K rows of each."""
+        total = 0.0 * x[..., 0]  # NaN where that is
         for weight, z, reference in ((self.Q, x, self.x_ref), (self.R, u, self.u_ref)):
             if weight is not None and z is not None:
-                d = _apart(z, reference)
-                total = total + d @ (weight @ d)
-        return total
-
-    def along(self, xs: Array, us: Array) -> Array:
-        """(K,) the costs of xs (K, nx) and us (K, nu)."""
-        total = 0.0 * xs[:, 0]  # NaN where that is
-        for weight, z, reference in ((self.Q, xs, self.x_ref), (self.R, us, self.u_ref)):
-            if weight is not None:
-                d = _apart(z, reference)
-                total += np.einsum("ki,ki->k", d, d @ weight)
+                d = z if reference is None else z - reference
+                total = total + ((d @ weight) * d).sum(axis=-1)
         return total
 
 
@@ -108,11 +94,7 @@ class ConstantCost:
     rate: float
 
     def __call__(self, x: Any, u: Any) -> Any:
-        return self.rate + 0.0 * x[0]
-
-    def along(self, xs: Array, us: Array) -> Array:
-        """(K,) the costs of xs (K, nx) and us (K, nu)."""
-        return np.full(len(xs), self.rate)
+        return self.rate + 0.0 * x[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,60 +114,80 @@ class CostToGo:
         return self.gradient @ d + d @ (self.hessian @ d) / 2
 
 
-def _apart(z: Any, reference: Any) -> Any:
-    return z if reference is None else z - reference
+@dataclass(frozen=True, eq=False)
+class QuadraticForm:
+    """constant + slope' d + d' weight d, d being the distance of z = [x, u] from `reference`, all of (n,)."""
+
+    weight: Array  # (n, n)
+    reference: Array
+    slope: Array
+    constant: float = 0.0
+
+    def values(self, z: Array) -> Array:
+        """(...) at z (..., n)."""
+        d = z - self.reference
+        return np.asarray(self.constant + d @ self.slope + ((d @ self.weight) * d).sum(axis=-1))
+
+    def gradients(self, z: Array) -> Array:
+        """(..., n) at z (..., n)."""
+        return self.slope + 2 * (z - self.reference) @ self.weight
 
 
-def _slope(weight: Any, z: Array, reference: Any) -> Array:
-    """(n,) the gradient of a quadratic form at z (n,)."""
-    return np.zeros(len(z)) if weight is None else np.asarray(2 * weight @ _apart(z, reference))
+def quadratic_form(cost: Any, nx: int, nu: int) -> QuadraticForm | None:
+    """A cost of x and u as a quadratic form; None where it is none."""
+    n = nx + nu
+    if isinstance(cost, ConstantCost):
+        return QuadraticForm(np.zeros((n, n)), np.zeros(n), np.zeros(n), cost.rate)
+    if isinstance(cost, CostToGo):
+        return QuadraticForm(cost.hessian / 2, cost.x_ref, cost.gradient)
+    if not isinstance(cost, QuadraticCost):
+        return None
+    weight, reference = np.zeros((n, n)), np.zeros(n)
+    sides = (slice(0, nx), cost.Q, cost.x_ref), (slice(nx, n), cost.R if nu else None, cost.u_ref)
+    for columns, given, known in sides:
+        if given is not None:
+            weight[columns, columns] = given
+            reference[columns] = 0.0 if known is None else known
+    return QuadraticForm(weight, reference, np.zeros(n))
 
 
 def differentiate_cost(cost: RunningCost, x: Array, u: Array) -> tuple[float, Array, Array]:
     """(value, gradient by x (nx,), gradient by u (nu,)) of a running cost."""
-    if isinstance(cost, QuadraticCost):
-        return float(cost(x, u)), _slope(cost.Q, x, cost.x_ref), _slope(cost.R, u, cost.u_ref)
-    value, gradient = gradient_of(lambda z: cost(z[: len(x)], z[len(x) :]), np.concatenate([x, u]))
+    value, gradient = _gradient(_of_knot(cost, len(x)), quadratic_form(cost, len(x), len(u)), np.concatenate([x, u]))
     return value, gradient[: len(x)], gradient[len(x) :]
 
 
 def differentiate_final_cost(cost: FinalCost, x: Array) -> tuple[float, Array]:
     """(value, gradient (nx,)) of a final cost."""
-    if isinstance(cost, QuadraticCost):
-        return float(cost(x)), _slope(cost.Q, x, cost.x_ref)
-    if isinstance(cost, CostToGo):
-        return float(cost(x)), cost.gradient + cost.hessian @ (x - cost.x_ref)
-    return gradient_of(cost, x)
+    return _gradient(cost, quadratic_form(cost, len(x), 0), x)
 
 
 def running_cost_hessian(cost: RunningCost, x: Array, u: Array) -> Array:
-    """(nx+nu, nx+nu): the Hessian by [x; u], exact for a QuadraticCost, else made positive semidefinite.
+    """(nx+nu, nx+nu): the Hessian by [x; u], exact for a quadratic form, else made positive semidefinite.
 
     Any other cost's Hessian is the central difference of its exact gradient, its negative eigenvalues cut to 0.
     """
-    nx, nu = len(x), len(u)
-    if isinstance(cost, QuadraticCost):
-        hessian = np.zeros((nx + nu, nx + nu))
-        hessian[:nx, :nx] = 0 if cost.Q is None else 2 * cost.Q
-        hessian[nx:, nx:] = 0 if cost.R is None else 2 * cost.R
-        return hessian
-    return _difference_hessian(
-        lambda z: np.concatenate(differentiate_cost(cost, z[:nx], z[nx:])[1:]), np.concatenate([x, u])
-    )
+    return _hessian(_of_knot(cost, len(x)), quadratic_form(cost, len(x), len(u)), np.concatenate([x, u]))
 
 
 def final_cost_hessian(cost: FinalCost, x: Array) -> Array:
     """(nx, nx): like `running_cost_hessian`, by x."""
-    if isinstance(cost, QuadraticCost):
-        return np.zeros((len(x), len(x))) if cost.Q is None else 2 * cost.Q
-    if isinstance(cost, CostToGo):
-        return cost.hessian
-    return _difference_hessian(lambda z: differentiate_final_cost(cost, z)[1], x)
+    return _hessian(cost, quadratic_form(cost, len(x), 0), x)
 
 
-def _difference_hessian(gradient: Callable[[Array], Array], z: Array) -> Array:
+def _of_knot(cost: RunningCost, nx: int) -> FinalCost:
+    return lambda z: cost(z[:nx], z[nx:])
+
+
+def _gradient(f: FinalCost, form: QuadraticForm | None, z: Array) -> tuple[float, Array]:
+    return gradient_of(f, z) if form is None else (float(form.values(z)), form.gradients(z))
+
+
+def _hessian(f: FinalCost, form: QuadraticForm | None, z: Array) -> Array:
+    if form is not None:
+        return 2 * form.weight
     scale = np.maximum(1.0, np.abs(z))
-    quotient = central_differences(lambda d: gradient(z + scale * d), len(z), 1e-5) / scale
+    quotient = central_differences(lambda d: gradient_of(f, z + scale * d)[1], len(z), 1e-5) / scale
     values, vectors = np.linalg.eigh((quotient + quotient.T) / 2)
     return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)
 
@@ -307,21 +309,13 @@ class TrackingCost(TimedCost):
         return xs, known[:, nx:] if self.reference[2] is not None and self.R is not None else None
 
     def of(self, x: Any, u: Any, known: Any) -> Any:
-        nx, total = len(x), 0.0 * x[0]
-        held = self.reference[2] is not None
-        for weight, apart in ((self.Q, x - known[:nx]), (self.R, u - known[nx:] if held else u)):
-            if weight is not None:
-                total = total + apart @ (weight @ apart)
-        return total
+        return self._with(known)(x, u)
 
     def at(self, time: float) -> QuadraticCost:
         return self._with(self.known_at(np.array([time]))[0])
 
-    def along(self, times: Array) -> QuadraticCost:
-        """The costs at `times` (K,) [s] as one, whose references are of each of them: (K, nx) and (K, nu)."""
-        return self._with(self.known_at(times))
-
-    def _with(self, known: Array) -> QuadraticCost:
+    def _with(self, known: Any) -> QuadraticCost:
+        """The cost with the references `known` (p,), or with those (K, p) of K rows."""
         nx = self.reference[1].shape[1]
         cost = copy.copy(self._form)  # type: ignore[attr-defined]  # whose weights were checked
         object.__setattr__(cost, "x_ref", known[..., :nx] if self.Q is not None else None)
@@ -333,7 +327,7 @@ class TrackingCost(TimedCost):
 def quadratic_along(cost: Any, times: Array) -> QuadraticCost | None:
     """A running cost at `times` (K,) [s] as one QuadraticCost, its references of all or of each; None if it is none."""
     if isinstance(cost, TrackingCost):
-        return cost.along(times)
+        return cost._with(cost.known_at(times))
     return cost if isinstance(cost, QuadraticCost) else None
 
 
@@ -370,26 +364,6 @@ class SumOfCosts(TimedCost):
         return total
 
 
-@dataclass(frozen=True, eq=False)
-class Later(TimedCost):
-    """A timed cost whose time starts at `start` [s]: what is left of it for a plan that begins then."""
-
-    cost: TimedCost
-    start: float
-
-    def known_at(self, times: Array) -> Array:
-        return self.cost.known_at(np.asarray(times) + self.start)
-
-    def followed(self, times: Array) -> tuple[Array, Array | None] | None:
-        return self.cost.followed(np.asarray(times) + self.start)
-
-    def of(self, x: Any, u: Any, known: Any) -> Any:
-        return self.cost.of(x, u, known)
-
-    def at(self, time: float) -> RunningCost:
-        return self.cost.at(self.start + time)
-
-
 def running_cost_of(given: Any) -> Any:
     """What a Problem's `running_cost` means: a function of three variables is one of time, a sequence a sum."""
     if isinstance(given, (list, tuple)):
@@ -398,17 +372,7 @@ def running_cost_of(given: Any) -> Any:
         return SumOfCosts(tuple(running_cost_of(cost) for cost in given))
     if given is None or isinstance(given, (QuadraticCost, TimedCost)) or not callable(given):
         return given
-    return FunctionOfTime(given) if _takes_time(given) else given
-
-
-def _takes_time(f: Any) -> bool:
-    """Whether a function has three variables without a default."""
-    try:
-        parameters = inspect.signature(f).parameters.values()
-    except (TypeError, ValueError):  # some that are built in do not tell
-        return False
-    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(p.kind in kinds and p.default is inspect.Parameter.empty for p in parameters) == 3
+    return FunctionOfTime(given) if arguments_of(given) == 3 else given
 
 
 def _table(reference: Any) -> tuple[Any, Any, Any]:

@@ -5,7 +5,6 @@ x (nx, K) and u (nu, K), is called once for all knots; whether it does is tried 
 """
 
 import copy
-import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -28,7 +27,7 @@ from drake_diff.model.parameters import (
     write_autodiff,
 )
 from drake_diff.model.plant import joints, labelled
-from drake_diff.optimize.problem.constraint import Bounds, carried, plant_limits, resolve_bounds
+from drake_diff.optimize.problem.constraint import Bounds, arguments_of, carried, plant_limits, resolve_bounds
 
 SMALLEST_TRIED = 1e-3  # of a parameter's first value: where a smaller one's derivatives are certified
 SIDES = ("lower", "upper")
@@ -271,7 +270,7 @@ class DiscreteMap(Dynamics):
     """
 
     def __init__(self, f: Any, nx: int, nu: int, **limits: Any):
-        self.f, self.counts = f, _takes_a_step(f)
+        self.f, self.counts = f, arguments_of(f) > 2
         self.steps: dict[int, Pointwise] = {}
         super().__init__((lambda x, u: f(x, u, 0)) if self.counts else f, nx, nu, **limits)
 
@@ -447,18 +446,6 @@ class PlantKnots:
             write_autodiff(self.vector, self.model, variables[self.width :])
         rates = self.equations.autodiff(variables[:nx], variables[nx : self.width])
         return ExtractValue(rates.reshape(-1, 1)).ravel(), gradient_rows(rates, len(knot))
-
-
-def _takes_a_step(f: Any) -> bool:
-    """Whether `f` has a third argument."""
-    if not callable(f) or hasattr(f, "linearize"):
-        return False
-    try:
-        parameters = inspect.signature(f).parameters.values()
-    except (TypeError, ValueError):
-        return False
-    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return len([p for p in parameters if p.kind in kinds and p.default is p.empty]) > 2
 
 
 def _names(subject: str, given: Sequence[str] | None, letter: str, count: int) -> tuple[str, ...]:

@@ -435,7 +435,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             before = xs[: len(inputs)]
             quadratic = quadratic_along(running, h * np.arange(float(len(inputs))))
             if quadratic is not None:
-                rates = quadratic.along(before, inputs)
+                rates = quadratic(before, inputs)
             else:
                 along = enumerate(zip(before, inputs, strict=True))
                 rates = np.array([float(cost_at(running, k * h)(x, u)) for k, (x, u) in along])

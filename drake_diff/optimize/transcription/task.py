@@ -133,7 +133,7 @@ class KnownRate:
 
     def values(self, knots: Array) -> Array:
         """(K, 1) at `knots` (K, nx + nu)."""
-        return np.asarray(self.f.along(knots[:, : self.nx], knots[:, self.nx :]))[:, None]
+        return np.asarray(self.f(knots[:, : self.nx], knots[:, self.nx :]))[:, None]
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
         """(K, 1) and the gradients (K, 1, nx + nu)."""
