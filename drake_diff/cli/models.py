@@ -8,6 +8,7 @@ import typer
 from drake_diff.cli.text import (
     Seed,
     as_options,
+    conclude,
     floats_in,
     judged,
     names_in,
@@ -16,9 +17,11 @@ from drake_diff.cli.text import (
     out_option,
     plain,
     progress_line,
+    repeated,
     show,
+    show_table,
+    show_written,
     split_pair,
-    table,
     takes_model,
 )
 from drake_diff.derivatives import METHODS
@@ -50,7 +53,7 @@ def audit(model: Any, file: Path) -> None:
             show(plain("    option:", "dim"), as_options(finding.arguments))
     errors, warnings, notes = (sum(f.severity == severity for f in findings) for severity in FINDINGS)
     show(f"{model.name}: {errors} errors, {warnings} warnings, {notes} notes")
-    raise typer.Exit(1 if errors else 0)
+    conclude(not errors)
 
 
 def certify(
@@ -74,21 +77,16 @@ def certify(
     show(plain(file.name, "bold"), f"{model}, contact {model.contract.contact.model}")
     names = tuple(names_in(parameters) or ())
     record: Any = certify_model(model, states=states, seed=seed, parameters=names, method=method, directory=directory)
-    rows = table("state", "motion", "contacts", "entries", "largest", "from", "noticed", "verdict")
+    rows = []
     for i, state in enumerate(record.certification.states):
-        modes = list(state.contact_modes.values())
-        gradient, near = state.gradient, f", {len(state.mode_changes)} near" if state.mode_changes else ""
-        rows.add_row(
-            str(i),
-            state.kind,
-            ", ".join(f"{modes.count(mode)} {mode}" for mode in sorted(set(modes))),
-            str(gradient.entries) if gradient else "",
-            "" if state.largest is None else f"{state.largest:.4g}",
-            gradient.method if gradient else "",
-            f"{100 * gradient.power:.1g} %" if gradient else "",
-            plain(state.verdict + near, "green" if state.verdict == "agree" else "red"),
-        )
-    show(rows)
+        modes, gradient = list(state.contact_modes.values()), state.gradient
+        near = f", {len(state.mode_changes)} near" if state.mode_changes else ""
+        contacts = ", ".join(f"{modes.count(mode)} {mode}" for mode in sorted(set(modes)))
+        largest = "" if state.largest is None else f"{state.largest:.4g}"
+        source = (gradient.method, f"{100 * gradient.power:.1g} %") if gradient else ("", "")
+        verdict = plain(state.verdict + near, "green" if state.verdict == "agree" else "red")
+        rows.append((i, state.kind, contacts, gradient.entries if gradient else "", largest, *source, verdict))
+    show_table(("state", "motion", "contacts", "entries", "largest", "from", "noticed", "verdict"), rows)
     for i, state in enumerate(record.certification.states):
         if state.verdict != "agree":
             show(f"state {i}: {state.refusal or state.gradient.worst}")
@@ -96,7 +94,7 @@ def certify(
                 show(f"    {change}")
     show(judged(record.verdict), f"{record.sentence}, {record.wall_clock.duration_s:.1f} s")
     show(f"wrote {directory / record.FILE}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
+    conclude(record.verdict == "pass")
 
 
 def compare(
@@ -130,23 +128,16 @@ def compare(
         apart = {e.engine for e in comparison.engines if e.verdict != "same"}
         causes = {motion.name: cause_of(model, motion) for motion in recordings if motion.name in apart}
         record = write_comparison(comparison, folder, causes=causes)
-    rows = table(
-        "engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian", wrap=False
-    )
-    clock = record.wall_clock
+    clock, rows = record.wall_clock, []
     for i, e in enumerate(record.engines):
         times = (clock.seconds_per_step[e.engine], clock.seconds_per_jacobian[e.engine])
-        answer = {"its own step's": "yes", "not its own step's": "no"}.get(e.gradient, e.gradient)
-        rows.add_row(
-            plain(e.engine),
-            plain(e.verdict, GAPS[e.verdict]) if i else plain("reference", "dim"),
-            f"{e.largest_step_gap:.1e}",
-            "" if e.first_apart_s is None else f"{e.first_apart_s:.4g} s",
-            f"{max((j.gap for j in e.jacobians), default=0.0):.1e}",
-            plain(answer, "red" if answer == "no" else ""),
-            *("-" if t is None else f"{1e6 * t:.0f} µs" for t in times),
-        )
-    show(rows)
+        answer = {"its own step's": "yes", "not its own step's": plain("no", "red")}.get(e.gradient, e.gradient)
+        first = "" if e.first_apart_s is None else f"{e.first_apart_s:.4g} s"
+        verdict = plain(e.verdict, GAPS[e.verdict]) if i else plain("reference", "dim")
+        gaps = (f"{e.largest_step_gap:.1e}", first, f"{max((j.gap for j in e.jacobians), default=0.0):.1e}")
+        rows.append((e.engine, verdict, *gaps, answer, *("-" if t is None else f"{1e6 * t:.0f} µs" for t in times)))
+    columns = ("engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian")
+    show_table(columns, rows, wrap=False)
     for e in record.engines[1:]:
         show(plain(e.engine, "bold"), e.sentence)
         if e.cause is not None:
@@ -155,7 +146,7 @@ def compare(
         show(plain(r.engine, "bold dim"), plain(f"not compared: {r.reason}", "dim"))
     show(judged(record.verdict), record.sentence)
     show(f"wrote {directory / PAGE}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
+    conclude(record.verdict == "pass")
 
 
 def identify(
@@ -165,28 +156,16 @@ def identify(
         list[Path], typer.Option(help="A recorded motion: CSV, MCAP or a ROS 2 bag. Can be given again.")
     ],
     parameters: Annotated[str | None, names_option("Parameters to estimate", "all")] = None,
-    noise: Annotated[
-        list[str] | None,
-        typer.Option(metavar="STATE=DEVIATION", help="Standard deviation of a state's noise. Can be given again."),
-    ] = None,
+    noise: Annotated[list[str] | None, repeated("STATE=DEVIATION", "Standard deviation of a state's noise")] = None,
     held_out: Annotated[
         str,
         typer.Option(metavar="PART|NAME", help="The part at the end of each recording, or a recording, to predict."),
     ] = "0.2",
     motion: Annotated[str, typer.Option(help="auto, continuous, steps or impacts")] = "auto",
-    prior: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PARAMETER=MEAN,DEVIATION", help="What is known of a parameter. Can be given again."),
-    ] = None,
-    bounds: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PARAMETER=LOWER,UPPER", help="Between which a parameter is. Can be given again."),
-    ] = None,
+    prior: Annotated[list[str] | None, repeated("PARAMETER=MEAN,DEVIATION", "What is known of a parameter")] = None,
+    bounds: Annotated[list[str] | None, repeated("PARAMETER=LOWER,UPPER", "Between which a parameter is")] = None,
     sensor: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LABEL=BODY:X,Y,Z[,R,P,Y]", help="Where a sensor sits on a body [m, rad]. Can be given again."
-        ),
+        list[str] | None, repeated("LABEL=BODY:X,Y,Z[,R,P,Y]", "Where a sensor sits on a body [m, rad]")
     ] = None,
     out: Annotated[Path | None, out_option("artifacts/identify_<model>")] = None,
 ) -> None:
@@ -215,20 +194,18 @@ def identify(
             identification = estimate(model, list(recording), names, **asked, priors=priors, bounds=limits)
         record: Any = write_identification(identification, folder)
     show(judged(record.verdict), record.sentence)
-    rows = table("parameter", "before", "found", "95 % from", "to", "unit", "", left=1)
+    rows = []
     for e in record.estimates:
         known = e.lower is not None and e.upper is not None
         differs = known and not e.lower <= e.before <= e.upper
-        remark = plain("not known", "dim") if not known else plain("differs", "yellow") if differs else plain("")
-        rows.add_row(
-            plain(e.name), plain(e.before), plain(e.value), plain(e.lower), plain(e.upper), plain(e.unit), remark
-        )
-    show(rows)
+        remark = plain("not known", "dim") if not known else plain("differs", "yellow") if differs else ""
+        rows.append((e.name, e.before, e.value, e.lower, e.upper, e.unit, remark))
+    show_table(("parameter", "before", "found", "95 % from", "to", "unit", ""), rows, left=1)
     for line in record.unidentifiable:
         show(plain("left open", "bold dim"), line)
     show(f"fitted: {record.motion}")
-    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
+    show_written(directory, record)
+    conclude(record.verdict == "pass")
 
 
 def excite(
@@ -243,14 +220,8 @@ def excite(
             metavar="NUMBERS", show_default="the model's", help="The first state, at rest, with commas between."
         ),
     ] = None,
-    noise: Annotated[
-        list[str] | None,
-        typer.Option(metavar="STATE=DEVIATION", help="What is measured, and how well. Can be given again."),
-    ] = None,
-    limit: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=MOST|LOWER,UPPER", help="Of a state or an input. Can be given again."),
-    ] = None,
+    noise: Annotated[list[str] | None, repeated("STATE=DEVIATION", "What is measured, and how well")] = None,
+    limit: Annotated[list[str] | None, repeated("NAME=MOST|LOWER,UPPER", "Of a state or an input")] = None,
     harmonics: Annotated[int, typer.Option(help="Frequencies of the series.")] = 4,
     max_iterations: Annotated[int, typer.Option(min=0, help="Of the search; 0: the best of random motions.")] = 20,
     seed: Seed = 0,
@@ -280,14 +251,14 @@ def excite(
     with progress_line("searching"):
         excitation = design(model, names, duration=duration, period=period, **asked)
     show(excitation.sentence)
-    rows = table("parameter", "known to", "random", "at rest", "unit", left=1)
+    rows = []
     for name, value in excitation.deviations.items():
         columns = [np.atleast_1d(deviations) for deviations in (value, excitation.random[name], excitation.rest[name])]
         for k, numbers in enumerate(zip(*columns, strict=True)):
             label = name if len(columns[0]) == 1 else f"{name}[{k}]"
-            cells = (plain(float(number) if np.isfinite(number) else "not known") for number in numbers)
-            rows.add_row(plain(label), *cells, plain(excitation.units[name]))
-    show(rows)
+            cells = (float(number) if np.isfinite(number) else "not known" for number in numbers)
+            rows.append((label, *cells, excitation.units[name]))
+    show_table(("parameter", "known to", "random", "at rest", "unit"), rows, left=1)
     for line in excitation.unidentifiable:
         show(plain("left open", "bold dim"), line)
     if out is not None:

@@ -1,8 +1,6 @@
 """Commands that plan, and that try many times: plan, robustness, panel."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +11,7 @@ from drake_diff.cli.text import (
     ModelFolder,
     RunDirectory,
     Seed,
+    conclude,
     console,
     floats_in,
     judged,
@@ -23,8 +22,8 @@ from drake_diff.cli.text import (
     plain,
     progress_line,
     show,
+    show_table,
     survived,
-    table,
 )
 from drake_diff.exceptions import InputError
 
@@ -42,6 +41,7 @@ Obstacles = Annotated[
     ),
 ]
 NUMBERS = {"sphere": 4, "box": 6}
+PAUSE = 5.0  # [s] between two lines of progress where there is no terminal
 
 
 def plan(
@@ -77,10 +77,16 @@ def plan(
     if robot is not None:
         survived(robot, {"time_step": TIME_STEP})
     try:
-        with _stages() as report:
-            done = planned(
-                file, goals=goals, avoid=obstacles, time=time, out=out, seed=seed, restarts=restarts, report=report
-            )
+        with progress_line("reading", pause=PAUSE) as report:
+            asked: dict[str, Any] = {
+                "goals": goals,
+                "avoid": obstacles,
+                "time": time,
+                "out": out,
+                "seed": seed,
+                "restarts": restarts,
+            }
+            done = planned(file, **asked, report=lambda stage, sentence: report(f"{stage:9} {sentence}"))
     except KeyboardInterrupt as error:
         show("; ".join(("interrupted", *getattr(error, "__notes__", ()))))
         show("drake-diff recover measures the plan there, if there is one")
@@ -88,7 +94,7 @@ def plan(
     show(judged("pass" if done.success else "fail"), f" {file.name}: {done.solution.status.value}")
     for line in done.lines:
         show(plain(line))
-    raise typer.Exit(0 if done.success else 1)
+    conclude(done.success)
 
 
 def _shape(words: str) -> tuple[str, list[float]]:
@@ -100,24 +106,6 @@ def _shape(words: str) -> tuple[str, list[float]]:
     if len(numbers) != NUMBERS[kind]:
         raise InputError("--avoid", got=repr(words), expected=f"{NUMBERS[kind]} numbers: {expected}")
     return kind, numbers
-
-
-@contextmanager
-def _stages() -> Iterator[Callable[[str, str], None]]:
-    """Progress by stage: rewritten on a terminal, a line for each stage elsewhere."""
-    last = ""
-    with progress_line("reading") as report:
-
-        def note(stage: str, sentence: str) -> None:
-            nonlocal last
-            if stage != last or console().is_terminal:
-                report(f"{stage:9} {sentence}")
-            last = stage
-
-        yield note
-
-
-EVERY = 5.0  # seconds between two lines of a panel's progress where there is no terminal
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -154,23 +142,19 @@ def robustness(
             with progress_line("trying", stderr=True) as report:
                 result = try_plan(solution, levels, trials=trials, controller=controller, seed=seed, progress=report)
             record: Any = write_robustness(result, folder, run)
-    columns = ("perturbation", "level", "success", "95 % interval", "goal error", "measured", "predicted", "labels")
-    rows = table(*columns, wrap=False)
+    rows: list[Any] = []
     for p in record.robustness.perturbations:
         for i, c in enumerate(p.cells):
+            rate = plain(f"{c.successes} of {c.trials}", "green" if c.level <= p.margin else "red")
+            errors = ("-" if v is None else f"{v:.3g}" for v in (c.goal_error_median, c.displacement, c.predicted))
             labels = ", ".join(f"{count} {label.removesuffix('_error')}" for label, count in c.labels.items())
-            rows.add_row(
-                plain("" if i else p.name, "bold"),
-                f"{c.level:g}",
-                plain(f"{c.successes} of {c.trials}", "green" if c.level <= p.margin else "red"),
-                f"{c.lower_95:.3f} to {c.upper_95:.3f}",
-                *("-" if v is None else f"{v:.3g}" for v in (c.goal_error_median, c.displacement, c.predicted)),
-                plain(labels),
-            )
-    show(rows)
+            name = plain("" if i else p.name, "bold")
+            rows.append((name, f"{c.level:g}", rate, f"{c.lower_95:.3f} to {c.upper_95:.3f}", *errors, labels))
+    columns = ("perturbation", "level", "success", "95 % interval", "goal error", "measured", "predicted", "labels")
+    show_table(columns, rows, wrap=False)
     show(judged(record.verdict), record.sentence)
     show(f"wrote {directory / PAGE}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
+    conclude(record.verdict == "pass")
 
 
 def panel(
@@ -191,46 +175,31 @@ def panel(
     """
     from drake_diff.panels.panel import run_panel
 
-    directory = out or Path("artifacts") / file.stem
+    directory, start = out or Path("artifacts") / file.stem, time.monotonic()
     try:
-        with _counted() as progress:
-            results = run_panel(file, out=directory, workers=workers, engine=engine, address=address, progress=progress)
+        with progress_line("starting", pause=PAUSE) as report:
+
+            def count(finished: int, trials: int, errors: int) -> None:
+                report(f"{finished} of {trials} trials, {errors} errors, {time.monotonic() - start:.0f} s")
+
+            results = run_panel(file, out=directory, workers=workers, engine=engine, address=address, progress=count)
     except KeyboardInterrupt:
         show(f"interrupted: finished trials are in {directory}; the same command goes on from there")
         raise typer.Exit(INTERRUPTED) from None
     cells = results.summary["cells"]
-    with_success = any("success" in cell for cell in cells)
     axes, names = (list(dict.fromkeys(name for cell in cells for name in cell[key])) for key in ("cell", "numbers"))
-    judgement = ["success", "95 %"] if with_success else []
-    rows = table(*axes, "trials", "errors", *judgement, *names, wrap=console().is_terminal)
+    judgement = ["success", "95 %"] if any("success" in cell for cell in cells) else []
+    rows = []
     for cell in cells:
         words = [cell["cell"].get(name) for name in axes] + [cell["trials"], cell["errors"]]
-        if with_success:
+        if judgement:
             success = cell["success"]
             words += [f"{success['rate']:.3g}", f"{success['low']:.3g} to {success['high']:.3g}"]
-        for name in names:
-            n = cell["numbers"].get(name)
+        for n in (cell["numbers"].get(name) for name in names):
             spread = "" if n is None or n["std"] is None else f" ± {n['std']:.2g}"
             words.append(None if n is None else f"{n['mean']:.4g}{spread}")
-        rows.add_row(*(plain(word) for word in words))
-    show(rows)
+        rows.append(words)
+    show_table([*axes, "trials", "errors", *judgement, *names], rows, wrap=console().is_terminal)
     show(f"{results.summary['trials']} trials, {results.errors} errors")
     show(f"wrote {directory}: record.json, table.csv, summary.json, panel.html, a record of each trial in trials")
-    raise typer.Exit(1 if results.errors else 0)
-
-
-@contextmanager
-def _counted() -> Iterator[Callable[[int, int, int], None]]:
-    """Progress in numbers: on a terminal at once, elsewhere every few seconds."""
-    start = last = time.monotonic()
-    pause = 0.0 if console().is_terminal else EVERY
-    with progress_line("starting") as report:
-
-        def count(finished: int, trials: int, errors: int) -> None:
-            nonlocal last
-            now = time.monotonic()
-            if now - last >= pause:
-                last = now
-                report(f"{finished} of {trials} trials, {errors} errors, {now - start:.0f} s")
-
-        yield count
+    conclude(not results.errors)

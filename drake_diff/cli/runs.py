@@ -14,7 +14,18 @@ import typer
 
 from drake_diff._base.clock import INTERRUPTED, held_interrupts
 from drake_diff._base.sandbox import memory_at_most
-from drake_diff.cli.text import ModelFolder, RunDirectory, judged, out_option, plain, progress_line, show, table
+from drake_diff.cli.text import (
+    ModelFolder,
+    RunDirectory,
+    conclude,
+    judged,
+    out_option,
+    plain,
+    progress_line,
+    show,
+    show_table,
+    show_written,
+)
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, WriteError
 
 LogFile = Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that drake_diff wrote.")]
@@ -58,40 +69,42 @@ def run(
     if not script.is_file():
         raise InputError("SCRIPT", got=str(script), expected="a Python file that exists")
     directory = out or Path("artifacts") / script.stem
-    shown: list[str] = []  # the address of the page
+    addresses: list[str] = []
 
     def show_address(address: str) -> None:
-        shown.append(address)
+        addresses.append(address)
         typer.echo(f"the search is shown at {address}")
 
-    claimed: list[Path] = []
-    try:
-        # Only here: a script that is missing is refused before Drake is loaded.
-        from drake_diff.runs.directory import written_whole
-        from drake_diff.runs.save import record_without_problem
+    record = _run_into(directory, script, cross_check, {"view": show_address} if view else {})
+    (_show_record if record.phases is None else _show_phases)(record)
+    show_written(directory, record)
+    if addresses:
+        _wait_at(f"the plan is at {addresses[0]}")
+    conclude(record.verdict == "pass")
 
+
+def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[str, Any]) -> Any:
+    """Set up the problem and write the record of its solution; what is interrupted takes no other run's place."""
+    from drake_diff.runs.directory import written_whole  # only here: a missing script is refused before Drake is loaded
+    from drake_diff.runs.save import record_without_problem
+
+    folder = None
+    try:
         with written_whole(directory) as folder:
-            claimed.append(folder)
             try:
-                problem, options = _asked(script, cross_check)
+                problem, asked = _asked(script, cross_check)
             except KeyboardInterrupt:
                 sentence = "the run was interrupted while its problem was set up, before the search began"
                 with held_interrupts():
                     record_without_problem(directory.name, sentence).begin(folder)
                 show(f"{sentence}; a record that says so is in {folder}")
                 raise typer.Exit(INTERRUPTED) from None
-            view_options: dict[str, Any] = {"view": show_address} if view else {}
-            record = _solved_into(directory, folder, problem, options | view_options, cross_check)
+            return _solved_into(directory, folder, problem, asked | options, cross_check)
     except KeyboardInterrupt:
-        if claimed:
+        if folder is not None:
             raise
         show(f"interrupted before {directory} was opened: nothing is written")
         raise typer.Exit(INTERRUPTED) from None
-    (_show_record if record.phases is None else _show_phases)(record)
-    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
-    if shown:
-        _wait_at(f"the plan is at {shown[0]}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 
 def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
@@ -177,10 +190,8 @@ def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str,
 
 def _show_phases(record: Any) -> None:
     show(judged(record.verdict), f" {record.solver.status}: {record.sentence}")
-    rows = table("phase", "ended", "cost", "steps" if record.phases.counts_steps else "seconds")
-    for phase in record.phases.phases:
-        rows.add_row(plain(phase.name), plain(phase.status), plain(phase.cost), plain(phase.duration))
-    show(rows)
+    columns = ("phase", "ended", "cost", "steps" if record.phases.counts_steps else "seconds")
+    show_table(columns, [(p.name, p.status, p.cost, p.duration) for p in record.phases.phases])
     for link in record.phases.links:
         errors = [float("inf") if error is None else error for error in link.errors]
         show(f"link {link.before} to {link.after}: missed by {max(errors):.3g}, tolerance {link.tolerance:g}")
@@ -200,14 +211,13 @@ def _loaded(script: Path) -> ModuleType:
 
 
 def _show_record(record: Any) -> None:
-    solver = record.solver
+    solver, holds = record.solver, {"pass": "holds", "info": ""}
     show(judged(record.verdict), f" {solver.status}: {record.sentence}")
-    rows = table("measured again", "value", "unit", "tolerance", "")
-    for metric in record.metrics:
-        tolerance = "" if metric.tolerance is None else f"{metric.tolerance:g}"
-        shown = {"pass": plain("holds"), "info": plain("")}.get(metric.verdict, plain("does not hold", "red"))
-        rows.add_row(metric.name, plain(metric.value), metric.unit, tolerance, shown)
-    show(rows)
+    rows = []
+    for m in record.metrics:
+        tolerance = "" if m.tolerance is None else f"{m.tolerance:g}"
+        rows.append((m.name, m.value, m.unit, tolerance, holds.get(m.verdict, plain("does not hold", "red"))))
+    show_table(("measured again", "value", "unit", "tolerance", ""), rows)
     for replay in record.replays:
         verdict = plain("holds") if replay.holds else plain(f"does not hold: {replay.failures[0]}", "red")
         goal = "-" if replay.goal_error is None else f"{replay.goal_error:.3g}"
@@ -244,7 +254,7 @@ def verify(
     show(judged(verification.verdict), f"{run}: {sentence}; the run's verdict: {verdict}")
     for line in verification.lines:
         show(plain(f"  {line}", "red" if line.startswith("broken") else "dim"))
-    raise typer.Exit(0 if verification.holds else 1)
+    conclude(verification.holds)
 
 
 @memory_at_most(MOST_MEMORY)
@@ -254,11 +264,9 @@ def list_all(
     """List the records in DIRECTORY and their verdicts as written; `verify` checks them."""
     from drake_diff.runs.view import list_runs
 
-    rows = table("run", "verdict", "kind", "status", "cost", "model", "written")
-    for line in list_runs(directory):
-        words = (line.kind, line.status, line.cost, line.model, line.written_utc)
-        rows.add_row(plain(line.name), judged(line.verdict), *(plain(word) for word in words))
-    show(rows)
+    columns = ("run", "verdict", "kind", "status", "cost", "model", "written")
+    lines = list_runs(directory)
+    show_table(columns, [(r.name, judged(r.verdict), r.kind, r.status, r.cost, r.model, r.written_utc) for r in lines])
 
 
 def recover_run(
@@ -273,9 +281,8 @@ def recover_run(
 
     record: Any = complete(run, out)
     show(judged(record.verdict), f" {record.sentence}")
-    directory = out or run.resolve().with_name(record.name)
-    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
+    show_written(out or run.resolve().with_name(record.name), record)
+    conclude(record.verdict == "pass")
 
 
 @memory_at_most(MOST_MEMORY)
@@ -296,11 +303,8 @@ def compare_runs(
     for title in ("configuration", "versions", "metrics"):
         differing = getattr(comparison, title)
         show(plain(title if differing else f"{title}: no difference", "bold"))
-        rows = table("", "A", "B")
-        for row in differing:
-            rows.add_row(plain(row.key), plain(row.a), plain(row.b))
         if differing:
-            show(rows)
+            show_table(("", "A", "B"), [(row.key, row.a, row.b) for row in differing])
     for line in comparison.refused:
         show(plain(f"not compared: {line}", "red"))
     if out is not None:
@@ -308,7 +312,7 @@ def compare_runs(
 
         write_runs_page(out, a, b, models=models)
         show(f"wrote {out}")
-    raise typer.Exit(0 if comparison.comparable else 1)
+    conclude(comparison.comparable)
 
 
 def schema(
@@ -360,12 +364,11 @@ def info(file: LogFile) -> None:
     from drake_diff.logs.mcap_file import read_mcap
 
     log = read_mcap(file, links=False)
-    rows = table("channel", "schema", "messages", "from [s]", "to [s]", left=2)
+    rows = []
     for topic, messages in log.messages.items():
         ends = [f"{messages[i][0] / 1e9:g}" for i in (0, -1)] if messages else ["", ""]
-        schema = log.message_types[topic].DESCRIPTOR.full_name
-        rows.add_row(plain(topic), plain(schema), str(len(messages)), *ends)
-    show(rows)
+        rows.append((topic, log.message_types[topic].DESCRIPTOR.full_name, len(messages), *ends))
+    show_table(("channel", "schema", "messages", "from [s]", "to [s]"), rows, left=2)
     for topic, metadata in log.channel_metadata.items():
         show(f"units of {topic}: {_units(metadata.get('units', {}))}")
     for name, record in log.metadata.items():

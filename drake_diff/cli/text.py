@@ -6,10 +6,11 @@ What a record or a model says may be a stranger's text: it is printed without ma
 import functools
 import inspect
 import shlex
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+import time
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -21,33 +22,10 @@ from drake_diff.exceptions import InputError
 NOT_FOLDED = 160  # columns
 GREEN, RED, YELLOW = ("pass", "holds", "agree"), ("fail", "broken", "error", "damaged"), ("warning",)
 
-ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file.")]
 RunDirectory = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")]
 ModelFolder = Annotated[
     Path | None, typer.Option("--models", help="A folder below which meshes and models that RUN names may be read.")
 ]
-TimeStep = Annotated[float, typer.Option(help="Time step of the discrete plant, in seconds.")]
-ContactModel = Annotated[str, typer.Option(help="point, hydroelastic or hydroelastic_with_fallback")]
-Approximation = Annotated[str, typer.Option(help="sap, similar or lagged")]
-Geometry = Annotated[
-    str | None, typer.Option(help="For pairs of shapes that Drake refuses: corner_spheres, hydroelastic or differences")
-]
-Ground = Annotated[
-    str | None, typer.Option(metavar="FRICTION", help="Add a floor at z = 0 with this friction; true: the usual one.")
-]
-Actuators = Annotated[
-    str | None, typer.Option(metavar="all|NAMES|NAME=EFFORT,...", help="Joints to drive beside those of the file.")
-]
-Base = Annotated[
-    str | None, typer.Option(metavar="weld|free|FRAME", help="weld fixes what floats; a frame is fixed at the origin.")
-]
-Meshes = Annotated[str, typer.Option(help="What becomes of collision meshes: skip, convex or spheres")]
-Packages = Annotated[
-    list[str] | None, typer.Option(metavar="NAME=FOLDER", help="Where a package:// is. Can be given again.")
-]
-Mimic = Annotated[str | None, typer.Option(help="Joints that follow others: reduce or fix")]
-Gravity = Annotated[str | None, typer.Option(metavar="X,Y,Z", show_default="0,0,-9.81", help="Gravity in m/s^2.")]
-Contact = Annotated[bool, typer.Option(help="Whether anything collides.")]
 Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same draws.")]
 
 
@@ -59,6 +37,11 @@ def out_option(default: str) -> Any:
 def names_option(what: str, otherwise: str) -> Any:
     """An option that takes names with commas between; see `names_in`."""
     return typer.Option(metavar="NAMES", show_default=otherwise, help=f"{what}, with commas between.")
+
+
+def repeated(metavar: str, what: str) -> Any:
+    """An option that can be given several times."""
+    return typer.Option(metavar=metavar, help=f"{what}. Can be given again.")
 
 
 def names_in(words: str | None) -> list[str] | None:
@@ -87,37 +70,49 @@ def takes_model(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _load(
-    model: ModelFile,
-    time_step: TimeStep = 0.01,
-    contact_model: ContactModel = "point",
-    contact_approximation: Approximation = "sap",
-    contact_geometry: Geometry = None,
-    actuators: Actuators = None,
-    base: Base = None,
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file.")],
+    time_step: Annotated[float, typer.Option(help="Time step of the discrete plant, in seconds.")] = 0.01,
+    contact_model: Annotated[str, typer.Option(help="point, hydroelastic or hydroelastic_with_fallback")] = "point",
+    contact_approximation: Annotated[str, typer.Option(help="sap, similar or lagged")] = "sap",
+    contact_geometry: Annotated[
+        str | None, typer.Option(help="For pairs that Drake refuses: corner_spheres, hydroelastic or differences")
+    ] = None,
+    actuators: Annotated[
+        str | None, typer.Option(metavar="all|NAMES|NAME=EFFORT,...", help="Joints to drive beside those of the file.")
+    ] = None,
+    base: Annotated[
+        str | None,
+        typer.Option(metavar="weld|free|FRAME", help="weld fixes what floats; a frame is put at the origin."),
+    ] = None,
     fix_joints: Annotated[str | None, names_option("Joints to replace by welds", "none")] = None,
-    meshes: Meshes = "skip",
-    packages: Packages = None,
-    mimic: Mimic = None,
-    ground: Ground = None,
-    gravity: Gravity = None,
-    contact: Contact = True,
+    meshes: Annotated[str, typer.Option(help="What becomes of collision meshes: skip, convex or spheres")] = "skip",
+    packages: Annotated[list[str] | None, repeated("NAME=FOLDER", "Where a package:// is")] = None,
+    mimic: Annotated[str | None, typer.Option(help="Joints that follow others: reduce or fix")] = None,
+    ground: Annotated[
+        str | None,
+        typer.Option(metavar="FRICTION", help="Add a floor at z = 0 with this friction; true: the usual one."),
+    ] = None,
+    gravity: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", show_default="0,0,-9.81", help="Gravity in m/s^2.")
+    ] = None,
+    contact: Annotated[bool, typer.Option(help="Whether anything collides.")] = True,
 ) -> Any:
     # What is wrong is refused before Drake is loaded.
     options: dict[str, Any] = {
-        "ground": _ground(ground),
-        "gravity": gravity and [_number("--gravity", word, "three numbers") for word in gravity.split(",")],
-        "actuators": _actuators(actuators),
-        "packages": dict(split_pair("--packages", words, "NAME=FOLDER") for words in packages) if packages else None,
-    }
-    options |= {
         "time_step": time_step,
         "contact_model": contact_model,
         "contact_approximation": contact_approximation,
         "contact_geometry": contact_geometry,
+        "actuators": _actuators(actuators),
         "base": base,
         "fix_joints": names_in(fix_joints) or (),
         "meshes": meshes,
+        "packages": dict(split_pair("--packages", words, "NAME=FOLDER") for words in packages) if packages else None,
         "mimic": mimic,
+        "ground": True
+        if ground == "true"
+        else ground and _number("--ground", ground, "true, or a friction coefficient"),
+        "gravity": gravity and floats_in("--gravity", gravity, "three numbers"),
         "contact": contact,
     }
     from drake_diff.model.model import load_model
@@ -146,21 +141,13 @@ def survived(file: Path, options: Mapping[str, Any]) -> None:
         raise typer.Exit(1)
 
 
-def _ground(words: str | None) -> float | bool | None:
-    if words is None or words == "true":
-        return None if words is None else True
-    return _number("--ground", words, "true, or a friction coefficient")
-
-
 def _actuators(words: str | None) -> str | list[str] | dict[str, float] | None:
-    names = names_in(words)
+    names, expected = names_in(words), "all, names of joints, or an effort for each: NAME=EFFORT"
     if names is None or names == ["all"]:
         return words
     if not any("=" in name for name in names):
         return names
-    efforts = [
-        split_pair("--actuators", name, "all, names of joints, or an effort for each: NAME=EFFORT") for name in names
-    ]
+    efforts = [split_pair("--actuators", name, expected) for name in names]
     return {name: _number("--actuators", effort, "an effort limit [N or N m]") for name, effort in efforts}
 
 
@@ -218,8 +205,8 @@ def console(*, stderr: bool = False) -> Console:
     return terminal
 
 
-def show(*parts: str | Text | Table) -> None:
-    """Print a line or a table; only `Text` keeps a style."""
+def show(*parts: str | Text) -> None:
+    """Print a line; only `Text` keeps a style."""
     console().print(*(plain(renderable) if isinstance(renderable, str) else renderable for renderable in parts))
 
 
@@ -235,21 +222,41 @@ def judged(verdict: str) -> Text:
     return plain(verdict, f"bold {colour}")
 
 
-def table(*columns: str, left: int | None = None, wrap: bool = True) -> Table:
-    """An empty table; all but the first `left` columns are set to the right."""
-    made = Table(box=None, pad_edge=False, header_style="dim")
+def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, left: int = 99, wrap: bool = True) -> None:
+    """Print a table; all but the first `left` columns are set to the right."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
     for i, name in enumerate(columns):
-        justify: Any = "left" if left is None or i < left else "right"
-        made.add_column(plain(name), overflow="fold", no_wrap=not wrap, justify=justify)
-    return made
+        justify: Any = "left" if i < left else "right"
+        table.add_column(plain(name), overflow="fold", no_wrap=not wrap, justify=justify)
+    for row in rows:
+        table.add_row(*(cell if isinstance(cell, Text) else plain(cell) for cell in row))
+    console().print(table)
+
+
+def conclude(holds: bool) -> NoReturn:
+    """End the command: status 0 only where what was asked for holds."""
+    raise typer.Exit(0 if holds else 1)
+
+
+def show_written(directory: Path, record: Any) -> None:
+    """Say what of a record is in a directory."""
+    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
 
 
 @contextmanager
-def progress_line(begin: str, *, stderr: bool = False) -> Iterator[Callable[[str], None]]:
-    """A function that shows a line of progress: rewritten on a terminal, one below the other elsewhere."""
-    screen = console(stderr=stderr)
-    if not screen.is_terminal:
-        yield lambda line: screen.print(plain(line))
+def progress_line(begin: str, *, stderr: bool = False, pause: float = 0.0) -> Iterator[Callable[[str], None]]:
+    """A function that shows a line of progress: rewritten on a terminal; elsewhere one below the other, `pause` [s]
+    between them at least."""
+    screen, last = console(stderr=stderr), -pause
+    if screen.is_terminal:
+        with screen.status(begin) as status:
+            yield lambda line: status.update(plain(line))
         return
-    with screen.status(begin) as status:
-        yield lambda line: status.update(plain(line))
+
+    def write(line: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= pause:
+            last = time.monotonic()
+            screen.print(plain(line))
+
+    yield write
