@@ -1,6 +1,5 @@
 """From a robot file to a verified plan, in one call: what `drake-diff plan` does."""
 
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -84,7 +83,6 @@ class Plan(ShowsItsRepr):
         directory: What was written.
         tried: What was tried, and how it ended, a sentence each.
         apart: Whether the last of it was verified and no shapes of the robot overlap along it.
-        seconds: Of processor time, by stage.
     """
 
     model: Model
@@ -96,7 +94,6 @@ class Plan(ShowsItsRepr):
     directory: Path
     tried: tuple[str, ...]
     apart: bool
-    seconds: Mapping[str, float]
 
     @property
     def success(self) -> bool:
@@ -186,7 +183,7 @@ def plan(
     path = Path(robot)
     if time not in TIMES:
         raise InputError("time", got=repr(time), expected='None or "least"')
-    clock = _Clock(report or _quiet)
+    note = report or (lambda stage, sentence: None)
     if out is not None:
         check_place(Path(out).resolve())  # before minutes are spent
     with warnings.catch_warnings(), ExitStack() as stack:
@@ -194,18 +191,18 @@ def plan(
         folders: list[Path] = []
         weld = "the least time is sought without contact" if time else ""
         for _ in range(2):
-            clock.begin("load", path.name)
+            note("load", path.name)
             ready = load_robot(path, seed, weld)
             if not folders:
                 directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
                 folders.append(stack.enter_context(written_whole(directory)))
-            clock.begin("audit", str(ready.model))
+            note("audit", str(ready.model))
             findings = tuple(audit(ready.model))
-            clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
+            note("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
             task = read_goals(ready.model, goals or {}, avoid)
             try:
                 attempts = (attempt.restarted(restarts) for attempt in _attempts(ready, task, time, seed))
-                tried, solutions, apart = _first_that_holds(attempts, clock, partial(_keep, folder=folders[0]))
+                tried, solutions, apart = _first_that_holds(attempts, note, partial(_keep, folder=folders[0]))
             except ModelError as error:
                 if ready.standing is None:
                     raise
@@ -216,18 +213,15 @@ def plan(
         if not solutions:
             raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or NOTHING}")
         best = solutions[-1] if apart else min(solutions, key=lambda s: s.defect + s.goal_error)
-        clock.begin("save", best.status.value)
+        note("save", best.status.value)
         with plan_kept(best, directory.name, folders[0]):
             record = write_run(best, folders[0])
         if best.status is Status.INTERRUPTED and is_taken(directory):
             raise KeyboardInterrupt  # it stays beside the earlier run
         stack.close()  # it takes its place
-        clock.begin("verify", record.verdict)
+        note("verify", record.verdict)
         verification = verify_own(directory)
-        seconds = clock.end()
-    return Plan(
-        ready.model, ready.repairs, findings, best, record, verification, directory, tuple(tried), apart, seconds
-    )
+    return Plan(ready.model, ready.repairs, findings, best, record, verification, directory, tuple(tried), apart)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +263,7 @@ def _keep(plan: Solution, folder: Path) -> None:
 
 
 def _first_that_holds(
-    attempts: Iterator[_Attempt], clock: "_Clock", on_plan: Callable[[Solution], None]
+    attempts: Iterator[_Attempt], note: Report, on_plan: Callable[[Solution], None]
 ) -> tuple[list[str], list[Solution], bool]:
     """How each attempt ended, the solutions, and whether the last one is verified and keeps shapes apart.
 
@@ -280,9 +274,9 @@ def _first_that_holds(
     for first in attempts:
         attempt: _Attempt | None = first
         while attempt is not None:
-            clock.begin("solve", attempt.name)
+            note("solve", attempt.name)
             try:
-                solution = attempt.solved(lambda line: clock.report("solve", line), on_plan)
+                solution = attempt.solved(partial(note, "solve"), on_plan)
             except WriteError:
                 raise
             except DrakeDiffError as error:
@@ -418,28 +412,30 @@ def _of_reachable(robot: Robot, task: Task, seed: int) -> Iterator[_Attempt]:
     random = np.random.default_rng([seed, 2])
     fractions = random.uniform(-1, 1, robot.model.nq)
     target = robot.q + fractions * (robot.upper - robot.lower) / 2
-    guesses = [_reachable(robot, robot.model, target, *REACHES[0])]
-    if robot.apart is not None:
-        space, elsewhere = Space.around(robot, task.avoid), _elsewhere(robot, random)
-        for reach, begun in product(REACHES, (robot, elsewhere)):
-            guess = _reachable(begun, robot.apart, target, *reach, "touching nothing (contact=False)")
-            guesses += [guess] if guess is not None and _touched(space, guess) <= 0 else []
-    yield from (_feasible(robot, task, guess) for guess in guesses if guess is not None and _goes(guess))
-    if robot.apart is not None:
-        gentle = robot.model.changed(**GENTLE)
-        rest = by_controller(robot, gentle, robot.q, steps=COMES_TO_REST, reach=0.0, name="")
-        settled = robot if rest is None else replace(robot, q=rest.xs[-1][: gentle.nq])
-        label = f"from where it comes to rest, by spheres in its shapes and steps of {GENTLE['time_step']:g} s"
-        guesses = [_reachable(settled, gentle, target, reach, steps, label) for reach, steps in GENTLY]
-    else:
-        guesses = []
-    guesses += [_reachable(robot, robot.model, target, *reach) for reach in REACHES[1:]]
-    yield from (_feasible(robot, task, guess) for guess in guesses if guess is not None and _goes(guess))
 
+    def reach(begun: Robot, model: Model, way: float, steps: int, how: str = "") -> Iterator[Guess]:
+        name = f"what controllers reach ({way:g} of the way in {steps} steps){how and f', {how}'}"
+        guess = by_controller(begun, model, target, steps=steps, reach=way, name=name)
+        if guess is not None and _goes(guess):
+            yield guess
 
-def _reachable(robot: Robot, model: Model, target: Array, reach: float, steps: int, how: str = "") -> Guess | None:
-    name = f"what controllers reach ({reach:g} of the way in {steps} steps){how and f', {how}'}"
-    return by_controller(robot, model, target, steps=steps, reach=reach, name=name)
+    def guesses() -> Iterator[Guess]:
+        yield from reach(robot, robot.model, *REACHES[0])
+        if robot.apart is not None:
+            space, elsewhere = Space.around(robot, task.avoid), _elsewhere(robot, random)
+            for way, begun in product(REACHES, (robot, elsewhere)):
+                made = reach(begun, robot.apart, *way, "touching nothing (contact=False)")
+                yield from (guess for guess in made if _touched(space, guess) <= 0)
+            gentle = robot.model.changed(**GENTLE)
+            rest = by_controller(robot, gentle, robot.q, steps=COMES_TO_REST, reach=0.0, name="")
+            settled = robot if rest is None else replace(robot, q=rest.xs[-1][: gentle.nq])
+            how = f"from where it comes to rest, by spheres in its shapes and steps of {GENTLE['time_step']:g} s"
+            for way in GENTLY:
+                yield from reach(settled, gentle, *way, how)
+        for way in REACHES[1:]:
+            yield from reach(robot, robot.model, *way)
+
+    yield from (_feasible(robot, task, guess) for guess in guesses())
 
 
 def _elsewhere(robot: Robot, random: np.random.Generator) -> Robot:
@@ -505,31 +501,3 @@ def _goes(guess: Guess) -> bool:
     low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
     goes = np.max(np.ptp(guess.xs[:, : guess.model.nq], axis=0)) >= SMALLEST_WAY
     return bool(goes and np.all((low >= high) | ((guess.xs >= low) & (guess.xs <= high))))
-
-
-class _Clock:
-    """Processor time by stage."""
-
-    def __init__(self, report: Report):
-        self.report, self.seconds, self.stage = report, dict[str, float](), ""
-        self.start = time.process_time()
-
-    def begin(self, stage: str, sentence: str) -> None:
-        self._close()
-        self.stage = stage
-        self.report(stage, sentence)
-
-    def end(self) -> dict[str, float]:
-        self._close()
-        self.stage = ""
-        return self.seconds
-
-    def _close(self) -> None:
-        now = time.process_time()
-        if self.stage:
-            self.seconds[self.stage] = self.seconds.get(self.stage, 0.0) + now - self.start
-        self.start = now
-
-
-def _quiet(stage: str, sentence: str) -> None:
-    """Nothing."""

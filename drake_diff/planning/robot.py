@@ -4,7 +4,7 @@ What the file leaves out is mended, each repair a sentence: motors, thrusters of
 """
 
 import warnings
-from collections.abc import Collection
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -87,222 +87,117 @@ class Robot:
         return 0.0 if self.shapes is None else deepest(self.shapes, q, self.always)
 
 
+class _Draft:
+    """A robot's file, the options that it is loaded with, the model, and a sentence on each repair."""
+
+    def __init__(self, path: Path, options: dict[str, Any], repairs: Sequence[str] = ()):
+        self.path, self.options, self.repairs = path, dict(options), list(repairs)
+        self.model = self.read()
+
+    def read(self, **changes: Any) -> Model:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ModelWarning)  # what was mended is told at the end
+            return load_model(self.path, **self.options | changes)
+
+    def mend(self, repair: str, model: Model | None = None, **changes: Any) -> None:
+        self.model = self.read(**changes) if model is None else model
+        self.options |= changes
+        self.repairs.append(repair)
+
+    def fix(self, names: Sequence[str], why: str) -> None:
+        fixed = (*self.options.get("fix_joints", ()), *names)
+        self.mend(f"{why}: fixed (fix_joints)", fix_joints=fixed)
+
+
 def load_robot(path: Path, seed: int, weld: str = "") -> Robot:
     """The robot in a file, mended where it has to be; ModelError where nothing in it can be driven.
 
     What floats and can stand on feet does so, unless `weld` says why it is to be fixed to the world.
     """
-    options: dict[str, Any] = {"time_step": TIME_STEP}
-    repairs: list[str] = []
-    model = _loaded(path, options)
-    reduced = _reduced(path, options, model, repairs)
-    if reduced.nv < model.nv:
-        options["mimic"], gone = "reduce", model.nv - reduced.nv
-        repairs.append(f"{gone} joint{'s' * (gone > 1)} that follow others left the state (mimic='reduce')")
-        model = reduced
-    count = sum(joint.num_velocities() == 1 for joint in joints(model.plant))
-    if model.nu < (count if count > TEXTBOOK else FEW * count):
-        had, model = model.nu, _loaded(path, options | {"actuators": "all"})
-        if model.nu > had:
-            options["actuators"] = "all"
-            begin = f"only {had} joints had a motor" if had else "no joint had a motor"
-            repairs.append(f"{begin}: all {model.nu} that can be driven have one (actuators='all')")
-    if model.plant.GetFloatingBaseBodies() and joints(model.plant):
-        standing = Refusal(weld) if weld else _standing(path, model, options, repairs, seed)
+    draft = _Draft(path, {"time_step": TIME_STEP})
+    _reduce_followers(draft)
+    _add_motors(draft)
+    if draft.model.plant.GetFloatingBaseBodies() and joints(draft.model.plant):
+        standing = Refusal(weld) if weld else _standing(draft, seed)
         if isinstance(standing, Robot):
             return standing
-        welded = _welded(path, options)
-        if welded is not None and welded.nv < model.nv:
-            names = _few(model.plant.get_body(b).name() for b in sorted(model.plant.GetFloatingBaseBodies()))
-            options["base"], model = "weld", welded
-            repairs.append(f"{names} floated: it is fixed to the world (base='weld'), as {standing}")
-    stuck = _stuck(model)
-    if stuck and len(stuck) == count:
-        raise ModelError(f"{path}: no joint of it can move: each has the same lower and upper limit, which Drake keeps")
-    if stuck:
-        options["fix_joints"] = stuck
-        model = _loaded(path, options)
-        repairs.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
-    model = _with_mass(path, options, model, repairs)
-    model = _with_thrusters(path, options, model, repairs)
-    return _placed(path, options, model, repairs, np.random.default_rng(seed))
+        _weld_base(draft, standing)
+    _fix_stuck(draft)
+    _fix_massless(draft)
+    _add_thrusters(draft)
+    return _placed(draft, np.random.default_rng(seed))
 
 
-# Of a robot that stands: every shape is spheres, which a ground meets with derivatives, and only the ground is met.
-ON_FEET: dict[str, Any] = {"base": "free", "meshes": "spheres", "contact_geometry": "corner_spheres"}
-# Drake's own values let light legs sink by millimetres, by how much depends on the step, and rise only in 0.2 s.
-GROUND: dict[str, Any] = {"ground": True, "contact": "ground", "near_rigid": 0.1, "relaxation_time": 0.02}
-STEPS_ON_FEET, MANY = (0.005, 0.01), 24  # [s], the second of robots of more velocities, each of whose steps costs more
-DRAWN = 16  # postures, to see which shapes always overlap
-
-
-def _standing(path: Path, read: Model, options: dict[str, Any], repairs: list[str], seed: int) -> Robot | Refusal:
-    """The robot that was `read` on its feet on a ground; or why it does not stand."""
-    on_feet = options | ON_FEET | GROUND | {"time_step": STEPS_ON_FEET[read.nv > MANY]}
-    random = np.random.default_rng(seed)
-    repairs = list(repairs)
+def _reduce_followers(draft: _Draft) -> None:
     try:
-        model = _loaded(path, on_feet)
-        stuck = _stuck(model)
-        if stuck:
-            on_feet["fix_joints"] = stuck
-            model = _loaded(path, on_feet)
-            repairs.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
-        model = _with_mass(path, on_feet, model, repairs)
-        if model.nv > MANY and isinstance(analytic_of(model), Refusal) and options.get("mimic") == "reduce":
-            on_feet["mimic"] = "fix"
-            model = _loaded(path, on_feet)
-            repairs.append(
-                "what follows and what leads is fixed where it stands (mimic='fix'), for analytic derivatives"
-            )
-        derivatives = analytic_of(model)
-        if model.nv > MANY and isinstance(derivatives, Refusal):
-            return Refusal(f"the derivatives of {model.nv} velocities in contact would take minutes: {derivatives}")
-        lower, upper = ranges(model)
-        stance = stand(model, lower, upper)
-        if isinstance(stance, Refusal):
-            return Refusal(f"it cannot stand: {stance}")
-        shapes = _loaded(path, on_feet | {"ground": None, "contact": True})
-        q, is_joint = stance[1].x[: model.nq], of_joints(model)
-        overlapping = pairs_always([np.where(is_joint, random.uniform(lower, upper), q) for _ in range(DRAWN)], shapes)
-        besides = overlapping | pairs_always([q], shapes)
-    except DrakeDiffError as error:
-        return Refusal(f"a model that could stand cannot be made: {error}")
-    feet = _few(foot.name for foot in stance[0].feet)
-    repairs.append(
-        f"it stands on {feet}, on a ground that was added (base='free', ground=True), by spheres in its shapes"
-    )
-    if besides:
-        repairs.append(f"{_few(map(' and '.join, sorted(besides)))} overlap where it stands, which is not looked at")
-    return Robot(model, shapes, q, lower, upper, tuple(repairs), False, besides, stance)
-
-
-def _with_thrusters(path: Path, options: dict[str, Any], model: Model, repairs: list[str]) -> Model:
-    """The model, with thrusters where it floats and nothing drives it; ModelError where nothing can."""
-    if not model.nu and model.plant.GetFloatingBaseBodies():
-        options["body_forces"] = thrusters(model)
-        model = _loaded(path, options)
-        names = _few(dict.fromkeys(force.body for force in options["body_forces"]))
-        repairs.append(f"nothing drives {names}: six thrusters push and turn it, two along each axis (body_forces)")
-    if not model.nu:
-        raise ModelError(f"{path}: nothing in it can be driven: it has no revolute or prismatic joint, and none floats")
-    return model
-
-
-def _reduced(path: Path, options: dict[str, Any], model: Model, repairs: list[str]) -> Model:
-    """The model without the joints that follow others; as it is where that cannot be done, which is told."""
-    try:
-        return _loaded(path, options | {"mimic": "reduce"})
+        reduced = draft.read(mimic="reduce")
     except ModelError as error:
-        repairs.append(f"joints that follow others stay in the state, as {error}")
-        return model
+        draft.repairs.append(f"joints that follow others stay in the state, as {error}")
+        return
+    if gone := draft.model.nv - reduced.nv:
+        draft.mend(f"{gone} joints that follow others left the state (mimic='reduce')", reduced, mimic="reduce")
 
 
-def _placed(
-    path: Path, options: dict[str, Any], model: Model, repairs: list[str], random: np.random.Generator
-) -> Robot:
-    """The robot in the posture it starts in, and with the contact that its plan needs."""
-    lower, upper = ranges(model)
-    first = inside(model, lower, upper)
-    touches = bool(model.contract.contact.collision_pairs)
-    apart = _loaded(path, options | {"contact": False}) if touches else model
-    driven = is_fully_driven(apart)
-    flies = bool(options.get("body_forces"))
-    shapes = model if touches else None
-    if flies and shapes is not None:
-        first = lifted(shapes, first)
+def _add_motors(draft: _Draft) -> None:
+    count, had = _movable(draft.model), draft.model.nu
+    if had < (count if count > TEXTBOOK else FEW * count):
+        driven = draft.read(actuators="all")
+        if driven.nu > had:
+            begin = f"only {had} joints had a motor" if had else "no joint had a motor"
+            repair = f"{begin}: all {driven.nu} that can be driven have one (actuators='all')"
+            draft.mend(repair, driven, actuators="all")
+
+
+def _movable(model: Model) -> int:
+    return sum(joint.num_velocities() == 1 for joint in joints(model.plant))
+
+
+def _weld_base(draft: _Draft, why: Refusal) -> None:
     try:
-        posture = start(shapes, apart if driven else None, first, lower, upper, random)
-    except SimulationError as error:
-        repairs.append(f"its overlap is not looked for: {error}")
-        shapes, posture = None, start(None, apart if driven else None, first, lower, upper, random)
-    weak = _too_weak(apart, posture) if driven and posture.load > 1 else ()
-    if weak and len(weak) < model.nv:
-        repairs.append(f"the motors of {_few(weak)} cannot hold the weight in any posture tried: fixed (fix_joints)")
-        fixed = options | {"fix_joints": (*options.get("fix_joints", ()), *weak)}
-        return _placed(path, fixed, _loaded(path, fixed), repairs, random)
-    if posture.always:
-        repairs.append(
-            f"{_few(map(' and '.join, sorted(posture.always)))} overlap in every posture, which is not looked at"
-        )
-    if (driven or flies) and touches:
-        model = apart
-        seen = "" if shapes is None else ": overlap is looked for along the plan"
-        repairs.append(f"contact is left out of its steps (contact=False){seen}")
-    if np.any(np.abs(posture.q - model.default_state[: model.nq]) > 1e-9):
-        repairs.append(
-            "its start is moved to where joints are inside their limits, nothing overlaps and its motors hold it"
-        )
-    other = apart if model is not apart else None
-    return Robot(model, shapes, posture.q, lower, upper, tuple(repairs), driven, posture.always, apart=other)
-
-
-def _too_weak(model: Model, posture: Start) -> tuple[str, ...]:
-    """The joints whose motors are too weak for the posture, and those that follow them."""
-    over = np.flatnonzero(shares_to_hold(model, posture.q) > 1)
-    moved = [actuator.joint().name() for actuator in actuators(model.plant)]
-    return _with_followers(model, [moved[i] for i in model.inputs.actuator[over]])
-
-
-def _loaded(path: Path, options: dict[str, Any]) -> Model:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)  # what was mended is told at the end
-        return load_model(path, **options)
-
-
-def _welded(path: Path, options: dict[str, Any]) -> Model | None:
-    """With its base welded; None where nothing can move then."""
-    try:
-        return _loaded(path, options | {"base": "weld"})
+        welded = draft.read(base="weld")
     except ModelError:
-        return None
+        return  # nothing can move then
+    if welded.nv < draft.model.nv:
+        plant = draft.model.plant
+        names = _few(plant.get_body(b).name() for b in sorted(plant.GetFloatingBaseBodies()))
+        draft.mend(f"{names} floated: it is fixed to the world (base='weld'), as {why}", welded, base="weld")
 
 
-def _stuck(model: Model) -> tuple[str, ...]:
-    """The joints that have no way to go between their limits, and those that follow them."""
-    lower, upper = model.position_limits
+def _fix_stuck(draft: _Draft) -> None:
+    """Fix the joints that have no way to go between their limits, and those that follow them."""
+    model, (lower, upper) = draft.model, draft.model.position_limits
     names: list[str] = []
     for joint in joints(model.plant):
-        (positions, _) = model.places(joint)
+        positions, _ = model.places(joint)
         if joint.num_positions() == 1 and len(positions) and lower[positions[0]] >= upper[positions[0]]:
             names.append(joint.name())
-    return _with_followers(model, names)
+    stuck = _with_followers(model, names)
+    if stuck and len(stuck) == _movable(model):
+        got = "each has the same lower and upper limit, which Drake keeps"
+        raise ModelError(f"{draft.path}: no joint of it can move: {got}")
+    if stuck:
+        draft.fix(stuck, f"{_few(stuck)} had the same lower and upper limit")
 
 
-def _with_followers(model: Model, names: list[str]) -> tuple[str, ...]:
-    """The joints, and those that follow them."""
-    joint_names, mimics = list(names), () if model.coupling is None else model.coupling.mimics
-    while more := [m.follower for m in mimics if m.leader in joint_names and m.follower not in joint_names]:
-        joint_names += more
-    return tuple(joint_names)
-
-
-def _with_mass(path: Path, options: dict[str, Any], model: Model, repairs: list[str]) -> Model:
-    """The model, less joints that nothing hangs on which has a mass: Drake could take no step of them."""
-    if _can_step(model):
-        return model
-    if options.get("mimic"):
-        fixed = _loaded(path, options | {"mimic": "fix"})
-        if _can_step(fixed):
-            options["mimic"] = "fix"
-            repairs.append(
-                "joints that follow others, and those that they follow, are fixed (mimic='fix'), as Drake cannot "
-                f"take a step with them: {_why_not(model)}"
-            )
-            return fixed
-    moved = model.double.mass_matrix()
-    light = tuple(
+def _fix_massless(draft: _Draft) -> None:
+    """Fix the joints on which nothing hangs that has a mass: Drake could take no step of them."""
+    model, why = draft.model, _why_not(draft.model)
+    if not why:
+        return
+    if draft.options.get("mimic"):
+        fixed = draft.read(mimic="fix")
+        if not _why_not(fixed):
+            repair = "joints that follow others, and those that they follow, are fixed (mimic='fix')"
+            draft.mend(f"{repair}, as Drake cannot take a step with them: {why}", fixed, mimic="fix")
+            return
+    mass = np.diag(model.double.mass_matrix())
+    light = [
         joint.name()
         for joint in joints(model.plant)
-        if joint.num_velocities() == 1
-        and len(velocities := model.places(joint)[1])
-        and moved[velocities[0], velocities[0]] <= 0
-    )
-    if not light:
-        return model
-    options["fix_joints"] = (*options.get("fix_joints", ()), *light)
-    repairs.append(f"{_few(light)} move nothing that has a mass or inertia: fixed (fix_joints)")
-    return _loaded(path, options)
+        if joint.num_velocities() == 1 and any(mass[v] <= 0 for v in model.places(joint)[1])
+    ]
+    if light:
+        draft.fix(light, f"{_few(light)} move nothing that has a mass or inertia")
 
 
 def _why_not(model: Model) -> str:
@@ -314,11 +209,109 @@ def _why_not(model: Model) -> str:
     return ""
 
 
-def _can_step(model: Model) -> bool:
-    return not _why_not(model)
+def _add_thrusters(draft: _Draft) -> None:
+    if not draft.model.nu and draft.model.plant.GetFloatingBaseBodies():
+        forces = thrusters(draft.model)
+        names = _few(dict.fromkeys(force.body for force in forces))
+        repair = f"nothing drives {names}: six thrusters push and turn it, two along each axis (body_forces)"
+        draft.mend(repair, body_forces=forces)
+    if not draft.model.nu:
+        reason = "it has no revolute or prismatic joint, and none floats"
+        raise ModelError(f"{draft.path}: nothing in it can be driven: {reason}")
 
 
-def _few(names: "Collection[str] | Any") -> str:
+# Of a robot that stands: every shape is spheres, which a ground meets with derivatives, and only the ground is met.
+ON_FEET: dict[str, Any] = {"base": "free", "meshes": "spheres", "contact_geometry": "corner_spheres"}
+# Drake's own values let light legs sink by millimetres, by how much depends on the step, and rise only in 0.2 s.
+GROUND: dict[str, Any] = {"ground": True, "contact": "ground", "near_rigid": 0.1, "relaxation_time": 0.02}
+STEPS_ON_FEET, MANY = (0.005, 0.01), 24  # [s], the second of robots of more velocities, each of whose steps costs more
+DRAWN = 16  # postures, to see which shapes always overlap
+
+
+def _standing(read: _Draft, seed: int) -> Robot | Refusal:
+    """The robot on its feet on a ground; or why it does not stand."""
+    step = STEPS_ON_FEET[read.model.nv > MANY]
+    random = np.random.default_rng(seed)
+    try:
+        draft = _Draft(read.path, read.options | ON_FEET | GROUND | {"time_step": step}, read.repairs)
+        _fix_stuck(draft)
+        _fix_massless(draft)
+        derivatives = analytic_of(draft.model)
+        if draft.model.nv > MANY and isinstance(derivatives, Refusal) and draft.options.get("mimic") == "reduce":
+            what = "what follows and what leads is fixed where it stands"
+            draft.mend(f"{what} (mimic='fix'), for analytic derivatives", mimic="fix")
+            derivatives = analytic_of(draft.model)
+        model = draft.model
+        if model.nv > MANY and isinstance(derivatives, Refusal):
+            return Refusal(f"the derivatives of {model.nv} velocities in contact would take minutes: {derivatives}")
+        lower, upper = ranges(model)
+        stance = stand(model, lower, upper)
+        if isinstance(stance, Refusal):
+            return Refusal(f"it cannot stand: {stance}")
+        shapes = draft.read(ground=None, contact=True)
+        q, is_joint = stance[1].x[: model.nq], of_joints(model)
+        overlapping = pairs_always([np.where(is_joint, random.uniform(lower, upper), q) for _ in range(DRAWN)], shapes)
+        besides = overlapping | pairs_always([q], shapes)
+    except DrakeDiffError as error:
+        return Refusal(f"a model that could stand cannot be made: {error}")
+    ground = "on a ground that was added (base='free', ground=True), by spheres in its shapes"
+    draft.repairs.append(f"it stands on {_few(foot.name for foot in stance[0].feet)}, {ground}")
+    if besides:
+        pairs = _few(map(" and ".join, sorted(besides)))
+        draft.repairs.append(f"{pairs} overlap where it stands, which is not looked at")
+    return Robot(model, shapes, q, lower, upper, tuple(draft.repairs), False, besides, stance)
+
+
+def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
+    """The robot in the posture it starts in, and with the contact that its plan needs."""
+    model, repairs = draft.model, draft.repairs
+    lower, upper = ranges(model)
+    first = inside(model, lower, upper)
+    touches, flies = bool(model.contract.contact.collision_pairs), bool(draft.options.get("body_forces"))
+    apart = draft.read(contact=False) if touches else model
+    driven = is_fully_driven(apart)
+    shapes, holds = model if touches else None, apart if driven else None
+    if flies and shapes is not None:
+        first = lifted(shapes, first)
+    try:
+        posture = start(shapes, holds, first, lower, upper, random)
+    except SimulationError as error:
+        repairs.append(f"its overlap is not looked for: {error}")
+        shapes, posture = None, start(None, holds, first, lower, upper, random)
+    weak = _too_weak(apart, posture) if driven and posture.load > 1 else ()
+    if weak and len(weak) < model.nv:
+        draft.fix(weak, f"the motors of {_few(weak)} cannot hold the weight in any posture tried")
+        return _placed(draft, random)
+    if posture.always:
+        pairs = _few(map(" and ".join, sorted(posture.always)))
+        repairs.append(f"{pairs} overlap in every posture, which is not looked at")
+    if (driven or flies) and touches:
+        model = apart
+        seen = "" if shapes is None else ": overlap is looked for along the plan"
+        repairs.append(f"contact is left out of its steps (contact=False){seen}")
+    if np.any(np.abs(posture.q - model.default_state[: model.nq]) > 1e-9):
+        where = "inside their limits, nothing overlaps and its motors hold it"
+        repairs.append(f"its start is moved to where joints are {where}")
+    other = apart if model is not apart else None
+    return Robot(model, shapes, posture.q, lower, upper, tuple(repairs), driven, posture.always, apart=other)
+
+
+def _too_weak(model: Model, posture: Start) -> tuple[str, ...]:
+    """The joints whose motors are too weak for the posture, and those that follow them."""
+    over = np.flatnonzero(shares_to_hold(model, posture.q) > 1)
+    moved = [actuator.joint().name() for actuator in actuators(model.plant)]
+    return _with_followers(model, [moved[i] for i in model.inputs.actuator[over]])
+
+
+def _with_followers(model: Model, names: list[str]) -> tuple[str, ...]:
+    """The joints, and those that follow them."""
+    joint_names, mimics = list(names), () if model.coupling is None else model.coupling.mimics
+    while more := [m.follower for m in mimics if m.leader in joint_names and m.follower not in joint_names]:
+        joint_names += more
+    return tuple(joint_names)
+
+
+def _few(names: Iterable[str]) -> str:
     """The names with commas between, the first ones of many."""
     every = list(names)
     more = f" and {len(every) - NAMED} more" if len(every) > NAMED + 1 else ""
