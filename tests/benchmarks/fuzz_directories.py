@@ -364,7 +364,7 @@ def opened_as_users_do(folder, base, place, rng, wanted):
 def fuzz(count, seed, *, log=None, every_model=False):
     """Counts of what went wrong, and how the ways to open a directory ended.
 
-    With `every_model` each file of `models` is tried once instead; one with which the run holds is wrong too.
+    With `every_model`, at most `count` files of `models` are tried, once each; a run that holds with one is wrong too.
     """
     rng, ended, wrong, slowest = np.random.default_rng(seed), Counter(), [], 0.0
     read = []
@@ -377,13 +377,15 @@ def fuzz(count, seed, *, log=None, every_model=False):
         task = dd.Problem(model, x0=[0, 0], x_goal=[0.1, 0], num_steps=4, running_cost=dd.QuadraticCost(R=[[1.0]]))
         dd.save(dd.solve(task, method="shooting"), base)
         pool = models(canaries.folder)
-        for i in range(len(pool) if every_model else count):
+        chosen = rng.permutation(len(pool))[:count]
+        for i in range(len(chosen) if every_model else count):
             folder = place / "runs" / "run"
             shutil.copytree(base, folder)
             way = list(WAYS)[rng.choice(len(WAYS), p=list(WAYS.values()))]
             wanted = ["list", "mcap info", "load_record", str(rng.choice(["mcap recover", "compare-runs"]))]
             if every_model:
-                told = replace_model(folder, pool[i][0], pool[i][1].encode())
+                file_name, text = pool[chosen[i]]
+                told = replace_model(folder, file_name, text.encode())
                 wanted += ["verify", *(("view", "robustness") if i % 5 == 0 else ())]
             else:
                 told = way(folder, rng, canaries)
@@ -414,7 +416,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=1000)
-    parser.add_argument("--every-model", action="store_true", help="each strange robot file once, nothing by chance")
+    parser.add_argument("--every-model", action="store_true", help="robot files, each once, instead")
     parser.add_argument("--log", type=Path)
     asked = parser.parse_args()
     start = time.monotonic()

@@ -3,6 +3,7 @@
 import warnings
 from dataclasses import replace
 from importlib.metadata import files
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -327,11 +328,11 @@ def test_an_inertia_that_no_body_has_is_taken_as_drake_takes_it(name):
 @pytest.mark.slow
 def test_auto_serves_wherever_autodiff_does_and_every_step_is_had_to_rounding():
     served = []
-    for model, x, u in example_robots():
+    for model, x, u in islice(example_robots(), 0, None, 3):
         served.append(same_where_autodiff_works(model, x, u))
         solved = refine_steps(model, select(model, ()), x[None], u[None])
         assert not solved.refused, f"{model.name}: {solved.refused}"
-    assert served.count(True) >= 30
+    assert served.count(True) >= 10
 
 
 @each_row("name", ["solo12.urdf", "go2.urdf", "bolt.urdf"])

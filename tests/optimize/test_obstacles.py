@@ -65,7 +65,7 @@ def test_a_plan_goes_around_as_drake_measures_it(name, method):
 
 
 @pytest.mark.slow
-@each_row("name, method", [("post", "collocation"), ("ball", "ilqr"), ("post", "ilqr")])
+@each_row("name, method", [("post", "ilqr")])
 def test_a_plan_of_steps_or_lines_goes_around_too(name, method):
     check_that_it_goes_around(name, method)
 

@@ -24,10 +24,10 @@ NAMES = sorted(path.name for path in MODELS.iterdir())
 @pytest.mark.slow
 @each_row("name", NAMES)
 def test_every_model_here_is_certified_at_every_sampled_state(load, name):
-    """Eight models of 20 states, contact among them: the good states of the zoo."""
-    record = certify_model(load(name, time_step=0.005), states=20, seed=3)
+    """Eight states of each model, every other one in contact if the model can touch something."""
+    record = certify_model(load(name, time_step=0.005), states=8, seed=3)
     assert record.verdict == "pass", [s for s in record.certification.states if s.verdict != "agree"]
-    assert len(record.certification.states) == 20
+    assert len(record.certification.states) == 8
 
 
 @pytest.mark.slow
@@ -36,7 +36,7 @@ def test_real_robots_are_certified(name, base):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(robot_file(name), time_step=0.005, weld_base=base)
-    assert certify_model(model, states=20).verdict == "pass"
+    assert certify_model(model, states=8).verdict == "pass"
 
 
 @pytest.mark.parametrize("name", ["sphere_on_ground.sdf", "sliding_block.sdf"])

@@ -109,7 +109,7 @@ def test_limits_and_folders_that_are_none_are_refused(run, tmp_path):
 
 
 @pytest.mark.slow
-@each_row("words, refused", [(["--every-model"], 20), (["--count", "100"], 30)])
+@each_row("words, refused", [(["--every-model", "--count", "12"], 8), (["--count", "25"], 8)])
 def test_no_strange_directory_ends_this_process_or_leads_the_reader_out(words, refused):
     """The program fails for a crash, a hang, an opened canary, an error without a name, an accepted robot file."""
     done = subprocess.run([sys.executable, FUZZ, *words], capture_output=True, text=True, check=False)
