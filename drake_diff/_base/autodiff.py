@@ -18,7 +18,6 @@ from drake_diff.exceptions import GradientError, InputError
 
 # AutoDiffXd carries a whole row of derivatives with every number; this many at a time keeps memory flat.
 DIRECTIONS = 128
-WIDE = 1000  # variables: the identity of more is told row by row, where two matrices of n^2 numbers take seconds
 
 
 def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
@@ -70,14 +69,9 @@ def plain(values: Any) -> Array:
 
 def _seed(z: Any) -> Array | None:
     """(n, m) the derivatives that `z` (n,) carries; None where they are the identity, as solvers seed it."""
-    if len(z) > WIDE and all(_is_unit(entry.derivatives(), i, len(z)) for i, entry in enumerate(z)):
-        return None
-    seed = np.asarray(ExtractGradient(z.reshape(-1, 1)))
-    return None if len(z) <= WIDE and np.array_equal(seed, np.eye(len(z))) else seed
-
-
-def _is_unit(row: Array, i: int, n: int) -> bool:
-    return len(row) == n and row[i] == 1.0 and np.count_nonzero(row) == 1
+    rows = [entry.derivatives() for entry in z]
+    is_unit = (len(row) == len(z) and row[i] == 1.0 and np.count_nonzero(row) == 1 for i, row in enumerate(rows))
+    return None if all(is_unit) else np.asarray(ExtractGradient(z.reshape(-1, 1)))
 
 
 def chain(value: float, gradient: Array, z: Any) -> AutoDiffXd:

@@ -8,7 +8,7 @@ import signal
 import stat
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import FrameType
@@ -16,11 +16,7 @@ from typing import Any
 
 LONGEST_PIECE = 0.4  # of what the pieces before it took, as CasADi's take on chains of 20, 50 and 100 joints
 DEADLINE: ContextVar[float | None] = ContextVar("DEADLINE", default=None)  # of `now`
-
-
 STOP: ContextVar[threading.Event | None] = ContextVar("STOP", default=None)
-
-
 _uncounted = 0.0  # [s]
 
 
@@ -87,16 +83,10 @@ class Pace:
 
 INTERRUPTED = 130  # the exit status, as shells have it after Ctrl-C
 ALIKE = (signal.SIGTERM, signal.SIGHUP)
-AGAIN = signal.SIGVTALRM  # of a timer of this process's own work
-UNWOUND = 0.1  # [s] of work in which what is raised has left Numba, if nothing stopped it on its way
 # Called by C or by the garbage collector, which print what is raised in them and go on.
-GOES_NOWHERE = {
-    "__del__",
-    "on_disposal",
-    "_object_compiled_hook",
-    "_object_getbuffer_hook",
-    "_raw_object_cache_notify",
-    "_raw_object_cache_getbuffer",
+PRINTS_WHAT_IS_RAISED = {
+    *("__del__", "on_disposal", "_object_compiled_hook", "_object_getbuffer_hook"),
+    *("_raw_object_cache_notify", "_raw_object_cache_getbuffer"),
 }
 
 
@@ -113,31 +103,25 @@ class _Flag(threading.Event):
     """
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        if number != AGAIN:
-            _hush(number)
-            self.set()
-        if STOP.get() is self:
-            self._stop_compiling(frame)
-
-    def _stop_compiling(self, frame: FrameType | None) -> None:
+        _hush(number)
+        self.set()
         names, compiles = set(), False
         while frame is not None:
             names.add(frame.f_code.co_name)
             compiles = compiles or frame.f_globals.get("__name__", "").startswith("numba.")
             frame = frame.f_back
-        if not compiles:
-            return
-        if signal.getsignal(AGAIN) in (signal.SIG_DFL, self):  # else somebody's own timer
-            signal.signal(AGAIN, self)
-            signal.setitimer(signal.ITIMER_VIRTUAL, UNWOUND)
-        if names.isdisjoint(GOES_NOWHERE):
+        if STOP.get() is self and compiles and names.isdisjoint(PRINTS_WHAT_IS_RAISED):
             raise StoppedError("interrupted")
 
-    def end(self) -> None:
-        """Raise nothing any more."""
-        if signal.getsignal(AGAIN) is self:
-            signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
-            signal.signal(AGAIN, signal.SIG_DFL)
+
+@contextmanager
+def _handled(handler: Any, numbers: Iterable[int]) -> Iterator[None]:
+    former = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, was in former.items():
+            signal.signal(number, was)
 
 
 def interrupt_alike() -> None:
@@ -153,24 +137,15 @@ def noted_interrupts() -> Iterator[threading.Event]:
 
     What a user's own handler does, and what is ignored, as after nohup, stays so for SIGTERM and SIGHUP.
     """
-    flag = _Flag()
+    flag, outer = _Flag(), signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread():
         yield flag
-        return
-    former = {number: signal.getsignal(number) for number in (signal.SIGINT, *ALIKE)}
-    outer = former[signal.SIGINT]
-    if isinstance(outer, _Flag):
+    elif isinstance(outer, _Flag):
         yield outer
-        return
-    taken = [n for n, was in former.items() if n == signal.SIGINT or was in (signal.SIG_DFL, interrupt)]
-    for number in taken:
-        signal.signal(number, flag)
-    try:
-        yield flag
-    finally:
-        flag.end()
-        for number in taken:
-            signal.signal(number, former[number])
+    else:
+        ours = [number for number in ALIKE if signal.getsignal(number) in (signal.SIG_DFL, interrupt)]
+        with _handled(flag, (signal.SIGINT, *ours)):
+            yield flag
 
 
 @contextmanager
@@ -180,15 +155,11 @@ def held_interrupts() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    former = {number: signal.getsignal(number) for number in (signal.SIGINT, *ALIKE)}
-    taken = [number for number, was in former.items() if was not in (None, signal.SIG_IGN)]
-    for number in taken:
-        signal.signal(number, lambda number, _: came.append(number))
+    numbers = [n for n in (signal.SIGINT, *ALIKE) if signal.getsignal(n) not in (None, signal.SIG_IGN)]
     try:
-        yield
+        with _handled(lambda number, _: came.append(number), numbers):
+            yield
     finally:
-        for number in taken:
-            signal.signal(number, former[number])
         for caught in came:
             signal.raise_signal(caught)
 

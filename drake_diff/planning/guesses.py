@@ -53,7 +53,7 @@ FLY_SPEED, FLY_TURN, FLY_FAR, FLY_TURNED, FLY_UP, FLIGHTS = 1.0, 1.0, (1.0, 1.0,
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class Goals:
     """Goals of one robot: positions (3,) of frames, positions of joints by their place in q; none is a random goal.
 
     `avoid` is what it keeps clear of on its way.
@@ -69,7 +69,7 @@ class Task:
         return not self.frames and not self.joints
 
 
-def read_goals(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle] = ()) -> Task:
+def read_goals(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle] = ()) -> Goals:
     """The task that `goals` are for `model`: a name with three numbers is a frame's, with one a joint's.
 
     Raises UnknownNameError where there is no such frame or joint, InputError where the numbers do not fit.
@@ -97,7 +97,7 @@ def read_goals(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle]
     for obstacle in avoid:
         if not isinstance(obstacle, Obstacle):
             raise InputError("avoid", got=repr(obstacle)[:80], expected="SphereObstacles and BoxObstacles")
-    return Task(places, angles, tuple(avoid))
+    return Goals(places, angles, tuple(avoid))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ class Space:
         )
 
 
-def postures(robot: Robot, task: Task, seed: int) -> list[Array]:
+def postures(robot: Robot, task: Goals, seed: int) -> list[Array]:
     """Postures (nq,) that keep the task, the nearest to the start first; ModelError where none is found.
 
     Where nothing is asked for it is a random one: inside the limits, without overlap, and held by its motors.
@@ -170,7 +170,7 @@ def postures(robot: Robot, task: Task, seed: int) -> list[Array]:
     return sorted(candidates, key=lambda q: float(np.max(np.abs(q - robot.q))))[:CANDIDATES]
 
 
-def _reach(robot: Robot, task: Task, first: Array, fixed: Array) -> tuple[Array, float]:
+def _reach(robot: Robot, task: Goals, first: Array, fixed: Array) -> tuple[Array, float]:
     """The posture nearest to `first` (nq,) inside the limits that has the frames at their goals, and how far [m] it
     is off; what is `fixed` (nq,) stays."""
     model, plant = robot.model, robot.model.double.plant
@@ -218,7 +218,7 @@ def _random_posture(space: Space, random: np.random.Generator) -> Array | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class PostureLine:
     """A curve of postures: a clamped B-spline by its control points (K, nq), the first and last of which it meets."""
 
     name: str
@@ -247,7 +247,7 @@ class Line:
         return self.at(np.linspace(0, 1, 2 + int(np.ceil(self.length / NEAR))))
 
 
-def lines(space: Space, target: Array, seed: int) -> list[Line]:
+def lines(space: Space, target: Array, seed: int) -> list[PostureLine]:
     """Lines from where the robot starts to `target` (nq,), the best first.
 
     The straight one if it is clear; else the shortest bent ones that are, and of those that searches find; else the
@@ -255,7 +255,7 @@ def lines(space: Space, target: Array, seed: int) -> list[Line]:
     OMPL.
     """
     robot = space.robot
-    straight = Line("a straight line in the joints", np.array([robot.q, target]))
+    straight = PostureLine("a straight line in the joints", np.array([robot.q, target]))
     if space.is_free(straight.postures):
         return [straight]
     random = np.random.default_rng([seed, 3])
@@ -264,7 +264,7 @@ def lines(space: Space, target: Array, seed: int) -> list[Line]:
     for i in range(BENDS):
         pull = WIDTH * (i + 1) / BENDS * random.uniform(-1, 1, len(target)) * (robot.upper - robot.lower)
         middle = np.clip((robot.q + target) / 2 + pull, robot.lower, robot.upper)
-        line = Line(bent, np.array([robot.q, middle, target]))
+        line = PostureLine(bent, np.array([robot.q, middle, target]))
         if space.is_free(line.postures):
             candidates.append(line)
     if not (can_search or candidates):
@@ -274,7 +274,7 @@ def lines(space: Space, target: Array, seed: int) -> list[Line]:
     return sorted(candidates, key=lambda line: line.length)[:MOST_LINES] or [straight]
 
 
-def _search(space: Space, target: Array, seed: int) -> Line | None:
+def _search(space: Space, target: Array, seed: int) -> PostureLine | None:
     """Around what is in the way, by RRT-Connect; None where it finds nothing.
 
     Source: Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path planning", 2000.
@@ -286,7 +286,9 @@ def _search(space: Space, target: Array, seed: int) -> Line | None:
     for count in CONTROLS:
         knots = np.array(BsplineBasis(CUBIC, count).knots())
         even = along[-1] * np.array([np.mean(knots[i + 1 : i + CUBIC]) for i in range(count)])  # of an even speed
-        line = Line("a way around by a search", np.array([np.interp(even, along, column) for column in chain.T]).T)
+        line = PostureLine(
+            "a way around by a search", np.array([np.interp(even, along, column) for column in chain.T]).T
+        )
         if space.is_free(line.postures):
             return line
     return None
@@ -315,7 +317,7 @@ def _chain(space: Space, target: Array, seed: int) -> Array | None:
     class Lines(base.MotionValidator):  # type: ignore[misc]
         def checkMotion(self, a: Any, b: Any) -> bool:
             ends = np.array([values(a), values(b)])
-            return is_free(Line("", ends).postures)
+            return is_free(PostureLine("", ends).postures)
 
     level = util.getLogLevel()
     util.setLogLevel(util.LOG_NONE)
@@ -350,7 +352,7 @@ def _chain(space: Space, target: Array, seed: int) -> Array | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Guess:
+class MotionGuess:
     """A motion xs (N+1, nx) under us (N, nu) of `model`, and what it is called.
 
     `effort` is the largest share of an effort limit that it takes, `depth` [m] its deepest overlap.
@@ -368,7 +370,7 @@ class Guess:
         """The number of steps."""
         return len(self.us)
 
-    def in_steps(self, count: int) -> "Guess":
+    def in_steps(self, count: int) -> "MotionGuess":
         """The same motion at `count` + 1 even times, for a search whose horizon is free."""
         now, then = np.linspace(0, 1, count + 1), np.linspace(0, 1, len(self.xs))
         xs = np.array([np.interp(now, then, column) for column in self.xs.T]).T
@@ -382,7 +384,7 @@ def speed_limits(model: Model) -> Array:
     return np.where((limits > 0) & np.isfinite(limits), np.minimum(OF_SPEED * limits, 5 * FASTEST), FASTEST)
 
 
-def along(robot: Robot, line: Line, *, slower: float = 1.0) -> Guess:
+def along(robot: Robot, line: PostureLine, *, slower: float = 1.0) -> MotionGuess:
     """The smooth motion along a line, at rest at both ends, and the inputs that make it.
 
     It is as fast as the joints' speeds and efforts allow, within the limits of this module. SimulationError where
@@ -400,7 +402,7 @@ def along(robot: Robot, line: Line, *, slower: float = 1.0) -> Guess:
     return guess
 
 
-def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> Guess:
+def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> MotionGuess:
     """A smooth flight of what floats to where the frames of `places` are at theirs (3,) [m], at rest.
 
     Without places each body goes to a random one, by a straight line on which nothing overlaps, turned about the
@@ -408,7 +410,7 @@ def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> Guess:
     """
     model, random, still = robot.model, np.random.default_rng([seed, 4]), np.zeros(robot.model.nv)
     free, space = floating(model), tangent_space(model)
-    guesses = list[Guess]()
+    guesses = list[MotionGuess]()
     for _ in range(1 if places else FLIGHTS):
         way = np.zeros(model.nv)
         for _, _, v in () if places else free:
@@ -442,7 +444,7 @@ def _carrier(robot: Robot, name: str) -> int:
     raise InputError("goals", got=name, expected=f"a frame on what flies: {', '.join(label for label, _, _ in free)}")
 
 
-def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], duration: float) -> Guess:
+def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], duration: float) -> MotionGuess:
     """The motion through postures (M, nq) at s (M,) from 0 to 1 in `duration` [s], and the inputs that make it."""
     model = robot.model
     steps = int(np.clip(round(duration / model.time_step), *STEPS))
@@ -458,7 +460,7 @@ def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], durat
         us.append(u)
         xs.append(x_next)
     depth = max(robot.overlap(x[: model.nq]) for x in xs[:: max(1, steps // 25)])
-    return Guess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))), depth)
+    return MotionGuess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))), depth)
 
 
 def _inputs(model: Model, x: Array, wanted: Array) -> tuple[Array, Array]:
@@ -493,7 +495,9 @@ def _positions(model: Model) -> Indices:
     return indices
 
 
-def by_controller(robot: Robot, model: Model, target: Array, *, steps: int, reach: float, name: str) -> Guess | None:
+def by_controller(
+    robot: Robot, model: Model, target: Array, *, steps: int, reach: float, name: str
+) -> MotionGuess | None:
     """What `model` of the robot does when each input pulls its own joint toward `target` (nq,), `reach` of the way.
 
     None where Drake cannot take a step of it.
@@ -517,4 +521,4 @@ def by_controller(robot: Robot, model: Model, target: Array, *, steps: int, reac
     except SimulationError:
         return None
     depth = max(robot.overlap(x[: model.nq]) for x in xs) if model is robot.apart else 0.0
-    return Guess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))), depth)
+    return MotionGuess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))), depth)

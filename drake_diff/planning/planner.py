@@ -29,9 +29,9 @@ from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.solve import solve
 from drake_diff.planning.guesses import (
     OF_EFFORT,
-    Guess,
+    Goals,
+    MotionGuess,
     Space,
-    Task,
     along,
     by_controller,
     flight,
@@ -234,7 +234,7 @@ class _Attempt:
     name: str
     robot: Robot
     problem: Problem
-    guess: Guess | None
+    guess: MotionGuess | None
     options: Mapping[str, Any]
     instead: "_Attempt | None" = None
 
@@ -297,7 +297,7 @@ def _first_that_holds(
     return tried, solutions, False
 
 
-def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:
+def _attempts(robot: Robot, task: Goals, least: str | None, seed: int) -> Iterator[_Attempt]:
     """What to try, one after the other, until one is verified."""
     if robot.standing is not None:
         yield from _of_standing(robot, robot.standing, task, seed)
@@ -313,7 +313,7 @@ def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterato
         yield from _of_passive(robot, task)
 
 
-def _of_standing(robot: Robot, standing: tuple[Legs, Rest], task: Task, seed: int) -> Iterator[_Attempt]:
+def _of_standing(robot: Robot, standing: tuple[Legs, Rest], task: Goals, seed: int) -> Iterator[_Attempt]:
     """A robot on its feet, which stay where they are; where the goal is free, to another one if need be."""
     legs, rest = standing
     for again in range(1 + (task.is_free and robot.model.nv <= TRIED_TWICE)):
@@ -325,10 +325,10 @@ def _of_standing(robot: Robot, standing: tuple[Legs, Rest], task: Task, seed: in
             raise ModelError(f"from where it stands no other posture was found: {shift}")
         moved = np.max(np.abs(legs.apart(shift.xs[-1][: robot.model.nq], robot.q)))
         name = f"its feet where they are, up to {moved:.2g} rad or m to a posture that it holds"
-        yield _feasible(robot, task, Guess(name, robot.model, shift.xs, shift.us, 0.0))
+        yield _feasible(robot, task, MotionGuess(name, robot.model, shift.xs, shift.us, 0.0))
 
 
-def _of_driven(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:
+def _of_driven(robot: Robot, task: Goals, least: str | None, seed: int) -> Iterator[_Attempt]:
     """A robot whose every smooth motion can be driven: from each posture that keeps the goals, the best guess first."""
     if least:
         _check_that_limits_bound_time(robot.model)
@@ -351,7 +351,7 @@ def _check_that_limits_bound_time(model: Model) -> None:
         raise InputError('time="least"', got=got, expected="limits of every speed or of every motor in the file")
 
 
-def _guesses(space: Space, target: Array, seed: int) -> list[Guess]:
+def _guesses(space: Space, target: Array, seed: int) -> list[MotionGuess]:
     """First guesses to `target` (nq,): those that touch nothing before others, then those within the effort limits."""
     robot, paths = space.robot, lines(space, target, seed)
     guesses = [along(robot, line) for line in paths]
@@ -360,13 +360,13 @@ def _guesses(space: Space, target: Array, seed: int) -> list[Guess]:
     return sorted(guesses, key=lambda guess: (_touched(space, guess), max(guess.effort, OF_EFFORT)))
 
 
-def _touched(space: Space, guess: Guess) -> float:
+def _touched(space: Space, guess: MotionGuess) -> float:
     """[m] how deep shapes overlap or what is used of an obstacle's margin along a guess; 0 where nothing is."""
     depth = guess.depth if guess.depth > TOUCHING else 0.0
     return max(0.0, depth, float(np.max(space.lacking(guess.xs[:, : space.robot.model.nq]))))
 
 
-def _collocated(robot: Robot, task: Task, guess: Guess, least: str | None) -> _Attempt:
+def _collocated(robot: Robot, task: Goals, guess: MotionGuess, least: str | None) -> _Attempt:
     """The least effort, or the least time, by collocation."""
     model, x1 = guess.model, guess.xs[-1].copy()
     asked: dict[str, Any] = {"running_cost": _effort(model)}
@@ -385,13 +385,13 @@ def _collocated(robot: Robot, task: Task, guess: Guess, least: str | None) -> _A
     return _Attempt(name, robot, problem, guess, options, instead if guess.depth <= TOUCHING else None)
 
 
-def _feasible(robot: Robot, task: Task, guess: Guess) -> _Attempt:
+def _feasible(robot: Robot, task: Goals, guess: MotionGuess) -> _Attempt:
     """Any motion to where the guess ends that keeps all limits: the guess itself, if it does."""
     problem = _problem(task, guess, guess.xs[-1])
     return _Attempt(guess.name, robot, problem, guess, {"method": "shooting", "time_limit": BUDGET})
 
 
-def _problem(task: Task, guess: Guess, x_goal: Array, **asked: Any) -> Problem:
+def _problem(task: Goals, guess: MotionGuess, x_goal: Array, **asked: Any) -> Problem:
     goals = [FrameGoal(name, position=position) for name, position in task.frames.items()]
     return Problem(
         guess.model,
@@ -404,7 +404,7 @@ def _problem(task: Task, guess: Guess, x_goal: Array, **asked: Any) -> Problem:
     )
 
 
-def _of_reachable(robot: Robot, task: Task, seed: int) -> Iterator[_Attempt]:
+def _of_reachable(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
     """To the state that a controller reaches, which shows that it can be reached.
 
     As the file says; then on ways on which nothing touches; then from where it comes to rest.
@@ -413,13 +413,13 @@ def _of_reachable(robot: Robot, task: Task, seed: int) -> Iterator[_Attempt]:
     fractions = random.uniform(-1, 1, robot.model.nq)
     target = robot.q + fractions * (robot.upper - robot.lower) / 2
 
-    def reach(begun: Robot, model: Model, way: float, steps: int, how: str = "") -> Iterator[Guess]:
+    def reach(begun: Robot, model: Model, way: float, steps: int, how: str = "") -> Iterator[MotionGuess]:
         name = f"what controllers reach ({way:g} of the way in {steps} steps){how and f', {how}'}"
         guess = by_controller(begun, model, target, steps=steps, reach=way, name=name)
         if guess is not None and _goes(guess):
             yield guess
 
-    def guesses() -> Iterator[Guess]:
+    def guesses() -> Iterator[MotionGuess]:
         yield from reach(robot, robot.model, *REACHES[0])
         if robot.apart is not None:
             space, elsewhere = Space.around(robot, task.avoid), _elsewhere(robot, random)
@@ -450,7 +450,7 @@ def _elsewhere(robot: Robot, random: np.random.Generator) -> Robot:
     return robot
 
 
-def _of_passive(robot: Robot, task: Task) -> Iterator[_Attempt]:
+def _of_passive(robot: Robot, task: Goals) -> Iterator[_Attempt]:
     """A robot with joints that no motor drives, to a goal of joints: all else ends where it began, at rest."""
     if task.frames:
         raise InputError("goal", got=", ".join(task.frames), expected="goals of joints: not every joint has a motor")
@@ -495,7 +495,7 @@ def _bounds(model: Model, near: Array | None = None) -> Bounds | None:
     return Bounds(x_lower=lower, x_upper=upper)
 
 
-def _goes(guess: Guess) -> bool:
+def _goes(guess: MotionGuess) -> bool:
     """Whether the motion goes somewhere, and keeps the limits of its model, but for velocity limits of 0."""
     terms = [*guess.model.contract.positions, *guess.model.contract.velocities]
     low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])

@@ -48,7 +48,7 @@ Pair = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class StartPosture:
     """A posture q (nq,), the sum of its overlaps [m] and what it takes of the effort limits.
 
     `always` are the pairs of shapes that overlap in every posture that was seen, which are not looked at.
@@ -296,7 +296,7 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
     return Robot(model, shapes, posture.q, lower, upper, tuple(repairs), driven, posture.always, apart=other)
 
 
-def _too_weak(model: Model, posture: Start) -> tuple[str, ...]:
+def _too_weak(model: Model, posture: StartPosture) -> tuple[str, ...]:
     """The joints whose motors are too weak for the posture, and those that follow them."""
     over = np.flatnonzero(shares_to_hold(model, posture.q) > 1)
     moved = [actuator.joint().name() for actuator in actuators(model.plant)]
@@ -336,7 +336,7 @@ def is_fully_driven(model: Model) -> bool:
 
 def start(
     shapes: Model | None, driven: Model | None, first: Array, lower: Array, upper: Array, random: np.random.Generator
-) -> Start:
+) -> StartPosture:
     """The posture `first` (nq,), or one that is better: where nothing overlaps, and which the motors of `driven` hold.
 
     It has room beside it where one of ATTEMPTS has, since searches go on from it in all directions.
@@ -344,7 +344,7 @@ def start(
     """
     model = shapes or driven
     if model is None:
-        return Start(first, 0.0, 0.0, frozenset())
+        return StartPosture(first, 0.0, 0.0, frozenset())
     is_joint, margin = of_joints(model), INSIDE * (upper - lower)
 
     def drawn(middle: Array, width: Array, moved: NDArray[np.bool_]) -> Array:
@@ -354,11 +354,11 @@ def start(
     every, whole = np.ones(len(first), dtype=bool), upper - lower
     always = pairs_always([first, *(drawn(first, whole, every) for _ in range(SEEN - 1))], shapes)
 
-    def measured(q: Array) -> Start:
+    def measured(q: Array) -> StartPosture:
         load = 0.0 if driven is None else share_to_hold(driven, q)
         depths = {} if shapes is None else _overlaps(shapes, q)
         overlap = sum(depth for pair, depth in depths.items() if pair not in always and depth > TOUCHING)
-        return Start(q, overlap, load, always)
+        return StartPosture(q, overlap, load, always)
 
     def has_room(q: Array) -> bool:
         beside = [q + np.where(is_joint, random.choice([-ROOM, ROOM], len(q)), 0.0) for _ in range(BESIDE)]
@@ -383,7 +383,7 @@ def start(
     return best
 
 
-def _badness(candidate: Start) -> float:
+def _badness(candidate: StartPosture) -> float:
     return candidate.overlap / DEPTH + max(0.0, candidate.load - HOLD_SHARE)
 
 

@@ -1,6 +1,6 @@
 """Does a plan survive: trials under each perturbation and level, how sure the rates are, and how far one can go.
 
-Before anything is tried, gradients predict how far a small perturbation displaces the last state (`Sensitivity`);
+Before anything is tried, gradients predict how far a small perturbation displaces the last state (`LoopSensitivity`);
 beside the measured displacement that shows how far first order reaches.
 """
 
@@ -82,7 +82,7 @@ def robustness(
     if solution.problem.motion != STEPS:
         raise InputError("solution", got='one with motion="continuous"', expected='motion="steps": trials are stepped')
     task = Task(solution.plan, controller, loop)
-    levels, sensitivity = levels_named(task.model, perturbations), Sensitivity(task)
+    levels, sensitivity = levels_named(task.model, perturbations), LoopSensitivity(task)
     cells = []
     for name, values in levels.items():
         for level in values:
@@ -277,7 +277,7 @@ def sized(name: str, level: float) -> str:
     return perturbation_for(name).with_unit(level)
 
 
-class Sensitivity:
+class LoopSensitivity:
     """How far perturbations displace the last state of a task's unperturbed run, to first order.
 
     Along that run, with A_k, B_k, C_k the derivatives of step k by state, input and parameters on the tangent space

@@ -52,7 +52,7 @@ MakeController = Callable[[Plan, Model, Array, Array], Controller]
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class JudgedRun:
     """A run and how it is judged. `failures` is empty where it succeeded."""
 
     run: ClosedLoop
@@ -72,7 +72,7 @@ class Trial:
 
     levels: Mapping[str, float]
     seed: int
-    outcome: Outcome
+    outcome: JudgedRun
     label: Label | None
     reason: str
 
@@ -160,7 +160,7 @@ class Task:
                 return name
         return ""
 
-    def run(self, setup: Setup, seed: int, policy: Controller | None = None) -> Outcome:
+    def run(self, setup: Setup, seed: int, policy: Controller | None = None) -> JudgedRun:
         """One run of `setup`, judged; under `policy` in the controller's place, if it is given."""
         with applied(select(setup.model, setup.parameters)) as model:
             loop_run = closed_loop(model, policy or self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
@@ -170,7 +170,7 @@ class Task:
         if not loop_run.ended:  # a run that broke off may have no step to measure
             of_motion = (bounds_check(self.plan, loop_run.motion), *clearance_checks(self.plan, loop_run.motion))
             checks = [goal_check(self.plan, goal), *of_motion, *checks]
-        return Outcome(
+        return JudgedRun(
             run=loop_run,
             failures=(loop_run.ended,) if loop_run.ended else tuple(str(check) for check in checks if not check.passes),
             goal_error=float(np.max(np.abs(goal))),
@@ -191,7 +191,7 @@ def run_trial(task: Task, levels: Mapping[str, float], seed: int) -> Trial:
     return Trial(levels, seed, outcome, label, f"{outcome.failures[0]}; {why}")
 
 
-def _label(task: Task, setup: Setup, seed: int, outcome: Outcome) -> tuple[Label, str]:
+def _label(task: Task, setup: Setup, seed: int, outcome: JudgedRun) -> tuple[Label, str]:
     if component := outcome.run.failed_part:
         return RAISED[component], f"the {component} itself failed"
     if not task.nominal.success:

@@ -11,7 +11,7 @@ import drake_diff as dd
 from drake_diff.cli.main import main
 from drake_diff.exceptions import InputError, MissingDependencyError
 from drake_diff.planning import guesses, plan
-from drake_diff.planning.guesses import Line, Space, lines
+from drake_diff.planning.guesses import PostureLine, Space, lines
 from drake_diff.planning.robot import load_robot
 
 pytestmark = pytest.mark.solve
@@ -64,7 +64,7 @@ def test_a_line_is_bent_around_a_disk_that_the_straight_one_meets(arm):
     ball = dd.SphereObstacle(center, 0.08)
     target = np.array([1.0, 0.0])
     space = Space.around(robot, [ball])
-    straight = Line("", np.array([robot.q, target]))
+    straight = PostureLine("", np.array([robot.q, target]))
     assert np.min(distance(straight.postures, center)) < 0.0
     assert not space.is_free(straight.postures)
     found = lines(space, target, 0)

@@ -13,7 +13,7 @@ from drake_diff.cli.main import main
 from drake_diff.exceptions import ModelError
 from drake_diff.model.example import example_files
 from drake_diff.planning import plan
-from drake_diff.planning.guesses import Line, along
+from drake_diff.planning.guesses import PostureLine, along
 from drake_diff.planning.robot import load_robot
 from drake_diff.runs import read_trace
 
@@ -63,7 +63,7 @@ def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
 def test_the_inputs_of_a_smooth_guess_make_that_motion(arm):
     """The recursion of Newton and Euler, stepped by Drake: to rounding of the state after 30 to 100 steps."""
     robot = load_robot(arm, 0)
-    guess = along(robot, Line("line", np.array([robot.q, [0.7, -0.4]])))
+    guess = along(robot, PostureLine("line", np.array([robot.q, [0.7, -0.4]])))
     motion = dd.rollout(guess.model, guess.xs[0], guess.us)
     assert motion.xs == pytest.approx(guess.xs, abs=1e-9)
     assert guess.xs[-1] == pytest.approx([0.7, -0.4, 0.0, 0.0], abs=1e-12)

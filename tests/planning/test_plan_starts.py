@@ -8,7 +8,7 @@ import pytest
 import drake_diff as dd
 from drake_diff.exceptions import ModelError
 from drake_diff.planning import plan
-from drake_diff.planning.guesses import Task, postures
+from drake_diff.planning.guesses import Goals, postures
 from drake_diff.planning.robot import TOUCHING, load_robot, share_to_hold
 from drake_diff.runs.fields import Failure
 
@@ -98,14 +98,14 @@ def test_a_random_goal_is_no_further_than_slow_joints_go(tmp_path):
     limit = 'lower="-3" upper="3" effort="50" velocity="0.1"'
     found = load_robot(robot(tmp_path, link("arm"), joint("shoulder", "world", "arm", limit=limit)), 0)
     for seed in range(10):
-        for goal in postures(found, Task({}, {}), seed):
+        for goal in postures(found, Goals({}, {}), seed):
             assert abs(goal[0] - found.q[0]) <= 0.06 * 2.0 / 1.875 + 1e-12
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_random_goal_and_the_way_to_it_are_held(tmp_path, seed):
     found = load_robot(outstretched(tmp_path, 1.0), seed)
-    for goal in postures(found, Task({}, {}), seed):
+    for goal in postures(found, Goals({}, {}), seed):
         for s in (0.5, 1.0):
             assert share_to_hold(found.model, found.q + s * (goal - found.q)) <= 0.63
         assert found.overlap(goal) <= TOUCHING

@@ -6,16 +6,13 @@ As a subprocess: nothing in tests/ imports from tests/benchmarks/.
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from helpers.models import ROOT
 
-PROGRAM = Path(__file__).parents[1] / "benchmarks" / "acceptance.py"
+PROGRAM = ROOT / "tests/benchmarks/acceptance.py"
 NO_FALSE_CLAIM = "no false claim"
-
-
-def call(*arguments):
-    return subprocess.run([sys.executable, PROGRAM, *map(str, arguments)], capture_output=True, text=True, timeout=60)
+RATIOS = {"outcomes": {"runs": [1, 1]}, "status": "measured", "seconds": 9.0}
 
 
 def task(solved=1, true=1, cost=1.0, **more):
@@ -23,86 +20,68 @@ def task(solved=1, true=1, cost=1.0, **more):
     return {"outcomes": outcomes, "status": "converged", "cost": cost, "seconds": 1.0, **more}
 
 
+def trust(noticed, status="measured"):
+    return {"outcomes": {"errors noticed": [noticed, 30]} if noticed else {}, "status": status, "seconds": 9.0}
+
+
+def speed(*ratios):
+    return RATIOS | {"ratios": {"panda, step, drake_diff": list(ratios)}}
+
+
+BEFORE = {f"tasks/pendulum/{i}": task() for i in range(100)}
+BEFORE |= {"trust/solve/0": trust(29), "speed/quick": speed(1.0, 0.95, 1.1)}
+
+
 @pytest.fixture
-def write(tmp_path):
-    def save(name, results, complete=True, tree="abc"):
-        path = tmp_path / name
-        path.write_text(json.dumps({"tree": tree, "complete": complete, "results": results}))
-        return path
+def call(tmp_path):
+    def compare(words, before, after, *options, complete=True):
+        paths = tmp_path / "before.json", tmp_path / "after.json"
+        for path, results, whole in zip(paths, (before, after), (True, complete), strict=True):
+            path.write_text(json.dumps({"tree": "abc", "complete": whole, "results": results}))
+        command = [sys.executable, PROGRAM, words, *map(str, (*paths, *options))]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
-    return save
-
-
-@pytest.fixture
-def before(write):
-    results = {f"tasks/pendulum/{i}": task() for i in range(100)}
-    results["trust/solve/0"] = {"outcomes": {"errors noticed": [29, 30]}, "status": "measured", "seconds": 9.0}
-    ratios = {"panda, step, drake_diff": [1.0, 0.95, 1.1]}
-    results["speed/quick"] = {"outcomes": {"runs": [1, 1]}, "status": "measured", "ratios": ratios, "seconds": 9.0}
-    return write("before.json", results)
+    return compare
 
 
-def changed(before, write, change, complete=True):
-    results = json.loads(before.read_text())["results"]
-    results.update(change)
-    return write("after.json", results, complete)
-
-
-def test_one_lost_task_of_a_hundred_is_listed_and_two_are_too_many(before, write):
-    lost = {"tasks/pendulum/7": task(solved=0, why="diverged")}
-    done = call("compare", before, changed(before, write, lost))
-    assert done.returncode == 0, done.stdout
-    assert "lost 1  tasks/pendulum/7, solved" in done.stdout
-    assert "diverged" in done.stdout
-    done = call("compare", before, changed(before, write, lost | {"tasks/pendulum/8": task(solved=0)}))
-    assert done.returncode == 1
-    assert "LOST MORE THAN 1 %" in done.stdout
-
-
-def test_a_gained_task_does_not_make_up_for_lost_ones(before, write):
-    old = json.loads(before.read_text())["results"]
-    old |= {f"tasks/pendulum/{i}": task(solved=0) for i in range(2)}
-    first = write("first.json", old)
-    new = old | {f"tasks/pendulum/{i}": task() for i in range(2)}
-    new |= {f"tasks/pendulum/{i}": task(solved=0) for i in range(50, 52)}
-    done = call("compare", first, write("second.json", new))
-    assert done.returncode == 1
-    assert "lost 2, gained 2" in done.stdout
+def lost(*numbers):
+    return {f"tasks/pendulum/{i}": task(solved=0, why="diverged") for i in numbers}
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("before", "after", "status", "told"),
     [
-        {"tasks/pendulum/7": task(true=0)},
-        {"tasks/pendulum/7": {"outcomes": {}, "status": "error", "seconds": 1.0}},
-        {"trust/solve/0": {"outcomes": {"errors noticed": [27, 30]}, "status": "measured", "seconds": 9.0}},
-        {"trust/solve/0": {"outcomes": {}, "status": "error", "seconds": 9.0}},
-        {"speed/quick": {"outcomes": {"runs": [1, 1]}, "status": "measured", "seconds": 9.0,
-                         "ratios": {"panda, step, drake_diff": [1.5, 1.4, 1.6]}}},
+        (BEFORE, BEFORE | lost(7), 0, "lost 1  tasks/pendulum/7, solved"),
+        (BEFORE, BEFORE | lost(7, 8), 1, "LOST MORE THAN 1 %"),
+        (BEFORE | lost(0, 1), BEFORE | lost(50, 51), 1, "lost 2, gained 2"),
+        (BEFORE, BEFORE | {"tasks/pendulum/7": task(true=0)}, 1, ""),
+        (BEFORE, BEFORE | {"tasks/pendulum/7": {"outcomes": {}, "status": "error", "seconds": 1.0}}, 1, ""),
+        (BEFORE, BEFORE | {"trust/solve/0": trust(27)}, 1, ""),
+        (BEFORE, BEFORE | {"trust/solve/0": trust(0, "error")}, 1, ""),
+        (BEFORE, BEFORE | {"speed/quick": speed(1.5, 1.4, 1.6)}, 1, ""),
     ],
-    ids=["a false claim", "a task that crashes", "missed errors", "an error", "a slower step"],
-)  # fmt: skip
-def test_what_may_not_be_lost_fails(before, write, change):
-    assert call("compare", before, changed(before, write, change)).returncode == 1
+    ids=["one lost", "two lost", "gained too", "a false claim", "a crash", "missed errors", "an error", "slower"],
+)
+def test_what_may_not_be_lost_fails(call, before, after, status, told):
+    done = call("compare", before, after)
+    assert done.returncode == status, done.stdout
+    assert told in done.stdout
 
 
 @pytest.mark.solve
-def test_an_incomplete_second_run_fails_and_an_item_removed_on_purpose_does_not(before, write):
-    assert call("compare", before, changed(before, write, {}, complete=False)).returncode == 1
-    gone = changed(before, write, {"trust/solve/0": {"outcomes": {}, "status": "error", "seconds": 9.0}})
-    done = call("compare", before, gone, "--removed", "trust/solve/*")
+def test_an_incomplete_second_run_fails_and_an_item_removed_on_purpose_does_not(call):
+    assert call("compare", BEFORE, BEFORE, complete=False).returncode == 1
+    done = call("compare", BEFORE, BEFORE | {"trust/solve/0": trust(0, "error")}, "--removed", "trust/solve/*")
     assert done.returncode == 0, done.stdout
     assert "removed on purpose" in done.stdout
 
 
-def test_stable_leaves_out_what_differs_and_drops_costs_that_differ(write, tmp_path):
+def test_stable_leaves_out_what_differs_and_drops_costs_that_differ(call, tmp_path):
     first = {"tasks/a/0": task(), "tasks/b/0": task(), "tasks/c/0": task(cost=1.0), "tasks/d/0": task()}
     second = {"tasks/a/0": task(), "tasks/b/0": task(solved=0), "tasks/c/0": task(cost=1.1), "tasks/e/0": task()}
-    out = tmp_path / "stable.json"
-    done = call("stable", write("1.json", first), write("2.json", second), "--out", out)
+    done = call("stable", first, second, "--out", tmp_path / "stable.json")
     assert done.returncode == 0, done.stderr
-    found = json.loads(out.read_text())
+    found = json.loads((tmp_path / "stable.json").read_text())
     assert set(found["results"]) == {"tasks/a/0", "tasks/c/0"}
     assert set(found["excluded"]) == {"tasks/b/0", "tasks/d/0", "tasks/e/0"}
-    assert found["results"]["tasks/a/0"]["cost"] == 1.0
-    assert found["results"]["tasks/c/0"]["cost"] is None
+    assert [found["results"][name]["cost"] for name in ("tasks/a/0", "tasks/c/0")] == [1.0, None]

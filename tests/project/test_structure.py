@@ -5,44 +5,30 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.solve
+pytestmark = pytest.mark.slow
 
 TESTS = Path(__file__).parents[1]
 BENCHMARKS = TESTS / "benchmarks"
-PROGRAMS = {path.stem for path in BENCHMARKS.glob("*.py")} - {"__main__"}
+PROGRAMS = {path.stem for path in BENCHMARKS.glob("*.py")} - {"__main__"} | {"benchmarks"}
 
 
 def imported(text):
-    """All that is imported, inside of functions too."""
+    """The parts of the names of all that is imported, inside of functions too."""
+    names = []
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            yield "." * node.level + (node.module or "")
-            yield from (f"{node.module or ''}.{alias.name}" for alias in node.names)
+            names += [f"{node.module or ''}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "importorskip")):
-            yield from (word.value for word in node.args[:1] if isinstance(word, ast.Constant))
+            names += [word.value for word in node.args[:1] if isinstance(word, ast.Constant)]
+    return [name.removeprefix("tests.").split(".") for name in names]
 
 
-def imported_tests(text):
-    return {name for name in imported(text) if any(p == "conftest" or p.startswith("test_") for p in name.split("."))}
-
-
-def imported_benchmarks(text):
-    """By `benchmarks.name`, or by `name` alone, which takes a changed search path."""
-    parts = [name.lstrip(".").removeprefix("tests.").split(".") for name in imported(text)]
-    return {names[0] for names in parts if names[0] in PROGRAMS or names[0] == "benchmarks"}
-
-
-def test_no_module_imports_a_test_module_or_conftest():
-    found = {path.name: imported_tests(path.read_text()) for path in TESTS.rglob("*.py")}
-    assert len(found) > 80
-    assert not {path: names for path, names in found.items() if names}
-
-
-@pytest.mark.slow
-def test_no_test_imports_a_benchmark():
-    paths = [path for path in TESTS.rglob("*.py") if BENCHMARKS not in path.parents]
-    found = {path.name: imported_benchmarks(path.read_text()) for path in paths}
+def test_no_module_imports_a_test_module_and_no_test_a_benchmark():
+    texts = {path: imported(path.read_text()) for path in TESTS.rglob("*.py")}
+    assert len(texts) > 80
     assert len(PROGRAMS) > 3
-    assert not {path: names for path, names in found.items() if names}
+    for path, names in texts.items():
+        assert not [name for name in names if any(p == "conftest" or p.startswith("test_") for p in name)], path
+        assert BENCHMARKS in path.parents or not [name for name in names if name[0] in PROGRAMS], path
