@@ -37,7 +37,7 @@ from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import name_of, written_whole
 from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, finite, reproducible
 from drake_diff.runs.other_records import FitRecord
-from drake_diff.runs.provenance import embodiment_of, model_input, provenance_of, written_now
+from drake_diff.runs.provenance import model_input, provenance_of, written_now
 from drake_diff.runs.rebuild import TRACE, rebuilt
 from drake_diff.runs.reproduce import contract_as, model_as
 
@@ -110,7 +110,6 @@ def _begun(name: str, asked: Asked) -> FitRecord:
         verdict="incomplete",
         sentence="it is still being written, or that was killed or broke off",
         model=model_input(asked.model),
-        embodiment=embodiment_of(asked.model.contract),
         contract=asked.model.contract.to_dict(),
         inputs=records.Asked(
             parameters=parameters,

@@ -25,7 +25,7 @@ from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.model import Model
 from drake_diff.runs.differences import ABSOLUTE, NUMBER, Reproduced, is_near
 from drake_diff.runs.other_records import CauseEvidence, ComparisonRecord, Numbers
-from drake_diff.runs.provenance import embodiment_of, model_input
+from drake_diff.runs.provenance import model_input
 from drake_diff.runs.rebuild import rebuilt
 from drake_diff.runs.reproduce import contract_as, model_as
 
@@ -112,7 +112,6 @@ def _of_the_model(record: ComparisonRecord, model: Model) -> dict[str, Any]:
     changed: dict[str, Any] = {
         "model": model_as(model_input(model), record.model),
         "contract": contract_as(model.contract.to_dict(), record.contract),
-        "embodiment": embodiment_of(model.contract),
         "time_step_s": model.time_step,
         "state_names": list(model.state_names),
         "input_names": list(model.input_names),

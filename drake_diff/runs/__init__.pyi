@@ -1,5 +1,4 @@
 from .certificates import certify_model as certify_model
-from .certificates import save_rollout as save_rollout
 from .cross_check import cross_check as cross_check
 from .fields import SealedRecord as SealedRecord
 from .measurement import Measurement as Measurement

@@ -1,16 +1,14 @@
-"""Certificates as records: of a model's step at sampled states, and of the gradient of a rollout."""
+"""Certificates of a model's step at sampled states, as a record."""
 
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import finite_array, positive_int
+from drake_diff._base.arrays import positive_int
 from drake_diff._base.files import write_whole
 from drake_diff.certificates.certify import certify
-from drake_diff.certificates.rollout import RolloutCertificate, SampledCertificate
 from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import active_modes
@@ -19,15 +17,8 @@ from drake_diff.model.parameters import Parameters, select
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import SampledState, sample_states
 from drake_diff.runs.directory import written_whole
-from drake_diff.runs.fields import Passed, evidence
-from drake_diff.runs.plan_record import (
-    CertificationSection,
-    CertifiedState,
-    PlanRecord,
-    RolloutSection,
-    SlopeEvidence,
-    TruthEvidence,
-)
+from drake_diff.runs.fields import Passed
+from drake_diff.runs.plan_record import CertificationSection, CertifiedState, PlanRecord
 from drake_diff.runs.provenance import gradient_evidence, header
 
 
@@ -76,8 +67,9 @@ def certify_model(
 
     def record(verdict: Passed, sentence: str, certified: Sequence[CertifiedState] = ()) -> PlanRecord:
         section = CertificationSection(seed=int(seed), method=method, parameters=names, states=list(certified))
-        seconds = time.monotonic() - start
-        return _record(model, verdict, sentence, seconds, certification=section, contract=model.contract.to_dict())
+        fields = header(model.name, model, time.monotonic() - start)
+        contract = model.contract.to_dict()
+        return PlanRecord(verdict=verdict, sentence=sentence, certification=section, contract=contract, **fields)
 
     def certified() -> PlanRecord:
         rows = [_certify_state(model, state, parameters, method) for state in sample_states(model, states, int(seed))]
@@ -112,59 +104,3 @@ def _certify_state(model: Model, state: SampledState, parameters: Parameters, me
         contact_modes=modes,
         mode_changes=[str(change) for change in certificate.mode_changes],
     )
-
-
-def _record(model: Model, verdict: Passed, sentence: str, seconds: float | None = None, **sections: Any) -> PlanRecord:
-    return PlanRecord(verdict=verdict, sentence=sentence, **header(model.name, model, seconds), **sections)
-
-
-def save_rollout(
-    certificate: RolloutCertificate | SampledCertificate, model: Model, directory: str | Path
-) -> PlanRecord:
-    """Write the certificate of a rollout's gradient, with its truth, as record.json.
-
-    Args:
-        certificate: What `certify_rollout` gave, not `sampled`.
-        model: The model that was rolled out.
-        directory: Where to write record.json and its schema; an earlier run there is replaced.
-
-    Returns:
-        A `PlanRecord`, whose verdict is "pass" only where every entry agrees.
-
-    Raises:
-        InputError: It is no certificate of a whole rollout, the rollout is of another model, or `directory` holds
-            what no run wrote.
-        WriteError: The disk is full, or does not let `directory` be written.
-
-    Example:
-        >>> import tempfile
-        >>> from drake_diff.runs import save_rollout
-        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
-        >>> certificate = dd.certify_rollout(model, [0.5, 0], np.zeros((20, 1)), lambda x: x[0], refine=True)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     record = save_rollout(certificate, model, folder)
-        >>> record.verdict, [slope.sign_agrees for slope in record.rollout.truth.slopes]
-        ('pass', [True, True, True])
-    """
-    if not isinstance(certificate, RolloutCertificate):
-        expected = "what certify_rollout gives, not sampled"
-        raise InputError("certificate", got=type(certificate).__name__, expected=expected)
-    motion, count = certificate.gradient, len(certificate.columns)
-    finite_array("the certificate's x0", motion.xs[0], (model.nx,))
-    agree, truth = certificate.count("agree"), certificate.truth
-    slopes = [] if truth is None else [evidence(SlopeEvidence, slope) for slope in truth.slopes]
-    section = RolloutSection(
-        x0=motion.xs[0].tolist(),
-        us=motion.us.tolist(),
-        loss=motion.loss,
-        columns=list(certificate.columns),
-        derivative=certificate.derivative[0].tolist(),
-        verdicts=[certificate.entry(0, j).verdict for j in range(count)],
-        certificate=gradient_evidence(certificate),
-        truth=None if truth is None else evidence(TruthEvidence, truth, slopes=slopes),
-        no_truth=certificate.no_truth,
-    )
-    verdict: Passed = "pass" if certificate.verdict == "agree" else "fail"
-    record = _record(model, verdict, f"{agree} of {count} entries of the gradient agree", rollout=section)
-    with written_whole(directory) as folder:
-        return record.write(folder)

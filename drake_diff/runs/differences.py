@@ -19,18 +19,12 @@ from drake_diff.logs.mcap_file import McapLog, fields_of, parse_mcap
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 READ = (1e-9, 1e-15)  # the same of what is read out of a file and not computed along a motion
 READ_SECTIONS = (
-    "action",
-    "claim",
     "contract",
     "data",
-    "embodiment",
     "inputs",
     "model",
-    "observation",
-    "panel",
     "phases",
     "problem",
-    "units",
 )
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 BLOB = re.compile(r"[A-Za-z0-9+/=_-]{40,}")  # hashes, and what a page draws: base64

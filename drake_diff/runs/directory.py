@@ -7,8 +7,8 @@ It is written beside its place under a name of its own, and moved there at the e
     .run.lock                    locked for as long as somebody writes `run`
 
 What was at `run` is there, whole, until the moment in which the new one is; where the file system can exchange two
-names, no moment is without either. Else the old one is called run.replaced-... for that moment. Records of version 2 of
-the schema are converted.
+names, no moment is without either. Else the old one is called run.replaced-... for that moment. Records of versions 2
+and 3 of the schema are converted.
 """
 
 import json
@@ -73,6 +73,7 @@ SECTIONS = {
 DROPPED = ("evaluations", "elsewhere")  # a second measurement, which is a test now, and what replays say now
 ARGUMENTS = ("method", "initial_guess", "max_iterations", "time_limit", "seed", "restarts")  # of `solve`
 RENAMED = {"panel": "conditions"}  # within the sections of a panel and of a trial
+READ_VERSIONS = ("2", "3", SCHEMA_VERSION.split(".")[0])
 FIXED_CONTACTS = {"HeldSpeeds": "FixedSpeeds", "HeldPlaces": "FixedPositions", "HeldForce": "FixedForce"}  # constraints
 
 
@@ -118,7 +119,7 @@ def record_path(directory: str | Path) -> Path | None:
 def load_record(directory: str | Path) -> SealedRecord:
     """Read the record in a directory that a solve, a fit, a comparison, trials or a certification wrote.
 
-    It is read, not verified: see `verify`. A record of version 2 of the schema is converted.
+    It is read, not verified: see `verify`. A record of version 2 or 3 of the schema is converted.
 
     Args:
         directory: The directory that holds record.json; or trials/ID.json of a panel.
@@ -159,12 +160,16 @@ def options_of_search(fields: dict[str, Any]) -> None:
 
 def parse_record(path: Path, fields: Mapping[str, Any]) -> SealedRecord:
     """The record with these fields, read from `path`; of a later minor version without what is not known here."""
-    version, major = fields.get("schema_version"), SCHEMA_VERSION.split(".")[0]
-    if not isinstance(version, str) or version.split(".")[0] not in ("2", major):
-        raise ArtifactError(f"{path}: schema_version {version!r}; this drake_diff reads 2.x.y and {major}.x.y")
+    version = fields.get("schema_version")
+    if not isinstance(version, str) or version.split(".")[0] not in READ_VERSIONS:
+        raise ArtifactError(f"{path}: schema_version {version!r}; this drake_diff reads {', '.join(READ_VERSIONS)}.x.y")
     known = json.loads(json.dumps(upgraded(fields) if version.startswith("2.") else fields))
     if version.startswith(("2.", "3.0.")):
         options_of_search(known)
+    gradient = known.get("gradient")
+    if isinstance(gradient, dict) and isinstance(gradient.get("stationarity"), dict):  # before version 4
+        gradient["stationarity"] = gradient["stationarity"].get("value")
+        known["data"] = None  # which followed from the other sections
     kind = KINDS.get(str(known.get("kind")))
     if kind is None:
         raise ArtifactError(f"{path}: kind {fields.get('kind')!r}; expected one of {', '.join(KINDS)}")

@@ -21,12 +21,12 @@ from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError
 
 # A new major one where a field goes or changes its meaning, a minor one where one is added.
-SCHEMA_VERSION = "3.1.0"
+SCHEMA_VERSION = "4.0.0"
 # How others are read, word for word in every published schema.
 READING = (
     f"This is version {SCHEMA_VERSION}. An earlier minor version of the same major one is read with what it lacks "
     "empty or null, which says that it was not recorded. A later minor version is read without the fields that are not "
-    "known here. Records of version 2 are converted. Another major version is refused by name."
+    "known here. Records of versions 2 and 3 are converted. Another major version is refused by name."
 )
 SCHEMAS = Path(__file__).parent.parent / "schema"
 MOST_NAMES = 5  # of files, in a printed record
@@ -78,20 +78,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, (float, np.floating)):
         return finite(float(value))
     return [plain(item) for item in value] if isinstance(value, (tuple, list, np.ndarray)) else value
-
-
-class Quantity(Fields):
-    """A number with its unit; `value` is null where there is no finite one, and `reason` says why."""
-
-    value: float | None
-    unit: str
-    reason: str | None = None
-
-    @model_validator(mode="after")
-    def _has_a_reason(self) -> "Quantity":
-        if self.value is None and not self.reason:
-            raise ValueError("a value of null: expected a reason")
-        return self
 
 
 class Metric(Fields):
@@ -237,43 +223,6 @@ class DataBoundary(Fields):
         return self
 
 
-class Drive(Fields):
-    """An actuator: its joint, what it is commanded, and what it can do; null is no limit, and no gain."""
-
-    actuator: str
-    joint: str
-    command: str
-    unit: str
-    effort_limit: float | None
-    gear_ratio: float
-    rotor_inertia: float
-    kp: float | None
-    kd: float | None
-
-
-class Embodiment(Fields):
-    """The robot: its base, which joints are driven and how, which only move, what is fixed, sensed and can touch.
-
-    `other_inputs` are those that are no actuator, such as the thrust on a body. Units are those of the contract.
-    """
-
-    robot: str
-    base: str
-    driven: list[Drive]
-    other_inputs: list[str]
-    passive: list[str]
-    fixed: list[str]
-    sensed: str
-    touching: list[str]
-
-
-class Claim(Fields):
-    """What the run says is true, and what it does not say."""
-
-    statement: str = f"nothing: {NOTHING_SOLVED}"
-    limitations: list[str] = Field(default_factory=list)
-
-
 class Inputs(Fields):
     """What the run started from, besides `problem`, which holds the initial state.
 
@@ -283,7 +232,6 @@ class Inputs(Fields):
     initial_guess: str = NOTHING_SOLVED
     initial_guess_sha256: str | None = None  # of the bytes of xs (N+1, nx), then us (N, nu), as doubles
     seed: int | None = None
-    random_generator: str = "numpy.random.default_rng"
     search: FiniteTable | None = None
 
 
@@ -313,70 +261,21 @@ class ParameterEvidence(Fields):
     upper: float | None
 
 
-class GradientColumn(Fields):
-    """One of the variables that the motion is differentiated by, and where that column of derivatives comes from."""
-
-    name: str
-    unit: str
-    source: str
-
-
 class GradientEvidence(Fields):
-    """What is differentiated, from where, and how far it agrees with differences."""
+    """The gradient along the motion, by knot, how stationary the plan is, and how far it agrees with differences.
 
-    differentiated: list[str]
-    columns: list[GradientColumn]
-    smoothing: str
-    regularization: str
-    solver_tolerance: Quantity
-    horizon: Quantity
-    final_state_norm_definition: str  # or why there are none
-    final_state_norms: list[float | None] = Field(default_factory=list)  # by knot; null where one is not finite
-    lagrangian_norm_definition: str  # or why there are none
+    `final_state_norms` are |d x_N / d x_k|, the largest singular value through the plant's steps after knot k.
+    `lagrangian_norms` are |d L / d x_k|, in the cost's unit per the state's: L is the cost plus multipliers times the
+    goal, bounds and constraints that the plan lies on, and x_k changes all later states. `stationarity` is the largest
+    |d L / d z| of an optimized variable that no bound holds, over the largest sum of magnitudes of its terms: 0 at an
+    optimum; multipliers are by least squares, not the solver's.
+    """
+
+    final_state_norms: list[float | None] = Field(default_factory=list)  # null where one is not finite
     lagrangian_norms: list[float | None] = Field(default_factory=list)  # the same
-    stationarity: Quantity
+    stationarity: float | None = None
+    reason: str | None = None  # why norms or stationarity are missing
     certificates: list[Certified] = Field(default_factory=list)
-
-
-class ObservedVariable(Fields):
-    """One variable of the state as it is observed."""
-
-    name: str
-    unit: str
-    frame: str
-    uncertainty: Quantity
-
-
-class Observation(Fields):
-    """What is observed, in which frame, and when."""
-
-    variables: list[ObservedVariable] = Field(default_factory=list)
-    clock: str = NOTHING_SOLVED
-    start_s: float = 0.0
-    period_s: float = 0.0
-    count: int = 0
-
-
-class Command(Fields):
-    """One commanded input; null is no limit."""
-
-    name: str
-    unit: str
-    lower: float | None
-    upper: float | None
-
-
-NO_TIME = Quantity(value=None, unit="s", reason=NOTHING_SOLVED)
-
-
-class ActionInterface(Fields):
-    """How the inputs reach the plant."""
-
-    command_type: str = NOTHING_SOLVED
-    commands: list[Command] = Field(default_factory=list)
-    update_rate: Quantity = NO_TIME
-    latency_budget: Quantity = NO_TIME
-    safety_fallback: str = NOTHING_SOLVED
 
 
 class ReplayEvidence(Fields):
@@ -392,34 +291,6 @@ class ReplayEvidence(Fields):
     penetration_m: float | None
     holds: bool
     failures: list[str]
-
-
-class PanelCase(Fields):
-    """One plant in which the plan was judged, and under which control; `decides` where the verdict rests on it."""
-
-    variant: str
-    control: str
-    time_step_s: float
-    contact_approximation: str
-    decides: bool
-
-
-class EvaluationPanel(Fields):
-    """Under what the plan was judged: plants, perturbations, latencies; runs of one `sha256` were judged alike.
-
-    The hash is that of the panel's canonical JSON with `sha256` empty.
-    """
-
-    statement: str
-    cases: list[PanelCase]
-    perturbations: list[str]
-    latencies_s: list[float]
-    sha256: str = ""
-
-    def hashed(self) -> "EvaluationPanel":
-        """The same with its hash."""
-        bare = self.model_copy(update={"sha256": ""})
-        return bare.model_copy(update={"sha256": sha256(canonical(bare.model_dump(mode="json")).encode()).hexdigest()})
 
 
 class WallClock(Fields):
@@ -453,7 +324,6 @@ class SealedRecord(ShowsItsRepr, Fields):
     verdict: Passed
     sentence: str
     model: ModelInput
-    embodiment: Embodiment | None = None  # null: of no robot, or of one in each phase
     data: DataBoundary | None = None  # null: nothing was fitted to data or judged on them
     provenance: Provenance
     wall_clock: WallClock

@@ -3,13 +3,10 @@
 from collections.abc import Iterator
 from typing import ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from drake_diff.runs.fields import (
-    ActionInterface,
     Certified,
-    Claim,
-    EvaluationPanel,
     Event,
     Failure,
     Fields,
@@ -18,7 +15,6 @@ from drake_diff.runs.fields import (
     Inputs,
     Label,
     Metric,
-    Observation,
     ParameterEvidence,
     ReplayEvidence,
     SealedRecord,
@@ -133,64 +129,14 @@ class CertificationSection(Fields):
         return {"states": counts or "none yet", "seed": str(self.seed), "method": self.method}
 
 
-class SlopeEvidence(Fields):
-    """One column beside the slope of the motion in continuous time; null is what is not known, or is not there."""
-
-    column: str
-    ours: float
-    exists: bool | None
-    value: float | None
-    error: float | None
-    sign_agrees: bool | None
-    agrees: bool | None
-    widths: list[float]  # to both sides
-    slopes: list[float]  # over them
-    reason: str
-    by_other_law: float | None  # what the other law adds to the slope
-
-    @model_validator(mode="after")
-    def _has_a_value_where_it_exists(self) -> "SlopeEvidence":
-        if bool(self.exists) != (self.value is not None and self.error is not None):
-            raise ValueError(f"{self.column}: expected value and error where the slope exists, and only there")
-        if not self.exists and not self.reason:
-            raise ValueError(f"{self.column}: expected a reason where there is no slope, or none is known")
-        return self
-
-
-class TruthEvidence(Fields):
-    """The loss and its slopes in continuous time, in `seconds` of work; null is what was not measured in them."""
-
-    law: str
-    touches: bool
-    loss: float | None
-    error: float | None
-    ours: float
-    other_law: str
-    by_other_law: float | None  # what it adds to the loss
-    other_reason: str
-    notes: list[str]
-    seconds: float
-    slopes: list[SlopeEvidence]
-
-
 class RolloutSection(Fields):
-    """The certificate of the gradient of a rollout's loss, with where it was taken."""
+    """The certificate of a rollout's gradient, of a record of schema 3 or earlier; no longer written."""
 
-    x0: list[float]
-    us: list[list[float]]
-    loss: float
+    model_config = ConfigDict(extra="allow")
+
     columns: list[str]
-    derivative: list[float]
     verdicts: list[str]
     certificate: Certified
-    truth: TruthEvidence | None = None
-    no_truth: str = ""  # why there is none
-
-    @model_validator(mode="after")
-    def _has_a_verdict_for_each_column(self) -> "RolloutSection":
-        if not len(self.columns) == len(self.derivative) == len(self.verdicts):
-            raise ValueError("expected a derivative and a verdict for each column")
-        return self
 
     def broken(self) -> Iterator[str]:
         """The entries that do not agree."""
@@ -198,11 +144,8 @@ class RolloutSection(Fields):
         yield from (f"{column} {verdict}" for column, verdict in pairs if verdict != "agree")
 
     def facts(self) -> dict[str, str]:
-        """How many slopes are the truth."""
-        words = {True: "the truth", False: "not the truth", None: "not known, or without a slope"}
-        slopes = [words[slope.agrees] for slope in self.truth.slopes] if self.truth else []
-        counts = ", ".join(f"{slopes.count(name)} {name}" for name in dict.fromkeys(slopes))
-        return {"columns": counts or self.no_truth or "not compared with the truth"}
+        """What was differentiated."""
+        return {"columns": ", ".join(self.columns)}
 
 
 class RunEvidence(Fields):
@@ -335,19 +278,14 @@ class PlanRecord(SealedRecord):
     KIND: ClassVar[str] = "plan"
 
     kind: Literal["plan"] = "plan"
-    claim: Claim = Claim()
     inputs: Inputs = Inputs()
     problem: FiniteTable = Field(default_factory=dict)
     contract: FiniteTable = Field(default_factory=dict)
-    panel: EvaluationPanel | None = None  # null before anything was judged
-    units: dict[str, str] = Field(default_factory=dict)  # of numbers in `problem` and `contract`, by their key
     solver: Solver | None = None
     parameters: list[ParameterEvidence] = Field(default_factory=list)
     metrics: list[Metric] = Field(default_factory=list)
     invariants: list[Metric] = Field(default_factory=list)
     gradient: GradientEvidence | None = None
-    observation: Observation = Observation()
-    action: ActionInterface = ActionInterface()
     events: list[Event] = Field(default_factory=list)
     replays: list[ReplayEvidence] = Field(default_factory=list)
     failures: list[Failure] = Field(default_factory=list)
@@ -381,26 +319,6 @@ class PlanRecord(SealedRecord):
         if broken:
             raise ValueError(f'a verdict "pass" with {", ".join(broken)}')
         return self
-
-    @model_validator(mode="after")
-    def _was_judged_on_its_panel(self) -> "PlanRecord":
-        judged = [(r.variant, r.control, r.time_step_s, r.contact_approximation) for r in self.replays]
-        cases = self.panel.cases if self.panel is not None else []
-        listed = [(c.variant, c.control, c.time_step_s, c.contact_approximation) for c in cases]
-        if self.panel is not None and listed != judged:
-            raise ValueError(f"panel: expected the {len(judged)} replays, got {len(listed)} others")
-        return self
-
-    def as_row(self) -> dict[str, str]:
-        """The textbook's view of the record: section, tool, observation, action, metric, perturbation."""
-        return {
-            "section": "differentiable physics",
-            "tool": f"drake {self.provenance.packages.get('drake', '?')}, {self.solver.method if self.solver else '-'}",
-            "observation": ", ".join(f"{x.name} [{x.unit}]" for x in self.observation.variables),
-            "action": ", ".join(f"{x.name} [{x.unit}]" for x in self.action.commands),
-            "metric": "; ".join(f"{m.name} {m.value} {m.unit}" for m in self.metrics),
-            "perturbation": "; ".join(dict.fromkeys(f"replayed {r.variant}" for r in self.replays)) or "none",
-        }
 
     def facts(self) -> dict[str, str]:
         """The section's, or the cost; the solver and the failures."""

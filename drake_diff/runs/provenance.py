@@ -1,4 +1,4 @@
-"""Where a record comes from: packages, commit, command, the model file with all files that it names, and the robot.
+"""Where a record comes from: packages, commit, command, and the model file with all files that it names.
 
 Those files (meshes, included models) are hashed, never copied. A name can lead anywhere (`../../etc/passwd`), and a
 model file may be a stranger's: what is not called like a mesh or a robot file is not opened at all.
@@ -20,18 +20,14 @@ import numpy as np
 
 from drake_diff.certificates.certificate import VERDICTS, Certificate
 from drake_diff.exceptions import ModelError
-from drake_diff.model.contract import Contract, CoordinateTerms, JointTerms
 from drake_diff.model.file_facts import with_includes
 from drake_diff.model.inputs import BodyForce
 from drake_diff.model.load_file import FORMATS, files_of_directives, package_above
 from drake_diff.model.meshes import in_any_case
 from drake_diff.model.model import Model
-from drake_diff.model.plant import FLOATING
 from drake_diff.model.xml_text import XmlText
 from drake_diff.runs.fields import (
     Certified,
-    Drive,
-    Embodiment,
     FileEvidence,
     ModelInput,
     Provenance,
@@ -40,17 +36,6 @@ from drake_diff.runs.fields import (
     file_evidence,
 )
 
-NO_BODY = Embodiment(
-    robot="plain dynamics",
-    base="none: equations alone, there is no body",
-    driven=[],
-    other_inputs=[],
-    passive=[],
-    fixed=[],
-    sensed="the whole state, exactly: there is no sensor and no noise",
-    touching=[],
-)
-WELD, WORLD = "weld", "world"
 MESHES = (".obj", ".mtl", ".vtk", ".gltf", ".glb", ".bin", ".stl", ".dae", ".ply", ".off", ".msh", ".png", ".jpg")
 OF_MJCF = (".xml", ".mjcf")  # all that such a file includes is read with it
 LIBRARIES = (".so", ".dll", ".dylib")  # plugins of Gazebo, which Drake does not read
@@ -71,11 +56,14 @@ def gradient_evidence(certificate: Certificate) -> Certified:
     )
 
 
-def header(name: str, model: Model | None = None, seconds: float | None = None) -> dict[str, Any]:
-    """The fields of every record: its name, model and robot, the versions, when it was made, and how long that took."""
-    robot = {} if model is None else {"embodiment": embodiment_of(model.contract)}
-    clock = WallClock(written_utc=written_now(), duration_s=seconds)
-    return {"name": name, "model": model_input(model), **robot, "provenance": provenance_of(), "wall_clock": clock}
+def header(name: str, model: Model | None = None, seconds: float | None = None, **clock: Any) -> dict[str, Any]:
+    """The fields of every record: its name and model, the versions, when it was made, and how long that took."""
+    return {
+        "name": name,
+        "model": model_input(model),
+        "provenance": provenance_of(),
+        "wall_clock": WallClock(written_utc=written_now(), duration_s=seconds, **clock),
+    }
 
 
 def model_input(model: Model | None) -> ModelInput:
@@ -218,55 +206,3 @@ def _resolve(path: Path, name: str, folder: str, packages: Mapping[str, Any]) ->
     if "\0" in name or "\0" in folder:
         return None
     return path.parent / folder / name.removeprefix("file://")
-
-
-def embodiment_of(contract: Contract) -> Embodiment:
-    """The robot of a contract: its base, what of it is driven and how, what only moves, is fixed, sensed, can touch."""
-    inputs = {entry.name: entry for entry in contract.inputs}
-    names = {a.name for a in contract.actuators}
-    driving = {a.joint for a in contract.actuators}
-    moving = [j for j in contract.joints if j.type != WELD and not j.locked]
-    return Embodiment(
-        robot=contract.name,
-        base=_base(contract, moving),
-        driven=[
-            evidence(
-                Drive,
-                a,
-                actuator=a.name,
-                command="effort" if a.kp is None else "effort, added to PD control to the joint's default position",
-                unit=_unit(a.name, a.joint, inputs, contract),
-            )
-            for a in contract.actuators
-        ],
-        other_inputs=[f"{entry.name} [{entry.unit}]" for entry in contract.inputs if entry.name not in names],
-        passive=[j.name for j in moving if j.name not in driving and j.type not in FLOATING],
-        fixed=[f"{j.name}: {j.child} on {j.parent}{', locked' if j.locked else ''}" for j in _fixed(contract)],
-        sensed="the whole state, exactly: there is no sensor and no noise",
-        touching=list(dict.fromkeys(g.body for g in contract.geometries)) if contract.contact.collision_pairs else [],
-    )
-
-
-def _fixed(contract: Contract) -> list[JointTerms]:
-    return [j for j in contract.joints if j.type == WELD or j.locked]
-
-
-def _unit(actuator: str, joint: str, inputs: dict[str, CoordinateTerms], contract: Contract) -> str:
-    """The input's own unit, or for an actuator without an input that of an effort on its joint."""
-    if actuator in inputs:
-        return inputs[actuator].unit
-    kind = next((j.type for j in contract.joints if j.name == joint), "")
-    return "N" if kind == "prismatic" else "N m"
-
-
-def _base(contract: Contract, moving: list[JointTerms]) -> str:
-    anchored, more = {WORLD}, True
-    while more:  # what is fixed to what is fixed to the world is so too
-        result = {j.child for j in _fixed(contract) if j.parent in anchored}
-        more = not result <= anchored
-        anchored |= result
-    floating = [j.child for j in moving if j.type in FLOATING]
-    held = [f"{j.child} by {j.name}" for j in moving if j.parent in anchored and j.type not in FLOATING]
-    words = [f"free: {', '.join(floating)}"] if floating else []
-    words += [f"held to the world: {', '.join(held)}"] if held else []
-    return "; ".join(words) or "fixed to the world"

@@ -50,7 +50,7 @@ from drake_diff.runs.trace import Trace, read_trace
 # What a record says of itself and of where it was made: nothing can make it again.
 GIVEN = ("name", "provenance", "wall_clock")
 # What the search tells of itself: it rests on the search, and not on the plan that it found alone.
-SEARCHED = ("data", "events", "failures", "gradient", "inputs", "sentence", "solver", "verdict")
+SEARCHED = ("events", "failures", "gradient", "inputs", "sentence", "solver", "verdict")
 SEARCH_TOPICS = ("/solver/", "/gradient/", "/events", "/replays")
 # What a constraint that is a user's function decides, beside the search.
 CONSTRAINED = ("metrics[constraint violation]", "problem.constraints", "problem.couplings")
@@ -206,7 +206,7 @@ def _but_for_simulators(again: PlanRecord, record: PlanRecord) -> tuple[PlanReco
             unchecked.append(f"replays in {name}, which {where}")
     if not unchecked:
         return again, ()
-    return again.model_copy(update={"replays": rows, "panel": record.panel}), tuple(unchecked)
+    return again.model_copy(update={"replays": rows}), tuple(unchecked)
 
 
 def _as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:

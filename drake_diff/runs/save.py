@@ -37,7 +37,6 @@ from drake_diff.runs.directory import (
     written_whole,
 )
 from drake_diff.runs.fields import (
-    Claim,
     Event,
     SealedRecord,
     Solver,
@@ -52,16 +51,7 @@ from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.plan_record import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesSection, PlanRecord
 from drake_diff.runs.provenance import gradient_evidence, header
 from drake_diff.runs.rebuild import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve, rows_of, write_plan
-from drake_diff.runs.sections import asked, found, panel_of, unknown_functions
-
-LIMITATIONS = ["of the model in simulation only: nothing here was measured on a robot"]
-AT_THEIR_TIMES = (
-    "resets happen at the times of the plan, also in the chain of all phases: an event that comes early is not tried"
-)
-WHERE_GAPS_CLOSE = (
-    "rigid impacts come where their own gaps close, also in the chain of all phases: other contacts on the way are not "
-    "tried"
-)
+from drake_diff.runs.sections import asked, found, unknown_functions
 
 
 def directory_of(i: int) -> str:
@@ -72,23 +62,9 @@ def directory_of(i: int) -> str:
 def unfinished_record(folder: Path, problem: Problem | PhasedProblem, sentence: str, **fields: Any) -> PlanRecord:
     """The record of a run that has no measured solution."""
     if isinstance(problem, PhasedProblem):
-        fields |= {"phases": PhasesSection(**_asked_of_all(problem)), **_asked_of_phases(folder, problem)}
+        fields |= {"phases": PhasesSection(**_asked_of_all(problem)), **header(name_of(folder))}
         return PlanRecord(verdict="incomplete", sentence=sentence, **fields)
     return _record(folder, verdict="incomplete", sentence=sentence, **asked(problem), **fields)
-
-
-def _asked_of_phases(folder: Path, problem: PhasedProblem, seconds: float | None = None) -> dict[str, Any]:
-    names = ", then ".join(problem.names)
-    repeated = " and again from the start" if problem.periodic is not False else ""
-    rigid = [isinstance(switch.reset, Impact) and switch.reset.has_gap for switch in problem.switches]
-    limitations = [*LIMITATIONS, *([] if all(rigid) else [AT_THEIR_TIMES]), *([WHERE_GAPS_CLOSE] if any(rigid) else [])]
-    statement = (
-        f"{problem.name} in {len(problem.phases)} phases ({names}{repeated}), linked by resets, each as its record"
-    )
-    return {
-        **header(name_of(folder), seconds=seconds),  # each phase has its own model
-        "claim": Claim(statement=f"{statement} says", limitations=limitations),
-    }
 
 
 def _asked_of_all(problem: PhasedProblem) -> dict[str, Any]:
@@ -132,7 +108,7 @@ def record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
             chain=chain_evidence(solution.chain),
             **_asked_of_all(solution.problem),
         ),
-        **_asked_of_phases(folder, solution.problem, solution.wall_time),
+        **header(name_of(folder), seconds=solution.wall_time),
     )
 
 
@@ -344,7 +320,6 @@ def record_of(m: Measurement, folder: Path) -> PlanRecord:
         invariants=m.invariants,
         events=m.events,
         replays=replays,
-        panel=panel_of(m.solution, replays),
         failures=m.failures,
         **asked(m.solution.problem, m.solution),
         **found(m.solution),
@@ -432,11 +407,9 @@ def _with_the_search(made: PlanRecord, record: PlanRecord) -> PlanRecord:
     content: dict[str, Any] = {
         "sentence": f"{made.sentence}; {RECOVERED}",
         "solver": record.solver,
-        "data": record.data,
         "inputs": record.inputs.model_copy(update={"search": None}),
         "wall_clock": made.wall_clock.model_copy(update={"duration_s": record.wall_clock.duration_s}),
     }
     if made.gradient is not None and record.gradient is not None:
-        known = {name: getattr(record.gradient, name) for name in ("columns", "certificates")}
-        content["gradient"] = made.gradient.model_copy(update=known)
+        content["gradient"] = made.gradient.model_copy(update={"certificates": record.gradient.certificates})
     return made.model_copy(update=content)

@@ -45,6 +45,7 @@ from drake_diff.runs.save import FILES
 from drake_diff.runs.trace import CONFIGURATION, read_trace
 
 MOST = 16  # lines of a kind that are printed
+SAME_VALUES = ("3.1.", SCHEMA_VERSION)  # versions of the schema whose values are those of this one
 WORDS = ("sentence", "message", "statement", "definition", "reason", "told")  # which versions choose
 OLD_SCHEMAS = tuple(name.replace(".json", ".schema.json") for name in OLD_FILES)
 MADE_APART = ("complaints", "undecided", "unchecked", "rounded")  # of a verification: told by the process apart
@@ -63,7 +64,7 @@ OF_FUNCTIONS = (
 NOT_RERUN = {
     "comparison": "the engines were not run again",
     "robustness": "the trials were not run again",
-    "rollout": "a loss is a function, and was not asked again",
+    "rollout": "a loss is a function, which no record holds",
     "panel": "no trial was evaluated again: their function is not in the directory",
     "trial": "it was not evaluated again: its function is not in the directory",
 }
@@ -187,8 +188,8 @@ def verify(
     reaches a limit "undecided".
 
     Args:
-        directory: What `save`, `save_comparison`, `save_robustness`, `certify_model`, `run_panel` or `save_rollout`
-            wrote; or trials/ID.json of a panel.
+        directory: What `save`, `save_comparison`, `save_robustness`, `certify_model` or `run_panel` wrote;
+            or trials/ID.json of a panel.
         models: A folder below which the model file and the meshes that it names may be read, where the directory does
             not hold them: the one in which the model stood when the run was made. Without it none of them is read.
         time_limit: How long it may take to make the run again, in seconds. Give more for a solve that took longer.
@@ -406,6 +407,7 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
     why = (f"every number: {NOT_RERUN[record.subject]}",) if nothing else (*UNCHECKED, *_others(record, again.written))
     compared, unchecked = [fields], [*why, *again.unchecked]
     unchecked += [f"{d.key}: schema {record.schema_version} has other words" for d in reworded]
+    unchecked += [f"what schema {record.schema_version} has and {SCHEMA_VERSION} has not"] * converted
     for name in (name for name in again.written if name in again.files or (again.files and name in FILES)):
         if name not in record.files:
             unchecked += [f"{name}: the directory has none"] * (name in again.files)
@@ -516,6 +518,6 @@ def _other_versions(record: SealedRecord) -> tuple[str, ...]:
     used = [n for n in used if n in was] if record.subject == "trial" else used  # it has those of its panel
     names = [n for n in used if was.get(n) != now.get(n)]
     content = [f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names]
-    if record.schema_version != SCHEMA_VERSION:
+    if not record.schema_version.startswith(SAME_VALUES):
         content.append(f"recorded by schema {record.schema_version}, and converted to {SCHEMA_VERSION}")
     return tuple(content)

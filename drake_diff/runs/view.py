@@ -25,14 +25,13 @@ from drake_diff.runs.other_records import TRIALS, ComparisonRecord, is_trial_fil
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.rebuild import TRACE
 from drake_diff.runs.save import REPLAY
-from drake_diff.runs.trace import read_trace
 from drake_diff.runs.verify import recalled
 
 PLAN, WITHOUT = "plan", "without_feedback"  # the names of ghosts
 OPEN_LOOP = "open loop"
 LOOPBACK = "127.0.0.1"
 UNDER_FEEDBACK = "what moves is the plan, near which feedback keeps the robot; blue: the robot without feedback"
-CONFIGURATION = ("problem", "contract", "model", "inputs", "solver", "action", "observation")
+CONFIGURATION = ("problem", "contract", "model", "inputs", "solver")
 # What nobody chose, of the configuration: where a file was, what the solver said.
 NO_CHOICE = ("contract.source", "solver.status", "solver.message", "solver.solver_message", "solver.iterations")
 
@@ -297,20 +296,21 @@ def write_runs_page(path: Path, a: str | Path, b: str | Path, *, models: str | P
 
 def _curves(record: PlanRecord, folder: Path) -> tuple[dict[str, _Curve], dict[str, _Curve]]:
     """The states and the inputs of a run's plan, by name."""
-    trace = read_trace(folder / TRACE)
-    problem: dict[str, Any] = dict(record.problem)
-    if not len(trace.times):
+    log, p = read_mcap(folder / TRACE, links=False), dict[str, Any](record.problem)
+    if not log.messages.get("/planned/state"):
         raise ArtifactError(f"{folder / TRACE} has no plan")
-    states = {
-        v.name: _Curve(v.unit, trace.times, trace.planned_xs[:, i], (problem["x_lower"][i], problem["x_upper"][i]))
-        for i, v in enumerate(record.observation.variables)
-    }
-    times = trace.times[: len(trace.planned_us)]
-    inputs = {
-        c.name: _Curve(c.unit, times, trace.planned_us[:, i], (c.lower, c.upper))
-        for i, c in enumerate(record.action.commands)
-    }
-    return states, inputs
+
+    def curves(topic: str, parts: str, lower: list[Any], upper: list[Any]) -> dict[str, _Curve]:
+        columns, metadata = log.arrays(topic), log.channel_metadata[topic]
+        values = np.hstack([columns[part] for part in parts])
+        pairs = [(name, metadata["units"][part][name]) for part in parts for name in metadata["names"][part]]
+        return {
+            name: _Curve(unit, columns["time"], values[:, i], (lower[i], upper[i]))
+            for i, (name, unit) in enumerate(pairs)
+        }
+
+    states = curves("/planned/state", "qv", p["x_lower"], p["x_upper"])
+    return states, curves("/planned/input", "u", p["u_lower"], p["u_upper"])
 
 
 def _plots(group: str, names: Sequence[str], both: Sequence[dict[str, _Curve]], held: bool = False) -> Iterator[Plot]:

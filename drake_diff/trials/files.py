@@ -24,7 +24,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.runs.directory import load_plan_record, name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, EvaluationPanel, WallClock, canonical, evidence, finite, plain
+from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, evidence, finite, plain
 from drake_diff.runs.plan_record import (
     CellEvidence,
     EventEvidence,
@@ -41,7 +41,6 @@ from drake_diff.trials.perturbation import Setup, perturbation_for, perturbed
 from drake_diff.trials.run import Cell, Robustness, agrees, sized
 from drake_diff.trials.trial import Task, Trial, result_of
 
-LATENCY = "latency"  # the perturbation whose levels are steps of the controller
 PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
 PLAIN = Loop()
 SENSED = ("noise", "bias", "delay", "every", "dropout")
@@ -110,7 +109,7 @@ def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -
             for name in result.names
         ],
     )
-    sections = {"panel": _panel(result), "data": _data(result, source), "wall_clock": _times(result, record.wall_clock)}
+    sections = {"data": _data(result, source), "wall_clock": _times(result, record.wall_clock)}
     record = record.model_copy(update=sections)
     for name in result.names:
         worst = result.worst(name)
@@ -126,20 +125,6 @@ def _is_repeatable(task: Task) -> bool:
     loop, named = task.loop, ("sensor", "actuator", "fallback", "substeps")
     plain_loop = all(repr(getattr(loop, name)) == repr(getattr(PLAIN, name)) for name in named)
     return plain_loop and isinstance(task.controller, str) and type(loop.estimator) is Hold and not loop.pushes
-
-
-def _panel(result: Robustness) -> EvaluationPanel:
-    units = {name: perturbation_for(name).unit for name in result.names}
-    period = result.task.loop.substeps * result.task.model.time_step
-    late = [0.0, *(c.level * period for name in result.names if name == LATENCY for c in result.of(name))]
-    statement = f"the plan under the controller {result.task.controller_name}, each level by itself, seed {result.seed}"
-    return EvaluationPanel(
-        statement=statement,
-        cases=[],
-        perturbations=[f"{c.perturbation} {c.level:g} {units[c.perturbation]}, {c.rate.trials} trials"
-                       for name in result.names for c in result.of(name)],
-        latencies_s=[float(value) for value in late],
-    ).hashed()  # fmt: skip
 
 
 def _data(result: Robustness, run: RunEvidence | None) -> DataBoundary:

@@ -1,7 +1,6 @@
 """The truth in continuous time that a rollout's certificate carries: its integration, its slopes, and its verdicts."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -11,10 +10,8 @@ from helpers.table import slow_after
 
 import drake_diff as dd
 from drake_diff.certificates.truth import TrueSlope, judged, softest_contact
-from drake_diff.exceptions import ArtifactError, InputError
+from drake_diff.exceptions import InputError
 from drake_diff.motion.continuous import ContinuousMotion, ImplicitSteps
-from drake_diff.runs import save_rollout
-from drake_diff.runs.plan_record import SlopeEvidence
 
 pytestmark = pytest.mark.solve
 
@@ -203,38 +200,6 @@ def test_a_slope_exists_where_the_narrow_ones_agree_and_the_wide_one_as_on_a_cur
     noise = np.full(3, 1e-5)
     assert judged(over(1.0, 1.0, 1.0, widths=three), noise, 1e-3).exists is None
     assert judged(over(1.0, 1.0, 1.0, 9.0), noise, 1e-3).exists is False
-
-
-@pytest.mark.slow
-def test_the_truth_goes_into_a_record_and_back(dropped, tmp_path):
-    """One slope is not ours; one is not measured; the steps' gradient is refused, and the record says so."""
-    _, model = dropped("sap", relaxation_time=0.005, dissipation=0.2)
-    certificate = dd.certify_rollout(model, (0.2, -2.0), None, height, num_steps=15, refine=True, seconds=60)
-    saved = save_rollout(certificate, model, tmp_path / "run")
-    read = dd.load_record(tmp_path / "run")
-    assert read == saved
-    assert read.verdict == "fail"
-    assert read.rollout.truth.law == "Kelvin-Voigt"
-    assert read.rollout.truth.loss == certificate.truth.loss
-    assert read.rollout.truth.by_other_law == certificate.truth.by_other_law
-    for kept, slope in zip(read.rollout.truth.slopes, certificate.truth.slopes, strict=True):
-        assert (kept.value, kept.error, kept.ours) == (slope.value, slope.error, slope.ours)
-        assert (kept.sign_agrees, kept.agrees) == (slope.sign_agrees, slope.agrees)
-    assert dd.verify(tmp_path / "run").verdict == "intact"
-    path = tmp_path / "run" / "record.json"
-    fields = json.loads(path.read_text())
-    fields["rollout"]["truth"]["slopes"][0]["value"] = None
-    path.write_text(json.dumps(fields))
-    with pytest.raises(ArtifactError, match="expected value and error where the slope exists"):
-        dd.load_record(tmp_path / "run")
-    slow = dd.certify_rollout(model, (0.2, -2.0), None, height, num_steps=15, method="continuous", seconds=1e-6)
-    kept = save_rollout(slow, model, tmp_path / "cut").rollout.truth
-    assert kept.loss is None
-    assert {slope.exists for slope in kept.slopes} == {None}
-    with pytest.raises(ValueError, match="expected a reason where there is no slope"):
-        SlopeEvidence(**kept.slopes[0].model_dump() | {"reason": ""})
-    with pytest.raises(InputError, match="not sampled"):
-        save_rollout(dd.certify_rollout(model, (0.2, -2.0), None, height, num_steps=15, sampled=True), model, tmp_path)
 
 
 @pytest.mark.parametrize("stiffness", [1e4, 1e7])

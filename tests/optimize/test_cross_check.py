@@ -212,7 +212,6 @@ def test_a_record_has_it_and_verify_measures_it_again(pushed, tmp_path):
     rows = record.replays[-len(pushed.cross_checks) :]
     assert [row.variant for row in rows] == [row.variant for row in pushed.cross_checks]
     assert [row.goal_error for row in rows] == [row.goal_error for row in pushed.cross_checks]
-    assert not any(case.decides for case in record.panel.cases[-len(rows) :])
     assert dd.verify(tmp_path / "run").require().verdict == "holds"
 
 

@@ -20,7 +20,7 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.runs import measure
 from drake_diff.runs.directory import KINDS, parse_record
 from drake_diff.runs.fields import SCHEMA_VERSION, DataBoundary, Metric, canonical, own_sha256
-from drake_diff.runs.plan_record import PlanRecord, RolloutSection, SlopeEvidence
+from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.provenance import named_files
 
 pytestmark = pytest.mark.solve
@@ -66,11 +66,6 @@ def records_of(model):
         fields["reason"] = st.text(min_size=1, max_size=12)
     if model is PlanRecord:
         fields |= {"schema_version": st.just(SCHEMA_VERSION), "verdict": st.just("fail")}
-        fields |= {"panel": st.none()}  # it rests on replays
-    if model is SlopeEvidence:
-        fields |= dict.fromkeys(("exists", "value", "error"), st.none())
-    if model is RolloutSection:
-        fields |= dict.fromkeys(("columns", "derivative", "verdicts"), st.just([]))
     if model is DataBoundary:
         fields["held_out"] = st.just([])
     return st.builds(model, **fields)
@@ -108,7 +103,6 @@ def test_any_record_comes_back_as_it_was(record):
     assert canonical(fields) == sealed.to_json()
     assert own_sha256(fields) == sealed.record_sha256
     assert parse_record(Path("record.json"), fields) == sealed
-    assert list(sealed.as_row()) == ["section", "tool", "observation", "action", "metric", "perturbation"]
 
 
 @pytest.fixture(scope="module")
@@ -173,45 +167,16 @@ def test_a_metric_whose_verdict_is_not_that_of_its_value_is_refused():
 
 def test_another_major_version_is_refused_by_name_and_a_later_minor_one_is_read(record):
     fields = record.model_dump(mode="json")
-    for version in ("1.0.0", "4.0.0", None):
-        with pytest.raises(ArtifactError, match=r"schema_version .*; this drake_diff reads 2\.x\.y and 3\.x\.y"):
+    for version in ("1.0.0", "5.0.0", None):
+        with pytest.raises(ArtifactError, match=r"schema_version .*; this drake_diff reads 2, 3, 4\.x\.y"):
             parse_record(Path("record.json"), {**fields, "schema_version": version})
-    later = {**fields, "schema_version": "3.7.0", "weather": "fine"}
+    later = {**fields, "schema_version": "4.7.0", "weather": "fine"}
     later["metrics"] = [{**later["metrics"][0], "colour": "blue"}, *later["metrics"][1:]]
     assert parse_record(Path("record.json"), later).metrics == record.metrics
     with pytest.raises(ArtifactError, match="weather"):
         parse_record(Path("record.json"), {**fields, "weather": "fine"})
     with pytest.raises(ArtifactError, match="verdict"):
         parse_record(Path("record.json"), {**later, "verdict": "great"})
-
-
-def test_every_number_of_a_contract_and_a_problem_has_a_unit(record):
-    def keys(value):
-        if isinstance(value, dict):
-            for key, item in value.items():
-                if isinstance(item, (int, float)) and not isinstance(item, bool):
-                    yield key
-                yield from keys(item)
-        elif isinstance(value, list):
-            for item in value:
-                yield from keys(item)
-
-    units = {name.strip() for names in record.units for name in names.split(",")}
-    assert {*keys(record.contract), *keys(record.problem)} <= units
-
-
-def test_the_record_says_how_the_plant_is_observed_and_commanded(record):
-    assert [(v.name, v.unit) for v in record.observation.variables] == [("hinge_q", "rad"), ("hinge_w", "rad/s")]
-    assert {v.frame for v in record.observation.variables} == {"axes of hinge, world to pole"}
-    assert all(v.uncertainty.value == 0 and "exact" in v.uncertainty.reason for v in record.observation.variables)
-    assert (record.observation.period_s, record.observation.count) == (0.02, 41)
-    assert record.action.update_rate.value == pytest.approx(50, rel=1e-15)  # 1 / 0.02 s
-    assert record.action.latency_budget.value is None
-    assert record.action.safety_fallback.startswith("none")
-    assert {c.source for c in record.gradient.columns} == {c.method for c in record.gradient.certificates}
-    assert record.gradient.horizon.value == pytest.approx(0.8, rel=1e-15)
-    assert record.inputs.seed == 0
-    assert len(record.inputs.initial_guess_sha256) == 64
 
 
 def test_inputs_at_their_bounds_begin_and_end_in_the_events(tmp_path):
@@ -238,7 +203,6 @@ def test_momentum_energy_and_the_friction_cone_of_a_falling_ball(thrown, tmp_pat
     assert found["friction-cone excess"].value < 1e-6  # N: SAP keeps the cone
     assert found["penetration"].value == thrown.replay.penetration.max() > 0
     record = dd.save(thrown, tmp_path / "ball")
-    assert {v.frame for v in record.observation.variables} == {record.contract["frame"]}
     assert dd.verify(tmp_path / "ball").require().holds
     made = [e for e in record.events if e.kind == "contact_made"]
     assert made[0].t_s == thrown.replay.times[touches]
