@@ -1,9 +1,8 @@
-"""The same panel as tasks of a real Ray cluster on this machine, and of two nodes that only a network joins."""
+"""The same panel as tasks of a real Ray cluster on this machine, of one node and of two."""
 
 import contextlib
 import os
 import secrets
-import shutil
 import signal
 import socket
 import subprocess
@@ -118,19 +117,42 @@ def test_a_cluster_that_is_not_there_is_refused(write, tmp_path):
 
 
 @pytest.fixture
-def cluster(monkeypatch):
-    """A head that runs already, of two cores, on loopback alone."""
-    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+def start_node(monkeypatch):
+    """Starts a node of two cores on this machine; the first one is the head, at the address that is returned."""
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--num-cpus=2", "--block"]
-    head = subprocess.Popen([*command, f"--port={port}", "--include-dashboard=false"])
-    wait_for(lambda: listens(port))
-    yield f"127.0.0.1:{port}"
-    head.terminate()
-    head.wait(60)
+    nodes = []
+
+    def start(name):
+        words = [f"--address=127.0.0.1:{port}"] if nodes else ["--head", f"--port={port}", "--include-dashboard=false"]
+        command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--num-cpus=2", "--block", *words]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        nodes.append(subprocess.Popen(command, env=os.environ | {"NODE": name}, start_new_session=True, **quiet))
+        wait_for(lambda: listens(port) and has_raylet(nodes[-1]), 120)
+        return nodes[-1], f"127.0.0.1:{port}"
+
+    yield start
+    for node in nodes:
+        kill(node)
+
+
+def processes(node):
+    """All of a node, by their session."""
+    listed = subprocess.run(["ps", "-o", "pid=,args=", "-s", str(node.pid)], capture_output=True, text=True).stdout
+    return [line.split(maxsplit=1) for line in listed.splitlines()]
+
+
+def has_raylet(node):
+    return any("raylet/raylet" in words for _, words in processes(node))
+
+
+def kill(node):
+    for pid, _ in processes(node):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(int(pid), signal.SIGKILL)
+    node.wait(60)
 
 
 def listens(port):
@@ -145,96 +167,27 @@ def wait_for(condition, seconds=60):
         time.sleep(0.1)
 
 
-def test_a_cluster_that_runs_already_gives_the_table_of_local_processes(write, tmp_path, cluster):
+def test_a_cluster_that_runs_already_gives_the_table_of_local_processes(write, tmp_path, start_node):
     write("cheap")
-    for options in (["--out", "ray", "--engine", "ray", "--address", cluster], ["--out", "local"]):
+    for options in (["--out", "ray", "--engine", "ray", "--address", start_node("head")[1]], ["--out", "local"]):
         done = panel(tmp_path, *options)
         assert done.returncode == 1, done.stderr
         assert "200 trials, 2 errors" in done.stdout
     assert files(tmp_path / "ray") == files(tmp_path / "local")
 
 
-# ---- two machines' worth ---------------------------------------------------------------------------------------------
-
-APART = """
-import os, socket, time
-
-def node():
-    return os.environ.get("NODE", "here")
+NODES = """
+import os, time
 
 def slow(trial):
     with open("log", "ab", buffering=0) as file:
-        file.write(f"{node()} {trial['level']} {trial['repeat']}\\n".encode())
+        file.write(f"{os.environ.get('NODE', 'here')} {trial['level']} {trial['repeat']}\\n".encode())
     time.sleep(0.2)
     row = {"cost": trial["level"] * 100 + trial["repeat"]}
     if trial["level"] == 1:  # too large for a reply: it stays in the memory of the node that made it
         row["text"] = "x" * 200_000
     return row
 """
-HEAD, OTHER = "10.213.7.1", "10.213.7.2"  # in the two namespaces alone
-PORT = 6379
-
-
-def run(*words):
-    return subprocess.run(words, check=True, capture_output=True, text=True).stdout
-
-
-def has_namespaces():
-    """Whether namespaces, and a pair of interfaces between them, can be made here."""
-    if os.geteuid() != 0 or not all(shutil.which(tool) for tool in ("ip", "unshare", "nsenter", "mount")):
-        return False
-    name = f"dd{os.getpid()}"
-    done = subprocess.run(["ip", "link", "add", f"{name}x", "type", "veth", "peer", "name", f"{name}y"])
-    if done.returncode == 0:
-        run("ip", "link", "del", f"{name}x")
-    alone = subprocess.run(["unshare", "-n", "-m", "true"])
-    return done.returncode == alone.returncode == 0
-
-
-@pytest.fixture
-def machines():
-    """Two namespaces of networks, joined by a pair of interfaces, and how to start a command in one of them.
-
-    Each node has a /tmp/ray and a /dev/shm of its own, as two machines have.
-    """
-    if not has_namespaces():
-        pytest.skip("namespaces cannot be made: not root, or no ip or unshare")
-    names = [f"dd{os.getpid()}{side}" for side in "ab"]
-    started = []
-
-    def inside(name, *command, **options):
-        os.makedirs("/tmp/ray", exist_ok=True)
-        own = 'mount -t tmpfs none /tmp/ray && mount -t tmpfs none /dev/shm && exec "$@"'
-        wrapped = ["ip", "netns", "exec", name, "unshare", "-m", "sh", "-c", own, "sh"]
-        process = subprocess.Popen([*wrapped, *command], **options)
-        started.append(process)
-        return process
-
-    try:
-        for name in names:
-            run("ip", "netns", "add", name)
-        run("ip", "link", "add", names[0], "netns", names[0], "type", "veth", "peer", "name", names[1],
-            "netns", names[1])  # fmt: skip
-        for name, address in zip(names, (HEAD, OTHER), strict=True):
-            run("ip", "-n", name, "addr", "add", f"{address}/24", "dev", name)
-            for device in ("lo", name):
-                run("ip", "-n", name, "link", "set", device, "up")
-        yield names, inside
-    finally:
-        for name in names:
-            kill_all(name)
-        for process in started:
-            process.wait(60)
-        for name in names:
-            subprocess.run(["ip", "netns", "del", name])
-
-
-def kill_all(name):
-    """Kill whatever runs in a namespace that this test made."""
-    listed = subprocess.run(["ip", "netns", "pids", name], capture_output=True, text=True).stdout.split()
-    for pid in listed:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(int(pid), signal.SIGKILL)
 
 
 def in_log(folder):
@@ -242,60 +195,30 @@ def in_log(folder):
     return [line.split() for line in path.read_text().splitlines()] if path.exists() else []
 
 
-@pytest.mark.slow
-def test_a_node_that_is_killed_takes_no_trial_with_it(tmp_path, machines):
-    """Two nodes with nothing in common but the folder and a cable: every trial ends once, and the table is the same."""
-    names, inside = machines
-    (tmp_path / "trials.py").write_text(APART)
+def test_a_node_that_is_killed_takes_no_trial_with_it(tmp_path, start_node):
+    """Of two nodes of a cluster: every trial ends once, those of the killed one too, and the table is the same."""
+    (tmp_path / "trials.py").write_text(NODES)
     (tmp_path / "panel.toml").write_text('evaluate = "trials.py:slow"\nseeds = 30\n[axes]\nlevel = [1, 2, 3, 4]\n')
-    environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0"}
-    ray = [sys.executable, "-m", "ray.scripts.scripts", "start", "--num-cpus=2", "--block"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
-    roles = [(HEAD, ["--head", f"--port={PORT}", "--include-dashboard=false"]), (OTHER, [f"--address={HEAD}:{PORT}"])]
-    nodes = []
-    for name, (address, options) in zip(names, roles, strict=True):
-        command = [*ray, f"--node-ip-address={address}", *options]
-        nodes.append(inside(name, *command, env={**environment, "NODE": address}, **quiet))
-        wait_for(lambda name=name, at=(HEAD, PORT): reaches(name, *at), 120)
-    wait_for(lambda: raylets(names[1]), 120)
-    words = ["panel", "panel.toml", "--out", "ray", "--engine", "ray", "--address", f"{HEAD}:{PORT}"]
+    (_, address), (other, _) = start_node("head"), start_node("other")
+    words = ["panel", "panel.toml", "--out", "ray", "--engine", "ray", "--address", address]
     command = [sys.executable, "-m", "drake_diff.cli.main", *words]
-    entered = ["nsenter", f"--target={nodes[0].pid}", "--net", "--mount", f"--wd={tmp_path}"]  # the head's machine
-    done = subprocess.Popen([*entered, *command], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    wait_for(lambda: sum(node == OTHER for node, *_ in in_log(tmp_path)) >= 10 or done.poll() is not None, 180)
+    done = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    wait_for(lambda: sum(node == "other" for node, *_ in in_log(tmp_path)) >= 10 or done.poll() is not None, 180)
     done.send_signal(signal.SIGSTOP)  # so that the node ends trials whose rows nobody has fetched
     time.sleep(3)
-    kill_all(names[1])
+    kill(other)
     done.send_signal(signal.SIGCONT)
     output = done.communicate(timeout=240)[0].decode()
     assert done.returncode == 0, output
     log = in_log(tmp_path)
-    both = {node: sum(n == node for n, *_ in log) for node in (HEAD, OTHER)}
-    assert both[OTHER] >= 10
-    assert both[HEAD] > both[OTHER]  # it did the rest
     started = [tuple(trial) for _, *trial in log]
     assert len(set(started)) == 120
     # Only what the killed node still held, or was at, began again.
-    again = [trial for trial in set(started) if started.count(trial) > 1]
+    again = {trial for trial in started if started.count(trial) > 1}
     assert again
     assert all(started.count(trial) == 2 for trial in again)
-    of_other = {tuple(trial) for node, *trial in log if node == OTHER}
-    assert set(again) <= of_other
+    assert again <= {tuple(trial) for node, *trial in log if node == "other"}
     assert len(list((tmp_path / "ray" / "trials").glob("*.json"))) == 120
     assert panel(tmp_path, "--out", "local", "--workers", "2").returncode == 0
     assert files(tmp_path / "ray") == files(tmp_path / "local")
     assert dd.verify(tmp_path / "ray").verdict == "intact"
-
-
-def reaches(name, host, port):
-    """Whether something in the namespace `name` can connect to this address."""
-    code = f"import socket; socket.create_connection(({host!r}, {port}), 2)"
-    return (
-        subprocess.run(["ip", "netns", "exec", name, sys.executable, "-c", code], capture_output=True).returncode == 0
-    )
-
-
-def raylets(name):
-    """Whether the node in the namespace `name` has a raylet."""
-    pids = run("ip", "netns", "pids", name).split()
-    return any("raylet/raylet" in open(f"/proc/{pid}/cmdline").read() for pid in pids if os.path.exists(f"/proc/{pid}"))

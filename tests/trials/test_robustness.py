@@ -259,7 +259,7 @@ def slow(plan, model, xs, us):
 @pytest.mark.parametrize("make", [wrong_sign, idle, slow])
 def test_a_bad_controller_is_to_blame_where_another_one_follows_the_plan(cart, make):
     loop = dd.loop.Loop(latency_budget=0.01 if make is slow else None)
-    trial = run_trial(Task(pushed_and_stopped(cart).plan, make, loop), {"mass": 1e-3}, 0)
+    trial = run_trial(Task(pushed_and_stopped(cart).plan, make, loop), {"mass": 0.05}, 0)
     assert trial.label == "control_error"
     assert "the plan's own inputs in the controller's place succeeds" in trial.reason
 
