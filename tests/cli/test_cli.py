@@ -72,17 +72,12 @@ def problem():
     (tmp_path / "block.py").write_text(text)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
-    assert exit_of(monkeypatch, "run", tmp_path / "block.py") == 0
+    assert exit_of(monkeypatch, "run", tmp_path / "block.py", "--out", tmp_path / "elsewhere") == 0
+    assert (tmp_path / "elsewhere" / "record.json").is_file()
+    assert not (tmp_path / "artifacts").exists()
     shown = capsys.readouterr().out
     assert "Dynamics of the states x0, x1 under the inputs u0, 10 steps" in shown
     assert re.search(r"cost +12 ", shown)
-
-
-def test_out_names_the_run_directory(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert exit_of(monkeypatch, "run", script(tmp_path, num_steps=20), "--out", tmp_path / "elsewhere") == 0
-    assert (tmp_path / "elsewhere" / "record.json").is_file()
-    assert not (tmp_path / "artifacts").exists()
 
 
 @pytest.mark.slow

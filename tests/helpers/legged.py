@@ -79,59 +79,23 @@ ANYMAL_FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
 CHEETAH_FEET = ("toe_fr", "toe_fl", "toe_hr", "toe_hl")
 LEGGED = {
     "solo12": Legged(
-        file="solo12.urdf",
-        feet=SOLO_FEET,
-        radius=0.016,
-        high=_legs(0.8, -1.6, hind=-1),
-        low=_legs(1.2, -2.4, hind=-1),
-        weight=24.5,
-        gains=(5.0, 0.1),
+        "solo12.urdf", SOLO_FEET, 0.016, _legs(0.8, -1.6, hind=-1), _legs(1.2, -2.4, hind=-1), 24.5, (5.0, 0.1)
     ),
-    "go2": Legged(
-        file="go2.urdf",
-        feet=GO2_FEET,
-        radius=0.022,
-        high=_legs(0.8, -1.6),
-        low=_legs(1.2, -2.4),
-        weight=158.0,
-        gains=(80.0, 2.0),
-        base="base",
-    ),
+    "go2": Legged("go2.urdf", GO2_FEET, 0.022, _legs(0.8, -1.6), _legs(1.2, -2.4), 158.0, (80.0, 2.0), base="base"),
     "anymal": Legged(
-        file="anymal_b_simple_description/robots/anymal.urdf",
-        feet=ANYMAL_FEET,
-        radius=0.031,
-        high=_legs(0.5, -1.0, hind=-1),
-        low=_legs(1.0, -2.0, hind=-1),
-        weight=299.0,
-        gains=(300.0, 8.0),
-        base="base",
+        "anymal_b_simple_description/robots/anymal.urdf", ANYMAL_FEET, 0.031, _legs(0.5, -1.0, hind=-1),
+        _legs(1.0, -2.0, hind=-1), 299.0, (300.0, 8.0), base="base",
     ),
-    "cheetah": Legged(
-        file="mini_cheetah/mini_cheetah.urdf",
-        feet=CHEETAH_FEET,
-        radius=0.015,
-        high=_legs(-0.8, 1.6),
-        low=_legs(-1.2, 2.4),
-        weight=86.8,
-        gains=(40.0, 1.0),
-        base="body",
-        package="pybullet",  # no other package of an index has it
+    "cheetah": Legged(  # no other package of an index has it
+        "mini_cheetah/mini_cheetah.urdf", CHEETAH_FEET, 0.015, _legs(-0.8, 1.6), _legs(-1.2, 2.4), 86.8, (40.0, 1.0),
+        base="body", package="pybullet",
     ),
-    "talos": Legged(  # soles of 20 x 12 cm, as its maker has them
-        file="talos_reduced.urdf",
-        feet=("leg_left_6_link", "leg_right_6_link"),
-        radius=0.016,
-        soles=tuple((x, y, -0.091) for x in (-0.1, 0.1) for y in (-0.06, 0.06)),
-        high=(0.0, 0.0, -0.45, 0.9, -0.45, 0.0) * 2,
-        low=(0.0, 0.0, -0.65, 1.3, -0.65, 0.0) * 2,
-        weight=885.0,
-        gains=(4000.0, 40.0),
-        drawn=0.02,
-        held="torso|arm|gripper|head",
-        rotor=(1e-5, 100.0),  # as talos.srdf has it
+    "talos": Legged(  # soles of 20 x 12 cm, as its maker has them; rotors as talos.srdf has them
+        "talos_reduced.urdf", ("leg_left_6_link", "leg_right_6_link"), 0.016, (0.0, 0.0, -0.45, 0.9, -0.45, 0.0) * 2,
+        (0.0, 0.0, -0.65, 1.3, -0.65, 0.0) * 2, 885.0, (4000.0, 40.0), drawn=0.02, held="torso|arm|gripper|head",
+        soles=tuple((x, y, -0.091) for x in (-0.1, 0.1) for y in (-0.06, 0.06)), rotor=(1e-5, 100.0),
     ),
-}
+}  # fmt: skip
 
 
 @cache
@@ -156,20 +120,15 @@ def robot_on_feet(name, time_step):
             collision = ElementTree.SubElement(link, "collision")
             ElementTree.SubElement(collision, "origin", xyz=" ".join(map(str, centre)))
             ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "sphere", radius=str(robot.radius))
+            depth, carriers = robot.depth(time_step), len(robot.feet) * len(robot.soles)
             properties = ElementTree.SubElement(collision, "drake:proximity_properties")
-            for quantity, value in (
-                (
-                    "point_contact_stiffness",
-                    robot.weight / (len(robot.feet) * len(robot.soles)) / robot.depth(time_step),
-                ),
-                (
-                    "hunt_crossley_dissipation",
-                    RELAXES * time_step / robot.depth(time_step) if robot.is_flat else DISSIPATION,
-                ),
-                ("relaxation_time", RELAXES * time_step),
-                ("mu_dynamic", FRICTION),
-                ("mu_static", FRICTION),
-            ):
+            for quantity, value in {
+                "point_contact_stiffness": robot.weight / carriers / depth,
+                "hunt_crossley_dissipation": RELAXES * time_step / depth if robot.is_flat else DISSIPATION,
+                "relaxation_time": RELAXES * time_step,
+                "mu_dynamic": FRICTION,
+                "mu_static": FRICTION,
+            }.items():
                 ElementTree.SubElement(properties, f"drake:{quantity}", value=str(value))
     path = Path(tempfile.mkdtemp(prefix="drake_diff_legged_")) / Path(robot.file).name
     tree.write(path)

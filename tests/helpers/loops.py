@@ -1,9 +1,8 @@
-"""A cart that is a double integrator, and its motions in a loop; TVLQR about a solution."""
+"""A cart that is a double integrator, and its motions in a loop."""
 
 import numpy as np
 
 import drake_diff as dd
-from drake_diff.optimize.replay import track
 
 H = 0.01
 MASS = 2.0
@@ -28,9 +27,3 @@ def pushed_and_stopped(model, factor=1.0):
     """Half the time forward, half the time back: from rest at 0 to rest at 50 (N/2)^2 h^2 = 2 m, `factor` 1."""
     us = factor * 100.0 * np.repeat([[1.0], [-1.0]], STEPS // 2, axis=0)
     return plan(model, us, [0.0, 0.0], [100 / MASS * (STEPS // 2 * H) ** 2, 0.0])
-
-
-def tracking(solution, parts=1):
-    """TVLQR about `solution`, in steps of a `parts`-th of its own, as its replays do it."""
-    plan = solution.plan
-    return track(plan, plan.model_at(parts), *plan.sample(parts))

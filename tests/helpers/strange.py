@@ -106,48 +106,42 @@ def broken(ending: str, seed: int, count: int) -> Iterator[tuple[str, bytes]]:
 
 
 def _bytes(data: bytes, random: np.random.Generator) -> tuple[str, bytes]:
-    at, way = int(random.integers(len(data))), random.integers(5)
-    if way == 0:
-        return f"cut at {at}", data[:at]
-    if way == 1:
-        return f"a strange byte at {at}", data[:at] + bytes([int(random.integers(256))]) + data[at + 1 :]
-    if way == 2:
-        encoding = str(random.choice(ENCODINGS))
-        return encoding, data.decode().encode(encoding)
-    if way == 3:
-        return f"twice from {at}", data[:at] + data[max(0, at - 40) :]
-    return f"without 15 bytes at {at}", data[:at] + data[at + 15 :]
+    i, encoding = int(random.integers(len(data))), str(random.choice(ENCODINGS))
+    ways = {
+        f"cut at {i}": data[:i],
+        f"a strange byte at {i}": data[:i] + bytes([int(random.integers(256))]) + data[i + 1 :],
+        f"twice from {i}": data[:i] + data[max(0, i - 40) :],
+        f"without 15 bytes at {i}": data[:i] + data[i + 15 :],
+        encoding: data.decode().encode(encoding, "replace"),
+    }
+    what = str(random.choice(list(ways)))
+    return what, ways[what]
 
 
 def _element(text: str, random: np.random.Generator) -> tuple[str, bytes]:
     ET.register_namespace("drake", "http://drake.mit.edu")
     root = ET.fromstring(text)
     parents = {child: parent for parent in root.iter() for child in parent}
-    element = list(root.iter())[random.integers(len(list(root.iter())))]
+    element = list(parents)[random.integers(len(parents))]
     value = str(random.choice(VALUES))
     if " " not in value.strip() and random.random() < 0.3:
         value = " ".join([value] * int(random.integers(2, 7)))
     way, what = random.integers(8), element.tag
-    if way < 4 and element.attrib:
-        name = str(random.choice(sorted(element.attrib)))
+    name = str(random.choice(sorted(element.attrib))) if element.attrib else ""
+    if way < 4 and (name or not len(element)):
         what += f" {name}={value!r}"
-        element.set(name, value)
-    elif way < 4 and not len(element):
-        what += f" text {value!r}"
-        element.text = value
-    elif way == 4 and element.attrib:
-        name = str(random.choice(sorted(element.attrib)))
+        element.attrib.update({name: value} if name else {})
+        element.text = element.text if name else value
+    elif way == 4 and name:
         what += f" without {name}"
         del element.attrib[name]
-    elif way == 5 and element in parents:
+    elif way == 5:
         what += " removed"
         parents[element].remove(element)
-    elif way == 6 and element in parents:
-        what += " twice"
-        parents[element].append(copy.deepcopy(element))
     else:
-        what += " in itself"
-        element.append(copy.deepcopy(element))
+        where = parents[element] if way == 6 else element
+        what += " twice" if way == 6 else " in itself"
+        where.append(copy.deepcopy(element))
     return what, ET.tostring(root)
 
 

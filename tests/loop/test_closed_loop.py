@@ -199,52 +199,45 @@ def test_a_controller_that_fails_ends_the_run_or_is_replaced(cart):
     np.testing.assert_allclose(kept.motion.xs[-1, 1], 6 * H / MASS, rtol=1e-12)
 
 
-class Stubborn:
-    """Any exception of a user's code, of a call or of the start."""
+class Broken:
+    """A controller or an estimator that raises, or answers nonsense, in its start or from the fourth call on."""
 
     def __init__(self, where):
-        self.where = where
+        self.where, self.calls = where, 0
 
     def start(self, x0):
+        self.calls = 0
         if self.where == "start":
-            raise KeyError("no such gain")
+            raise KeyError("no model")
 
     def __call__(self, x, t):
-        if self.where == "call" and t > 0.055:
-            raise KeyError("no such gain")
-        return [1.0]
+        return self.estimate([1.0], None)
+
+    def estimate(self, answer, u):
+        self.calls += 1
+        if self.where == "call" and self.calls > 3:
+            raise KeyError("no model")
+        return [1.0, 1.0, 1.0] if self.where == "shape" and self.calls > 3 else answer
 
 
-@pytest.mark.parametrize(("where", "steps"), [("start", 0), ("estimate", 3), ("shape", 3)])
-def test_whatever_an_estimator_raises_ends_the_run_and_is_told(cart, where, steps):
-    class Broken:
-        def start(self, x0):
-            self.calls = 0
-            if where == "start":
-                raise KeyError("no model")
-
-        def estimate(self, observation, u):
-            self.calls += 1
-            if where == "estimate" and self.calls > 3:
-                raise KeyError("no model")
-            return [1.0] if where == "shape" and self.calls > 3 else observation
-
-    run = closed_loop(cart, lambda x, t: [1.0], [0.0, 0.0], 20, Loop(estimator=Broken(), fallback=Fallback("stop")))
-    why = "ShapeError: the estimate" if where == "shape" else "KeyError: 'no model'"
-    assert run.ended.startswith(f"at t = {steps * H:.4g} s: the estimator failed: {why}")
-    assert (run.failed_part, run.controller_error, len(run.times)) == ("estimator", "", steps)
-
-
-@pytest.mark.parametrize(("where", "steps"), [("start", 0), ("call", 6)])
-def test_whatever_a_controller_raises_is_its_own_failure(cart, where, steps):
-    alone = closed_loop(cart, Stubborn(where), [0.0, 0.0], 20)
-    assert (alone.failed_part, alone.controller_error) == ("controller", "KeyError: 'no such gain'")
-    assert alone.ended == f"at t = {steps * H:.4g} s: the controller failed: KeyError: 'no such gain'"
-    assert len(alone.times) == steps
-    kept = closed_loop(cart, Stubborn(where), [0.0, 0.0], 20, Loop(fallback=Fallback("stop")))
-    assert (kept.ended, kept.failed_part, kept.controller_error) == ("", "", "")
-    assert kept.controller_status[6] == "the controller failed: KeyError: 'no such gain'"
-    np.testing.assert_allclose(kept.motion.xs[-1, 1], steps * H / MASS, rtol=1e-12)
+@pytest.mark.parametrize("component", ["controller", "estimator"])
+@pytest.mark.parametrize(("where", "steps"), [("start", 0), ("call", 3), ("shape", 3)])
+def test_whatever_a_part_of_the_loop_raises_is_its_own_failure(cart, component, where, steps):
+    """It ends the run; a fallback takes the place of the controller, and of no estimator."""
+    why = r"ShapeError: .*" if where == "shape" else r"KeyError: 'no model'"
+    for fallback in (None, Fallback("stop")):
+        broken = Broken(where)
+        controller = broken if component == "controller" else lambda x, t: [1.0]
+        loop = Loop(fallback=fallback, **({"estimator": broken} if component == "estimator" else {}))
+        run = closed_loop(cart, controller, [0.0, 0.0], 20, loop)
+        if fallback and component == "controller":
+            assert (run.ended, run.failed_part, run.controller_error) == ("", "", "")
+            assert re.fullmatch(f"the controller failed: {why}", run.controller_status[6])
+            np.testing.assert_allclose(run.motion.xs[-1, 1], steps * H / MASS, rtol=1e-12)
+        else:
+            assert re.fullmatch(f"at t = {steps * H:.4g} s: the {component} failed: {why}", run.ended)
+            assert (run.failed_part, len(run.times)) == (component, steps)
+            assert bool(run.controller_error) == (component == "controller")
 
 
 def test_ctrl_c_in_a_controller_is_no_failure_of_it(cart):
@@ -287,8 +280,6 @@ def test_where_the_first_answer_is_late_nothing_is_applied(cart):
     free = closed_loop(cart, slow, [0.0, 1.0], 5)  # no budget: it is waited for
     assert free.late == 0
     assert free.applied.all()
-    with pytest.raises(InputError, match=r"Loop\.latency_budget"):
-        closed_loop(cart, slow, [0.0, 1.0], 5, Loop(latency_budget=0.0))
 
 
 @each_row(
@@ -307,16 +298,20 @@ def test_bad_numbers_are_named(make, said):
         make()
 
 
-def test_bad_runs_are_named(cart):
-    for loop, said in (
+@each_row(
+    "loop, said",
+    [
         (Loop(sensor=Sensor(noise=[-1.0, 0.0])), "Sensor.noise"),
         (Loop(sensor=Sensor(noise=np.zeros(3))), "Sensor.noise"),
         (Loop(pushes=[Push("wheel", [0, 0, 1.0], 0.1)]), "cart"),
         (Loop(pushes=[Push("cart", [0, 0, 1.0], -0.1)]), "Push.at"),
         (Loop(substeps=0), "Loop.substeps"),
-    ):
-        with pytest.raises(InputError, match=said):
-            closed_loop(cart, gain(1, 1), [0.0, 0.0], 5, loop)
+        (Loop(latency_budget=0.0), r"Loop\.latency_budget"),
+    ],
+)
+def test_bad_runs_are_named(cart, loop, said):
+    with pytest.raises(InputError, match=said):
+        closed_loop(cart, gain(1, 1), [0.0, 0.0], 5, loop)
 
 
 def test_a_cart_pole_is_kept_upright_by_lqr_and_falls_without():

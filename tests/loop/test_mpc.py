@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from helpers.loops import tracking
 from helpers.models import MODELS
 from helpers.plants import block
 from helpers.problems import DOUBLE_INTEGRATOR, OTHERS, lqr, riccati
@@ -10,9 +9,8 @@ from helpers.table import each_row
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 import drake_diff as dd
-from drake_diff.exceptions import GradientError, InputError, SimulationError
+from drake_diff.exceptions import GradientError, InputError
 from drake_diff.model.step import advance
-from drake_diff.motion import TVLQR
 from drake_diff.optimize.replay import regulator_weights
 
 pytestmark = pytest.mark.solve
@@ -131,27 +129,6 @@ def test_a_refused_solve_is_told_and_the_last_plan_followed(swung, monkeypatch):
     assert mpc.status == "ok"
 
 
-def test_a_loop_logs_the_steps_whose_solve_failed(swung, monkeypatch):
-    """Steps 4 to 6 by the shifted plan, which unperturbed is what would be planned: the motion is the same."""
-    mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
-    undisturbed = dd.loop.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
-    original, calls = mpc._rolling.stretch, []
-
-    def refusing(k, count):
-        calls.append(k)
-        if 4 <= k <= 6:
-            raise SimulationError("no")
-        return original(k, count)
-
-    monkeypatch.setattr(mpc._rolling, "stretch", refusing)
-    found = dd.loop.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
-    told = "the last plan is followed further: SimulationError: no"
-    assert found.controller_status == ("ok",) * 4 + (told,) * 3 + ("ok",) * 3
-    assert calls == list(range(10))
-    assert found.ended == ""
-    np.testing.assert_allclose(found.motion.xs, undisturbed.motion.xs, atol=1e-4)  # as above: two minima's distance
-
-
 @each_row(
     "changes, options, said",
     [
@@ -176,12 +153,3 @@ def test_what_it_cannot_do_is_refused_at_once(changes, options, said):
     problem = dd.Problem(block(time_step=0.1), **fields)
     with pytest.raises(InputError, match=said):
         dd.loop.MPC(problem, **{"horizon": 5, "plan": straight(problem), **options})
-
-
-def test_tracking_is_the_regulator_of_the_replays_within_bounds(swung):
-    controller = tracking(swung)
-    xs, us = swung.plan.sample(1)
-    gains = TVLQR(swung.problem.model, xs, us, *regulator_weights(swung.plan, us)).gains
-    d = np.array([0.01, -0.02, 0.0, 0.01])
-    assert controller(xs[40] + d, 0.8) == pytest.approx(us[40] - gains[40] @ d, abs=1e-12)
-    assert controller(xs[40] + 1e6, 0.8)[0] in (-20, 20)

@@ -9,7 +9,6 @@ from helpers.robots import example_robot
 
 import drake_diff as dd
 from drake_diff.model.step import advance
-from drake_diff.optimize.realtime import step as realtime
 
 pytestmark = pytest.mark.solve
 
@@ -112,22 +111,6 @@ def test_its_plan_is_the_plants_own_motion(solo):
     assert xs[0] == pytest.approx(struck(model, rest, 0.6), abs=0.0)
     for x, u, after in zip(xs[:-1], us, xs[1:], strict=True):
         np.testing.assert_array_equal(advance(model.double, x, u), after)
-
-
-def test_where_derivatives_are_wrong_the_last_plan_is_followed(solo, monkeypatch):
-    """Their sign is turned: no step is taken that costs more, and it is told."""
-    model, _, rest = solo
-    problem, plan = standing(model, rest)
-    mpc = dd.loop.MPC(problem, horizon=10, plan=plan)
-    right = realtime.linearize
-
-    def turned(*args, **options):
-        A, B, methods = right(*args, **options)
-        return A, -B, methods
-
-    monkeypatch.setattr(realtime, "linearize", turned)
-    mpc(struck(model, rest, 0.6), 0.0)
-    assert "followed further: no step lowers what is paid" in mpc.status
 
 
 def test_it_pushes_from_a_guess_that_does_not_touch(two_spheres):

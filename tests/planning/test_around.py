@@ -1,6 +1,5 @@
 """Ways around obstacles: what is in the way is named, and what is found is clear by closed forms of two links."""
 
-import sys
 from itertools import pairwise
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.cli.main import main
 from drake_diff.exceptions import InputError, MissingDependencyError
 from drake_diff.planning import guesses, plan
 from drake_diff.planning.guesses import PostureLine, Space, lines
@@ -123,29 +121,6 @@ def test_what_no_way_leads_around_is_named_before_it_is_solved(avoid, message, a
     with pytest.raises(InputError, match=message):
         plan(arm, goals={"tip": [-0.9, 0, 0.1]}, avoid=avoid, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-@each_row(
-    "words, message",
-    [
-        ("ball:0,0,0,1", "sphere:x,y,z,radius or box:"),
-        ("0,0,0,1", "sphere:x,y,z,radius or box:"),
-        ("sphere:0,0,0", "4 numbers"),
-        ("box:0,0,0,1", "6 numbers"),
-        ("sphere:a,0,0,1", "numbers with commas"),
-        ("sphere:0,0,0,-1", "SphereObstacle.radius"),
-        ("box:0,0,0,1,0,1", "BoxObstacle.size"),
-    ],
-)
-def test_bad_words_of_an_obstacle_are_one_sentence(words, message, arm, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["drake-diff", "plan", str(arm), "--goal", "elbow=1", "--avoid", words])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    told = capsys.readouterr().err
-    assert ended.value.code == 2
-    assert told.startswith("drake-diff: ")
-    assert message in told
 
 
 @pytest.mark.slow

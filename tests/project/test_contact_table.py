@@ -150,18 +150,6 @@ def test_the_table_in_the_documents_is_this_table(found):
     assert [float(number) for number in told.groups()] == pytest.approx(laws, abs=0.0051)
 
 
-@pytest.mark.slow
-def test_what_the_documents_say_of_physx_and_newton():
-    needs("mujoco")
-    for module in ("sapien", "newton"):
-        pytest.importorskip(module)
-    rigid = {name: TABLE.rigid_answer(name, case).value for name, case in CASES.items()}
-    assert 1 - TABLE.measure("stop", "sapien").value / rigid["stop"] == pytest.approx(0.005, abs=5e-4)
-    assert TABLE.measure("bounce", "sapien").value == 0
-    assert 1 - TABLE.measure("bounce", "newton").value / rigid["bounce"] == pytest.approx(0.76, abs=5e-3)
-    assert TABLE.measure("hold", "newton").value == pytest.approx(0.02, abs=5e-4)
-
-
 def test_the_rebound_is_read_at_any_step_of_the_flight():
     """z + v^2 / (2 g) - h v / 2 is kept by semi-implicit Euler: an apex in steps, known from each of them."""
     case, h = CASES["bounce"], CASES["bounce"].time_step
