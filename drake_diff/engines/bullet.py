@@ -24,7 +24,7 @@ from drake_diff.engines.interface import (
     geometry_contracts,
     limit,
     shape_of,
-    without_lines,
+    silent,
 )
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
@@ -32,7 +32,7 @@ from drake_diff.mechanics.description import Geometry, JointContract, PairContra
 from drake_diff.model.model import Model
 
 try:
-    with without_lines("pybullet build time"):
+    with silent():
         import pybullet as p
 except ImportError as error:
     raise MissingDependencyError(
@@ -67,7 +67,7 @@ class PybulletEngine(RigidEngine):
 
     def __init__(self, model: Model):
         super().__init__(model)
-        with without_lines("argv[0]="):
+        with silent():
             self.bullet: Any = Client()
         self.bullet.setTimeStep(model.time_step)
         self.bullet.setGravity(*(float(g) for g in self.description.gravity))

@@ -1,16 +1,15 @@
 """Models by hand, each readable beside its file in models/, and an engine of them with nothing but NumPy.
 
-Every `residual_by_motion` is d(M(q) a + bias(q, v)) / dq at fixed a and v, every `bias_by_velocity` is d bias / dv. Of
-the two models with contact, a ball that lands and a block that slides, it is the next velocity and its derivative.
+Their derivatives are complex steps of M(q) a + bias(q, v) at fixed a, which have no truncation error.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from math import cos, sin
 from typing import ClassVar
 
 import numpy as np
+from numpy import cos, sin
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, positive_float
@@ -22,6 +21,7 @@ from drake_diff.model.model import Model
 
 (X, Y, Z), ORIGIN, NO_INERTIA = np.eye(3), np.zeros(3), np.zeros((3, 3))
 Limits = tuple[float, float]
+TINY = 1e-30  # of a complex step
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,6 @@ class HandForm(ABC):
     def bias(self, q: Array, v: Array) -> Array:
         """(nv,)."""
 
-    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
-        """(nv, nv); 0 unless said otherwise."""
-        return np.zeros((len(v), len(v)))
-
-    def bias_by_velocity(self, q: Array, v: Array) -> Array:
-        """(nv, nv); 0 unless said otherwise."""
-        return np.zeros((len(v), len(v)))
-
     @abstractmethod
     def potential_energy(self, q: Array) -> float:
         """[J]."""
@@ -88,8 +80,10 @@ class HandForm(ABC):
         M, D, limit = self.mass_matrix(q), self.damping, np.array(self.effort_limits)
         effort = np.clip(u, -limit, limit)
         a = euler_acceleration(M, D, h, v, self.actuation @ effort - self.bias(q, v))
+        by_q = _complex_steps(lambda z: self.mass_matrix(z) @ a + self.bias(z, v), q)
+        by_v = _complex_steps(lambda z: self.bias(q, z), v)
         inside = self.actuation * (np.abs(u) <= limit)
-        residual = [self.residual_by_motion(q, v, a), self.bias_by_velocity(q, v) + np.diag(D), -inside]
+        residual = [by_q @ self.coordinates.rate(q), by_v + np.diag(D), -inside]
         return a, np.asarray(-np.linalg.solve(M + h * np.diag(D), np.hstack(residual)), dtype=float)
 
     def _joint(
@@ -102,6 +96,12 @@ class HandForm(ABC):
             name=self.joint_names[index], kind=kind, axis=axis, anchor=anchor, carried=[(mass, com, inertia)],
             damping=damping, lower=lower, upper=upper, **spring,
         )  # fmt: skip
+
+
+def _complex_steps(function: Callable[[Array], Array], z: Array) -> Array:
+    """(m, n) the derivative of an analytic function of z (n,)."""
+    columns = [np.imag(function(z + 1j * TINY * e)) / TINY for e in np.eye(len(z))]
+    return np.array(columns).T.astype(float)
 
 
 @dataclass(frozen=True)
@@ -167,9 +167,6 @@ class MassSpringDamper(Slider):
     def bias(self, q: Array, v: Array) -> Array:
         return self.stiffness * (q - self.rest)
 
-    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
-        return np.array([[self.stiffness]])
-
     def potential_energy(self, q: Array) -> float:
         return float(self.stiffness * (q[0] - self.rest) ** 2 / 2)
 
@@ -194,9 +191,6 @@ class Pendulum(HandForm):
 
     def bias(self, q: Array, v: Array) -> Array:
         return np.array([self.mass * self.gravity * self.length * sin(q[0])])
-
-    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
-        return np.array([[self.mass * self.gravity * self.length * cos(q[0])]])
 
     def potential_energy(self, q: Array) -> float:
         return -self.mass * self.gravity * self.length * cos(q[0])
@@ -235,18 +229,6 @@ class DoublePendulum(HandForm):
         upper = g1 * sin(q[0]) + lower
         return np.array([upper - c * s2 * (2 * v[0] + v[1]) * v[1], lower + c * s2 * v[0] ** 2])
 
-    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
-        (_, _, c), (g1, g2), s2, c2 = self._moments, self._weights, sin(q[1]), cos(q[1])
-        lower = g2 * cos(q[0] + q[1])
-        by_elbow = -c * s2 * (2 * a[0] + a[1]) - c * c2 * (2 * v[0] + v[1]) * v[1]
-        return np.array(
-            [[g1 * cos(q[0]) + lower, by_elbow + lower], [lower, lower - c * s2 * a[0] + c * c2 * v[0] ** 2]]
-        )
-
-    def bias_by_velocity(self, q: Array, v: Array) -> Array:
-        cs = self._moments[2] * sin(q[1])
-        return np.array([[-2 * cs * v[1], -2 * cs * (v[0] + v[1])], [2 * cs * v[0], 0]])
-
     def potential_energy(self, q: Array) -> float:
         g1, g2 = self._weights
         return -g1 * cos(q[0]) - g2 * cos(q[0] + q[1])
@@ -278,14 +260,6 @@ class CartPole(HandForm):
 
     def bias(self, q: Array, v: Array) -> Array:
         return self.bob * self.length * sin(q[1]) * np.array([-(v[1] ** 2), self.gravity])
-
-    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
-        s, c = sin(q[1]), cos(q[1])
-        by_hinge = np.array([-s * a[1] - c * v[1] ** 2, -s * a[0] + c * self.gravity])
-        return np.column_stack([np.zeros(2), self.bob * self.length * by_hinge])
-
-    def bias_by_velocity(self, q: Array, v: Array) -> Array:
-        return np.array([[0, -2 * self.bob * self.length * sin(q[1]) * v[1]], [0, 0]])
 
     def potential_energy(self, q: Array) -> float:
         return -self.bob * self.gravity * self.length * cos(q[1])

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -69,49 +69,59 @@ class Match:
         self.precision: Precision = "float32" if "float32" in [c.precision for c in self.contracts] else "float64"
         sides = [side for c in self.contracts for j in c.joints for side in (j.lower, j.upper)]
         self.limited = any(math.isfinite(side) for side in sides)
+        self.touches = any(c.contacts for c in self.contracts)
 
     def same(self, a: Any, b: Any) -> bool:
-        if isinstance(a, str) or isinstance(b, str) or not (math.isfinite(a) and math.isfinite(b)):
+        if not all(isinstance(x, (int, float)) and math.isfinite(x) for x in (a, b)):
             return bool(a == b)
-        return abs(a - b) <= max(NOTHING[self.precision], SAME_NUMBER[self.precision] * max(abs(a), abs(b)))
+        return bool(abs(a - b) <= max(NOTHING[self.precision], SAME_NUMBER[self.precision] * max(abs(a), abs(b))))
+
+    def all_same(self, a: Sequence[Any], b: Sequence[Any]) -> bool:
+        return len(a) == len(b) and all(map(self.same, a, b))
 
     def both(self, a: object, b: object) -> str:
         return f"{self.one.engine}: {a}; {self.two.engine}: {b}"
 
+    def reason(self, quantity: str) -> str:
+        """Why one of the two engines cannot have what the other has."""
+        return self.one.reasons.get(quantity) or self.two.reasons.get(quantity) or ""
+
     def different(self, quantity: str, what: str) -> ContractLine:
         """With the reason of the engine that has one."""
-        reason = self.one.reasons.get(quantity) or self.two.reasons.get(quantity) or ""
+        reason = self.reason(quantity)
         detail = reason if reason in UNKNOWN else "; ".join(text for text in (what, reason) if text)
         return ContractLine(quantity, "different", detail, reason)
-
-    def text(self, quantity: str, a: str, b: str) -> ContractLine:
-        return ContractLine(quantity, "equal", a) if a == b else self.different(quantity, self.both(a, b))
-
-    def all_same(self, a: Sequence[Any], b: Sequence[Any]) -> bool:
-        return len(a) == len(b) and all(map(self.same, a, b))
 
     def numbers(self, quantity: str, a: tuple[Any, ...], b: tuple[Any, ...], unit: str = "") -> ContractLine:
         if self.all_same(a, b):
             return ContractLine(quantity, "equal", f"{values_told(a)} {unit}".strip())
         return self.different(quantity, f"{self.both(values_told(a), values_told(b))} {unit}".strip())
 
+    def text(self, quantity: str, read: Callable[[EngineContract], str]) -> ContractLine:
+        return self.numbers(quantity, (read(self.one),), (read(self.two),))
+
+    def mapped(self, quantity: str, read: Callable[[EngineContract], str]) -> ContractLine:
+        """Of what each engine may have in its own way."""
+        a, b = map(read, self.contracts)
+        return ContractLine(quantity, "equal", a) if a == b else ContractLine(quantity, "mapped", self.both(a, b))
+
     def order(self) -> ContractLine:
         quantity = "joint order and names"
         a, b = (tuple(j.name for j in contract.joints) for contract in self.contracts)
-        if a != b:
-            return self.numbers(quantity, a, b)
-        inside = [values_told(contract.native_order) for contract in self.contracts]
-        if inside[0] != inside[1]:
-            return ContractLine(quantity, "mapped", f"by name, from {self.both(*inside)}")
-        return ContractLine(quantity, "equal", values_told(a))
+        line = self.numbers(quantity, a, b)
+        if line.verdict == "different" or self.one.native_order == self.two.native_order:
+            return line
+        inside = (values_told(contract.native_order) for contract in self.contracts)
+        return ContractLine(quantity, "mapped", f"by name, from {self.both(*inside)}")
 
     def joints(self, quantity: str, read: Callable[[JointContract], tuple[Any, ...]]) -> ContractLine:
         """By name, so that another order is reported once and not in every line."""
         others = {j.name: j for j in self.two.joints}
-        common = [j for j in self.one.joints if j.name in others]
-        if not common:
+        lines = {
+            j.name: self.numbers(quantity, read(j), read(others[j.name])) for j in self.one.joints if j.name in others
+        }
+        if not lines:
             return ContractLine(quantity, "different", "no joint has the same name in both")
-        lines = {j.name: self.numbers(quantity, read(j), read(others[j.name])) for j in common}
         wrong = {name: line for name, line in lines.items() if line.verdict == "different"}
         if not wrong:
             return ContractLine(quantity, "equal", "of " + ", ".join(lines))
@@ -123,24 +133,16 @@ class Match:
 
     def actuation(self) -> ContractLine:
         quantity, inputs = "actuator mapping", self.one.inputs
-        if inputs != self.two.inputs:
+        if inputs != self.two.inputs or not inputs:
             return self.numbers(quantity, inputs, self.two.inputs)
-        if not inputs:
-            return ContractLine(quantity, "equal", "no inputs")
         a, b = _forces_by_joint(self.one), _forces_by_joint(self.two)
-        wrong = [
-            f"{self.one.engine}: {name} drives {a[name]}; {self.two.engine}: {b[name]}"
-            for name in inputs
-            if a[name].keys() != b[name].keys() or not all(self.same(gain, b[name][j]) for j, gain in a[name].items())
-        ]
+        same = {
+            n: a[n].keys() == b[n].keys() and self.all_same([*a[n].values()], [b[n][j] for j in a[n]]) for n in inputs
+        }
+        wrong = [self.both(f"{name} drives {a[name]}", b[name]) for name in inputs if not same[name]]
         if wrong:
             return self.different(quantity, "; ".join(wrong))
         return ContractLine(quantity, "equal", "; ".join(f"{name} drives {a[name]}" for name in inputs))
-
-    def effort_limits(self) -> ContractLine:
-        if not self.one.inputs and not self.two.inputs:
-            return ContractLine("effort limits", "equal", "no inputs")
-        return self.numbers("effort limits", self.one.effort_limits, self.two.effort_limits)
 
     def dynamics(self) -> tuple[ContractLine, ...]:
         """M and bias at random states in Drake's coordinates; of a closed form the parts of its forces."""
@@ -171,45 +173,43 @@ class Match:
             where = np.unravel_index(int(np.argmax(gap)), gap.shape)
             if not gap[where] <= worst:
                 values = self.both(f"{x[where]:.10g}", f"{y[where]:.10g}")
-                worst, entry = float(gap[where]), f"entry {[int(i) for i in where]}, {values}"
+                worst, entry = float(gap[where]), f", entry {[int(i) for i in where]}, {values}"
         within = f"to {worst:.1e} of its largest entry at {RANDOM_STATES} random states"
         if worst <= same:
             return ContractLine(quantity, "equal", within)
-        return ContractLine(quantity, "different", f"{within}, {entry}")
+        return ContractLine(quantity, "different", within + entry)
 
     def state(self) -> ContractLine:
-        quantity, (a, b) = "state of a free body", (contract.state for contract in self.contracts)
         if not any(j.kind == "quaternion_floating" for c in self.contracts for j in c.joints):
-            return ContractLine(quantity, "equal", "no free body")
-        return ContractLine(quantity, "equal", a) if a == b else ContractLine(quantity, "mapped", self.both(a, b))
+            return ContractLine("state of a free body", "equal", "no free body")
+        return self.mapped("state of a free body", lambda contract: contract.state)
 
     def limit_law(self) -> ContractLine:
         if not self.limited:
             return ContractLine("limit law", "equal", "no joint is limited")
-        return self.text("limit law", self.one.limit_law, self.two.limit_law)
+        return self.text("limit law", lambda contract: contract.limit_law)
 
     def solver_tolerance(self) -> ContractLine:
-        if not self.limited and not any(c.contacts for c in self.contracts):
+        if not self.limited and not self.touches:
             return ContractLine("solver tolerance", "equal", "nothing to solve: neither contact nor limits")
-        tolerances = ("none" if c.solver_tolerance is None else f"{c.solver_tolerance:g}" for c in self.contracts)
-        return self.text("solver tolerance", *tolerances)
+        return self.text(
+            "solver tolerance", lambda c: "none" if c.solver_tolerance is None else f"{c.solver_tolerance:g}"
+        )
 
     def scalar_type(self) -> ContractLine:
-        a, b = (contract.precision for contract in self.contracts)
-        if a == b:
-            return ContractLine("scalar type", "equal", a)
-        return ContractLine("scalar type", "different", self.both(a, b), f"its arithmetic is {self.precision}")
+        line = self.text("scalar type", lambda contract: contract.precision)
+        return line if line.verdict == "equal" else replace(line, reason=f"its arithmetic is {self.precision}")
 
     def derivatives(self) -> ContractLine:
-        quantity, conventions = "derivative convention", [contract.derivatives for contract in self.contracts]
-        if conventions[0] == conventions[1]:
-            return ContractLine(quantity, "equal", conventions[0])
-        if "none" in conventions:
-            return ContractLine(quantity, "different", self.both(*conventions), "it offers no derivatives")
-        return ContractLine(quantity, "mapped", self.both(*conventions))
+        line = self.mapped("derivative convention", lambda contract: contract.derivatives)
+        if line.verdict == "mapped" and any(contract.derivatives == "none" for contract in self.contracts):
+            return replace(line, verdict="different", reason="it offers no derivatives")
+        return line
 
 
 def values_told(values: tuple[Any, ...]) -> str:
+    if not values:
+        return "none"
     shown = [value if isinstance(value, str) else f"{value:.10g}" for value in values]
     return shown[0] if len(shown) == 1 else "(" + ", ".join(shown) + ")"
 
@@ -255,16 +255,16 @@ def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
         *(match.joints(quantity, read) for quantity, read in JOINT_NUMBERS.items()),
         match.numbers("gravity", first.gravity, two.gravity, "[m/s^2]"),
         match.actuation(),
-        match.effort_limits(),
+        match.numbers("effort limits", first.effort_limits, two.effort_limits),
         *match.dynamics(),
         match.numbers("time step", (first.time_step,), (two.time_step,), "[s]"),
-        match.text("integrator", first.integrator, two.integrator),
+        match.text("integrator", lambda contract: contract.integrator),
         match.state(),
         match.limit_law(),
-        match.text("contact law", first.contact_law, two.contact_law),
+        match.text("contact law", lambda contract: contract.contact_law),
         *contact_lines(match),
         match.solver_tolerance(),
-        match.text("reset", first.reset, two.reset),
+        match.text("reset", lambda contract: contract.reset),
         match.scalar_type(),
         match.derivatives(),
     )
@@ -286,7 +286,7 @@ def _random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array,
     return np.concatenate(parts), random.standard_normal(len(kinds) + 5 * sum(free))
 
 
-TOLD = 4  # pairs or geometries that a line names
+NAMED = 4  # pairs or geometries that a line names
 Shared = Sequence[tuple[PairContract, PairContract]]
 
 
@@ -295,10 +295,9 @@ def contact_lines(match: Match) -> tuple[ContractLine, ...]:
 
     A number that differs has no reason: it is another model. What an engine has no number for has its reason.
     """
-    first, two = match.contracts
     same = same_geometries(match)
-    a = {frozenset(same.get(name, name) for name in pair.names): pair for pair in first.contacts}
-    b = {frozenset(pair.names): pair for pair in two.contacts}
+    a = {frozenset(same.get(name, name) for name in pair.names): pair for pair in match.one.contacts}
+    b = {frozenset(pair.names): pair for pair in match.two.contacts}
     shared = [(a[names], b[names]) for names in a if names in b]
     return (
         *_geometries(match, same),
@@ -318,7 +317,6 @@ def same_geometries(match: Match) -> dict[str, str]:
     """
     a, b = (list(c.geometries) for c in match.contracts)
     same: dict[str, str] = {}
-    touching = _touching(match.one) | _touching(match.two)
 
     def take(rule: Callable[[GeometryContract, GeometryContract], bool]) -> None:
         for x in [x for x in a if x.name not in same]:
@@ -328,6 +326,7 @@ def same_geometries(match: Match) -> dict[str, str]:
 
     take(lambda x, y: x.name == y.name)
     take(lambda x, y: _plain(x.name) == _plain(y.name) and x.carrier == y.carrier)
+    touching = {name for c in match.contracts for pair in c.contacts for name in pair.names}
     a, b = ([g for g in side if g.name in touching] for side in (a, b))
     take(lambda x, y: _same_shape(match, x, y) and _same_pose(match, x, y))
     take(lambda x, y: x.kind == y.kind and x.carrier == y.carrier)
@@ -338,35 +337,30 @@ def _plain(name: str) -> str:
     return name.split("#")[0].split("::")[-1]
 
 
-def _touching(contract: EngineContract) -> set[str]:
-    return {name for pair in contract.contacts for name in pair.names}
-
-
 def _same_shape(match: Match, x: GeometryContract, y: GeometryContract) -> bool:
     return x.kind == y.kind and match.all_same(x.sizes, y.sizes)
 
 
 def _same_pose(match: Match, x: GeometryContract, y: GeometryContract) -> bool:
-    placed = match.all_same(x.position, y.position) and match.all_same(x.directions, y.directions)
-    return x.carrier == y.carrier and placed
+    return x.carrier == y.carrier and match.all_same(x.position + x.directions, y.position + y.directions)
 
 
 def _geometries(match: Match, same: Mapping[str, str]) -> tuple[ContractLine, ContractLine]:
     """Of those that are in both, and may touch something in one."""
     a, b = ({g.name: g for g in c.geometries} for c in match.contracts)
-    touching = _touching(match.one), _touching(match.two)
+    touching = [{name for pair in c.contacts for name in pair.names} for c in match.contracts]
     both = [(a[x], b[y]) for x, y in same.items() if x in touching[0] or y in touching[1]]
-    shapes, poses = [], []
-    for x, y in both:
-        if not _same_shape(match, x, y):
-            shapes.append(f"{x.name}: {match.both(*(f'{g.kind} {values_told(g.sizes)}' for g in (x, y)))} [m]")
-        if not _same_pose(match, x, y):
-            poses.append(f"{x.name}: {match.both(*map(_place, (x, y)))}")
-    details = f"of {len(both)} geometries" if both else "nothing can touch"
-    return _line(match, "shapes", shapes, details), _line(match, "poses", poses, details)
+    shapes = [
+        f"{x.name}: {match.both(*(f'{g.kind} {values_told(g.sizes)}' for g in (x, y)))} [m]"
+        for x, y in both
+        if not _same_shape(match, x, y)
+    ]
+    poses = [f"{x.name}: {match.both(*map(_pose, (x, y)))}" for x, y in both if not _same_pose(match, x, y)]
+    detail = f"of {len(both)} geometries" if both else "nothing can touch"
+    return _line(match, "shapes", shapes, detail), _line(match, "poses", poses, detail)
 
 
-def _place(g: GeometryContract) -> str:
+def _pose(g: GeometryContract) -> str:
     along = f", directions {values_told(g.directions)}" if g.directions else ""
     return f"on {g.carrier} at {values_told(g.position)} [m]{along}"
 
@@ -375,79 +369,66 @@ def _line(match: Match, quantity: str, wrong: list[str], detail: str) -> Contrac
     """What is wrong without a reason to excuse it; the engine's own word on it is told all the same."""
     if not wrong:
         return ContractLine(quantity, "equal", detail)
-    remark = match.one.reasons.get(quantity) or match.two.reasons.get(quantity)
+    remark = match.reason(quantity)
     return ContractLine(quantity, "different", "; ".join([_some(wrong), *([remark] if remark else [])]))
 
 
-def _some(parts: list[str]) -> str:
-    return "; ".join(parts[:TOLD]) + (f"; and {len(parts) - TOLD} more" if len(parts) > TOLD else "")
+def _some(details: list[str]) -> str:
+    return "; ".join(details[:NAMED]) + (f"; and {len(details) - NAMED} more" if len(details) > NAMED else "")
 
 
 def _pairs(
     match: Match, a: Mapping[frozenset[str], PairContract], b: Mapping[frozenset[str], PairContract]
 ) -> ContractLine:
-    quantity = "contact pairs"
     if a.keys() == b.keys():
-        return ContractLine(quantity, "equal", f"{len(a)} pairs" if a else "none")
-    sides = ((match.one.engine, a, b), (match.two.engine, b, a))
-    only = [
-        f"only in {engine}: {_some(missing)}"
-        for engine, own_names, others in sides
-        if (missing := sorted(" with ".join(own_names[names].names) for names in own_names.keys() - others.keys()))
-    ]
-    return match.different(quantity, "; ".join([match.both(len(a), len(b)), *only]))
+        return ContractLine("contact pairs", "equal", f"{len(a)} pairs" if a else "none")
+    only = []
+    for contract, pairs, others in ((match.one, a, b), (match.two, b, a)):
+        missing = sorted(" with ".join(pairs[names].names) for names in pairs.keys() - others.keys())
+        only += [f"only in {contract.engine}: {_some(missing)}"] if missing else []
+    return match.different("contact pairs", "; ".join([match.both(len(a), len(b)), *only]))
 
 
 def _numbers(
     match: Match, quantity: str, shared: Shared, read: Callable[[PairContract], float | None], unit: str
 ) -> ContractLine:
     """A value that neither gives is the same default only where the contact law is the same."""
-    wrong, absent, seen = [], [], set()
+    wrong, absent = [], []
     for x, y in shared:
         p, q = read(x), read(y)
-        seen.add(p)
-        details = f"{' with '.join(x.names)}: {match.both(p, q)} {unit}"
+        detail = f"{' with '.join(x.names)}: {match.both(p, q)} {unit}"
         if p is None or q is None:
-            absent += [details] if p is not q or match.one.contact_law != match.two.contact_law else []
+            absent += [detail] if p is not q or match.one.contact_law != match.two.contact_law else []
         elif not match.same(p, q):
-            wrong.append(details)
+            wrong.append(detail)
     if absent and not wrong:
         return match.different(quantity, _some(absent))
-    values = sorted(value for value in seen if value is not None)
-    details = f"{values_told(tuple(values[:TOLD]))} {unit}" if values else "of no pair"
-    return _line(match, quantity, wrong + absent, details)
+    values = sorted({value for x, _ in shared if (value := read(x)) is not None})[:NAMED]
+    return _line(match, quantity, wrong + absent, f"{values_told(tuple(values))} {unit}" if values else "of no pair")
 
 
 def _dissipation(match: Match, shared: Shared) -> ContractLine:
     """Hunt and Crossley's where both have it, and the relaxation time, or the critical one of an engine's own law."""
     quantity = "dissipation"
-    wrong: list[str] = []
-    absent: list[str] = []
-    mapped: list[str] = []
+    details: dict[str, list[str]] = {"wrong": [], "absent": [], "mapped": []}
     for x, y in shared:
+        (d_x, d_y), (p, q) = (x.dissipation, y.dissipation), (x.relaxation_time, y.relaxation_time)
         name = " with ".join(x.names)
-        if x.dissipation is not None and y.dissipation is not None and not match.same(x.dissipation, y.dissipation):
-            wrong.append(f"{name}: {match.both(x.dissipation, y.dissipation)} [s/m]")
-        p, q = x.relaxation_time, y.relaxation_time
-        details = f"{name}: {match.both(p, q)} [s]"
-        if p is None or q is None:
-            absent += [details] if p is not q else []
-        elif not match.same(p, q):
-            critical = any(_critical(match, pair) for pair in (x, y))
-            (mapped if critical else wrong).append(details)
-    if wrong:
-        return _line(match, quantity, wrong, "")
-    if absent:
-        return match.different(quantity, _some(absent))
-    if mapped:
-        values = f"relaxation times {_some(mapped)}: the damping is critical, which is the engine's own"
-        return ContractLine(quantity, "mapped", values)
+        if d_x is not None and d_y is not None and not match.same(d_x, d_y):
+            details["wrong"].append(f"{name}: {match.both(d_x, d_y)} [s/m]")
+        if p is not q and not match.same(p, q):
+            times = [(pair.relaxation_time, pair.critical_time) for pair in (x, y) if pair.critical_time is not None]
+            critical = any(match.same(*both) for both in times)
+            kind = "absent" if p is None or q is None else "mapped" if critical else "wrong"
+            details[kind].append(f"{name}: {match.both(p, q)} [s]")
+    if details["wrong"]:
+        return _line(match, quantity, details["wrong"], "")
+    if details["absent"]:
+        return match.different(quantity, _some(details["absent"]))
+    if details["mapped"]:
+        detail = f"relaxation times {_some(details['mapped'])}: the damping is critical, which is the engine's own"
+        return ContractLine(quantity, "mapped", detail)
     return ContractLine(quantity, "equal", f"of {len(shared)} pairs" if shared else "of no pair")
-
-
-def _critical(match: Match, pair: PairContract) -> bool:
-    times = pair.relaxation_time, pair.critical_time
-    return None not in times and match.same(*times)
 
 
 def _more(match: Match, shared: Shared) -> ContractLine:
@@ -455,7 +436,6 @@ def _more(match: Match, shared: Shared) -> ContractLine:
     for x, y in shared:
         p, q = dict(x.more), dict(y.more)
         for name in {**p, **q}:
-            if not match.same(p.get(name, 0.0), q.get(name, 0.0)):
-                both = match.both(p.get(name, 0.0), q.get(name, 0.0))
-                wrong.append(f"{' with '.join(x.names)}: {name}, {both}")
+            both = p.get(name, 0.0), q.get(name, 0.0)
+            wrong += [] if match.same(*both) else [f"{' with '.join(x.names)}: {name}, {match.both(*both)}"]
     return _line(match, "other contact terms", wrong, "none")

@@ -2,7 +2,6 @@
 
 import os
 import sys
-import tempfile
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -282,34 +281,20 @@ class RigidEngine(PlantEngine):
 
 
 @contextmanager
-def without_lines(*greetings: str) -> Iterator[None]:
-    """What libraries print from C on stdout and stderr comes when it ends, but for lines that begin as a greeting."""
-    with _filtered(1, greetings), _filtered(2, greetings):
-        yield
-
-
-@contextmanager
-def _filtered(stream: int, greetings: tuple[str, ...]) -> Iterator[None]:
-    """Of one file descriptor."""
-    _flush()
-    original = os.dup(stream)
-    with tempfile.TemporaryFile() as file:
-        os.dup2(file.fileno(), stream)
-        try:
-            yield
-        finally:
-            _flush()
-            os.dup2(original, stream)
-            os.close(original)
-            file.seek(0)
-            for line in file.read().splitlines(keepends=True):
-                if not line.startswith(tuple(g.encode() for g in greetings)):
-                    os.write(stream, line)
-
-
-def _flush() -> None:
+def silent() -> Iterator[None]:
+    """What libraries print from C on stdout and stderr goes nowhere."""
     sys.stdout.flush()
     sys.stderr.flush()
+    originals = [(stream, os.dup(stream)) for stream in (1, 2)]
+    with open(os.devnull, "w") as nowhere:
+        try:
+            for stream, _ in originals:
+                os.dup2(nowhere.fileno(), stream)
+            yield
+        finally:
+            for stream, original in originals:
+                os.dup2(original, stream)
+                os.close(original)
 
 
 def row(values: object) -> str:

@@ -22,8 +22,8 @@ from drake_diff.engines.interface import (
     geometry_contracts,
     limit,
     shape_of,
+    silent,
     without_damping,
-    without_lines,
 )
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
@@ -38,7 +38,6 @@ try:
 except ImportError as error:
     raise MissingDependencyError("this engine needs Newton: pip install 'drake-diff[forward]'") from error
 
-NO_GPU = "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 # Newton takes friction and stiffness of a contact for not given where they are 0; of this nothing is felt.
 NONE = 1e-30
 KINDS = {0: "prismatic", 1: "revolute", 4: "quaternion_floating"}  # newton.JointType
@@ -52,7 +51,7 @@ class NewtonEngine(RigidEngine):
 
     def __init__(self, model: Model):
         super().__init__(model)
-        with without_lines(NO_GPU):
+        with silent():
             self.newton, self.shapes = _build(self.tree, self.description.gravity)
         self.solver = newton.solvers.SolverFeatherstone(self.newton, update_mass_matrix_interval=1)
         # Newton's places in Drake's order, and the centres of mass that it uses.

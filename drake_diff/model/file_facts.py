@@ -13,7 +13,6 @@ from functools import cached_property
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-from pydrake.multibody.parsing import FlattenModelDirectives, LoadModelDirectives, PackageMap
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
@@ -182,7 +181,7 @@ class Mjcf:
         ]
         self.xml.replace(first, "".join(sections))
         for section in others:
-            self.xml.remove(section)
+            self.xml.replace(section, "")  # which stays in the tree, to be read again
 
     def attributes(self, element: Element) -> Attributes:
         """Those of an element, with those that its default class gives."""
@@ -411,34 +410,16 @@ class FileFacts:
     left_out: set[Key] = field(default_factory=set)
 
 
-def file_facts(path: Path, packages: PackageMap) -> FileFacts:
-    """What the file at `path`, and the models that a .dmd.yaml adds, say of joints and links; of MJCF no links.
+def read_facts(xml: XmlText, instance: str | None, facts: FileFacts) -> None:
+    """Add to `facts` what a robot file, its slips mended, says of joints and links; of MJCF no links.
 
-    Of what is no XML that is nothing. Raises ModelError where a file cannot be read.
+    `instance` is what a .dmd.yaml calls the robot.
     """
-    facts = FileFacts()
-    _read(path, packages, None, facts)
-    return facts
-
-
-def _read(path: Path, packages: PackageMap, instance: str | None, facts: FileFacts) -> None:
-    try:
-        if path.name.endswith(".dmd.yaml"):
-            for directive in FlattenModelDirectives(LoadModelDirectives(str(path)), packages).directives:
-                if directive.add_model is not None:
-                    file = Path(packages.ResolveUrl(directive.add_model.file))
-                    _read(file, packages, directive.add_model.name, facts)
-            return
-        xml = XmlText(path.read_bytes())
-        root = xml.root
-    except ModelError:
-        return  # a note says that the file is no XML
-    except (OSError, RuntimeError) as error:
-        raise ModelError(f"{path}: what it says of joints and links cannot be read: {error}") from error
+    root = xml.root
     if root.tag == "robot":
-        _read_urdf(root, instance or root.get("name") or path.stem, facts)
+        _read_urdf(root, instance or root.get("name"), facts)
     if root.tag == "mujoco":
-        _read_mjcf(Mjcf(with_includes(xml, path)), instance or root.get("model") or path.stem, facts)
+        _read_mjcf(Mjcf(xml), instance or root.get("model"), facts)
     for model in root.findall("model"):  # of SDF
         _read_sdf(model, instance or model.get("name"), facts)
     for model in (model for world in root.findall("world") for model in world.findall("model")):
@@ -446,11 +427,10 @@ def _read(path: Path, packages: PackageMap, instance: str | None, facts: FileFac
 
 
 def _read_urdf(robot: Element, name: str, facts: FileFacts) -> None:
-    names = {joint.get("name") for joint in robot.findall("joint")}
     for joint in robot.findall("joint"):
         limit, mimic, key = joint.find("limit"), joint.find("mimic"), (name, joint.get("name"))
         facts.joints[key] = JointSays(None if limit is None else _number(limit.get("effort")))
-        if mimic is not None and joint.get("type") != "fixed" and mimic.get("joint") in names:
+        if mimic is not None:
             facts.followers[key] = _drakes_mimic(key, mimic)
     for link in robot.findall("link"):
         facts.links[name, link.get("name")] = _link_of_urdf(link)

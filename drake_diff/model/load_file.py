@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import yaml
 from pydrake.multibody.parsing import (
@@ -26,13 +25,12 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_diff.exceptions import InputError, ModelError
-from drake_diff.model.file_facts import Mjcf, as_mujoco_means, correct
+from drake_diff.model.file_facts import FileFacts, Mjcf, as_mujoco_means, correct, read_facts
 from drake_diff.model.meshes import DOWNLOADED, FileMeshes, make_absolute, put_meshes, read_meshes
-from drake_diff.model.xml_text import Element, XmlText
+from drake_diff.model.xml_text import XmlText
 
 OF_SIMULATORS = {"gazebo": "what only Gazebo reads", "contact": "friction and the like that only PyBullet reads"}
 MOST_NODES = 100_000  # of a YAML file, its aliases written out
-MOVING = ("revolute", "continuous", "prismatic")  # the types of joints that can be fixed
 IN_CPP = re.compile(r"Failure at \S+ in \w+\(\): ")
 
 
@@ -42,7 +40,6 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
     Raises ModelError, with the line, where it is no XML or Drake would not survive it.
     """
     path.read_text()  # which says what byte is no text
-    refuse_circles(path, ())
     if path.name.endswith(".dmd.yaml"):
         return None
     try:
@@ -106,30 +103,6 @@ def _without_lost_joints(xml: XmlText) -> list[str]:
     return sentences
 
 
-def _check_yaml(path: Path) -> None:
-    """Raise ModelError where a file is no YAML, or its aliases stand for more than memory holds."""
-    sizes: dict[int, int] = {}
-
-    def size(node: Any) -> int:
-        if id(node) not in sizes:
-            inner = [] if node is None or isinstance(node.value, str) else node.value
-            pairs = [pair for entry in inner for pair in (entry if isinstance(entry, tuple) else (entry,))]
-            sizes[id(node)] = 1 + sum(map(size, pairs))
-        return sizes[id(node)]
-
-    try:
-        root = yaml.compose(path.read_text())
-        large = size(root) > MOST_NODES
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line_number = f":{mark.line + 1}" if mark else ""
-        raise ModelError(f"{path}{line_number}: no YAML: {getattr(error, 'problem', None) or error}") from error
-    except RecursionError as error:
-        raise ModelError(f"{path}: its lists are too deep") from error
-    if large:
-        raise ModelError(f"{path}: its aliases stand for more than {MOST_NODES} entries")
-
-
 def _one_colour_for_each_material(xml: XmlText) -> list[str]:
     """Drake refuses a material that is defined in two ways or in none, which only changes what is drawn."""
     known: dict[str, str] = {}
@@ -170,79 +143,47 @@ def _continuous_without_limits(xml: XmlText) -> list[str]:
     )
 
 
-def fix_in_text(xml: XmlText, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Make joints of a URDF fixed ones, at zero, if any of its joints mimics another; those that were made so.
-
-    Drake could not take a joint out of such a model later. Raises ModelError where a joint mimics a fixed one.
-    """
-    there = {joint.get("name"): joint for joint in xml.root.findall("joint")}
-    followers = {name: mimic.get("joint") for name, joint in there.items() if (mimic := joint.find("mimic"))}
-    if xml.root.tag != "robot" or not followers:
-        return ()
-    moving = [name for name in names if name in there and there[name].get("type") in MOVING]
-    for follower, leader in followers.items():
-        if leader in moving and follower not in moving:
-            raise ModelError(f"{path}: fix_joints={leader!r}: {follower} mimics it: fix {follower} too")
-    for name in moving:
-        limit = there[name].find("limit")
-        if limit and (_above(limit.get("lower"), "0") or _above("0", limit.get("upper"))):
-            range_ = f"[{limit.get('lower')}, {limit.get('upper')}]"
-            raise ModelError(f"{path}: fix_joints={name!r}: 0 is outside of its limits {range_}: give mimic= too")
-        xml.set(there[name], "type", "fixed")
-        for mimic in there[name].findall("mimic"):
-            xml.remove(mimic)
-    return tuple(moving)
-
-
-def included(path: Path) -> Iterator[str]:
+def included(path: Path) -> list[str]:
     """The robot files that the one at `path` includes, as it names them."""
     if path.name.endswith(".dmd.yaml"):
-        yield from files_of_directives(path)
-        return
+        return files_of_directives(path)
     try:
-        root = XmlText(path.read_bytes()).root
+        includes = list(XmlText(path.read_bytes()).root.iter("include"))
     except ModelError:
-        return  # Drake has the word
-    for include in root.iter("include"):
-        uri = include.find("uri")
-        name = include.get("file") or (uri.text.strip() if uri else "")
-        if name:
-            yield name
+        return []  # Drake has the word
+    uris = [include.get("file") or (uri.text.strip() if (uri := include.find("uri")) else "") for include in includes]
+    return [uri for uri in uris if uri]
 
 
 def files_of_directives(path: Path) -> list[str]:
-    """What a .dmd.yaml file calls `file`. ModelError where it is no YAML, or far too large."""
-    _check_yaml(path)
-    files, waiting = [], [yaml.compose(path.read_text())]
+    """What a .dmd.yaml file calls `file`. ModelError where it is no YAML, or its aliases stand for far too much."""
+    try:
+        waiting = [yaml.compose(path.read_text())]
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line_number = f":{mark.line + 1}" if mark else ""
+        raise ModelError(f"{path}{line_number}: no YAML: {getattr(error, 'problem', None) or error}") from error
+    except RecursionError as error:
+        raise ModelError(f"{path}: its lists are too deep") from error
+    files, count = [], 0
     while waiting:
-        node = waiting.pop()
-        for entry in getattr(node, "value", None) or [] if not isinstance(node, yaml.ScalarNode) else []:
-            if not isinstance(entry, tuple):
-                waiting.append(entry)
-            elif entry[0].value == "file" and isinstance(entry[1], yaml.ScalarNode):
-                files.append(str(entry[1].value))
-            else:
-                waiting.append(entry[1])
+        node, count = waiting.pop(), count + 1
+        if count > MOST_NODES:
+            raise ModelError(f"{path}: its aliases stand for more than {MOST_NODES} entries")
+        if isinstance(node, yaml.MappingNode):
+            files += [str(v.value) for k, v in node.value if k.value == "file" and isinstance(v, yaml.ScalarNode)]
+            waiting += [entry for pair in node.value for entry in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            waiting += node.value
     return files
-
-
-def refuse_circles(path: Path, above: tuple[Path, ...]) -> None:
-    """Raise ModelError where a file includes itself, by way of others too: Drake would read on until memory ends."""
-    here = path.resolve()
-    if here in above:
-        circle = " -> ".join(p.name for p in (*above[above.index(here) :], here))
-        raise ModelError(f"{above[0]}: it includes itself: {circle}")
-    for name in included(path):
-        target = path.parent / name.removeprefix("file://")
-        if "://" not in name.removeprefix("file://") and target.is_file():
-            refuse_circles(target, (*above, here))
 
 
 def add_packages(packages: PackageMap, path: Path, given: Mapping[str, str] | None) -> None:
     """Tell Drake where packages are: as `given`, else the nearest folder of that name above the file.
 
     That folder may also stand beside one above the file, as in a workspace of ROS, if it has a package.xml. The
-    package that Drake would download is taken out of the map, so that it is an unknown one.
+    package that Drake would download is taken out of the map, so that it is an unknown one. Raises ModelError where a
+    file includes itself, by way of others too: Drake would read on until memory ends.
     """
     if packages.Contains(DOWNLOADED):
         packages.Remove(DOWNLOADED)
@@ -250,26 +191,27 @@ def add_packages(packages: PackageMap, path: Path, given: Mapping[str, str] | No
         if packages.Contains(name):
             packages.Remove(name)
         packages.Add(name, folder)
-    seen: set[Path] = set()
-    waiting = [path.resolve()]
-    while waiting:
-        file = waiting.pop()
-        if file in seen or not file.is_file():
+    _add_packages_of(packages, path.resolve(), ())
+
+
+def _add_packages_of(packages: PackageMap, file: Path, above: tuple[Path, ...]) -> None:
+    if file in above:
+        circle = " -> ".join(path.name for path in (*above[above.index(file) :], file))
+        raise ModelError(f"{above[0]}: it includes itself: {circle}")
+    for name in sorted(set(re.findall(r"(?:package|model)://([^/\"'<>\s]+)/", file.read_text(errors="replace")))):
+        location = None if packages.Contains(name) else package_above(file, name)
+        if location is not None:
+            packages.Add(name, str(location))
+    for uri in included(file):
+        package = re.match(r"(?:package|model)://([^/]+)/(.*)", uri)
+        if package is None:
+            target = file.parent / uri.removeprefix("file://")
+        elif packages.Contains(package[1]):
+            target = Path(packages.GetPath(package[1]), package[2])
+        else:
             continue
-        seen.add(file)
-        for name in sorted(set(re.findall(r"(?:package|model)://([^/\"'<>\s]+)/", file.read_text(errors="replace")))):
-            location = None if packages.Contains(name) else package_above(file, name)
-            if location is not None:
-                packages.Add(name, str(location))
-        waiting += [target for uri in included(file) if (target := _target(packages, file, uri)) is not None]
-
-
-def _target(packages: PackageMap, file: Path, uri: str) -> Path | None:
-    """Where an included file is; None where its package is not known."""
-    package = re.match(r"(?:package|model)://([^/]+)/(.*)", uri)
-    if package is None:
-        return (file.parent / uri.removeprefix("file://")).resolve()
-    return Path(packages.GetPath(package[1]), package[2]).resolve() if packages.Contains(package[1]) else None
+        if target.is_file():
+            _add_packages_of(packages, target.resolve(), (*above, file))
 
 
 def package_above(file: Path, name: str) -> Path | None:
@@ -284,15 +226,8 @@ def package_above(file: Path, name: str) -> Path | None:
 
 
 def refusal(path: Path, message: str, xml: XmlText | None, notes: list[str]) -> str:
-    """What Drake says of the file, with its name, the line if that can be known, and what to do if that is known."""
-    message = IN_CPP.sub("", message).strip()
-    message = message.replace(f"{path}:{path}", str(path))
-    known = re.search(re.escape(str(path)) + r":\d+", message)
-    line = (
-        ""
-        if known or xml is None
-        else "".join(f"; see {path}:{line_number}: {what}" for line_number, what in _suspects(xml, message))
-    )
+    """What Drake says of the file, with its name, and what to do if that is known."""
+    message = IN_CPP.sub("", message).strip().replace(f"{path}:{path}", str(path))
     unknown = re.search(r"unknown package '([^']+)'", message)
     remedy = ""
     if unknown:
@@ -301,39 +236,7 @@ def refusal(path: Path, message: str, xml: XmlText | None, notes: list[str]) -> 
             remedy += "; drake_diff downloads nothing, pydrake's PackageMap().GetPath('drake_models') does"
     elif xml is None and notes and notes[0].startswith(f"{path}, line"):
         remedy = f". Correct {notes[0].split(': only')[0]}"
-    return f"{path}: expected a robot model that Drake can read; Drake says: {message}{line}{remedy}"
-
-
-def _suspects(xml: XmlText, message: str) -> list[tuple[int, str]]:
-    """The first element that what Drake said can be about, with its line: Drake names none for a wrong value."""
-    value = re.search(r"attribute (\w+) got (.*)", message)
-    for element in xml.root.iter():
-        shown = f"<{element.tag} " + " ".join(f'{k}="{v}"' for k, v in element.attributes.items()) + ">"
-        if value and element.attributes.get(value[1]) == value[2].strip():
-            return [(element.line, shown)]
-        if not value and any(_wrong(element, word) for word in re.findall(r"\w+", message)):
-            return [(element.line, shown)]
-    return []
-
-
-def _wrong(element: Element, word: str) -> bool:
-    """Whether a number of an element cannot be right, where Drake's message has this word."""
-    if word.endswith(("limits", "lower")):
-        low, high = element.get("lower"), element.get("upper")
-        if element.get("range"):
-            low, _, high = element.get("range").partition(" ")
-        return _above(low, high) or _above("0", element.get("velocity", "0"))
-    if word in ("radius", "length", "size", "mass"):
-        text = element.get(word) or element.get("size" if word == "radius" else "value" if element.tag == word else "")
-        return any(_above("0", number) for number in text.split())
-    return False
-
-
-def _above(a: str, b: str) -> bool:
-    try:
-        return float(a) > float(b)
-    except ValueError:
-        return False
+    return f"{path}: expected a robot model that Drake can read; Drake says: {message}{remedy}"
 
 
 FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
@@ -346,11 +249,10 @@ logging.getLogger("drake").addFilter(lambda r: "not currently supported for defo
 
 @dataclass(frozen=True)
 class FileRead:
-    """What the user should know of a file that was read, a sentence each, where its packages are, and what it fixed."""
+    """What the user should know of a file that was read, a sentence each, and what it says that Drake does not keep."""
 
     notes: tuple[str, ...]
-    packages: PackageMap
-    fixed: tuple[str, ...]
+    facts: FileFacts
 
 
 def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None:
@@ -366,16 +268,11 @@ def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None
 
 
 def read_into(
-    plant: MultibodyPlant,
-    path: Path,
-    packages: Mapping[str, str] | None = None,
-    meshes: str = "skip",
-    fixed: tuple[str, ...] = (),
+    plant: MultibodyPlant, path: Path, packages: Mapping[str, str] | None = None, meshes: str = "skip"
 ) -> FileRead:
     """Add the model in `path` to `plant`; `packages` are folders by the name that package:// uses.
 
-    `meshes` is what becomes of collision meshes: see `load_model`. The joints called `fixed` are made fixed ones where
-    Drake could not do so later, in a file with mimic joints.
+    `meshes` is what becomes of collision meshes: see `load_model`.
 
     Raises InputError where the file is missing or of an unknown kind, ModelError where Drake refuses it.
     """
@@ -384,24 +281,22 @@ def read_into(
         raise InputError("model file", got=got, expected="a file that exists")
     if not path.name.endswith(FORMATS):
         raise InputError("model file", got=str(path), expected="a name that ends in " + ", ".join(FORMATS))
-    parser = Parser(plant)
     with TemporaryDirectory(prefix="drake_diff_") as folder, _drake_warnings() as notes:
-        reading = _Reading(parser, FileMeshes(meshes, Path(folder)), notes, packages, fixed)
+        reading = _Reading(Parser(plant), FileMeshes(meshes, Path(folder)), notes)
         try:
-            add_packages(parser.package_map(), path, packages)
+            add_packages(reading.parser.package_map(), path, packages)
             if path.name.endswith(".dmd.yaml"):
                 reading.directives(path)
             else:
                 reading.robot(path)
-            became = put_meshes(plant, parser.scene_graph(), reading.meshes)
+            became = put_meshes(plant, reading.parser.scene_graph(), reading.meshes)
             notes += reading.meshes.notes() + became
         except UnicodeDecodeError as error:
             got = f"byte {error.object[error.start]:#04x} at position {error.start}"
             raise ModelError(f"{path}: expected text in UTF-8, got {got}") from error
         except DRAKES_REFUSALS as error:
             raise ModelError(refusal(path, reading.in_own_words(str(error)), reading.xml, notes)) from error
-    sentences = tuple(reading.in_own_words(note) for note in notes)
-    return FileRead(sentences, PackageMap(parser.package_map()), reading.done)
+    return FileRead(tuple(map(reading.in_own_words, notes)), reading.facts)
 
 
 @dataclass
@@ -411,9 +306,7 @@ class _Reading:
     parser: Parser
     meshes: FileMeshes
     notes: list[str]
-    packages: Mapping[str, str] | None
-    fixed: tuple[str, ...]
-    done: tuple[str, ...] = ()
+    facts: FileFacts = field(default_factory=FileFacts)
     xml: XmlText | None = None  # of the robot file that is read at the moment
     given: dict[str, str] = field(default_factory=dict)  # the robot files by what the parser calls them
 
@@ -425,7 +318,8 @@ class _Reading:
             added = self.parser.AddModelsFromString(str(xml), path.suffix.lstrip("."))
         else:
             added = self.parser.AddModels(str(path))
-        self._corrected(xml, added[0] if added else None)
+        if added:
+            self._corrected(xml, added[0])
 
     def directives(self, path: Path) -> None:
         """Read a .dmd.yaml file: each robot file that it adds as `robot` reads one."""
@@ -437,7 +331,7 @@ class _Reading:
                 continue
             self.xml = None
             file = Path(self.parser.package_map().ResolveUrl(model.file))
-            robots[model.name] = xml = self._prepared(file)
+            robots[model.name] = xml = self._prepared(file, model.name)
             if xml is not None and xml.changed:
                 changed = self.meshes.folder / f"model_{i}" / file.name
                 changed.parent.mkdir()
@@ -446,24 +340,24 @@ class _Reading:
                 model.file = changed.as_uri()
         self.xml = None
         ProcessModelDirectives(flat, parser=self.parser)
-        plant = self.parser.plant()
         for name, xml in robots.items():
-            self._corrected(xml, plant.GetModelInstanceByName(name) if plant.HasModelInstanceNamed(name) else None)
+            if self.parser.plant().HasModelInstanceNamed(name):
+                self._corrected(xml, self.parser.plant().GetModelInstanceByName(name))
 
-    def _prepared(self, path: Path) -> XmlText | None:
+    def _prepared(self, path: Path, instance: str | None = None) -> XmlText | None:
         """The text of a robot file with its slips mended and its meshes looked for; None where it is no XML."""
         self.xml = xml = text_of(path, self.notes)
         if xml is None:
             return None
-        self.done += fix_in_text(xml, path, self.fixed)
+        read_facts(xml, instance, self.facts)
         read_meshes(self.meshes, xml, path, self.parser.package_map())
         if xml.changed:
             make_absolute(xml, path)
         return xml
 
-    def _corrected(self, xml: XmlText | None, instance: ModelInstanceIndex | None) -> None:
+    def _corrected(self, xml: XmlText | None, instance: ModelInstanceIndex) -> None:
         """Give what was read of an MJCF file the numbers that the file means."""
-        if xml is not None and xml.root.tag == "mujoco" and instance is not None:
+        if xml is not None and xml.root.tag == "mujoco":
             mjcf = Mjcf(xml)
             self.notes += correct(self.parser.plant(), instance, mjcf)
             if not mjcf.has_other_springs:

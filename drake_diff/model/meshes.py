@@ -98,7 +98,7 @@ def read_meshes(meshes: FileMeshes, xml: XmlText, path: Path, packages: PackageM
     if xml.root.tag == "mujoco":
         _convert_assets(meshes, xml, path)
         return
-    for element in xml.root.iter("visual", "collision"):
+    for element in list(xml.root.iter("visual", "collision")):
         mesh = next(element.iter("mesh"), None)
         if mesh is not None:
             try:

@@ -28,7 +28,7 @@ from drake_diff.model.contact_geometry import (
     touch_what_can_separate,
 )
 from drake_diff.model.contract import Contract, read_contract
-from drake_diff.model.file_facts import FileFacts, Mimic, file_facts
+from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.inputs import TIMES, BodyForce, add_body_forces, check_body_forces, read_inputs
 from drake_diff.model.load_file import DRAKES_REFUSALS, as_packages, read_into
 from drake_diff.model.meshes import TREATMENTS
@@ -540,10 +540,8 @@ def load_model(
         "packages": as_packages(packages),
         "body_forces": body_forces,
     }
-    fixed = options["fix_joints"] if mimic is None else ()  # else the followers are free of each other later
-    read = read_into(plant, source, options["packages"], meshes, fixed)
-    facts = file_facts(source, read.packages)
-    repairs, mimics = _repaired(plant, scene_graph, source, facts, read.fixed, options)
+    read = read_into(plant, source, options["packages"], meshes)
+    repairs, mimics = _repaired(plant, scene_graph, source, read.facts, options)
     notes = read.notes + repairs
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
@@ -575,7 +573,7 @@ def load_model(
         body_forces=body_forces,
     )
     model.options = options
-    model.file_facts = facts
+    model.file_facts = read.facts
     return model
 
 
@@ -699,27 +697,27 @@ def _check_choice(subject: str, value: str, known: tuple[str, ...]) -> None:
 
 
 def _repaired(
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    source: Path,
-    facts: FileFacts,
-    fixed: tuple[str, ...],
-    options: dict[str, Any],
+    plant: MultibodyPlant, scene_graph: SceneGraph, source: Path, facts: FileFacts, options: dict[str, Any]
 ) -> tuple[tuple[str, ...], tuple[Mimic, ...]]:
     """Change the plant as `options` say: a sentence for each change, and what is reduced. ModelError names the file."""
-    base, weld_base, asked = options["base"], options["weld_base"], options["actuators"]
+    base, weld_base, choice = options["base"], options["weld_base"], options["mimic"]
     if base is not None and weld_base is not None:
         raise InputError("base", got=f"{base!r} and weld_base={weld_base!r}", expected="one of them")
     if options["ground"] is not None and not options["contact"]:
         raise InputError("ground", got="contact=False too", expected="contact, without which nothing stands on it")
-    choice = options["mimic"]
+    mimics: tuple[Mimic, ...] = ()
     try:
-        mimics = () if choice is None else uncoupled(plant, still_moving(plant, facts.followers.values()))
-        notes = fix(plant, options["fix_joints"], fixed)
+        if choice is not None or options["fix_joints"]:  # Drake takes no joint out of a model with constraints
+            followers = [m for m in facts.followers.values() if choice is not None or m.in_drake]
+            mimics = uncoupled(plant, still_moving(plant, followers))
+        notes = fix(plant, options["fix_joints"])
         mimics = still_moving(plant, mimics)
-        notes += fix_mimics(plant, mimics) if choice == "fix" else ()
-        notes += couple(plant, mimics) if choice == "reduce" else ()
-        notes += add_actuators(plant, asked, facts)
+        if choice == "fix":
+            notes += fix_mimics(plant, mimics)
+        else:
+            reduced = couple(plant, mimics)
+            notes += reduced if choice == "reduce" else ()
+        notes += add_actuators(plant, options["actuators"], facts)
         if weld_base is not None:
             weld_link(plant, weld_base)
         notes += hold_base(plant, base)

@@ -247,14 +247,11 @@ def _what_holds(plant: MultibodyPlant) -> str:
     return f"as the file ties it to the world: {holders or 'there is no body'}"
 
 
-def fix(plant: MultibodyPlant, names: tuple[str, ...], done: Collection[str] = ()) -> tuple[str, ...]:
-    """Replace the joints called `names` by welds, where they start or at the nearest limit; a sentence that says so.
-
-    Those that are `done` were made fixed in the file's text.
-    """
+def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Replace the joints called `names` by welds, where they start or at the nearest limit; a sentence that says so."""
     known = {name: joint for name, joint in labelled(joints(plant)).items() if joint.num_velocities()}
-    fixed_at = [f"{name} at 0" for name in done]
-    for name in [name for name in names if name not in done]:
+    fixed_at = []
+    for name in names:
         if name not in known:
             raise UnknownNameError("fix_joints: joint that can move", got=name, known=known)
         joint = known[name]
@@ -264,8 +261,7 @@ def fix(plant: MultibodyPlant, names: tuple[str, ...], done: Collection[str] = (
         if plant.num_constraints():
             raise ModelError(
                 f"fix_joints={name!r}: Drake cannot take a joint out of a model with constraints, and this one has "
-                f"{plant.num_constraints()} (mimic joints, MJCF's equalities): "
-                "give mimic=, or fix the joint in the file"
+                f"{plant.num_constraints()} that are no mimic joints: fix the joint in the file"
             )
         low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
         q = float(np.clip(joint.default_positions()[0], low, high))

@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Convex
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull, QhullError
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError
@@ -314,8 +316,7 @@ def hull_of_file(path: Path, scale: tuple[float, float, float]) -> Hull:
 
     Raises ModelError where it cannot be read or encloses no volume.
     """
-    state = _state(path)
-    return _hull_of_file(path, scale, *state)
+    return _hull_of_file(path, scale, *_state(path))
 
 
 @lru_cache(maxsize=256)  # a model is built again for every other time step
@@ -330,69 +331,55 @@ def _hull_of_file(path: Path, scale: tuple[float, float, float], changed: int, s
 
 
 def hull_of(points: Array, label: str) -> Hull:
-    """The convex hull of `points` (n, 3), of at most MOST_CORNERS corners, by Drake.
+    """The convex hull of `points` (n, 3), of at most MOST_CORNERS corners.
 
     Of more than 20,000 points only those are taken that are farthest out in MOST_CORNERS directions. Raises
     ModelError where the points lie in one plane.
     """
     if len(points) > MESHES.most_points:
-        points = _outside(points, _drakes_hull(_farthest(points, MESHES.few_directions), label))
-    hull = _drakes_hull(points if len(points) <= MESHES.most_points else _farthest(points, MOST_CORNERS), label)
+        size = float(np.max(np.ptp(points, axis=0)))
+        inner = _qhull(_farthest(points, MESHES.few_directions), label)
+        points = points[_distance(points, inner) > -MESHES.joined * size]
+    hull = _qhull(points if len(points) <= MESHES.most_points else _farthest(points, MOST_CORNERS), label)
     if len(hull.corners) > MOST_CORNERS:
-        hull = _drakes_hull(_farthest(hull.corners, MOST_CORNERS), label)
+        hull = _qhull(_farthest(hull.corners, MOST_CORNERS), label)
     return replace(hull, lost=max(0.0, float(np.max(_distance(points, hull)))))
 
 
-def _outside(points: Array, hull: Hull) -> Array:
-    """Those of the points that are not inside the hull, its corners included."""
-    size = float(np.max(np.ptp(hull.corners, axis=0)))
-    return points[_distance(points, hull) > -MESHES.joined * size]
+def _qhull(points: Array, label: str) -> Hull:
+    try:
+        qhull = ConvexHull(points)
+    except (QhullError, ValueError) as error:
+        reason = str(error).strip().split("\n")[0]
+        raise ModelError(f"{label}: expected a mesh that encloses a volume; Qhull says: {reason}") from error
+    used, triangles = np.unique(qhull.simplices, return_inverse=True)
+    corners, triangles = points[used], triangles.reshape(-1, 3)
+    a, b, c = (corners[triangles[:, i]] for i in range(3))
+    inward = np.sum(np.cross(b - a, c - a) * qhull.equations[:, :3], axis=1) < 0
+    triangles[inward] = triangles[inward, ::-1]
+    planes = np.unique(qhull.equations, axis=0)
+    normals, offsets = planes[:, :3], -planes[:, 3]
+    if np.min(offsets - np.min(corners @ normals.T, axis=0)) <= MESHES.joined * np.max(np.ptp(corners, axis=0)):
+        raise ModelError(f"{label}: expected a mesh that encloses a volume, got a flat one")
+    return Hull(corners, normals, offsets, triangles, 0.0)
 
 
 def _distance(points: Array, hull: Hull) -> Array:
     """(n,) how far each point is outside the plane that it is farthest out of, negative inside the hull."""
-    planes = np.append(hull.normals, -hull.offsets[:, None], axis=1).T
-    return np.concatenate(
-        [np.max(np.append(block, np.ones((len(block), 1)), axis=1) @ planes, axis=1) for block in _split(points)]
-    )
+    return np.concatenate([np.max(p @ hull.normals.T - hull.offsets, axis=1) for p in _split(points)])
 
 
 def _split(points: Array) -> list[Array]:
-    """The points in parts of a size that products with many vectors are fast for."""
-    return np.array_split(points, 1 + len(points) // 500)
+    return np.array_split(points, 1 + len(points) // 2000)  # a product with many vectors of more points is slow
 
 
 def _farthest(points: Array, count: int) -> Array:
     """Those points that are farthest out along some of `count` directions."""
-    among = directions(count)
-    best, reach, start = np.zeros(count, dtype=np.int64), np.full(count, -np.inf), 0
+    among, best = directions(count), points[:0]
     for block in _split(points):
-        along = among @ block.T
-        winner = np.argmax(along, axis=1)
-        farther = along[np.arange(count), winner]
-        best, reach = np.where(farther > reach, winner + start, best), np.maximum(farther, reach)
-        start += len(block)
-    return points[np.unique(best)]
-
-
-def _drakes_hull(points: Array, label: str) -> Hull:
-    try:
-        mesh = Convex(points=points.T, label=" ".join(label.split())).GetConvexHull()
-    except RuntimeError as error:
-        raise ModelError(f"{label}: expected a mesh that encloses a volume; Drake says: {error}") from error
-    corners = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
-    faces = [mesh.element(e) for e in range(mesh.num_elements())]
-    normals = np.array([mesh.face_normal(e) for e in range(len(faces))])
-    offsets = np.max(corners @ normals.T, axis=0)
-    size = float(np.max(np.ptp(corners, axis=0)))
-    if float(np.min(offsets - np.min(corners @ normals.T, axis=0))) <= MESHES.joined * size:
-        raise ModelError(f"{label}: expected a mesh that encloses a volume, got a flat one")
-    triangles = [
-        [face.vertex(0), face.vertex(i), face.vertex(i + 1)]
-        for face in faces
-        for i in range(1, face.num_vertices() - 1)
-    ]
-    return Hull(corners, normals, offsets, np.array(triangles, dtype=np.int64), 0.0)
+        candidates = np.concatenate([best, block])
+        best = candidates[np.unique(np.argmax(among @ candidates.T, axis=1))]
+    return best
 
 
 MOST_SPHERES = 8  # for one hull
@@ -436,7 +423,7 @@ def fit_spheres(hull: Hull, label: str) -> Spheres:
     offsets = (hull.offsets - hull.normals @ middle) / size
     shape = _Shape(corners, hull.normals, offsets, _surface_points(corners, hull.triangles), label)
     largest = shape.largest_radius()
-    best = shape.alone(largest)
+    best = shape.measured([shape.closest_centre(shape.middle, largest)], largest)
     if best.ground_gap > SPHERES.close_enough * largest:
         tried = [shape.filled(share * largest) for share in SPHERES.radii]
         enough = [spheres for spheres in tried if spheres.ground_gap <= SPHERES.good_enough * largest]
@@ -454,14 +441,14 @@ class _Shape:
     surface: Array
     label: str
 
+    @property
+    def middle(self) -> Array:
+        return np.asarray(np.mean(self.surface, axis=0))
+
     def largest_radius(self) -> float:
         """That of the largest sphere that fits in (the Chebyshev ball), less what the solver may be off."""
-        program = MathematicalProgram()
-        x = program.NewContinuousVariables(4)
-        planes = np.append(self.normals, np.ones((len(self.normals), 1)), axis=1)
-        program.AddLinearConstraint(planes, np.full(len(planes), -np.inf), self.offsets, x)
-        program.AddLinearCost(-x[3])
-        solution = self._solved(program, x)
+        planes = np.column_stack([self.normals, np.ones(len(self.normals))])
+        solution = linprog([0, 0, 0, -1], planes, self.offsets, bounds=(None, None)).x
         return float(np.min(self.offsets - self.normals @ solution[:3])) * (1 - 1e-6)
 
     def closest_centre(self, point: Array, radius: float) -> Array:
@@ -470,60 +457,47 @@ class _Shape:
         x = program.NewContinuousVariables(3)
         program.AddLinearConstraint(self.normals, np.full(len(self.normals), -np.inf), self.offsets - radius, x)
         program.AddQuadraticErrorCost(np.eye(3), point, x)
-        return self._solved(program, x)
-
-    def _solved(self, program: MathematicalProgram, x: Array) -> Array:
         result = ClarabelSolver().Solve(program)
         if not result.is_success():
-            raise ModelError(
-                f"{self.label}: no place for a sphere in its hull was found: {result.get_solution_result()}"
-            )
+            why = result.get_solution_result()
+            raise ModelError(f"{self.label}: no place for a sphere in its hull was found: {why}")
         return np.asarray(result.GetSolution(x), dtype=float)
-
-    def alone(self, radius: float) -> Spheres:
-        """One sphere, as close to the middle as it fits in."""
-        return self._measured([self.closest_centre(np.mean(self.surface, axis=0), radius)], radius)
 
     def filled(self, radius: float) -> Spheres:
         """Spheres of `radius`, one after the other where they are missed most."""
-        farthest = self.corners[np.argmax(np.linalg.norm(self.corners - np.mean(self.surface, axis=0), axis=1))]
+        farthest = self.corners[np.argmax(np.linalg.norm(self.corners - self.middle, axis=1))]
         centres = [self.closest_centre(farthest, radius)]
         while len(centres) < MOST_SPHERES:
-            placed = np.array(centres)
-            wanted = [self.closest_centre(point, radius) for point in self._missing(placed, radius)]
-            new = [c for c in wanted if np.min(np.linalg.norm(placed - c, axis=1)) >= SPHERES.same * radius]
+            wanted = [self.closest_centre(point, radius) for point in self._missing(np.array(centres), radius)]
+            new = [c for c in wanted if np.min(np.linalg.norm(centres - c, axis=1)) >= SPHERES.same * radius]
             if not new:
                 break  # the spheres will do, or none of this radius comes closer
             centres.append(new[0])
-        return self._measured(centres, radius)
+        return self.measured(centres, radius)
 
-    def _measured(self, places: list[Array], radius: float) -> Spheres:
+    def measured(self, places: list[Array], radius: float) -> Spheres:
+        """The spheres, as large as they fit in, with their gaps."""
         centres = np.array(places)
         inside = min(radius, float(np.min(self.offsets - centres @ self.normals.T)))
-        ground, bare = self._ground_gaps(centres, inside), self._open_gaps(centres, inside)
+        ground, bare = self._gaps(centres, inside)
         return Spheres(centres, inside, max(0.0, float(np.max(ground))), max(0.0, float(np.max(bare))))
 
     def _missing(self, centres: Array, radius: float) -> list[Array]:
         """The points (3,) of the hull that need a sphere most, the worst first."""
-        probes = directions(SPHERES.probes)
-        ground, bare = self._ground_gaps(centres, radius), self._open_gaps(centres, radius)
-        missing = []
+        (ground, bare), missing = self._gaps(centres, radius), []
         if np.max(ground) > SPHERES.close_enough * radius:
-            missing.append(self.corners[np.argmax(self.corners @ probes[np.argmax(ground)])])
+            worst = directions(SPHERES.probes)[np.argmax(ground)]
+            missing.append(self.corners[np.argmax(self.corners @ worst)])
         if np.max(bare) > radius:
             missing.append(self.surface[np.argmax(bare)])
         return missing
 
-    def _ground_gaps(self, centres: Array, radius: float) -> Array:
-        """How much farther than the spheres the hull reaches in each direction."""
-        probes = directions(SPHERES.probes)
-        reach = np.max(self.corners @ probes.T, axis=0)
-        return np.asarray(reach - np.max(centres @ probes.T, axis=0) - radius)
-
-    def _open_gaps(self, centres: Array, radius: float) -> Array:
-        """The distance of each point of the surface from the closest sphere."""
-        apart = np.linalg.norm(self.surface[:, None] - centres, axis=2)
-        return np.asarray(np.min(apart, axis=1) - radius)
+    def _gaps(self, centres: Array, radius: float) -> tuple[Array, Array]:
+        """How much farther than the spheres the hull reaches by direction, and how far its surface is from them."""
+        probes = directions(SPHERES.probes).T
+        ground = np.max(self.corners @ probes, axis=0) - np.max(centres @ probes, axis=0) - radius
+        bare = np.min(np.linalg.norm(self.surface[:, None] - centres, axis=2), axis=1) - radius
+        return np.asarray(ground), np.asarray(bare)
 
 
 def _surface_points(corners: Array, triangles: Integers) -> Array:

@@ -110,12 +110,19 @@ class XmlText:
 
     def content(self, element: Element) -> str:
         """The XML text inside an element."""
+        close = self._end_tag(element)
+        return "" if close is None else self.data[element.inside : close].decode()
+
+    def _end_tag(self, element: Element) -> int | None:
+        """Where the end tag of an element begins; None where it has none."""
         if self.data[element.inside - 2 : element.inside] == b"/>":
-            return ""
-        return self.data[element.inside : self._tags.rindex(b"</", element.inside, element.end)].decode()
+            return None
+        return self._tags.rindex(b"</", element.inside, element.end)
 
     def remove(self, element: Element) -> None:
         """Take an element out; its lines stay, empty."""
+        if element.parent is not None:
+            element.parent.children.remove(element)
         self._replace(element.start, element.end, b"")
 
     def replace(self, element: Element, text: str) -> None:
@@ -128,27 +135,23 @@ class XmlText:
 
     def append(self, element: Element, text: str) -> None:
         """Put XML text behind all that is inside an element."""
-        if self.data[element.inside - 2 : element.inside] == b"/>":
+        close = self._end_tag(element)
+        if close is None:
             self.fill(element, text)
-            return
-        close = self._tags.rindex(b"</", element.inside, element.end)
-        self._replace(close, close, text.encode())
+        else:
+            self._replace(close, close, text.encode())
 
     def rename(self, element: Element, tag: str) -> None:
         """Give an element another tag."""
-        old = element.tag.encode()
-        self._replace(element.start + 1, element.start + 1 + len(old), tag.encode())
-        if self.data[element.inside - 2 : element.inside] != b"/>":
-            close = self._tags.rindex(b"</", element.inside, element.end)
-            self._replace(close + 2, close + 2 + len(old), tag.encode())
+        close, length = self._end_tag(element), len(element.tag.encode())
+        for start in (element.start + 1, *([] if close is None else [close + 2])):
+            self._replace(start, start + length, tag.encode())
         element.tag = tag
 
     def set(self, element: Element, name: str, value: str) -> None:
         """Give an attribute another value, or add it."""
         element.attributes[name] = value
-        tag = self.data[element.start : element.inside]
-        new = quoteattr(value).encode()
-        match = re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
+        match, new = self._attribute(element, name), quoteattr(value).encode()
         if match:
             self._replace(element.start + match.start(1), element.start + match.end(1), new)
         else:
@@ -157,19 +160,20 @@ class XmlText:
 
     def drop(self, element: Element, name: str) -> None:
         """Take an attribute out, if it is there."""
-        tag = self.data[element.start : element.inside]
-        match = re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
-        if match:
+        if match := self._attribute(element, name):
             self._replace(element.start + match.start(), element.start + match.end(), b"")
+
+    def _attribute(self, element: Element, name: str) -> re.Match[bytes] | None:
+        tag = self.data[element.start : element.inside]
+        return re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
 
     def fill(self, element: Element, content: str) -> None:
         """Put XML text in the place of all that is inside an element."""
-        if self.data[element.inside - 2 : element.inside] == b"/>":
-            end = f"</{element.tag}>"
-            self._replace(element.inside - 2, element.inside, f">{content}{end}".encode())
-            return
-        close = self._tags.rindex(b"</", element.inside, element.end)
-        self._replace(element.inside, close, content.encode())
+        close = self._end_tag(element)
+        if close is None:
+            self._replace(element.inside - 2, element.inside, f">{content}</{element.tag}>".encode())
+        else:
+            self._replace(element.inside, close, content.encode())
 
     def _replace(self, start: int, end: int, new: bytes) -> None:
         lost = self.data.count(b"\n", start, end) - new.count(b"\n")

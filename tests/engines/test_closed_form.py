@@ -72,21 +72,10 @@ def test_a_textbooks_equations_stand_beside_drake_and_mujoco(model):
     assert both.engines[1].function.name == "cart_pole"
 
 
-def test_the_functions_own_order_of_joints_is_told_and_mapped(model):
-    def other_way(q, v, u, p):
-        return cart_pole(q[::-1], v[::-1], u, p)[::-1]
-
-    told = found(model, mine(model, other_way, joints=("hinge", "slide")))
-    assert told.verdict == "same"
-    assert lines(told)["joint order and names"].verdict == "mapped"
-    untold = found(model, mine(model, other_way))
-    assert untold.verdict == "other model"
-
-
 WRONG = {  # what is wrong: parameters, the only part that is different, how it is told
-    "the sign of gravity": ({"g": -9.81}, "forces at rest", "of hinge, .* its sign is the other one"),
+    "the sign of gravity": ({"g": -9.81}, "forces at rest", "of hinge, .* -1 times what it is to be"),
     "gravity of another place": ({"g": 9.7902}, "forces at rest", "0.997982 times"),
-    "no velocity products": ({"coriolis": 0.0}, "velocity products", "of slide, .* it is missing"),
+    "no velocity products": ({"coriolis": 0.0}, "velocity products", "of slide, .*e?-?[0-9]+ times"),
     "half of the velocity products": ({"coriolis": 0.5}, "velocity products", "of slide, .* 0.5 times"),
     "an actuator that gives 1 % more": ({"gain": 1.01}, "forces of the inputs", "of slide, .* 1.01 times"),
 }
@@ -154,11 +143,8 @@ REFUSED = {
     "text": (lambda q, v, u, p: "a", {}, InputError, "expected an array of numbers"),
     "fails": (fails, {}, InputError, "IndexError"),
     "too few arguments": (lambda q: q, {}, InputError, "TypeError"),
-    "not twice the same": (changes, {}, InputError, "a function of its arguments alone"),
+    "not twice the same": (changes, {}, InputError, "a function of q, v and u alone"),
     "no function": (1.0, {}, InputError, "expected a function of q, v and u, got 1.0"),
-    "unknown joint": (cart_pole, {"joints": ("slide", "pole")}, UnknownNameError, "hinge, slide"),
-    "a joint twice": (cart_pole, {"joints": ("slide", "slide")}, InputError, "each of slide, hinge once"),
-    "unknown input": (cart_pole, {"inputs": ("motor",)}, UnknownNameError, "force"),
     "integrator": (cart_pole, {"integrator": "Euler"}, UnknownNameError, "RK4"),
     "parameter": (cart_pole, {"parameters": {**TRUE, "g": np.inf}}, NonFiniteError, "parameters"),
     "name": (cart_pole, {"name": ""}, InputError, "expected a name"),

@@ -141,12 +141,6 @@ BAD_FILES = {
         "directives:\n- add_model:\n    name: x\n    file: package://drake_models/a.urdf\n",
         r"packages=\{'drake_models': folder\}\); drake_diff downloads nothing",
     ),
-    # What Drake names no line for.
-    "line_of_limits.urdf": (
-        urdf("</joint>", f"\n{LIMITED}").replace("continuous", "revolute"),
-        r'see .*line_of_limits.urdf:2: <limit lower="1" upper="-1"',
-    ),
-    "line_of_radius.urdf": (shape('\n\n<sphere radius="-1"/>'), r'line_of_radius.urdf:3: <sphere radius="-1">'),
     # These two are refused by a condition in Drake's C++, which pydrake raises as SystemExit: it ended the process.
     "limits_crossed.urdf": (urdf("</joint>", LIMITED).replace("continuous", "revolute"), "limit"),
     "range_crossed.xml": (mjcf('range="1 -1"'), "limits"),
