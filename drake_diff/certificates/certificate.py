@@ -6,14 +6,14 @@ What the differences say is in `differences`; `judge` makes the verdict, and `Ce
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.arrays import Array, Indices, finite_array, frozen
 from drake_diff._base.differences import Difference, Function, Many, one_by_one
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.certificates.differences import DIFFERENCES, TINY, Neighbourhood, look_around
@@ -51,6 +51,7 @@ class VerdictOptions:
 LIMITS = VerdictOptions()
 
 EPS = float(np.finfo(float).eps)
+AGREE, UNDECIDED, NOT_CONVERGED, DISAGREE, DISCONTINUOUS = range(len(VERDICTS))
 
 Flags = NDArray[np.bool_]
 Scales = tuple[Array, Array]
@@ -83,35 +84,29 @@ def judge(
     """
     difference, doubt = _nearest(around, a, second)
     size, least = _matters(around, a, difference, second)
-    early = LIMITS.early * stopped * np.abs(difference).max(axis=1, keepdims=True, initial=0)
-    tolerance = LIMITS.exact * np.abs(difference) + LIMITS.trusted * doubt + LIMITS.power * least / 100
-    doubtful = tolerance + np.minimum(early, LIMITS.doubtful * size)
-    tolerance += np.minimum(early, LIMITS.stopped * size)
+    largest = np.abs(difference).max(axis=1, keepdims=True, initial=0)
+    early = LIMITS.early * stopped * largest
+    exact = LIMITS.exact * np.abs(difference) + LIMITS.trusted * doubt + LIMITS.power * least / 100
+    doubtful = exact + np.minimum(early, LIMITS.doubtful * size)
+    tolerance = exact + np.minimum(early, LIMITS.stopped * size)
     gap = np.abs(a - difference)
     noticeable = tolerance + gap
     tells = LIMITS.trusted * doubt <= LIMITS.power * size
-    codes = np.full(a.shape, VERDICTS.index("undecided"))
-    codes[(gap <= tolerance) & (noticeable <= LIMITS.power * size)] = VERDICTS.index("agree")
-    left_out = (a == 0) & _is_left_out(around) & (noticeable <= LIMITS.exact * np.abs(difference).max(initial=0))
-    codes[left_out] = VERDICTS.index("agree")
-    size = np.where(
-        left_out, np.maximum(size, noticeable / LIMITS.power), size
-    )  # nothing else tells what matters there
-    codes[(gap > doubtful) & (tells | (gap > LIMITS.doubtless * tolerance))] = VERDICTS.index("disagree")
-    reasons = _broken(around, a, difference, size)
-    for j, why in _stairs(around, size).items():
-        reasons.setdefault(j, why)
+    codes = np.full(a.shape, UNDECIDED)
+    codes[(gap <= tolerance) & (noticeable <= LIMITS.power * size)] = AGREE
+    # The function does not depend on the variable: to the last bit it is the same at every step.
+    unchanged = np.all((around.forward == 0) & (around.backward == 0), axis=0)
+    left_out = (a == 0) & unchanged & (noticeable <= LIMITS.exact * np.abs(difference).max(initial=0))
+    codes[left_out] = AGREE
+    size = np.where(left_out, np.maximum(size, noticeable / LIMITS.power), size)
+    codes[(gap > doubtful) & (tells | (gap > LIMITS.doubtless * tolerance))] = DISAGREE
+    reasons = _stairs(around, size) | _broken(around, a, difference, size)
     if beside is not None:
-        for i, j in np.argwhere(_jittery(around, a, beside)):
-            reasons.setdefault((int(i), int(j)), f"1e-9 beside the point the derivative is {beside[i, j]:.6g}")
+        jittery = np.argwhere(_jittery(around, a, beside)).tolist()
+        reasons = {(i, j): f"1e-9 beside the point the derivative is {beside[i, j]:.6g}" for i, j in jittery} | reasons
     for entry in reasons:
-        codes[entry] = VERDICTS.index("discontinuous")
+        codes[entry] = DISCONTINUOUS
     return Judgement(difference, tolerance, noticeable, size, codes, reasons)
-
-
-def _is_left_out(around: Neighbourhood) -> Flags:
-    """(m, n) where the function does not depend on the variable: to the last bit it is the same at every step."""
-    return np.asarray(np.all((around.forward == 0) & (around.backward == 0), axis=0))
 
 
 def _nearest(around: Neighbourhood, a: Array, second: Scales | None) -> tuple[Array, Array]:
@@ -120,15 +115,17 @@ def _nearest(around: Neighbourhood, a: Array, second: Scales | None) -> tuple[Ar
     The limit is at the smallest steps that tell 1 %; of the plateaus that agree with that one the best is taken.
     """
     values, uncertainty = around.plateaus()
-    best = np.argmin(uncertainty, axis=0)[None]
-    size, _ = _matters(around, a, np.take_along_axis(values, best, axis=0)[0], second)
+
+    def choose(which: Indices) -> tuple[Array, Array]:
+        value, doubt = (np.take_along_axis(numbers, which[None], axis=0)[0] for numbers in (values, uncertainty))
+        return value, doubt
+
+    best = np.argmin(uncertainty, axis=0)
+    size, _ = _matters(around, a, choose(best)[0], second)
     tells = LIMITS.trusted * uncertainty <= LIMITS.power * size
-    nearest = np.where(tells.any(axis=0), len(values) - 1 - np.argmax(tells[::-1], axis=0), best[0])[None]
-    first, doubt = (np.take_along_axis(numbers, nearest, axis=0) for numbers in (values, uncertainty))
-    stands = np.abs(values - first) <= LIMITS.trusted * (uncertainty + doubt)
-    best = np.argmin(np.where(stands, uncertainty, np.inf), axis=0)[None]
-    nearest_value, doubt = (np.take_along_axis(numbers, best, axis=0)[0] for numbers in (values, uncertainty))
-    return nearest_value, doubt
+    value, doubt = choose(np.where(tells.any(axis=0), len(values) - 1 - np.argmax(tells[::-1], axis=0), best))
+    stands = np.abs(values - value) <= LIMITS.trusted * (uncertainty + doubt)
+    return choose(np.argmin(np.where(stands, uncertainty, np.inf), axis=0))
 
 
 def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales | None) -> tuple[Array, Array]:
@@ -145,28 +142,22 @@ def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales 
     - what the smallest step of the widest plateau leaves of the rounding of the value, which is measured, up to 1e-6
       of the largest entry of the row.
     """
-    magnitude = np.abs(difference)
-    small = _negligible(magnitude, second)
+    largest = np.abs(difference).max(axis=1, keepdims=True, initial=0)
     rounding = (LIMITS.significant * around.finest / DIFFERENCES.steps[3] / LIMITS.power)[:, None]
-    rounding = np.minimum(rounding, LIMITS.rounded * magnitude.max(axis=1, keepdims=True, initial=0))
     widest = LIMITS.vanishing * np.maximum(np.abs(around.forward[0]), np.abs(around.backward[0]))
-    least = np.maximum(np.maximum(small, widest), rounding) + EPS * magnitude.max(initial=0) + TINY
-    return np.maximum(np.maximum(np.abs(a), magnitude), least), least
+    return weigh(a, difference, second, np.maximum(widest, np.minimum(rounding, LIMITS.rounded * largest)))
 
 
-def weighed(a: Array, second: Scales | None) -> Array:
-    """(m, n) what an error of each entry of `a` is measured by: see `_matters`; nothing is excused by rounding."""
-    magnitude = np.abs(a)
-    return np.maximum(magnitude, _negligible(magnitude, second) + EPS * magnitude.max(initial=0) + TINY)
-
-
-def _negligible(magnitude: Array, second: Scales | None) -> Array:
-    """(m, n) the least that matters of entries of these magnitudes."""
+def weigh(a: Array, difference: Array, second: Scales | None, floor: Array | float = 0.0) -> tuple[Array, Array]:
+    """(m, n) what an error of each entry is measured by, and the least of that: see `_matters`."""
+    magnitude = np.abs(difference)
     small = _small(magnitude)
     if second is not None:
         unit = second[0][:, None] / second[1]
         small = np.minimum(small, unit * _small(magnitude / unit))
-    return np.maximum(small, LIMITS.unseen * magnitude.max(axis=1, keepdims=True, initial=0))
+    small = np.maximum(small, LIMITS.unseen * magnitude.max(axis=1, keepdims=True, initial=0))
+    least = np.maximum(small, floor) + EPS * magnitude.max(initial=0) + TINY
+    return np.maximum(np.maximum(np.abs(a), magnitude), least), least
 
 
 def _small(magnitude: Array) -> Array:
@@ -313,15 +304,15 @@ class Certificate(ShowsItsRepr):
     noticeable: Array
     size: Array
     codes: NDArray[np.int64]
-    reasons: dict[tuple[int, int], str]  # of the entries that are discontinuous
     method: str
     subject: str
+    scale: Array  # (n,) of the displacements by which entries are compared
+    reasons: dict[tuple[int, int], str] = field(default_factory=dict)  # of the entries that are discontinuous
     # In displacements of which one changes a column by its `scale`; None where the differences are of another motion,
     # or along directions alone: `difference` then is the matrix nearest to the derivative that has their slopes.
-    around: Neighbourhood | None
-    scale: Array  # (n,)
-    stopped: float  # how early the solver stopped where the derivative was taken, as a part of the momentum
-    second: Scales | None  # units of rows and columns by which entries are weighed as well
+    around: Neighbourhood | None = None
+    stopped: float = 0.0  # how early the solver stopped where the derivative was taken, as a part of the momentum
+    second: Scales | None = None  # units of rows and columns by which entries are weighed as well
     told: str = ""  # whose differences these are, where it is not plain
     mode_changes: tuple[ModeChange, ...] = ()  # of contact, within 1e-4 of the point
 
@@ -361,10 +352,8 @@ class Certificate(ShowsItsRepr):
         if self.around is None:
             raise InputError("of", got="a certificate without differences of each entry", expected="one by `certify`")
         a = finite_array("derivative", derivative, self.derivative.shape) * self.scale
-        named = {
-            name: getattr(self, name) for name in ("rows", "columns", "method", "subject", "told", "stopped", "second")
-        }
-        return certificate_of(self.around, a, None, scale=self.scale, **named)
+        names = ("rows", "columns", "method", "subject", "told", "stopped", "second", "scale")
+        return certificate_of(self.around, a, None, **{name: getattr(self, name) for name in names})
 
     def count(self, verdict: str) -> int:
         """How many entries have this verdict."""
@@ -469,30 +458,25 @@ def certify_displacement(
     *,
     rows: tuple[str, ...],
     columns: tuple[str, ...],
-    scale: Array,
+    subject: str,
     beside: Array | None = None,
     minus: Difference = np.subtract,
     unsolved: Array | float = 0.0,
-    stopped: float = 0.0,
     point: Array | None = None,
-    told: str = "",
-    method: str = "given",
-    subject: str = "the derivative",
+    **named: Any,
 ) -> Certificate:
     """Certify `derivative` (m, n) of `f` at 0, a function of scaled displacements (K, n) with values (K, m).
 
-    `beside` is the derivative at a point 1e-9 away; `scale` (n,) takes the scaling out of what is reported;
     `minus` subtracts two values of `f`, on a tangent space if need be; `unsolved` (m,) is how wrong a value of `f` may
-    be because a solver stopped early, and `stopped` is how early, relative: see `judge`; `point` (n,) is what is
-    displaced, in the same units, if it is numbers that are rounded; `told` says whose differences these are.
+    be because a solver stopped early; `point` (n,) is what is displaced, in the same units, if it is numbers that are
+    rounded. The others are arguments of `certificate_of`.
     """
     if derivative.shape != (len(rows), len(columns)):
         raise ShapeError("derivative", got=derivative.shape, expected=(len(rows), len(columns)))
     if not np.all(np.isfinite(derivative)):
         raise GradientError(f"{subject} is not finite: {derivative}")
     around = look_around(f, len(columns), minus, unsolved, point)
-    named: dict[str, Any] = {"rows": rows, "columns": columns, "method": method, "subject": subject, "told": told}
-    return certificate_of(around, derivative, beside, scale=scale, stopped=stopped, **named)
+    return certificate_of(around, derivative, beside, rows=rows, columns=columns, subject=subject, **named)
 
 
 def certificate_of(
@@ -505,14 +489,20 @@ def certificate_of(
     second: Scales | None = None,
     **named: Any,
 ) -> Certificate:
-    """The verdict on a `derivative` (m, n) by the scaled displacements; see `judge`."""
-    judgement = judge(around, derivative, beside, stopped, second)
-    numbers = (derivative, judgement.difference, judgement.tolerance, judgement.noticeable, judgement.size)
-    a, d, t, noticeable, size = (frozen(some / scale) for some in numbers)
-    return Certificate(
-        derivative=a, difference=d, tolerance=t, noticeable=noticeable, size=size, codes=judgement.codes,
-        reasons=judgement.reasons, around=around, scale=scale, stopped=stopped, second=second, **named,
-    )  # fmt: skip
+    """The verdict on a `derivative` (m, n) by displacements in parts of `scale` (n,): see `judge`."""
+    by = judge(around, derivative, beside, stopped, second)
+    numbers = unscaled(scale, derivative, by.difference, by.tolerance, by.noticeable, by.size)
+    more: dict[str, Any] = {"around": around, "scale": scale, "stopped": stopped, "second": second}
+    return Certificate(**numbers, codes=by.codes, reasons=by.reasons, **more, **named)
+
+
+def unscaled(
+    scale: Array, derivative: Array, difference: Array, tolerance: Array, noticeable: Array, size: Array
+) -> dict[str, Any]:
+    """A certificate's numbers (m, n) by its columns, of those by scaled displacements."""
+    numbers = {"derivative": derivative, "difference": difference, "tolerance": tolerance}
+    numbers |= {"noticeable": noticeable, "size": size}
+    return {name: frozen(values / scale) for name, values in numbers.items()}
 
 
 def jitter(scale: Array) -> Array:

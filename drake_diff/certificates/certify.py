@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,8 +13,8 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.differences import one_by_one
 from drake_diff.certificates.certificate import LIMITS, Certificate, ModeChange, certificate_of, jitter
 from drake_diff.certificates.differences import Neighbourhood, is_broken, look_around
-from drake_diff.certificates.directions import FirstLook, LookAt, certificate_by
-from drake_diff.derivatives.refine_step import refine_steps
+from drake_diff.certificates.directions import FirstLook, LookAt
+from drake_diff.derivatives.refine_step import RefinedSteps, refine_steps
 from drake_diff.derivatives.smooth_step import form_of
 from drake_diff.derivatives.sources import check_method, step_at
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along, step_jacobians
@@ -93,7 +94,7 @@ def _certified(
 ) -> Certificate:
     """`certify`; `look_beside` the point too, at the derivative 1e-9 away by `method`."""
     with applied(vector) as model:
-        step, nx = StepAround.of_point(model, vector, tangent_space(model), x, u), model.nx
+        step, nx = StepAround.of_point(model, vector, x, u), model.nx
         d, beside = derivatives or step_jacobians(model, vector, x, u, method), None
         if look_beside and not vector.parameters:
             jittered = step.moved(jitter(np.ones_like(step.scale)))
@@ -101,15 +102,10 @@ def _certified(
         derivative = step.jacobian(d, x)
         around, note, left = step.look_around()
         certificate = certificate_of(
-            around,
-            derivative,
-            beside,
-            stopped=left,
-            second=in_steps(model, step.space, len(step.scale)),
-            **step.labels(d, note),
+            around, derivative, beside, stopped=left, second=step.units, **step.labels(d, note)
         )
-        limits = _at_limits(model, x) if certificate.verdict != "agree" else ""
-        certificate = replace(certificate, told=_joined(certificate.told, limits))
+        if certificate.verdict != "agree":
+            certificate = replace(certificate, told=_joined(certificate.told, _limits_that_act(model, x)))
         if not model.contract.contact.collision_pairs:
             return certificate
         return replace(certificate, mode_changes=_find_mode_changes(step, derivative))
@@ -120,7 +116,7 @@ def _joined(*texts: str) -> str:
     return "; ".join(text for text in texts if text)
 
 
-def _at_limits(model: Model, x: Array) -> str:
+def _limits_that_act(model: Model, x: Array) -> str:
     """Which positions are at or beyond a joint limit, where a step has a corner and its forces are stiff."""
     limits = []
     for name, q, low, high in zip(model.position_names, x, *model.position_limits, strict=False):
@@ -140,44 +136,68 @@ def certify_inside(
     what the derivative exactly at the limit differs from the one just inside, what is certified is off. `derivatives`
     are those on the inner side, where they are known.
     """
-    inside = with_room(model, u)
+    inside = _with_room(model, u)
     certificate = _certified(model, x, inside, select(model, parameters), "auto", derivatives, look_beside=True)
-    moved = inside != u
-    if not moved.any():
+    if np.array_equal(inside, u):
         return certificate
-    note = _joined(certificate.told, beside_limits(model, moved))
-    leap = leap_at_limits(model, x, u, np.sign(inside - u), parameters)
+    note = _joined(certificate.told, _beside_limits(model, inside != u))
+    leap = _leap_at_limits(model, x, u, np.sign(inside - u), parameters)
     if np.any(np.abs(leap) > STEP.leap * certificate.size):
         note += f", at which the derivative is another one, by up to {np.max(np.abs(leap)):.3g}"
         certificate = replace(certificate.of(certificate.derivative + leap), mode_changes=certificate.mode_changes)
     return replace(certificate, told=note)
 
 
-def beside_limits(model: Model, at_limit: NDArray[np.bool_]) -> str:
+def _beside_limits(model: Model, at_limit: NDArray[np.bool_]) -> str:
     """What a certificate says of inputs that are at the limit of their effort."""
     return f"{', '.join(np.array(model.input_names)[at_limit])} certified beside the limit of its effort"
 
 
-def with_room(model: Model, us: Array) -> Array:
+def _with_room(model: Model, us: Array) -> Array:
     """Inputs (..., nu) that leave differences room to effort limits."""
     limits = form_of(model).cut
     room = np.minimum(STEP.effort_room * np.maximum(1.0, np.abs(us)), STEP.effort_part * limits)
     return np.minimum(np.maximum(us, room - limits), limits - room)
 
 
-def leap_at_limits(model: Model, x: Array, u: Array, inward: Array, parameters: Parameters) -> Array:
+def _leap_at_limits(model: Model, x: Array, u: Array, inward: Array, parameters: Parameters) -> Array:
     """The derivative at u (nu,) less that 1e-9 of u away, to the side that the signs `inward` (nu,) say."""
-    vector, both = select(model, parameters), []
+    vector = select(model, parameters)
+    beside = u + LIMITS.jitter * np.maximum(1.0, np.abs(u)) * inward
     with applied(vector) as model:
         space = tangent_space(model)
-        for inputs in (u, u + LIMITS.jitter * np.maximum(1.0, np.abs(u)) * inward):
-            d = step_jacobians(model, vector, x, inputs, "auto")
-            both.append(space.jacobian(x, d.x_next, d.A, d.B, d.C))
-    return np.asarray(both[0] - both[1])
+        both = (step_jacobians(model, vector, x, inputs, "auto") for inputs in (u, beside))
+        exactly, inside = (space.jacobian(x, d.x_next, d.A, d.B, d.C) for d in both)
+    return np.asarray(exactly - inside)
 
 
-class _RefusedError(Exception):
-    """A step that is not known to rounding."""
+def certify_steps(model: Model, xs: Array, us: Array, *, parameters: Parameters = ()) -> tuple[Certificate, ...]:
+    """`certify_inside` at each of xs (N, nx) and us (N, nu), by a first look where that leaves no doubt.
+
+    The derivatives are taken in one call, as by a search. What is in doubt is looked at as it is, not taken anew.
+    """
+    inside, certificates = _with_room(model, us), []
+    for x, u, within, look in zip(xs, us, inside, first_looks(model, xs, inside, parameters), strict=True):
+        sure, at_limit = look.certificate, within != u
+        if sure is not None and at_limit.any():
+            leap = _leap_at_limits(model, x, u, np.sign(within - u), parameters)
+            small = np.all(np.abs(leap) <= STEP.leap * sure.size)
+            sure = replace(sure, told=f"{sure.told}; {_beside_limits(model, at_limit)}") if small else None
+        if sure is None:
+            sure = certify_inside(model, x, u, parameters=parameters, derivatives=look.derivatives)
+        certificates.append(sure)
+    return tuple(certificates)
+
+
+class UnsolvedError(Exception):
+    """A step is not known to rounding; it says why."""
+
+
+def solved(refined: RefinedSteps) -> RefinedSteps:
+    """`refined`; raises UnsolvedError where a step is refused."""
+    for k, why in refined.refused.items():
+        raise UnsolvedError(f"{why} (step {k})" if len(refined.refused) < len(refined.left) else str(why))
+    return refined
 
 
 @dataclass(frozen=True)
@@ -191,10 +211,18 @@ class StepAround:
     scale: Array
 
     @classmethod
-    def of_point(cls, model: Model, vector: ParameterVector, space: TangentSpace, x: Array, u: Array) -> StepAround:
+    def of_point(cls, model: Model, vector: ParameterVector, x: Array, u: Array) -> StepAround:
         """Around the step from x (nx,) under u (nu,), `vector` being applied."""
+        space = tangent_space(model)
         scale = np.concatenate([state_scale(space, x), np.maximum(1.0, np.abs(u)), vector.difference_scale()])
         return cls(model, vector, space, np.concatenate([x, u, vector.values]), scale)
+
+    @property
+    def units(self) -> tuple[Array, Array]:
+        """Of the state (size,), and of all columns, where time is counted in steps."""
+        size, nv = self.space.size, self.model.nv
+        state = np.where(np.arange(size) < size - nv, 1.0, 1 / self.model.time_step)
+        return state, np.concatenate([state, np.ones(len(self.scale) - size)])
 
     def jacobian(self, d: StepDerivatives, x: Array) -> Array:
         """(size, n) of derivatives at x (nx,), by scaled displacements."""
@@ -217,36 +245,122 @@ class StepAround:
 
     def drake(self, displacement: Array) -> Array:
         """(nx,) where Drake's own step leads, on the double twin, which is left there."""
-        moved, nx, end = self.moved(displacement), self.model.nx, self.model.nx + self.model.nu
-        return step_at(self.model, self.vector, moved[:nx], moved[nx:end], moved[end:])
+        return step_at(self.model, self.vector, *self._split(self.moved(displacement)))
+
+    def solved(self, displacements: Array, held: Array | None = None) -> RefinedSteps:
+        """The steps at displacements (K, n) to rounding, with a momentum that is held back in their balance."""
+        points = self._split(np.array([self.moved(d) for d in displacements]))
+        momenta = None if held is None else np.repeat(held, len(displacements), axis=0)
+        return solved(refine_steps(self.model, self.vector, *points, momenta))
+
+    def _split(self, points: Array) -> tuple[Array, Array, Array]:
+        nx, end = self.model.nx, self.model.nx + self.model.nu
+        return points[..., :nx], points[..., nx:end], points[..., end:]
+
+    @property
+    def tolerance(self) -> float:
+        """How accurately Drake solves the step."""
+        return solver_tolerance(self.model, *self._split(self.point)[:2])
 
     def look_around(self) -> tuple[Neighbourhood, str, float]:
         """The differences of the step, to rounding if that can be had, whose steps they are of, and what Drake's own
         step leaves at the point, of the momentum."""
-        model, space, n = self.model, self.space, len(self.scale)
-        tolerance = solver_tolerance(model, self.point[: model.nx], self.point[model.nx : model.nx + model.nu])
+        space, n, tolerance = self.space, len(self.scale), self.tolerance
         if not tolerance:
             return look_around(one_by_one(self.drake), n, space.minus), "", 0.0
-        left = []
+        worst = []
 
-        def solved(displacements: Array) -> Array:
-            moved, nx, end = np.array([self.moved(d) for d in displacements]), model.nx, model.nx + model.nu
-            refined = refine_steps(model, self.vector, moved[:, :nx], moved[:, nx:end], moved[:, end:])
-            for refusal in refined.refused.values():
-                raise _RefusedError(str(refusal))
-            left.append(float(refined.left[0]))
-            left.append(float(np.max(refined.left)))
+        def ends(displacements: Array) -> Array:
+            refined = self.solved(displacements)
+            worst.append(float(np.max(refined.left)))
             return refined.x_next
 
         try:
-            solved(np.zeros((1, n)))  # what is never known is told by the first
-            around = look_around(solved, n, space.minus)
-        except _RefusedError as why:
-            x_next = self.drake(np.zeros(n))
-            size = np.delete(np.maximum(1.0, np.abs(x_next)), list(space.quaternions))
+            left = float(self.solved(np.zeros((1, n))).left[0])  # what is never known is told by the first
+            around = look_around(ends, n, space.minus)
+        except UnsolvedError as why:
+            size = np.delete(np.maximum(1.0, np.abs(self.drake(np.zeros(n)))), list(space.quaternions))
             around = look_around(one_by_one(self.drake), n, space.minus, tolerance * size)
             return around, differences_of_drake(str(why)), tolerance
-        return around, differences_of_solved(max(left)), left[0]
+        return around, differences_of_solved(max(left, *worst)), left
+
+    def ends(self) -> Callable[[Array], tuple[Array, float]]:
+        """Where steps lead from displacements (K, n), with what Drake's own leave of the momentum.
+
+        They leave what Drake's own leaves at the point, so that they begin there; a negative number where nothing is
+        solved for. Raises UnsolvedError.
+        """
+        if not self.tolerance:
+            return lambda displacements: (np.array([self.drake(d) for d in displacements]), -1.0)
+        missing = np.nan_to_num(self.solved(np.zeros((1, len(self.scale)))).missing)
+
+        def held(displacements: Array) -> tuple[Array, float]:
+            refined = self.solved(displacements, missing)
+            return refined.x_next, float(np.max(refined.left))
+
+        return held
+
+    def first_look(self, derivative: Array) -> Looked:
+        """What the step does along a few directions, what Drake's own steps leave, and why that is in doubt.
+
+        What is in doubt is looked at once more over a tenth of the widths, where a contact that begins or slides a
+        little farther away is not met. Stairs that are longer than these are met there neither, nor is a corner by a
+        column of small weight: they are sought along a line, as by a look at every entry.
+        """
+        look, left, doubt = None, -1.0, ""
+        try:
+            ends = self.ends()
+            look, left = self._look(LookAt(derivative, self.units), ends)
+            doubt = look.doubt()
+            if doubt:
+                nearer, its_left = self._look(LookAt(derivative, self.units, nearer=True), ends)
+                if not (nearer.doubt() or is_broken(lambda d: self._changes(ends, d), len(self.scale))):
+                    return nearer, its_left, ""
+        except (UnsolvedError, SimulationError) as why:
+            return look, left, doubt or str(why)
+        return look, left, doubt
+
+    def _look(self, plan: LookAt, ends: Ends) -> tuple[FirstLook, float]:
+        values, left = ends(plan.displacements)
+        return plan.taken(values, self.space.minus), left
+
+    def _changes(self, ends: Ends, displacements: Array) -> Array:
+        x_next, _ = ends(np.vstack([np.zeros((1, len(self.scale))), displacements]))
+        return np.array([self.space.minus(end, x_next[0]) for end in x_next[1:]])
+
+
+Ends = Callable[[Array], tuple[Array, float]]
+Looked = tuple[FirstLook | None, float, str]
+
+
+@dataclass(frozen=True, eq=False)
+class StepLook:
+    """A step along a few directions: its certificate, or why every entry has to be looked at."""
+
+    step: StepAround
+    derivatives: StepDerivatives
+    look: FirstLook | None  # None where the steps are not known to rounding
+    left: float  # what Drake's own leave of the momentum
+    doubt: str
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """That the derivative is the step's; None where that is in doubt."""
+        if self.look is None or self.doubt:
+            return None
+        note = differences_of_solved(self.left) if self.left >= 0 else ""
+        return self.look.certificate(**self.step.labels(self.derivatives, note))
+
+
+def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> list[StepLook]:
+    """Each of the steps from xs (N, nx) under us (N, nu) along a few directions."""
+    vector, looks = select(model, parameters), []
+    with applied(vector) as model:
+        derivatives = derivatives_along(model, xs[0], us, vector=vector, xs=xs)
+        for x, u, d in zip(xs, us, derivatives, strict=True):
+            step = StepAround.of_point(model, vector, x, u)
+            looks.append(StepLook(step, d, *step.first_look(step.jacobian(d, x))))
+    return looks
 
 
 def differences_of_solved(left: float) -> str:
@@ -268,37 +382,27 @@ def _find_mode_changes(step: StepAround, derivative: Array) -> tuple[ModeChange,
     directions = np.eye(derivative.shape[1])
     centre, changes = f(np.zeros(len(directions))), []
     here = active_modes(model)
-    for j, column in enumerate(space.names + model.input_names):
+    for direction, column, scale in zip(directions, space.names + model.input_names, step.scale, strict=False):
         for reach in (STEP.neighbourhood, -STEP.neighbourhood):
-            move_by = reach * directions[j]
-            change = space.minus(f(move_by), centre)
-            there = active_modes(model)
-            predicted = derivative @ move_by
+            change = space.minus(f(reach * direction), centre)
+            there, predicted = active_modes(model), derivative @ (reach * direction)
             size = np.maximum(np.abs(predicted), np.abs(change))
             missed = np.abs(change - predicted) > STEP.touched * np.maximum(size, 1e-6 * size.max(initial=0.0))
             touched = tuple(name for name, miss in zip(space.names, missed, strict=True) if miss)
             for pair in sorted(pair for pair in here.keys() | there.keys() if here.get(pair) != there.get(pair)):
-                before, after = here.get(pair, SEPARATED), there.get(pair, SEPARATED)
-                changes.append(ModeChange(pair, before, after, column, float(reach * step.scale[j]), touched))
+                modes = here.get(pair, SEPARATED), there.get(pair, SEPARATED)
+                changes.append(ModeChange(pair, *modes, column, float(reach * scale), touched))
     return tuple(changes)
 
 
 def solver_tolerance(model: Model, x: Array, u: Array) -> float:
     """How accurately the step at (`x`, `u`) is solved: SAP's tolerance if SAP has anything to solve, else 0."""
-    plant = model.plant
     advance(model.double, x, u)
     q, reach = x[: model.nq], STEP.limit_reach + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)
     lower, upper = model.position_limits
     near_limit = np.any(q < lower + reach) or np.any(q > upper - reach)
-    pd = any(actuator.has_controller() for actuator in actuators(plant))
-    solves = model.double.touches() or near_limit or pd or model.num_constraints
-    return SAP_RELATIVE_TOLERANCE if solves else 0.0
-
-
-def in_steps(model: Model, space: TangentSpace, n: int) -> tuple[Array, Array]:
-    """The units of the state (size,), and of `n` columns that begin with it, where time is counted in steps."""
-    state = np.where(np.arange(space.size) < space.size - model.nv, 1.0, 1 / model.time_step)
-    return state, np.concatenate([state, np.ones(n - space.size)])
+    pd = any(actuator.has_controller() for actuator in actuators(model.plant))
+    return SAP_RELATIVE_TOLERANCE if model.double.touches() or near_limit or pd or model.num_constraints else 0.0
 
 
 def state_scale(space: TangentSpace, x: Array) -> Array:
@@ -309,148 +413,5 @@ def state_scale(space: TangentSpace, x: Array) -> Array:
 
 
 def move(space: TangentSpace, nx: int, point: Array, displacement: Array) -> Array:
+    """[x; u; ...] moved by a displacement, of the state (nx,) on its tangent space."""
     return np.concatenate([space.plus(point[:nx], displacement[: space.size]), point[nx:] + displacement[space.size :]])
-
-
-def certify_steps(model: Model, xs: Array, us: Array, *, parameters: Parameters = ()) -> tuple[Certificate, ...]:
-    """`certify_inside` at each of xs (N, nx) and us (N, nu), by a first look where that leaves no doubt.
-
-    The derivatives are taken in one call, as by a search, and so are the steps along the directions of all points.
-    What is in doubt is looked at as it is, not taken anew.
-    """
-    inside = with_room(model, us)
-    certificates = []
-    for x, u, within, look in zip(xs, us, inside, first_looks(model, xs, inside, parameters), strict=True):
-        sure = look.certificate
-        at_limit = within != u
-        if sure is not None and at_limit.any():
-            leap = leap_at_limits(model, x, u, np.sign(within - u), parameters)
-            if np.any(np.abs(leap) > STEP.leap * sure.size):
-                sure = None
-            else:
-                sure = replace(sure, told=f"{sure.told}; {beside_limits(model, at_limit)}")
-        if sure is None:
-            sure = certify_inside(model, x, u, parameters=parameters, derivatives=look.derivatives)
-        certificates.append(sure)
-    return tuple(certificates)
-
-
-@dataclass(frozen=True, eq=False)
-class StepLook:
-    """A step along a few directions: its certificate, or why every entry has to be looked at."""
-
-    step: StepAround
-    derivatives: StepDerivatives
-    look: FirstLook | None  # None where the steps are not known to rounding
-    left: float  # what Drake's own leave of the momentum
-    doubt: str
-
-    @property
-    def certificate(self) -> Certificate | None:
-        """That the derivative is the step's; None where that is in doubt."""
-        if self.look is None or self.doubt:
-            return None
-        solved = differences_of_solved(self.left) if self.left >= 0 else ""
-        return certificate_by(self.look, **self.step.labels(self.derivatives, solved))
-
-
-def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> list[StepLook]:
-    """Each of the steps from xs (N, nx) under us (N, nu) along a few directions, as `looks` takes them."""
-    vector = select(model, parameters)
-    with applied(vector) as model:
-        space = tangent_space(model)
-        derivatives = derivatives_along(model, xs[0], us, vector=vector, xs=xs)
-        steps = [StepAround.of_point(model, vector, space, x, u) for x, u in zip(xs, us, strict=True)]
-        plans = [
-            LookAt(step.jacobian(d, x), in_steps(model, space, len(step.scale)))
-            for step, d, x in zip(steps, derivatives, xs, strict=True)
-        ]
-        every = zip(steps, derivatives, looks(steps, plans), strict=True)
-        return [StepLook(step, d, *looked) for step, d, looked in every]
-
-
-Looked = tuple[FirstLook | None, float, str]  # as in a StepLook
-
-
-def looks(steps: list[StepAround], plans: list[LookAt]) -> list[Looked]:
-    """What the steps, all of one model, do at the `plans`; what Drake's own leave, and the doubt.
-
-    A step in doubt is looked at once more, nearer to the point.
-    """
-    looked = _taken(steps, plans)
-    for k, (step, (look, _, doubt)) in enumerate(zip(steps, looked, strict=True)):
-        if look is not None and doubt:
-            nearer = _look_nearer(step, look)
-            looked[k] = looked[k] if nearer[2] else nearer
-    return looked
-
-
-def _taken(steps: list[StepAround], plans: list[LookAt]) -> list[Looked]:
-    first, nx = steps[0], steps[0].model.nx
-    xs, us = (
-        np.array([step.point[columns] for step in steps]) for columns in (slice(nx), slice(nx, nx + first.model.nu))
-    )
-    points = [np.array([step.moved(d) for d in plan.displacements]) for step, plan in zip(steps, plans, strict=True)]
-    try:
-        ends = ends_around(first.model, first.vector, xs, us, points)
-    except SimulationError as error:  # of one of them, which its certificate tells
-        ends = [(np.zeros(0), -1.0, str(error))] * len(points)
-    looked = list[Looked]()
-    for plan, (values, left, why) in zip(plans, ends, strict=True):
-        look = None if why else plan.taken(values, first.space.minus)
-        looked.append((look, left, why if look is None else look.doubt()))
-    return looked
-
-
-def _look_nearer(step: StepAround, look: FirstLook) -> Looked:
-    """`looks` over a tenth of the widths, where a contact that begins or slides a little farther away is not met.
-
-    Stairs that are longer than these are met there neither, nor is a corner by a column of small weight: they are
-    sought along a line, as by a look at every entry.
-    """
-    plan = LookAt(look.derivative, look.second, nearer=True)
-    ((near, left, doubt),) = _taken([step], [plan])
-    if near is None or doubt:
-        return near, left, doubt
-    row, nx, end = step.point[None], step.model.nx, step.model.nx + step.model.nu
-
-    def changes(displacements: Array) -> Array:
-        points = np.array([step.point, *[step.moved(d) for d in displacements]])
-        ((ends, _, why),) = ends_around(step.model, step.vector, row[:, :nx], row[:, nx:end], [points])
-        if why:
-            raise SimulationError(why)
-        return np.array([step.space.minus(x_next, ends[0]) for x_next in ends[1:]])
-
-    try:
-        return near, left, is_broken(changes, len(step.scale))
-    except SimulationError as error:
-        return near, left, str(error)
-
-
-def ends_around(
-    model: Model, vector: ParameterVector, xs: Array, us: Array, points: list[Array]
-) -> list[tuple[Array, float, str]]:
-    """Where the steps lead from each of `points` (p, nx + nu + np), the first of which is that of xs and us; with what
-    Drake's own leave of the momentum, negative where nothing is solved for; and why they are not known to rounding.
-
-    They leave what Drake's own leaves at the first point, so that they begin there.
-    """
-    nx, end = model.nx, model.nx + model.nu
-    results: list[tuple[Array, float, str]] = [(np.zeros(0), -1.0, "")] * len(points)
-    solved = [k for k, (x, u) in enumerate(zip(xs, us, strict=True)) if solver_tolerance(model, x, u)]
-    for k in set(range(len(points))).difference(solved):
-        ends = [step_at(model, vector, row[:nx], row[nx:end], row[end:]) for row in points[k]]
-        results[k] = (np.array(ends), -1.0, "")
-    if not solved:
-        return results
-    first = np.array([points[k][0] for k in solved])
-    here = refine_steps(model, vector, first[:, :nx], first[:, nx:end], first[:, end:])
-    every, counts = np.vstack([points[k] for k in solved]), [len(points[k]) for k in solved]
-    held = np.repeat(np.nan_to_num(here.missing), counts, axis=0)
-    there = refine_steps(model, vector, every[:, :nx], every[:, nx:end], every[:, end:], held)
-    begins = np.cumsum([0, *counts])
-    for i, k in enumerate(solved):
-        rows = slice(int(begins[i]), int(begins[i + 1]))
-        whys = [str(why) for row, why in there.refused.items() if rows.start <= row < rows.stop]
-        results[k] = (there.x_next[rows], float(np.max(there.left[rows])), whys[0] if whys else "")
-    return results

@@ -24,8 +24,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, finite_array
 from drake_diff._base.differences import central_differences
-from drake_diff.certificates.certify import move, solver_tolerance, state_scale
-from drake_diff.derivatives.refine_step import RefinedSteps, refine_steps
+from drake_diff.certificates.certify import move, solved, solver_tolerance, state_scale
+from drake_diff.derivatives.refine_step import refine_steps
 from drake_diff.derivatives.sources import PARITY_TOLERANCE
 from drake_diff.exceptions import GradientError
 from drake_diff.model.model import Model
@@ -40,10 +40,6 @@ from drake_diff.motion.policy import ParametricPolicy, active_parameters, differ
 WIDEST = 0.25  # of the scale of a state or a parameter: how far differences may move it
 MANY = 256  # rollouts whose steps are solved at once
 Point = tuple[Array, Array, Array, ParameterVector]  # x0 (nx,), us (N, nu), the policy's parameters, the model's
-
-
-class NotSolvedError(Exception):
-    """A step is not known to rounding; it says why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +72,15 @@ class Displaced:
     @cached_property
     def space(self) -> TangentSpace:
         return tangent_space(self.model)
+
+    @property
+    def subject(self) -> str:
+        return f"the rollout of {self.model.name}"
+
+    @property
+    def time_step(self) -> float:
+        """[s] as the parameters say."""
+        return self.vector.time_step(self.vector.values)
 
     @cached_property
     def _values(self) -> Array:
@@ -166,11 +171,10 @@ class Displaced:
     def left_by_drake(self, g: RolloutGradient) -> tuple[Array, float]:
         """(N, size) what Drake's own steps along the motion of `g` leave unsolved, and the worst, of the momentum.
 
-        Raises NotSolvedError where a step is not known to rounding.
+        Raises UnsolvedError where a step is not known to rounding.
         """
         with applied(self.vector) as model:
-            refined = refine_steps(model, self.vector, g.xs[:-1], g.us)
-        _check_solved(refined)
+            refined = solved(refine_steps(model, self.vector, g.xs[:-1], g.us))
         left = [self.space.minus(*pair) for pair in zip(refined.drake, refined.x_next, strict=True)]
         return np.array(left), float(np.max(refined.left))
 
@@ -178,7 +182,7 @@ class Displaced:
         """(K, 1) as `losses`, of rollouts whose every step is solved to rounding and then moved by `left` (N, size).
 
         That is what Drake's own steps leave unsolved along the motion, so that this is where the rollouts start from,
-        and differences are of the steps' equation there. Raises NotSolvedError as `left_by_drake`.
+        and differences are of the steps' equation there. Raises UnsolvedError as `left_by_drake`.
         """
         parts = np.array_split(displacements, -(-len(displacements) // MANY))
         return np.vstack([self._solved(left, chunk) for chunk in parts])
@@ -194,8 +198,7 @@ class Displaced:
         with applied(self.vector) as model:
             for k in range(count):
                 inputs[:, k] = [ask(x, k, h) for ask, x, h in zip(asks, xs[:, k], times, strict=True)]
-                refined = refine_steps(model, self.vector, xs[:, k], inputs[:, k], values)
-                _check_solved(refined)
+                refined = solved(refine_steps(model, self.vector, xs[:, k], inputs[:, k], values))
                 xs[:, k + 1] = [self.space.plus(x_next, left[k]) for x_next in refined.x_next]
         return np.array([[evaluate_loss(self.loss, *motion)] for motion in zip(xs, inputs, strict=True)])
 
@@ -210,11 +213,6 @@ class Displaced:
             return lambda x, k, h: us[k]
         asked, nu = with_parameters(fresh(self.policy) if policy is None else policy, parameters), self.model.nu
         return lambda x, k, h: finite_array("policy(x, t)", asked(x.copy(), k * h), (nu,))
-
-
-def _check_solved(refined: RefinedSteps) -> None:
-    for k, refusal in refined.refused.items():
-        raise NotSolvedError(f"{refusal} (step {k})" if len(refined.refused) < len(refined.left) else str(refusal))
 
 
 SHARED = ("pydrake.", "drake_diff.model.")  # packages whose objects a copy shares with the original: models and plants

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.values import ShowsItsRepr
-from drake_diff.certificates.certificate import VERDICTS
+from drake_diff.certificates.certificate import AGREE, DISAGREE, DISCONTINUOUS, UNDECIDED, Certificate, unscaled
 from drake_diff.certificates.differences import TINY
 from drake_diff.certificates.displaced import Displaced, Line
 from drake_diff.exceptions import DrakeDiffError, InputError
@@ -344,31 +344,33 @@ def judged(slope: TrueSlope, noise: Array, least: float) -> TrueSlope:
     return replace(sized, exists=False, reason="the slopes do not settle")
 
 
-def by_truth(truth: Truth, subject: str) -> dict[str, Any]:
-    """The parts of a certificate of one row, the loss, and a column for each of the slopes."""
-    slopes, shape = truth.slopes, (1, len(truth.slopes))
+def by_truth(truth: Truth, subject: str) -> Certificate:
+    """The certificate of one row, the loss, and a column for each of the slopes."""
+    slopes = truth.slopes
     ours, value, error, size = (
-        np.array([getattr(slope, name) for slope in slopes], dtype=float).reshape(shape)
+        np.array([[getattr(slope, name) for slope in slopes]], dtype=float)
         for name in ("ours", "value", "error", "size")
     )
-    size = np.maximum(size, TINY)
-    known = np.array([bool(slope.exists) for slope in slopes]).reshape(shape)
-    gap, tolerance = np.abs(ours - value), TRUTH.close * size + error
-    codes = np.full(shape, VERDICTS.index("undecided"))
-    codes[known & (gap <= tolerance) & (gap + tolerance <= TRUTH.right * size)] = VERDICTS.index("agree")
-    codes[known & (gap > TRUTH.right * size + error)] = VERDICTS.index("disagree")
-    reasons = {}
-    for j, slope in enumerate(slopes):
-        if slope.exists is False:
-            codes[0, j], reasons[0, j] = VERDICTS.index("discontinuous"), repr(slope)
-    unknown = TRUTH.unknown * size
-    return {
-        "rows": ("loss",), "columns": tuple(slope.column for slope in slopes), "derivative": frozen(ours),
-        "difference": frozen(np.where(known, value, np.nan)), "tolerance": frozen(np.where(known, tolerance, unknown)),
-        "noticeable": frozen(np.where(known, gap + tolerance, unknown)), "size": frozen(size), "codes": codes,
-        "reasons": reasons, "method": CONTINUOUS, "subject": subject, "around": None, "stopped": 0.0, "second": None,
-        "scale": frozen(np.ones(len(slopes))), "told": "differences are of another integration of the same motion",
-    }  # fmt: skip
+    size, known = np.maximum(size, TINY), np.array([[bool(slope.exists) for slope in slopes]], dtype=bool)
+    gap, tolerance, unknown = np.abs(ours - value), TRUTH.close * size + error, TRUTH.unknown * size
+    codes = np.full(size.shape, UNDECIDED)
+    codes[known & (gap <= tolerance) & (gap + tolerance <= TRUTH.right * size)] = AGREE
+    codes[known & (gap > TRUTH.right * size + error)] = DISAGREE
+    reasons = {(0, j): repr(slope) for j, slope in enumerate(slopes) if slope.exists is False}
+    for entry in reasons:
+        codes[entry] = DISCONTINUOUS
+    tolerance, noticeable = np.where(known, tolerance, unknown), np.where(known, gap + tolerance, unknown)
+    return Certificate(
+        rows=("loss",),
+        columns=tuple(slope.column for slope in slopes),
+        **unscaled(np.ones(len(slopes)), ours, np.where(known, value, np.nan), tolerance, noticeable, size),
+        codes=codes,
+        reasons=reasons,
+        method=CONTINUOUS,
+        subject=subject,
+        scale=np.ones(len(slopes)),
+        told="differences are of another integration of the same motion",
+    )
 
 
 REFINEMENTS = (1, 2, 4)  # parts of a time step

@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
-from drake_diff.certificates.directions import LookAt, certificate_by
+from drake_diff.certificates.directions import LookAt
 from drake_diff.model.contact import penetration
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import applied
@@ -196,5 +196,5 @@ def certify_equations(
         if look.doubt():
             certificates.append(certify_jacobian(f, point, derivative, batched=True, scale=scale, **named))
         else:
-            certificates.append(certificate_by(look, scale=scale, told="", **named))
+            certificates.append(look.certificate(scale, **named))
     return tuple(certificates)

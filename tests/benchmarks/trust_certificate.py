@@ -20,11 +20,9 @@ from pydrake.multibody.tree import JointIndex
 from trust import Figure
 
 import drake_diff as dd
-from drake_diff.certificates.certify import StepAround, in_steps, looks, state_scale
-from drake_diff.certificates.directions import LookAt
+from drake_diff.certificates.certify import StepAround
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.parameters import applied, select
-from drake_diff.model.tangent import tangent_space
 
 COUNT = 1000
 FLOATING = ("solo12.urdf", "go2.urdf", "bolt.urdf", "simple_humanoid.urdf")
@@ -159,12 +157,8 @@ def first_look(case, derivative):
     """Whether a look along a few directions passes a derivative: what `dd.solve` asks before anything else."""
     vector = select(case.model, case.parameters)
     with applied(vector) as model:
-        space = tangent_space(model)
-        point = np.concatenate([case.x, case.u, vector.values])
-        scale = np.concatenate([state_scale(space, case.x), np.maximum(1.0, np.abs(case.u)), vector.difference_scale()])
-        step = StepAround(model, vector, space, point, scale)
-        plan = LookAt(derivative * scale, in_steps(model, space, len(scale)))
-        ((_, _, doubt),) = looks([step], [plan])
+        step = StepAround.of_point(model, vector, case.x, case.u)
+        *_, doubt = step.first_look(derivative * step.scale)
         return not doubt
 
 

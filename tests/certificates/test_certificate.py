@@ -377,7 +377,7 @@ def test_1_percent_near_a_joint_limit_and_under_pd_control_is_found_and_named(na
 def test_steps_that_are_not_known_to_rounding_are_said_to_be_drakes_own_and_hide_less(monkeypatch):
     """Nothing is known to be better than the solver's tolerance then, and what it would hide is undecided."""
 
-    def refused(model, vector, xs, us, values):
+    def refused(model, vector, xs, us, values, held=None):
         n = len(xs)
         refusals = dict.fromkeys(range(n), Refusal("not today"))
         return RefinedSteps(

@@ -11,8 +11,8 @@ from pydrake.autodiffutils import AutoDiffXd
 
 import drake_diff as dd
 from drake_diff._base.autodiff import chain_rows, plain
-from drake_diff.certificates.directions import SAMPLE, Probe, weights
 from drake_diff.certificates.displaced import fresh, stairs_of_policy
+from drake_diff.certificates.sampling import SAMPLE, Probe, weights
 from drake_diff.exceptions import CertificateError, GradientError, InputError
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import ParametricPolicy
