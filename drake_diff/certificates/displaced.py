@@ -111,26 +111,31 @@ class Displaced:
         of_model = [first + i for i, p in enumerate(self.vector.parameters) for _ in p.value]
         return np.array([*of_x0, *given, *of_model], dtype=np.intp)
 
+    @property
+    def units(self) -> list[str]:
+        """(n,) the unit of each column of a gradient by given inputs; what is of one kind has one."""
+        contract = self.model.contract
+        units = [f"position [{term.unit}]" for term in contract.positions]
+        units += [f"velocity [{term.unit}]" for term in contract.velocities]
+        inputs = len(self.us) * [f"input [{term.unit}]" for term in contract.inputs]
+        return [u for i, u in enumerate(units) if i not in self.space.quaternions] + inputs + list(self.vector.names)
+
     @cached_property
     def lines(self) -> tuple[Line, ...]:
         """Each state, each input by as much at all times or each parameter of the policy, and each of the model."""
-        (count, nu), size = self.us.shape, self.space.size
-        given = count * nu if self.policy is None else 0
-        units = np.eye(len(self.scale)) / self.scale
-        lines = [
-            Line(self.columns[j], np.array([j]), float(self.scale[j]), units[j], WIDEST * float(self.scale[j]))
-            for j in (*range(size), *range(size + given, len(self.scale)))
-        ]
+        (count, nu), size, n = self.us.shape, self.space.size, len(self.scale)
+        units, names, scales = np.eye(n) / self.scale, self.columns, self.scale.tolist()
+        single = [Line(names[j], np.array([j]), scales[j], units[j], WIDEST * scales[j]) for j in range(n)]
         if self.policy is not None:
-            return tuple(lines)
+            return tuple(single)
         limits = self.model.inputs.of_actuators([a.effort_limit() for a in actuators(self.model.plant)])
         cut = np.where(self.model.inputs.actuator >= 0, limits, np.inf)
+        inputs = []
         for j in range(nu):
             columns, sizes = size + j + nu * np.arange(count), np.abs(self.us[:, j])
             name, room = f"{self.model.input_names[j]} at all times", float(np.abs(cut[j] - sizes).min())
-            scale = max(1.0, float(sizes.max()))
-            lines.insert(size + j, Line(name, columns, scale, units[columns].sum(axis=0), room))
-        return tuple(lines)
+            inputs.append(Line(name, columns, max(1.0, float(sizes.max())), units[columns].sum(axis=0), room))
+        return (*single[:size], *inputs, *single[size + count * nu :])
 
     def point(self, displacement: Array) -> Point:
         """What is rolled out at a displacement (n,)."""

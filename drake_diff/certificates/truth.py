@@ -16,8 +16,7 @@ error hides it.
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -153,18 +152,13 @@ class Truth(ShowsItsRepr):
         if self.other_law:
             difference = self.other_reason or f"the loss changes by {self.by_other_law:.3g}"
             lines.append(f"difference of the laws, to {self.other_law} of Drake's continuous plant: {difference}")
-        groups: dict[str, list[TrueSlope]] = {"wrong": [], "none": [], "unknown": [], "right": []}
-        for slope in self.slopes:
-            key = {None: "unknown", False: "none", True: "right" if slope.agrees else "wrong"}[slope.exists]
-            groups[key].append(slope)
-        for key, label in (
-            ("wrong", "not ours"),
-            ("none", "without a slope"),
-            ("unknown", "not known"),
-            ("right", "ours"),
+        for label, slopes in (
+            ("not ours", self.wrong),
+            ("without a slope", [slope for slope in self.slopes if slope.exists is False]),
+            ("not known", [slope for slope in self.slopes if slope.exists is None]),
+            ("ours", [slope for slope in self.slopes if slope.agrees]),
         ):
-            if ones := groups[key]:
-                lines.append(f"{len(ones)} of {len(self.slopes)} {label}, first {ones[0]!r}")
+            lines += [f"{len(slopes)} of {len(self.slopes)} {label}, first {slopes[0]!r}"] if slopes else []
         return "; ".join([*lines, *self.notes])
 
 
@@ -175,7 +169,8 @@ def truth_of(
 
     Raises ModelError or SimulationError, which say why, where the motion has no continuous form.
     """
-    truth = _Measurement(moved, moved.flat(gradient), gradient.loss, seconds, columns).truth()
+    lines = [line for line in moved.lines if columns is None or line.name in columns]
+    truth = _Measurement(moved, moved.flat(gradient), seconds).truth(gradient.loss, lines)
     if CONTINUOUS in gradient.methods or truth.law != KELVIN_VOIGT:
         return truth
     with applied(moved.vector) as model:
@@ -202,49 +197,37 @@ def softest_contact(model: Model, xs: Array) -> str | None:
     return note
 
 
-@dataclass(eq=False)
 class _Measurement:
-    moved: Displaced
-    gradient: Array
-    ours: float
-    seconds: float
-    columns: Sequence[str] | None
-    deadline: float = field(init=False)
-    touches: bool = False
-    losses: list[float] = field(default_factory=list)  # here: one for each of the widths, and one that is better
+    """Losses of the motion in continuous time, by a deadline."""
 
-    def __post_init__(self) -> None:
-        self.deadline = time.thread_time() + self.seconds
+    def __init__(self, moved: Displaced, gradient: Array, seconds: float):
+        self.moved, self.gradient, self.seconds = moved, gradient, seconds
+        self.deadline = time.thread_time() + seconds
+        self.touches = False
+        self.losses: list[float] = []  # here: one for each of the widths, and one that is better
 
-    def truth(self) -> Truth:
+    def truth(self, ours: float, lines: Sequence[Line]) -> Truth:
         with applied(self.moved.vector) as model:
             law = ContinuousMotion(model).law
-        losses = self.losses
         with suppress(TimeoutError):  # every slope says so below
-            losses.extend(self._losses())
-        order = sorted(self.lines, key=lambda x: -abs(self._ours(x)) * x.scale)
-        measured = {x.name: self._measured(x) for x in order}
-        sizes = [abs(s) * x.scale for x in order for s in (*measured[x.name].slopes[-1:], self._ours(x))]
+            self._measure_losses()
+        order = sorted(lines, key=lambda line: -abs(self._ours(line)) * line.scale)
+        measured = {line.name: self._measured(line) for line in order}
+        sizes = [abs(s) * line.scale for line in order for s in (*measured[line.name].slopes[-1:], self._ours(line))]
+        losses, largest = np.array(self.losses), max(map(abs, self.losses), default=0.0)
         # and what changes the loss by no part of it that matters, moved by a whole scale
-        least = max(TRUTH.negligible * max(sizes, default=0.0), TRUTH.nothing * max(map(abs, losses), default=0.0))
-        noise = (
-            np.abs(np.array(losses[:3]) - losses[-1]) + TRUTH.rounded * max(map(abs, losses)) if losses else np.zeros(3)
-        )
-        slopes = tuple(judged(measured[x.name], noise, least / x.scale) for x in self.lines)
-        loss, error = losses[-1] if losses else np.nan, abs(losses[-1] - losses[-2]) if losses[1:] else np.nan
-        truth = Truth(law, loss, error, self.ours, slopes, self.seconds, self.touches)
-        return self._beside_other_law(truth) if law == KELVIN_VOIGT and self.touches else truth
+        least = max(TRUTH.negligible * max(sizes, default=0.0), TRUTH.nothing * largest)
+        noise = np.abs(losses[:3] - losses[-1]) + TRUTH.rounded * largest if self.losses else np.zeros(3)
+        slopes = tuple(judged(measured[line.name], noise, least / line.scale) for line in lines)
+        loss, error = losses[-1] if len(losses) else np.nan, abs(losses[-1] - losses[-2]) if losses[1:].size else np.nan
+        truth = Truth(law, float(loss), float(error), ours, slopes, self.seconds, self.touches)
+        return self._beside_other_law(truth, lines) if law == KELVIN_VOIGT and self.touches else truth
 
     def _beyond(self) -> str:
         return f"not measured within the budget of {self.seconds:g} s"
 
     def _ours(self, line: Line) -> float:
         return float(self.gradient[line.columns].sum())
-
-    @cached_property
-    def lines(self) -> list[Line]:
-        """Those that are asked for."""
-        return [line for line in self.moved.lines if self.columns is None or line.name in self.columns]
 
     def _loss(self, displacement: Array, tolerance: float, law: str | None = None) -> float:
         x0, us, parameters, values = self.moved.point(displacement)
@@ -257,17 +240,16 @@ class _Measurement:
             self.touches |= motion.touched
         return evaluate_loss(self.moved.loss, xs, inputs)
 
-    def _widths(self) -> tuple[float, ...]:
-        return tuple(w if self.touches else TRUTH.smooth * w for w in TRUTH.widths)
+    def _widths(self) -> list[float]:
+        return [w if self.touches else TRUTH.smooth * w for w in TRUTH.widths]
 
-    def _losses(self) -> Iterator[float]:
+    def _measure_losses(self) -> None:
         """The loss by an integration for each width, and by one that is better than the last."""
         still = np.zeros(len(self.moved.scale))
         first = self._loss(still, TRUTH.tolerance * TRUTH.widths[0])  # and what touches
-        yield first if self.touches else self._loss(still, TRUTH.tolerance * self._widths()[0])
-        for width in self._widths()[1:]:
-            yield self._loss(still, TRUTH.tolerance * width)
-        yield self._loss(still, TRUTH.tolerance * self._widths()[-1] / 10)
+        self.losses.append(first if self.touches else self._loss(still, TRUTH.tolerance * self._widths()[0]))
+        for width in (*self._widths()[1:], self._widths()[-1] / 10):
+            self.losses.append(self._loss(still, TRUTH.tolerance * width))
 
     def _slope(self, line: Line, width: float, law: str | None = None) -> tuple[float, float]:
         """Over `width` times the scale to both sides; and by how much it is another one ahead than behind."""
@@ -278,7 +260,7 @@ class _Measurement:
 
     def _measured(self, line: Line) -> TrueSlope:
         """The slopes along a line, from wide to narrow; not judged."""
-        widths = list(self._widths())
+        widths = self._widths()
         measured = TrueSlope(line.name, tuple(line.columns.tolist()), self._ours(line))
         if widths[0] * line.scale > line.room:
             return replace(measured, reason=f"not measured: moved by {widths[0] * line.scale:.2g} it is cut off")
@@ -294,29 +276,21 @@ class _Measurement:
         slopes, corners = zip(*over, strict=True)
         return replace(measured, widths=tuple(w * line.scale for w in widths), slopes=slopes, corners=corners)
 
-    def _beside_other_law(self, truth: Truth) -> Truth:
+    def _beside_other_law(self, truth: Truth, lines: Sequence[Line]) -> Truth:
         """With what Drake's continuous plant would do, which has Hunt and Crossley's law whatever the steps have."""
-        still, slopes, tolerance = (
-            np.zeros(len(self.moved.scale)),
-            list(truth.slopes),
-            TRUTH.tolerance * TRUTH.widths[1],
-        )
+        still, width, slopes = np.zeros(len(self.moved.scale)), TRUTH.widths[1], list(truth.slopes)
         truth = replace(truth, other_law=HUNT_CROSSLEY)
         try:
-            loss = self._loss(still, tolerance, HUNT_CROSSLEY)
+            loss = self._loss(still, TRUTH.tolerance * width, HUNT_CROSSLEY)
         except TimeoutError:
             return replace(truth, other_reason=self._beyond())
         except DrakeDiffError as error:
             return replace(truth, other_reason=f"not measured: {error}")
-        for i, (slope, line) in enumerate(zip(slopes, self.lines, strict=True)):
-            if not slope.exists:
-                continue
-            try:
-                slopes[i] = replace(
-                    slope, by_other_law=self._slope(line, TRUTH.widths[1], HUNT_CROSSLEY)[0] - slope.value
-                )
-            except (TimeoutError, DrakeDiffError):
-                break  # NaN: not measured
+        with suppress(TimeoutError, DrakeDiffError):  # the slopes that are left are NaN: not measured
+            for i, (slope, line) in enumerate(zip(slopes, lines, strict=True)):
+                if slope.exists:
+                    other, _ = self._slope(line, width, HUNT_CROSSLEY)
+                    slopes[i] = replace(slope, by_other_law=other - slope.value)
         return replace(truth, slopes=tuple(slopes), by_other_law=loss - truth.loss)
 
 
@@ -391,36 +365,22 @@ class Refinement:
     converged: NDArray[np.bool_]  # (n,)
     apart: tuple[str, ...] = ()
 
-    @property
-    def worst(self) -> int:
-        """The column whose first value is furthest from its limit, those that have converged last."""
-        distance = np.abs(self.values[0] - self.limit) / np.maximum(self.scale, 1e-300)
-        return int(np.argmax(distance + 1e6 * ~self.converged))
-
     def __str__(self) -> str:
-        j = self.worst
-        levels = ", ".join(f"{level:.4g}" for level in self.levels)
-        if self.converged.all():
-            text = f"converges with the time step ({levels}): by {self.columns[j]} {_row(self.values[:, j])}, "
-            parts = [f"{text}limit {self.limit[j]:.4g}"]
-        else:
-            count = int((~self.converged).sum())
-            parts = [
-                f"not converged: do not optimize with this; with the time step ({levels}) the gradient by "
-                f"{self.columns[j]} is {_row(self.values[:, j])}"
-                + (f" ({count} of {len(self.columns)} entries)" if count > 1 else "")
-            ]
+        distance = np.abs(self.values[0] - self.limit) / np.maximum(self.scale, TINY)
+        j, wrong = int(np.argmax(distance + 1e6 * ~self.converged)), int((~self.converged).sum())
+        head = f"not converged: do not optimize with this ({wrong} of {len(self.columns)} entries)"
+        levels, values = (", ".join(f"{v:.4g}" for v in row) for row in (self.levels, self.values[:, j]))
+        text = (
+            f"{head if wrong else 'converges'} with the time step ({levels}): by {self.columns[j]} {values}, "
+            f"limit {self.limit[j]:.4g}"
+        )
         if self.apart:
             more = f" and {len(self.apart) - 1} more" if len(self.apart) > 1 else ""
-            parts.append(f"it is not known to be the slope of the motion in continuous time by {self.apart[0]}{more}")
-        return "; ".join(parts)
+            text += f"; it is not known to be the slope of the motion in continuous time by {self.apart[0]}{more}"
+        return text
 
 
-def _row(values: Array) -> str:
-    return ", ".join(f"{value:.4g}" for value in values)
-
-
-def at_finer_steps(moved: Displaced) -> Iterator[Array]:
+def _at_finer_steps(moved: Displaced) -> Iterator[Array]:
     """The gradient at h/2 and h/4 under the same inputs, the loss seeing the states at the same times."""
     if TIME_STEP in {p.name for p in moved.vector.parameters}:
         raise InputError("parameters", got=TIME_STEP, expected="others, as refine=True changes the time step")
@@ -431,15 +391,6 @@ def at_finer_steps(moved: Displaced) -> Iterator[Array]:
         coarse = loss if takes_one_argument(loss) else lambda xs, us, m=m: loss(xs[::m], us[::m])
         g = differentiate_rollout(finer, moved.x0, held, coarse, **options)
         yield moved.flat(replace(g, by_us=g.by_us.reshape(count, m, nu).sum(axis=1)))
-
-
-def kinds_of(moved: Displaced) -> list[str]:
-    """(n,) the kind of each column of a gradient: what is of one kind has one unit."""
-    contract, space = moved.model.contract, moved.space
-    units = [f"position [{term.unit}]" for term in contract.positions]
-    units += [f"velocity [{term.unit}]" for term in contract.velocities]
-    kinds = [unit for i, unit in enumerate(units) if i not in space.quaternions]
-    return kinds + len(moved.us) * [f"input [{term.unit}]" for term in contract.inputs] + list(moved.vector.names)
 
 
 def judge_levels(levels: tuple[float, ...], columns: Sequence[str], values: Array, kinds: Sequence[str]) -> Refinement:
@@ -465,21 +416,20 @@ def judge_levels(levels: tuple[float, ...], columns: Sequence[str], values: Arra
 
 def refine_by_time_step(moved: Displaced, gradient: RolloutGradient, truth: Truth | None) -> Refinement:
     """The `gradient` at h, at h/2 and h/4, beside the slopes of the motion in continuous time."""
-    values = np.array([moved.flat(gradient), *at_finer_steps(moved)])
+    values = np.array([moved.flat(gradient), *_at_finer_steps(moved)])
     levels = tuple(moved.model.time_step / m for m in REFINEMENTS)
-    refinement = judge_levels(levels, moved.columns, values, kinds_of(moved))
+    refinement = judge_levels(levels, moved.columns, values, moved.units)
     return beside_truth(refinement, moved.lines, truth, touches=_overlaps(moved.model, gradient.xs))
 
 
 def _overlaps(model: Model, xs: Array) -> bool:
     """Whether geometries that may collide overlap in one of the states `xs` (N + 1, nx)."""
-    if not model.contract.contact.collision_pairs:
-        return False
-    for x in xs:
-        set_state(model.double, x)
-        if model.double.overlaps():
-            return True
-    return False
+    return bool(model.contract.contact.collision_pairs) and any(_overlap(model, x) for x in xs)
+
+
+def _overlap(model: Model, x: Array) -> bool:
+    set_state(model.double, x)
+    return bool(model.double.overlaps())
 
 
 def beside_truth(refinement: Refinement, lines: Sequence[Line], truth: Truth | None, *, touches: bool) -> Refinement:
