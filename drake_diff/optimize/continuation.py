@@ -30,7 +30,6 @@ from drake_diff.optimize.ilqr.through_contact import (
     PATIENCE,
     cost_of,
     miss_of,
-    restore_goal,
     solve_through_jumps,
     where_it_jumps,
 )
@@ -112,8 +111,8 @@ def solve_continuation(
 
     Stages of SoftContacts take the inputs, relaxed ones the positions. Gives what `solve_ilqr` gives, of the true
     plant, and a log for each stage. `limits.time_limit` is that of all stages together; if it or Ctrl-C ends one, the
-    rest are left out and the motion is the true plant's rollout. A search that ends short of a minimum is taken to the
-    goal by `restore_goal`, which its message says. Raises GradientError or SimulationError if the true plant refuses.
+    rest are left out and the motion is the true plant's rollout. Raises GradientError or SimulationError if the true
+    plant refuses.
     """
     with noted_interrupts() as interrupted:
         through = _Stages(problem, limits, report, interrupted)
@@ -188,7 +187,7 @@ class _Stages:
     def _relax(self, xs: Array, plant: RelaxedPlant, followed: list[tuple[float, Array, Array]]) -> None:
         """Add to `followed` (how far it is from the stage, xs, us) of each motion of the true plant that follows it."""
         problem, nq = self.problem, self.problem.model.nq
-        search, closed = RelaxedSearch(problem, plant), None
+        search = RelaxedSearch(problem, plant)
         q = np.array(xs[:, :nq])
         q[0] = problem.x0[:nq]
         for i, _ in plant.coordinates.free:
@@ -206,10 +205,6 @@ class _Stages:
                     followed.append((float(off) + result.gap + result.violation, *motion))
             if self.is_over():
                 break
-            if result.ended != "inaccurate":
-                closed = q, search.learned
-            elif closed is not None:  # the next one begins where the last that closed ended
-                q, search.learned = closed
 
     def _say(self, line: str) -> None:
         if self.report:
@@ -228,13 +223,7 @@ class _Stages:
             return NlpResult(self.us.ravel(), outcome, message, ())
         self.log(None, None, *_told(problem, result, xs, us))
         if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
-            xs, us, done = restore_goal(problem, xs, us, limits.tolerance, self.is_over)
-            message, outcome = result.message + where_it_jumps(problem, xs) + done, result.outcome
-            if outcome is Outcome.INFEASIBLE and miss_of(problem, xs) <= limits.tolerance:
-                outcome = Outcome.INACCURATE  # state bounds are measured again by the verdict
-            result = replace(result, z=us.ravel(), outcome=outcome, message=message)
-            if done:
-                self._say(done.removeprefix("; "))
+            result = replace(result, message=result.message + where_it_jumps(problem, xs))
         self.xs, self.us = xs, us
         return result
 

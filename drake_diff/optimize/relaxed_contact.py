@@ -39,7 +39,7 @@ from drake_diff.mechanics.description import describe_tree
 from drake_diff.mechanics.tree import Tree, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
-from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
+from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian, PenalizedRows
 from drake_diff.optimize.ilqr.expansion import Motion, expand_costs
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic, follow, slope_along, solve_riccati
 from drake_diff.optimize.problem.problem import Problem
@@ -291,10 +291,8 @@ def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
 class SearchOptions:
     """What tunes the search of a stage."""
 
-    penalty: float = 1.0  # the first
     growth: float = 5.0
     largest_penalty: float = 1e8
-    relent: float = 25.0  # times the first penalty: the highest that a stage begins with
     sufficient: float = 1e-3  # of the decrease that the model promises
     smallest: float = 1e-8  # of the Hessian's largest entry: what counts as its smallest
     least_damping: float = 1e-9
@@ -347,13 +345,12 @@ class RelaxedSearch:
         self.problem, self.plant, self.h = problem, plant, problem.model.time_step
         model = problem.model
         self.nv, self.count = model.nv, problem.num_steps
-        self.constraints = AugmentedLagrangian(problem)
         self.undriven = plant.undriven
-        self.lower, self.upper = problem.bounds.u_lower, problem.bounds.u_upper
-        self.rest_multipliers = np.zeros((self.count, self.undriven.shape[1]))
-        self.input_multipliers = np.zeros((self.count, problem.nu))
-        self.rest_penalty, self.input_penalty = OPTIONS.penalty, 0.0
-        self.rest_scale, self.input_scale = self._scales()
+        rest_scale, input_scale = self._scales()
+        none = np.zeros((self.count, self.undriven.shape[1]))
+        lower, upper = (np.tile(side, (self.count, 1)) for side in (problem.bounds.u_lower, problem.bounds.u_upper))
+        self.rest, self.inputs = PenalizedRows(none, none, rest_scale), PenalizedRows(lower, upper, input_scale)
+        self.constraints = AugmentedLagrangian(problem)
         self.started = False
 
     def _scales(self) -> tuple[Array, Array]:
@@ -372,9 +369,7 @@ class RelaxedSearch:
     ) -> Found:
         """At most `most` steps from q (N+1, nq), of which the first is given."""
         motion = self.motion(q, soft)
-        if self.started:
-            self._relent()
-        else:
+        if not self.started:
             self._start(motion)
         merit, damping, since, ended, stuck = self._merit(motion), 1e-3, 0, "iteration_limit", 0
         number, before = 0, (self._gap(motion), self._violation(motion))
@@ -432,76 +427,45 @@ class RelaxedSearch:
 
     # ------------------------------------------------------------------ the augmented cost
 
-    @property
-    def learned(self) -> tuple[Any, ...]:
-        """Multipliers and penalties, to go back to."""
-        learned = self.rest_multipliers, self.input_multipliers, self.rest_penalty, self.input_penalty
-        return (*learned, self.constraints.forces, self.constraints.penalty)
-
-    @learned.setter
-    def learned(self, learned: tuple[Any, ...]) -> None:
-        self.rest_multipliers, self.input_multipliers, self.rest_penalty, self.input_penalty, forces, penalty = learned
-        self.constraints.forces, self.constraints.penalty = forces, penalty
-
     def _start(self, motion: RelaxedMotion) -> None:
-        self.started = True
         cost = self.problem.objective(motion.xs, motion.us)
-        wrong = float(np.sum(self._rest(motion) ** 2)) / 2
-        size = abs(cost) / wrong if wrong > 0 else 0.0
-        self.rest_penalty = float(np.clip(size, 1.0, 1e4))
-        self.input_penalty = self.rest_penalty
-        self.constraints.start(motion.xs, motion.us, cost, float(np.sum(self._rest(motion) ** 2)))
-        self.first_penalty, self.first_weight = self.rest_penalty, self.constraints.penalty
+        wrong = float(np.sum((self._undriven(motion) * self.rest.scale) ** 2))
+        self.rest.penalty = self.inputs.penalty = float(np.clip(2 * abs(cost) / wrong if wrong else 0.0, 1.0, 1e4))
+        self.constraints.start(motion.xs, motion.us, cost, wrong)
+        self.started = True
 
-    def _relent(self) -> None:
-        """Penalties no higher than a few times the first: those of the stage before are too stiff for another law."""
-        most = OPTIONS.relent * self.first_penalty
-        self.rest_penalty, self.input_penalty = min(self.rest_penalty, most), min(self.input_penalty, most)
-        self.constraints.penalty = min(self.constraints.penalty, OPTIONS.relent * self.first_weight)
-
-    def _rest(self, motion: RelaxedMotion) -> Array:
-        return (motion.tau @ self.undriven) * self.rest_scale
-
-    def _input_pushes(self, motion: RelaxedMotion) -> Array:
-        p, s = self.input_penalty, self.input_scale
-        above = self.input_multipliers + p * s * (motion.us - self.upper)
-        below = self.input_multipliers + p * s * (motion.us - self.lower)
-        return np.maximum(above, 0.0) + np.minimum(below, 0.0)
+    def _undriven(self, motion: RelaxedMotion) -> Array:
+        """(N, nv - rank) the forces that no motor gives."""
+        return motion.tau @ self.undriven
 
     def _merit(self, motion: RelaxedMotion) -> float:
-        rest, p = self._rest(motion), self.rest_penalty
         with np.errstate(all="ignore"):
-            total = self.problem.objective(motion.xs, motion.us) + self.constraints.value(motion.xs, motion.us)
-        total += float(np.sum(self.rest_multipliers * rest + p * rest**2 / 2))
-        pushes = self._input_pushes(motion)
-        return total + float(np.sum(pushes**2 - self.input_multipliers**2)) / (2 * self.input_penalty)
+            of_rows = self.rest.value(self._undriven(motion)) + self.inputs.value(motion.us)
+            cost = self.problem.objective(motion.xs, motion.us)
+            return cost + of_rows + self.constraints.value(motion.xs, motion.us)
 
     def _size(self, motion: RelaxedMotion) -> float:
         """What the merit's parts come to, which may cancel in it."""
-        return abs(self.problem.objective(motion.xs, motion.us)) + self.rest_penalty / 2 * float(
-            np.sum(self._rest(motion) ** 2)
-        )
+        of_rest = float(np.sum((self._undriven(motion) * self.rest.scale) ** 2))
+        return abs(self.problem.objective(motion.xs, motion.us)) + self.rest.penalty / 2 * of_rest
 
     def _update(
         self, motion: RelaxedMotion, before: tuple[float, float], now: tuple[float, float], *, grow: bool
     ) -> None:
         """Better multipliers, and where the last ones did not help, higher penalties."""
-        self.rest_multipliers = self.rest_multipliers + self.rest_penalty * self._rest(motion)
-        self.input_multipliers = self._input_pushes(motion)
+        self.rest.update(self._undriven(motion))
+        self.inputs.update(motion.us)
         self.constraints.update(motion.xs, motion.us)
-        if not grow:
-            return
-        if now[0] > max(OPTIONS.closed, before[0] / OPTIONS.growth):
-            self.rest_penalty = min(OPTIONS.growth * self.rest_penalty, OPTIONS.largest_penalty)
-        if now[1] > max(OPTIONS.closed, before[1] / OPTIONS.growth):
-            self.input_penalty = min(OPTIONS.growth * self.input_penalty, OPTIONS.largest_penalty)
-            self.constraints.penalty = min(OPTIONS.growth * self.constraints.penalty, OPTIONS.largest_penalty)
+        slow = [b > max(OPTIONS.closed, a / OPTIONS.growth) for a, b in zip(before, now, strict=True)]
+        for rows, stands in ((self.rest, slow[0]), (self.inputs, slow[1]), (self.constraints, slow[1])):
+            if grow and stands:
+                rows.penalty = min(OPTIONS.growth * rows.penalty, OPTIONS.largest_penalty)
 
     def _gap(self, motion: RelaxedMotion) -> float:
-        return float(np.max(np.abs(self._rest(motion)), initial=0.0))
+        return float(np.max(self.rest.scale * self.rest.excess(self._undriven(motion)), initial=0.0))
 
     def _violation(self, motion: RelaxedMotion) -> float:
-        beyond = np.maximum(np.maximum(self.lower - motion.us, motion.us - self.upper), 0.0) * self.input_scale
+        beyond = self.inputs.scale * self.inputs.excess(motion.us)
         return max(self.constraints.violation(motion.xs, motion.us), float(np.max(beyond, initial=0.0)))
 
     # ------------------------------------------------------------------ its expansion
@@ -543,15 +507,14 @@ class RelaxedSearch:
         T[:, nx:, 2 * nv :] = self.plant.inverse_actuation
         rollout = Motion(motion.xs, motion.us, np.zeros((N, nx)))
         gradients, hessians = expand_costs(self.problem, rollout, self.constraints)
-        pushes = self._input_pushes(motion)
-        gradients[:-1, nx:] += self.input_scale * pushes
-        inputs = np.arange(nx, T.shape[1])
-        hessians[:-1, inputs, inputs] += np.where(pushes != 0, self.input_penalty, 0.0) * self.input_scale**2
+        inputs, (slopes, stiffness) = np.arange(nx, T.shape[1]), self.inputs.expand(motion.us)
+        gradients[:-1, nx:] += slopes
+        hessians[:-1, inputs, inputs] += stiffness
         g = (T.swapaxes(1, 2) @ gradients[..., None])[..., 0]
         H = T.swapaxes(1, 2) @ hessians @ T
-        U = self.undriven * self.rest_scale
-        g[:-1, 2 * nv :] += (self.rest_multipliers + self.rest_penalty * (motion.tau @ U)) @ U.T
-        H[:-1, 2 * nv :, 2 * nv :] += self.rest_penalty * U @ U.T
+        slopes, stiffness = self.rest.expand(self._undriven(motion))
+        g[:-1, 2 * nv :] += slopes @ self.undriven.T
+        H[:-1, 2 * nv :, 2 * nv :] += (self.undriven * stiffness[:, None]) @ self.undriven.T
         return g, H
 
     def _step(self, model: LinearQuadratic, weights: Array) -> tuple[Array, Array] | None:

@@ -12,10 +12,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.values import ShowsItsRepr
-from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError, UnknownNameError
-from drake_diff.model.contact import active_modes
-from drake_diff.model.parameters import applied, select
-from drake_diff.model.step import advance
+from drake_diff.exceptions import GradientError, InputError, ModelError, UnknownNameError
+from drake_diff.model.parameters import select
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.obstacles import swept
 from drake_diff.optimize.problem.problem import Problem
@@ -54,7 +52,7 @@ class Sensitivity(ShowsItsRepr):
         cost: (p,) of the cost.
         active: How many bounds and inequalities hold the plan.
         weak: What makes a corner of the plan, of which this is the derivative of one side: bounds that begin or cease
-            to hold it, contacts that begin, end or slip as it changes, and columns whose two sides differ.
+            to hold it, and columns whose two sides differ, as where a contact begins.
         differences: (p,) the largest distance from differences of re-solves, as a part of the column; None if not
             asked for, NaN where a re-solve failed.
         derivatives: Where the second derivatives came from.
@@ -104,8 +102,9 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         certified: Whether the problem is solved again on both sides of each column, and the differences are compared.
 
     Returns:
-        A `Sensitivity`. Where a bound holds the plan without force, or a contact is about to change, its `verdict` is
-        "discontinuous": a plan that is pushed to one side changes otherwise than one that is pushed to the other.
+        A `Sensitivity`. Where a bound holds the plan without force, or differences of re-solves tell that a contact is
+        about to change, its `verdict` is "discontinuous": a plan that is pushed to one side changes otherwise than one
+        that is pushed to the other.
 
     Raises:
         InputError: The solution is no success, its cost is one of the whole trajectory, or nothing is asked for.
@@ -149,7 +148,7 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         ),
         cost=frozen(response.cost),
         active=response.active,
-        weak=(*response.weak, *_changes_of_contact(plan, plan_held, change, dz)),
+        weak=tuple(response.weak),
         derivatives=plan.derivatives(program),
     )
     if not certified:
@@ -241,36 +240,6 @@ def _change(solution: Solution, by: Any) -> Change:
     if chosen and problem.optimizes_parameters:
         raise InputError("by", got=sorted(chosen), expected="parameters that the plan does not choose itself")
     return Change(vector.names, np.array(vector.values), None, parameters=by)
-
-
-def _changes_of_contact(plan: _Plan, held: HeldPlan, change: Change, dz: Array) -> list[str]:
-    """The contacts that are others a little way along a column: they begin, end, or begin to slip or to stick."""
-    if not plan.discrete or not plan.problem.model.contract.contact.collision_pairs:
-        return []
-    changes: dict[str, None] = {}
-    here = _modes(plan.problem, held.program, held.z)
-    for i, value in enumerate(change.values):
-        for side in (-1, 1):
-            step = side * NEAREST * max(1.0, abs(value))
-            with change.moved(plan.problem, i, step) as problem:
-                there = _modes(problem, held.program, held.z + step * dz[:, i])
-            for k, (before, after) in enumerate(zip(here, there, strict=True)):
-                pairs = sorted({pair for pair, _ in before.items() ^ after.items()})
-                changes |= {f"contact of {a} with {b} at knot {k}": None for a, b in pairs}
-    return list(changes)
-
-
-def _modes(problem: Problem, program: KnotProgram, z: Array) -> list[dict[tuple[str, str], str]]:
-    """(N,) the modes of the pairs that push each other in each step; one that cannot be taken has a mode of its own."""
-    modes: list[dict[tuple[str, str], str]] = []
-    with applied(StepProgram(problem).vector(z)) as model:
-        for x, u in zip(z[program.states_at[:-1]], z[program.inputs_at], strict=True):
-            try:
-                advance(model.double, x, u)
-                modes.append(active_modes(model))
-            except SimulationError:
-                modes.append({("a step", "nothing, as it cannot be taken"): ""})
-    return modes
 
 
 def _differences(plan: _Plan, held: HeldPlan, change: Change, response: Held) -> tuple[Array, list[str]]:

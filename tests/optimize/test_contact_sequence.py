@@ -9,7 +9,7 @@ import drake_diff as dd
 from drake_diff.model.contact import separations
 from drake_diff.model.step import set_state
 from drake_diff.optimize import Options
-from drake_diff.optimize.ilqr.through_contact import MARGIN, beginnings, restore_goal
+from drake_diff.optimize.ilqr.through_contact import MARGIN, beginnings
 from drake_diff.optimize.problem.design import ShootingVariables
 
 pytestmark = pytest.mark.solve
@@ -55,10 +55,6 @@ def test_beginnings_are_where_a_distance_turns_negative(two_spheres):
     assert [(h.knot, h.apart) for h in found] == [(1, False), (3, True), (4, False)]  # knot 0 is given
     assert str(found[1]) == "pusher and ball apart at knot 3"
     for hold in found:
-        moved = hold.moved_beyond(problem.model, xs[hold.knot])
-        assert separation(problem.model, moved).distance == pytest.approx(-MARGIN if hold.apart else MARGIN, rel=1e-9)
-        centre = [1.0, 0.5] @ moved[:2] - [1.0, 0.5] @ xs[hold.knot][:2]  # the masses' centre stays
-        assert centre == pytest.approx(0, abs=1e-15)
         rows = hold.constraint(problem.model).differentiate(xs[hold.knot], np.zeros(1))
         assert rows[0] == pytest.approx([gaps[hold.knot]], abs=1e-12)
         assert rows[1] == pytest.approx(np.array([[-1.0, 1, 0, 0, 0]]), abs=1e-12)
@@ -120,7 +116,7 @@ def test_a_minimum_at_a_jump_meets_the_conditions_of_one_on_its_side(elastic):
     distance = [x[1] - x[0] - 0.2 for x in solution.xs]
     (knot,) = (k for k, d in enumerate(distance) if abs(abs(d) - MARGIN) < 1e-7)
     apart = distance[knot] > 0
-    assert f"held by pusher and ball {'apart' if apart else 'touching'} at knot {knot} (beyond: " in note
+    assert f"held by pusher and ball {'apart' if apart else 'touching'} at knot {knot}" in note
     variables = ShootingVariables(problem)
     by_u = [np.zeros((problem.nx, solution.us.size))]
     for k, d in enumerate(variables.linearization(variables.pack(solution.xs[0], solution.us))):
@@ -143,21 +139,3 @@ def test_a_goal_that_no_contact_reaches_is_no_success(two_spheres, goal):
     )
     assert not solution.success
     assert solution.goal_error > 0.25
-
-
-def test_restoration_keeps_bounds_and_looks_at_the_clock(two_spheres):
-    """The ball needs more than 1 m/s on its way to 1.2 m: no step towards the goal may take it there."""
-    model = two_spheres(damping=0)
-    us = np.full((50, 1), 2.0)
-    bounds = dd.Bounds(x_upper=[np.inf, np.inf, np.inf, 1.4])
-    free, bounded = (push(model, gap=0.2, goal=1.8, bounds=b) for b in (None, bounds))
-    xs = dd.rollout(model, free.x0, us).xs
-    assert xs[:, 3].max() < 1.4
-    moved, found, done = restore_goal(free, xs, us, 1e-8)
-    assert moved[-1, 1] == pytest.approx(1.8, abs=1e-8)
-    assert moved[:, 3].max() > 1.5
-    assert "Newton step" in done
-    kept, _, _ = restore_goal(bounded, xs, us, 1e-8)
-    assert kept[:, 3].max() < 1.4 + 1e-5
-    assert restore_goal(free, xs, us, 1e-8, lambda: True)[1] is us
-    assert found is not us

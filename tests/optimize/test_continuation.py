@@ -11,7 +11,6 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.optimize import Options
 from drake_diff.optimize.continuation import default_schedule
-from drake_diff.optimize.ilqr.through_contact import restore_goal
 from drake_diff.optimize.solution import Status
 
 pytestmark = pytest.mark.solve
@@ -112,14 +111,6 @@ def test_only_ilqr_takes_a_continuation(two_spheres, load):
     pendulum = load("pendulum.urdf")
     with pytest.raises(InputError, match="may collide"):
         dd.solve(dd.Problem(pendulum, x0=[0, 0], num_steps=5, x_goal=[1, 0]), options=Options(continuation="auto"))
-
-
-def test_restoration_leaves_a_goal_that_nothing_moves(two_spheres):
-    problem = push(two_spheres(), gap=0.4, goal=1.2, num_steps=10)
-    us = np.zeros((10, 1))
-    _, found, done = restore_goal(problem, np.tile(problem.x0, (11, 1)), us, 1e-8)
-    assert found is us
-    assert done == ""
 
 
 @pytest.mark.slow

@@ -124,7 +124,7 @@ def test_the_gradient_of_the_augmented_cost_is_that_of_differences():
     step = 0.01 * random.standard_normal((N + 1, model.nv))
     step[0] = 0.0
     at = search._moved(still, step)
-    search.rest_multipliers = 0.1 * random.standard_normal(search.rest_multipliers.shape)
+    search.rest.multipliers = 0.1 * random.standard_normal(search.rest.multipliers.shape)
     quadratic, _ = search._expand(search.motion(at, soft), soft)
     dvs, moved = random.standard_normal((N, model.nv)), np.zeros((N + 1, 2 * model.nv))
     for k, (F, dv) in enumerate(zip(quadratic.F, dvs, strict=True)):

@@ -7,9 +7,9 @@ p J'J of the rows that push is kept (Gauss-Newton), which no constraint can make
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, slices_of
 from drake_diff.optimize.problem.constraint import Constraint
@@ -17,17 +17,85 @@ from drake_diff.optimize.problem.problem import Problem
 
 FIRST_PENALTIES = (1.0, 1e6)  # the lowest and the highest
 LARGEST_PENALTY, GROWTH = 1e9, 10.0
-Active = tuple[NDArray[np.bool_], NDArray[np.bool_]]  # (m,) which upper bounds push, and which lower ones
 SMALLEST_SLOPE = 1e-8  # of a row: below it nothing says in what unit it is to be weighed
 
 
-class AugmentedLagrangian:
-    """What must hold of a motion, as rows lower <= c <= upper, their multipliers and their common penalty.
+class PenalizedRows:
+    """Rows lower <= c <= upper, each weighed by its `scale`, with their multipliers and one penalty.
+
+    Multipliers are positive at an upper bound and negative at a lower one. All methods take what `values` takes: here
+    the values of the rows themselves, of the shape of `lower`.
+    """
+
+    def __init__(self, lower: Array, upper: Array, scale: Any = 1.0):
+        self.lower, self.upper = lower, upper
+        self.scale = np.array(np.broadcast_to(scale, lower.shape), dtype=float)
+        self.multipliers = np.zeros(lower.shape)
+        self.penalty = FIRST_PENALTIES[0]
+        self.is_equality = lower == upper
+
+    def values(self, *given: Array) -> Array:
+        """c."""
+        return given[0]
+
+    @property
+    def forces(self) -> Array:
+        """The multipliers of the rows in their own units, whatever their scales are."""
+        return self.multipliers * self.scale
+
+    @forces.setter
+    def forces(self, forces: Array) -> None:
+        self.multipliers = forces / self.scale
+
+    def excess(self, *given: Array) -> Array:
+        """How far beyond a bound each row is, in its own unit."""
+        values = self.values(*given)
+        return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
+
+    def violation(self, *given: Array) -> float:
+        """The largest of these."""
+        return float(np.max(self.excess(*given), initial=0.0))
+
+    def pushes(self, *given: Array) -> Array:
+        """y + p c of each bound that pushes, 0 elsewhere."""
+        above, below = self._sides(self.values(*given))
+        return np.maximum(above, 0.0) + np.minimum(below, 0.0)
+
+    def residual(self, *given: Array) -> float:
+        """The largest change of a multiplier by `update`, over the penalty: 0 at a KKT point."""
+        return float(np.abs(self.pushes(*given) - self.multipliers).max(initial=0.0)) / self.penalty
+
+    def unrest(self, *given: Array) -> float:
+        """How far the augmented cost is from being the same after an `update`."""
+        return float(np.sum((self.pushes(*given) - self.multipliers) ** 2)) / (2 * self.penalty)
+
+    def value(self, *given: Array) -> float:
+        """What the rows add to the cost."""
+        return float(np.sum(self.pushes(*given) ** 2 - self.multipliers**2)) / (2 * self.penalty)
+
+    def expand(self, *given: Array) -> tuple[Array, Array]:
+        """The gradient of `value` by each row, and the curvature of those that push, as equalities always do."""
+        above, below = self._sides(self.values(*given))
+        on = (above > 0) | (below < 0) | self.is_equality
+        pushes = np.maximum(above, 0.0) + np.minimum(below, 0.0)
+        return self.scale * pushes, np.where(on, self.penalty * self.scale**2, 0.0)
+
+    def update(self, *given: Array) -> None:
+        """Take over the multipliers that the minimum of the augmented cost tells."""
+        self.multipliers = self.pushes(*given)
+
+    def _sides(self, values: Array) -> tuple[Array, Array]:
+        """y + p c of the upper bounds, which push where it is positive, and of the lower ones."""
+        weight = self.penalty * self.scale
+        return self.multipliers + weight * (values - self.upper), self.multipliers + weight * (values - self.lower)
+
+
+class AugmentedLagrangian(PenalizedRows):
+    """What must hold of a motion xs (N+1, nx), us (N, nu), which all methods take.
 
     First a row for every state coordinate at every knot, in its own unit (the bounds of x_0 are not here), then those
     of the problem's constraints. These are divided by the largest slope |dc / d(x, u)| that they were seen to have at
-    any of their knots, so that newtons beside metres weigh as the metres do that change them. Multipliers (m,) are
-    positive at an upper bound and negative at a lower one.
+    any of their knots, so that newtons beside metres weigh as the metres do that change them.
     """
 
     def __init__(self, problem: Problem):
@@ -35,122 +103,56 @@ class AugmentedLagrangian:
         lower, upper = problem.state_limits()
         lower[0], upper[0] = -np.inf, np.inf
         self.groups = [_Rows(problem, constraint) for constraint in problem.kept]
-        self.lower = np.concatenate([lower.ravel(), *(g.lower for g in self.groups)])
-        self.upper = np.concatenate([upper.ravel(), *(g.upper for g in self.groups)])
+        super().__init__(
+            np.concatenate([lower.ravel(), *(g.lower for g in self.groups)]),
+            np.concatenate([upper.ravel(), *(g.upper for g in self.groups)]),
+        )
         self.slices = slices_of([lower.size, *(g.size for g in self.groups)])[1:]  # where the rows of each group are
-        self.scale = np.ones(len(self.lower))
-        self.multipliers = np.zeros(len(self.lower))
-        self.penalty = FIRST_PENALTIES[0]
-        self.any = bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
-        self.is_equality = self.lower == self.upper
-        self.have_bends = bool((np.isfinite(self.lower) | np.isfinite(self.upper))[~self.is_equality].any())
-
-    @property
-    def forces(self) -> Array:
-        """(m,) the multipliers of the rows in their own units, whatever their scales are."""
-        return self.multipliers * self.scale
-
-    @forces.setter
-    def forces(self, forces: Array) -> None:
-        self.multipliers = forces / self.scale
+        self.any = bool(np.any(np.isfinite(self.lower) | np.isfinite(self.upper)))
 
     def start(self, xs: Array, us: Array, cost: float, gaps: float) -> None:
         """Choose scales, and a first penalty that makes the guess as wrong as it is expensive: a good one is not left.
 
-        `gaps` is the sum of the squares of what else is wrong with the guess xs (N+1, nx), us (N, nu).
+        `gaps` is the sum of the squares of what else is wrong with the guess.
         """
         self._choose_scales(xs, us)
-        wrong = (gaps + float(np.sum((self.scale * self._excess(xs, us)) ** 2))) / 2
+        wrong = (gaps + float(np.sum((self.scale * self.excess(xs, us)) ** 2))) / 2
         self.penalty = float(np.clip(abs(cost) / wrong if wrong else np.inf, *FIRST_PENALTIES))
 
-    def violation(self, xs: Array, us: Array) -> float:
-        """The largest excess over a bound, or distance from the goal, in the row's own unit."""
-        return float(np.max(self._excess(xs, us), initial=0.0))
+    def value(self, *given: Array) -> float:
+        return super().value(*given) if self.any else 0.0
 
-    def residual(self, xs: Array, us: Array) -> float:
-        """The largest change of a multiplier by `update`, over the penalty: 0 at a KKT point."""
-        return float(np.abs(self._pushes(xs, us) - self.multipliers).max(initial=0.0)) / self.penalty
+    def values(self, *given: Array) -> Array:
+        return np.concatenate([given[0].ravel(), *(group.values(*given) for group in self.groups)])
 
-    def unrest(self, xs: Array, us: Array) -> float:
-        """How far the augmented cost is from saying the same at xs, us after an `update`."""
-        return float(np.sum((self._pushes(xs, us) - self.multipliers) ** 2)) / (2 * self.penalty)
+    def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
+        """(gradients (N+1, nx + nu), Hessians (N+1, nx + nu, nx + nu)) of `value` by each [x_k; u_k], as by `expand`.
 
-    def value(self, xs: Array, us: Array) -> float:
-        """What the constraints add to the cost of xs (N+1, nx), us (N, nu)."""
-        if not self.any:
-            return 0.0
-        return self._value(*self._forces(self._values(xs, us)))
-
-    def active(self, xs: Array, us: Array) -> Active:
-        """Which rows push."""
-        return self._active(*self._forces(self._values(xs, us)))
-
-    def look_ahead(self, xs: Array, us: Array, dxs: Array, dus: Array) -> tuple[Active, float]:
-        """Which rows push, and `value`, at the distance dxs (N+1, nx), dus (N, nu) from xs, us, by the rows' slopes."""
-        zs, moved = np.hstack([dxs, np.vstack([dus, dus[-1:]])]), [dxs.ravel()]
-        for group in self.groups:
-            moved.append(np.einsum("kri,ki->kr", group.jacobians(xs, us), zs[group.knots]).ravel())
-        forces = self._forces(self._values(xs, us) + np.concatenate(moved))
-        return self._active(*forces), self._value(*forces)
-
-    def differentiate(self, xs: Array, us: Array, active: Active | None = None) -> tuple[Array, Array]:
-        """(gradients (N+1, nx + nu), Hessians (N+1, nx + nu, nx + nu)) of `value` by each [x_k; u_k].
-
-        Given other rows than those that push here, of what `value` would be if the given pushed, and they alone. Raises
-        GradientError if that of a constraint is lost or not finite.
+        Raises GradientError if the derivative of a constraint is lost or not finite.
         """
-        above, below = self._forces(self._values(xs, us))
-        active = self._active(above, below) if active is None else active
-        pushes = np.where(active[0], above, 0.0) + np.where(active[1], below, 0.0)
-        stiffness = np.where(active[0] | active[1], self.penalty, 0.0)
+        slopes, stiffness = self.expand(xs, us)
         (count, nx), n = xs.shape, xs.shape[1] + us.shape[1]
         gradients, hessians = np.zeros((count, n)), np.zeros((count, n, n))
-        gradients[:, :nx] = pushes[: xs.size].reshape(xs.shape)
+        gradients[:, :nx] = slopes[: xs.size].reshape(xs.shape)
         hessians[:, np.arange(nx), np.arange(nx)] = stiffness[: xs.size].reshape(xs.shape)
         for group, rows in zip(self.groups, self.slices, strict=True):
-            jacobians = self.scale[rows].reshape(group.shape)[:, :, None] * group.jacobians(xs, us)
-            gradients[group.knots] += (pushes[rows].reshape(group.shape)[:, None] @ jacobians)[:, 0]
-            stiff = stiffness[rows].reshape(group.shape)
-            for k, those, by_z in zip(group.knots, stiff, jacobians, strict=True):
-                pushing = by_z[those > 0]
-                if len(pushing):
-                    hessians[k] += self.penalty * pushing.T.dot(pushing)
+            jacobians = group.jacobians(xs, us)
+            gradients[group.knots] += (slopes[rows].reshape(group.shape)[:, None] @ jacobians)[:, 0]
+            for k, stiff, by_z in zip(group.knots, stiffness[rows].reshape(group.shape), jacobians, strict=True):
+                on = stiff > 0
+                if on.any():
+                    hessians[k] += (by_z[on].T * stiff[on]).dot(by_z[on])
         return gradients, hessians
 
-    def update(self, xs: Array, us: Array) -> None:
-        """Take over the multipliers that the minimum xs, us of the augmented cost tells, and look at the scales."""
-        forces = self._pushes(xs, us) * self.scale
-        self._choose_scales(xs, us)
+    def update(self, *given: Array) -> None:
+        """Take over the multipliers, and look at the scales."""
+        forces = self.pushes(*given) * self.scale
+        self._choose_scales(*given)
         self.forces = forces
 
     def _choose_scales(self, xs: Array, us: Array) -> None:
         for group, rows in zip(self.groups, self.slices, strict=True):
             self.scale[rows] = group.scale(xs, us)
-
-    def _values(self, xs: Array, us: Array) -> Array:
-        return np.concatenate([xs.ravel(), *(group.values(xs, us) for group in self.groups)])
-
-    def _excess(self, xs: Array, us: Array) -> Array:
-        values = self._values(xs, us)
-        return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
-
-    def _forces(self, values: Array) -> tuple[Array, Array]:
-        """(m,) each: y + p c of the upper bounds, which push where it is positive, and of the lower ones."""
-        weight = self.penalty * self.scale
-        return self.multipliers + weight * (values - self.upper), self.multipliers + weight * (values - self.lower)
-
-    def _active(self, above: Array, below: Array) -> Active:
-        """An equality pushes always, on one side or the other: it is told as its upper bound."""
-        return (above > 0) | self.is_equality, (below < 0) & ~self.is_equality
-
-    def _value(self, above: Array, below: Array) -> float:
-        pushes = np.maximum(above, 0.0) + np.minimum(below, 0.0)
-        return float(np.sum(pushes**2 - self.multipliers**2)) / (2 * self.penalty)
-
-    def _pushes(self, xs: Array, us: Array) -> Array:
-        """(m,): y + p c of each bound that pushes, 0 elsewhere."""
-        above, below = self._forces(self._values(xs, us))
-        return np.maximum(above, 0.0) + np.minimum(below, 0.0)
 
 
 class _Rows:

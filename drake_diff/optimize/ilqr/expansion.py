@@ -17,7 +17,7 @@ from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.steps import known_steps
 from drake_diff.model.parameters import select
 from drake_diff.motion.rollout import STEPS
-from drake_diff.optimize.ilqr.constraints import Active, AugmentedLagrangian
+from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import differentiate_final_cost, final_cost_hessian
@@ -104,19 +104,6 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
         start_upper=np.where(free, bounds.x_upper - xs[0], 0.0),
     )
     return _with_design(problem, motion, expansion, h) if len(motion.c) else expansion
-
-
-def with_active(
-    problem: Problem, motion: Motion, model: LinearQuadratic, rows: AugmentedLagrangian, old: Active, new: Active
-) -> LinearQuadratic:
-    """`model` of `motion`, in which the `old` rows push, as if the `new` ones pushed, and they alone."""
-    nx, n = motion.xs.shape[1], model.F.shape[2]
-    columns = np.r_[:nx, nx + len(motion.c) : n]  # where x and u are in [x, c, u]
-    before, after = rows.differentiate(*motion.point, old), rows.differentiate(*motion.point, new)
-    gradients, hessians = np.array(model.gradients), np.array(model.hessians)
-    gradients[:, columns] += after[0] - before[0]
-    hessians[:, columns[:, None], columns] += after[1] - before[1]
-    return replace(model, gradients=gradients, hessians=hessians)
 
 
 def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: float) -> LinearQuadratic:

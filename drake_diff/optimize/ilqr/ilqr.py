@@ -21,14 +21,13 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
 from drake_diff.motion.smooth_roll import SmoothRoll, smooth_roll_of
-from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, Active, AugmentedLagrangian
+from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import (
     DynamicsCurvature,
     Motion,
     curvature_along,
     expand,
     jacobians_along,
-    with_active,
 )
 from drake_diff.optimize.ilqr.riccati import (
     ROUNDING_OF_CURVATURE,
@@ -75,8 +74,6 @@ class IlqrOptions:
     beside: float = 1e-14  # of a bound: an input that is no further from it is on it
     slow: float = 1 / 2  # of what a step gained: where the next one gains more, the curvature is not the right one
     same_motion: float = 1e-9  # of the largest state: what rounding of two forms of a step may come to under feedback
-    settle: int = 12  # sweeps for one policy, until it leads to the bounds that it was made for
-    parts: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125)  # of such a sweep's step
 
 
 OPTIONS = IlqrOptions()
@@ -152,30 +149,6 @@ def _smooth_roll(problem: Problem) -> SmoothRoll | None:
     if not problem.optimizes_controls:
         return None
     return smooth_roll_of(problem.model)
-
-
-class _Bends:
-    """The model of an augmented cost with the bends where bounds begin to push, as a function of steps (dxs, dus)."""
-
-    def __init__(self, smooth: LinearQuadratic, rows: AugmentedLagrangian, point: tuple[Array, Array]):
-        self.smooth, self.rows, self.point = smooth, rows, point
-        self.still = np.zeros((len(point[0]), smooth.num_states)), np.zeros_like(point[1])
-        self.base = rows.value(*point)
-
-    def __call__(self, step: tuple[Array, Array]) -> tuple[Active, float]:
-        """Which bounds push there, and how the model changes."""
-        active, value = self.rows.look_ahead(*self.point, step[0][:, : self.point[0].shape[1]], step[1])
-        slope, curvature = slope_along(self.smooth, *step)
-        return active, slope + curvature / 2 + value - self.base
-
-    def lower_between(self, old: tuple[Array, Array], new: tuple[Array, Array]) -> tuple[Array, Array]:
-        """The first step on the way back from `new` to `old` that is lower than `old`."""
-        before, step = self(old)[1], new
-        for fraction in OPTIONS.parts:
-            step = old[0] + fraction * (new[0] - old[0]), old[1] + fraction * (new[1] - old[1])
-            if self(step)[1] < before:
-                break
-        return step
 
 
 class _Search:
@@ -317,7 +290,7 @@ class _Search:
         refusals = self.refusals
         while self.regularization <= OPTIONS.largest_regularization:
             with np.errstate(all="ignore"):  # a policy that leads to infinity promises nothing
-                policies = (self._settled(candidate, solve(candidate, self.regularization)) for candidate in models)
+                policies = (solve(candidate, self.regularization) for candidate in models)
                 policy = next((p for p in policies if p is not None and p.expected >= 0), None)
             if policy is not None and self._search_along(model, policy):
                 return None
@@ -328,38 +301,6 @@ class _Search:
             self.regularization = self._tightened()
         self.regularization = 0.0
         return Outcome.NO_GRADIENT if self.refusals > refusals else Outcome.INACCURATE
-
-    def _settled(self, model: LinearQuadratic, policy: AffinePolicy | None) -> AffinePolicy | None:
-        """The policy for the bounds that push where it leads, in place of those that push here.
-
-        Where a bound begins to push, or ends, the augmented cost has a bend that no quadratic model has, and a step is
-        cut back at the next of them. Quadratic but for its bends, the cost's model has its minimum where Newton steps,
-        each a sweep, lead: they end at a policy that leads to the very bounds it was made for. Of a rollout alone: what
-        closes gaps goes too far for such a model.
-        """
-        rows, point = self.constraints, self.motion.point
-        if policy is None or not rows.have_bends or not self.motion.is_rollout:
-            return policy
-        here, none = rows.active(*point), np.zeros(len(rows.lower), dtype=bool)
-        smooth = with_active(self.problem, self.motion, model, rows, here, (none, none))
-        bends = _Bends(smooth, rows, point)
-        active, step, best, least = here, bends.still, policy, math.inf
-        for _ in range(OPTIONS.settle):
-            led = follow(model, policy)
-            ahead, change = bends(led)
-            if change < least:
-                slope, least = slope_along(model, *led)[0], change
-                best = replace(policy, slope=slope, curvature=2 * (change - slope))
-            if all(map(np.array_equal, ahead, active)):
-                break
-            step = bends.lower_between(step, led)
-            active = bends(step)[0]
-            bent = with_active(self.problem, self.motion, smooth, rows, (none, none), active)
-            next_policy = solve_riccati(bent, self.regularization)
-            if next_policy is None:
-                break
-            policy = next_policy
-        return best
 
     def _tightened(self) -> float:
         return max(OPTIONS.harder * self.regularization, OPTIONS.first_regularization)

@@ -7,15 +7,16 @@ the boxes those of Tassa, Mansard and Todorov, "Control-limited differential dyn
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_diff._base.arrays import Array
-from drake_diff.optimize.ilqr import riccati_kernel
+from drake_diff._base.arrays import Array, Indices, own_array
+from drake_diff._base.compiled import compiled, inner
 
 BOX_ITERATIONS = 30
-HALVINGS = np.asarray(0.5 ** np.arange(20), dtype=np.float64)
+HALVINGS = 20
 ROUNDING_OF_CURVATURE = 1e-8  # of the inputs' curvature: makes one that is only just not positive definite so
 LEAST_SCALE = 1e-12  # of the largest diagonal entry: an input of no effect has a ridge too
 
@@ -96,25 +97,9 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePoli
     P[-1], s[-1] = problem.final_hessian, problem.final_gradient
     K, free = np.empty((count, m, n + 1)), np.ones((count, m), dtype=bool)  # feedforward and feedback
     gradients, hessians = np.empty((count, m)), np.empty((count, m, m))  # by the inputs
-    is_solved = riccati_kernel.sweep(
-        _contiguous(problem.F),
-        _contiguous(problem.gaps),
-        _contiguous(problem.gradients),
-        _contiguous(problem.hessians),
-        _contiguous(problem.lower),
-        _contiguous(problem.upper),
-        float(regularization),
-        LEAST_SCALE,
-        BOX_ITERATIONS,
-        HALVINGS,
-        P,
-        s,
-        K,
-        free,
-        gradients,
-        hessians,
-    )
-    if not is_solved:
+    names = ("F", "gaps", "gradients", "hessians", "lower", "upper")
+    arrays: Any = [_contiguous(getattr(problem, name)) for name in names]
+    if not _sweep(*[*arrays, float(regularization), P, s, K, free, gradients, hessians]):
         return None
     try:
         start, left = _best_start(problem, P[0], s[0], regularization)
@@ -133,9 +118,7 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePoli
 def _contiguous(array: Array) -> Array:
     """Itself, or a copy that is contiguous and may be written: of others the sweep would be compiled once more."""
     flags = array.flags
-    return (
-        array if flags.c_contiguous and flags.writeable and array.dtype == float else np.array(array, float, order="C")
-    )
+    return array if flags.c_contiguous and flags.writeable and array.dtype == float else own_array(array.astype(float))
 
 
 def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: float) -> tuple[Array, float]:
@@ -145,7 +128,7 @@ def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: fl
     if not len(moves):
         return start, 0.0
     hessian = P[np.ix_(moves, moves)]
-    riccati_kernel.add_ridge(hessian, float(regularization), LEAST_SCALE)
+    _add_ridge(hessian, float(regularization))
     lower, upper = problem.start_lower[moves], problem.start_upper[moves]
     start[moves], free = minimize_in_box(hessian, s[moves], lower, upper)
     return start, float(np.abs(s[moves[free]]).max(initial=0.0))
@@ -158,8 +141,8 @@ def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array)
     """
     np.linalg.cholesky(hessian)
     d, free = np.empty(len(gradient)), np.ones(len(gradient), dtype=bool)
-    H, g, low, high = _contiguous(hessian), _contiguous(gradient), _contiguous(lower), _contiguous(upper)
-    if not riccati_kernel.minimize_in_box(H, g, low, high, BOX_ITERATIONS, HALVINGS, d, free):
+    H, g, low, high = (_contiguous(array) for array in (hessian, gradient, lower, upper))
+    if not _minimize_in_box(H, g, low, high, d, free, np.empty(hessian.shape)):
         raise np.linalg.LinAlgError
     return d, free
 
@@ -187,3 +170,176 @@ def slope_along(problem: LinearQuadratic, dxs: Array, dus: Array) -> tuple[float
     zs = np.hstack([dxs, np.vstack([dus, np.zeros((1, dus.shape[1]))])])
     bent = (problem.hessians @ zs[:, :, None])[:, :, 0]
     return float(np.sum(problem.gradients * zs)), float(np.sum(bent * zs))
+
+
+# What Numba compiles: plain loops over rows, which for the few states of a robot are faster than BLAS.
+
+Flags = NDArray[np.bool_]
+
+
+@inner
+def _factor(A: Array, which: Indices, L: Array) -> bool:
+    """L D L' = A of the rows and columns `which`, D on L's diagonal; False if A is not positive definite there."""
+    for i in range(len(which)):
+        for j in range(i + 1):
+            total = A[which[i], which[j]]
+            for k in range(j):
+                total -= L[i, k] * L[j, k] * L[k, k]
+            if j < i:
+                L[i, j] = total / L[j, j]
+            elif total > 0 and total < np.inf:  # not where it is NaN
+                L[i, i] = total
+            else:
+                return False
+    return True
+
+
+@inner
+def _solve(A: Array, B: Array, which: Indices, L: Array) -> bool:
+    """B = -A^-1 B of the rows and columns `which`; False if A is not positive definite there."""
+    if not _factor(A, which, L):
+        return False
+    m, width = len(which), B.shape[1]
+    for i in range(m):
+        for k in range(i):
+            for c in range(width):
+                B[which[i], c] -= L[i, k] * B[which[k], c]
+    for i in range(m):
+        for c in range(width):
+            B[which[i], c] /= -L[i, i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            for c in range(width):
+                B[which[i], c] -= L[k, i] * B[which[k], c]
+    return True
+
+
+@inner
+def _value(H: Array, g: Array, d: Array) -> float:
+    total = 0.0
+    for i in range(len(d)):
+        row = 0.0
+        for j in range(len(d)):
+            row += H[i, j] * d[j]
+        total += d[i] * (g[i] + row / 2)
+    return total
+
+
+@compiled
+def _minimize_in_box(H: Array, g: Array, lower: Array, upper: Array, d: Array, free: Flags, L: Array) -> bool:
+    """The d (m,) of least g' d + d' H d / 2 within bounds, and which are free; False if a part of H fails."""
+    m = len(g)
+    step, moved = np.empty((m, 1)), np.empty(m)
+    for i in range(m):
+        d[i] = min(max(0.0, lower[i]), upper[i])
+    for _ in range(BOX_ITERATIONS):
+        for i in range(m):
+            slope = g[i]
+            for j in range(m):
+                slope += H[i, j] * d[j]
+            step[i, 0] = slope
+            free[i] = not ((d[i] <= lower[i] and slope > 0) or (d[i] >= upper[i] and slope < 0))
+        which = np.flatnonzero(free)
+        if not _solve(H, step, which, L):
+            return False
+        before, size, same = _value(H, g, d), 1.0, True
+        for _ in range(HALVINGS):
+            moved[:] = d
+            for a in which:
+                moved[a] = min(max(d[a] + size * step[a, 0], lower[a]), upper[a])
+            if _value(H, g, moved) < before:
+                same = np.array_equal(d, moved)
+                d[:] = moved
+                break
+            size /= 2
+        if same:
+            break
+    return True
+
+
+@compiled
+def _add_ridge(hessian: Array, regularization: float) -> None:
+    """Add `regularization` times its diagonal, of entries far below the largest LEAST_SCALE of that, to a Hessian."""
+    m, largest = len(hessian), 0.0
+    for a in range(m):
+        largest = max(largest, abs(hessian[a, a]))
+    for a in range(m if regularization > 0 else 0):
+        scale = max(abs(hessian[a, a]), LEAST_SCALE * largest) if largest > 0 else 1.0
+        hessian[a, a] += regularization * scale
+
+
+@inner
+def _gains(H: Array, rows: Array, lower: Array, upper: Array, K: Array, free: Flags, L: Array) -> bool:
+    """The gain K (m, n+1) = -H^-1 rows whose feedforward keeps the bounds; False if there is none."""
+    m, leaves = len(rows), False
+    K[:] = rows
+    if not _solve(H, K, np.arange(m), L):
+        return False
+    for i in range(m):
+        leaves = leaves or not (K[i, 0] >= lower[i] and K[i, 0] <= upper[i])
+    if not leaves:
+        return True
+    d = np.empty(m)
+    if not _minimize_in_box(H, rows[:, 0].copy(), lower, upper, d, free, L):
+        return False
+    for i in range(m):
+        for c in range(K.shape[1]):
+            K[i, c] = rows[i, c] if free[i] else 0.0
+    is_solved = _solve(H, K, np.flatnonzero(free), L)
+    K[:, 0] = d
+    return is_solved
+
+
+@inner
+def _add_product(A: Array, B: Array, out: Array) -> None:
+    """out += A' B."""
+    for k in range(len(A)):
+        for i in range(A.shape[1]):
+            for c in range(B.shape[1]):
+                out[i, c] += A[k, i] * B[k, c]
+
+
+@compiled
+def _sweep(
+    F: Array,
+    gaps: Array,
+    gradients: Array,
+    hessians: Array,
+    lower: Array,
+    upper: Array,
+    regularization: float,
+    P: Array,
+    s: Array,
+    K: Array,
+    free: Flags,
+    by_input: Array,
+    of_inputs: Array,
+) -> bool:
+    """Fill P (N+1, n, n) and s (N+1, n) from their last on, the gains K (N, m, n+1) and which inputs are `free` (N, m).
+
+    And the gradients (N, m) and Hessians (N, m, m) of the inputs. False if no minimum is found.
+    """
+    count, n, z = F.shape
+    m = z - n
+    PF, Q, L, hessian = np.empty((n, z + 1)), np.empty((z, z + 1)), np.empty((m, m)), np.empty((m, m))
+    rows, T, added = np.empty((m, n + 1)), np.empty((m, n + 1)), np.empty((n + 1, n + 1))
+    for k in range(count - 1, -1, -1):
+        PF[:, :z], PF[:, z] = 0.0, s[k + 1]  # P F, and s + P gap behind it
+        _add_product(P[k + 1], F[k], PF)
+        _add_product(P[k + 1], gaps[k].copy().reshape(n, 1), PF[:, z:])
+        Q[:, :z], Q[:, z] = hessians[k], gradients[k]  # by [x, u], and the gradient behind it
+        _add_product(F[k], PF, Q)
+        by_input[k], of_inputs[k], hessian[:] = Q[n:, z], Q[n:, n:z], Q[n:, n:z]
+        rows[:, 0], rows[:, 1:] = Q[n:, z], Q[n:, :n]
+        _add_ridge(hessian, regularization)
+        if not _gains(hessian, rows, lower[k], upper[k], K[k], free[k], L):
+            return False
+        T[:], added[:] = rows, 0.0
+        _add_product(of_inputs[k], K[k], T)
+        _add_product(K[k], T, added)
+        _add_product(rows, K[k], added)
+        for i in range(n):
+            s[k, i] = Q[i, z] + added[1 + i, 0]
+            for c in range(i, n):
+                P[k, i, c] = P[k, c, i] = Q[i, c] + added[1 + i, 1 + c]
+    return True

@@ -250,12 +250,10 @@ class FrameVelocityGoal(Goal):
         point: (3,) [m] in `frame`, what moves at `velocity`.
         tolerance: [m/s] how far from `velocity` it may be; free entries do not count.
         angular_tolerance: [rad/s] the same of `angular_velocity`.
-        knots: The knots at which it holds, as those of a `Constraint`; the last one where not given, None for all.
-        weight: With one it is part of the cost and not kept, as that of a `FrameGoal`.
+        knots, weight: As those of a `FrameGoal`.
 
     Raises:
-        InputError: Values that are none.
-        UnknownNameError: By the Problem: its model has no such frame; the message lists those that exist.
+        InputError, UnknownNameError: As of a `FrameGoal`.
 
     Example:
         >>> dd.FrameVelocityGoal("hand", [0.5, None, None])
@@ -301,12 +299,10 @@ class JointGoal(Goal):
         values: The value wanted of each coordinate by its name: one of the model's `state_names`, or a joint's name
             where the joint has one position, which it then is. In the coordinates' units: m, rad, m/s, rad/s.
         tolerance: How far from its value each may be, in its own unit.
-        knots: The knots at which it holds, as those of a `Constraint`; the last one where not given, None for all.
-        weight: With one it is part of the cost and not kept, as that of a `FrameGoal`.
+        knots, weight: As those of a `FrameGoal`.
 
     Raises:
-        InputError: Values that are none.
-        UnknownNameError: By the Problem: its model has no such coordinate; the message lists those that exist.
+        InputError, UnknownNameError: As of a `FrameGoal`.
 
     Example:
         >>> dd.JointGoal({"elbow": 1.0})
@@ -343,8 +339,7 @@ class CenterOfMassGoal(Goal):
     Args:
         position: (3,) [m] in the world; None or NaN where an entry is free.
         tolerance: [m] how far from it it may be; free entries do not count.
-        knots: The knots at which it holds, as those of a `Constraint`; the last one where not given, None for all.
-        weight: With one it is part of the cost and not kept, as that of a `FrameGoal`.
+        knots, weight: As those of a `FrameGoal`.
 
     Raises:
         InputError: Values that are none.
@@ -380,12 +375,10 @@ class KeepLevel(Goal):
         frame: The frame; a body's name will do.
         axis: (3,) what points up, along the world's z, in `frame`; of any length.
         tolerance: [rad] how far it may lean.
-        knots: The knots at which it holds, as those of a `Constraint`; all where not given.
-        weight: With one it is part of the cost and not kept, as that of a `FrameGoal`.
+        knots, weight: As those of a `FrameGoal`; all knots where not given.
 
     Raises:
-        InputError: Values that are none.
-        UnknownNameError: By the Problem: its model has no such frame; the message lists those that exist.
+        InputError, UnknownNameError: As of a `FrameGoal`.
 
     Example:
         >>> dd.KeepLevel("tray", tolerance=0.1)

@@ -223,15 +223,10 @@ class BoxObstacle(_Solid):
         size: (3,) [m] the edges along its own x, y and z.
         rotation: The box's own in the world: a rotation matrix (3, 3), or a quaternion (4,) as w, x, y, z; upright
             where not given.
-        margin: [m] the least distance that a plan keeps. Replays in other steps may use it up.
-        links: The bodies that keep clear; all that can move where not given.
-        name: What it is called in messages and pages.
-        weight: With one, it is no longer kept: weight times the square of what is used of the margin [m], of every
-            capsule, is added to the cost per second.
+        margin, links, name, weight: As those of a `SphereObstacle`.
 
     Raises:
-        InputError: Values that are none; by the Problem, a first or last state that is too near.
-        UnknownNameError: By the Problem: its model has no such body.
+        InputError, UnknownNameError: As of a `SphereObstacle`.
 
     Example:
         >>> dd.BoxObstacle([0.5, 0, 0.4], [0.1, 0.4, 0.8], name="shelf")
@@ -268,14 +263,12 @@ class SelfCollision(Obstacle):
     every one of 1,000 random states.
 
     Args:
-        margin: [m] the least distance that a plan keeps. Replays in other steps may use it up.
+        margin, weight: As those of a `SphereObstacle`.
         links: The bodies that keep clear of each other; all where not given.
         ignore: Pairs of bodies that may touch, such as [("hand", "finger")].
-        weight: With one, it is no longer kept, see `SphereObstacle`.
 
     Raises:
-        InputError: Values that are none; by the Problem, a first or last state in which two are too near.
-        UnknownNameError: By the Problem: its model has no such body.
+        InputError, UnknownNameError: As of a `SphereObstacle`.
 
     Example:
         >>> dd.SelfCollision(margin=0.02, ignore=[("panda_hand", "panda_link5")])

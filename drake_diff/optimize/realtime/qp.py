@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from scipy.sparse import csc_matrix
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.values import Refusal
@@ -120,13 +121,18 @@ class SoftProgram:
                 sides += len(r.lower) * len(bounded)
         entries = np.concatenate([np.stack(pair) for pair in places], axis=1)
         self._inside = entries[1] >= 0  # what depends on the first state, which is given, has no column
-        self._order = np.lexsort((entries[0][self._inside], entries[1][self._inside]))
-        a = _sparsity(entries[:, self._inside][:, self._order], (sides, self.size))
-        h = self._set_hessian(n)
-        shapes = {"h": h, "a": a}
+        self._a, self._shape = entries[:, self._inside], (sides, self.size)
+        self._h = self._set_hessian(n)
+        shapes = {"h": self._hessian(np.ones(len(self._h[0]))), "a": self._rows(np.ones(len(self._a[0])))}
+        shapes = {name: matrix.sparsity() for name, matrix in shapes.items()}
         self._solvers = [ca.conic("step", "piqp", shapes, {"error_on_fail": False, "piqp": o}) for o in OPTIONS]
-        self._a, self._h = a, h
         self._free = np.full(self.size - moves, FREE)
+
+    def _rows(self, data: Array) -> ca.DM:
+        return ca.DM(csc_matrix((data, self._a), self._shape))
+
+    def _hessian(self, data: Array) -> ca.DM:
+        return ca.DM(csc_matrix((data, self._h), (self.size, self.size)))
 
     def _dynamics(self) -> tuple[Indices, Indices]:
         """(rows, columns) of dx_(k+1), then of -F_k."""
@@ -151,14 +157,12 @@ class SoftProgram:
         slacks = self.slack_at[i] + k * m + bounded[a]
         return first + rows, np.concatenate([self._column(steps + r.first, r.function.columns[j]), slacks])
 
-    def _set_hessian(self, n: int) -> ca.Sparsity:
+    def _set_hessian(self, n: int) -> Indices:
         k, i, j = _all(self.count + 1, n, n)
         last = (k == self.count) & ((i >= self.nx) | (j >= self.nx))
-        rows, columns = self._column(k, i), self._column(k, j)
-        self._curved = (rows >= 0) & (columns >= 0) & ~last
-        entries = np.stack([rows[self._curved], columns[self._curved]])
-        self._hessian_order = np.lexsort((entries[0], entries[1]))
-        return _sparsity(entries[:, self._hessian_order], (self.size, self.size))
+        entries = np.stack([self._column(k, i), self._column(k, j)])
+        self._curved = np.all(entries >= 0, axis=0) & ~last
+        return entries[:, self._curved]
 
     def solve(self, model: LinearQuadratic, limited: Sequence[Limited]) -> Moves | Refusal:
         """A Refusal where PIQP finds no solution, as of numbers that are not finite or far too large."""
@@ -175,15 +179,17 @@ class SoftProgram:
             side = np.clip(side, -far, far).ravel()  # PIQP complains of rows without a limit
             lower.append(side if sign < 0 else np.full(side.size, -np.inf))
             upper.append(side if sign > 0 else np.full(side.size, np.inf))
-        a = np.concatenate(data)[self._inside][self._order]
-        h = model.hessians.ravel()[self._curved][self._hessian_order]
+        a, h = (
+            self._rows(np.concatenate(data)[self._inside]),
+            self._hessian(unit * model.hessians.ravel()[self._curved]),
+        )
         of_slacks = [np.tile(rows.prices, len(rows.lower)) for rows in limited]
         g = np.concatenate([model.gradients.ravel()[nx : nx + count * n], *of_slacks])
         least, most = np.full((count, n), -np.inf), np.full((count, n), np.inf)
         least[:, :nu], most[:, :nu] = model.lower, model.upper
         sides = {"lba": np.concatenate(lower), "uba": np.concatenate(upper)}
         sides |= {"lbx": np.append(least.ravel(), 0.0 * self._free), "ubx": np.append(most.ravel(), self._free)}
-        given = {"h": ca.DM(self._h, unit * h), "g": unit * g, "a": ca.DM(self._a, a), **sides}
+        given = {"h": self._hessian(h), "g": unit * g, "a": self._rows(a), **sides}
         for solver in self._solvers:
             solution, stats = solver(**given), solver.stats()
             z = np.asarray(solution["x"]).ravel()
@@ -213,9 +219,3 @@ class SoftProgram:
 def _all(*counts: int) -> Indices:
     """All indices below `counts`, in order: one row for each of them."""
     return np.indices(counts, dtype=np.intp).reshape(len(counts), -1)
-
-
-def _sparsity(entries: Array, shape: tuple[int, int]) -> ca.Sparsity:
-    """Of (rows, columns), in the order of columns and then rows."""
-    starts = np.searchsorted(entries[1], np.arange(shape[1] + 1))
-    return ca.Sparsity(*shape, starts.tolist(), entries[0].tolist())

@@ -46,11 +46,6 @@ class StepOptions:
     gap_price: float = 2.0  # over the largest multiplier of the dynamics
     rounding: float = 1e-12  # of the merit: a change below this is lost in the sum
     solved_to: float = 1e-9  # the same of a quadratic program with limits that push
-    # Of what a step moves the plant by: an error above it is looked at over a part of the step, where it has to shrink.
-    suspect: float = 0.1
-    short_part: float = 1e-2
-    still: float = 0.5
-    unseen: float = 1e-5  # of a state: Drake solves contact to 1e-6
     # Of a multiplier over its price: a row between the two holds the motion, others do not or give way.
     holds: float = 1e-6
     gives: float = 1 - 1e-6
@@ -137,7 +132,6 @@ class Step:
     expansion: Expansion
     moves: Moves
     whole: bool  # whether no limit pushed
-    is_doubtful: bool = False  # whether the derivatives seem not to be those of the plant's steps
     swept: Array | None = None  # (N, nu, nx) the gains of the sweep that solved it, if one did
 
     @cached_property
@@ -208,7 +202,7 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
         slope -= float(np.sum(rows.prices * (rows.beyond - slack)))
     promised = -(slope + curvature / 2)
     rounding = OPTIONS.rounding * (1 + abs(before))
-    step = Step(stretch, motion, 0.0, promised, before, expansion, moves, solved.whole, True, solved.feedback)
+    step = Step(stretch, motion, 0.0, promised, before, expansion, moves, solved.whole, solved.feedback)
     if stretch.rolls and not motion.is_rollout:
         return _first_rollout(step)
     for size in OPTIONS.rolled_sizes if stretch.rolls else OPTIONS.step_sizes:
@@ -218,9 +212,7 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
         except SimulationError:
             continue
         if after <= before + OPTIONS.sufficient_decrease * size * min(slope, 0.0) + rounding:
-            step = replace(step, motion=tried, size=size, merit=after)
-            # The plant's own motion costs less: whatever the derivatives are, they led there.
-            return replace(step, is_doubtful=not stretch.rolls and _is_doubtful(step, motion))
+            return replace(step, motion=tried, size=size, merit=after)
     return step
 
 
@@ -262,7 +254,7 @@ def _first_rollout(step: Step) -> Step:
             best = tried, after
     if best is None:
         return step
-    return replace(step, motion=best[0], size=1.0, merit=best[1], is_doubtful=False)
+    return replace(step, motion=best[0], size=1.0, merit=best[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,25 +285,6 @@ def _solve(stretch: Stretch, expansion: Expansion) -> _Solved | Refusal:
         expansion = replace(expansion, limited=_dear_enough(expansion.limited, moves.dynamics))
     priced = stretch.program.solve(quadratic, expansion.limited)
     return priced if isinstance(priced, Refusal) else _Solved(expansion, priced, False, None)
-
-
-def _is_doubtful(step: Step, before: Motion) -> bool:
-    """Whether the plant leaves its derivatives by an error that does not shrink with the step, as a true one's does.
-
-    It is looked at again, over a short part of the step, where the error is large.
-    """
-    dxs, dus = step.motion.xs - before.xs, step.motion.us - before.us
-    linear = np.einsum("kij,kj->ki", step.expansion.quadratic.F, np.hstack([dxs[:-1], dus]))
-    change = float(np.max(np.abs(linear - dxs[:-1])))  # beside what a state moves by anyway
-
-    def error(motion: Motion, fraction: float) -> float:
-        return float(np.max(np.abs(motion.ends - before.ends - fraction * linear)))
-
-    large = error(step.motion, 1.0)
-    if large <= max(OPTIONS.suspect * change, OPTIONS.unseen * (1 + float(np.max(np.abs(before.ends))))):
-        return False
-    short = step.stretch.motion(before.xs + OPTIONS.short_part * dxs, before.us + OPTIONS.short_part * dus)
-    return error(short, OPTIONS.short_part) > OPTIONS.still * OPTIONS.short_part * large
 
 
 def expand(stretch: Stretch, motion: Motion) -> Expansion:
