@@ -341,7 +341,6 @@ class Separation:
     bodies: tuple[str, str]
     distance: float  # [m], signed
     gradient: Array  # (nq,) of the distance
-    opening: Array  # (nq,) the least motion that adds a metre, in the metric of the mass matrix; 0 where there is none
     mobility: float  # [1/kg] how fast a unit impulse between the two makes them part
 
 
@@ -354,10 +353,8 @@ def separations(twin: Twin) -> list[Separation]:
         to_v = to_v[np.ix_(coupling.own_v, coupling.own_q)]
     for pair, (a, b) in _pairs(plant, context):
         rate = twin.own_force(_distance_rate(plant, context, pair, (a, b)))
-        v = np.linalg.solve(mass, rate)
-        opening = twin.rates(v / max(rate @ v, np.finfo(float).tiny))
-        names = (a.name(), b.name())
-        rows.append(Separation(names, float(pair.distance), rate @ to_v, opening, float(rate @ v)))
+        mobility = float(rate @ np.linalg.solve(mass, rate))
+        rows.append(Separation((a.name(), b.name()), float(pair.distance), rate @ to_v, mobility))
     return rows
 
 

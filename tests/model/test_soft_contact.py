@@ -92,7 +92,6 @@ def test_a_floating_ball_leaves_the_ground_along_its_height(load):
     (pair,) = separations(twin)
     assert pair.distance == pytest.approx(0.4, abs=1e-14)
     assert pair.gradient == pytest.approx(np.eye(7)[6], abs=1e-12)
-    assert pair.opening == pytest.approx(np.eye(7)[6], abs=1e-12)
     assert pair.mobility == pytest.approx(1 / 1.0, rel=1e-12)  # its mass is 1 kg
 
 

@@ -179,10 +179,7 @@ class SoftProgram:
             side = np.clip(side, -far, far).ravel()  # PIQP complains of rows without a limit
             lower.append(side if sign < 0 else np.full(side.size, -np.inf))
             upper.append(side if sign > 0 else np.full(side.size, np.inf))
-        a, h = (
-            self._rows(np.concatenate(data)[self._inside]),
-            self._hessian(unit * model.hessians.ravel()[self._curved]),
-        )
+        a, h = np.concatenate(data)[self._inside], unit * model.hessians.ravel()[self._curved]
         of_slacks = [np.tile(rows.prices, len(rows.lower)) for rows in limited]
         g = np.concatenate([model.gradients.ravel()[nx : nx + count * n], *of_slacks])
         least, most = np.full((count, n), -np.inf), np.full((count, n), np.inf)
