@@ -16,7 +16,7 @@ everything here has a closed form.
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -111,10 +111,10 @@ class RelaxedPlant:
         moved = tree.compiled(q, v, a, derivatives=slopes)
         stretched = np.where(tree.free, 0.0, q[:, tree.positions] - tree.rest) * tree.stiffness
         added = stretched + tree.damping * v_next + tree.reflected * a
-        contacts, law = self._contacts(self._poses(moved.poses), moved.S, v_next, soft)
+        contacts, (force, by_z) = self._contacts(self._poses(moved.poses), moved.S, v_next, soft)
         state = contacts.touch.state
         push = np.zeros_like(v)
-        np.add.at(push, state, (contacts.jacobian @ law.force[..., None])[..., 0])
+        np.add.at(push, state, (contacts.jacobian @ force[..., None])[..., 0])
         if not slopes:
             return Forces(moved.tau + added - push, *3 * (np.empty(0),))
         by_q, mass, diagonal = moved.by_q, moved.mass, np.arange(n)
@@ -126,9 +126,9 @@ class RelaxedPlant:
         J = contacts.jacobian
         point, normal, phi = contacts.displacement()
         velocity = contacts.velocity_change(v_next[state], point)
-        changed = law.change(velocity, normal, phi)
-        np.subtract.at(by_q, state, contacts.force_change(law.force, point) + J @ changed.swapaxes(-1, -2))
-        np.subtract.at(by_next, state, J @ law.by_velocity() @ J.swapaxes(-1, -2))
+        changed = np.concatenate([velocity, normal, phi[..., None]], axis=-1) @ by_z
+        np.subtract.at(by_q, state, contacts.force_change(force, point) + J @ changed.swapaxes(-1, -2))
+        np.subtract.at(by_next, state, J @ by_z[:, :3].swapaxes(-1, -2) @ J.swapaxes(-1, -2))
         return Forces(moved.tau + added - push, by_q, by_v, by_next)
 
     def distances(self, q: Array) -> Array:
@@ -140,7 +140,7 @@ class RelaxedPlant:
         gaps[touch.state, touch.pair] = touch.phi
         return gaps
 
-    def _contacts(self, poses: Array, S: Array, v_next: Array, soft: Softness) -> tuple[Contacts, "Law"]:
+    def _contacts(self, poses: Array, S: Array, v_next: Array, soft: Softness) -> tuple[Contacts, tuple[Array, Array]]:
         touch = _within(self.pairs, poses, FAR * soft.reach)
         spatial, (point, change) = S[touch.state], touch.contact_points(np.full(len(touch.pair), 0.5))
         angular, linear = spatial[..., :3], spatial[..., 3:]
@@ -155,81 +155,42 @@ class RelaxedPlant:
             change=change,
         )
         velocity = (v_next[touch.state][:, None, :] @ contacts.jacobian)[:, 0]
-        friction, force = self.material.friction[touch.pair], soft.force[touch.pair]
-        return contacts, Law(velocity, touch.normal, touch.phi, friction, force, soft, self.model.time_step)
+        constants = np.empty((len(touch.pair), 6))
+        constants[:, 0], constants[:, 1] = self.material.friction[touch.pair], soft.force[touch.pair]
+        constants[:, 2:] = soft.reach, soft.slip, soft.rebound, self.model.time_step
+        return contacts, contact_forces(np.hstack([velocity, touch.normal, touch.phi[:, None]]), constants)
 
 
-@dataclass(frozen=True, eq=False)
-class Law:
-    """M relaxed contacts, see the module's text."""
+@cache
+def _law() -> Any:
+    """The force (3,) on the sphere's side, and its Jacobian by z: v' of that side less the other's, normal and phi."""
+    import casadi as ca
 
-    velocity: Array  # (M, 3) v' of the sphere's side less the other's
-    normal: Array  # (M, 3)
-    phi: Array  # (M,)
-    friction: Array  # (M,)
-    size: Array  # (M,) F
-    soft: Softness
-    time_step: float
+    from drake_diff.optimize.knots import Columns
 
-    @cached_property
-    def vn(self) -> Array:
-        return np.asarray((self.velocity * self.normal).sum(axis=-1))
+    z, constants = ca.SX.sym("z", 7), ca.SX.sym("constants", 6)
+    velocity, normal, phi = z[:3], z[3:6], z[6]
+    friction, size, reach, slip, rebound, h = ca.vertsplit(constants)
+    vn = ca.dot(velocity, normal)
+    ahead = (phi + h * vn) / reach  # how far the two are apart after the step, in reaches
+    elastic = size / np.log(2) * (ca.fmax(-ahead, 0) + ca.log1p(ca.exp(-ca.fabs(ahead))))
+    damping = ca.if_else(vn < 0, 1 - vn / rebound, ca.fmax(1 - vn / rebound / 2, 0) ** 2)
+    tangent = velocity - vn * normal
+    slide = tangent / ca.sqrt(ca.sumsqr(tangent) + slip**2)
+    force = elastic * damping * (normal - friction * slide)
+    return Columns([z, constants], [force, ca.jacobian(force, z)])
 
-    @cached_property
-    def _ahead(self) -> Array:
-        """How far the two are apart after the step, in reaches."""
-        return (self.phi + self.time_step * self.vn) / self.soft.reach
 
-    @cached_property
-    def _damping(self) -> tuple[Array, Array]:
-        """d(vn) and its derivative."""
-        w = self.soft.rebound
-        ratio = self.vn / w
-        leaving = np.clip(1 - ratio / 2, 0.0, 1.0)
-        value = np.where(ratio < 0, 1 - ratio, leaving**2)
-        slope = np.where(ratio < 0, -1.0, np.where(ratio < 2, -leaving, 0.0)) / w
-        return value, slope
+def contact_forces(z: Array, constants: Array) -> tuple[Array, Array]:
+    """(M, 3) the forces of M contacts, and (M, 7, 3) their derivatives by each entry of z (M, 7).
 
-    @cached_property
-    def _elastic(self) -> tuple[Array, Array]:
-        """The normal force without dissipation, and its derivative by phi."""
-        value = self.size / np.log(2) * np.logaddexp(0.0, -self._ahead)
-        slope = -self.size / np.log(2) / self.soft.reach / (1 + np.exp(np.clip(self._ahead, -500, 500)))
-        return value, slope
-
-    @cached_property
-    def normal_force(self) -> Array:
-        """(M,) [N]."""
-        return np.asarray(self._elastic[0] * self._damping[0])
-
-    @cached_property
-    def _tangent(self) -> tuple[Array, Array]:
-        """vt / s_c (M, 3) and s_c (M,)."""
-        vt = self.velocity - self.vn[:, None] * self.normal
-        size = np.sqrt((vt * vt).sum(axis=-1) + self.soft.slip**2)
-        return vt / size[:, None], size
-
-    @cached_property
-    def force(self) -> Array:
-        """(M, 3) on the sphere's side [N]."""
-        return self.normal_force[:, None] * (self.normal - self.friction[:, None] * self._tangent[0])
-
-    def change(self, velocity: Array, normal: Array, phi: Array) -> Array:
-        """(M, K, 3) the change of the force by K changes of the velocity, the normal (M, K, 3) and phi (M, K)."""
-        n, (tangent, size), mu = self.normal[:, None, :], self._tangent, self.friction[:, None, None]
-        d_vn = (velocity * n).sum(axis=-1) + (self.velocity[:, None, :] * normal).sum(axis=-1)
-        (elastic, by_phi), (damping, by_vn) = self._elastic, self._damping
-        d_fn = (by_phi * damping)[:, None] * (phi + self.time_step * d_vn) + (elastic * by_vn)[:, None] * d_vn
-        d_vt = velocity - d_vn[..., None] * n - self.vn[:, None, None] * normal
-        along = (tangent[:, None, :] * d_vt).sum(axis=-1)
-        d_tangent = (d_vt - tangent[:, None, :] * along[..., None]) / size[:, None, None]
-        f_n = self.normal_force[:, None, None]
-        return np.asarray(d_fn[..., None] * (n - mu * tangent[:, None, :]) + f_n * (normal - mu * d_tangent))
-
-    def by_velocity(self) -> Array:
-        """(M, 3, 3) the derivative of the force by the velocity."""
-        along = np.repeat(np.eye(3)[None], len(self.phi), axis=0)
-        return np.swapaxes(self.change(along, 0 * along, np.zeros((len(self.phi), 3))), -1, -2)
+    By the expressions of the law, of as many rows as a power of two, so that few maps of them are made.
+    """
+    count = len(z)
+    padded = [np.ones((1 << count.bit_length(), rows.shape[1])) for rows in (z, constants)]
+    padded[0][:count], padded[1][:count] = z, constants
+    force, jacobian = (result[:count] for result in _law()(*padded))
+    return force[:, 0], jacobian
 
 
 def _within(pairs: ContactPairs, poses: Array, far: float) -> Touches:
