@@ -31,7 +31,8 @@ from drake_diff.exceptions import DrakeDiffError, InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, applied
 from drake_diff.model.step import set_state
-from drake_diff.motion.continuous import HUNT_CROSSLEY, KELVIN_VOIGT, ContinuousMotion
+from drake_diff.motion.compliance import HUNT_CROSSLEY, KELVIN_VOIGT
+from drake_diff.motion.continuous import ContinuousMotion
 from drake_diff.motion.gradient import CONTINUOUS, RolloutGradient, differentiate_rollout
 from drake_diff.motion.loss import evaluate_loss, takes_one_argument
 

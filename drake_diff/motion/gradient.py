@@ -19,6 +19,7 @@ from drake_diff.exceptions import GradientWarning, InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.model.step import advance
+from drake_diff.motion.integrate import TOLERANCE
 from drake_diff.motion.loss import Feedback, Loss, Totals, total_gradients
 from drake_diff.motion.policy import active_parameters, differentiate_policy
 from drake_diff.motion.rollout import Policy, check_inputs
@@ -217,8 +218,7 @@ def _in_continuous_time(
     num_steps: int | None,
 ) -> RolloutGradient:
     """The gradient along the flow, and a warning where the loss has no slope: see `drake_diff.motion.undefined`."""
-    from drake_diff.motion.flow.integrate import TOLERANCE  # loads CasADi
-    from drake_diff.motion.flow.steps import FlowSteps
+    from drake_diff.motion.flow import FlowSteps  # loads CasADi
     from drake_diff.motion.undefined import Beside, undefined_columns
 
     if policy is None:

@@ -37,9 +37,9 @@ class Intervals(Protocol):
 def intervals_of(model: Model, vector: ParameterVector, motion: str) -> Intervals:
     """By the name of the motion; ModelError where the model has none in continuous time."""
     if motion == CONTINUOUS:
-        from drake_diff.motion.flow.steps import FlowIntervals  # loads CasADi
+        from drake_diff.motion.flow import FlowSteps  # loads CasADi
 
-        return FlowIntervals(model, vector)
+        return FlowSteps(model, vector)
     return DrakeSteps(model, vector)
 
 

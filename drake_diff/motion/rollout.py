@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -164,7 +164,7 @@ def _in_continuous_time(
     model: Model, vector: ParameterVector, x0: Array, inputs: Array | Policy, count: int
 ) -> Rollout:
     """`rollout` of a model, to which the vector is applied, by its flow."""
-    from drake_diff.motion.flow.steps import measured_flow  # loads CasADi
+    from drake_diff.motion.flow import measured_flow  # loads CasADi
 
     def choose(x: Array, k: int) -> Array:
         return finite_array("u", inputs(x.copy(), k * model.time_step), (model.nu,)) if callable(inputs) else inputs[k]
@@ -173,25 +173,20 @@ def _in_continuous_time(
 
 
 def continuous_rollout(
-    model: Model,
-    xs: Array,
-    us: Array,
-    efforts: Array,
-    work: Array,
-    penetration: Array,
-    contacts: tuple[tuple[ContactPoint, ...], ...],
+    model: Model, xs: Array, us: Array, efforts: Array, work: Array, contacts: Sequence[tuple[ContactPoint, ...]]
 ) -> Rollout:
     """A motion in continuous time at the ends of N intervals.
 
-    `work` (N+1, 3) [J] is that of actuators, damping and contact since the start, `penetration` (N+1,) [m] the largest
-    since the end before.
+    `work` (N+1, 3) [J] is that of actuators, damping and contact since the start; `contacts` are those of each interval
+    where they are deepest.
     """
     meter = Meter(model)
     for x in xs:
         set_state(model.double, x)
         meter.measure_state(x)
     _, kinetic, potential, at_ends = (np.array(column) for column in zip(*meter.states, strict=True))
-    deepest = np.maximum(np.maximum(at_ends, penetration), np.append(0.0, at_ends[:-1]))
+    between = [max((point.depth for point in points), default=0.0) for points in contacts]
+    deepest = np.maximum(np.maximum(at_ends, [0.0, *between]), [0.0, *at_ends[:-1]])
     return Rollout(
         times=frozen(model.time_step * np.arange(len(xs))),
         xs=frozen(xs),
@@ -205,7 +200,7 @@ def continuous_rollout(
         limit_work=frozen(np.zeros(len(xs))),  # a motion that reaches one is refused
         penetration=frozen(deepest),
         constraint_violation=frozen(meter.violations(xs[:, : model.nq])),
-        contacts=contacts,
+        contacts=tuple(contacts),
     )
 
 

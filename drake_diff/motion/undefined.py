@@ -32,8 +32,8 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.flow.integrate import TOLERANCE
-from drake_diff.motion.flow.steps import FlowSteps
+from drake_diff.motion.flow import FlowSteps
+from drake_diff.motion.integrate import TOLERANCE
 from drake_diff.motion.loss import Feedback, Loss, Totals, evaluate_loss, total_gradients
 from drake_diff.motion.policy import (
     ParametricPolicy,
@@ -198,8 +198,9 @@ class Beside:
         def choose(x: Array, k: int) -> Array:
             return us[k] if policy is None else np.asarray(policy(x, k * self.model.time_step), dtype=float)
 
-        xs, inputs, flow = self._steps(vector, tolerance).roll(x0, choose, len(us))
-        return evaluate_loss(self.loss, xs, inputs), bool(flow.events)
+        flow = self._steps(vector, tolerance).roll(x0, choose, len(us))
+        touches = any(step.pushing or step.events for step, _ in flow.steps)
+        return evaluate_loss(self.loss, flow.xs, flow.us), touches
 
     def gradient(self, displacement: Array) -> tuple[float, Array]:
         """The loss, and its derivative (n,) by the displacement."""
@@ -297,8 +298,8 @@ def along_the_flow(
         feedback.append((by_x, by_parameters[:, active].copy(), active))
         return u
 
-    _, inputs, flow = steps.roll(x0, choose, len(us))
-    return steps.derivatives(flow), feedback, inputs
+    flow = steps.roll(x0, choose, len(us))
+    return steps.differentiate(flow), feedback, flow.us
 
 
 def undefined_columns(beside: Beside, totals: Totals) -> tuple[Undefined, ...]:

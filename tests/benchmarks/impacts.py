@@ -29,7 +29,7 @@ from rates import success_rate
 from drake_diff import differentiate_rollout
 from drake_diff.exceptions import DrakeDiffError, GradientWarning
 from drake_diff.model.parameters import select
-from drake_diff.motion.flow.steps import FlowSteps
+from drake_diff.motion.flow import FlowSteps
 
 HERE = Path(__file__).parent
 RIGHT = 0.01  # part of the truth

@@ -11,7 +11,6 @@ import drake_diff as dd
 from drake_diff.certificates.displaced import Line
 from drake_diff.certificates.truth import TrueSlope, Truth, beside_truth, judge_levels
 from drake_diff.exceptions import CertificateError, InputError, ModelError, SimulationError
-from drake_diff.motion import continuous
 from drake_diff.motion.continuous import ContinuousMotion
 
 pytestmark = pytest.mark.solve
@@ -98,7 +97,7 @@ def test_where_there_is_no_continuous_motion_it_is_said_why(tmp_path):
 
 
 def test_a_motion_that_is_too_stiff_for_error_control_says_so(tmp_path, monkeypatch):
-    monkeypatch.setattr(continuous, "EVALUATIONS", 300)
+    monkeypatch.setattr(ContinuousMotion, "most", 300)
     model = Bounce(1e4, relaxation_time=0.01).model(tmp_path / "bouncer.sdf", "sap", 2e-3)
     with pytest.raises(SimulationError, match="too stiff: 300 evaluations do not reach its end"):
         ContinuousMotion(model).states(np.array(DROP), np.zeros((250, 0)))

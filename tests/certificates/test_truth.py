@@ -11,28 +11,9 @@ from helpers.table import slow_after
 import drake_diff as dd
 from drake_diff.certificates.truth import TrueSlope, judged, softest_contact
 from drake_diff.exceptions import InputError
-from drake_diff.motion.continuous import ContinuousMotion, ImplicitSteps
+from drake_diff.motion.continuous import ContinuousMotion
 
 pytestmark = pytest.mark.solve
-
-
-def test_the_implicit_step_is_of_order_five_and_follows_what_is_stiff():
-    """y' = -y^2 from 1 is 1 / (1 + t); y' = -1e6 (y - sin) + cos stays on the sine (an autonomous pair [y, t])."""
-    errors = []
-    for count in (8, 16):
-        y = np.array([1.0])
-        for _ in range(count):
-            y, _ = ImplicitSteps(lambda y: -(y**2), y).take(1 / count)
-        errors.append(abs(y[0] - 0.5))
-    assert 2**4.5 < errors[0] / errors[1] < 2**5.5
-
-    def stiff(x):
-        return np.array([-1e6 * (x[0] - np.sin(x[1])) + np.cos(x[1]), 1.0])
-
-    x = np.zeros(2)
-    for _ in range(10):
-        x, _ = ImplicitSteps(stiff, x).take(0.1)
-    assert x[0] == pytest.approx(np.sin(1.0), abs=1e-8)
 
 
 @pytest.mark.parametrize("approximation", slow_after(1, ["sap", "lagged"]))

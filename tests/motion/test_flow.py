@@ -19,10 +19,9 @@ from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import select
 from drake_diff.motion.continuous import ContinuousMotion
-from drake_diff.motion.flow.integrate import pushing_of
-from drake_diff.motion.flow.plant import flow_plant, material_of, numbers_of
-from drake_diff.motion.flow.steps import FlowSteps
-from drake_diff.motion.tableaus import ROSENBROCK_COUPLINGS, ROSENBROCK_GAMMA, ROSENBROCK_STAGES
+from drake_diff.motion.flow import FlowSteps, FlowSystem
+from drake_diff.motion.flow_plant import flow_plant, material_of, numbers_of
+from drake_diff.motion.integrate import Integrator, System
 
 pytestmark = pytest.mark.solve
 
@@ -121,6 +120,11 @@ def cube(time_step, *, gravity, side=0.1, mass=0.1, radius=1e-3, stiffness=2e3, 
     return plant, builder.Build()
 
 
+def system_of(model):
+    plant = flow_plant(model)
+    return FlowSystem(plant, numbers_of(plant, material_of(plant)))
+
+
 TOSSED = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0, 0, 0, 0, 0.2, 0, 0, 0, 0, -0.1, -2.0])
 
 
@@ -129,17 +133,15 @@ def test_the_rates_are_those_of_drakes_continuous_plant():
     model = dd.model_from_diagram(cube(1e-3, gravity=9.81)[1])
     plant, diagram = cube(0.0, gravity=9.81)
     context = plant.GetMyContextFromRoot(diagram.CreateDefaultContext())
-    ours, random, most = flow_plant(model), np.random.default_rng(0), 0
-    materials = numbers_of(ours, material_of(ours))
+    ours, random, most = system_of(model), np.random.default_rng(0), 0
     for k in range(40):
         turn = random.standard_normal(4)
         speed = 10.0 ** random.uniform(-5, 0.5) if k % 2 else 1.0
         v = speed * random.standard_normal(6)
         x = np.concatenate([turn / np.linalg.norm(turn), [0.3, -0.2, random.uniform(0.03, 0.06)], v])
-        modes = (np.asarray(ours.switches(x, [], materials)).ravel() > 0).astype(float)
-        pushing = pushing_of(modes)
-        most = max(most, len(pushing))
-        found = np.asarray(ours.part(pushing).rates(x, [], materials)).ravel()
+        ours.push(ours.pushing_where(ours.watch(x, x)[0] > 0))
+        most = max(most, len(ours.pushing))
+        found = ours.rates(x)
         plant.SetPositionsAndVelocities(context, x)
         wanted = plant.EvalTimeDerivatives(context).CopyToVector()
         assert np.max(np.abs(found - wanted)) <= 1e-12 * max(1.0, np.max(np.abs(wanted)))
@@ -172,8 +174,8 @@ def test_a_ball_at_a_can_has_the_rates_of_drakes_continuous_plant_and_their_slop
     model = dd.model_from_diagram(can_and_ball(1e-3)[1])
     plant, diagram, turned = can_and_ball(0.0)
     context = plant.GetMyContextFromRoot(diagram.CreateDefaultContext())
-    ours, random, met = flow_plant(model), np.random.default_rng(0), []
-    materials, part = numbers_of(ours, material_of(ours)), ours.part((0,))
+    ours, random, met = system_of(model), np.random.default_rng(0), []
+    ours.push((0,))
     radius, half = CAN[0], CAN[1] / 2
     while len(met) < 200:
         angle, away = random.uniform(0, 2 * np.pi), radius + random.uniform(-0.15, 0.05)
@@ -183,7 +185,7 @@ def test_a_ball_at_a_can_has_the_rates_of_drakes_continuous_plant_and_their_slop
         v = 10.0 ** random.uniform(-4, 0.5) * random.standard_normal(12)
         ball, can = pose @ turned @ local, [*pose.rotation().ToQuaternion().wxyz(), *pose.translation()]
         x = np.concatenate([[1, 0, 0, 0], ball, can, v])
-        switches = np.asarray(ours.switches(x, [], materials)).ravel()
+        switches = ours.watch(x, x)[0]
         plant.SetPositionsAndVelocities(context, x)
         query = plant.get_geometry_query_input_port().Eval(context)
         found = query.ComputePointPairPenetration()
@@ -192,8 +194,8 @@ def test_a_ball_at_a_can_has_the_rates_of_drakes_continuous_plant_and_their_slop
             continue
         assert switches[0] == pytest.approx(found[0].depth, abs=1e-12)
         wanted = plant.EvalTimeDerivatives(context).CopyToVector()
-        rates, slopes = (np.asarray(a) for a in part.slopes(x, [], materials))
-        assert np.max(np.abs(rates.ravel() - wanted)) <= 1e-12 * max(1.0, np.max(np.abs(wanted)))
+        rates, slopes = ours.all_slopes(x)
+        assert np.max(np.abs(rates - wanted)) <= 1e-12 * max(1.0, np.max(np.abs(wanted)))
         met.append((away > radius, abs(local[2]) > half))
         if len(met) % 20 == 0:  # Drake's differences
             way = random.standard_normal(model.nx)
@@ -211,16 +213,16 @@ def test_the_rates_of_robots_are_those_of_drakes_terms(name):
     """Without friction, whose law in continuous time the other form has otherwise."""
     model = example_robot(name, feet=True, friction=0.0)
     random = np.random.default_rng(1)
-    ours, other = flow_plant(model), ContinuousMotion(model)
+    ours, other = system_of(model), ContinuousMotion(model)
     x = state_in_contact(model, random)
-    ours.check(x)
-    materials, u = numbers_of(ours, material_of(ours)), 0.1 * random.standard_normal(model.nu)
-    model.double.set_input(u)
-    wanted = other.rates(model.actuation @ u, x)
-    modes = (np.asarray(ours.switches(x, u, materials)).ravel() > 0).astype(float)
-    found = np.asarray(ours.part(pushing_of(modes)).rates(x, u, materials)).ravel()
-    assert pushing_of(modes)
-    assert np.max(np.abs(found - wanted)) <= 1e-9 * np.max(np.abs(wanted))
+    ours.plant.check(x)
+    ours.u[:] = 0.1 * random.standard_normal(model.nu)
+    other.set_input(ours.u)
+    for system in (ours, other):
+        system.push(system.pushing_where(system.watch(x, x)[0] > 0))
+        assert system.pushing
+    wanted = other.rates(x)
+    assert np.max(np.abs(ours.rates(x) - wanted)) <= 1e-9 * np.max(np.abs(wanted))
 
 
 @pytest.mark.parametrize("name", ["bolt.urdf", "finger_edu.urdf"])
@@ -238,26 +240,55 @@ def test_the_slopes_of_the_rates_are_those_of_casadi(name):
     assert np.max(np.abs(found - of_materials)) <= 1e-11 * np.max(np.abs(of_materials))
 
 
-def test_the_rosenbrock_method_has_order_5():
+class Equation(System):
+    """x' = f(x), whose slopes are `by_x`, without contacts."""
+
+    time_step, num_pairs = 0.1, 0
+
+    def __init__(self, f, by_x):
+        self.f, self.by_x = f, by_x
+
+    def rates(self, x):
+        self.used += 1
+        return np.array(self.f(x))
+
+    def slopes(self, x, rates):
+        return np.array(self.by_x(x))
+
+    def watch(self, x, rates):
+        return np.zeros(0), np.zeros(0)
+
+    def pushing_where(self, on):
+        return ()
+
+
+def end_of(system, x0, duration, tolerance):
+    integrator = Integrator(system, tolerance)
+    integrator.start(np.array(x0))
+    return integrator.advance(duration)[-1].ahead
+
+
+def test_a_stiff_motion_is_followed_by_long_steps_of_order_5():
+    """y' = -k (y - sin t) + cos t stays on the sine; explicit steps of 2e-6 would take 1e7 evaluations for 10 s."""
+    k = 1e6
+    stiff = Equation(
+        lambda x: [-k * (x[0] - np.sin(x[1])) + np.cos(x[1]), 1.0],
+        lambda x: [[-k, k * np.cos(x[1]) - np.sin(x[1])], [0, 0]],
+    )
+    assert end_of(stiff, [0.0, 0.0], 10.0, 1e-9)[0] == pytest.approx(np.sin(10.0), abs=1e-8)
+    assert stiff.used < 20_000
+
+
+def test_the_error_follows_the_tolerance_and_non_finite_rates_end_the_motion():
     """A pendulum with cubic drag, beside Dormand and Prince's eighth order at 1e-13."""
-
-    def rates(x):
-        return np.array([x[1], -3 * np.sin(x[0]) - 0.2 * x[1] ** 3])
-
-    def after(count):
-        x, h = np.array([1.0, 0.5]), 1 / count
-        for _ in range(count):
-            slope = np.array([[0, 1], [-3 * np.cos(x[0]), -0.6 * x[1] ** 2]])
-            W, changes = np.eye(2) / (h * ROSENBROCK_GAMMA) - slope, np.zeros((8, 2))
-            for i, (a, c) in enumerate(zip(ROSENBROCK_STAGES, ROSENBROCK_COUPLINGS, strict=True)):
-                changes[i] = np.linalg.solve(W, rates(x + a @ changes[:i]) + c @ changes[:i] / h)
-            x = x + ROSENBROCK_STAGES[7] @ changes[:7] + changes[7]
-        return x
-
-    exact = solve_ivp(lambda _, x: rates(x), (0, 1), [1, 0.5], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
-    errors = [np.max(np.abs(after(count) - exact)) for count in (8, 16, 32)]
-    orders = np.log2(np.divide(errors[:-1], errors[1:]))
-    assert np.all(orders > 4.7)
+    pendulum = Equation(lambda x: [x[1], -3 * np.sin(x[0]) - 0.2 * x[1] ** 3], None)
+    exact = solve_ivp(lambda _, x: pendulum.rates(x), (0, 3), [1, 0.5], method="DOP853", rtol=1e-13, atol=1e-14).y[
+        :, -1
+    ]
+    for tolerance in (1e-6, 1e-9, 1e-11):
+        assert np.max(np.abs(end_of(pendulum, [1.0, 0.5], 3.0, tolerance) - exact)) < 100 * tolerance
+    with pytest.raises(SimulationError, match="it cannot go on"):
+        end_of(Equation(lambda x: x**2, lambda x: [2 * x]), [1.0], 1.1, 1e-9)  # 1 / (1 - t)
 
 
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.GradientWarning")  # a little aside it flies past
@@ -387,11 +418,11 @@ def test_a_limit_that_is_passed_within_an_interval_is_seen():
 def along(model, x0, count, tolerance=1e-9):
     """(nx,) where a flow ends, and its derivative by the start."""
     steps = FlowSteps(model, select(model, ()), tolerance)
-    xs, _, flow = steps.roll(np.array(x0, dtype=float), lambda x, k: np.zeros(model.nu), count)
+    flow = steps.roll(np.array(x0, dtype=float), lambda x, k: np.zeros(model.nu), count)
     found = np.eye(model.nx)
-    for step in steps.derivatives(flow):
+    for step in steps.differentiate(flow):
         found = step.A @ found
-    return xs[-1], found
+    return flow.xs[-1], found
 
 
 def ball_at(shape, *, stiffness, radius=0.02, time_step=0.05, gravity=9.81, dissipation=0.1, friction=0.3):

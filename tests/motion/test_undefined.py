@@ -10,7 +10,7 @@ from pydrake.geometry import Sphere
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, GradientWarning, InputError
 from drake_diff.motion import ParametricPolicy
-from drake_diff.motion.flow.steps import FlowSteps
+from drake_diff.motion.flow import FlowSteps
 from drake_diff.motion.undefined import Undefined
 
 
@@ -125,7 +125,7 @@ def test_a_derivative_that_is_not_the_slope_that_there_is_is_not_called_undefine
     """Steps that are too long for the derivative: taken again at a hundredth of the tolerance; then it is named."""
     model, x0 = ball(gravity=9.81), [0, 0.5, 0.3, 0]
     right = gradient(model, x0, lambda x: x[1], 60)[0]
-    real = FlowSteps.derivatives
+    real = FlowSteps.differentiate
 
     def wrong(only_first):
         def derivatives(self, flow):
@@ -136,11 +136,11 @@ def test_a_derivative_that_is_not_the_slope_that_there_is_is_not_called_undefine
 
         return derivatives
 
-    monkeypatch.setattr(FlowSteps, "derivatives", wrong(only_first=True))
+    monkeypatch.setattr(FlowSteps, "differentiate", wrong(only_first=True))
     again, undefined = gradient(model, x0, lambda x: x[1], 60)
     assert undefined == []
     assert np.allclose(again.by_x0, right.by_x0, rtol=1e-4, atol=1e-6)
-    monkeypatch.setattr(FlowSteps, "derivatives", wrong(only_first=False))
+    monkeypatch.setattr(FlowSteps, "differentiate", wrong(only_first=False))
     g, undefined = gradient(model, x0, lambda x: x[1], 60)
     assert {"ball_z_x[0]", "ball_z_v[0]"} <= set(undefined)
     assert all(isinstance(one, Undefined) and one.missed for one in g.undefined)

@@ -1,20 +1,14 @@
 """The equations of motion in continuous time of a tree that touches, as CasADi functions: compliant point contact.
 
-    M(q) dv/dt = B u - C(q, v) v + gravity + springs - D v + sum over contacts J' (f n - mu(|v_t|) f v_t / |v_t|)
+    M(q) dv/dt = B u - C(q, v) v + gravity + springs - D v + sum over contacts J' (the force of `compliance`)
 
-with a normal force f at depth x and its rate x' of
-
-    `similar`, `lagged`:   k x (1 + d x')+      (Hunt and Crossley)
-    `sap`:                 k (x + tau x')+      (Kelvin and Voigt)
-
-and Drake's friction in continuous time, mu(s) = mu step5(s / v_s) below the stiction speed v_s and mu above, where
-step5(r) = r^3 (10 - 15 r + 6 r^2). Each contact has two switches: whether the shapes overlap, and whether the bracket
-is above 0. A contact pushes where both are on; the equations of a given set of contacts that push are smooth. Bodies
-are moved by spatial vectors [angular; linear] in world about its origin (Featherstone, "Rigid Body Dynamics
-Algorithms", 2008, ch. 5 and 6).
+Each contact has two switches: whether the shapes overlap, and whether the bracket of its law is above 0. A contact
+pushes where both are on; the equations of a given set of contacts that push are smooth. Bodies are moved by spatial
+vectors [angular; linear] in world about its origin (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 5, 6).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -23,14 +17,14 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.contact.active_contacts import ContactPairs, read_pairs
-from drake_diff.derivatives.contact.laws import QUANTITIES, Material, MaterialChange, combine
-from drake_diff.exceptions import GradientError, ModelError, SimulationError
+from drake_diff.derivatives.contact.laws import QUANTITIES, Material, MaterialChange
+from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.mechanics.casadi_tree import SymbolicTree
 from drake_diff.mechanics.description import describe, names_of
 from drake_diff.mechanics.tree import tree_of
 from drake_diff.model.model import Model
-from drake_diff.model.plant import proximity_property
 from drake_diff.model.step import set_state
+from drake_diff.motion import compliance
 from drake_diff.motion.tableaus import ERROR, STAGES
 
 TINY_LENGTH = 1e-30  # [m^2] keeps the distance from a point or an axis differentiable on it
@@ -96,9 +90,7 @@ def _from_faces(outside: Any, ways: Any, normals: Any) -> tuple[Any, Any]:
     return ca.if_else(beyond, length, -least), ca.if_else(beyond, outside / length, face)
 
 
-STICTION_SPEED = 1e-3  # v_s [m/s], Drake's default in continuous time
 MOST_PARTS = 200  # sets of contacts whose equations are kept
-SAME_WAY = 0.5  # the cosine of a normal's turn within a step: a step's error keeps it near 1 where it does not jump
 TINY_SLIP = 1e-24  # [m^2/s^2] keeps the length of a slip of 0 differentiable
 
 
@@ -123,7 +115,7 @@ class FlowPlant:
         contact, self.description = model.contract.contact, describe(model)
         if contact.collision_pairs and contact.model != "point":
             raise ModelError(f"{contact.model} contact has no motion in continuous time here: point contact has one")
-        self.model, self.pairs, self.is_sap = model, read_pairs(model, cylinders=True), contact.approximation == "sap"
+        self.model, self.pairs, self.law = model, read_pairs(model, cylinders=True), compliance.limit_law(model)
         count = len(self.pairs.ids)
         self.is_whole = count == contact.collision_pairs  # whether all that may touch are pairs here
         self.x, self.u, self.materials = (
@@ -154,7 +146,7 @@ class FlowPlant:
         self._switches = switches
         self._switch_slopes: dict[int, Any] = {}
         self._parts: dict[tuple[int, ...], FlowPart] = {}
-        self._normals: Any = None
+        self._powers: dict[tuple[int, ...], Any] = {}
 
     def _touch(self, i: int, material: Any) -> "_Touch":
         """Pair `i`, of `material` (4,)."""
@@ -176,11 +168,9 @@ class FlowPlant:
         rate = -ca.dot(normal, velocity)
         slip = velocity + rate * normal
         speed = ca.sqrt(ca.sumsqr(slip) + TINY_SLIP)
-        r = ca.fmin(speed / STICTION_SPEED, 1.0)
-        drag = mu * r**3 * (10 - 15 * r + 6 * r**2) / speed
-        bracket = -phi + damping * rate if self.is_sap else 1 + damping * rate
-        push = k * bracket if self.is_sap else -k * phi * bracket
-        on_sphere = push * (normal - drag * slip)
+        bracket = compliance.bracket(self.law, -phi, rate, damping)
+        push = compliance.normal_force(self.law, k, -phi, bracket)
+        on_sphere = push * (normal - compliance.drag(mu, speed, ca.fmin) * slip)
         return _Touch(-phi, bracket, J.T @ on_sphere, point, normal, on_sphere, speed, edges_of(pairs, i, local))
 
     @property
@@ -194,19 +184,21 @@ class FlowPlant:
             self._switch_slopes[switch] = self._function("switch_slope", ca.jacobian(self._switches[switch], by))
         return self._switch_slopes[switch]
 
-    def check_normals(self, before: Array, after: Array, pushing: tuple[int, ...]) -> None:
-        """GradientError where the normal of one of the pairs `pushing` jumps between two states (nx,)."""
-        if self._normals is None:
-            normals = ca.horzcat(*[t.normal for t in self.touches])
-            self._normals = ca.Function("normals", [self.x], [ca.densify(normals)])
-        ends = [np.asarray(self._normals(x))[:, list(pushing)] for x in (before, after)]
-        for i in np.flatnonzero(np.sum(ends[0] * ends[1], axis=0) < SAME_WAY):
-            inspector = self.model.double.inspector
-            names = " and ".join(inspector.GetName(j) for j in self.pairs.ids[pushing[i]])
-            raise GradientError(
-                f"{names} overlap so deep that they push each other out by another way: the derivative of that motion "
-                "is not known here; stiffer contact does not let them"
-            )
+    @cached_property
+    def contacts(self) -> Any:
+        """(x, materials) -> (3, 4 P): of each pair where it acts, its normal, its force and (depth, speed of slip)."""
+        columns = [ca.horzcat(t.point, t.normal, t.push, ca.vertcat(t.depth, t.speed, 0)) for t in self.touches]
+        return ca.Function("contacts", [self.x, self.materials], [ca.densify(ca.horzcat(*columns))])
+
+    def powers(self, pushing: tuple[int, ...]) -> Any:
+        """(x, u, materials) -> (3,) [W] of actuators, damping and contact where the pairs `pushing` push."""
+        if pushing not in self._powers:
+            driven = ca.DM(self.description.actuation) @ self.effort
+            push = sum((self.touches[i].force for i in pushing), ca.SX.zeros(self.model.nv))
+            damping, v = ca.DM(self.description.by_velocity("damping")), self.tree.v
+            power = ca.vertcat(ca.dot(v, driven), ca.dot(damping * v, v), ca.dot(v, push))
+            self._powers[pushing] = self._function("powers", power)
+        return self._powers[pushing]
 
     def check(self, x: Array) -> None:
         """SimulationError where shapes overlap at `x` (nx,) that are no pair here."""
@@ -275,21 +267,13 @@ def flow_plant(model: Model) -> FlowPlant:
 
 
 def material_of(plant: FlowPlant) -> Material:
-    """What the pairs have in the context, parameters that are applied included; ModelError where one has no law."""
-    inspector, sides = plant.model.double.inspector, []
-    needed = ("friction", "stiffness", "relaxation_time" if plant.is_sap else "dissipation")
-    for i in (i for ids in plant.pairs.ids for i in ids):
-        read = {name: proximity_property(inspector, i, name) for name in QUANTITIES}
-        missing = [name for name in needed if read[name] is None]
-        if missing:
-            raise ModelError(f"{inspector.GetName(i)} states no {missing[0]}: its contact has no law of motion")
-        sides.append([read[name] or 0.0 for name in QUANTITIES])
-    return combine(np.array(sides, dtype=float).reshape(plant.num_pairs, 2, 4))
+    """What the pairs have in the context, parameters that are applied included."""
+    return compliance.read_material(plant.model.double.inspector, plant.pairs.ids, plant.law)
 
 
 def numbers_of(plant: FlowPlant, material: Material | MaterialChange) -> Array:
     """(4 P, ...) a material, or its change, as the functions take it."""
-    damping = material.time if plant.is_sap else material.dissipation
+    damping = material.time if plant.law == compliance.KELVIN_VOIGT else material.dissipation
     columns = np.stack([material.friction, material.stiffness, damping, material.other_part], axis=1)
     return columns.reshape(4 * plant.num_pairs, *columns.shape[2:])
 

@@ -1,0 +1,408 @@
+"""The flow over a model's intervals: its ends, their derivatives, and contacts and work along its steps.
+
+Within a step the motion is taken to be the polynomial of degree 5 that has the states at its ends, their rates and how
+these change.
+
+In a step the change Phi of the motion follows Phi' = A(t) Phi + B(t), A and B being the slopes of the rates on the way,
+by the collocation method of three points of order 5 (Radau IIA; Hairer and Wanner, "Solving Ordinary Differential
+Equations II", 1996, IV.5). It is stable at any length of step: a motion that rests does not show how stiff the friction
+is that holds it, and small changes of it do.
+
+Where a switch turns at an event that the motion meets under way, the time of the event moves with the state, and where
+the rates jump there from f- to f+,
+
+    dx+ = (1 + (f+ - f-) g' / (g' f-)) dx-,
+
+g' being the slope of the switch: the saltation matrix (Leine and Nijmeijer, "Dynamics and Bifurcations of Non-Smooth
+Mechanical Systems", 2004). The step before it ends at the event, so that its own length does not count.
+
+Work is the power at three points of each step by Gauss' quadrature of order 6.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.derivatives.contact.laws import QUANTITIES, material_change
+from drake_diff.derivatives.step import StepDerivatives
+from drake_diff.exceptions import GradientError, ModelError, SimulationError
+from drake_diff.model.contact import ContactPoint
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector
+from drake_diff.model.step import stepped
+from drake_diff.motion.flow_plant import FlowPlant, flow_plant, material_of, numbers_of
+from drake_diff.motion.integrate import TOLERANCE, Flags, Integrator, Pairs, Step, System, deepest_contacts
+
+METHOD = "continuous"
+EDGE = 1e-9  # [m] a body that moves along an edge passes it all the time by less
+Chooser = Callable[[Array, int], Array]  # the state (nx,) and the number of the interval -> the input (nu,)
+
+
+class FlowSystem(System):
+    """A `FlowPlant` with contacts of given materials (4 P,), under the input `u` (nu,), on arrays that stay."""
+
+    per_pair = 2
+    most = 10_000_000
+
+    def __init__(self, plant: FlowPlant, materials: Array):
+        model, watched = plant.model, 2 * plant.num_pairs + len(plant.edge_pairs)
+        nx, nu = model.nx, model.nu
+        self.plant, self.num_pairs, self.time_step = plant, plant.num_pairs, model.time_step
+        self.materials, self.u, self._x, self._h = (
+            np.array(materials, dtype=float),
+            np.zeros(nu),
+            np.zeros(nx),
+            np.zeros(1),
+        )
+        self._ahead, self._rates, self._summary, self._moving = np.zeros(nx), np.zeros(nx), np.zeros(2), np.zeros(nx)
+        self._slopes, self._values, self._changes = np.zeros((nx + nu, nx)), np.zeros(watched), np.zeros(watched)
+        self.slack = np.append(np.zeros(2 * plant.num_pairs), np.full(len(plant.edge_pairs), EDGE))
+        self._point = self._x, self.u, self.materials
+        self._contacts = np.zeros((self.num_pairs, 4, 3))
+        self._run_contacts = _bind(plant.contacts, (self._x, self.materials), (self._contacts,))
+        self.lower, self.upper = model.position_limits
+        self._watch = _bind(plant.watched, (*self._point, self._moving), (self._values, self._changes))
+        self._parts: dict[Pairs, tuple[Any, ...]] = {}
+        self.push(())
+
+    def push(self, pairs: Pairs) -> None:
+        super().push(pairs)
+        if pairs not in self._parts:
+            part = self.plant.part(pairs)
+            self._parts[pairs] = (
+                _bind(part.rates, self._point, (self._rates,)),
+                _bind(part.slopes, self._point, (self._rates, self._slopes)),
+                _bind(part.step, (*self._point, self._h), (self._ahead, self._rates, self._summary)),
+            )
+        self._run_rates, self._run_slopes, self._run_step = self._parts[pairs]
+
+    def rates(self, x: Array) -> Array:
+        self.used += 1
+        self._x[:] = x
+        self._run_rates()
+        return self._rates.copy()
+
+    def slopes(self, x: Array, rates: Array) -> Array:
+        return self.all_slopes(x)[1][:, : len(x)]
+
+    def all_slopes(self, x: Array) -> tuple[Array, Array]:
+        """(nx,) the rates and (nx, nx + nu) their slopes by state and input."""
+        self._x[:] = x
+        self._run_slopes()
+        return self._rates.copy(), self._slopes.T.copy()
+
+    def explicit(self, x: Array, rates: Array, h: float) -> tuple[Array, Array, float, float]:
+        self.used += 6
+        self._x[:], self._h[0] = x, h
+        self._run_step()
+        return self._ahead.copy(), self._rates.copy(), float(self._summary[0]), float(self._summary[1])
+
+    def watch(self, x: Array, rates: Array) -> tuple[Array, Array]:
+        self._x[:], self._moving[:] = x, rates
+        self._watch()
+        return self._values.copy(), self._changes.copy()
+
+    def pushing_where(self, on: Flags) -> Pairs:
+        count = 2 * self.num_pairs
+        return tuple(np.flatnonzero(on[:count:2] & on[1:count:2]).tolist())
+
+    def relevant(self, on: Flags) -> Flags:
+        """A bracket where its pair overlaps, and an edge where its pair pushes."""
+        relevant, count = np.ones(len(on), dtype=bool), 2 * self.num_pairs
+        relevant[1:count:2] = on[:count:2]
+        relevant[count:] = (on[:count:2] & on[1:count:2])[self.plant.edge_pairs]
+        return relevant
+
+    def check(self, x: Array) -> None:
+        beyond = (x[: len(self.lower)] < self.lower) | (x[: len(self.lower)] > self.upper)
+        if beyond.any():
+            name = self.plant.model.state_names[int(np.argmax(beyond))]
+            raise SimulationError(f"{name} reaches a joint limit, whose motion in continuous time is not known here")
+        self.plant.check(x)
+
+    def contacts(self, x: Array) -> Array:
+        """(P, 4, 3) of each pair where it acts, its normal, its force, and its depth and speed of slip."""
+        self._x[:] = x
+        self._run_contacts()
+        return self._contacts.copy()
+
+    def points_at(self, x: Array, pairs: Pairs) -> list[tuple[int, ContactPoint]]:
+        plant, values, points = self.plant, self.contacts(x), []
+        for i in pairs:
+            point, normal, force, (depth, speed, _) = values[i]
+            a, b = (plant.pairs.bodies[side[i]] for side in (plant.pairs.sphere_body, plant.pairs.other_body))
+            if plant.model.plant.IsAnchored(a):  # the force is the one on what can move
+                a, b, normal, force = b, a, -normal, -force
+            where = frozen(point), frozen(normal), frozen(force)
+            points.append((i, ContactPoint(a.name(), b.name(), *where, float(depth), float(speed))))
+        return points
+
+
+def _bind(function: Any, arguments: Sequence[Array], results: Sequence[Array]) -> Any:
+    """What runs a function of CasADi's on arrays that stay where they are."""
+    buffer, run = function.buffer()
+    for i, a in enumerate(arguments):
+        if a.size:
+            buffer.set_arg(i, a.data)
+    for i, a in enumerate(results):
+        if a.size:
+            buffer.set_res(i, a.data)
+    run.buffer = buffer  # which has to live as long
+    return run
+
+
+def _between(share: float, starts: Array, ends: Array, hs: Array, at_start: Any, at_end: Any) -> Array:
+    """(M, nx) at a `share` of steps of lengths hs (M,), from the rates and their slopes there."""
+    c, d, h = share, 1 - share, hs[:, None]
+    (f0, A0), (f1, A1) = at_start, at_end
+    j0, j1 = ((A[:, :, : f.shape[1]] @ f[:, :, None])[:, :, 0] for f, A in ((f0, A0), (f1, A1)))
+    of_gap = c**3 * (10 - 15 * c + 6 * c**2)
+    of_f0, of_f1 = c * d**3 * (1 + 3 * c), -(c**3) * d * (4 - 3 * c)
+    of_j0, of_j1 = c**2 * d**3 / 2, c**3 * d**2 / 2
+    states = starts + of_gap * (ends - starts) + h * (of_f0 * f0 + of_f1 * f1) + h**2 * (of_j0 * j0 + of_j1 * j1)
+    return np.asarray(states)
+
+
+ROOT_6 = np.sqrt(6.0)
+NODES = (4 - ROOT_6) / 10, (4 + ROOT_6) / 10  # and the end
+WEIGHTS = np.array(
+    [
+        [(88 - 7 * ROOT_6) / 360, (296 - 169 * ROOT_6) / 1800, (-2 + 3 * ROOT_6) / 225],
+        [(296 + 169 * ROOT_6) / 1800, (88 + 7 * ROOT_6) / 360, (-2 - 3 * ROOT_6) / 225],
+        [(16 - ROOT_6) / 36, (16 + ROOT_6) / 36, 1 / 9],
+    ]
+)
+SWING = 0.5  # of a part's length times the frequency that its stiffest entry would swing at
+SAME_WAY = 0.5  # the cosine of a normal's turn within a step: a step's error keeps it near 1 where it does not jump
+ALONG = 1e-9  # of the sizes of a switch's slope and of the rates: less is no crossing
+AT_ONCE = 1_000_000  # numbers of the equations that are solved in one call
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """`intervals` are N lists of steps, which lead from xs[k] under us[k] to xs[k + 1] unless they begin elsewhere."""
+
+    xs: Array
+    us: Array
+    intervals: list[list[Step]]
+
+    @property
+    def steps(self) -> list[tuple[Step, Array]]:
+        """Every step and its input."""
+        return [(step, u) for steps, u in zip(self.intervals, self.us, strict=True) for step in steps]
+
+
+class FlowSteps:
+    """The `Intervals` of a model in continuous time, to which a vector of contact parameters is applied.
+
+    ModelError where it has none.
+    """
+
+    def __init__(self, model: Model, vector: ParameterVector, tolerance: float = TOLERANCE):
+        for parameter in vector.parameters:
+            if parameter.kind.quantity not in QUANTITIES:
+                raise ModelError(
+                    f'method="continuous" takes no {parameter.name}: of parameters it takes contact\'s '
+                    f"{', '.join(QUANTITIES)}"
+                )
+        self.model, self.vector, self.plant = model, vector, flow_plant(model)
+        self.material = material_of(self.plant)
+        self.system = FlowSystem(self.plant, numbers_of(self.plant, self.material))
+        self.integrator = Integrator(self.system, tolerance)
+
+    def roll(self, x0: Array, choose: Chooser, count: int) -> Flow:
+        """The motion from `x0` (nx,) over `count` (N) intervals."""
+        xs, us, intervals = np.empty((count + 1, self.model.nx)), np.empty((count, self.model.nu)), []
+        xs[0] = x0
+        for k in range(count):
+            us[k] = choose(xs[k], k)
+            intervals.append(self._advance(us[k], xs[0] if k == 0 else None))
+            xs[k + 1] = intervals[-1][-1].ahead
+        return Flow(xs, us, intervals)
+
+    def _advance(self, u: Array, start: Array | None = None) -> list[Step]:
+        """The steps of an interval from `start` (nx,), or from where the last led."""
+        stepped()
+        self.system.u[:] = u
+        if start is not None:
+            self.integrator.start(start)
+        return self.integrator.advance(self.model.time_step)
+
+    def end(self, x: Array, u: Array) -> Array:
+        return self._advance(u, x)[-1].ahead
+
+    def derivatives(self, x0: Array, us: Array, xs: Array | None = None) -> list[StepDerivatives]:
+        intervals = list[list[Step]]()
+        for k, u in enumerate(us):
+            start = xs[k] if xs is not None else intervals[-1][-1].ahead if intervals else x0
+            intervals.append(self._advance(u, start))
+        return self.differentiate(Flow(np.array([x0, *(steps[-1].ahead for steps in intervals)]), us, intervals))
+
+    def jacobians(self, xs: Array, us: Array, ends: Array | None = None) -> Array:
+        return np.array([np.hstack([d.A, d.B]) for d in self.derivatives(xs[0], us, xs[: len(us)])])
+
+    def touching(self, x: Array, u: Array) -> tuple[tuple[str, str], ...]:
+        pairs = self.plant.pairs
+        pushing = sorted({i for step in self._advance(u, x) for i in step.pushing})
+        names = ((pairs.bodies[side[i]].name() for side in (pairs.sphere_body, pairs.other_body)) for i in pushing)
+        return tuple((a, b) for a, b in names)
+
+    def differentiate(self, flow: Flow) -> list[StepDerivatives]:
+        """Of the intervals of a flow."""
+        nx, nu, names = self.model.nx, self.model.nu, self.vector.names
+        by_parameters = np.zeros((4 * self.plant.num_pairs, len(names)))
+        if names:
+            change = material_change(self.plant.pairs, self.material, self.vector, self.model.double)
+            by_parameters = numbers_of(self.plant, change)
+        changes = iter(self._changes(flow, by_parameters))
+        derivatives = []
+        for steps in flow.intervals:
+            total = np.hstack([np.eye(nx), np.zeros((nx, nu + len(names)))])
+            for change in (next(changes) for _ in steps):
+                total = change[:, :nx] @ total
+                total[:, nx:] += change[:, nx:]
+            A, B, C = (frozen(part) for part in np.split(total, [nx, nx + nu], axis=1))
+            reason, sources = f"the flow by {len(steps)} steps", (METHOD,) * len(names)
+            derivatives.append(StepDerivatives(frozen(steps[-1].ahead), A, B, C, names, sources, METHOD, reason))
+        return derivatives
+
+    def _changes(self, flow: Flow, by_parameters: Array) -> Array:
+        """(M, nx, nx + nu + n) of all steps by state, input and parameters, jumps at events included."""
+        steps, nx = flow.steps, self.model.nx
+        changes = np.empty((len(steps), nx, nx + self.model.nu + by_parameters.shape[1]))
+        at_once = max(1, AT_ONCE // (9 * nx * changes.shape[2]))
+        for first in range(0, len(steps), at_once):
+            _Slopes(self.system, steps[first : first + at_once], by_parameters).integrate(
+                changes[first : first + at_once]
+            )
+        for change, (step, u) in zip(changes, steps, strict=True):
+            self._check_normals(step)
+            if step.events:
+                self._jump(step, u, by_parameters, change)
+        return changes
+
+    def _check_normals(self, step: Step) -> None:
+        """GradientError where the normal of a pair that pushes jumps within a step."""
+        if not step.pushing:
+            return
+        pairs = list(step.pushing)
+        first, last = (self.system.contacts(x)[pairs, 1] for x in (step.x, step.ahead))
+        for i in np.flatnonzero(np.sum(first * last, axis=1) < SAME_WAY):
+            inspector = self.model.double.inspector
+            names = " and ".join(inspector.GetName(j) for j in self.plant.pairs.ids[pairs[i]])
+            raise GradientError(
+                f"{names} overlap so deep that they push each other out by another way: the derivative of that motion "
+                "is not known here; stiffer contact does not let them"
+            )
+
+    def _jump(self, step: Step, u: Array, by_parameters: Array, change: Array) -> None:
+        """Put the jumps at the events that ended a step onto its derivative, one after the other."""
+        (nx, nu), x, pushing = (self.model.nx, self.model.nu), step.ahead, step.pushing
+        for event in step.events:
+            before, after = (self._rates(pairs, x, u) for pairs in (pushing, event.pushing))
+            row = np.asarray(self.plant.switch_slope(event.switch)(x, u, self.system.materials)).ravel()
+            rate, pushing = float(row[:nx] @ before), event.pushing
+            steep = abs(rate) / max(float(np.linalg.norm(row[:nx]) * np.linalg.norm(before)), 1e-300)
+            if np.any(after != before) and steep > ALONG:
+                by = row[:nx] @ change
+                by[nx : nx + nu] += row[nx : nx + nu]
+                by[nx + nu :] += row[nx + nu :] @ by_parameters
+                change += np.outer((after - before) / rate, by)
+
+    def _rates(self, pushing: Pairs, x: Array, u: Array) -> Array:
+        return np.asarray(self.plant.part(pushing).rates(x, u, self.system.materials)).ravel()
+
+
+class _Slopes:
+    """Rates along some steps, and their slopes by state, input and n parameters (4 P, n) of the materials."""
+
+    def __init__(self, system: FlowSystem, steps: Sequence[tuple[Step, Array]], by_parameters: Array):
+        self.system, self.steps, self.by_parameters = system, steps, by_parameters
+        self.starts, self.ends = (np.array([getattr(step, end) for step, _ in steps]) for end in ("x", "ahead"))
+        self.hs = np.array([step.h for step, _ in steps])
+        every = range(len(steps))
+        self.at_start, self.at_end = self(self.starts, every), self(self.ends, every)
+
+    def __call__(self, xs: Array, rows: Any) -> tuple[Array, Array]:
+        """(M, nx) the rates at xs (M, nx) of the steps `rows`, and (M, nx, nx + nu + n) their slopes."""
+        system, n = self.system, self.by_parameters.shape[1]
+        (count, nx), nu = xs.shape, len(system.u)
+        rates, slopes = np.empty((count, nx)), np.empty((count, nx, nx + nu + n))
+        for k, i in enumerate(rows):
+            step, system.u[:] = self.steps[i]
+            if step.pushing != system.pushing:
+                system.push(step.pushing)
+            rates[k], slopes[k, :, : nx + nu] = system.all_slopes(xs[k])
+            if n:
+                of_pushing = [4 * pair + j for pair in step.pushing for j in range(4)]
+                by_materials = system.plant.part(step.pushing).material_slopes(xs[k], system.u, system.materials)
+                slopes[k, :, nx + nu :] = np.asarray(by_materials) @ self.by_parameters[of_pushing]
+        return rates, slopes
+
+    def between(self, share: float, rows: Any) -> Array:
+        """(M, nx) the states at a `share` of the steps `rows`."""
+        at_ends = ((rates[rows], slopes[rows]) for rates, slopes in (self.at_start, self.at_end))
+        return _between(share, self.starts[rows], self.ends[rows], self.hs[rows], *at_ends)
+
+    def integrate(self, changes: Array) -> None:
+        """Fill `changes` (M, nx, nx + nu + n).
+
+        A motion that rests does not show how fast it would swing either: steps that are long for that are taken in
+        parts.
+        """
+        nx, nq = self.starts.shape[1], self.system.plant.model.nq
+        stiffness = np.max(np.abs(self.at_start[1][:, nq:, :nq]), axis=(1, 2), initial=0.0)
+        parts = np.ceil(np.maximum(self.hs * np.sqrt(stiffness) / SWING, 1.0)).astype(int)
+        for number in np.unique(parts).tolist():
+            rows = np.flatnonzero(parts == number)
+            for j in range(number):
+                points = [(j + c) / number for c in NODES] + [(j + 1) / number] * (j + 1 < number)
+                slopes = [self(self.between(point, rows), rows)[1] for point in points]
+                slopes += [self.at_end[1][rows]] * (j + 1 == number)
+                change = _collocated(np.stack(slopes, axis=1), self.hs[rows] / number)
+                if j:
+                    total = change[:, :, :nx] @ changes[rows]
+                    total[:, :, nx:] += change[:, :, nx:]
+                    change = total
+                changes[rows] = change
+
+
+def _collocated(slopes: Array, hs: Array) -> Array:
+    """(M, nx, width) from the slopes (M, 3, nx, width) at the three points of steps of lengths hs (M,)."""
+    count, _, nx, _ = slopes.shape
+    parts = hs[:, None, None, None, None] * WEIGHTS[None, :, :, None, None] * slopes[:, None]
+    left = -parts[..., :nx].transpose(0, 1, 3, 2, 4).reshape(count, 3 * nx, 3 * nx)
+    diagonal = np.arange(3 * nx)
+    left[:, diagonal, diagonal] += 1.0
+    right = np.sum(parts, axis=2)
+    right[..., :nx] = np.eye(nx)
+    return np.asarray(np.linalg.solve(left, right.reshape(count, 3 * nx, -1))[:, 2 * nx :])
+
+
+GAUSS_NODES = 0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)
+GAUSS_WEIGHTS = 5 / 18, 8 / 18, 5 / 18
+
+
+def measured_flow(
+    model: Model, vector: ParameterVector, x0: Array, choose: Chooser, count: int
+) -> tuple[Array, Array, Array, Array, list[tuple[ContactPoint, ...]]]:
+    """The flow of a model, to which the vector is applied, over `count` of its intervals: see `continuous_rollout`."""
+    steps = FlowSteps(model, vector)
+    flow = steps.roll(x0, choose, count)
+    limits, ends = steps.plant.description.effort_limits, np.cumsum([0, *map(len, flow.intervals)])
+    contacts = [deepest_contacts(steps.system, interval) for interval in flow.intervals]
+    return flow.xs, flow.us, np.clip(flow.us, -limits, limits), _work(steps.system, flow.steps)[ends], contacts
+
+
+def _work(system: FlowSystem, steps: Sequence[tuple[Step, Array]]) -> Array:
+    """(M+1, 3) [J] what actuators did, what damping took and what contact did since the start."""
+    slopes, rows = _Slopes(system, steps, np.zeros((4 * system.num_pairs, 0))), np.arange(len(steps))
+    done = np.zeros((len(steps) + 1, 3))
+    for share, weight in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
+        for k, (x, (step, u)) in enumerate(zip(slopes.between(share, rows), steps, strict=True)):
+            watts = system.plant.powers(step.pushing)(x, u, system.materials)
+            done[k + 1] += weight * step.h * np.asarray(watts).ravel()
+    return np.asarray(np.cumsum(done, axis=0))
