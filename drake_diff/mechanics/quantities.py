@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd
+from pydrake.math import RotationMatrix_
 from pydrake.multibody.tree import FrameIndex
 
 from drake_diff._base.arrays import finite_array
@@ -42,6 +43,7 @@ ORIGIN = (0.0, 0.0, 0.0)
 UP = (0.0, 0.0, 1.0)
 ROTATION_TOLERANCE = 1e-9  # of R' R = I: a goal written down with fewer digits would be another rotation
 
+CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])  # times a quaternion
 RECORDED = "recorded_as"  # the attribute of a function of this module by which a record knows it
 
 OfState = Callable[[Any], Any]
@@ -73,13 +75,8 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
     here, base, p = _frame_index(model, frame), _frame_index(model, relative_to), finite_array("point", point, (3,))
 
     def position(x: Any) -> Any:
-        if _is_symbolic(x):
-            tree, there = _tree_of(model, PLACE), model.plant.get_frame(base)
-            carrier, origin = tree.frame(x, model.plant.get_frame(here)), tree.frame(x, there)
-            return origin.R.T @ (carrier.p + carrier.R @ p - origin.p)
-        twin, _ = _at(model, PLACE, x)
-        pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
-        return pose.translation() + pose.rotation().matrix() @ p
+        R, origin = _pose(model, x, here, base)
+        return origin + R @ p
 
     return recorded(position, "frame_position", frame=frame, point=p.tolist(), relative_to=relative_to)
 
@@ -121,11 +118,10 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
         if _is_symbolic(x):
             tree = _tree_of(model, PLACE)
             turned, origin = (tree.quaternion(x, model.plant.get_frame(i)) for i in (here, base))
-            relative = product(product(_conjugate(origin), turned), _conjugate(_quaternion(goal)))
+            relative = product(product(CONJUGATE * origin, turned), CONJUGATE * _quaternion(goal, float))
             return 2 * relative[0].sign() * relative[1:]
-        twin, _ = _at(model, PLACE, x)
-        pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
-        return 2 * _quaternion(pose.rotation().matrix() @ goal.T)[1:]
+        R, _ = _pose(model, x, here, base)
+        return 2 * _quaternion(R @ goal.T, float if R.dtype == float else AutoDiffXd)[1:]
 
     return recorded(error, "frame_rotation_error", frame=frame, R_goal=goal.tolist(), relative_to=relative_to)
 
@@ -153,15 +149,7 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
     """
     here, p = _frame_index(model, frame), finite_array("point", point, (3,))
 
-    def velocity(x: Any) -> Any:
-        if _is_symbolic(x):
-            return _tree_of(model, PLACE).frame(x, model.plant.get_frame(here), speeds=True).shifted(np.eye(3), p).v
-        twin, _ = _at(model, PLACE, x)
-        world, moving = twin.plant.world_frame(), twin.plant.get_frame(here)
-        arm = moving.CalcPose(twin.context, world).rotation().matrix() @ p
-        return moving.CalcSpatialVelocity(twin.context, world, world).Shift(arm).translational()
-
-    return recorded(velocity, "frame_velocity", frame=frame, point=p.tolist())
+    return recorded(lambda x: _velocities(model, x, here, p)[1], "frame_velocity", frame=frame, point=p.tolist())
 
 
 def frame_angular_velocity(model: Model, frame: str) -> OfState:
@@ -185,13 +173,7 @@ def frame_angular_velocity(model: Model, frame: str) -> OfState:
     """
     here = _frame_index(model, frame)
 
-    def velocity(x: Any) -> Any:
-        if _is_symbolic(x):
-            return _tree_of(model, PLACE).frame(x, model.plant.get_frame(here), speeds=True).w
-        twin, _ = _at(model, PLACE, x)
-        return twin.plant.get_frame(here).CalcSpatialVelocityInWorld(twin.context).rotational()
-
-    return recorded(velocity, "frame_angular_velocity", frame=frame)
+    return recorded(lambda x: _velocities(model, x, here, np.zeros(3))[0], "frame_angular_velocity", frame=frame)
 
 
 def frame_tilt(model: Model, frame: str, axis: ArrayLike = UP) -> OfState:
@@ -218,20 +200,15 @@ def frame_tilt(model: Model, frame: str, axis: ArrayLike = UP) -> OfState:
         >>> tilt([0.01, 0.0]).round(6)
         array([0.01, 0.  ])
     """
-    here, a = _frame_index(model, frame), finite_array("axis", axis, (3,))
+    here, world, a = _frame_index(model, frame), _frame_index(model, "world"), finite_array("axis", axis, (3,))
     if not np.linalg.norm(a) > 0:
         raise InputError("axis", got=a.tolist(), expected="a direction")
     a = a / np.linalg.norm(a)
 
     def tilt(x: Any) -> Any:
-        if _is_symbolic(x):
-            R = _tree_of(model, PLACE).frame(x, model.plant.get_frame(here)).R
-        else:
-            twin, _ = _at(model, PLACE, x)
-            R = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.world_frame()).rotation().matrix()
-            if not plain([1 + (R @ a)[2]])[0] > 0:  # upside down: it leans every way
-                return np.array([2.0, 0.0]) + 0 * (R @ a)[:2]
-        pointing = R @ a
+        pointing = _pose(model, x, here, world)[0] @ a
+        if not _is_symbolic(x) and not plain([1 + pointing[2]])[0] > 0:  # upside down: it leans every way
+            return np.array([2.0, 0.0]) + 0 * pointing[:2]
         return pointing[:2] / np.sqrt((1 + pointing[2]) / 2)
 
     return recorded(tilt, "frame_tilt", frame=frame, axis=a.tolist())
@@ -321,20 +298,39 @@ def description_of(function: Any) -> dict[str, Any] | None:
 
 def made_from(model: Model, description: Any) -> OfState | OfStateAndInput:
     """The function that `description_of` described, on `model`. InputError where it describes none."""
-    kinds: dict[str, Any] = {
-        "frame_position": frame_position,
-        "frame_rotation_error": frame_rotation_error,
-        "frame_velocity": frame_velocity,
-        "frame_angular_velocity": frame_angular_velocity,
-        "frame_tilt": frame_tilt,
-        "center_of_mass": center_of_mass,
-        "contact_force": contact_force,
-    }
+    makers: tuple[Any, ...] = (
+        *(frame_position, frame_rotation_error, frame_velocity, frame_angular_velocity, frame_tilt),
+        *(center_of_mass, contact_force),
+    )
+    kinds = {make.__name__: make for make in makers}
     if isinstance(description, dict) and len(description) == 1:
         ((name, arguments),) = description.items()
         if name in kinds and isinstance(arguments, dict):
             return kinds[name](model, **arguments)
     raise InputError("quantity", got=repr(description), expected=f"one of {', '.join(kinds)} with its arguments")
+
+
+def _pose(model: Model, x: Any, here: FrameIndex, base: FrameIndex) -> tuple[Any, Any]:
+    """Rotation (3, 3) and origin (3,) of a frame in another one."""
+    if _is_symbolic(x):
+        tree = _tree_of(model, PLACE)
+        moving, origin = (tree.frame(x, model.plant.get_frame(i)) for i in (here, base))
+        return origin.R.T @ moving.R, origin.R.T @ (moving.p - origin.p)
+    twin, _ = _at(model, PLACE, x)
+    pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
+    return pose.rotation().matrix(), pose.translation()
+
+
+def _velocities(model: Model, x: Any, here: FrameIndex, point: Any) -> tuple[Any, Any]:
+    """(3,) the angular velocity of a frame and (3,) that of a point in it, in world."""
+    if _is_symbolic(x):
+        moving = _tree_of(model, PLACE).frame(x, model.plant.get_frame(here), speeds=True).shifted(np.eye(3), point)
+        return moving.w, moving.v
+    twin, _ = _at(model, PLACE, x)
+    frame = twin.plant.get_frame(here)
+    arm = frame.CalcPose(twin.context, twin.plant.world_frame()).rotation().matrix() @ point
+    velocity = frame.CalcSpatialVelocityInWorld(twin.context).Shift(arm)
+    return velocity.rotational(), velocity.translational()
 
 
 def _at(model: Model, depends_on: frozenset[str], x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:
@@ -378,10 +374,6 @@ def _tree_of(model: Model, depends_on: frozenset[str]) -> ForwardKinematics:
     return kinematics
 
 
-def _conjugate(q: Any) -> Any:
-    return q * np.array([1.0, -1.0, -1.0, -1.0])
-
-
 def _frame_index(model: Model, name: str) -> FrameIndex:
     plant = model.plant
     frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
@@ -395,20 +387,7 @@ def _frame_index(model: Model, name: str) -> FrameIndex:
     raise UnknownNameError("frame", got=name, known=[*known, *(n for n in full if n.split("::")[-1] not in known)])
 
 
-def _quaternion(R: Any) -> Any:
-    """(4,) w x y z, w not negative, of a rotation matrix; divided by the largest entry (Shepperd, 1978).
-
-    4 w^2 = 1 + tr R, 4 x^2 = 1 + 2 R_xx - tr R, 4 w x = R_zy - R_yz, 4 x y = R_xy + R_yx, and so on around.
-    """
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
-    squares = [1 + trace, *(1 + 2 * R[i, i] - trace for i in range(3))]
-    largest = int(np.argmax(plain(squares)))
-    if largest == 0:
-        quadruple = [squares[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
-    else:
-        i = largest - 1
-        j, k = (i + 1) % 3, (i + 2) % 3
-        quadruple = [R[k, j] - R[j, k], None, None, None]
-        quadruple[1 + i], quadruple[1 + j], quadruple[1 + k] = squares[largest], R[i, j] + R[j, i], R[i, k] + R[k, i]
-    quaternion = np.array(quadruple) / (2 * np.sqrt(squares[largest]))
+def _quaternion(R: Any, scalar: Any) -> Any:
+    """(4,) w x y z, w not negative, of a rotation matrix."""
+    quaternion = RotationMatrix_[scalar](R).ToQuaternion().wxyz()
     return -quaternion if quaternion[0] < 0 else quaternion
