@@ -13,7 +13,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.exceptions import ModelError, UnknownNameError
-from drake_diff.identification.tree import Dynamics, Tree, ten_numbers, tree_for_identification
+from drake_diff.identification.tree import Dynamics, Tree, numbers_of, tree_for_identification
 from drake_diff.model.model import Model
 
 STATES = 60  # random ones, of at least as many rows as there are numbers
@@ -91,7 +91,7 @@ def base_parameters(model: Model, bodies: Sequence[str] | None = None) -> tuple[
     of_links = _effects(model, tree, len(wanted))
     for body in wanted:
         link = tree.bodies[body]
-        numbers = ten_numbers(link.mass, link.center_of_mass, link.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+        numbers = numbers_of(link)
         effect = of_links[tree.placed[body][0]] @ tree.moved_by[body]
         for j in ORDER:
             effects.append(effect[:, j])
@@ -107,7 +107,9 @@ def _effects(model: Model, tree: Tree, count: int) -> list[Array]:
     N = max(STATES, 20 * count // max(model.nv, 1) + 1)
     q = random.uniform(-np.pi, np.pi, (N, model.nq))
     v, a = random.standard_normal((2, N, model.nv))
-    return Dynamics(tree, numbers).regressors(q, v, a)
+    E = tree.spread
+    by_links = Dynamics(tree, numbers).regressors(tree.joint_positions(q), v @ E.T, a @ E.T)
+    return [(E.T @ by_links[:, :, i]).reshape(-1, 10) for i in range(len(tree.links))]
 
 
 def _sums(effects: Array, names: Sequence[str], units: Sequence[str], values: Array) -> tuple[BaseParameter, ...]:

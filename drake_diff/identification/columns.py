@@ -18,7 +18,6 @@ from drake_diff.exceptions import DrakeDiffError
 from drake_diff.identification.fit import cut_segments
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import HOPELESS, likelihood_of, noise_of
-from drake_diff.identification.messages import mistaken
 from drake_diff.identification.motion import ContinuousMotion, EulerMotion, Law
 from drake_diff.identification.recordings import Chart, Piece, guess_states, noise_by_differences
 from drake_diff.identification.results import Explanation
@@ -165,7 +164,10 @@ def mistaken_columns(
         if explains or not falls:
             return None
         first, *rest = sorted(falls, key=lambda words: scores[words])
-        return mistaken(first, [words for words in rest if scores[words] - scores[first] < SAME], falls)
+        alike = [words for words in rest if scores[words] - scores[first] < SAME]
+        tail = "the recording cannot tell" if alike else "this explains the recording"
+        sentence = f"{', or '.join((first, *alike))}: {tail}."
+        return Explanation((first,), {}, {}, tuple((words,) for words in alike), True, sentence, falls)
     return None
 
 

@@ -104,15 +104,12 @@ class Touching(Ranking):
         changed = [candidate for candidate in tried if not any(candidate is other for other in none)]
         named = self.enough(base, changed, len(self.changes))
         if named:
-            explanation = self.named(named)
-            before = explanation.sentence.removesuffix(self.end).removesuffix(".")
-            sentence = f"{before}, by the model's own steps of {1e3 * self.model.time_step:.4g} ms.{self.end}"
-            return replace(explanation, sentence=sentence)
+            return self.named(named, f", by the model's own steps of {1e3 * self.model.time_step:.4g} ms")
         if base.explains:
-            return self.right()
+            return self.nothing()
         near = min(tried, key=self.bic, default=None)
         what = f"with {near.names[0]}, {near.doubt}" if near and near.doubt else "none comes near it"
-        return Explanation((), {}, {}, (), False, f"{NO_CHANGE}; {what}.{self.end}", self.evidence)
+        return self.unexplained(f"{NO_CHANGE}; {what}.")
 
     def from_best(self, base: Tried, tried: Sequence[Tried]) -> Tried:
         """The model as it is, from first states of the best change too: they may lead it to less than its own."""
@@ -241,7 +238,7 @@ class Touching(Ranking):
         candidate = self.judge(names, self.problem(unknowns, followed.fit.segments.pieces), followed.fit, solved)
         if followed.stage == len(self.stages) - 1:
             return candidate
-        return candidate._replace(score=np.inf, explains=False, doubt="its motion leaves the recordings")
+        return candidate._replace(score=np.inf, doubt="its motion leaves the recordings")
 
     def unchanged(self, pieces: Sequence[Piece]) -> tuple[float, bool]:
         """How well the model as it is goes through other pieces."""

@@ -204,7 +204,7 @@ class _Design:
         """(nx + nu,) lower and upper, of states and inputs."""
         model = self.model
         low, high = (
-            np.concatenate([q, v, sign * self.tree.limits])
+            np.concatenate([q, v, sign * self.tree.numbers.limit])
             for q, v, sign in zip(model.position_limits, model.velocity_limits, (-1, 1), strict=True)
         )
         names = (*model.state_names, *model.input_names)

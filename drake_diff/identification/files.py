@@ -1,6 +1,6 @@
 """The directory of an identification: its record, the recordings themselves, trace.mcap and a report.
 
-The recordings are kept as they were read, so that `verify` fits them again.
+The recordings are in it as they were read, so that `verify` fits them again.
 """
 
 import json
@@ -47,6 +47,8 @@ OF_RECORDINGS = (
     "inputs, model and the recordings: they are what was asked, and whether a robot moved so is for who recorded it; "
     "recordings[...].sha256 is the hash of the file that was read"
 )
+MOST_PLOTS = 12  # of coordinates
+MOST_COLUMNS = 16  # of the table of correlations
 
 
 def save_identification(identification: Identification, directory: str | Path) -> FitRecord:
@@ -63,17 +65,19 @@ def write_identification(identification: Identification, folder: Path) -> FitRec
     asked, name = _asked(identification), name_of(folder)
     stored = (folder.with_name(name) / RECORDINGS).resolve()
     for recording, given in zip(asked.recordings, asked.files, strict=True):
-        if given is not None and given[0].resolve().is_relative_to(stored):
-            got = f"{given[0]}, which is in the directory to be written"
-            raise InputError(f"recording {recording.name}", got=got, expected="one elsewhere")
-        if given is not None and (not given[0].exists() or hash_of(given[0]) != given[1]):
-            raise ArtifactError(f"recording {recording.name}: {given[0]} has changed since it was read")
-        if given is not None and (size := _size(given[0])) > LARGEST:
-            expected = f"at most {LARGEST} bytes, as it is kept in the directory"
-            raise InputError(f"recording {recording.name}", got=f"{size} bytes", expected=expected)
+        if given is not None:
+            _check_file(recording.name, *given, stored)
     _begun(name, asked).begin(folder)
-    for i, recording in enumerate(asked.recordings):
-        _keep(folder / _place(i, asked), recording, asked.files[i])
+    for i, (recording, given) in enumerate(zip(asked.recordings, asked.files, strict=True)):
+        target = folder / _path(i, asked)
+        make_folder(target.parent)
+        if given is None:
+            write_arrays(target, recording)
+            continue
+        for path in _files(given[0]):
+            copy = target / path.relative_to(given[0])
+            make_folder(copy.parent)
+            write_whole(copy, path.read_bytes())
     record = record_of(identification, name)
     write_made(folder, identification, record)
     if asked.model.source is not None:
@@ -81,49 +85,48 @@ def write_identification(identification: Identification, folder: Path) -> FitRec
     return record.write(folder)
 
 
-def _place(i: int, asked: Asked) -> str:
+def _check_file(name: str, path: Path, sha256: str, stored: Path) -> None:
+    subject = f"recording {name}"
+    if path.resolve().is_relative_to(stored):
+        raise InputError(subject, got=f"{path}, which is in the directory to be written", expected="one elsewhere")
+    if not path.exists() or hash_of(path) != sha256:
+        raise ArtifactError(f"{subject}: {path} has changed since it was read")
+    if (size := sum(file.stat().st_size for file in _files(path))) > LARGEST:
+        expected = f"at most {LARGEST} bytes, as it is copied into the directory"
+        raise InputError(subject, got=f"{size} bytes", expected=expected)
+
+
+def _files(path: Path) -> list[Path]:
+    """The file, or those of a folder."""
+    return [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+
+
+def _path(i: int, asked: Asked) -> str:
     given = asked.files[i]
     return f"{RECORDINGS}/{i}/{ARRAYS if given is None else given[0].name}"
 
 
-def _size(path: Path) -> int:
-    return sum(p.stat().st_size for p in ([path] if path.is_file() else path.rglob("*")) if p.is_file())
-
-
-def _keep(target: Path, recording: Recording, given: tuple[Path, str] | None) -> None:
-    make_folder(target.parent)
-    if given is None:
-        write_arrays(target, recording)
-    elif given[0].is_dir():
-        for path in sorted(given[0].rglob("*")):
-            if path.is_file():
-                make_folder((target / path.relative_to(given[0])).parent)
-                write_whole(target / path.relative_to(given[0]), path.read_bytes())
-    else:
-        write_whole(target, given[0].read_bytes())
-
-
 def _begun(name: str, asked: Asked) -> FitRecord:
-    parameters = asked.parameters if isinstance(asked.parameters, str) else list(asked.parameters)
+    inputs = records.Asked(
+        parameters=asked.parameters if isinstance(asked.parameters, str) else list(asked.parameters),
+        noise={key: float(value) for key, value in asked.noise.items()},
+        held_out=asked.held_out,
+        motion=asked.motion,
+        max_iterations=asked.max_iterations,
+        priors={key: [np.ravel(values).tolist() for values in pair] for key, pair in asked.priors.items()},
+        bounds={key: [finite(bound) for bound in pair] for key, pair in asked.bounds.items()},
+        sensors={
+            key: records.Mounted(body=body, pose=[float(value) for value in pose])
+            for key, (body, pose) in asked.sensors.items()
+        },
+    )
     return FitRecord(
         name=name,
         verdict="incomplete",
         sentence="it is still being written, or that was killed or broke off",
         model=model_input(asked.model),
         contract=asked.model.contract.to_dict(),
-        inputs=records.Asked(
-            parameters=parameters,
-            noise={key: float(value) for key, value in asked.noise.items()},
-            held_out=asked.held_out,
-            motion=asked.motion,
-            max_iterations=asked.max_iterations,
-            priors={key: [np.ravel(piece).tolist() for piece in pair] for key, pair in asked.priors.items()},
-            bounds={key: [finite(bound) for bound in pair] for key, pair in asked.bounds.items()},
-            sensors={
-                key: records.Mounted(body=body, pose=[float(value) for value in pose])
-                for key, (body, pose) in asked.sensors.items()
-            },
-        ),
+        inputs=inputs,
         recordings=[],
         provenance=provenance_of(),
         wall_clock=WallClock(written_utc=written_now()),
@@ -134,7 +137,11 @@ def record_of(e: Identification, name: str) -> FitRecord:
     """The record of an identification, but for the files."""
     asked = _asked(e)
     recordings = [_recording(i, e, asked) for i in range(len(asked.recordings))]
-    result: dict[str, Any] = {
+    begun = _begun(name, asked)
+    fields = {key: getattr(begun, key) for key in FitRecord.model_fields}
+    fields |= {key: finite(getattr(e, key)) for key in ("error_before", "error_after", "score")}
+    fields |= {key: getattr(e, key) for key in ("explained", "reason", "converged", "steps", "motion", "count")}
+    fields |= {
         "verdict": "pass" if e.explained else "fail",
         "sentence": e.sentence,
         "recordings": recordings,
@@ -143,31 +150,25 @@ def record_of(e: Identification, name: str) -> FitRecord:
         "unidentifiable": list(e.unidentifiable),
         "noise": dict(e.noise),
         "correlation": _correlation(e.covariance),
-        **{key: finite(getattr(e, key)) for key in ("error_before", "error_after", "score")},
-        **{key: getattr(e, key) for key in ("explained", "reason", "converged", "steps", "motion", "count")},
     }
-    begun = _begun(name, asked)
-    return FitRecord(**{**{key: getattr(begun, key) for key in type(begun).model_fields}, **result})
+    return FitRecord(**fields)
 
 
-def _data(recordings: list[records.RecordingEvidence]) -> DataBoundary:
+def _data(recordings: Sequence[records.RecordingEvidence]) -> DataBoundary:
     """Which spans of which recordings were fitted, and which were predicted only."""
 
-    def uses(r: records.RecordingEvidence, spans: list[list[float]], whole: bool) -> list[DataUse]:
-        hashed = r.sha256 if whole else None  # that of a file is of no part of it
-        return [
-            DataUse(name=f"{r.path}, {a:g} to {b:g} s", what=f"recording {r.name}", sha256=hashed) for a, b in spans
-        ]
+    def use(r: records.RecordingEvidence, span: list[float], is_all: bool) -> DataUse:
+        sha256 = r.sha256 if is_all else None  # that of a file is of no span in it
+        return DataUse(name=f"{r.path}, {span[0]:g} to {span[1]:g} s", what=f"recording {r.name}", sha256=sha256)
 
-    seen = [use for r in recordings for use in uses(r, r.fitted_s, not r.held_out_s)]
-    held_out = [use for r in recordings for use in uses(r, r.held_out_s, not r.fitted_s)]
-    fitted, stored = ("1 span" if len(piece) == 1 else f"{len(piece)} spans" for piece in (seen, held_out))
+    seen = [use(r, span, not r.held_out_s) for r in recordings for span in r.fitted_s]
+    held_out = [use(r, span, not r.fitted_s) for r in recordings for span in r.held_out_s]
+    fitted, stored = ("1 span" if len(uses) == 1 else f"{len(uses)} spans" for uses in (seen, held_out))
     statement = (
         f"parameters were fitted on {fitted}, and the fit is judged on {stored} that it did not see, and its own"
     )
-    return DataBoundary(
-        statement=statement, seen=seen, judged_on=[*seen, *held_out], held_out=[use.name for use in held_out]
-    )
+    names = [use.name for use in held_out]
+    return DataBoundary(statement=statement, seen=seen, judged_on=[*seen, *held_out], held_out=names)
 
 
 def _asked(e: Identification) -> Asked:
@@ -176,43 +177,34 @@ def _asked(e: Identification) -> Asked:
     return e.asked
 
 
-def _bounds(pair: list[float | None]) -> tuple[float, float]:
-    low, high = pair
-    return -np.inf if low is None else low, np.inf if high is None else high
-
-
 def _recording(i: int, e: Identification, asked: Asked) -> records.RecordingEvidence:
     recording, given = asked.recordings[i], asked.files[i]
-    pieces = [motion.piece for motion in e.motions if motion.piece.recording == i]
-    spans = [[float(p.times[0]), float(p.times[-1])] for p in pieces]
+    spans: dict[bool, list[list[float]]] = {True: [], False: []}
+    for piece in (motion.piece for motion in e.motions if motion.piece.recording == i):
+        spans[piece.held_out].append([float(piece.times[0]), float(piece.times[-1])])
     return records.RecordingEvidence(
         name=recording.name,
         version=recording.version,
         facts=dict(recording.facts),
         file=None if given is None else given[0].name,
-        path=_place(i, asked),
+        path=_path(i, asked),
         sha256=None if given is None else given[1],
         samples=len(recording.times),
-        fitted_s=[span for span, piece in zip(spans, pieces, strict=True) if not piece.held_out],
-        held_out_s=[span for span, piece in zip(spans, pieces, strict=True) if piece.held_out],
+        fitted_s=spans[False],
+        held_out_s=spans[True],
     )
 
 
 def estimates_of(e: Identification) -> list[records.Estimate]:
     """Each entry of each value with its interval."""
-    result = []
+    estimates = []
     for name, value in e.values.items():
-        now, was = np.atleast_1d(value), np.atleast_1d(e.start[name])
-        limits = np.reshape(e.intervals[name], (-1, 2))
+        now, was, limits = np.atleast_1d(value), np.atleast_1d(e.start[name]), np.reshape(e.intervals[name], (-1, 2))
         for i, (low, high) in enumerate(limits):
-            label = name if len(now) == 1 else f"{name}[{i}]"
-            result.append(
-                records.Estimate(
-                    name=label, unit=e.units[name], before=float(was[i]), value=float(now[i]),
-                    lower=finite(low), upper=finite(high),
-                )
-            )  # fmt: skip
-    return result
+            label, ends = name if len(now) == 1 else f"{name}[{i}]", {"lower": finite(low), "upper": finite(high)}
+            numbers: dict[str, Any] = {"before": float(was[i]), "value": float(now[i]), **ends}
+            estimates.append(records.Estimate(name=label, unit=e.units[name], **numbers))
+    return estimates
 
 
 def _correlation(covariance: Array) -> list[list[float | None]]:
@@ -225,33 +217,33 @@ def _correlation(covariance: Array) -> list[list[float | None]]:
 def write_made(folder: Path, e: Identification, record: FitRecord) -> None:
     """Write `MADE`."""
     fields = json.loads(canonical(record.model_dump(mode="json")))  # in the order in which the record is written
-    carried = {record.FILE: ("application/json", reproducible(fields).encode())}
-    write_identification_trace(folder / TRACE, e, carried)
-    write_page_of(folder / REPORT, e, fields)
+    _write_trace(folder / TRACE, e, {record.FILE: ("application/json", reproducible(fields).encode())})
+    plots = [*_motion_plots(e), *_residual_plots(e)]
+    data = page_data(max(float(m.piece.times[-1]) for m in e.motions), plots)
+    write_page(folder / REPORT, "identification.html.j2", record=fields, data=data, most_columns=MOST_COLUMNS)
 
 
-def write_identification_trace(path: Path, e: Identification, attachments: Mapping[str, tuple[str, bytes]]) -> None:
+def _write_trace(path: Path, e: Identification, attachments: Mapping[str, tuple[str, bytes]]) -> None:
     """Write what was measured and how the model moves with the values found, and with its own, on one axis of time.
 
     Of recording k: /k/measured/state (NaN is what was not measured), /k/input, /k/fitted/state and, where it was looked
     at, /k/before/state. The frames are those of the first recording.
     """
-    model = _asked(e).model
-    contract = model.contract
-    names = {"recordings": ", ".join(r.name for r in _asked(e).recordings), "model": model.name}
-    inner = {p.name for p in list_parameters(model)}
-    vector = select(model, {name: value for name, value in e.values.items() if name in inner})
+    asked = _asked(e)
+    model, contract = asked.model, asked.model.contract
+    known = {p.name for p in list_parameters(model)}
+    vector = select(model, {name: value for name, value in e.values.items() if name in known})
+    facts = {"recordings": ", ".join(r.name for r in asked.recordings), "model": model.name}
     with applied(vector) if vector.parameters else nullcontext():
-        channels = [c for i in range(len(_asked(e).recordings)) for c in _channels_of(e, i)]
-        first = joined([m for m in e.motions if m.piece.recording == 0])
-        channels.append(transform_channel(model, first[0], {"": first[2]}))
-        write_mcap(path, channels, {**names, "time_axis": "recorded", "contract": contract.name}, attachments)
+        channels = [channel for i in range(len(asked.recordings)) for channel in _channels_of(e, asked, i)]
+        times, _, xs, _ = _joined(e, 0)
+        channels.append(transform_channel(model, times, {"": xs}))
+        write_mcap(path, channels, {**facts, "time_axis": "recorded", "contract": contract.name}, attachments)
 
 
-def _channels_of(e: Identification, i: int) -> Iterator[Channel]:
-    contract = _asked(e).model.contract
-    times, ys, xs, before = joined([m for m in e.motions if m.piece.recording == i])
-    recording = _asked(e).recordings[i]
+def _channels_of(e: Identification, asked: Asked, i: int) -> Iterator[Channel]:
+    contract, recording = asked.model.contract, asked.recordings[i]
+    times, ys, xs, before = _joined(e, i)
     entries = contract.positions, contract.velocities
     yield state_channel(f"/{i}/measured/state", times, ys, *entries)
     yield input_channel(f"/{i}/input", (recording.times - recording.times[0])[:-1], recording.us, contract.inputs)
@@ -262,23 +254,7 @@ def _channels_of(e: Identification, i: int) -> Iterator[Channel]:
 
 
 def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduced:
-    """The fit once more from the recordings in the directory, and all that was written of it."""
-    made, identification = _fitted_again(folder, record, models)
-    changed = {"contract": contract_as(made.contract, record.contract), "model": model_as(made.model, record.model)}
-    again = made.model_copy(update=changed)
-    with TemporaryDirectory() as location:
-        write_made(Path(location), identification, again)
-        files = {name: (Path(location) / name).read_bytes() for name in MADE}
-    problems = tuple(f"{name}: every fit is written with it, and the directory has none" for name in MADE
-                     if name not in record.files)  # fmt: skip
-    stored = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
-    carried = "" if record.model.file is None else record.model.file.path
-    fields = again.model_dump(mode="json")
-    return Reproduced(fields, files, problems=problems, unchecked=(OF_RECORDINGS,), written=(carried, *stored, *MADE))
-
-
-def _fitted_again(folder: Path, record: FitRecord, models: Path | None) -> tuple[FitRecord, Identification]:
-    """The record of the fit run again from the directory's own recordings, and that fit.
+    """The fit once more from the recordings in the directory, and all that was written of it.
 
     ArtifactError where the directory does not have what the record says; ModelError where the model cannot be rebuilt,
     `models` as in `rebuilt`.
@@ -288,80 +264,79 @@ def _fitted_again(folder: Path, record: FitRecord, models: Path | None) -> tuple
     carried = "" if record.model.file is None else record.model.file.path
     attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
     with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
-        given: list[Recording] = []
-        files: list[tuple[Path, str] | None] = []
-        for i, stored in enumerate(record.recordings):
-            name = ARRAYS if stored.file is None else stored.file
-            if stored.path != f"{RECORDINGS}/{i}/{name}" or Path(name).name != name or name in ("", "..", "."):
-                raise ArtifactError(f"{record.FILE}: recording {stored.name} is not where drake_diff keeps it")
-            path = folder / stored.path
-            if stored.file is None:
-                given.append(read_arrays(path, stored.name, stored.version, stored.facts))
-                files.append(None)
-            else:
-                if not path.exists() or hash_of(path) != stored.sha256:
-                    raise ArtifactError(f"{stored.path}: it is not the recording that {record.FILE} describes")
-                read = read_recording(path, model, gaps=True)
-                given.append(replace(read, name=stored.name, version=stored.version, facts=dict(stored.facts)))
-                files.append((path, str(stored.sha256)))
-        inputs = record.inputs
-        result = identify(
-            model, given, inputs.parameters, noise=inputs.noise or None, held_out=inputs.held_out, motion=inputs.motion,
-            max_iterations=inputs.max_iterations,
-            priors={key: (mean, deviation) for key, (mean, deviation) in inputs.priors.items()} or None,
-            bounds={key: _bounds(pair) for key, pair in inputs.bounds.items()} or None,
-            sensors={key: (item.body, item.pose) for key, item in inputs.sensors.items()} or None,
-        )  # fmt: skip
-        if result.asked is None:
-            raise ArtifactError("the fit does not say what was asked")
-        result = replace(result, asked=replace(result.asked, files=tuple(files)))
-        made = record_of(result, record.name)
-    kept_as = {name: getattr(record, name) for name in ("provenance", "wall_clock", "files", "record_sha256")}
-    return made.model_copy(update=kept_as), result
-
-
-def joined(motions: Sequence[Followed]) -> tuple[Array, Array, Array, Array]:
-    """times (n,), measured, fitted and earlier states (n, nx) of one recording's stretches, NaN where there is none.
-
-    A sample where one stretch ends and the next begins is told once, as the next one has it.
-    """
-    motions = sorted(motions, key=lambda motion: float(motion.piece.times[0]))
-    parts: list[list[Array]] = [[], [], [], []]
-    for k, motion in enumerate(motions):
-        count = len(motion.piece.times) - (k < len(motions) - 1)
-        before = np.full_like(motion.xs, np.nan) if motion.xs_before is None else motion.xs_before
-        for arrays, values in zip(parts, (motion.piece.times, motion.piece.ys, motion.xs, before), strict=True):
-            arrays.append(values[:count])
-    times, ys, xs, before = (np.concatenate(arrays) for arrays in parts)
-    return times, ys, xs, before
-
-
-MOST_PLOTS = 12  # of coordinates
-MOST_COLUMNS = 16  # of the table of correlations
-
-
-def write_page_of(path: Path, e: Identification, record: Mapping[str, Any]) -> None:
-    """Write the report of `e`, whose record has these fields."""
-    duration = max(float(m.piece.times[-1]) for m in e.motions)
-    write_page(
-        path,
-        "identification.html.j2",
-        record=record,
-        data=page_data(duration, [*_motion_plots(e), *_residual_plots(e)]),
-        most_columns=MOST_COLUMNS,
+        given, files = zip(*(_stored(folder, record, i, model) for i in range(len(record.recordings))), strict=True)
+        again = identify(model, given, record.inputs.parameters, **_options(record.inputs))
+        again = replace(again, asked=replace(_asked(again), files=files))
+        made = record_of(again, record.name)
+    fields = {name: getattr(record, name) for name in ("provenance", "wall_clock", "files", "record_sha256")}
+    fields |= {"contract": contract_as(made.contract, record.contract), "model": model_as(made.model, record.model)}
+    made = made.model_copy(update=fields)
+    with TemporaryDirectory() as location:
+        write_made(Path(location), again, made)
+        contents = {name: (Path(location) / name).read_bytes() for name in MADE}
+    lacking = (name for name in MADE if name not in record.files)
+    problems = tuple(f"{name}: every fit is written with it, and the directory has none" for name in lacking)
+    stored = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
+    written = (carried, *stored, *MADE)
+    return Reproduced(
+        made.model_dump(mode="json"), contents, problems=problems, unchecked=(OF_RECORDINGS,), written=written
     )
+
+
+def _options(inputs: records.Asked) -> dict[str, Any]:
+    """What `identify` was called with beside model, recordings and parameters."""
+    ends = (-np.inf, np.inf)
+    return {
+        "noise": inputs.noise or None,
+        "held_out": inputs.held_out,
+        "motion": inputs.motion,
+        "max_iterations": inputs.max_iterations,
+        "priors": {key: tuple(pair) for key, pair in inputs.priors.items()} or None,
+        "bounds": {
+            key: tuple(end if bound is None else bound for bound, end in zip(pair, ends, strict=True))
+            for key, pair in inputs.bounds.items()
+        }
+        or None,
+        "sensors": {key: (item.body, item.pose) for key, item in inputs.sensors.items()} or None,
+    }
+
+
+def _stored(folder: Path, record: FitRecord, i: int, model: Any) -> tuple[Recording, tuple[Path, str] | None]:
+    """A recording in the directory, and its file with the hash, if it is not arrays."""
+    stored = record.recordings[i]
+    name, path = ARRAYS if stored.file is None else stored.file, folder / stored.path
+    if stored.path != f"{RECORDINGS}/{i}/{name}" or Path(name).name != name or name in ("", "..", "."):
+        raise ArtifactError(f"{record.FILE}: recording {stored.name} is not where drake_diff keeps it")
+    if stored.file is None:
+        return read_arrays(path, stored.name, stored.version, stored.facts), None
+    if not path.exists() or hash_of(path) != stored.sha256:
+        raise ArtifactError(f"{stored.path}: it is not the recording that {record.FILE} describes")
+    read = read_recording(path, model, gaps=True)
+    return replace(read, name=stored.name, version=stored.version, facts=dict(stored.facts)), (path, stored.sha256)
+
+
+def _joined(e: Identification, i: int) -> tuple[Array, ...]:
+    """times (n,), measured, fitted and earlier states (n, nx) of a recording's stretches, NaN where there is none.
+
+    A sample where one stretch ends and the next begins is as the next one has it.
+    """
+    motions = sorted((m for m in e.motions if m.piece.recording == i), key=lambda motion: float(motion.piece.times[0]))
+
+    def arrays(motion: Followed, is_last: bool) -> tuple[Array, ...]:
+        before = np.full_like(motion.xs, np.nan) if motion.xs_before is None else motion.xs_before
+        count = len(motion.piece.times) - (not is_last)
+        return tuple(values[:count] for values in (motion.piece.times, motion.piece.ys, motion.xs, before))
+
+    return tuple(map(np.concatenate, zip(*(arrays(m, m is motions[-1]) for m in motions), strict=True)))
 
 
 def _motion_plots(e: Identification) -> Iterator[Plot]:
     """What was measured beside the model's motion."""
-    if e.asked is None:
-        return
-    model = e.asked.model
+    model = _asked(e).model
     units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
-    for i, recording in enumerate(e.asked.recordings):
-        times, ys, xs, before = joined([m for m in e.motions if m.piece.recording == i])
-        seen = [j for j in range(model.nx) if np.any(np.isfinite(ys[:, j]))]
-        for j in seen[:MOST_PLOTS]:
+    for i, recording in enumerate(_asked(e).recordings):
+        times, ys, xs, before = _joined(e, i)
+        for j in [j for j in range(model.nx) if np.any(np.isfinite(ys[:, j]))][:MOST_PLOTS]:
             lines = [Line("measured", ys[:, j]), Line("with the values found", xs[:, j])]
             if np.any(np.isfinite(before[:, j])):
                 lines.append(Line("with the model's own values", before[:, j], dashed=True))
@@ -370,24 +345,16 @@ def _motion_plots(e: Identification) -> Iterator[Plot]:
 
 def _residual_plots(e: Identification) -> Iterator[Plot]:
     """What is left of each entry that was fitted, in standard deviations of the noise."""
-    if e.asked is None:
-        return
-    names = e.entries
-    fitted = [m.piece for m in e.motions if not m.piece.held_out]
-    for j, name in enumerate([n for n in names if n in e.noise][:MOST_PLOTS]):
-        column = names.index(name)
-        x = np.concatenate([p.times for p in fitted])
-        y = np.concatenate([r[:, column] for r in e.residuals])
-        order = np.argsort(x, kind="stable")
-        yield Plot(
-            name,
-            "standard deviations",
-            x[order],
-            [Line("what is left", y[order])],
-            axis="time [s]",
-            place="residuals",
-            group="Residuals",
-            marks="points",
-            limits=(-2.0, 2.0),
-            note="of noise, 95 % lie between the dashed lines" if j == 0 else "",
-        )
+    times = np.concatenate([m.piece.times for m in e.motions if not m.piece.held_out])
+    order = np.argsort(times, kind="stable")
+    looks: dict[str, Any] = {
+        "axis": "time [s]",
+        "place": "residuals",
+        "group": "Residuals",
+        "marks": "points",
+        "limits": (-2.0, 2.0),
+    }
+    for j, name in enumerate([n for n in e.entries if n in e.noise][:MOST_PLOTS]):
+        left = np.concatenate([r[:, e.entries.index(name)] for r in e.residuals])[order]
+        note = "of noise, 95 % lie between the dashed lines" if j == 0 else ""
+        yield Plot(name, "standard deviations", times[order], [Line("what is left", left)], note=note, **looks)

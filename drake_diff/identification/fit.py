@@ -12,12 +12,12 @@ data say nothing: it is one standard deviation where a quantity is three times i
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear, minimize_scalar
+from scipy.optimize import lsq_linear
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, SimulationError
@@ -35,10 +35,8 @@ SETTLED = 1e-5  # of |r|^2, in units of the noise: what a last step may still ga
 PROMISED = 1e-2  # the same where slopes promise more than there is, as by kinks: a tenth of a standard deviation
 CLOSED = 1e-3  # of the noise: how far gaps may stand open at the end
 HALVINGS = 8
-AT_REST = 4.0  # of |r|^2: what each joint that begins at rest may leave more, as by two standard deviations
 FARTHER = 3.0  # by which a step may lead farther each time that a whole one did well, where motion kinks
 NEAR = 10.0  # times how well a velocity is known from the samples around: about how far a step leads where motion kinks
-SHORT = 0.1  # of a step: a kink is near
 TOO_LARGE = 1e100  # of a derivative, in units of the noise: its square is beyond what numbers hold
 STUCK = "no part of a step made the motion nearer to what was measured"
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
@@ -138,22 +136,6 @@ class Reduced:
     def finite(self) -> bool:
         """Whether its numbers are small enough to go on with."""
         return bool(np.all(np.abs(np.column_stack([self.R, self.b])) < TOO_LARGE))
-
-    def mixed(self, other: "Reduced", share: float) -> "Reduced":
-        """The sum of this least squares and the other one, which has this share of it; starts follow as here."""
-        mine, nz, blocks = 1 - share, len(self.b), []
-        rows = [_weighed(mine, self.R, self.b), _weighed(share, other.R, other.b)]
-        rest = mine * self.rest + share * other.rest
-        for a, b in zip(self.own, other.own, strict=True):
-            nt = len(a[2])
-            R = _triangle(np.vstack([_weighed(mine, *a), _weighed(share, *b)]))
-            blocks.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
-            rows.append(R[nt : nt + nz, nt:])
-            rest += float(R[nt + nz, -1] ** 2)
-        R = _triangle(np.vstack(rows))
-        rest += float(R[nz, -1] ** 2)
-        now = mine * self.now + share * other.now
-        return replace(self, now=now, R=R[:nz, :nz], b=R[:nz, -1], rest=rest, own=blocks)
 
 
 class Fit:
@@ -376,20 +358,13 @@ class Fit:
             after[k] = self.chart.plus(starts[k], fraction * d)
         return after
 
-    def solve(self, z: Array, starts: Array, most: int) -> "Solved":
-        """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
-        solved = self._descended(z, starts, most)
-        exact = self.law.exact() if solved.stuck else None
-        if exact is not None:
-            solved = self.by(exact)._descended(solved.z, solved.starts, most)
-        return self._from_rest(solved, most) if solved.stuck and self.law.kinks else solved
-
     def by(self, law: Law) -> "Fit":
         """The same with another law, of segments as long."""
         arguments = self.model, law, self.chart, self.unknowns, self.segments.pieces, self.noise
         return Fit(*arguments, sensors=self.sensors, fixed=self.fixed)
 
-    def _descended(self, z: Array, starts: Array, most: int) -> "Solved":
+    def solve(self, z: Array, starts: Array, most: int) -> "Solved":
+        """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
         merit, reach, here = 0.0, 1.0, self.at(z, starts)
         if here is None:
             raise SimulationError(
@@ -411,9 +386,6 @@ class Fit:
             if ahead is None and reach > 1.0:
                 reach = 1.0
                 continue
-            if self.law.kinks and fraction <= SHORT:
-                reduced = self._both_sides(here, reduced, dz, max(2 * fraction, 0.5**HALVINGS))
-                promised, fraction, ahead = self._along_a_kink(here, reduced, merit, fraction, ahead)
             if ahead is None:
                 ended = promised <= PROMISED and here.gap <= CLOSED
                 return Solved(here.z, here.starts, reduced, ended, steps, "" if ended else STUCK)
@@ -426,38 +398,6 @@ class Fit:
         dz = self.step_of(here.z, reduced)
         then = reduced.rest + float(np.sum((reduced.b - reduced.R @ dz) ** 2)) + self._pull(here.z + dz)
         return dz, reduced.now + self._pull(here.z) - then
-
-    def _along_a_kink(
-        self, here: "Point", both: Reduced, merit: float, fraction: float, ahead: "Point | None"
-    ) -> "tuple[float, float, Point | None]":
-        """(What both sides promise, part of their step or of the one ahead, whichever does better, where it leads)."""
-        dz, promised = self._promised(here, both)
-        if promised <= PROMISED and here.gap <= CLOSED:
-            return promised, 0.0, None
-        along, there = self._ahead(here, both, dz, merit, promised + merit * here.gap)
-        if there is None or (ahead is not None and ahead.above(merit) <= there.above(merit)):
-            return promised, fraction, ahead
-        return promised, along, there
-
-    def _both_sides(self, here: "Point", reduced: Reduced, dz: Array, fraction: float) -> Reduced:
-        """The linearized motion at a kink: with that a part of dz farther on, weighed so that it promises least.
-
-        What is left is the larger of the two there. Where even so little is promised, least is left at the kink itself,
-        as where a joint stops just when an input changes.
-        """
-        beyond = self.at(
-            np.clip(here.z + fraction * dz, *self.unknowns.bounds), self.moved(here.starts, reduced, dz, fraction)
-        )
-        if beyond is None:
-            return reduced
-        other = self.reduce(beyond)
-        least = minimize_scalar(
-            lambda share: self._promised(here, reduced.mixed(other, share))[1],
-            bounds=(0.0, 1.0),
-            method="bounded",
-            options={"xatol": 1e-6},
-        )
-        return reduced.mixed(other, float(least.x))
 
     def _ahead(
         self, here: "Point", reduced: Reduced, dz: Array, merit: float, gain: float
@@ -472,26 +412,6 @@ class Fit:
                 return fraction, ahead
         return 0.0, None
 
-    def _from_rest(self, stuck: "Solved", most: int) -> "Solved":
-        """Begun anew with joints at rest that stop in the first segment, if that converges and leaves as little.
-
-        Noise lets them move at first, and the order in which they stop has kinks that no step leads out of.
-        """
-        here, nq = self.at(stuck.z, stuck.starts), self.model.nq
-        if here is None:
-            return stuck
-        starts, count = here.starts.copy(), 0
-        for k in np.flatnonzero(np.diff(here.segments.of_piece, prepend=-1)):
-            stops = np.any(here.xs[k, 1:, nq:] == 0, axis=0) & (starts[k, nq:] != 0)
-            starts[k, nq:][stops] = 0.0
-            count += int(np.sum(stops))
-        if count == 0 or self.at(here.z, starts) is None:
-            return stuck
-        again = self._descended(here.z, starts, most)
-        there = self.at(again.z, again.starts)
-        close = there is not None and there.value <= here.value + AT_REST * count
-        return again if again.converged and close else stuck
-
 
 @dataclass(frozen=True, eq=False)
 class Point:
@@ -505,15 +425,6 @@ class Point:
     value: float  # |r|^2 with the pull to the file's values
     gap: float  # the size of the gaps
     segments: Segments
-
-    def above(self, merit: float) -> float:
-        """|r|^2 and what gaps count."""
-        return self.value + merit * self.gap
-
-
-def _weighed(share: float, *columns: Array) -> Array:
-    """Rows of a least squares that has this share of another."""
-    return np.asarray(np.sqrt(share) * np.column_stack(columns))
 
 
 def _triangle(matrix: Array) -> Array:

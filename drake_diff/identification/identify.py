@@ -26,7 +26,7 @@ from drake_diff.identification.judge import (
     noise_of,
     score_of,
 )
-from drake_diff.identification.messages import NOISE_IS_LEFT, identification_sentence, unidentifiable
+from drake_diff.identification.messages import unidentifiable
 from drake_diff.identification.motion import ContinuousMotion, Law, discrete_motion
 from drake_diff.identification.recordings import (
     Chart,
@@ -38,7 +38,7 @@ from drake_diff.identification.recordings import (
     read_given,
     read_pieces,
 )
-from drake_diff.identification.results import Asked, Followed, Identification
+from drake_diff.identification.results import Asked, Followed, Identification, identification
 from drake_diff.identification.sensors import Sensors, choose_sensors
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
@@ -138,7 +138,7 @@ def identify(
     if motion == "impacts":
         if priors or bounds:
             raise InputError("priors and bounds", got="some", expected='none with motion="impacts"')
-        identification = fit_through_impacts(model, pieces, parameters, problem.first_noise)
+        found = fit_through_impacts(model, pieces, parameters, problem.first_noise)
     else:
         law: Law = (
             discrete_motion(model, unknowns, pieces)
@@ -146,7 +146,7 @@ def identify(
             else ContinuousMotion(model, own_tree, unknowns)
         )
         fit, solved = problem.solve(law, max_iterations)
-        identification = problem.judged(fit, solved, why if motion == "auto" else "")
+        found = problem.judged(fit, solved, why if motion == "auto" else "")
     names = parameters if isinstance(parameters, str) else tuple(parameters)
     asked = Asked(
         model,
@@ -161,7 +161,7 @@ def identify(
         dict(bounds or {}),
         dict(sensors or {}),
     )
-    return replace(identification, asked=asked)
+    return replace(found, asked=asked)
 
 
 def what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
@@ -297,41 +297,29 @@ class Problem:
 
     def judged(self, fit: Fit, solved: Solved, why_steps: str) -> Identification:
         unknowns, z = self.unknowns, solved.z
-        count, taken = freedom_of(fit, solved)
+        freedom = freedom_of(fit, solved)
         known = known_of(unknowns, z, solved.reduced.R)
-        intervals = intervals_of(unknowns, z, known.covariance, count - taken)
+        intervals = intervals_of(unknowns, z, known.covariance, freedom.left)
         values, by_z = unknowns.values(z), unknowns.by_z(z)
-        before, after, why_not, motions = self._predicted(fit, solved, known, count - taken)
+        before, after, why_not, motions = self._predicted(fit, solved, known, freedom.left)
         reason = self.doubt(fit, solved, why_not)
         lost = ~np.isfinite(np.diag(known.covariance))
         covariance = by_z @ np.where(np.isfinite(known.covariance), known.covariance, 0.0) @ by_z.T
         hidden = np.any(by_z[:, lost] != 0, axis=1)
         covariance[hidden, hidden] = np.inf
-        names, open_ = self.entries, unidentifiable(unknowns, z, known.open)
-        why = reason or NOISE_IS_LEFT
-        return Identification(
-            values=unknowns.named(values),
-            start=unknowns.named(unknowns.start),
-            intervals={
-                unknown.name: frozen(intervals[s][0] if len(unknown.start) == 1 else intervals[s])
-                for unknown, s in zip(unknowns.each, unknowns.slices, strict=True)
-            },
-            units={unknown.name: unknown.unit for unknown in unknowns.each},
-            unidentifiable=open_,
-            explained=not reason,
-            reason=why,
-            sentence=identification_sentence(
-                unknowns, values, intervals, open_, (before, after), explained=not reason, reason=why
-            ),
-            noise={n: float(s) for n, s in zip(names, fit.noise, strict=True) if np.isfinite(s)},
-            error_before=before,
-            error_after=after,
+        return identification(
+            unknowns,
+            values,
+            intervals,
+            open_=unidentifiable(unknowns, z, known.open),
+            errors=(before, after),
+            reason=reason,
+            noise={n: float(s) for n, s in zip(self.entries, fit.noise, strict=True) if np.isfinite(s)},
             residuals=tuple(frozen(r) for r in solved.reduced.residuals),
-            columns=unknowns.columns,
-            entries=names,
+            entries=self.entries,
             covariance=frozen(covariance),
             score=score_of(fit, solved),
-            count=count,
+            count=freedom.numbers,
             converged=solved.converged,
             steps=solved.steps,
             motion=fit.law.words + (f", as {why_steps}" if why_steps else ""),
@@ -349,9 +337,9 @@ class Problem:
         for z in (self.unknowns.z_start, solved.z):
             fixed = states_fit.solve(z, self.guess(states_fit), 20)
             moved.append([frozen(xs) for xs in states_fit.states(fixed)])
-            count, taken = freedom_of(states_fit, fixed)
+            left = max(freedom_of(states_fit, fixed).left, 1)
             total = sum(float(np.nansum(r**2)) for r in fixed.reduced.residuals)
-            errors.append(float(np.sqrt(total / max(count - taken, 1))))
+            errors.append(float(np.sqrt(total / left)))
         fitted = [frozen(xs) for xs in fit.states(solved)]
         if not held:
             return errors[0], errors[1], "", [*map(Followed, pieces, fitted, moved[0])]
@@ -359,17 +347,11 @@ class Problem:
         motions += map(Followed, held, moved[1], moved[0])
         finite = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
         extra = float(np.trace(fixed.reduced.R @ finite @ fixed.reduced.R.T))
-        allowed = float(stats.f.ppf(0.999, max(count - taken, 1), max(freedom, 1))) * (
-            1 + extra / max(count - taken, 1)
-        )
+        allowed = float(stats.f.ppf(0.999, left, max(freedom, 1))) * (1 + extra / left)
         if fixed.converged and errors[1] ** 2 <= allowed:
             return errors[0], errors[1], "", motions
-        return (
-            errors[0],
-            errors[1],
-            f"samples that were held out are missed by {errors[1]:.3g} times the noise",
-            motions,
-        )
+        why = f"samples that were held out are missed by {errors[1]:.3g} times the noise"
+        return errors[0], errors[1], why, motions
 
     def doubt(self, fit: Fit, solved: Solved, why_not: str) -> str:
         """Why the model does not explain the recordings; empty where it does."""

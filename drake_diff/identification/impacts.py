@@ -16,8 +16,8 @@ same measured positions allow: through impacts small errors of a first state gro
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -27,10 +27,9 @@ from drake_diff.comparison.recordings import CLOCK_TOLERANCE, Recording
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.identification.judge import SCATTER
-from drake_diff.identification.messages import NOISE_IS_LEFT, identification_sentence
 from drake_diff.identification.motion import DiscreteMotion, discrete_motion
 from drake_diff.identification.recordings import Chart, Piece, noise_by_differences, read_pieces
-from drake_diff.identification.results import Followed, Identification
+from drake_diff.identification.results import Followed, Identification, identification
 from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, Unknown, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
@@ -60,8 +59,7 @@ def flights_of(model: Model, xs: Array) -> list[tuple[int, int]]:
     return flights
 
 
-@dataclass(frozen=True, eq=False)
-class Start:
+class Start(NamedTuple):
     """A first state, and what measured positions leave open of it."""
 
     x: Array  # (nx,)
@@ -158,10 +156,29 @@ ROUNDS = 5  # of reweighting
 PULL = 1e-3  # towards where a cloud stands: what no residual knows stays there
 AGAIN = 4  # steps of one width at most: it shrinks where a step is no longer than it
 FAR = 2.0  # widths of the cloud that a step may go along each direction
+# [s] how long segments go on after a flight, and the widths of the clouds of each stage.
+STAGES = (
+    (0.15, tuple(0.6**k for k in range(6))),
+    (np.inf, (0.1, 0.05)),
+)
+SLOPES = 0.15  # width of the cloud that intervals are from: a narrower one sees its own ragged ground
+HALF = (0.4, SLOPES)  # widths of the clouds of steps of half the length: wide enough to leave that ground
+# The grid convergence index of the coarser of two grids: an error that grows as the step does is twice what half the
+# step changes, with a safety of 3 beside. It is needed: a ball's friction was off by 0.021 and 0.014 by steps of 5 and
+# 2.5 ms, where half of 0.021 was to be expected.
+BY_HALF = 6.0
+REST = 0.15  # [s] the end of a recording: where things lie says how large they are
+# Of a positive number; [m, rad] of a bias or a length; of a radius of gyration.
+LOG_SCALE, LENGTH_SCALE, CENTER_SCALE = 0.3, 1e-3, 0.02
+SAMPLES = 3  # every so many samples are compared: neighbours say the same
+LOST = 1000.0  # times the unit: the residual of a motion that Drake cannot step
+SEED = 0  # of clouds and other first states: the same recordings give the same values
+OTHERS = 8  # first states of each recording
+Build = Callable[..., Model]
+Residual = Callable[[Array], Array]
 
 
-@dataclass(frozen=True, eq=False)
-class Plane:
+class Plane(NamedTuple):
     """Residuals near w: r + J d, and how far to believe each."""
 
     r: Array  # (M,)
@@ -182,7 +199,7 @@ class Plane:
         return d
 
 
-def plane_at(residual: Callable[[Array], Array], w: Array, width: float, random: np.random.Generator) -> Plane:
+def plane_at(residual: Residual, w: Array, width: float, random: np.random.Generator) -> Plane:
     """Laid through the residuals (M,) of 4 n or more values about w (n,), in pairs."""
     n = len(w)
     half = max(2 * n, 4)
@@ -195,8 +212,7 @@ def plane_at(residual: Callable[[Array], Array], w: Array, width: float, random:
     return Plane(C[0], C[1:].T / width, scatter + 1)
 
 
-@dataclass(frozen=True, eq=False)
-class Shrunk:
+class Shrunk(NamedTuple):
     """Where steps led."""
 
     w: Array  # (n,)
@@ -204,9 +220,7 @@ class Shrunk:
     converged: bool  # whether the last step was within the narrowest cloud
 
 
-def shrink_to(
-    residual: Callable[[Array], Array], w: Array, widths: Sequence[float], random: np.random.Generator
-) -> Shrunk:
+def shrink_to(residual: Residual, w: Array, widths: Sequence[float], random: np.random.Generator) -> Shrunk:
     """Where steps lead, some for each width of the cloud, from w (n,).
 
     Residuals are in units of what they are uncertain by at best.
@@ -224,27 +238,7 @@ def shrink_to(
     return Shrunk(w, rounds, within)
 
 
-# [s] how long segments go on after a flight, and the widths of the clouds of each stage.
-STAGES = (
-    (0.15, tuple(0.6**k for k in range(6))),
-    (np.inf, (0.1, 0.05)),
-)
-SLOPES = 0.15  # width of the cloud that intervals are from: a narrower one sees its own ragged ground
-HALF = (0.4, SLOPES)  # widths of the clouds of steps of half the length: wide enough to leave that ground
-# The grid convergence index of the coarser of two grids: an error that grows as the step does is twice what half the
-# step changes, with a safety of 3 beside. It is needed: a ball's friction was off by 0.021 and 0.014 by steps of 5 and
-# 2.5 ms, where half of 0.021 was to be expected.
-BY_HALF = 6.0
-REST = 0.15  # [s] the end of a recording: where things lie says how large they are
-# Of a positive number; [m, rad] of a bias or a length; of a radius of gyration.
-LOG_SCALE, LENGTH_SCALE, CENTER_SCALE = 0.3, 1e-3, 0.02
-SAMPLES = 3  # every so many samples are compared: neighbours say the same
-LOST = 1000.0  # times the unit: the residual of a motion that Drake cannot step
-Build = Callable[..., Model]
-
-
-@dataclass(frozen=True)
-class Segment:
+class Segment(NamedTuple):
     """A stretch of a recording, and where its motion begins."""
 
     piece: int
@@ -253,8 +247,7 @@ class Segment:
     x0: Array  # (nx,)
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(NamedTuple):
     """Where a search ended."""
 
     w: Array  # (n,)
@@ -277,41 +270,35 @@ class Search:
         build: Build | None = None,
     ):
         self.model, self.build, self.lengths, self.names = model, build, dict(lengths or {}), names
-        self.chart = Chart(coordinates_of(self.model))
-        self.pieces = list(pieces)
+        self.chart, self.pieces = Chart(coordinates_of(model)), list(pieces)
         for piece in self.pieces:
             if np.any(np.isnan(piece.ys)):
                 raise InputError(f"recording {piece.name}", got="NaN", expected="every position and velocity measured")
-        chosen = choose_unknowns(self.model, None, names)
-        self.law: DiscreteMotion = discrete_motion(self.model, chosen, self.pieces)
+        chosen = choose_unknowns(model, None, names)
+        self.law: DiscreteMotion = discrete_motion(model, chosen, self.pieces)
         of_lengths = (Unknown(name, "m", np.array([value]), 0.0, value) for name, value in self.lengths.items())
         self.unknowns = Unknowns((*chosen.each, *of_lengths))
-        self.scale, self.by_log = self._scales()
+        scales = [(*self._scale(unknown),) for unknown in self.unknowns.each for _ in unknown.start]
+        self.scale, self.by_log = np.array([s for s, _ in scales]), np.array([b for _, b in scales], dtype=bool)
         self.unit = millisecond(self.chart, [piece for piece in self.pieces if not piece.held_out])
 
-    def _scales(self) -> tuple[Array, Array]:
-        scales, logs = [], []
-        for unknown in self.unknowns.each:
-            if unknown.quantity in (INERTIA, STRENGTH):
-                raise InputError(
-                    unknown.name, got="a quantity of smooth motion", expected="one of contact; see dd.identify"
-                )
-            by_log = unknown.quantity not in (BIAS, CENTER) and unknown.name not in self.lengths
-            if by_log and not np.all(unknown.start > 0):
-                raise InputError(unknown.name, got=unknown.start, expected="a value above 0 to begin from")
-            size = LOG_SCALE if by_log else CENTER_SCALE * unknown.size if unknown.quantity == CENTER else LENGTH_SCALE
-            if unknown.quantity == "radius":
-                size = LENGTH_SCALE / unknown.size
-            scales += [size] * len(unknown.start)
-            logs += [by_log] * len(unknown.start)
-        return np.array(scales), np.array(logs)
+    def _scale(self, unknown: Unknown) -> tuple[float, bool]:
+        """What w = 1 changes, and whether it is of the logarithm."""
+        if unknown.quantity in (INERTIA, STRENGTH):
+            expected = "one of contact; see dd.identify"
+            raise InputError(unknown.name, got="a quantity of smooth motion", expected=expected)
+        if unknown.quantity == CENTER:
+            return CENTER_SCALE * unknown.size, False
+        if unknown.quantity == BIAS or unknown.name in self.lengths:
+            return LENGTH_SCALE, False
+        if not np.all(unknown.start > 0):
+            raise InputError(unknown.name, got=unknown.start, expected="a value above 0 to begin from")
+        return LENGTH_SCALE / unknown.size if unknown.quantity == "radius" else LOG_SCALE, True
 
     def values(self, w: Array) -> Array:
         """(n,) of the parameters, then of the lengths."""
-        moved = self.scale * w
-        return np.asarray(
-            self.unknowns.start * np.exp(np.where(self.by_log, moved, 0)) + np.where(self.by_log, 0, moved)
-        )
+        moved, start = self.scale * w, self.unknowns.start
+        return np.asarray(np.where(self.by_log, start * np.exp(np.where(self.by_log, moved, 0)), start + moved))
 
     def intervals(self, solution: Solution) -> Array:
         """(n, 2) of the values."""
@@ -319,11 +306,12 @@ class Search:
 
     def open(self, solution: Solution) -> tuple[str, ...]:
         """What the recordings leave open: entries whose interval is wider than a factor of 3, 10 mm or 10 mrad."""
-        wide = np.where(self.by_log, self.scale * solution.spread > np.log(3.0), self.scale * solution.spread > 0.01)
+        wide = self.scale * solution.spread > np.where(self.by_log, np.log(3.0), 0.01)
         return tuple(column for column, is_open in zip(self.unknowns.columns, wide, strict=True) if is_open)
 
-    def vector(self, values: Array) -> ParameterVector:
-        """The model's parameters at values (n,), of a model of its own where there are lengths."""
+    def vector(self, w: Array) -> ParameterVector:
+        """The model's parameters at w, of a model of its own where there are lengths."""
+        values = self.values(w)
         parameters = values[self.law.own]
         if self.build is None:
             return self.law.vector.at(parameters)
@@ -337,8 +325,8 @@ class Search:
 
         Each goes on for `length` [s] after its flight. The end of each recording is one more.
         """
-        segments, vector = [], self.vector(self.values(w))
-        with applied(vector) as model:
+        segments = []
+        with applied(self.vector(w)) as model:
             for p, piece in enumerate(self.pieces):
                 if piece.held_out:
                     continue
@@ -358,37 +346,40 @@ class Search:
     def starts(self, w: Array, noise: Array) -> list[Start]:
         """Of each recording, those held out too, by its first flight; else as measured, with `noise` (2 nv,)."""
         starts = []
-        with applied(self.vector(self.values(w))) as model:
+        with applied(self.vector(w)) as model:
             for piece in self.pieces:
                 flights = flights_of(model, piece.ys)
-                if flights and flights[0][0] == 0:
-                    starts.append(start_of(model, self.chart, piece.part(*flights[0]), self.unit))
-                else:
-                    starts.append(Start(piece.ys[0], np.diag(noise)))
+                is_flying = flights and flights[0][0] == 0
+                starts.append(
+                    start_of(model, self.chart, piece.part(*flights[0]), self.unit)
+                    if is_flying
+                    else Start(piece.ys[0], np.diag(noise))
+                )
         return starts
 
-    def whole(self, w: Array, starts: Sequence[Array]) -> list[Array]:
+    def recordings(self, w: Array, starts: Sequence[Array]) -> list[Array]:
         """(n, nx) the motion of each recording, from starts (nx,)."""
         segments = [Segment(p, 0, len(self.pieces[p].times) - 1, x0) for p, x0 in enumerate(starts)]
         return [np.concatenate([x0[None], xs]) for x0, xs in zip(starts, self.motions(w, segments), strict=True)]
 
     def motions(self, w: Array, segments: Sequence[Segment]) -> list[Array]:
         """Of each segment (samples - 1, nx) after its first, as they would be measured; NaN where Drake cannot step."""
-        values = self.values(w)
-        shift = np.zeros(self.model.nx)
-        names = self.model.state_names
-        for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True):
+        shift, values, motions = np.zeros(self.model.nx), self.values(w), []
+        for unknown, s in self.unknowns.items():
             if unknown.quantity == BIAS:
-                shift[names.index(unknown.label)] = values[s][0]
-        vector, motions = self.vector(values), []
-        with applied(vector) as model:
+                shift[self.model.state_names.index(unknown.label)] = values[s][0]
+        with applied(self.vector(w)) as model:
             for segment in segments:
                 piece = self.pieces[segment.piece].part(segment.first, segment.last)
-                stride = steps_between(model, piece)
+                x, xs = segment.x0 - shift, np.full((len(piece.us), self.model.nx), np.nan)
                 try:
-                    motions.append(_sampled(model, segment.x0 - shift, piece.us, stride) + shift)
+                    for k, u in enumerate(piece.us):
+                        for _ in range(steps_between(model, piece)):
+                            x = advance(model.double, x, u)
+                        xs[k] = x + shift
                 except SimulationError:
-                    motions.append(np.full((len(piece.us), self.model.nx), np.nan))
+                    xs[:] = np.nan
+                motions.append(xs)
         return motions
 
     def residual(self, w: Array, segments: Sequence[Segment]) -> Array:
@@ -405,28 +396,24 @@ class Search:
         w, random, rounds, converged = np.zeros(len(self.scale)), np.random.default_rng(seed), 0, True
         for length, widths in STAGES:
             segments = self.segments(w, length)
-
-            def residual(w: Array, segments: list[Segment] = segments) -> Array:
-                return self.residual(w, segments)
-
-            shrunk = shrink_to(residual, w, widths, random)
+            shrunk = shrink_to(partial(self.residual, segments=segments), w, widths, random)
             w, rounds, converged = shrunk.w, rounds + shrunk.rounds, shrunk.converged
         count = sum(not piece.held_out for piece in self.pieces)
-        spread, correlation = _between(plane_at(residual, w, SLOPES, random), segments, count)
+        plane = plane_at(partial(self.residual, segments=segments), w, SLOPES, random)
+        spread, correlation = _spread_between(plane, segments, count)
         half = self.by_half(w, random)
         if half is not None:
             spread = np.hypot(spread, BY_HALF * (half - w))
         return Solution(w, spread, half, correlation, converged, rounds + 1)
 
     def by_half(self, w: Array, random: np.random.Generator) -> Array | None:
-        """(n,) where the search leads from w (n,) over whole recordings by steps of half the length."""
+        """(n,) where the search leads from w (n,) over full recordings by steps of half the length."""
         source = self.law.model.source
         if not self.law.model.can_rebuild or source is None or not source.exists():
             return None  # a diagram, or a file that is gone, as a function that makes models may have it
         model = self.law.model.at_time_step(self.law.model.time_step / 2)
         finer = Search(model, self.pieces, self.names, self.lengths, self.build)
-        segments = finer.segments(w, np.inf)
-        return shrink_to(lambda point: finer.residual(point, segments), w, HALF, random).w
+        return shrink_to(partial(finer.residual, segments=finer.segments(w, np.inf)), w, HALF, random).w
 
 
 def identify_contact(
@@ -435,7 +422,7 @@ def identify_contact(
     parameters: Sequence[str],
     *,
     lengths: Mapping[str, float] | None = None,
-    seed: int = 0,
+    seed: int = SEED,
 ) -> Identification:
     """Estimate friction, stiffness, dissipation, radii and centres of mass from motions through impacts.
 
@@ -484,17 +471,7 @@ def identify_contact(
     return fit_through_impacts(first_model, pieces, parameters, noise, lengths=begin, build=build, seed=seed)
 
 
-def _sampled(model: Model, x0: Array, us: Array, count: int) -> Array:
-    """(n, nx) after every `count` steps under each of us (n, nu); which of them touched takes time and is not asked."""
-    xs, x = np.empty((len(us), model.nx)), x0
-    for k, u in enumerate(us):
-        for _ in range(count):
-            x = advance(model.double, x, u)
-        xs[k] = x
-    return xs
-
-
-def _between(plane: Plane, segments: Sequence[Segment], count: int) -> tuple[Array, Array]:
+def _spread_between(plane: Plane, segments: Sequence[Segment], count: int) -> tuple[Array, Array]:
     """(n,) half widths of 95 % intervals of w, and their correlation (n, n).
 
     Each recording counts as one observation, however it hangs together.
@@ -511,15 +488,10 @@ def _between(plane: Plane, segments: Sequence[Segment], count: int) -> tuple[Arr
         begin = end
     inverse = np.linalg.pinv(bread)
     covariance = inverse @ scores.T @ scores @ inverse * count / (count - n)
-    lost = np.diag(bread) <= 0
-    spread = np.where(lost, np.inf, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    spread = np.where(np.diag(bread) <= 0, np.inf, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = np.where(np.isfinite(spread), covariance / np.outer(spread, spread), np.nan)
     return np.asarray(spread * float(stats.t.ppf(0.975, count - n))), np.asarray(correlation)
-
-
-SEED = 0  # of clouds and other first states: the same recordings give the same values
-OTHERS = 8  # first states of each recording
 
 
 def fit_through_impacts(
@@ -539,64 +511,54 @@ def fit_through_impacts(
     """
     search, nv, noise = Search(model, pieces, names, lengths, build), model.nv, noise[: 2 * model.nv]
     solution = search.run(seed)
-    after, left = _followed(search, solution.w, noise)
-    before, was = _followed(search, np.zeros(len(solution.w)), noise)
+    after, left = _predicted(search, solution.w, noise)
+    before, was = _predicted(search, np.zeros(len(solution.w)), noise)
     fitted, held = ([r for r, p in zip(left, pieces, strict=True) if p.held_out == h] for h in (False, True))
     was_held = [r for r, piece in zip(was, pieces, strict=True) if piece.held_out]
     entries = tangent_space(model).names
-    converged = "" if solution.converged else "the search did not converge: its last step was longer than the cloud"
     reason = (
-        converged
+        ("" if solution.converged else "the search did not converge: its last step was longer than the cloud")
         or _doubt(entries, fitted, "what is left of {} is {:.3g} times what noise explains")
         or _doubt(entries, held, "{} of what was held out is missed by {:.3g} times the noise")
     )
-    unknowns, values, limits = search.unknowns, search.values(solution.w), search.intervals(solution)
+    limits = search.intervals(solution)
     deviations = (limits[:, 1] - limits[:, 0]) / (2 * 1.96)
     known = np.isfinite(deviations)
     covariance = np.where(np.outer(known, known), solution.correlation * np.outer(deviations, deviations), 0.0)
     covariance[~known, ~known] = np.inf
-    every = np.concatenate(fitted)[:, :nv]
+    squares = np.concatenate(fitted)[:, :nv] ** 2
     motions = [Followed(p, frozen(a), frozen(b)) for p, a, b in zip(pieces, after, before, strict=True)]
-    why, open_, errors = reason or NOISE_IS_LEFT, search.open(solution), (_size(was_held or was), _size(held or left))
     without = "" if solution.half is not None else "; intervals leave out what the step does: the model has but one"
     steps = f"the model's own steps of {1e3 * search.law.model.time_step:.4g} ms through impacts"
-    return Identification(
-        values=unknowns.named(values),
-        start=unknowns.named(unknowns.start),
-        intervals={
-            unknown.name: frozen(limits[s][0] if len(unknown.start) == 1 else limits[s])
-            for unknown, s in zip(unknowns.each, unknowns.slices, strict=True)
-        },
-        units={unknown.name: unknown.unit for unknown in unknowns.each},
-        unidentifiable=open_,
-        explained=not reason,
-        reason=why,
-        sentence=identification_sentence(unknowns, values, limits, open_, errors, explained=not reason, reason=why),
+    return identification(
+        search.unknowns,
+        search.values(solution.w),
+        limits,
+        open_=search.open(solution),
+        errors=(_size(was_held or was), _size(held or left)),
+        reason=reason,
         noise={name: float(s) for name, s in zip(entries[:nv], noise[:nv], strict=True)},
-        error_before=errors[0],
-        error_after=errors[1],
         residuals=tuple(frozen(rows) for rows in fitted),
-        columns=unknowns.columns,
         entries=entries,
         covariance=frozen(covariance),
-        score=float(np.sum(every**2)) + 2 * len(every) * float(np.sum(np.log(noise[:nv]))),
-        count=every.size,
+        score=float(np.sum(squares)) + 2 * len(squares) * float(np.sum(np.log(noise[:nv]))),
+        count=squares.size,
         converged=solution.converged,
         steps=solution.rounds,
         motion=f"{steps}, slopes from clouds of values{without}",
         motions=tuple(sorted(motions, key=lambda motion: motion.piece.held_out)),
-        at_half_step=None if solution.half is None else unknowns.named(search.values(solution.half)),
+        at_half_step=None if solution.half is None else search.unknowns.named(search.values(solution.half)),
     )
 
 
-def _followed(search: Search, w: Array, noise: Array) -> tuple[list[Array], list[Array]]:
+def _predicted(search: Search, w: Array, noise: Array) -> tuple[list[Array], list[Array]]:
     """The motion (n, nx) of each recording, and what is left (n, 2 nv) in units of what noise explains; NaN of v."""
     starts, random, nv = search.starts(w, noise), np.random.default_rng(SEED), search.model.nv
-    xs = search.whole(w, [start.x for start in starts])
+    xs = search.recordings(w, [start.x for start in starts])
     others = [start.others(search.chart, OTHERS, random) for start in starts]
     squares = [np.zeros((len(x), 2 * nv)) for x in xs]
     for k in range(OTHERS):
-        for square, other, x in zip(squares, search.whole(w, [draws[k] for draws in others]), xs, strict=True):
+        for square, other, x in zip(squares, search.recordings(w, [draws[k] for draws in others]), xs, strict=True):
             square += search.chart.minus(other, x) ** 2 / OTHERS
     left = []
     for piece, x, square in zip(search.pieces, xs, squares, strict=True):
@@ -614,8 +576,8 @@ def _doubt(names: Sequence[str], residuals: Sequence[Array], words: str) -> str:
     """Where residuals are larger than noise makes them; empty where they are not."""
     if not residuals:
         return ""
-    every = np.concatenate(residuals)
-    seen = np.flatnonzero(np.isfinite(every).any(axis=0))
-    sizes = np.sqrt(np.nanmean(every[:, seen] ** 2, axis=0))
+    rows = np.concatenate(residuals)
+    seen = np.flatnonzero(np.isfinite(rows).any(axis=0))
+    sizes = np.sqrt(np.nanmean(rows[:, seen] ** 2, axis=0))
     worst = int(np.argmax(sizes))
     return words.format(names[seen[worst]], sizes[worst]) if sizes[worst] > SCATTER else ""

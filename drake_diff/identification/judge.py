@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -96,22 +97,34 @@ def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float
     return intervals
 
 
-def freedom_of(fit: Fit, solved: Solved) -> tuple[int, float]:
-    """(how many numbers were measured, how many of them the unknowns and first states take up)."""
-    taken = sum(float(np.sum(np.abs(np.diag(R)) > 10 * NO_PRIOR)) for R, _, _ in solved.reduced.own)
+class Freedom(NamedTuple):
+    """How many numbers were measured, and how many of them first states and unknowns take up."""
+
+    numbers: int
+    of_starts: float
+    of_unknowns: float
+
+    @property
+    def left(self) -> float:
+        return self.numbers - self.of_starts - self.of_unknowns
+
+
+def freedom_of(fit: Fit, solved: Solved) -> Freedom:
+    """Of a fit where it ended."""
+    of_starts = sum(float(np.sum(np.abs(np.diag(R)) > 10 * NO_PRIOR)) for R, _, _ in solved.reduced.own)
+    of_unknowns = 0.0
     if not fit.fixed and len(solved.z):
-        widths = fit.unknowns.widths
-        norms = np.linalg.norm(solved.reduced.R, axis=0)
+        widths, norms = fit.unknowns.widths, np.linalg.norm(solved.reduced.R, axis=0)
         scale = np.where(np.isfinite(widths), widths, 1e6 / np.where(norms > 0, norms, 1.0))
         s = np.linalg.svd(solved.reduced.R * scale, compute_uv=False)
-        taken += float(np.sum(s**2 / (1 + s**2)))
-    return sum(int(np.isfinite(r).sum()) for r in solved.reduced.residuals), taken
+        of_unknowns = float(np.sum(s**2 / (1 + s**2)))
+    return Freedom(sum(int(np.isfinite(r).sum()) for r in solved.reduced.residuals), of_starts, of_unknowns)
 
 
 def noise_of(fit: Fit, solved: Solved) -> Array:
     """(2 nv,) the noise that the residuals show."""
-    count, taken = freedom_of(fit, solved)
-    free = max(count - taken, 1.0) / count
+    freedom = freedom_of(fit, solved)
+    free = max(freedom.left, 1.0) / freedom.numbers
     every = np.concatenate(solved.reduced.residuals)
     numbers = np.isfinite(every).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):

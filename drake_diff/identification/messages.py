@@ -1,39 +1,17 @@
 """What identification says in words: of parameters, of what recordings leave open, of causes and of motions."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.identification.results import Explanation
 from drake_diff.identification.unknowns import Unknowns
 
 PART = 0.03  # of the largest change in a combination: what is not told
 COMBINED = ("friction", "stiffness")  # of two bodies that touch, which Drake makes one of: 2 a b / (a + b), half of it
 NOISE_IS_LEFT = "what is left is like noise, and what was held out is predicted"
 NO_CHANGE = "Not explained: no change that was tried explains the recording"
-
-
-def search_ended(seconds: float) -> str:
-    """Where no further change was tried, as the search took so much processor time."""
-    return f" The search was ended after {seconds:.3g} s of processor time."
-
-
-def also_touching(explanation: Explanation, touched: Explanation) -> Explanation:
-    """Not explained by motion in which nothing touches, and not by motion in which bodies do."""
-    rest = touched.sentence.removeprefix(NO_CHANGE)
-    return replace(
-        explanation, sentence=f"{explanation.sentence} Where bodies touch, none that was tried explains it either{rest}"
-    )
-
-
-def mistaken(first: str, others: Sequence[str], evidence: Mapping[str, float]) -> Explanation:
-    """By columns that are mistaken, and nothing else; by `others` as well."""
-    tail = ": the recording cannot tell" if others else ": this explains the recording"
-    sentence = f"{', or '.join((first, *others))}{tail}."
-    return Explanation((first,), {}, {}, tuple((words,) for words in others), True, sentence, evidence)
 
 
 def changed_to(name: str, values: Array, intervals: Array, start: Array, unit: str) -> str:

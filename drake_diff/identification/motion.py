@@ -21,12 +21,12 @@ from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.derivatives.contact.laws import QUANTITIES
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError
+from drake_diff.identification.coulomb_friction import friction_jacobians, step_with_friction
 from drake_diff.identification.recordings import Piece
 from drake_diff.identification.tree import ORDER_8, Dynamics, Method, Tree
 from drake_diff.identification.unknowns import (
     BIAS,
     COULOMB,
-    HELD_INERTIA,
     Unknowns,
     numbers_at,
     set_numbers,
@@ -36,10 +36,8 @@ from drake_diff.model.parameters import Parameter, ParameterVector, applied, sel
 from drake_diff.model.step import advance
 
 LONGEST = 0.02  # [s] of a step in continuous time
-CHUNK = 128  # steps whose exponentials are taken in one call
-ORDER = 8  # of the series of phi
+CHUNK = 256  # steps that are differentiated in one call
 FINITE_DIFFERENCE, DIFFERENCE = "finite_difference", 1e-5  # of a parameter, relative
-SMALL = 0.5  # the norm of X up to which it is summed; 0.5^9 / 10! is 5e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,18 +53,16 @@ class ContinuousMotion:
     longest: float = LONGEST  # [s] the longest step
     segment: float = 0.15  # [s]
     method: Method = ORDER_8
+    frozen: bool = False  # whether steps are differentiated with their equations frozen halfway
     smooth: bool = False
-    frozen: bool = False  # whether steps are differentiated with their equations frozen halfway, where nothing is dry
 
     @cached_property
     def dry(self) -> tuple[int, ...]:
         """The velocities of joints that friction holds; one that others follow has the friction of all of them."""
-        labels, coupling = (
-            {unknown.label for unknown in self.unknowns.each if unknown.quantity == COULOMB},
-            self.tree.coupling,
-        )
-        places = {link.joint.v_start for link in self.tree.links if link.joint.joint in labels and not self.smooth}
-        return tuple(sorted(places if coupling is None else {int(coupling.of_v[i]) for i in places}))
+        labels = {unknown.label for unknown in self.unknowns.each if unknown.quantity == COULOMB}
+        joints = {link.joint.v_start for link in self.tree.links if link.joint.joint in labels and not self.smooth}
+        coupling = self.tree.coupling
+        return tuple(sorted(joints if coupling is None else {int(coupling.of_v[i]) for i in joints}))
 
     @property
     def kinks(self) -> bool:
@@ -87,10 +83,6 @@ class ContinuousMotion:
         """By steps of at most half of a length [s]."""
         return replace(self, longest=than / 2)
 
-    def exact(self) -> "ContinuousMotion | None":
-        """Differentiated by the method's own derivatives; None where it is."""
-        return replace(self, frozen=False) if self.frozen else None
-
     def is_possible(self, values: Array) -> bool:
         """Whether there are bodies with these values."""
         return self.unknowns.consistent(values, self.tree)
@@ -98,45 +90,31 @@ class ContinuousMotion:
     def dynamics(self, values: Array) -> Dynamics:
         """The tree that unknowns of these values make."""
         numbers = set_numbers(self.model, self.tree, self.unknowns, values)
-        gives = any(unknown.quantity == HELD_INERTIA for unknown in self.unknowns.each)
-        return Dynamics(self.tree, numbers, self.dry, gives, self.method)
+        return Dynamics(self.tree, numbers, self.dry, self.method, self.frozen)
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
+        dynamics = self.dynamics(values)
         xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
         xs[:, 0] = starts
-        self.dynamics(values).run(xs, hs, us)
+        for m in range(hs.shape[1]):
+            xs[:, m + 1], some = xs[:, m], hs[:, m] > 0
+            steps = xs[some, m], hs[some, m], us[some, m]
+            xs[some, m + 1] = step_with_friction(dynamics, *steps)[0] if self.dry else dynamics.step(*steps)
         return xs
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
-        if self.frozen and not self.dry:
-            return self._frozen_slopes(z, xs, hs, us)
-        jacobians = self.dynamics(self.unknowns.values(z)).step_jacobians(xs, hs, us, self.by(z))
-        return jacobians[..., : xs.shape[2]], jacobians[..., xs.shape[2] :]
-
-    def _frozen_slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """With d' = J d + C dz frozen halfway through each step (the first term of the series of Magnus, 1954).
-
-        d(h) = exp(h J) d(0) + h phi(h J) C dz, phi(X) = (exp(X) - 1) / X, wrong by h^3 / 24 of how J bends: one
-        evaluation instead of twelve, also where a motion decays within the step.
-        """
-        (K, M), nx, nq, coordinates = hs.shape, xs.shape[2], self.model.nq, self.tree.coordinates
-        h, u, x = hs.reshape(-1), us.reshape(K * M, -1), xs[:, :-1].reshape(K * M, nx)
-        values = self.unknowns.values(z)
-        halfway = self.run(values, x, h[:, None] / 2, u[:, None])[:, 1]
-        _, by = self.dynamics(values).acceleration_jacobians(halfway, u, self.by(z))
-        q, v, nv = halfway[:, :nq], halfway[:, nq:], nx - nq
-        J, C = np.zeros((K * M, nx, nx)), np.zeros((K * M, nx, len(z)))
-        J[:, :nq, :nq], J[:, :nq, nq:] = coordinates.rate_by_position(v), coordinates.rate(q)
-        J[:, nq:, :nq], J[:, nq:, nq:] = by[..., :nv] @ coordinates.motion(q), by[..., nv : 2 * nv]
-        C[:, nq:] = by[..., 2 * nv :]
-        by_x, by_z = np.empty_like(J), np.empty_like(C)
-        for k in range(0, K * M, CHUNK):
-            some = slice(k, k + CHUNK)
-            by_x[some], phi = exponential(h[some, None, None] * J[some])
-            by_z[some] = h[some, None, None] * (phi @ C[some])
-        return by_x.reshape(K, M, nx, nx), by_z.reshape(K, M, nx, -1)
+        dynamics, by, nx = self.dynamics(self.unknowns.values(z)), self.by(z), xs.shape[2]
+        x, h, u = xs[:, :-1].reshape(-1, nx), hs.reshape(-1), us.reshape(hs.size, -1)
+        total = np.zeros((hs.size, nx, nx + by.shape[1]))
+        total[:, :, :nx] = np.eye(nx)
+        steps = np.flatnonzero(h > 0)
+        for rows in np.split(steps, range(CHUNK, len(steps), CHUNK)):
+            points = x[rows], h[rows], u[rows], by
+            total[rows] = friction_jacobians(dynamics, *points) if self.dry else dynamics.step_jacobians(*points)
+        total = total.reshape(*hs.shape, nx, -1)
+        return total[..., :nx], total[..., nx:]
 
     def by(self, z: Array) -> Array:
         """(count, np) how the numbers of the tree change with z."""
@@ -147,22 +125,6 @@ class ContinuousMotion:
         q, v = x[:, : self.model.nq], x[:, self.model.nq :]
         speed = (self.tree.coordinates.rate(q) @ v[..., None])[..., 0]
         return np.concatenate([speed, self.dynamics(values).accelerate(x, u)], axis=1)
-
-
-def exponential(X: Array) -> tuple[Array, Array]:
-    """exp(X) and phi(X) of matrices (N, n, n), by the series of X / 2^s and s times twice as much."""
-    norm = float(np.max(np.sum(np.abs(X), axis=1), initial=0.0))
-    halvings = max(0, int(np.ceil(np.log2(norm / SMALL)))) if norm > 0 else 0
-    X = X / 2.0**halvings
-    identity = np.eye(X.shape[1])
-    phi = np.broadcast_to(identity, X.shape)
-    for k in range(ORDER, 0, -1):
-        phi = identity + X @ phi / (k + 1)
-    whole = identity + X @ phi
-    for _ in range(halvings):
-        phi = (phi + whole @ phi) / 2
-        whole = whole @ whole
-    return whole, phi
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,10 +198,6 @@ class DiscreteMotion:
 
     def shorter(self, than: float) -> None:
         """There is none: it is the model's step that is fitted."""
-        return
-
-    def exact(self) -> None:
-        """None: it has the derivatives of its own steps."""
         return
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:

@@ -14,11 +14,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from scipy import stats
 
-from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.arrays import Array
 from drake_diff.identification.fit import Fit, Solved
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import freedom_of, intervals_of, known_of, likelihood_of
-from drake_diff.identification.messages import changed_to, search_ended
+from drake_diff.identification.messages import changed_to
 from drake_diff.identification.recordings import Chart, Piece, noise_by_differences
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.unknowns import Unknowns
@@ -36,12 +36,15 @@ class Tried(NamedTuple):
     score: float
     pull: float  # how far it is from the file's values, as the fit weighs that
     freedom: float
-    explains: bool
-    doubt: str
+    doubt: str  # why it does not explain the recordings; empty where it does
     values: dict[str, Any]
     intervals: dict[str, Array]
     z: Array
     starts: Array
+
+    @property
+    def explains(self) -> bool:
+        return not self.doubt
 
 
 @dataclass(eq=False)
@@ -63,9 +66,14 @@ class Ranking:
         self.ended_early = self.ended_early or time.process_time() - self.begun > LONGEST_SEARCH
         return self.ended_early
 
-    @property
+    @cached_property
     def count(self) -> int:
         return int(sum(np.isfinite(p.ys).sum() for p in self.pieces))
+
+    @property
+    def price(self) -> float:
+        """Of each number of a change, by BIC."""
+        return float(np.log(self.count))
 
     @cached_property
     def scatter(self) -> Array:
@@ -75,60 +83,49 @@ class Ranking:
         return Problem(self.model, self.chart, unknowns, list(pieces), self.stated, self.scatter, jumps=self.jumps)
 
     def judge(self, names: tuple[str, ...], problem: Problem, fit: Fit, solved: Solved) -> Tried:
-        unknowns = problem.unknowns
-        count, taken = freedom_of(fit, solved)
-        _, alone = freedom_of(problem.fit(fit.law, fit.segments.pieces, fit.noise, fixed=True), solved)
+        unknowns, freedom = problem.unknowns, freedom_of(fit, solved)
         known = known_of(unknowns, solved.z, solved.reduced.R)
-        intervals = intervals_of(unknowns, solved.z, known.covariance, count - taken)
-        doubt = problem.doubt(fit, solved, "")
-        with np.errstate(divide="ignore"):
-            pull = float(np.sum(((solved.z - unknowns.z_start) / unknowns.widths) ** 2))
-        shaped = {
-            unknown.name: frozen(intervals[s][0] if len(unknown.start) == 1 else intervals[s])
-            for unknown, s in zip(unknowns.each, unknowns.slices, strict=True)
-        }
-        values = unknowns.named(unknowns.values(solved.z))
-        point = solved.z, solved.starts
         return Tried(
             names,
             likelihood_of(fit, solved, self.stated, self.scatter),
-            pull,
-            taken - alone,
-            not doubt,
-            doubt,
-            values,
-            shaped,
-            *point,
+            float(np.sum(((solved.z - unknowns.z_start) / unknowns.widths) ** 2)),
+            freedom.of_unknowns,
+            problem.doubt(fit, solved, ""),
+            unknowns.named(unknowns.values(solved.z)),
+            unknowns.named_intervals(intervals_of(unknowns, solved.z, known.covariance, freedom.left)),
+            solved.z,
+            solved.starts,
         )
 
     def bic(self, candidate: Tried) -> float:
-        return candidate.score + candidate.pull + candidate.freedom * float(np.log(self.count))
+        return candidate.score + candidate.pull + candidate.freedom * self.price
 
     def least(self, freedom: float, count: int) -> float:
         """By how much a score must fall, where so many changes were tried."""
-        return max(float(stats.chi2.isf(FALSE_NAME / max(count, 1), freedom)), freedom * float(np.log(self.count)))
+        return max(float(stats.chi2.isf(FALSE_NAME / max(count, 1), freedom)), freedom * self.price)
 
     def enough(self, base: Tried, tried: Sequence[Tried], count: int) -> list[Tried]:
         """The changes that explain and have the evidence, best first, and not told from the best."""
-        candidates = []
-        for candidate in tried:
-            freedom = max(candidate.freedom, 1.0)
-            if candidate.explains and base.score - candidate.score > self.least(freedom, count):
-                candidates.append(candidate)
+        candidates = [
+            candidate
+            for candidate in tried
+            if candidate.explains and base.score - candidate.score > self.least(max(candidate.freedom, 1.0), count)
+        ]
         candidates.sort(key=self.bic)
         return [candidate for candidate in candidates if self.bic(candidate) - self.bic(candidates[0]) < SAME]
 
-    def named(self, named: Sequence[Tried]) -> Explanation:
+    def named(self, named: Sequence[Tried], how: str = "") -> Explanation:
+        """The first of some changes with the others as alternatives; `how` says by which motion."""
         texts = [" and ".join(self.changed(candidate, name) for name in candidate.names) for candidate in named]
-        both = "this explains" if len(named[0].names) == 1 else "these two explain"
-        tail = f": {both} the recording" if len(named) == 1 else ": the recording cannot tell"
+        explains = "this explains" if len(named[0].names) == 1 else "these two explain"
+        tail = f"{explains} the recording" if len(named) == 1 else "the recording cannot tell"
         return Explanation(
             names=named[0].names,
             values={name: value for candidate in reversed(named) for name, value in candidate.values.items()},
             intervals={name: value for candidate in reversed(named) for name, value in candidate.intervals.items()},
             alternatives=tuple(candidate.names for candidate in named[1:]),
             explained=True,
-            sentence=f"{', or '.join(texts)}{tail}.{self.end}",
+            sentence=self.ended(f"{', or '.join(texts)}: {tail}{how}."),
             evidence=self.evidence,
         )
 
@@ -140,9 +137,14 @@ class Ranking:
         """What a quantity is in the model, and its unit."""
         raise NotImplementedError
 
-    @property
-    def end(self) -> str:
-        return search_ended(LONGEST_SEARCH) if self.ended_early else ""
+    def ended(self, sentence: str) -> str:
+        """The sentence, with that the search was ended where it was."""
+        late = f" The search was ended after {LONGEST_SEARCH:.3g} s of processor time."
+        return sentence + late if self.ended_early else sentence
 
-    def right(self) -> Explanation:
-        return Explanation((), {}, {}, (), True, "Nothing: the model explains it.", self.evidence)
+    def nothing(self, how: str = "") -> Explanation:
+        """Of a model that is right."""
+        return Explanation((), {}, {}, (), True, f"Nothing: the model explains it{how}.", self.evidence)
+
+    def unexplained(self, sentence: str) -> Explanation:
+        return Explanation((), {}, {}, (), False, self.ended(sentence), self.evidence)

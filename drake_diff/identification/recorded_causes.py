@@ -8,6 +8,7 @@ deviation, 0.0016 of half a 95 % interval.
 import math
 from collections.abc import Iterator, Sequence
 from html import unescape
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -46,38 +47,42 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
     ArtifactError where the directory does not have what the record says; ModelError where the model cannot be rebuilt,
     `models` as in `rebuilt`.
     """
+    functions = [(e.engine, e.function.name) for e in record.engines if e.function is not None]
+    unchecked = [f"{e}: a user's function ({name}), whose code the record does not hold" for e, name in functions]
     if not record.recordings:
-        lost = (f"{e.engine}: {LOST}" for e in record.engines if e.cause is not None)
-        return Reproduced({}, {}, unchecked=(*_functions_of(record), *lost))
-    problems, undecided, unchecked = [*_odd_recordings(record)], list[str](), [*NEVER, *_functions_of(record)]
+        unchecked += [f"{e.engine}: {LOST}" for e in record.engines if e.cause is not None]
+        return Reproduced({}, {}, unchecked=tuple(unchecked))
     carried = "" if record.model.file is None else record.model.file.path
     written = (carried, *WRITTEN, *(r.path for r in record.recordings))
+    problems, undecided, unchecked = [*_odd_recordings(record)], list[str](), [*NEVER, *unchecked]
     if problems:
         return Reproduced({}, {}, problems=tuple(problems), written=written)
     given = [read_arrays(folder / r.path, r.name, r.version, r.facts) for r in record.recordings]
     attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
     with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
-        result = compare_recordings(model, given)
+        compared = compare_recordings(model, given)
         rows = [e for e in record.engines if not e.jacobians]
-        names = [[e.engine for e in engines] for engines in (rows, result.engines)]
+        names = [[e.engine for e in engines] for engines in (rows, compared.engines)]
         if names[0] != names[1]:
             problems.append(f"{record.FILE}: its recordings are {names[0]}, compared again {names[1]}")
             return Reproduced({}, {}, problems=tuple(problems), written=written)
-        problems += _odd_files(folder, record, result.recordings)
-        known = _motion_hash(record) == hash_of_arrays(result.x0, result.us)
-        if not known:
+        problems += _odd_files(folder, record, compared.recordings)
+        uses = () if record.data is None else record.data.judged_on
+        motion = next((use.sha256 for use in uses if use.name == MOTION), None)
+        is_same_motion = motion == hash_of_arrays(compared.x0, compared.us)
+        if not is_same_motion:
             unchecked.append("engines[...].final_gap of recordings: the motion began elsewhere")
         fields, engines = _of_the_model(record, model), list[dict[str, Any]]()
-        for row, now, recording in zip(rows, result.engines, result.recordings, strict=True):
-            cause = None if row.cause is None else cause_of(model, recording)
-            if row.cause is not None and cause is not None:
-                cause, doubts = as_recorded(row.engine, row.cause, cause)
+        for row, now, recording in zip(rows, compared.engines, compared.recordings, strict=True):
+            cause = None
+            if row.cause is not None:
+                cause, doubts = as_recorded(row.engine, row.cause, cause_of(model, recording))
                 undecided += doubts
             made = row_of(now, cause)
-            made = made if known else made.model_copy(update={"final_gap": row.final_gap})
+            made = made if is_same_motion else made.model_copy(update={"final_gap": row.final_gap})
             engines.append({"name": row.engine, **made.model_dump(mode="json")})
+    dumped = record.model_dump(mode="json")
     content = [{"name": row.engine, **row.model_dump(mode="json")} for row in rows]
-    recorded = {**{key: record.model_dump(mode="json")[key] for key in fields}, "engines": content}
     return Reproduced(
         {**fields, "engines": engines},
         {},
@@ -85,15 +90,8 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
         undecided=tuple(undecided),
         unchecked=tuple(unchecked),
         written=written,
-        recorded=recorded,
+        recorded={**{key: dumped[key] for key in fields}, "engines": content},
     )
-
-
-def _functions_of(record: ComparisonRecord) -> Iterator[str]:
-    """The users' functions that were compared, which no record holds."""
-    for e in record.engines:
-        if e.function is not None:
-            yield f"{e.engine}: a user's function ({e.function.name}), whose code the record does not hold"
 
 
 def _odd_recordings(record: ComparisonRecord) -> Iterator[str]:
@@ -140,27 +138,12 @@ def _odd_files(folder: Path, record: ComparisonRecord, given: Sequence[Recording
             yield f"{PAGE}: it does not say what {record.FILE} says of the cause of {recording.name}"
 
 
-def _motion_hash(record: ComparisonRecord) -> str | None:
-    uses = () if record.data is None else record.data.judged_on
-    return next((use.sha256 for use in uses if use.name == MOTION), None)
-
-
 def as_recorded(name: str, recorded: CauseEvidence, repeated: CauseEvidence) -> tuple[CauseEvidence, list[str]]:
     """The cause that was found again, as it is recorded where it is the same within SAME_VALUE; and what is in doubt.
 
     In doubt is what a search that its limit of processor time ended says: no run repeats that.
     """
-    same = (recorded.names, recorded.alternatives, recorded.explained) == (
-        repeated.names,
-        repeated.alternatives,
-        repeated.explained,
-    )
-    same = same and all(
-        old.keys() == new.keys() and all(_is_same(old[q], new[q], repeated.intervals.get(q, [])) for q in new)
-        for old, new in ((recorded.values, repeated.values), (recorded.intervals, repeated.intervals))
-    )
-    same = same and _is_same_sentence(recorded.sentence, repeated.sentence)
-    if same or recorded == repeated:
+    if recorded == repeated or _is_same(recorded, repeated):
         return recorded, []
     if ENDED in recorded.sentence or ENDED in repeated.sentence:
         why = "a search that its limit of processor time ends is not repeated"
@@ -168,29 +151,31 @@ def as_recorded(name: str, recorded: CauseEvidence, repeated: CauseEvidence) -> 
     return repeated, []
 
 
-def _is_same(recorded: Any, repeated: Any, intervals: Sequence[Numbers]) -> bool:
-    """Whether the numbers of a value, or both ends of each interval, are those found again."""
-    if len(recorded) != len(repeated) or len(repeated) != len(intervals):
+def _is_same(recorded: CauseEvidence, repeated: CauseEvidence) -> bool:
+    """Whether the words are the same, values and intervals as near as SAME_VALUE, and texts but for their rounding."""
+    for name in ("names", "alternatives", "explained"):
+        if getattr(recorded, name) != getattr(repeated, name):
+            return False
+    tables = (recorded.values, repeated.values, recorded.intervals, repeated.intervals)
+    if any(table.keys() != repeated.intervals.keys() for table in tables):
         return False
-    for old, new, ends in zip(recorded, repeated, intervals, strict=True):
-        low, high = (None, None) if len(ends) != 2 else ends
-        least = 0.0 if low is None or high is None else SAME_VALUE * abs(high - low) / 2
-        pairs = zip(old, new, strict=True) if isinstance(old, list) and isinstance(new, list) else ((old, new),)
-        for a, b in pairs:
-            if a is None or b is None:
-                if a is not b:
-                    return False
-            elif not is_near(a, b, absolute=ABSOLUTE + least):
+    for name, intervals in repeated.intervals.items():
+        numbers = (recorded.values.get(name, []), repeated.values.get(name, []), recorded.intervals[name], intervals)
+        for old, new, old_ends, ends in zip_longest(*numbers):
+            pairs = [(old, new), *zip_longest(old_ends or [], ends or [])]
+            known = [end for end in ends or [] if end is not None]
+            least = SAME_VALUE * abs(known[1] - known[0]) / 2 if len(known) == 2 else 0.0
+            if not all(_is_near(a, b, least) for a, b in pairs):
                 return False
-    return True
-
-
-def _is_same_sentence(recorded: str, repeated: str) -> bool:
-    """Whether two sentences have the same words, and numbers that are the same but for the fourth digit's rounding."""
-    if NUMBER.split(recorded) != NUMBER.split(repeated):
+    texts = recorded.sentence, repeated.sentence
+    if NUMBER.split(texts[0]) != NUMBER.split(texts[1]):
         return False
-    pairs = [(float(a), float(b)) for a, b in zip(NUMBER.findall(recorded), NUMBER.findall(repeated), strict=True)]
-    return all(a == b or abs(a - b) <= SAME_DIGIT * _fourth_digit(max(abs(a), abs(b))) for a, b in pairs)
+    digits = zip(*(map(float, NUMBER.findall(text)) for text in texts), strict=True)
+    return all(a == b or abs(a - b) <= SAME_DIGIT * _fourth_digit(max(abs(a), abs(b))) for a, b in digits)
+
+
+def _is_near(a: float | None, b: float | None, least: float) -> bool:
+    return a is b if a is None or b is None else is_near(a, b, absolute=ABSOLUTE + least)
 
 
 def _fourth_digit(value: float) -> float:
@@ -222,9 +207,7 @@ def cause_of(model: Model, recording: Recording) -> CauseEvidence:
     return CauseEvidence(
         names=list(explanation.names),
         values={name: _numbers(np.atleast_1d(value)) for name, value in explanation.values.items()},
-        intervals={
-            name: [_numbers(row) for row in np.atleast_2d(interval)] for name, interval in explanation.intervals.items()
-        },
+        intervals={n: [_numbers(row) for row in np.atleast_2d(ends)] for n, ends in explanation.intervals.items()},
         alternatives=[list(names) for names in explanation.alternatives],
         explained=explanation.explained,
         sentence=explanation.sentence,

@@ -8,7 +8,9 @@ from typing import Any
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.comparison.recordings import Recording
+from drake_diff.identification.messages import NOISE_IS_LEFT, identification_sentence
 from drake_diff.identification.recordings import Piece
+from drake_diff.identification.unknowns import Unknowns
 from drake_diff.model.model import Model
 
 
@@ -86,3 +88,32 @@ class Explanation(ShowsItsRepr):
 
     def __repr__(self) -> str:
         return self.sentence
+
+
+def identification(
+    unknowns: Unknowns,
+    values: Array,
+    intervals: Array,
+    *,
+    open_: tuple[str, ...],
+    errors: tuple[float, float],
+    reason: str,
+    **rest: Any,
+) -> Identification:
+    """Of values (np,) with intervals (np, 2), explained where there is no `reason` against it."""
+    why = reason or NOISE_IS_LEFT
+    sentence = identification_sentence(unknowns, values, intervals, open_, errors, explained=not reason, reason=why)
+    return Identification(
+        values=unknowns.named(values),
+        start=unknowns.named(unknowns.start),
+        intervals=unknowns.named_intervals(intervals),
+        units={unknown.name: unknown.unit for unknown in unknowns.each},
+        unidentifiable=open_,
+        explained=not reason,
+        reason=why,
+        sentence=sentence,
+        error_before=errors[0],
+        error_after=errors[1],
+        columns=unknowns.columns,
+        **rest,
+    )

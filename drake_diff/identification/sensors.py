@@ -195,12 +195,10 @@ class Sensors:
             if by_state is not None:
                 by_a[..., j] = self._read(numbers, q, v, a + step).imag / TINY
         by_parameters = np.zeros((len(q), self.count, by.shape[1]))
-        flat = numbers.flat
         for column in range(by.shape[1]):
             if np.any(by[:, column] != 0):
-                turned = flat + 1j * TINY * by[:, column]
-                parts = {name: turned[numbers.places(name)] for name in Numbers.__dataclass_fields__}
-                by_parameters[..., column] = self._read(Numbers(**parts), q, v, a).imag / TINY
+                turned = numbers.moved(1j * TINY * by[:, column])
+                by_parameters[..., column] = self._read(turned, q, v, a).imag / TINY
         if self._forces:
             _, mass, slopes = dynamics.inverse_dynamics(q, v, a, by)
             for i, k in self._forces:

@@ -1,43 +1,53 @@
 """The equations of motion of a tree at many states, as functions of the numbers that parameters set.
 
 The force of inverse dynamics is linear in each link's ten numbers: mass, mass times centre of mass, inertia about the
-frame's origin. So is it in damping, stiffness, friction and gravity, and
+frame's origin. So is it in damping, stiffness, friction and gravity; a shift of a joint on its parent enters as a
+polynomial of the second degree, whose derivative a central difference has. With these
 
     da / dnumber = M^-1 (d force / dnumber - d inverse dynamics / dnumber)   at fixed q, v and a.
-
-A shift of a joint on its parent is the motion of a virtual slide without mass that is put before the joint and does not
-move: its derivative is that by the slide's coordinate. `kernel` and `coulomb_friction` have the formulas.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 from scipy.integrate import DOP853
 
-from drake_diff._base.arrays import Array, Indices, own_array, skew
+from drake_diff._base.arrays import Array, Indices, cross, skew
 from drake_diff._base.compiled import kernel
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import Link, RigidLink, coordinates_of, read_links, springs_of
-from drake_diff.mechanics.tree import tree_of
+from drake_diff.mechanics.tree import CompiledTree, Moved, compile_links, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators
 from drake_diff.model.repairs import Coupling
 
 KERNEL = "drake_diff.identification.kernel"
-FRICTION = "drake_diff.identification.coulomb_friction"
-TREE = "drake_diff.mechanics.tree_kernel"
 INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz
 SLIP_SPEED = 0.02  # [rad/s or m/s] over which friction turns where it is smooth
+REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
+SHIFT = 0.437  # of a change of numbers: of a polynomial of the second degree a central difference is exact
+OF_JOINTS = ("reflected", "damping", "stiffness", "rest", "coulomb")
 Mask = NDArray[np.bool_]
 Method = tuple[Array, Array]  # of Runge and Kutta: (m, m) its stages, (m,) its weights
 ORDER_8: Method = (np.array(DOP853.A[: len(DOP853.B), : len(DOP853.B)]), np.array(DOP853.B))
-ORDER_4: Method = (np.diag([0.5, 0.5, 1.0], -1), np.array([1, 2, 2, 1]) / 6)
+ORDER_4: Method = (np.pad(np.diag([0.5, 0.5, 1.0]), ((1, 0), (0, 1))), np.array([1, 2, 2, 1]) / 6)
+
+
+class Grip(NamedTuple):
+    """What Coulomb friction does at N states."""
+
+    turn: Array  # (N, nv) 1 or -1 of joints that slide
+    held: Array  # (N, nv) 1 of joints that are held
+
+    def some(self, rows: Any) -> "Grip":
+        return Grip(self.turn[rows], self.held[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +62,8 @@ class Numbers:
     stiffness: Any  # (n,)
     rest: Any  # (n,)
     coulomb: Any  # (n,) dry friction [N or N m]
-    held_inertia: Any  # (n,) by which friction that gives way holds a joint, beside a damping
-    held_damping: Any  # (n,)
     strength: Any  # (nu,) what an input is multiplied by
+    limit: Any  # (nu,) what an input is cut at
 
     @property
     def flat(self) -> Any:
@@ -71,17 +80,21 @@ class Numbers:
             start += np.size(values)
         raise KeyError(name)
 
+    def moved(self, change: Any) -> "Numbers":
+        """With a change (count,) of all."""
+        return Numbers(**{n: getattr(self, n) + change[self.places(n)] for n in self.__dataclass_fields__})
+
 
 @dataclass(frozen=True, eq=False)
 class Tree:
     """The tree of a model: what stays where parameters change."""
 
     links: tuple[RigidLink, ...]  # parents first
+    compiled: CompiledTree  # of the moving links
     coordinates: Coordinates  # of the independent joints
     coupling: Coupling | None  # of joints that follow others
     n: int  # degrees of freedom of all joints
     actuation: Array  # (n, nu)
-    limits: Array  # (nu,) what Drake cuts each input at
     placed: Mapping[str, tuple[int, Any]]  # by body: the link it belongs to, and the pose of the body in its frame
     moved_by: Mapping[str, Array]  # (10, 10) by body: its ten numbers in the frame of its link
     bodies: Mapping[str, Link]
@@ -97,6 +110,32 @@ class Tree:
         """(n, nv) velocities of all joints by the independent ones."""
         return np.eye(self.n) if self.coupling is None else np.asarray(self.coupling.spread, dtype=float)
 
+    @cached_property
+    def springs(self) -> Indices:
+        """(n,) where the position of each degree of freedom is in q."""
+        positions = np.zeros(self.n, dtype=np.int64)
+        for link in self.links:
+            if not link.free:
+                positions[link.joint.v_start] = link.joint.q_start
+        return positions
+
+    def joint_positions(self, q: Array) -> Array:
+        """Of all joints, at q (N, nq) of the independent ones."""
+        return q if self.coupling is None else np.asarray(self.coupling.positions(q))
+
+    def with_numbers(self, numbers: Numbers) -> CompiledTree:
+        """The links with these numbers."""
+        ten, tables = numbers.inertial, self.compiled.tables
+        mass = ten[:, 0]
+        center = ten[:, 1:4] / np.where(mass != 0, mass, 1.0)[:, None]
+        inertia = np.empty((len(mass), 3, 3))
+        for k, (i, j) in enumerate(INERTIA):
+            inertia[:, i, j] = inertia[:, j, i] = ten[:, 4 + k]
+        inertia += mass[:, None, None] * (skew(center) @ skew(center))  # about the centre of mass
+        frame = np.concatenate([tables.frame[:, :, :3], numbers.offset[:, :, None]], axis=2)
+        parts = {"frame": frame, "mass": mass, "center": center, "inertia": inertia, "gravity": numbers.gravity}
+        return replace(self.compiled, tables=tables._replace(**{n: _array(values) for n, values in parts.items()}))
+
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
@@ -105,60 +144,183 @@ class Dynamics:
     tree: Tree
     numbers: Numbers
     dry: tuple[int, ...] = ()
-    gives: bool = False  # whether it gives way, of one joint
     method: Method = ORDER_8
+    frozen: bool = False  # whether steps are differentiated with their equations frozen halfway
 
-    def run(self, xs: Array, hs: Array, us: Array) -> None:
-        """Fill xs (K, M+1, nx), which has the starts, by steps of hs (K, M) [s] under us (K, M, nu)."""
-        kernel(FRICTION).run(*self._system(), own_array(hs), self._effort(us), xs, np.empty((0, 0, 0, 0)))
+    @property
+    def nv(self) -> int:
+        return int(self.tree.spread.shape[1])
 
-    def step_jacobians(self, xs: Array, hs: Array, us: Array, by: Array) -> Array:
-        """(K, M, nx, nx + P) of each of these steps; `by` (count, P) is how the numbers change with parameters."""
-        nx = xs.shape[2]
-        jacobians = np.empty((*hs.shape, nx, nx + by.shape[1]))
-        kernel(FRICTION).run(*self._system(by), own_array(hs), self._effort(us), own_array(xs), jacobians)
-        return jacobians
+    @property
+    def is_dry(self) -> Mask:
+        """(nv,)"""
+        return np.isin(np.arange(self.nv), self.dry)
+
+    @property
+    def friction(self) -> Array:
+        """(nv,) the most that friction pushes along a coordinate: of its joint and of those that follow it."""
+        return np.asarray(self.numbers.coulomb @ np.abs(self.tree.spread))
+
+    @cached_property
+    def links(self) -> CompiledTree:
+        return self.tree.with_numbers(self.numbers)
+
+    @cached_property
+    def _system(self) -> Any:
+        tree = self.tree
+        coupling, nq = tree.coupling, self.links.nq
+        follow = (np.arange(nq), np.ones(nq), np.zeros(nq))
+        if coupling is not None:
+            follow = (coupling.of_q, coupling.ratio_q, coupling.offset)
+        numbers = (getattr(self.numbers, name) for name in OF_JOINTS)
+        arrays = (*follow, tree.spread, *reversed(tree.coordinates.starts), tree.springs, *numbers)
+        return kernel(KERNEL).System(self.links.tables, *map(_array, arrays), 0.0 if self.dry else SLIP_SPEED)
+
+    def _push(self, u: Array) -> Array:
+        """(N, n) the forces of inputs u (N, nu)."""
+        inputs = np.clip(u, -self.numbers.limit, self.numbers.limit) * self.numbers.strength
+        return np.asarray(inputs @ self.tree.actuation.T)
+
+    def grip(self, x: Array, u: Array, released: Array | None = None) -> Grip:
+        """Of a motion that begins at x (N, nx); joints at rest are held, unless `released` or pushed too hard."""
+        v, free = x[:, -self.nv :], np.zeros((len(x), self.nv)) if released is None else released
+        turn = np.where(self.is_dry, np.where(np.abs(v) > REST, np.sign(v), free), 0.0)
+        grip = Grip(turn, (self.is_dry & (turn == 0)).astype(float))
+        for _ in self.dry:
+            _, holding = self.accelerate_and_hold(x, u, grip)
+            beyond = np.where(grip.held > 0, np.abs(holding) - self.friction, -np.inf)
+            rows, j = np.arange(len(x)), np.argmax(beyond, axis=1)
+            let = beyond[rows, j] > 0
+            if not np.any(let):
+                break
+            turn[rows[let], j[let]] = np.sign(holding[rows[let], j[let]])
+            grip.held[rows[let], j[let]] = 0.0
+        return grip
 
     def accelerate(self, x: Array, u: Array) -> Array:
         """(N, nv) at x (N, nx) under u (N, nu)."""
-        return self._accelerations(x, u, None)[0]
+        return self.accelerate_and_hold(x, u, self.grip(x, u))[0]
 
-    def acceleration_jacobians(self, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
+    def accelerate_and_hold(self, x: Array, u: Array, grip: Grip) -> tuple[Array, Array]:
+        """(N, nv), and the forces (N, nv) that hold joints still."""
+        a, holding = np.empty((2, len(x), self.nv))
+        kernel(KERNEL).accelerate(self._system, *map(_array, (x, self._push(u), *grip)), a, holding)
+        return a, holding
+
+    def step(self, x: Array, h: Array, u: Array, grip: Grip | None = None) -> Array:
+        """The states (N, nx) after steps of h (N,) [s] from x under u (N, nu)."""
+        nothing, out = np.zeros((len(x), self.nv)), np.empty(x.shape)
+        grip = Grip(nothing, nothing) if grip is None else grip
+        points = map(_array, (*self.method, x, h, self._push(u), *grip))
+        kernel(KERNEL).step(self._system, *points, out)
+        return out
+
+    def step_jacobians(self, x: Array, h: Array, u: Array, by: Array, grip: Grip | None = None) -> Array:
+        """(N, nx, nx + P) of these steps; `by` (count, P) is how the numbers change with parameters."""
+        (N, nx), nothing, h = x.shape, np.zeros((len(x), self.nv)), h[:, None, None]
+        grip = Grip(nothing, nothing) if grip is None else grip
+        if self.frozen:
+            # d' = J d + C halfway through the step, by the diagonal Pade approximation of the exponential of order 4
+            halfway = replace(self, method=ORDER_4).step(x, h[:, 0, 0] / 2, u, grip)
+            _, J, C = self._rates(halfway, u, by, grip)
+            X, identity = h * J, np.eye(nx)
+            even = identity + X @ X / 12
+            return np.linalg.solve(even - X / 2, np.concatenate([even + X / 2, h * C], axis=2))
+        stages, weights = self.method
+        start = np.zeros((N, nx, nx + by.shape[1]))
+        start[:, :, :nx] = np.eye(nx)
+        rates, changes = np.empty((len(weights), N, nx)), np.empty((len(weights), *start.shape))
+        for m, row in enumerate(stages):
+            y = x + h[..., 0] * np.tensordot(row[:m], rates[:m], 1)
+            rates[m], J, C = self._rates(y, u, by, grip)
+            changes[m] = J @ (start + h * np.tensordot(row[:m], changes[:m], 1))
+            changes[m, :, :, nx:] += C
+        return np.asarray(start + h * np.tensordot(weights, changes, 1))
+
+    def _rates(self, x: Array, u: Array, by: Array, grip: Grip) -> tuple[Array, Array, Array]:
+        """dx/dt (N, nx), and its derivatives by x (N, nx, nx) and by parameters (N, nx, P)."""
+        (N, nx), nv, coordinates = x.shape, self.nv, self.tree.coordinates
+        q, v, nq = x[:, : nx - nv], x[:, -nv:], nx - nv
+        a, by_state = self.acceleration_jacobians(x, u, by, grip)
+        J, C, rate = np.zeros((N, nx, nx)), np.zeros((N, nx, by.shape[1])), coordinates.rate(q)
+        J[:, :nq, :nq], J[:, :nq, nq:] = coordinates.rate_by_position(v), rate
+        J[:, nq:, :nq], J[:, nq:, nq:] = by_state[..., :nv] @ coordinates.motion(q), by_state[..., nv : 2 * nv]
+        C[:, nq:] = by_state[..., 2 * nv :]
+        return np.concatenate([(rate @ v[..., None])[..., 0], a], axis=1), J, C
+
+    def acceleration_jacobians(self, x: Array, u: Array, by: Array, grip: Grip | None = None) -> tuple[Array, Array]:
         """(N, nv), and (N, nv, 2 nv + P) by small motion, by v and by parameters."""
-        a, jacobians, _, _ = self._accelerations(x, u, by)
-        return a, jacobians
-
-    def grip(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """(N, nv) which way friction lets coordinates slide, and which of them it holds."""
-        return self._accelerations(x, u, None)[2:]
-
-    def _accelerations(self, x: Array, u: Array, by: Array | None) -> tuple[Array, Array, Array, Array]:
-        N, nv = len(x), self.tree.spread.shape[1]
-        a, turn, held = np.empty((N, nv)), np.zeros((N, nv)), np.zeros((N, nv))
-        jacobians = np.empty((0, 0, 0)) if by is None else np.empty((N, nv, 2 * nv + by.shape[1]))
-        kernel(FRICTION).accelerations(*self._system(by), own_array(x), self._effort(u), turn, held, a, jacobians)
-        return a, jacobians, turn, held
+        tree, numbers, nv, n = self.tree, self.numbers, self.nv, self.tree.n
+        grip, E, places = self.grip(x, u) if grip is None else grip, self.tree.spread, self.numbers.places
+        a, _ = self.accelerate_and_hold(x, u, grip)
+        q, v = tree.joint_positions(x[:, : x.shape[1] - nv]), x[:, -nv:] @ E.T
+        _, mass, jacobians = self.inverse_dynamics(q, v, a @ E.T, by)
+        slide, diagonal = grip.turn @ np.sign(E).T, np.arange(n)
+        jacobians[:, diagonal, diagonal] += numbers.stiffness
+        jacobians[:, diagonal, n + diagonal] += numbers.damping
+        if not self.dry:
+            slide = np.tanh(v / SLIP_SPEED)
+            jacobians[:, diagonal, n + diagonal] += numbers.coulomb / SLIP_SPEED * (1 - slide**2)
+        terms = (a @ E.T, v, q[:, tree.springs] - numbers.rest, -numbers.stiffness, slide)
+        for name, term in zip(OF_JOINTS, terms, strict=True):
+            jacobians[..., 2 * n :] += np.broadcast_to(term, v.shape)[..., None] * by[places(name)]
+        cut = np.clip(u, -numbers.limit, numbers.limit)
+        by_input = cut[..., None] * by[places("strength")]
+        beyond = np.where(np.abs(u) > numbers.limit, np.sign(u) * numbers.strength, 0.0)
+        by_input += beyond[..., None] * by[places("limit")]
+        jacobians[..., 2 * n :] -= tree.actuation @ by_input
+        columns = [jacobians[..., :n] @ E, jacobians[..., n : 2 * n] @ E, jacobians[..., 2 * n :]]
+        free = 1 - grip.held[..., None]
+        right = free * (E.T @ np.concatenate(columns, axis=2))
+        M = E.T @ (mass + np.diag(numbers.reflected)) @ E
+        M = M * free * np.swapaxes(free, 1, 2) + np.eye(nv) * (1 - free)
+        return a, -np.linalg.solve(M, right)
 
     def inverse_dynamics(self, q: Array, v: Array, a: Array, by: Array | None = None) -> tuple[Array, Array, Array]:
         """tau (N, n) of the links, mass (N, n, n), and tau by small motion, by v and by parameters (N, n, 2 n + P).
 
         At q, v and a of all joints, those that follow others included.
         """
-        system, changes = self._system(by)
-        N, n = v.shape
-        tau, mass, jacobians = np.empty((N, n)), np.empty((N, n, n)), np.empty((N, n, 2 * n + changes.parameters))
-        kernel(KERNEL).inverse_dynamics(system, changes, *map(own_array, (q, v, a)), tau, mass, jacobians)
-        return tau, mass, jacobians
+        moved = self.links(q, v, a, derivatives=by is not None)
+        if by is None:
+            return moved.tau, moved.mass, np.concatenate([moved.by_q, moved.by_v], axis=2)
+        places = self.numbers.places
+        by_parameters = np.zeros((*v.shape, by.shape[1]))
+        ten = by[places("inertial").ravel()]
+        if np.any(ten):
+            by_parameters += self._regressors(moved, v, a).reshape(*v.shape, -1) @ ten
+        others = np.concatenate([places("offset").ravel(), places("gravity")])
+        for p in np.flatnonzero(np.any(by[others] != 0, axis=0)):
+            change = np.zeros(len(by))
+            change[others] = SHIFT * by[others, p]
+            ends = [self.tree.with_numbers(self.numbers.moved(sign * change)) for sign in (1, -1)]
+            ahead, back = (end(q, v, a, derivatives=False).tau for end in ends)
+            by_parameters[..., p] += (ahead - back) / (2 * SHIFT)
+        return moved.tau, moved.mass, np.concatenate([moved.by_q, moved.by_v, by_parameters], axis=2)
 
-    def regressors(self, q: Array, v: Array, a: Array) -> list[Array]:
-        """Of each link (N nv, 10): the force of inverse dynamics at q, v and a (N, nv) by its ten numbers."""
-        tree, spread = self.tree, self.tree.spread
-        places = self.numbers.places("inertial")
-        by = np.eye(len(self.numbers.flat))[:, places.ravel()]
-        q = q if tree.coupling is None else tree.coupling.positions(q)
-        of_joints = self.inverse_dynamics(q, v @ spread.T, a @ spread.T, by)[2][..., 2 * tree.n :]
-        reduced = (spread.T @ of_joints).reshape(-1, len(tree.links), 10)
-        return [reduced[:, i] for i in range(len(tree.links))]
+    def regressors(self, q: Array, v: Array, a: Array) -> Array:
+        """(N, n, L, 10) the force of inverse dynamics at q, v and a of all joints by the ten numbers of each link."""
+        return self._regressors(self.links(q, v, a, derivatives=False), v, a)
+
+    def _regressors(self, moved: Moved, v: Array, a: Array) -> Array:
+        t, (N, n), S = self.links.tables, v.shape, moved.S
+        J = len(t.parent)
+        V, A = np.zeros((2, N, J + 1, 6))  # the last is the world's, which -1 finds
+        A[:, J, 3:] = -t.gravity
+        carries = np.zeros((J + 1, n), dtype=bool)
+        for j, (up, first, size) in enumerate(zip(t.parent, t.first, t.size, strict=True)):
+            s = slice(first, first + size)
+            turned = _cross_motion(V[:, None, up], S[:, s])
+            V[:, j] = V[:, up] + np.sum(v[:, s, None] * S[:, s], axis=1)
+            A[:, j] = A[:, up] + np.sum(a[:, s, None] * S[:, s] + v[:, s, None] * turned, axis=1)
+            carries[j] = carries[up]
+            carries[j, s] = True
+        regressors = np.zeros((N, n, len(t.kind), 10))
+        for link, j in enumerate(t.joint):
+            columns, X = np.flatnonzero(carries[j]), moved.poses[:, link]
+            along = [_in_frame(X, motion) for motion in (V[:, None, j], A[:, None, j], S[:, columns])]
+            regressors[:, columns, link] = along[2] @ _wrench(along[0][:, 0], along[1][:, 0])
+        return regressors
 
     @property
     def efforts(self) -> Array:
@@ -167,126 +329,52 @@ class Dynamics:
 
     def inputs_for(self, x: Array, a: Array) -> Array:
         """(N, nu) the inputs that give accelerations a (N, nv), the nearest where none do; limits are not looked at."""
-        nv, none = a.shape[1], np.zeros((len(x), self.tree.actuation.shape[1]))
-        _, mass, free = self._equations(x, none)
-        needed = (mass @ (a - free)[..., None])[..., 0]
-        return np.asarray(needed.reshape(-1, nv) @ np.linalg.pinv(self.efforts).T)
-
-    def _equations(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """x, the mass matrix (N, nv, nv) with reflected inertia, and the acceleration (N, nv) under u."""
-        tree, nv = self.tree, self.tree.spread.shape[1]
-        q = x[:, : x.shape[1] - nv]
-        q = q if tree.coupling is None else tree.coupling.positions(q)
-        still = np.zeros((len(x), tree.n))
-        mass = self.inverse_dynamics(q, still, still)[1] + np.diag(self.numbers.reflected)
-        return x, tree.spread.T @ mass @ tree.spread, self.accelerate(x, u)
+        free = self.accelerate(x, np.zeros((len(x), self.tree.actuation.shape[1])))
+        needed = (self.mass(x) @ (a - free)[..., None])[..., 0]
+        return np.asarray(needed @ np.linalg.pinv(self.efforts).T)
 
     def mass(self, x: Array) -> Array:
         """(N, nv, nv) with reflected inertia."""
-        return self._equations(x, np.zeros((len(x), self.tree.actuation.shape[1])))[1]
-
-    def _effort(self, u: Array) -> Array:
-        return np.ascontiguousarray(np.clip(u, -self.tree.limits, self.tree.limits))
-
-    def _system(self, by: Array | None = None) -> tuple[Any, Any]:
-        """A `kernel.System`, and `kernel.Changes` by parameters that move the numbers by `by` (count, P)."""
-        if by is None:
-            return self._fixed
-        shifted = np.flatnonzero(np.any(by[self.numbers.places("offset")] != 0, axis=(1, 2)))
-        if not len(shifted):
-            system, _ = self._fixed
-            return system, self._changes(by, system, ())
-        system = self._tables(tuple(int(i) for i in shifted))
-        return system, self._changes(by, system, tuple(int(i) for i in shifted))
-
-    @cached_property
-    def _fixed(self) -> tuple[Any, Any]:
-        system = self._tables(())
-        return system, self._changes(np.zeros((len(self.numbers.flat), 0)), system, ())
-
-    def _tables(self, shifted: tuple[int, ...]) -> Any:
-        """With three virtual slides before each joint that is shifted."""
-        tree, numbers, compiled, t = self.tree, self.numbers, kernel(KERNEL), kernel(TREE)
-        rows, joints = list[tuple[Any, ...]](), list[tuple[int, int, int]]()
-        table_of, joint_of = list[int](), list[int]()
-        n, nq = tree.n, sum(7 if link.free else 1 for link in tree.links)
-        kinds = {"revolute": t.HINGE, "prismatic": t.SLIDE, "quaternion_floating": t.FREE}
-        for i, link in enumerate(tree.links):
-            parent, joint = (-1, -1) if link.parent < 0 else (table_of[link.parent], joint_of[link.parent])
-            for k in range(3) if i in shifted else ():
-                index = 3 * shifted.index(i) + k
-                joints.append((joint, n + index, 1))
-                joint = len(joints) - 1
-                rows.append((parent, t.SLIDE, joint, nq + index, n + index, np.eye(3)[k], np.eye(3, 4), np.zeros(10)))
-                parent = len(rows) - 1
-            for start in (3, 0) if link.free else (0,):
-                joints.append((joint, link.joint.v_start + start, 3 if link.free else 1))
-                joint = len(joints) - 1
-            frame = np.hstack([link.on_parent.rotation().matrix(), numbers.offset[i][:, None]])
-            starts = link.joint.q_start, link.joint.v_start
-            rows.append((parent, kinds[link.joint.kind], joint, *starts, link.axis, frame, numbers.inertial[i]))
-            table_of.append(len(rows) - 1)
-            joint_of.append(joint)
-        parents, kind, joint_at, q_start, v_start, axis, frames, ten = (np.array(c) for c in zip(*rows, strict=True))
-        mass = ten[:, 0]
-        center = ten[:, 1:4] / np.where(mass != 0, mass, 1.0)[:, None]
-        inertia = np.empty((len(mass), 3, 3))
-        for k, (i, j) in enumerate(INERTIA):
-            inertia[:, i, j] = inertia[:, j, i] = ten[:, 4 + k]
-        inertia += mass[:, None, None] * (skew(center) @ skew(center))  # about the centre of mass
-        identity = np.broadcast_to(np.eye(3, 4), frames.shape)
-        chain = (np.array(column) for column in zip(*joints, strict=True))
-        tables = (
-            parents, kind, joint_at, q_start, v_start, axis, frames, identity, mass, center, inertia, *chain,
-            numbers.gravity,
-        )  # fmt: skip
-        positions = np.zeros(n, dtype=np.int64)
-        for link in tree.links:
-            if not link.free:
-                positions[link.joint.v_start] = link.joint.q_start
-        coupling, coordinates = tree.coupling, tree.coordinates
-        plain = np.arange(nq), np.ones(nq), np.zeros(nq)
-        follow = plain if coupling is None else (coupling.of_q, coupling.ratio_q, coupling.offset)
-        return compiled.System(
-            t.Tree(*map(_array, tables)),
-            _array(ten),
-            *map(_array, follow),
-            _array(tree.spread),
-            _array(np.array(coordinates.single, dtype=np.int64).reshape(-1, 2)),
-            _array(np.array(coordinates.free, dtype=np.int64).reshape(-1, 2)),
-            positions,
-            *(_array(getattr(numbers, name)) for name in OF_JOINTS),
-            SLIP_SPEED,
-            _array(tree.actuation * numbers.strength),
-            np.isin(np.arange(tree.spread.shape[1]), self.dry),
-            self.gives,
-            *map(_array, self.method),
-        )
-
-    def _changes(self, by: Array, system: Any, shifted: tuple[int, ...]) -> Any:
-        places = self.numbers.places
-        ten = by[places("inertial")]
-        links, parameters = np.nonzero(np.any(ten != 0, axis=1))
-        real = np.flatnonzero(system.tree.v_start < self.tree.n)
-        return kernel(KERNEL).Changes(
-            by.shape[1],
-            _array(real[links]),
-            _array(parameters),
-            _array(ten[links, :, parameters]),
-            _array(by[places("gravity")].T),
-            _array(by[places("offset")[list(shifted)].ravel()]),
-            *(_array(by[places(name)]) for name in (*OF_JOINTS, "strength")),
-            _array(self.tree.actuation),
-        )
-
-
-OF_JOINTS = ("reflected", "damping", "stiffness", "rest", "coulomb", "held_inertia", "held_damping")
+        tree, still = self.tree, np.zeros((len(x), self.tree.n))
+        mass = self.inverse_dynamics(tree.joint_positions(x[:, : x.shape[1] - self.nv]), still, still)[1]
+        return np.asarray(tree.spread.T @ (mass + np.diag(self.numbers.reflected)) @ tree.spread)
 
 
 def _array(values: Any) -> Any:
     """Contiguous, of float64 or int64: of other arrays the kernel would be compiled once more."""
     array = np.asarray(values)
-    return np.array(array, dtype=np.int64 if array.dtype.kind == "i" else float, order="C")
+    return np.ascontiguousarray(array, dtype=np.int64 if array.dtype.kind == "i" else float)
+
+
+def _cross_motion(motion: Array, other: Array) -> Array:
+    w, moving = motion[..., :3], cross(motion[..., :3], other[..., 3:])
+    return np.concatenate([cross(w, other[..., :3]), moving + cross(motion[..., 3:], other[..., :3])], axis=-1)
+
+
+def _in_frame(X: Array, motion: Array) -> Array:
+    """Motions (N, k, 6) about the world's origin, in frames whose poses are X (N, 3, 4)."""
+    R, p = X[:, :, :3], X[:, None, :, 3]
+    w = motion[..., :3]
+    return np.concatenate([w @ R, (motion[..., 3:] + cross(w, p)) @ R], axis=2)
+
+
+def _wrench(motion: Array, change: Array) -> Array:
+    """(N, 6, 10) moment and force on a link by its ten numbers, where it moves and accelerates so (N, 6)."""
+    w, w_dot = motion[:, :3], change[:, :3]
+    a = change[:, 3:] + cross(w, motion[:, 3:])
+    turn, wrench = skew(w), np.zeros((len(w), 6, 10))
+    wrench[:, 3:, 0] = a
+    wrench[:, :3, 1:4], wrench[:, 3:, 1:4] = -skew(a), skew(w_dot) + turn @ turn
+    wrench[:, :3, 4:] = _spun(w_dot) + turn @ _spun(w)
+    return wrench
+
+
+def _spun(w: Array) -> Array:
+    """(N, 3, 6) inertia times w (N, 3), by xx yy zz xy xz yz."""
+    spun = np.zeros((len(w), 3, 6))
+    for k, (i, j) in enumerate(INERTIA):
+        spun[:, i, k], spun[:, j, k] = w[:, j], w[:, i]
+    return spun
 
 
 def tree_for_identification(model: Model) -> Tree | Refusal:
@@ -300,15 +388,15 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         return dynamics
     if isinstance(springs, Refusal):
         return springs
-    every, links, placed = read_links(model.plant, springs), dynamics.links, dynamics.on
-    if any(link.stiffness != 0 and link.kind == "quaternion_floating" for link in every):
+    bodies, links, placed = read_links(model.plant, springs), dynamics.links, dynamics.on
+    if any(link.stiffness != 0 and link.kind == "quaternion_floating" for link in bodies):
         raise ModelError("a free body has a spring")
     n, inertial = len(dynamics.damping), np.zeros((len(links), 10))
-    for link in every:
+    for link in bodies:
         index, pose = placed[link.body]
         if index >= 0:
-            body_numbers = ten_numbers(link.mass, link.center_of_mass, link.inertia[tuple(np.transpose(INERTIA))])
-            inertial[index] += _moved_by(pose) @ body_numbers
+            inertial[index] += _moved_by(pose) @ numbers_of(link)
+    limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in actuators(model.plant)])
     numbers = Numbers(
         inertial=inertial,
         offset=np.array([link.on_parent.translation() for link in links]).reshape(-1, 3),
@@ -318,22 +406,30 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         stiffness=dynamics.stiffness,
         rest=dynamics.rest,
         coulomb=np.zeros(n),
-        held_inertia=np.zeros(n),
-        held_damping=np.zeros(n),
         strength=np.ones(model.nu),
+        limit=np.asarray(limits, dtype=float),
     )
-    limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in actuators(model.plant)])
-    actuation = model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T).T
+    names = ["world", *(link.joint.body for link in links)]
+    rigid = [
+        replace(
+            link.joint, parent=names[link.parent + 1], on_parent=link.on_parent, on_child=RigidTransform(),
+            mass=link.mass, center_of_mass=link.center_of_mass, inertia=link.inertia,
+        )
+        for link in links
+    ]  # fmt: skip
+    compiled = compile_links(rigid, dynamics.gravity, n)
+    if compiled is None:
+        return Refusal("a free body is not joined to the world by its own frame")
     return Tree(
         links=links,
+        compiled=compiled,
         coordinates=coordinates_of(model),
         coupling=model.coupling,
         n=n,
-        actuation=np.asarray(actuation),
-        limits=np.asarray(limits),
+        actuation=np.asarray(model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T).T),
         placed=placed,
         moved_by={body: _moved_by(pose) for body, (_, pose) in placed.items()},
-        bodies={link.body: link for link in every},
+        bodies={link.body: link for link in bodies},
         numbers=numbers,
     )
 
@@ -343,6 +439,11 @@ def ten_numbers(mass: Any, center: Any, inertia: Any) -> Any:
     x, y, z = center
     about = [y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z]
     return np.array([mass, *(mass * c for c in center), *(i + mass * s for i, s in zip(inertia, about, strict=True))])
+
+
+def numbers_of(link: Link) -> Array:
+    """(10,) of a body in its own frame."""
+    return np.asarray(ten_numbers(link.mass, link.center_of_mass, link.inertia[tuple(np.transpose(INERTIA))]))
 
 
 def _moved_by(pose: Any) -> Array:

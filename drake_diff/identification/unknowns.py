@@ -29,14 +29,10 @@ from drake_diff.model.plant import actuators, bodies, joints, labelled
 
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
-HELD_INERTIA, HELD_DAMPING = "held_inertia", "held_damping"  # by which dry friction that gives way holds a joint
-LOGARITHMS = (MASS, HELD_INERTIA, HELD_DAMPING)
-DELAY = "input_delay"  # [s] of all inputs
+DELAY, LIMIT = "input_delay", "limit"  # [s] of all inputs; of one input
 OF_JOINTS = {  # one number of a joint, as `tree.Numbers` calls it
     "damping": "damping",
     COULOMB: "coulomb",
-    HELD_INERTIA: "held_inertia",
-    HELD_DAMPING: "held_damping",
     "spring_stiffness": "stiffness",
     "spring_rest_angle": "rest",
     "spring_rest_length": "rest",
@@ -89,6 +85,9 @@ class Unknowns:
     def slices(self) -> tuple[slice, ...]:
         return slices_of(len(unknown.start) for unknown in self.each)
 
+    def items(self) -> list[tuple[Unknown, slice]]:
+        return list(zip(self.each, self.slices, strict=True))
+
     @property
     def columns(self) -> tuple[str, ...]:
         return tuple(name for unknown in self.each for name in unknown.columns)
@@ -114,8 +113,8 @@ class Unknowns:
     @property
     def z_start(self) -> Array:
         z = self.start.copy()
-        for unknown, s in zip(self.each, self.slices, strict=True):
-            if unknown.quantity in LOGARITHMS:
+        for unknown, s in self.items():
+            if unknown.quantity == MASS:
                 z[s] = np.log(unknown.start)
             elif unknown.quantity == INERTIA:
                 z[s] = to_log_cholesky(unknown.start)
@@ -126,8 +125,8 @@ class Unknowns:
     def widths(self) -> Array:
         """(np,) in z, how far the data may move it before they must say more than the file; infinite without a size."""
         widths = np.empty(len(self.start))
-        for unknown, s in zip(self.each, self.slices, strict=True):
-            relative = unknown.quantity in (*LOGARITHMS, INERTIA)
+        for unknown, s in self.items():
+            relative = unknown.quantity in (MASS, INERTIA)
             widths[s] = 1.0 if relative else unknown.size or np.inf
         return FAR * widths
 
@@ -135,16 +134,14 @@ class Unknowns:
     def pulls(self) -> Array:
         """(np,) the widths of those whose file's value is all that is known before; infinite where there is a prior."""
         pulls = self.widths
-        for unknown, s in zip(self.each, self.slices, strict=True):
+        for unknown, s in self.items():
             if unknown.prior is not None:
                 pulls[s] = np.inf
         return pulls
 
     def prior_rows(self, z: Array) -> tuple[Array, Array]:
         """How far the values (m, in standard deviations) are from their priors, and by z (m, np)."""
-        priors = [
-            (unknown.prior, s) for unknown, s in zip(self.each, self.slices, strict=True) if unknown.prior is not None
-        ]
+        priors = [(unknown.prior, s) for unknown, s in self.items() if unknown.prior is not None]
         if not priors:
             return np.zeros(0), np.zeros((0, len(z)))
         values, by_z = self.values(z), self.by_z(z)
@@ -155,8 +152,8 @@ class Unknowns:
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper z (np,)."""
         lower, upper = np.full(len(self.start), -np.inf), np.full(len(self.start), np.inf)
-        for unknown, s in zip(self.each, self.slices, strict=True):
-            if unknown.quantity in LOGARITHMS:
+        for unknown, s in self.items():
+            if unknown.quantity == MASS:
                 lower[s] = np.log(unknown.lower) if unknown.lower > 0 else -np.inf
                 upper[s] = np.log(unknown.upper)
             elif unknown.quantity != INERTIA:
@@ -171,18 +168,20 @@ class Unknowns:
     @property
     def delay(self) -> int | None:
         """Which column of z is a delay of inputs."""
-        return next((s.start for unknown, s in zip(self.each, self.slices, strict=True) if unknown.shifts), None)
+        return next((s.start for unknown, s in self.items() if unknown.shifts), None)
 
     def values(self, z: Any) -> Any:
-        """(np,) of z (np,), complex or float."""
-        values = np.array(z)
-        for unknown, s in zip(self.each, self.slices, strict=True):
-            if unknown.quantity in LOGARITHMS:
+        """(np,) of z (np,), complex or float; as in files a mass takes along the inertia of its body."""
+        values, heavier = np.array(z), dict[str, Any]()
+        for unknown, s in self.items():
+            if unknown.quantity == MASS:
                 values[s] = np.exp(z[s])
-            elif unknown.quantity == INERTIA:
+                heavier[unknown.label] = values[s] / unknown.start if self.as_in_files else 1.0
+        for unknown, s in self.items():
+            if unknown.quantity == INERTIA:
                 entries = np.array(z[s])
                 entries[3:] = entries[3:] * _spread(unknown)
-                values[s] = from_log_cholesky(entries)
+                values[s] = from_log_cholesky(entries) * heavier.get(unknown.label, 1.0)
         return values
 
     def by_z(self, z: Array) -> Array:
@@ -193,8 +192,12 @@ class Unknowns:
         """By name; a number where it is one."""
         return {
             unknown.name: float(values[s][0]) if len(unknown.start) == 1 else frozen(values[s])
-            for unknown, s in zip(self.each, self.slices, strict=True)
+            for unknown, s in self.items()
         }
+
+    def named_intervals(self, intervals: Array) -> dict[str, Array]:
+        """By name, (2,) or (k, 2) of the intervals (np, 2)."""
+        return {u.name: frozen(intervals[s][0] if len(u.start) == 1 else intervals[s]) for u, s in self.items()}
 
     def consistent(self, values: Array, tree: Tree) -> bool:
         """Whether some distribution of mass has every body's numbers: a centre of mass alone may leave it.
@@ -379,7 +382,7 @@ def numbers_at(model: Model, tree: Tree, unknowns: Unknowns, z: Array) -> tuple[
 def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Numbers:
     """The tree's numbers where the unknowns have `values` (np,), complex or float."""
     given: dict[str, Any] = {}
-    for unknown, s in zip(unknowns.each, unknowns.slices, strict=True):
+    for unknown, s in unknowns.items():
         given[unknown.name] = values[s][0] if len(unknown.start) == 1 else values[s]
     kind = np.result_type(np.asarray(values).dtype, float)
     arrays = {name: np.array(getattr(tree.numbers, name), dtype=kind) for name in Numbers.__dataclass_fields__}
@@ -395,8 +398,8 @@ def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Nu
             arrays["offset"][indices[label]] = pose.rotation().matrix() @ value + pose.translation()
         elif quantity == "gravity":
             arrays["gravity"][:] = value
-        elif quantity == STRENGTH:
-            arrays["strength"][model.input_names.index(label)] = value
+        elif quantity in (STRENGTH, LIMIT):
+            arrays[quantity][model.input_names.index(label)] = value
     if any(name.rsplit(".", 1)[1] in ("gear_ratio", "rotor_inertia") for name in given):
         _set_rotors(model, by_joint, given, arrays["reflected"])
     return Numbers(**arrays)

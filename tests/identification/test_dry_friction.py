@@ -7,13 +7,10 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
-from drake_diff.identification.fit import Fit
 from drake_diff.identification.motion import ContinuousMotion
-from drake_diff.identification.recordings import Chart, read_pieces
 from drake_diff.identification.sensors import choose_sensors
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns
-from drake_diff.mechanics.description import coordinates_of
 
 pytestmark = pytest.mark.solve
 
@@ -220,32 +217,3 @@ def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(tmp_path):
         assert high - low < 0.01 * value
         off.append((e.values[name] - value) / ((high - low) / (2 * 1.96)))
     assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 3), off  # of three standard normal numbers
-
-
-def fit_of(model, law, unknowns, us, xs, times, seed):
-    """(A fit to positions of a double pendulum with noise, the true starts of its segments)."""
-    ys = np.hstack([xs[:, :2], np.full((len(times), 2), np.nan)])
-    ys[:, :2] += NOISE * np.random.default_rng(seed).standard_normal((len(times), 2))
-    pieces = read_pieces(model, dd.Recording("lab", "1", times, ys, us), 0.0)
-    fit = Fit(model, law, Chart(coordinates_of(model)), unknowns, pieces, np.array([NOISE, NOISE, np.nan, np.nan]))
-    return fit, xs[fit.segments.first].copy()
-
-
-def test_a_least_squares_mixed_with_itself_is_the_same(load):
-    model, count = load("double_pendulum.urdf"), 40
-    tree = tree_for_identification(model)
-    unknowns = choose_unknowns(model, tree, ["shoulder.coulomb_friction", "elbow.damping"])
-    law = ContinuousMotion(model, tree, unknowns, H)
-    times, us = H * np.arange(count + 1), np.full((count, 2), 6.0)
-    z = np.array([2.0, 0.1])
-    xs = law.run(z, np.array([[0.3, -0.2, 0.0, 0.0]]), np.full((1, count), H), us[None])[0]
-    fit, starts = fit_of(model, law, unknowns, us, xs, times, 0)
-    found = fit.reduce(fit.at(z, starts))
-    other = fit.reduce(fit.at(z + 0.1, starts))
-    for share, same in ((0.0, found), (1.0, other)):
-        mixed = found.mixed(other, share)
-        assert mixed.now == pytest.approx(same.now, rel=1e-12)
-        assert mixed.rest == pytest.approx(same.rest, rel=1e-9)
-        for dz in np.eye(2):  # the rows of a triangle have either sign
-            one, two = (np.sum((each.b - each.R @ dz) ** 2) for each in (mixed, same))
-            assert one == pytest.approx(two, rel=1e-9)
