@@ -1,5 +1,6 @@
 """Results: how they pickle, show in Jupyter, and say that what was asked for is not possible."""
 
+import math
 import pickle
 from contextvars import ContextVar
 from dataclasses import dataclass, fields
@@ -51,6 +52,15 @@ def _check(name: str, value: Any) -> None:
         cloudpickle.dumps(value)
     except Exception as error:
         raise InputError(name, got=f"{value!r:.80}: {error}", expected="what can be pickled") from error
+
+
+def plain_numbers(value: Any) -> Any:
+    """Lists and dicts for JSON, which has no infinity: None."""
+    if isinstance(value, dict):
+        return {key: plain_numbers(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_numbers(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 BETWEEN_WORDS = "white-space: pre-wrap; word-break: normal; overflow-wrap: anywhere"  # JupyterLab breaks inside them

@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib.util import find_spec
-from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,13 +19,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from drake_diff._base.arrays import Array, positive_int
+from drake_diff._base.values import plain_numbers
 from drake_diff.engines.contract import LAWS, match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.formats import collision_name, mjcf, sdf, urdf
 from drake_diff.engines.interface import EngineContract, limit
 from drake_diff.engines.load import load_engine
 from drake_diff.exceptions import (
-    CertificateError,
     DrakeDiffError,
     InputError,
     MissingDependencyError,
@@ -278,7 +277,6 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
 
     Raises:
         UnknownNameError, InputError: an unknown target, or a directory that exists.
-        CertificateError: the USD, read again, is another model.
         ModelError: the format cannot say all of this model, or no other engine can have it.
 
     Example:
@@ -300,20 +298,15 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     missing = complaints(form, model, text)
     if missing:
         raise ModelError(f"nothing is exported: {form} cannot represent this model; " + "; ".join(missing))
-    made_usd, about_usd = {}, ""
+    made_usd: dict[str, str] = {}
+    about_usd = ""
     if target == "isaaclab":
         try:
             from drake_diff.export import usd
 
-            made_usd, about_usd = (
-                {"model.usda": usd.usd(description)},
-                "`model.usda` is the same model in USD, in float32.",
-            )
-            about_usd += f" It does not say: {'; '.join(usd.lost(description)) or 'nothing that is missed'}."
-            if wrong := usd.complaints(description, made_usd["model.usda"]):
-                raise CertificateError(
-                    f"nothing is exported: the USD, read again, is another model: {'; '.join(wrong)}"
-                )
+            made_usd = {"model.usda": usd.usd(description)}
+            losses = "; ".join(usd.lost(description)) or "nothing that is missed"
+            about_usd = f"`model.usda` is the same model in USD, in float32. It does not say: {losses}."
         except (MissingDependencyError, ModelError) as error:
             about_usd = f"No USD is written: {error}. UrdfConverter makes one."
     names = {g.name: collision_name(g.name) if form == "sdf" else g.name for g in description.geometries}
@@ -328,20 +321,15 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
         header=",".join(["time", *model.state_names, *model.input_names]),
         followers=_told(description.followers), **facts, **made,
     )  # fmt: skip
+    facts_of_model = {
+        **asdict(contract),
+        "followers": [asdict(follower) for follower in description.followers],
+        "not_in_the_file": left_out,
+        "initial_states": made,
+    }
     files = {
         f"model{SUFFIX[form]}": text,
-        "contract.json": json.dumps(
-            _plain(
-                {
-                    **asdict(contract),
-                    "followers": [asdict(follower) for follower in description.followers],
-                    "not_in_the_file": left_out,
-                    "initial_states": made,
-                }
-            ),
-            indent=1,
-        )
-        + "\n",
+        "contract.json": json.dumps(plain_numbers(facts_of_model), indent=1) + "\n",
         "initial_states.csv": _table(
             ["state", "kind", *model.whole.state_names], ([s.kind, *_whole(model, s.x)] for s in samples)
         ),
@@ -378,12 +366,3 @@ def _table(header: list[str], rows: Iterable[Iterable[Any]]) -> str:
     for i, row in enumerate(rows):
         writer.writerow([i, *(value if isinstance(value, str) else repr(float(value)) for value in row)])
     return out.getvalue()
-
-
-def _plain(value: Any) -> Any:
-    """As JSON has it: no infinity, which here is a limit that is none, and becomes null."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not isfinite(value) else value

@@ -21,7 +21,6 @@ except ImportError as error:
     raise MissingDependencyError("USD needs usd-core: pip install 'drake-diff[usd]'") from error
 
 ROOT, GROUND, MATERIALS = "/robot", "/fixed_to_the_world", "/materials"
-SINGLE = 1e-6  # of USD's float32
 SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
 MIMIC = "NewtonMimicAPI"  # of newton-usd-schemas, which Newton and Isaac Sim read
 
@@ -96,61 +95,6 @@ def lost(description: Description) -> tuple[str, ...]:
         losses.append("dissipation of contacts")
     limited = [x for x, e in zip(description.inputs, description.effort_limits, strict=True) if np.isfinite(e)]
     return (*losses, *(["effort limits of " + ", ".join(limited)] if limited else []))
-
-
-def complaints(description: Description, text: str) -> list[str]:
-    """What of bodies, joints and contact the .usda file `text`, read again, does not say."""
-    stage, problems, anchored = Usd.Stage.CreateInMemory(), [], _anchored(description)
-    stage.GetRootLayer().ImportFromString(text)
-
-    def check(subject: str, path: str, wanted: Mapping[str, float]) -> None:
-        for name, value in wanted.items():
-            read = stage.GetPrimAtPath(path).GetAttribute(name).Get() if stage.GetPrimAtPath(path) else None
-            if read is None or not np.isclose(float(read), value, rtol=SINGLE, atol=SINGLE):
-                problems.append(f"{name} of {subject}: {read} where {value} was meant")
-
-    scene, size = "/physicsScene", float(np.linalg.norm(description.gravity))
-    check("the world", scene, {"physics:gravityMagnitude": size})
-    for link in (link for link in description.links if link.body not in anchored):
-        check(f"link {link.body}", f"{ROOT}/{link.body}", {"physics:mass": link.mass})
-        kind = {"revolute": "angular", "prismatic": "linear"}.get(link.kind)
-        if kind:
-            unit = 180 / np.pi if kind == "angular" else 1.0
-            wanted = {
-                f"drive:{kind}:physics:damping": link.damping / unit,
-                f"drive:{kind}:physics:stiffness": link.stiffness / unit,
-                f"drive:{kind}:physics:targetPosition": link.rest * unit,
-                "physxJoint:armature": link.armature,
-            }
-            limits = {"physics:lowerLimit": link.lower * unit, "physics:upperLimit": link.upper * unit}
-            wanted |= {name: value for name, value in limits.items() if np.isfinite(value)}
-            check(f"joint {link.joint}", f"{ROOT}/joints/{link.joint}", wanted)
-    for follower in description.followers:
-        path = f"{ROOT}/joints/{follower.joint}"
-        offset = follower.offset * _unit_of(description.moving, follower.joint)
-        check(str(follower), path, {"newton:mimicCoef0": offset, "newton:mimicCoef1": follower.ratio})
-        problems += _other_leaders(stage.GetPrimAtPath(path), follower)
-    for i, geometry in enumerate(description.geometries):
-        if shape_of(geometry)[0] not in SHAPES:
-            continue
-        parent = GROUND if geometry.body == "world" else f"{ROOT}/{geometry.body}"
-        prim = stage.GetPrimAtPath(f"{parent}/collision_{i}")
-        if not prim or not prim.HasAPI(UsdPhysics.CollisionAPI):
-            problems.append(f"the shape of {geometry.name}: it collides with nothing")
-            continue
-        bound = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0]
-        names = {"friction": "physics:dynamicFriction", "stiffness": "physxMaterial:compliantContactStiffness"}
-        wanted = {names[name]: value for name, value in geometry.material.items() if name in names}
-        check(f"geometry {geometry.name}", str(bound.GetPath()) if bound else "/none", wanted)
-    return problems
-
-
-def _other_leaders(prim: Any, follower: Follower) -> list[str]:
-    leaders = [str(p) for p in prim.GetRelationship("newton:mimicJoint").GetTargets()] if prim else []
-    if leaders != [f"{ROOT}/joints/{follower.leader}"]:
-        return [f"{follower}: it follows {', '.join(leaders) or 'none'}"]
-    schemas = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
-    return [] if MIMIC in schemas else [f"{follower}: expected the schema {MIMIC}, got {', '.join(schemas)}"]
 
 
 def _vector(values: Any) -> Any:
@@ -274,11 +218,7 @@ def _filter_pairs(description: Description, prims: Mapping[str, Any]) -> None:
     touching = {frozenset(pair.names) for pair in description.pairs}
     body = {g.name: g.body for g in description.geometries}
     for i, name in enumerate(prims):
-        apart = [
-            other
-            for other in list(prims)[i + 1 :]
-            if body[name] != body[other] and frozenset((name, other)) not in touching
-        ]
-        if apart:
+        others = [n for n in list(prims)[i + 1 :] if body[name] != body[n] and frozenset((name, n)) not in touching]
+        if others:
             filtered = UsdPhysics.FilteredPairsAPI.Apply(prims[name])
-            filtered.CreateFilteredPairsRel().SetTargets([prims[other].GetPath() for other in apart])
+            filtered.CreateFilteredPairsRel().SetTargets([prims[other].GetPath() for other in others])

@@ -94,29 +94,19 @@ def active_modes(model: Model) -> dict[Pair, str]:
 
 
 def contacts_of_the_step(model: Model) -> tuple[ContactPoint, ...]:
-    """The contacts of the step that `step.advance` took last on the double twin."""
-    contacts, results = [], model.double.plant.get_contact_results_output_port().Eval(model.double.context)
-    for i in range(results.num_point_pair_contacts()):
-        info = results.point_pair_contact_info(i)
-        pair = info.point_pair()
-        where, ids = (info.contact_point(), pair.nhat_BA_W, -info.contact_force()), (pair.id_A, pair.id_B)
-        contacts.append(_contact_point(model, *ids, *where, pair.depth, info.slip_speed()))
-    for i in range(results.num_hydroelastic_contacts()):
-        info = results.hydroelastic_contact_info(i)
-        surface, force = info.contact_surface(), info.F_Ac_W().translational()
-        where, ids = (surface.centroid(), _normal(info), force), (surface.id_M(), surface.id_N())
-        contacts.append(_contact_point(model, *ids, *where, 0.0, 0.0))
+    """The contacts of the step that `step.advance` took last on the double twin, by the force on what can move."""
+    contacts = []
+    for a, b, force, info in contact_forces(model.double):
+        normal, depth, slip = _normal(info), 0.0, 0.0
+        if hasattr(info, "contact_surface"):
+            point = info.contact_surface().centroid()
+        else:
+            point, depth, slip = info.contact_point(), float(info.point_pair().depth), float(info.slip_speed())
+        (name_a, anchored), (name_b, _) = _carrier(model, a), _carrier(model, b)
+        if anchored:
+            name_a, name_b, normal, force = name_b, name_a, -normal, -force
+        contacts.append(ContactPoint(name_a, name_b, frozen(point), frozen(normal), frozen(force), depth, slip))
     return tuple(contacts)
-
-
-def _contact_point(
-    model: Model, a: Any, b: Any, point: Any, normal: Any, force: Any, depth: float, slip_speed: float
-) -> ContactPoint:
-    """Of the geometries a and b, by the force on a; told is the one on what can move."""
-    (name_a, anchored), (name_b, _) = _carrier(model, a), _carrier(model, b)
-    if anchored:
-        name_a, name_b, normal, force = name_b, name_a, -normal, -force
-    return ContactPoint(name_a, name_b, frozen(point), frozen(normal), frozen(force), float(depth), float(slip_speed))
 
 
 def contact_forces(twin: Twin) -> Iterator[tuple[Any, Any, Any, Any]]:
@@ -189,10 +179,7 @@ def deepest_overlap(model: Model) -> tuple[float, float, str]:
     The thickness and the name are those of the thinner of the two geometries; (0, inf, "nothing") where none overlap.
     """
     deepest = 0.0, float("inf"), "nothing"
-    port = model.plant.get_geometry_query_input_port()
-    if not port.HasValue(model.double.context):
-        return deepest
-    for pair in port.Eval(model.double.context).ComputePointPairPenetration():
+    for pair in _penetrations(model):
         thickness, name = min(_thickness(model, geometry) for geometry in (pair.id_A, pair.id_B))
         if pair.depth / thickness > deepest[0] / deepest[1]:
             deepest = float(pair.depth), thickness, name

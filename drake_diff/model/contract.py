@@ -6,7 +6,7 @@ from typing import Any
 
 from pydrake.geometry import Role
 
-from drake_diff._base.values import preformatted
+from drake_diff._base.values import plain_numbers, preformatted
 from drake_diff.model.plant import PROXIMITY, actuators, bodies, joints, proximity_property
 from drake_diff.model.twin import Twin
 
@@ -116,7 +116,7 @@ class Contract:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts and lists for JSON: an absent limit (infinite) is None."""
-        plain: dict[str, Any] = _plain(asdict(self))
+        plain: dict[str, Any] = plain_numbers(asdict(self))
         return plain
 
     def __str__(self) -> str:
@@ -172,16 +172,6 @@ class Contract:
 
     def _repr_html_(self) -> str:
         return preformatted(str(self))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def _row(values: tuple[float, ...]) -> str:

@@ -6,7 +6,7 @@ in the diagram drives are entries, too: where the diagram exports them, else fir
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from pydrake.planning import RobotDiagram
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPortIndex, OutputPortIndex, PortDataType
 
 from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.values import plain_numbers
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.plant import actuators, bodies, instances, joints, labelled
 
@@ -63,28 +64,25 @@ class BodyForce:
     upper: float = float("inf")
 
     def __post_init__(self) -> None:
+        subject = f"BodyForce {self.name}"
         for text in ("name", "body"):
             if not isinstance(getattr(self, text), str) or not getattr(self, text):
                 raise InputError(f"BodyForce.{text}", got=repr(getattr(self, text)), expected="a name")
-        for vector in ("point", "direction"):
-            numbers = finite_array(f"BodyForce {self.name}, {vector}", getattr(self, vector), (3,))
-            object.__setattr__(self, vector, tuple(numbers.tolist()))
+        for name, shape in (("point", (3,)), ("direction", (3,)), ("moment_ratio", ())):
+            numbers = finite_array(f"{subject}, {name}", getattr(self, name), shape).tolist()
+            object.__setattr__(self, name, tuple(numbers) if shape else numbers)
         if not np.any(self.direction):
-            raise InputError(f"BodyForce {self.name}, direction", got=self.direction, expected="not zero")
-        ratio = finite_array(f"BodyForce {self.name}, moment_ratio", [self.moment_ratio], (1,))
-        object.__setattr__(self, "moment_ratio", float(ratio[0]))
-        infinite = {"lower": -np.inf, "upper": np.inf}
-        for side, none in infinite.items():  # a record writes an infinite limit as None
+            raise InputError(f"{subject}, direction", got=self.direction, expected="not zero")
+        for side, none in (("lower", -np.inf), ("upper", np.inf)):  # a record writes an infinite limit as None
             given = getattr(self, side)
-            object.__setattr__(self, side, none if given is None else _limit(f"BodyForce {self.name}, {side}", given))
+            object.__setattr__(self, side, none if given is None else _limit(f"{subject}, {side}", given))
         if not self.lower < self.upper:
-            got = f"[{self.lower:g}, {self.upper:g}]"
-            raise InputError(f"BodyForce {self.name}", got=got, expected="lower below upper")
+            raise InputError(subject, got=f"[{self.lower:g}, {self.upper:g}]", expected="lower below upper")
 
     def to_dict(self) -> dict[str, Any]:
         """Its fields for JSON; an infinite limit is None."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {key: _plain(value) for key, value in values.items()}
+        values: dict[str, Any] = plain_numbers(asdict(self))
+        return values
 
 
 def _limit(subject: str, given: Any) -> float:
@@ -93,16 +91,11 @@ def _limit(subject: str, given: Any) -> float:
     return float(given)
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return list(value)
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def check_body_forces(given: Sequence[BodyForce | Mapping[str, Any]]) -> tuple[BodyForce, ...]:
     """What `load_model` was given, or what a record has of it, as BodyForces of different names."""
+    expected = "a list of dd.model.BodyForce"
     if isinstance(given, (str, Mapping, BodyForce)) or not isinstance(given, Sequence):
-        raise InputError("body_forces", got=type(given).__name__, expected="a list of dd.model.BodyForce")
+        raise InputError("body_forces", got=type(given).__name__, expected=expected)
     forces: list[BodyForce] = []
     for force in given:
         if isinstance(force, Mapping):
@@ -113,7 +106,7 @@ def check_body_forces(given: Sequence[BodyForce | Mapping[str, Any]]) -> tuple[B
                 raise InputError("body_forces", got=f"one without {key}", expected="name and body")
             force = BodyForce(**force)
         if not isinstance(force, BodyForce):
-            raise InputError("body_forces", got=type(force).__name__, expected="a list of dd.model.BodyForce")
+            raise InputError("body_forces", got=type(force).__name__, expected=expected)
         if any(force.name == other.name for other in forces):
             raise InputError("body_forces", got=f"{force.name} twice", expected="each name once")
         forces.append(force)
@@ -238,15 +231,19 @@ def read_inputs(diagram: Diagram, plant: Any, forces: Sequence[BodyForce] = ()) 
     """
     wiring = _Wiring(diagram)
     whole = int(plant.get_actuation_input_port().get_index())
-    parts = {int(plant.get_actuation_input_port(i).get_index()): i for i in instances(plant)}
+    ports_of = {i: int(plant.get_actuation_input_port(i).get_index()) for i in instances(plant)}
     generalized = int(plant.get_applied_generalized_force_input_port().get_index())
     targets = [int(plant.get_desired_state_input_port(i).get_index()) for i in instances(plant)]
-    acting = [whole, *parts, generalized, int(plant.get_applied_spatial_force_input_port().get_index()), *targets]
+    acting = [
+        whole,
+        *ports_of.values(),
+        generalized,
+        int(plant.get_applied_spatial_force_input_port().get_index()),
+        *targets,
+    ]
     systems, reached = wiring.behind(plant, acting)
     _check_states(systems)
-    always_exported = (
-        [generalized, *targets] if isinstance(diagram, RobotDiagram) else []
-    )  # which it exports in any case
+    always_exported = [generalized, *targets] if isinstance(diagram, RobotDiagram) else []
     vectors: list[tuple[int, Any, set[int]]] = []
     places: list[int] = []  # before which of them the actuators stand
     left_out: list[str] = []
@@ -256,7 +253,7 @@ def read_inputs(diagram: Diagram, plant: Any, forces: Sequence[BodyForce] = ()) 
             continue
         into = {i for leaf, i in consumers if leaf is plant}
         alone = all(leaf is plant for leaf, _ in consumers)
-        if alone and into and into <= {whole, *parts}:
+        if alone and into and into <= {whole, *ports_of.values()}:
             places.append(len(vectors))
         elif number not in reached:
             left_out.append(port.get_name())
@@ -264,7 +261,7 @@ def read_inputs(diagram: Diagram, plant: Any, forces: Sequence[BodyForce] = ()) 
             vectors.append((number, port, into))
     chosen = {number for number, _, _ in vectors}
     fed = frozenset(i for i in acting if _is_fed(wiring.sources[id(plant), i], chosen))
-    driven = [i for i, a in enumerate(actuators(plant)) if whole in fed or _own_port(a, parts) in fed]
+    driven = [i for i, a in enumerate(actuators(plant)) if whole in fed or ports_of[a.model_instance()] in fed]
     rows = _rows_of_actuators(plant, [i for i in range(plant.num_actuators()) if i not in driven])
     input_rows: list[Row] = []
     ports: list[tuple[int, slice]] = []
@@ -300,11 +297,6 @@ def _is_fed(source: Any, chosen: set[int]) -> bool:
     return source in chosen if isinstance(source, int) else source is not None
 
 
-def _own_port(actuator: Any, parts: Mapping[int, Any]) -> int:
-    """The actuation port of its model instance."""
-    return next(port for port, instance in parts.items() if instance == actuator.model_instance())
-
-
 def _check_states(systems: Sequence[Any]) -> None:
     for system in systems:
         kinds = {
@@ -312,13 +304,12 @@ def _check_states(systems: Sequence[Any]) -> None:
             "discrete": system.num_discrete_state_groups(),
             "abstract": system.num_abstract_states(),
         }
-        for kind, count in kinds.items():
-            if count:
-                raise ModelError(
-                    f"the system {system.get_name()!r} in the diagram acts on the plant and has a {kind} state of its "
-                    "own, which is not part of the state x: [q; v] of the plant; use a system without a state, or "
-                    "bodies and joints that move as it does"
-                )
+        for kind in (kind for kind, count in kinds.items() if count):
+            raise ModelError(
+                f"the system {system.get_name()!r} in the diagram acts on the plant and has a {kind} state of its own, "
+                "which is not part of the state x: [q; v] of the plant; use a system without a state, or bodies and "
+                "joints that move as it does"
+            )
 
 
 def _rows_of_actuators(plant: Any, which: list[int]) -> list[Row]:

@@ -69,20 +69,14 @@ class FileMeshes:
 
     def notes(self) -> list[str]:
         """What the user should know of meshes that are not used, a sentence each."""
-        sentences = []
-        if self.skipped:
-            sentences.append(
-                f"{len(self.skipped)} collision meshes skipped, Drake uses only {' '.join(USABLE_MESHES)}: "
-                f'{_listed(self.skipped)}. meshes="convex" or meshes="spheres" takes them.'
-            )
-        if self.missing:
-            sentences.append(
-                f"{len(self.missing)} meshes skipped, no file found: {_listed(self.missing)}. Links without a shape "
-                "are drawn as a skeleton; packages={name: folder} says where a package is."
-            )
-        if self.unusable:
-            sentences.append(f"{len(self.unusable)} meshes skipped, they cannot be used: {_listed(self.unusable)}.")
-        return sentences
+        sentences = {
+            f"{len(self.skipped)} collision meshes skipped, Drake uses only {' '.join(USABLE_MESHES)}: "
+            f'{_listed(self.skipped)}. meshes="convex" or meshes="spheres" takes them.': self.skipped,
+            f"{len(self.missing)} meshes skipped, no file found: {_listed(self.missing)}. Links without a shape "
+            "are drawn as a skeleton; packages={name: folder} says where a package is.": self.missing,
+            f"{len(self.unusable)} meshes skipped, they cannot be used: {_listed(self.unusable)}.": self.unusable,
+        }
+        return [sentence for sentence, names in sentences.items() if names]
 
 
 def _listed(names: list[str]) -> str:
@@ -363,9 +357,7 @@ def _told(meshes: list[CollisionMesh], treatment: str) -> str:
         kinds.setdefault((mesh.path, mesh.scale), []).append(mesh.link)
     became = {kind: _became(CollisionMesh("", *kind), treatment) for kind in kinds}
     lost = max(hull.lost for hull, _ in became.values())
-    less = (
-        f" Of fine meshes only part of the corners is used: they reach up to {lost:.2g} m farther." if lost > 0 else ""
-    )
+    less = f" Of fine meshes only part of the corners is used: they reach up to {lost:.2g} m farther." if lost else ""
     if treatment == "convex":
         corners = [len(hull.corners) for hull, _ in became.values()]
         return (
@@ -377,11 +369,10 @@ def _told(meshes: list[CollisionMesh], treatment: str) -> str:
     lines = [
         f"{kind[0].name} ({', '.join(kinds[kind])}): {len(s.centres)} of radius {s.radius:.2g} m, gaps "
         f"{s.ground_gap:.2g} and {s.open_gap:.2g} m"
-        for s, kind in fits[:MOST_TOLD]
+        for s, kind in fits
     ]
-    rest = f"; and {len(fits) - MOST_TOLD} kinds of link with smaller gaps" if len(fits) > MOST_TOLD else ""
     return (
         f"{len(meshes)} collision meshes became {count} spheres inside their convex hulls. The first gap is how "
         "much later a flat ground is met at most, the second how far the hull's surface is from the spheres: "
-        f"{'; '.join(lines)}{rest}.{less}"
+        f"{_listed(lines)}.{less}"
     )

@@ -136,10 +136,8 @@ class Model(ShowsItsRepr):
         positions = self.plant.GetPositionNames(add_model_instance_prefix=prefix)
         velocities = self.plant.GetVelocityNames(add_model_instance_prefix=prefix)
         if coupling is not None:
-            positions, velocities = (
-                [a[i] for i in independent]
-                for a, independent in ((positions, coupling.own_q), (velocities, coupling.own_v))
-            )
+            positions = [positions[i] for i in coupling.own_q]
+            velocities = [velocities[i] for i in coupling.own_v]
         self.position_names: tuple[str, ...] = tuple(positions)
         self.velocity_names: tuple[str, ...] = tuple(velocities)
         self.state_names = self.position_names + self.velocity_names
@@ -241,16 +239,10 @@ class Model(ShowsItsRepr):
     def places(self, joint: Any) -> tuple[range, range]:
         """Where the coordinates of a joint are in q and in v; empty of a joint that only follows another."""
         i, j = joint.position_start(), joint.velocity_start()
+        q, v = range(i, i + joint.num_positions()), range(j, j + joint.num_velocities())
         if self.coupling is None:
-            return range(i, i + joint.num_positions()), range(j, j + joint.num_velocities())
-        q, v = (
-            np.flatnonzero((independent >= start) & (independent < start + count))
-            for independent, start, count in (
-                (self.coupling.own_q, i, joint.num_positions()),
-                (self.coupling.own_v, j, joint.num_velocities()),
-            )
-        )
-        return tuple(range(int(p[0]), int(p[-1]) + 1) if len(p) else range(0) for p in (q, v))  # type: ignore[return-value]
+            return q, v
+        return _range_in(self.coupling.own_q, q), _range_in(self.coupling.own_v, v)
 
     def at_time_step(self, time_step: float) -> Model:
         """The same model at another time step [s]. ModelError where it came from a diagram, which has but one."""
@@ -530,7 +522,10 @@ def load_model(
     )
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config, builder)
-    _set_contact_law(plant, scene_graph, near_rigid, relaxation_time, stiffness, dissipation)
+    _set_contact_law(
+        plant, scene_graph, near_rigid,
+        relaxation_time=relaxation_time, point_stiffness=stiffness, hunt_crossley_dissipation=dissipation,
+    )  # fmt: skip
     options |= {
         "time_step": time_step,
         "ground": as_ground(ground),
@@ -545,7 +540,8 @@ def load_model(
     notes = read.notes + repairs
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
-    notes += _changed_shapes(plant, scene_graph, contact_geometry, contact)
+    notes += () if contact_geometry is None else replace_collision_geometry(plant, scene_graph, contact_geometry)
+    notes += touch_the_world_alone(plant, scene_graph) if contact == "ground" else ()
     if gravity is not None:
         plant.mutable_gravity_field().set_gravity_vector(options["gravity"])
     try:
@@ -588,33 +584,16 @@ def _load_again(path: str, digest: str, options: dict[str, Any]) -> Model:
         return load_model(source, **options)
 
 
-def _set_contact_law(
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    near_rigid: float | None,
-    relaxation_time: float | None,
-    stiffness: float | None,
-    dissipation: float | None,
-) -> None:
+def _set_contact_law(plant: MultibodyPlant, scene_graph: SceneGraph, near_rigid: float | None, **given: Any) -> None:
     if near_rigid is not None:
         plant.set_sap_near_rigid_threshold(positive_float("near_rigid", near_rigid))
     config = SceneGraphConfig()  # with Drake's own defaults
-    for name, unit, value in (
-        ("relaxation_time", "s", relaxation_time),
-        ("point_stiffness", "N/m", stiffness),
-        ("hunt_crossley_dissipation", "s/m", dissipation),
-    ):
+    units = {"relaxation_time": "s", "point_stiffness": "N/m", "hunt_crossley_dissipation": "s/m"}
+    for name, value in given.items():
         if value is not None:
-            setattr(config.default_proximity_properties, name, positive_float(f"{name} [{unit}]", value))
+            value = positive_float(f"{name} [{units[name]}]", value)
+            setattr(config.default_proximity_properties, name, value)
     scene_graph.set_config(config)
-
-
-def _changed_shapes(
-    plant: MultibodyPlant, scene_graph: SceneGraph, route: str | None, contact: bool | str
-) -> tuple[str, ...]:
-    """Replace shapes by the `route`, then say what may touch; a sentence for each change."""
-    notes = () if route is None else replace_collision_geometry(plant, scene_graph, route)
-    return notes + (touch_the_world_alone(plant, scene_graph) if contact == "ground" else ())
 
 
 def model_from_diagram(diagram: Diagram) -> Model:
@@ -654,6 +633,12 @@ def model_from_diagram(diagram: Diagram) -> Model:
     if model.inputs.systems or model.inputs.ports:
         model.double  # noqa: B018  which refuses systems that depend on time, or that cannot be evaluated
     return model
+
+
+def _range_in(entries: np.ndarray, of_plant: range) -> range:
+    """Where the entries are that are among some of the plant's."""
+    places = np.flatnonzero(np.isin(entries, of_plant))
+    return range(int(places[0]), int(places[-1]) + 1) if len(places) else range(0)
 
 
 def _check_time(model: Model, twin: Twin) -> None:

@@ -39,6 +39,7 @@ from pydrake.multibody.tree import (
     RevoluteSpring,
     WeldJoint,
 )
+from scipy.sparse.csgraph import connected_components
 
 from drake_diff._base.arrays import LARGEST, Array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
@@ -94,33 +95,28 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
     if asked is None:
         return ()
     driven = {actuator.joint().index(): actuator for actuator in actuators(plant)}
-    added: list[tuple[str, float]] = []
-    unlimited: list[str] = []
-    opened: list[str] = []
-    notes: list[str] = []
+    given_here = isinstance(asked, dict)
+    added, opened, notes = dict[str, float](), list[str](), list[str]()
     for name, joint in _chosen(plant, asked, facts).items():
         says = facts.joints.get(_key(plant, joint))
         given = asked[name] if isinstance(asked, dict) else None if says is None else says.effort
         limit = given if given is not None and given > 0 else np.inf
         if joint.index() in driven:
-            notes += _limit_again(driven[joint.index()], limit) if isinstance(asked, dict) else []
+            notes += _limit_again(driven[joint.index()], limit) if given_here else []
             continue
         actuator = plant.AddJointActuator(joint.name(), joint, limit)
         if says is not None and says.armature:
             actuator.set_default_rotor_inertia(says.armature)
         opened += [f"{name} ({what})" for what in _open(joint)]
-        if np.isfinite(limit):
-            added.append((name, limit))
-        else:
-            unlimited.append(name)
-    if added:
-        listing = ", ".join(f"{name} ({limit:g})" for name, limit in added)
-        whose = "given" if isinstance(asked, dict) else "that the file gives"
-        notes.append(f"{len(added)} actuators added, with the effort limits {whose}: {listing}.")
+        added[name] = limit
+    limited = [f"{name} ({limit:g})" for name, limit in added.items() if np.isfinite(limit)]
+    unlimited = [name for name, limit in added.items() if not np.isfinite(limit)]
+    if limited:
+        whose = "given" if given_here else "that the file gives"
+        notes.append(f"{len(limited)} actuators added, with the effort limits {whose}: {', '.join(limited)}.")
     if unlimited:
-        listing = ", ".join(unlimited)
-        why = "as asked" if isinstance(asked, dict) else "as the file gives none or 0"
-        notes.append(f"{len(unlimited)} actuators added without an effort limit, {why}: {listing}.")
+        why = "as asked" if given_here else "as the file gives none or 0"
+        notes.append(f"{len(unlimited)} actuators added without an effort limit, {why}: {', '.join(unlimited)}.")
     if opened:
         notes.append(f"Limits of 0 of driven joints taken as none: {', '.join(opened)}.")
     return tuple(notes)
@@ -219,20 +215,16 @@ def frame_named(plant: MultibodyPlant, subject: str, name: str) -> Any:
 
 def floating_trees(plant: MultibodyPlant) -> list[list[Any]]:
     """The bodies that no chain of joints ties to the world, those that hang together in one list, its root first."""
-    group = {int(body.index()): {int(body.index())} for body in [plant.world_body(), *bodies(plant)]}
-    children = set()
-    for joint in joints(plant):
-        a, b = (int(body.index()) for body in (joint.parent_body(), joint.child_body()))
-        children.add(b)
-        if group[a] is not group[b]:
-            group[a] |= group[b]
-            for index in group[b]:
-                group[index] = group[a]
-    trees: dict[int, list[Any]] = {}
-    for body in bodies(plant):
-        if int(plant.world_body().index()) not in group[int(body.index())]:
-            trees.setdefault(id(group[int(body.index())]), []).append(body)
-    return [sorted(tree, key=lambda body: int(body.index()) in children) for tree in trees.values()]
+    members = [plant.world_body(), *bodies(plant)]
+    index = {body.index(): i for i, body in enumerate(members)}
+    ends = [(index[j.parent_body().index()], index[j.child_body().index()]) for j in joints(plant)]
+    linked = np.zeros((len(members), len(members)), dtype=bool)
+    for a, b in ends:
+        linked[a, b] = True
+    _, group = connected_components(linked, directed=False)
+    children = {b for _, b in ends}
+    trees = [np.flatnonzero(group == g).tolist() for g in dict.fromkeys(group.tolist()) if g != group[0]]
+    return [[members[i] for i in sorted(tree, key=lambda i: i in children)] for tree in trees]
 
 
 def _can_move(plant: MultibodyPlant, tree: list[Any]) -> bool:
@@ -300,11 +292,8 @@ def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
         spring = RevoluteSpring if isinstance(joint, RevoluteJoint) else PrismaticSpring
         plant.AddForceElement(spring(joint, rest, stiffness))
         sentences.append(f"{name} ({stiffness:g} about {rest:g})")
-    return (
-        (f"{len(sentences)} springs of joints, which Drake's parser does not read: {', '.join(sentences)}.",)
-        if sentences
-        else ()
-    )
+    text = f"{len(sentences)} springs of joints, which Drake's parser does not read: {', '.join(sentences)}."
+    return (text,) if sentences else ()
 
 
 def check_contact(value: Any) -> None:
@@ -430,9 +419,7 @@ class Coupling:
         value = ExtractValue(A)
         mass = E.T @ value @ E
         solution = np.linalg.solve(mass, E.T @ (value @ ExtractValue(v.reshape(-1, 1)).ravel()))
-        missing = self.forces(
-            A @ (v - self.velocities(solution))
-        )  # 0, with the derivatives of one step of Newton's method
+        missing = self.forces(A @ (v - self.velocities(solution)))  # 0, with derivatives: a step of Newton's method
         return solution + np.linalg.inv(mass) @ missing
 
 
@@ -525,24 +512,23 @@ def fix_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, .
     if not mimics:
         return ()
     followers = _resolved(joints_of_mimics(plant, mimics))
-    leaders = {leader.index(): leader for leader, _, _ in followers.values()}
-    places: dict[Any, tuple[Any, float]] = {}
     by_index = {j.index(): j for j in joints(plant)}
-    for index, leader in leaders.items():
-        low, high = -np.inf, np.inf
-        led = [(by_index[f], r, o) for f, (who, r, o) in followers.items() if who.index() == index]
-        for joint, ratio, offset in [(leader, 1.0, 0.0), *led]:
-            ends = (joint.position_lower_limits()[0], joint.position_upper_limits()[0])
-            lower, upper = sorted((end - offset) / ratio for end in ends)
-            low, high = max(low, lower), min(high, upper)
+    welds: list[tuple[Any, float]] = []
+    for leader in {leader.index(): leader for leader, _, _ in followers.values()}.values():
+        led = [(by_index[f], r, o) for f, (who, r, o) in followers.items() if who.index() == leader.index()]
+        moving = [(leader, 1.0, 0.0), *led]
+        ends = [
+            sorted((float(end[0]) - offset) / ratio for end in (j.position_lower_limits(), j.position_upper_limits()))
+            for j, ratio, offset in moving
+        ]
+        low, high = max(low for low, _ in ends), min(high for _, high in ends)
         _check_limits(leader.name(), low, high)
         q = float(np.clip(leader.default_positions()[0], low, max(low, high)))
-        for joint, ratio, offset in [(leader, 1.0, 0.0), *led]:
-            places[joint.index()] = (joint, ratio * q + offset)
-    positions = ", ".join(f"{joint.name()} at {q:.6g}" for joint, q in places.values())  # before Drake forgets them
-    for joint, q in places.values():
+        welds += [(joint, ratio * q + offset) for joint, ratio, offset in moving]
+    positions = ", ".join(f"{joint.name()} at {q:.6g}" for joint, q in welds)  # before Drake forgets them
+    for joint, q in welds:
         weld(plant, joint, q)
-    return (f"{len(places)} mimic joints and those that they follow were fixed: {positions}.",)
+    return (f"{len(welds)} mimic joints and those that they follow were fixed: {positions}.",)
 
 
 def _check_limits(leader: str, low: float, high: float) -> None:

@@ -1,7 +1,5 @@
 """The exported USD, read by Newton: another engine than the one that wrote it, float32 as USD's schemas are."""
 
-import re
-
 import numpy as np
 import pytest
 from helpers.contracts import arms
@@ -97,37 +95,12 @@ def test_friction_ground_stiffness_limits_and_springs_are_read_by_usd_core(load)
     assert (slide.GetStiffnessAttr().Get(), slide.GetTargetPositionAttr().Get()) == pytest.approx((50, 0.1), rel=1e-6)
 
 
-DROPPED = {
-    "friction": ("sphere_on_ground.sdf", r"physics:dynamicFriction = 0.5"),
-    "stiffness of contact": ("sphere_on_ground.sdf", r"custom float physxMaterial:compliantContactStiffness = \d+"),
-    "the ground": ("sphere_on_ground.sdf", r'def Plane "collision_0"'),
-    "a spring": ("mass_spring_damper.sdf", r"drive:linear:physics:stiffness = 50"),
-    "damping": ("mass_spring_damper.sdf", r"drive:linear:physics:damping = 1.5"),
-    "a mass": ("mass_spring_damper.sdf", r"physics:mass = 2"),
-    "a limit": (None, r"physics:(lower|upper)Limit = "),
-}
-
-
-@pytest.mark.parametrize("what", DROPPED)
-def test_whatever_is_dropped_from_the_file_is_found(load, tmp_path, what):
-    from drake_diff.export.usd import complaints, usd
-
-    name, dropped = DROPPED[what]
-    description = describe(load(name) if name else arms(tmp_path))
-    text = usd(description)
-    assert complaints(description, text) == []
-    without, count = re.subn(dropped, lambda found: found[0].replace("hysics", "hysicist").replace("Plane", "Cone")
-                             .replace("hysx", "hysicx").replace("collision_0", "shown"), text)  # fmt: skip
-    assert count
-    assert complaints(description, without)
-
-
 def test_a_joint_that_follows_another_is_read_by_usd_core(tmp_path):
     """In degrees for a hinge, as newton-usd-schemas says."""
     pytest.importorskip("newton_usd_schemas", reason="no newton-usd-schemas")
     from pxr import Usd
 
-    from drake_diff.export.usd import complaints, usd
+    from drake_diff.export.usd import usd
 
     description = describe_whole(followed(tmp_path, ("revolute", "revolute")))
     text = usd(description)
@@ -137,11 +110,7 @@ def test_a_joint_that_follows_another_is_read_by_usd_core(tmp_path):
     assert "NewtonMimicAPI" in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
     found = [prim.GetAttribute(f"newton:mimicCoef{k}").Get() for k in (0, 1)]
     np.testing.assert_allclose(found, [0.3 * 180 / np.pi, 1.7], rtol=1e-6)
-    assert complaints(description, text) == []
-    for dropped, other in (("mimicCoef0 = 1", "mimicCoef0 = 2"), ("Coef1", "Coef2"), ("joints/a>", "joints/b>"),
-                           (', "NewtonMimicAPI"', "")):  # fmt: skip
-        assert dropped in text
-        assert complaints(description, text.replace(dropped, other)), dropped
+    assert [str(p) for p in prim.GetRelationship("newton:mimicJoint").GetTargets()] == ["/robot/joints/a"]
 
 
 def test_usd_has_no_hinge_that_follows_a_slide(tmp_path):
