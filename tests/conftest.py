@@ -13,7 +13,7 @@ from helpers.loops import CART, H  # noqa: E402
 from helpers.models import MODELS  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
-from drake_diff._base.sandbox import Outcome  # noqa: E402
+from drake_diff._base.sandbox import CallOutcome  # noqa: E402
 from drake_diff.runs import verify as verify_module  # noqa: E402
 
 # A shell starts what runs in the background with Ctrl-C ignored, nohup with SIGHUP ignored, and what tests start and
@@ -48,9 +48,9 @@ def child_process():
 def call_here(function, arguments, *_):
     module, _, name = function.partition(":")
     try:
-        return Outcome(value=getattr(import_module(module), name)(**arguments))
+        return CallOutcome(value=getattr(import_module(module), name)(**arguments))
     except Exception as error:
-        return Outcome(error=f"{type(error).__name__}: {error}")
+        return CallOutcome(error=f"{type(error).__name__}: {error}")
 
 
 # The quadruped's file has neither motors nor a ground, as most files of robots on legs.

@@ -15,10 +15,9 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 GIB = 2**30
 LARGEST_ANSWER = 64 * 2**20  # bytes, also of any other file that the child writes
@@ -30,27 +29,15 @@ USED = "/proc/self/statm"  # in pages; the sixth number is that of data and stac
 NEARLY = 0.9  # of the memory that a process may have
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The value that a call returned, or why there is none.
-
-    `crashed` names the signal that ended the child, `exceeded` the limit that it reached, `error` what it raised.
-    """
+class CallOutcome(NamedTuple):
+    """The value that a call returned, or the `error` why there is none, and whether that is a limit it reached."""
 
     value: Any = None
-    crashed: str = ""
-    exceeded: str = ""
     error: str = ""
-
-    @property
-    def sentence(self) -> str:
-        """Why there is no value; "" where there is one."""
-        if self.crashed:
-            return f"the model cannot be read or run: the process that did so ended by {self.crashed}"
-        return self.exceeded or self.error
+    is_limit: bool = False
 
 
-def call(function: str, arguments: Mapping[str, Any], seconds: float = 60.0, memory: float = 1.0) -> Outcome:
+def call(function: str, arguments: Mapping[str, Any], seconds: float = 60.0, memory: float = 1.0) -> CallOutcome:
     """Call `function`, "module:name", in a child process.
 
     Args:
@@ -88,19 +75,20 @@ def call(function: str, arguments: Mapping[str, Any], seconds: float = 60.0, mem
         return _outcome(folder, status, request)
 
 
-def _outcome(folder: Path, status: int, request: Mapping[str, Any]) -> Outcome:
+def _outcome(folder: Path, status: int, request: Mapping[str, Any]) -> CallOutcome:
     """What came of a child that has ended with `status`."""
     answer = folder / ANSWER
     if status == 0 and answer.is_file():
-        return Outcome(**json.loads(answer.read_bytes()))
+        return CallOutcome(*json.loads(answer.read_bytes()))
     if -status in (signal.SIGALRM, signal.SIGKILL):
         killed = "or the machine has no memory left" if -status == signal.SIGKILL else "the limit that was given"
-        return Outcome(exceeded=f"it did not end within {request['seconds']:g} s, {killed}")
+        return CallOutcome(error=f"it did not end within {request['seconds']:g} s, {killed}", is_limit=True)
     if -status == signal.SIGXFSZ:
-        return Outcome(error=f"its answer has more than {LARGEST_ANSWER} bytes")
+        return CallOutcome(error=f"its answer has more than {LARGEST_ANSWER} bytes")
     if status < 0:
-        return Outcome(crashed=signal.Signals(-status).name + _last_line((folder / OUTPUT).read_bytes()))
-    return Outcome(error=f"its process ended with status {status} and gave no answer")
+        name = signal.Signals(-status).name + _last_line((folder / OUTPUT).read_bytes())
+        return CallOutcome(error=f"the model cannot be read or run: the process that did so ended by {name}")
+    return CallOutcome(error=f"its process ended with status {status} and gave no answer")
 
 
 def serve() -> None:
@@ -114,11 +102,12 @@ def serve() -> None:
     signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # Python ignores it, and a write fails
     signal.setitimer(signal.ITIMER_REAL, request["seconds"])  # ends the child, whatever it does, also without a parent
     try:
-        answer = {"value": function(**request["arguments"])}
+        answer = CallOutcome(function(**request["arguments"]))
     except MemoryError:
-        answer = {"exceeded": f"it needs more than {request['memory'] / GIB:g} GiB, the limit that was given"}
+        limit = f"it needs more than {request['memory'] / GIB:g} GiB, the limit that was given"
+        answer = CallOutcome(error=limit, is_limit=True)
     except (Exception, SystemExit) as error:
-        answer = {"error": f"{type(error).__name__}: {error}"}
+        answer = CallOutcome(error=f"{type(error).__name__}: {error}")
     Path(ANSWER).write_text(json.dumps(answer))
     os._exit(0)  # threads of libraries may not end
 

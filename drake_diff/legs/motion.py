@@ -38,12 +38,7 @@ BY_INPUT, BY_FORCE, BY_BASE = 1e3, 1.0, 1e-3  # how willingly inputs, forces and
 # joints; and [rad or m] how far inside its limits a joint stays.
 AT_PLACE, OVER, TURNED, POSED, INSIDE = 1e-5, 1e-3, 0.02, 0.5, 1e-3
 ROUNDS = 3
-ALIKE, CHANGE, MOMENT, NEAR = (
-    1e-2,
-    1.0,
-    100.0,
-    0.1,
-)  # weights, of forces in weights of the robot and lengths in its size
+ALIKE, CHANGE, MOMENT, NEAR = 1e-2, 1.0, 100.0, 0.1  # of forces in weights of the robot, lengths in its size
 EASES = 0.2  # [s] in which a point is unloaded before a slow phase without it
 STEP = 0.02  # [s] of which these weights are; they are rates, so that they say the same in steps of another length
 SHARES = 0.5, 0.2, 0.02  # of an even share of the weight: what a standing point carries at least; the first that can be
@@ -247,25 +242,16 @@ def plan_forces(
         slow: First steps of phases, and of those after them, into and out of which points are unloaded bit by bit.
     """
     size = max(float(np.max(np.ptp(places[0], axis=0))) / 2, 1e-3)
-
     eased, unloaded = _eased(stands, slow, round(EASES / time_step))
-
-    def rounds(least: float) -> tuple[Array, Array] | Refusal:
+    for least in SHARES:
         plan: tuple[Array, Array] | Refusal = (np.array(way), np.zeros(0))
         for _ in range(ROUNDS):
-            if isinstance(plan, Refusal):
-                break
-            program = _Program(mass, gravity, time_step, size, stands)
-            program.follow(start, way)
-            program.share(friction, least * eased)
-            program.ease(unloaded)
-            program.keep_turn(places, plan[0])
-            plan = program.solve()
-        return plan
-
-    tried = (rounds(least) for least in SHARES)
-    plan: tuple[Array, Array] | Refusal = Refusal("")
-    for plan in tried:
+            if not isinstance(plan, Refusal):
+                program = _Program(mass, gravity, time_step, size, stands)
+                program.follow(start, way)
+                program.share(friction, least * eased, unloaded)
+                program.keep_turn(places, plan[0])
+                plan = program.solve()
         if not isinstance(plan, Refusal):
             break
     return plan
@@ -289,9 +275,8 @@ class _Program:
         first, speed = start
         program.AddBoundingBoxConstraint(first, first, positions[0])
         program.AddBoundingBoxConstraint(way[-1], way[-1], positions[-1])
-        program.AddLinearEqualityConstraint(
-            np.hstack([np.eye(3), -np.eye(3)]), np.zeros(3), np.concatenate([positions[-1], positions[-2]])
-        )
+        last = np.concatenate([positions[-1], positions[-2]])
+        program.AddLinearEqualityConstraint(np.hstack([np.eye(3), -np.eye(3)]), np.zeros(3), last)
         push = -(h**2) * self.pull * np.eye(3)
         for k, carrying in enumerate(self.of_step):
             blocks, known = [np.eye(3)], h**2 * self.gravity
@@ -307,12 +292,12 @@ class _Program:
         near = np.sqrt(NEAR * self.part) / self.size * np.eye(positions.size)
         program.Add2NormSquaredCost(near, near @ way.ravel(), positions.ravel())
 
-    def share(self, friction: float, least: Array) -> None:
-        """Forces within friction, upwards, alike among the points, and alike from step to step."""
+    def share(self, friction: float, least: Array, unloaded: Mask) -> None:
+        """Forces within friction, upwards, alike among the points and from step to step; small where unloaded."""
         program, steps = self.program, {(int(k), int(i)): j for j, (k, i) in enumerate(self.carries)}
         sides = np.array([[1, 0, -friction], [-1, 0, -friction], [0, 1, -friction], [0, -1, -friction]])
         up, alike = -self.gravity / self.pull, np.sqrt(ALIKE * self.part) * np.eye(3)
-        change = np.sqrt(CHANGE / self.part) * np.hstack([np.eye(3), -np.eye(3)])
+        change = np.sqrt(CHANGE / self.part) * np.eye(3)
         for (k, i), j in steps.items():
             force, share = self.forces[j], 1 / len(self.of_step[k])
             program.AddLinearConstraint(sides, np.full(4, -np.inf), np.zeros(4), force)
@@ -320,14 +305,10 @@ class _Program:
             program.Add2NormSquaredCost(alike, alike @ (share * up), force)
             before = steps.get((k - 1, i))
             if before is not None:
-                program.Add2NormSquaredCost(change, np.zeros(3), np.concatenate([force, self.forces[before]]))
-
-    def ease(self, unloaded: Mask) -> None:
-        """Forces that come from nothing, or go to it, where that is so of a point (N, n)."""
-        change = np.sqrt(CHANGE / self.part) * np.eye(3)
-        for j, (k, i) in enumerate(self.carries):
+                pair = np.concatenate([force, self.forces[before]])
+                program.Add2NormSquaredCost(np.hstack([change, -change]), np.zeros(3), pair)
             if unloaded[k, i]:
-                self.program.Add2NormSquaredCost(change, np.zeros(3), self.forces[j])
+                program.Add2NormSquaredCost(change, np.zeros(3), force)
 
     def keep_turn(self, places: Array, way: Array) -> None:
         """No moment about the way (N+1, 3) of the centre of mass, as nearly as may be."""

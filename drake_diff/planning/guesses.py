@@ -130,9 +130,8 @@ class Space:
         """What is too near to an obstacle at posture q (nq,); "" where nothing is."""
         x = np.concatenate([q, np.zeros(self.robot.model.nv)])
         worst = max(self.clear, key=lambda c: float(c.lacking(x[None])[0]), default=None)
-        return (
-            str(worst.check_at(x, "that posture", 0.0)) if worst is not None and worst.lacking(x[None])[0] > 0 else ""
-        )
+        is_near = worst is not None and worst.lacking(x[None])[0] > 0
+        return str(worst.check_at(x, "that posture", 0.0)) if is_near and worst else ""
 
 
 def postures(robot: Robot, task: Goals, seed: int) -> list[Array]:
@@ -185,7 +184,6 @@ def _reach(robot: Robot, task: Goals, first: Array, fixed: Array) -> tuple[Array
 
 
 def _random_goals(space: Space, random: np.random.Generator) -> list[Array]:
-    """Some postures at random; ModelError where none is found."""
     goals = [q for q in (_random_posture(space, random) for _ in range(RANDOM)) if q is not None]
     if not goals:
         message = "no posture to go to was found: none that was drawn is clear of all shapes and held by the motors"
@@ -477,9 +475,7 @@ def _inputs(model: Model, x: Array, wanted: Array) -> tuple[Array, Array]:
         off = wanted - x_next[nq:]
         if i == CORRECTIONS or np.max(np.abs(off), initial=0.0) < EXACT:
             break
-        if (
-            i == 1
-        ):  # controllers in the plant, and thrusters that turn with their body, which the equation does not have
+        if i == 1:  # the equation has no controllers in the plant, nor thrusters that turn with their body
             effect = np.array([np.array(advance(twin, x, u + d))[nq:] - x_next[nq:] for d in np.eye(model.nu)]).T
         u = u + np.linalg.lstsq(effect, off, rcond=None)[0]
     return np.asarray(u), x_next

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from drake_diff._base.arrays import positive_float
 from drake_diff._base.files import read_plain
-from drake_diff._base.sandbox import Outcome, call
+from drake_diff._base.sandbox import CallOutcome, call
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, MissingDependencyError, ModelError
 from drake_diff.model.step import step
@@ -218,18 +218,18 @@ def verify(
     if result.record.subject in NOT_RERUN and not has_recordings(result.record):
         return _run_again(result, result.record, None)
     answer = call_with_limits("drake_diff.runs.verify:_apart", folder, models, float(time_limit), float(memory_limit))
-    if answer.exceeded:
+    if answer.is_limit:
         more = "time_limit= and memory_limit=, or --time-limit and --memory-limit, give it more"
-        return replace(result, undecided=(f"it was not made again: {answer.exceeded}: {more}",))
-    if answer.sentence:
-        return _judged(result, [f"it cannot be made again: {answer.sentence}"], [])
+        return replace(result, undecided=(f"it was not made again: {answer.error}: {more}",))
+    if answer.error:
+        return _judged(result, [f"it cannot be made again: {answer.error}"], [])
     texts: dict[str, Any] = {name: tuple(str(line) for line in answer.value[name]) for name in MADE_APART}
     return replace(result, **texts, checked=int(answer.value["checked"]))
 
 
 def call_with_limits(
     function: str, folder: Path, models: str | Path | None, seconds: float = WAITED, memory: float = 1.0
-) -> Outcome:
+) -> CallOutcome:
     """Call `function(directory, models)` in a child process; InputError if `models` is no folder."""
     if models is not None and not Path(models).is_dir():
         raise InputError("models", got=str(models), expected="a folder that exists")
@@ -240,8 +240,8 @@ def call_with_limits(
 def require_readable(function: str, folder: Path, models: str | Path | None) -> None:
     """Call `function` in a child process first; ArtifactError where that does not survive it."""
     answer = call_with_limits(function, folder, models)
-    if answer.sentence:
-        raise ArtifactError(f"{folder}: {answer.sentence}")
+    if answer.error:
+        raise ArtifactError(f"{folder}: {answer.error}")
 
 
 def verify_own(directory: Path) -> Verification:

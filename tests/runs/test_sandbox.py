@@ -57,24 +57,24 @@ def ask(function, monkeypatch, seconds=20.0, **arguments):
 
 @pytest.mark.slow
 @each_row(
-    "function, kind, sentence",
+    "function, is_limit, sentence",
     [
-        (end, "crashed", "SIGABRT"),
-        (touch_nothing, "crashed", "SIGSEGV"),
-        (take_memory, "exceeded", "more than 1 GiB"),
-        (answer_much, "error", "67108864 bytes"),
-        (leave, "error", "enough"),
+        (end, False, "SIGABRT"),
+        (touch_nothing, False, "SIGSEGV"),
+        (take_memory, True, "more than 1 GiB"),
+        (answer_much, False, "67108864 bytes"),
+        (leave, False, "enough"),
     ],
 )
-def test_how_a_call_ends_is_reported(function, kind, sentence, monkeypatch):
+def test_how_a_call_ends_is_reported(function, is_limit, sentence, monkeypatch):
     outcome = ask(function, monkeypatch)
-    assert sentence in getattr(outcome, kind)
-    assert (outcome.value, bool(outcome.sentence)) == (None, True)
+    assert sentence in outcome.error
+    assert (outcome.value, outcome.is_limit) == (None, is_limit)
 
 
 def test_a_call_that_never_ends_is_ended(monkeypatch):
     start = time.monotonic()
-    assert "within 0.5 s" in ask(never_end, monkeypatch, seconds=0.5).exceeded
+    assert "within 0.5 s" in ask(never_end, monkeypatch, seconds=0.5).error
     assert time.monotonic() - start < 60
 
 
