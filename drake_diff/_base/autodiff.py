@@ -69,8 +69,8 @@ def plain(values: Any) -> Array:
 
 def _seed(z: Any) -> Array | None:
     """(n, m) the derivatives that `z` (n,) carries; None where they are the identity, as solvers seed it."""
-    rows = [entry.derivatives() for entry in z]
-    is_unit = (len(row) == len(z) and row[i] == 1.0 and np.count_nonzero(row) == 1 for i, row in enumerate(rows))
+    seeds = (entry.derivatives() for entry in z)  # one at a time: all of them are a matrix of n^2 numbers
+    is_unit = (len(row) == len(z) and row[i] == 1.0 and np.count_nonzero(row) == 1 for i, row in enumerate(seeds))
     return None if all(is_unit) else np.asarray(ExtractGradient(z.reshape(-1, 1)))
 
 
