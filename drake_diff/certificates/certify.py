@@ -31,7 +31,7 @@ SHARED = "the derivative is of differences too, of another step: the two share a
 
 
 @dataclass(frozen=True)
-class StepOptions:
+class CertifyOptions:
     """Where a step is differenced, and what around it is told."""
 
     limit_reach: float = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
@@ -42,7 +42,7 @@ class StepOptions:
     touched: float = 1e-2  # by what part of the larger one a row's change departs from the derivative's prediction
 
 
-STEP = StepOptions()
+STEP = CertifyOptions()
 
 
 def certify(

@@ -43,7 +43,7 @@ Point = tuple[Array, Array, Array, ParameterVector]  # x0 (nx,), us (N, nu), the
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class DisplacedDirection:
     """One direction in which a rollout is moved: one column of its gradient, or one input by as much at all times."""
 
     name: str
@@ -121,11 +121,13 @@ class Displaced:
         return [u for i, u in enumerate(units) if i not in self.space.quaternions] + inputs + list(self.vector.names)
 
     @cached_property
-    def lines(self) -> tuple[Line, ...]:
+    def lines(self) -> tuple[DisplacedDirection, ...]:
         """Each state, each input by as much at all times or each parameter of the policy, and each of the model."""
         (count, nu), size, n = self.us.shape, self.space.size, len(self.scale)
         units, names, scales = np.eye(n) / self.scale, self.columns, self.scale.tolist()
-        single = [Line(names[j], np.array([j]), scales[j], units[j], WIDEST * scales[j]) for j in range(n)]
+        single = [
+            DisplacedDirection(names[j], np.array([j]), scales[j], units[j], WIDEST * scales[j]) for j in range(n)
+        ]
         if self.policy is not None:
             return tuple(single)
         limits = self.model.inputs.of_actuators([a.effort_limit() for a in actuators(self.model.plant)])
@@ -134,7 +136,9 @@ class Displaced:
         for j in range(nu):
             columns, sizes = size + j + nu * np.arange(count), np.abs(self.us[:, j])
             name, room = f"{self.model.input_names[j]} at all times", float(np.abs(cut[j] - sizes).min())
-            inputs.append(Line(name, columns, max(1.0, float(sizes.max())), units[columns].sum(axis=0), room))
+            inputs.append(
+                DisplacedDirection(name, columns, max(1.0, float(sizes.max())), units[columns].sum(axis=0), room)
+            )
         return (*single[:size], *inputs, *single[size + count * nu :])
 
     def point(self, displacement: Array) -> Point:

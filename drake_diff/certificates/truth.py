@@ -26,7 +26,7 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.certificates.certificate import AGREE, DISAGREE, DISCONTINUOUS, UNDECIDED, Certificate, unscaled
 from drake_diff.certificates.differences import TINY
-from drake_diff.certificates.displaced import Displaced, Line
+from drake_diff.certificates.displaced import Displaced, DisplacedDirection
 from drake_diff.exceptions import DrakeDiffError, InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, applied
@@ -207,7 +207,7 @@ class _Measurement:
         self.touches = False
         self.losses: list[float] = []  # here: one for each of the widths, and one that is better
 
-    def truth(self, ours: float, lines: Sequence[Line]) -> Truth:
+    def truth(self, ours: float, lines: Sequence[DisplacedDirection]) -> Truth:
         with applied(self.moved.vector) as model:
             law = ContinuousMotion(model).law
         with suppress(TimeoutError):  # every slope says so below
@@ -227,7 +227,7 @@ class _Measurement:
     def _beyond(self) -> str:
         return f"not measured within the budget of {self.seconds:g} s"
 
-    def _ours(self, line: Line) -> float:
+    def _ours(self, line: DisplacedDirection) -> float:
         return float(self.gradient[line.columns].sum())
 
     def _loss(self, displacement: Array, tolerance: float, law: str | None = None) -> float:
@@ -252,14 +252,14 @@ class _Measurement:
         for width in (*self._widths()[1:], self._widths()[-1] / 10):
             self.losses.append(self._loss(still, TRUTH.tolerance * width))
 
-    def _slope(self, line: Line, width: float, law: str | None = None) -> tuple[float, float]:
+    def _slope(self, line: DisplacedDirection, width: float, law: str | None = None) -> tuple[float, float]:
         """Over `width` times the scale to both sides; and by how much it is another one ahead than behind."""
         w = width * line.scale
         ahead, behind = (self._loss(s * w * line.vector, TRUTH.tolerance * width, law) for s in (1, -1))
         nearest = int(np.argmin(np.abs(np.log(np.array(self._widths()) / width))))
         return (ahead - behind) / (2 * w), (ahead - 2 * self.losses[nearest] + behind) / w
 
-    def _measured(self, line: Line) -> TrueSlope:
+    def _measured(self, line: DisplacedDirection) -> TrueSlope:
         """The slopes along a line, from wide to narrow; not judged."""
         widths = self._widths()
         measured = TrueSlope(line.name, tuple(line.columns.tolist()), self._ours(line))
@@ -277,7 +277,7 @@ class _Measurement:
         slopes, corners = zip(*over, strict=True)
         return replace(measured, widths=tuple(w * line.scale for w in widths), slopes=slopes, corners=corners)
 
-    def _beside_other_law(self, truth: Truth, lines: Sequence[Line]) -> Truth:
+    def _beside_other_law(self, truth: Truth, lines: Sequence[DisplacedDirection]) -> Truth:
         """With what Drake's continuous plant would do, which has Hunt and Crossley's law whatever the steps have."""
         still, width, slopes = np.zeros(len(self.moved.scale)), TRUTH.widths[1], list(truth.slopes)
         truth = replace(truth, other_law=HUNT_CROSSLEY)
@@ -433,7 +433,9 @@ def _overlap(model: Model, x: Array) -> bool:
     return bool(model.double.overlaps())
 
 
-def beside_truth(refinement: Refinement, lines: Sequence[Line], truth: Truth | None, *, touches: bool) -> Refinement:
+def beside_truth(
+    refinement: Refinement, lines: Sequence[DisplacedDirection], truth: Truth | None, *, touches: bool
+) -> Refinement:
     """`refinement`, in which only what is the slope of the motion in continuous time, to 10 %, converges.
 
     Contact begins at the first step that overlaps, with a force that is not small (k tau v in `sap`): what is lost of

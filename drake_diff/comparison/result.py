@@ -50,7 +50,7 @@ TELLS: Mapping[str, tuple[str, ...]] = {
 }
 
 
-class Probe(NamedTuple):
+class StateProbe(NamedTuple):
     """A state at which Jacobians are compared: "start", "free", "contact" or "deepest"."""
 
     name: str
@@ -236,7 +236,7 @@ class Comparison:
     model: Model
     x0: Array
     us: Array
-    states: tuple[Probe, ...]
+    states: tuple[StateProbe, ...]
     engines: tuple[Compared, ...]
     refused: tuple[Refused, ...]
     recordings: tuple[Recording, ...] = ()

@@ -24,7 +24,7 @@ from drake_diff.comparison.attribution import (
     seconds,
 )
 from drake_diff.comparison.recordings import Recording, check_recording, steps_between
-from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
+from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Refused, StateProbe, first_above
 from drake_diff.engines.contract import MUST_HAVE, Match, contact_lines, match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.equations import ClosedForm
@@ -182,11 +182,13 @@ class _Panel:
     def look(self, seed: int) -> None:
         """Choose the states at which Jacobians are compared, and take the reference's: a recording has none."""
         motion = self.motion
-        self.probes = [Probe("start", motion.xs[0], motion.us[0])]
-        self.probes += [Probe(sample.kind, sample.x, sample.u) for sample in sample_states(self.model, 2, seed + 1)]
+        self.probes = [StateProbe("start", motion.xs[0], motion.us[0])]
+        self.probes += [
+            StateProbe(sample.kind, sample.x, sample.u) for sample in sample_states(self.model, 2, seed + 1)
+        ]
         if motion.depth is not None and np.max(motion.depth[:-1], initial=0.0) > 0:
             k = int(np.argmax(motion.depth[:-1]))
-            self.probes.append(Probe("deepest", motion.xs[k], motion.us[k]))
+            self.probes.append(StateProbe("deepest", motion.xs[k], motion.us[k]))
         self.jacobians = self._jacobians(self.reference)
         self.product = rollout_jacobian(self.reference, self.space, motion)
 

@@ -32,7 +32,7 @@ from drake_diff.mechanics.description import describe_tree
 from drake_diff.mechanics.tree import CompiledTree, compiled_tree
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select, write_autodiff
-from drake_diff.model.repairs import Coupling
+from drake_diff.model.repairs import JointCoupling
 from drake_diff.model.step import advance, set_state
 
 # Of the largest entry: two derivatives of one smooth step differ by rounding, which a mass matrix may magnify.
@@ -91,7 +91,7 @@ class Analytic:
             refused |= {k: NotSmoothError(of_step) for k, of_step in of_steps.items() if not known[k]}
         return Jacobians(values, refused, notes)
 
-    def _of_reduced(self, steps: Steps, coupling: Coupling) -> Jacobians | Refusal:
+    def _of_reduced(self, steps: Steps, coupling: JointCoupling) -> Jacobians | Refusal:
         """Where mimic joints are reduced: from the whole plant's."""
         model = steps.model
         if steps.vector.parameters:
@@ -99,7 +99,7 @@ class Analytic:
         smooth = analytic_of(model.whole)
         if isinstance(smooth, Refusal):
             return smooth
-        reduced = model.cache("reduced steps", lambda: Reduced.build(model, coupling, smooth), of_structure=True)
+        reduced = model.cache("reduced steps", lambda: ReducedStep.build(model, coupling, smooth), of_structure=True)
         whole, same = reduced.whole(steps)
         of_whole = self.differentiate(whole)
         if isinstance(of_whole, Refusal):
@@ -375,7 +375,7 @@ def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array, Arra
 
 
 @dataclass(frozen=True, eq=False)
-class Reduced:
+class ReducedStep:
     """What of a model with reduced mimic joints does not change from step to step.
 
     A step is that of the whole plant, from q = r q_own + offset and v = E v_own, whose velocities v' are then brought
@@ -386,12 +386,12 @@ class Reduced:
     and q' = q + h N(q) E v_own'.
     """
 
-    coupling: Coupling
+    coupling: JointCoupling
     tree: CompiledTree  # of the whole plant
     smooth: SmoothStep
 
     @classmethod
-    def build(cls, model: Model, coupling: Coupling, smooth: SmoothStep) -> "Reduced":
+    def build(cls, model: Model, coupling: JointCoupling, smooth: SmoothStep) -> "ReducedStep":
         """Of the smooth step of `model.whole`; raises ModelError where its tree is none of ours."""
         tree = compiled_tree(describe_tree(model.whole))
         if tree is None:

@@ -13,7 +13,7 @@ from drake_diff.engines.interface import Engine, EngineContract, EulerEngine, fl
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, UnknownNameError
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
-from drake_diff.model.repairs import Coupling
+from drake_diff.model.repairs import JointCoupling
 
 ENGINES = {
     "numpy": ("engines.closed_form", "NumpyEngine"),
@@ -139,7 +139,7 @@ class ReducedEngine(EulerEngine):
 
 def reduced_contract(contract: EngineContract, model: Model) -> EngineContract:
     """Of the independent coordinates: followers show in M(q) and the bias, and in the damping of what they follow."""
-    coupling: Coupling | None = model.coupling
+    coupling: JointCoupling | None = model.coupling
     if coupling is None:
         return contract
     damping, joints_left, start = np.zeros(len(coupling.of_v)), [], 0

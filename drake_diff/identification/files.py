@@ -27,7 +27,7 @@ from drake_diff.comparison.recordings import (
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.identification.identify import identify
 from drake_diff.identification.recordings import hash_of
-from drake_diff.identification.results import Asked, Followed, Identification
+from drake_diff.identification.results import Followed, Identification, Request
 from drake_diff.logs.channels import input_channel, state_channel, transform_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.model.parameters import applied, list_parameters, select
@@ -101,12 +101,12 @@ def _files(path: Path) -> list[Path]:
     return [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
 
 
-def _path(i: int, asked: Asked) -> str:
+def _path(i: int, asked: Request) -> str:
     given = asked.files[i]
     return f"{RECORDINGS}/{i}/{ARRAYS if given is None else given[0].name}"
 
 
-def _begun(name: str, asked: Asked) -> FitRecord:
+def _begun(name: str, asked: Request) -> FitRecord:
     inputs = records.Asked(
         parameters=asked.parameters if isinstance(asked.parameters, str) else list(asked.parameters),
         noise={key: float(value) for key, value in asked.noise.items()},
@@ -171,13 +171,13 @@ def _data(recordings: Sequence[records.RecordingEvidence]) -> DataBoundary:
     return DataBoundary(statement=statement, seen=seen, judged_on=[*seen, *held_out], held_out=names)
 
 
-def _asked(e: Identification) -> Asked:
+def _asked(e: Identification) -> Request:
     if e.asked is None:
         raise InputError("identification", got="one without what was asked", expected="what dd.identify returned")
     return e.asked
 
 
-def _recording(i: int, e: Identification, asked: Asked) -> records.RecordingEvidence:
+def _recording(i: int, e: Identification, asked: Request) -> records.RecordingEvidence:
     recording, given = asked.recordings[i], asked.files[i]
     spans: dict[bool, list[list[float]]] = {True: [], False: []}
     for piece in (motion.piece for motion in e.motions if motion.piece.recording == i):
@@ -241,7 +241,7 @@ def _write_trace(path: Path, e: Identification, attachments: Mapping[str, tuple[
         write_mcap(path, channels, {**facts, "time_axis": "recorded", "contract": contract.name}, attachments)
 
 
-def _channels_of(e: Identification, asked: Asked, i: int) -> Iterator[Channel]:
+def _channels_of(e: Identification, asked: Request, i: int) -> Iterator[Channel]:
     contract, recording = asked.model.contract, asked.recordings[i]
     times, ys, xs, before = _joined(e, i)
     entries = contract.positions, contract.velocities

@@ -38,7 +38,7 @@ from drake_diff.identification.recordings import (
     read_given,
     read_pieces,
 )
-from drake_diff.identification.results import Asked, Followed, Identification, identification
+from drake_diff.identification.results import Followed, Identification, Request, identification
 from drake_diff.identification.sensors import Sensors, choose_sensors
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
@@ -148,7 +148,7 @@ def identify(
         fit, solved = problem.solve(law, max_iterations)
         found = problem.judged(fit, solved, why if motion == "auto" else "")
     names = parameters if isinstance(parameters, str) else tuple(parameters)
-    asked = Asked(
+    asked = Request(
         model,
         given,
         files,

@@ -247,7 +247,7 @@ class Segment(NamedTuple):
     x0: Array  # (nx,)
 
 
-class Solution(NamedTuple):
+class ImpactSolution(NamedTuple):
     """Where a search ended."""
 
     w: Array  # (n,)
@@ -258,7 +258,7 @@ class Solution(NamedTuple):
     rounds: int  # planes that were laid
 
 
-class Search:
+class ImpactSearch:
     """Segments of all recordings, and the coordinates w in which the unknowns are sought: 0 at the model's values."""
 
     def __init__(
@@ -300,11 +300,11 @@ class Search:
         moved, start = self.scale * w, self.unknowns.start
         return np.asarray(np.where(self.by_log, start * np.exp(np.where(self.by_log, moved, 0)), start + moved))
 
-    def intervals(self, solution: Solution) -> Array:
+    def intervals(self, solution: ImpactSolution) -> Array:
         """(n, 2) of the values."""
         return np.stack([self.values(solution.w + sign * solution.spread) for sign in (-1, 1)], axis=1)
 
-    def open(self, solution: Solution) -> tuple[str, ...]:
+    def open(self, solution: ImpactSolution) -> tuple[str, ...]:
         """What the recordings leave open: entries whose interval is wider than a factor of 3, 10 mm or 10 mrad."""
         wide = self.scale * solution.spread > np.where(self.by_log, np.log(3.0), 0.01)
         return tuple(column for column, is_open in zip(self.unknowns.columns, wide, strict=True) if is_open)
@@ -391,7 +391,7 @@ class Search:
         r = np.concatenate(residuals)
         return np.asarray(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
 
-    def run(self, seed: int) -> Solution:
+    def run(self, seed: int) -> ImpactSolution:
         """Through all `STAGES`, with clouds drawn by `seed`."""
         w, random, rounds, converged = np.zeros(len(self.scale)), np.random.default_rng(seed), 0, True
         for length, widths in STAGES:
@@ -404,7 +404,7 @@ class Search:
         half = self.by_half(w, random)
         if half is not None:
             spread = np.hypot(spread, BY_HALF * (half - w))
-        return Solution(w, spread, half, correlation, converged, rounds + 1)
+        return ImpactSolution(w, spread, half, correlation, converged, rounds + 1)
 
     def by_half(self, w: Array, random: np.random.Generator) -> Array | None:
         """(n,) where the search leads from w (n,) over full recordings by steps of half the length."""
@@ -412,7 +412,7 @@ class Search:
         if not self.law.model.can_rebuild or source is None or not source.exists():
             return None  # a diagram, or a file that is gone, as a function that makes models may have it
         model = self.law.model.at_time_step(self.law.model.time_step / 2)
-        finer = Search(model, self.pieces, self.names, self.lengths, self.build)
+        finer = ImpactSearch(model, self.pieces, self.names, self.lengths, self.build)
         return shrink_to(partial(finer.residual, segments=finer.segments(w, np.inf)), w, HALF, random).w
 
 
@@ -509,7 +509,7 @@ def fit_through_impacts(
     Positions alone are judged, by their `noise` (2 nv,). InputError or UnknownNameError for a recording or a name that
     cannot be taken.
     """
-    search, nv, noise = Search(model, pieces, names, lengths, build), model.nv, noise[: 2 * model.nv]
+    search, nv, noise = ImpactSearch(model, pieces, names, lengths, build), model.nv, noise[: 2 * model.nv]
     solution = search.run(seed)
     after, left = _predicted(search, solution.w, noise)
     before, was = _predicted(search, np.zeros(len(solution.w)), noise)
@@ -551,7 +551,7 @@ def fit_through_impacts(
     )
 
 
-def _predicted(search: Search, w: Array, noise: Array) -> tuple[list[Array], list[Array]]:
+def _predicted(search: ImpactSearch, w: Array, noise: Array) -> tuple[list[Array], list[Array]]:
     """The motion (n, nx) of each recording, and what is left (n, 2 nv) in units of what noise explains; NaN of v."""
     starts, random, nv = search.starts(w, noise), np.random.default_rng(SEED), search.model.nv
     xs = search.recordings(w, [start.x for start in starts])

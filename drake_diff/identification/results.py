@@ -15,7 +15,7 @@ from drake_diff.model.model import Model
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class Request:
     """What `identify` was called with."""
 
     model: Model
@@ -68,7 +68,7 @@ class Identification(ShowsItsRepr):
     motion: str  # which motion was fitted
     motions: tuple[Followed, ...]  # of what was fitted, then of what was held out
     at_half_step: Mapping[str, Any] | None = None  # through impacts, the values by steps of half the length, if it has
-    asked: Asked | None = None  # what was asked: `dd.save` writes it, and `dd.verify` asks it again
+    asked: Request | None = None  # what was asked: `dd.save` writes it, and `dd.verify` asks it again
 
     def __repr__(self) -> str:
         return self.sentence

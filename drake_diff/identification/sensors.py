@@ -23,7 +23,7 @@ TINY = 1e-30  # of a complex step
 
 
 @dataclass(frozen=True, eq=False)
-class Sensor:
+class MountedSensor:
     """Three readings of a body, or one of a joint."""
 
     label: str  # as its columns call it
@@ -72,14 +72,14 @@ def choose_sensors(
     )
 
 
-def _sensor(model: Model, tree: Tree, label: str, quantity: str, mounted: Any) -> Sensor:
+def _sensor(model: Model, tree: Tree, label: str, quantity: str, mounted: Any) -> MountedSensor:
     if quantity == FORCE:
         by_label = labelled(joints(model.plant))
         known = [name for name, joint in by_label.items() if joint.num_velocities() == 1]
         if label not in known:
             raise UnknownNameError("joint with a force", got=label, known=known)
         index = next(i for i, link in enumerate(tree.links) if link.joint.joint == label)
-        return Sensor(label, quantity, index, np.eye(3), np.zeros(3))
+        return MountedSensor(label, quantity, index, np.eye(3), np.zeros(3))
     body, turn, point = label, np.eye(3), np.zeros(3)
     if mounted is not None:
         body, turn, point = _mounted(label, mounted)
@@ -89,7 +89,7 @@ def _sensor(model: Model, tree: Tree, label: str, quantity: str, mounted: Any) -
     if index < 0:
         raise InputError(f"sensor {label}", got=f"on {body}, which is fixed to the world", expected="one that moves")
     R = pose.rotation().matrix()
-    return Sensor(label, quantity, index, R @ turn, R @ point + pose.translation())
+    return MountedSensor(label, quantity, index, R @ turn, R @ point + pose.translation())
 
 
 def _mounted(label: str, given: Any) -> tuple[str, Array, Array]:
@@ -140,7 +140,7 @@ class Sensors:
     """All sensors of a fit; `columns` are those that were recorded, in their order."""
 
     tree: Tree | None
-    each: tuple[Sensor, ...]
+    each: tuple[MountedSensor, ...]
     columns: tuple[str, ...]
 
     @property

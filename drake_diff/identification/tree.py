@@ -26,7 +26,7 @@ from drake_diff.mechanics.description import Link, RigidLink, coordinates_of, re
 from drake_diff.mechanics.tree import CompiledTree, Moved, compile_links, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators
-from drake_diff.model.repairs import Coupling
+from drake_diff.model.repairs import JointCoupling
 
 KERNEL = "drake_diff.identification.kernel"
 INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz
@@ -92,7 +92,7 @@ class Tree:
     links: tuple[RigidLink, ...]  # parents first
     compiled: CompiledTree  # of the moving links
     coordinates: Coordinates  # of the independent joints
-    coupling: Coupling | None  # of joints that follow others
+    coupling: JointCoupling | None  # of joints that follow others
     n: int  # degrees of freedom of all joints
     actuation: Array  # (n, nu)
     placed: Mapping[str, tuple[int, Any]]  # by body: the link it belongs to, and the pose of the body in its frame

@@ -15,7 +15,7 @@ from pydrake.multibody.parsing import LoadModelDirectives, PackageMap
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
-from drake_diff.identification.results import Asked, Identification
+from drake_diff.identification.results import Identification, Request
 from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, INERTIA, MASS, STRENGTH
 from drake_diff.model.load_file import add_packages
 from drake_diff.model.model import Model, load_model
@@ -109,7 +109,7 @@ def _changed(e: Identification) -> dict[str, Any]:
     return {n: v for n, v in e.values.items() if not np.array_equal(v, e.start[n])}
 
 
-def _overlay(e: Identification, asked: Asked, source: Path, path: Path) -> dict[Path, str]:
+def _overlay(e: Identification, asked: Request, source: Path, path: Path) -> dict[Path, str]:
     """The texts to write of a model from a .dmd.yaml: corrected copies of robot files, and the overlay over them."""
     packages, text = PackageMap(), source.read_text()
     options = asked.model.options or {}
@@ -155,7 +155,7 @@ def _names_in(file: Path) -> set[str]:
     return {str(element.get("name")) for element in root.iter("link", "joint", "actuator") if element.get("name")}
 
 
-def _data(asked: Asked) -> str:
+def _data(asked: Request) -> str:
     return ", ".join(
         r.name if file is None else f"{file[0].name} (SHA-256 {file[1][:12]})"
         for r, file in zip(asked.recordings, asked.files, strict=True)
@@ -165,7 +165,7 @@ def _data(asked: Asked) -> str:
 class _Corrected:
     """The text of a file, and the changes to it."""
 
-    def __init__(self, e: Identification, asked: Asked, source: Path, changed: Mapping[str, Any]):
+    def __init__(self, e: Identification, asked: Request, source: Path, changed: Mapping[str, Any]):
         self.e, self.model, self.is_sdf = e, asked.model, source.suffix == ".sdf"
         self.xml = XmlText(source.read_bytes())
         self.data, self.changed = _data(asked), changed

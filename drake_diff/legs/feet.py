@@ -12,7 +12,7 @@ from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
 from drake_diff._base.arrays import Array, Indices, cross
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.legs.inverse_kinematics import Target
+from drake_diff.legs.inverse_kinematics import PointTarget
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.model import Model
 from drake_diff.model.plant import FLOATING, bodies, joints, proximity_property
@@ -196,13 +196,15 @@ class Legs:
         jacobian = plant.CalcJacobianCenterOfMassTranslationalVelocity(context, kind, world, world)
         return np.asarray(_of_model(self.model, jacobian) @ v)
 
-    def at(self, positions: Array, tolerance: Any, rolls: Collection[int] = (), unit: Any = np.inf) -> list[Target]:
+    def at(
+        self, positions: Array, tolerance: Any, rolls: Collection[int] = (), unit: Any = np.inf
+    ) -> list[PointTarget]:
         """That the lowest points of the soles are at `positions` (n, 3) [m], of a face three of them.
 
         Those of `rolls` stay where they touch in the twin's posture, whatever their position says sideways. Of a foot
         that is no face the material at the lowest point stays, and the centre of its sphere moves as a wheel's does.
         """
-        targets = list[Target]()
+        targets = list[PointTarget]()
         for i, owner in enumerate(self.owners):
             foot, centre, up = self.feet[owner], self.centres[i], np.array([0.0, 0.0, self.radii[i]])
             if i in self._spare:
@@ -213,9 +215,9 @@ class Legs:
                 position = np.array([*stays[:2], position[2]])
                 if not foot.is_flat:
                     lowest = pose.inverse().multiply(stays - up)
-                    targets.append(Target(foot.frame, lowest, [*stays[:2], np.nan], tolerance))
+                    targets.append(PointTarget(foot.frame, lowest, [*stays[:2], np.nan], tolerance))
                     position[:2] = np.nan
-            targets.append(Target(foot.frame, centre, position, tolerance, unit))
+            targets.append(PointTarget(foot.frame, centre, position, tolerance, unit))
         return targets
 
     @cached_property

@@ -26,7 +26,7 @@ OPTIONS.SetOption(SnoptSolver.id(), "Major feasibility tolerance", 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class PointTarget:
     """The wanted position (3,) [m] in the world of a point (3,) [m] of a frame; a NaN leaves that coordinate free.
 
     `tolerance` [m], a number or (3,), bounds the distance; infinity bounds nothing. The cost is (distance / `unit`)^2,
@@ -58,7 +58,7 @@ class Wish:
 
 
 def inverse_kinematics(
-    model: Model, first: Array, targets: Sequence[Target], wish: Wish, lower: Array, upper: Array
+    model: Model, first: Array, targets: Sequence[PointTarget], wish: Wish, lower: Array, upper: Array
 ) -> Array:
     """The posture (nq,) of least cost with the points at their targets, by SNOPT from the posture `first` (nq,).
 
@@ -103,7 +103,7 @@ def inverse_kinematics(
     return posture
 
 
-def miss(model: Model, targets: Sequence[Target]) -> float:
+def miss(model: Model, targets: Sequence[PointTarget]) -> float:
     """The largest distance [m] of a point from its target beyond the tolerance, in the state of the double plant."""
     off = [0.0]
     for target in targets:

@@ -17,7 +17,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.derivatives.step import linearize
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.legs.feet import GRAVITY, Legs, find_feet
-from drake_diff.legs.inverse_kinematics import Target, Wish, inverse_kinematics, miss
+from drake_diff.legs.inverse_kinematics import PointTarget, Wish, inverse_kinematics, miss
 from drake_diff.legs.motion import smooth
 from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.model import Model
@@ -346,7 +346,7 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
     for _ in range(CORRECTIONS + 1):
         lower, upper = legs.lower.copy(), legs.upper.copy()
         lower[indices] = upper[indices] = aimed
-        targets = [Target(origins[name], np.zeros(3), position, ON_GROUND) for name, position in places.items()]
+        targets = [PointTarget(origins[name], np.zeros(3), position, ON_GROUND) for name, position in places.items()]
         shift = _shift_to(legs, start, wish, lower, upper, targets)
         if isinstance(shift, Refusal):
             return shift
@@ -365,7 +365,7 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
 
 
 def _shift_to(
-    legs: Legs, start: Rest, wish: Wish, lower: Array, upper: Array, others: Sequence[Target] = ()
+    legs: Legs, start: Rest, wish: Wish, lower: Array, upper: Array, others: Sequence[PointTarget] = ()
 ) -> Shift | Refusal:
     """From rest to the posture nearest to a wish in which the feet stand where they are, and `others` are kept."""
     q0 = start.x[: legs.model.nq]

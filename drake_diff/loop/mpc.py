@@ -28,7 +28,7 @@ from drake_diff.optimize.problem.goals import LAST
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.realtime.rolling import Rolling, Staying
 from drake_diff.optimize.realtime.step import Step, Stretch, roll, take_step
-from drake_diff.optimize.replay import Plan, held, regulator_weights
+from drake_diff.optimize.replay import ReplayPlan, held, regulator_weights
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
 
@@ -348,7 +348,7 @@ def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
         if constraint.miss(goal) > constraint.tolerance:
             got = f"{constraint.told(constraint.miss(goal))} where inputs can hold the model"
             raise InputError(f"goal {constraint.label}", got=got, expected="one that can be stayed at")
-    plan = Plan(problem, problem.parameters, model.time_step, held(xs, us), False)
+    plan = ReplayPlan(problem, problem.parameters, model.time_step, held(xs, us), False)
     cost = problem.objective(xs, us)
     cost = cost if cost > 0 else 1.0
     Q, R, _ = (STAY * cost / problem.num_steps * weight for weight in regulator_weights(plan, us))

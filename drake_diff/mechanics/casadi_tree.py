@@ -25,7 +25,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.clock import Pace, check_time
 from drake_diff._base.values import Refusal
 from drake_diff.mechanics.description import Link, RigidLink, read_links, springs_of
-from drake_diff.mechanics.tree import Tree, tree_for, tree_of
+from drake_diff.mechanics.tree import TreeModel, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
@@ -184,7 +184,7 @@ class _Link:
 class SymbolicTree:
     """The numbers of a tree, of which `move` makes some symbols."""
 
-    def __init__(self, tree: Tree):
+    def __init__(self, tree: TreeModel):
         self.tree = tree
         self.turns = [np.eye(3) if link.free else _with_z(link.axis) for link in tree.links]
         self.links = [self._link(link, turn) for link, turn in zip(tree.links, self.turns, strict=True)]

@@ -21,7 +21,7 @@ from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.values import Refusal
 from drake_diff.mechanics.casadi_tree import SAME_PLANT, SymbolicTree, agrees
 from drake_diff.mechanics.symbol import Symbol, called, symbols
-from drake_diff.mechanics.tree import Tree, tree_for, tree_of
+from drake_diff.mechanics.tree import TreeModel, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
@@ -54,7 +54,7 @@ class FixedContactPlant:
     speeds: Callable[[Any], Any]
     rows: Indices  # (m,) of those, that some joint moves
     equations: EquationsOfMotion
-    tree: Tree
+    tree: TreeModel
 
     def values(self, knots: Array) -> Array:
         """(K, nx) dx/dt at `knots` (K, nx + nu), by Drake's own mass matrix, bias and velocities."""

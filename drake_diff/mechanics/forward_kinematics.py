@@ -25,7 +25,7 @@ from drake_diff.mechanics.coordinates import rotation
 from drake_diff.mechanics.description import Link, RigidLink, names_of, read_links, without_welds
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
-from drake_diff.model.repairs import Coupling
+from drake_diff.model.repairs import JointCoupling
 from drake_diff.model.step import set_state
 
 X, Y, Z = np.eye(3)
@@ -74,7 +74,7 @@ class ForwardKinematics:
         return self.model.nx
 
     @property
-    def coupling(self) -> Coupling | None:
+    def coupling(self) -> JointCoupling | None:
         """Where q has the independent coordinates alone."""
         return self.model.coupling
 

@@ -38,7 +38,7 @@ from drake_diff.mechanics import tree_kernel
 from drake_diff.mechanics.description import Description, Link, RigidLink, read_links, springs_of, without_welds
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
-from drake_diff.model.repairs import Coupling
+from drake_diff.model.repairs import JointCoupling
 from drake_diff.model.step import set_state
 
 
@@ -147,7 +147,7 @@ class InverseDynamics:
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
+class TreeModel:
     """A tree of n degrees of freedom, and what acts beside inertia and gravity, by velocity."""
 
     links: tuple[RigidLink, ...]  # with what they carry by welds, every parent before its children
@@ -160,7 +160,7 @@ class Tree:
     rest: Array  # (n,) [m or rad]
     damping: Array  # (n,)
     reflected: Array  # (n,) rotor inertia times gear ratio squared
-    coupling: Coupling | None  # where q, v and a are of the independent coordinates alone, and tau is along them
+    coupling: JointCoupling | None  # where q, v and a are of the independent coordinates alone, and tau is along them
 
     @property
     def own_damping(self) -> Array:
@@ -261,7 +261,7 @@ def _links_of(model: Model, free: bool) -> list[Any] | Refusal:
     return springs if isinstance(springs, Refusal) else read_links(plant, springs)
 
 
-def tree_of(model: Model, *, free: bool = False) -> Tree | Refusal:
+def tree_of(model: Model, *, free: bool = False) -> TreeModel | Refusal:
     """The tree of a model as it is read, not yet compared with Drake; a Refusal that names what in it is no tree.
 
     Of hinges and slides, and of `free` bodies where they are asked for.
@@ -283,10 +283,12 @@ def tree_of(model: Model, *, free: bool = False) -> Tree | Refusal:
         else:
             positions[joint.v_start] = joint.q_start
     stiffness, rest, damping, reflected = of_joints
-    return Tree(links, on, compiled, gravity, positions, is_free, stiffness, rest, damping, reflected, model.coupling)
+    return TreeModel(
+        links, on, compiled, gravity, positions, is_free, stiffness, rest, damping, reflected, model.coupling
+    )
 
 
-def tree_for(model: Model) -> Tree | None:
+def tree_for(model: Model) -> TreeModel | None:
     """The model's tree where it gives at two states what AutoDiffXd through Drake gives; None where it has no such.
 
     It is that of the model's own parameters: while others are applied there is none.
@@ -294,7 +296,7 @@ def tree_for(model: Model) -> Tree | None:
     if model.has_other_parameters:
         return None
 
-    def checked() -> Tree | None:
+    def checked() -> TreeModel | None:
         tree = tree_of(model)
         if isinstance(tree, Refusal):
             return None
@@ -307,7 +309,7 @@ def tree_for(model: Model) -> Tree | None:
     return model.cache("tree", checked)
 
 
-def _is_same(model: Model, tree: Tree, x: Array, a: Array) -> bool:
+def _is_same(model: Model, tree: TreeModel, x: Array, a: Array) -> bool:
     n = model.nv
     set_state(model.autodiff, InitializeAutoDiff(x).ravel())
     exact = model.autodiff.inverse_dynamics(np.array([AutoDiffXd(entry) for entry in a])).reshape(-1, 1)

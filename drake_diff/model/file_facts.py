@@ -124,7 +124,7 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Actuator:
+class FileActuator:
     """An actuator as MuJoCo means it: the limit of its effort at the joint, and what a PD law there would have."""
 
     kind: str
@@ -229,11 +229,11 @@ class Mjcf:
         return max(abs(end) for end in ends) if len(ends) == 2 and holds else None
 
     @cached_property
-    def actuators(self) -> list[Actuator]:
+    def actuators(self) -> list[FileActuator]:
         """All, in the order of the file."""
         return [self._actuator(e) for section in self.root.findall("actuator") for e in section.children]
 
-    def _actuator(self, element: Element) -> Actuator:
+    def _actuator(self, element: Element) -> FileActuator:
         says = self.attributes(element)
         gear, kind = abs(_first(says.get("gear", "1"), 1.0)), element.tag
         force, control = self._range(says, "force"), self._range(says, "ctrl")
@@ -250,7 +250,7 @@ class Mjcf:
         if joint in self.joints and self.joints[joint].effort is not None:
             at_joint.append(float(self.joints[joint].effort or 0.0))
         read = kind in KINDS and bool(joint)
-        return Actuator(kind, says.get("name", ""), joint, read, min(at_joint, default=math.inf), gains)
+        return FileActuator(kind, says.get("name", ""), joint, read, min(at_joint, default=math.inf), gains)
 
     @property
     def coupled(self) -> "Iterator[Coupled]":

@@ -22,8 +22,8 @@ from drake_diff.exceptions import ModelError
 from drake_diff.model.triangles import (
     OF_MUJOCO,
     READ_BY_TRIMESH,
+    CoverSpheres,
     Hull,
-    Spheres,
     as_obj,
     fit_spheres,
     hull_of_file,
@@ -259,14 +259,14 @@ def in_any_case(path: Path) -> Path | None:
         return None
 
 
-def _became(mesh: CollisionMesh, treatment: str) -> tuple[Hull, Spheres | None]:
+def _became(mesh: CollisionMesh, treatment: str) -> tuple[Hull, CoverSpheres | None]:
     """The hull of a mesh, and the spheres inside it where these are asked for. ModelError where there is no hull."""
     hull = hull_of_file(mesh.path, mesh.scale)
     return hull, _spheres(hull, mesh.path.name) if treatment == "spheres" else None
 
 
 @lru_cache(maxsize=256)  # by the hull itself, which is kept too
-def _spheres(hull: Hull, label: str) -> Spheres:
+def _spheres(hull: Hull, label: str) -> CoverSpheres:
     return fit_spheres(hull, label)
 
 
@@ -335,7 +335,7 @@ def _meant(plant: MultibodyPlant, inspector: Any, geometry: Any, meshes: FileMes
     return CollisionMesh(plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name(), path, (x, y, z))
 
 
-def _put_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: Any, spheres: Spheres) -> list[Any]:
+def _put_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: Any, spheres: CoverSpheres) -> list[Any]:
     """The ids of the spheres that the placeholder became, its own among them."""
     inspector = scene_graph.model_inspector()
     body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))

@@ -41,7 +41,7 @@ from drake_diff.model.plant import (
     scene_graph_beside,
 )
 from drake_diff.model.repairs import (
-    Coupling,
+    JointCoupling,
     add_actuators,
     add_ground,
     add_springs,
@@ -103,7 +103,7 @@ class Model(ShowsItsRepr):
         contact_geometry: str | None = None,
         rebuild: Callable[..., Model] | None = None,
         forces: tuple[AddedForce, ...] = (),
-        coupling: Coupling | None = None,
+        coupling: JointCoupling | None = None,
         body_forces: tuple[BodyForce, ...] = (),
         shared: SharedPlant | None = None,
     ):

@@ -354,7 +354,7 @@ SLACK = 1e-9  # [m or rad] of limits that meet in one point but for rounding
 
 
 @dataclass(frozen=True, eq=False)
-class Coupling:
+class JointCoupling:
     """The independent ("own") coordinates of a plant in which joints follow others, and all by them.
 
     Each entry of the plant's q (n,) is ratio * own entry `of_q` + offset, each of its v (m,) ratio * own entry `of_v`.
@@ -544,7 +544,7 @@ def couple(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, ...]:
     return (f"{len(mimics)} mimic joints were reduced: {listing}.",) if mimics else ()
 
 
-def coupling_of(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> Coupling | None:
+def coupling_of(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> JointCoupling | None:
     """The independent coordinates of a finalized plant; None where no joint follows another."""
     if not mimics:
         return None
@@ -557,7 +557,7 @@ def coupling_of(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> Coupling | 
         ratio_q[i], ratio_v[j], offset[i] = ratio, ratio, add
     own_q, own_v = np.flatnonzero(leading_q == np.arange(n)), np.flatnonzero(leading_v == np.arange(m))
     of_q, of_v = np.searchsorted(own_q, leading_q), np.searchsorted(own_v, leading_v)
-    coupling = Coupling(mimics, own_q, own_v, of_q, of_v, ratio_q, ratio_v, offset)
+    coupling = JointCoupling(mimics, own_q, own_v, of_q, of_v, ratio_q, ratio_v, offset)
     names = plant.GetPositionNames(add_model_instance_prefix=False)
     lows, highs = coupling.limits(plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
     for i, low, high in zip(own_q, lows, highs, strict=True):

@@ -401,7 +401,7 @@ SPHERES = SphereOptions()
 
 
 @dataclass(frozen=True, eq=False)
-class Spheres:
+class CoverSpheres:
     """Spheres of one radius [m] about `centres` (k, 3) [m], all inside a hull.
 
     `ground_gap` [m] is how far the hull reaches beyond the spheres at most, in any direction: a flat ground is met
@@ -415,7 +415,7 @@ class Spheres:
     open_gap: float
 
 
-def fit_spheres(hull: Hull, label: str) -> Spheres:
+def fit_spheres(hull: Hull, label: str) -> CoverSpheres:
     """At most MOST_SPHERES spheres for a hull, by the rule above; `label` names it in a ModelError."""
     size = float(np.max(np.ptp(hull.corners, axis=0)))  # the solver's tolerances are meant for numbers near 1
     middle = np.mean(hull.corners, axis=0)
@@ -428,7 +428,7 @@ def fit_spheres(hull: Hull, label: str) -> Spheres:
         tried = [shape.filled(share * largest) for share in SPHERES.radii]
         enough = [spheres for spheres in tried if spheres.ground_gap <= SPHERES.good_enough * largest]
         best = enough[0] if enough else min(tried, key=lambda spheres: spheres.ground_gap)
-    return Spheres(middle + size * best.centres, size * best.radius, size * best.ground_gap, size * best.open_gap)
+    return CoverSpheres(middle + size * best.centres, size * best.radius, size * best.ground_gap, size * best.open_gap)
 
 
 @dataclass(frozen=True, eq=False)
@@ -463,7 +463,7 @@ class _Shape:
             raise ModelError(f"{self.label}: no place for a sphere in its hull was found: {why}")
         return np.asarray(result.GetSolution(x), dtype=float)
 
-    def filled(self, radius: float) -> Spheres:
+    def filled(self, radius: float) -> CoverSpheres:
         """Spheres of `radius`, one after the other where they are missed most."""
         farthest = self.corners[np.argmax(np.linalg.norm(self.corners - self.middle, axis=1))]
         centres = [self.closest_centre(farthest, radius)]
@@ -475,12 +475,12 @@ class _Shape:
             centres.append(new[0])
         return self.measured(centres, radius)
 
-    def measured(self, places: list[Array], radius: float) -> Spheres:
+    def measured(self, places: list[Array], radius: float) -> CoverSpheres:
         """The spheres, as large as they fit in, with their gaps."""
         centres = np.array(places)
         inside = min(radius, float(np.min(self.offsets - centres @ self.normals.T)))
         ground, bare = self._gaps(centres, inside)
-        return Spheres(centres, inside, max(0.0, float(np.max(ground))), max(0.0, float(np.max(bare))))
+        return CoverSpheres(centres, inside, max(0.0, float(np.max(ground))), max(0.0, float(np.max(bare))))
 
     def _missing(self, centres: Array, radius: float) -> list[Array]:
         """The points (3,) of the hull that need a sphere most, the worst first."""

@@ -17,7 +17,7 @@ from drake_diff._base.clock import check_time
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.inputs import Inputs
 from drake_diff.model.plant import actuators, bodies, instances, joints, labelled
-from drake_diff.model.repairs import Coupling
+from drake_diff.model.repairs import JointCoupling
 
 
 class AddedForce(Protocol):
@@ -92,7 +92,7 @@ class Twin:
     defaults: Any  # a root context that nobody touches
     inputs: Inputs
     own: tuple[AddedForce, ...] = ()  # the model's own beside Drake's, which no parameter changes
-    coupling: Coupling | None = None  # where x has the independent coordinates of the plant alone
+    coupling: JointCoupling | None = None  # where x has the independent coordinates of the plant alone
     added: dict[str, AddedForce] = field(default_factory=dict)  # for parameters that Drake does not have
     thread: int = field(default_factory=get_ident)  # whose context it is
 

@@ -36,7 +36,7 @@ from drake_diff.derivatives.contact.laws import Material, read_material
 from drake_diff.derivatives.smooth_step import form_of
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
-from drake_diff.mechanics.tree import Tree, tree_of
+from drake_diff.mechanics.tree import TreeModel, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian, PenalizedRows
@@ -58,7 +58,7 @@ class Softness:
 
 
 @dataclass(frozen=True, eq=False)
-class Forces:
+class RelaxedForces:
     """tau (N, nv) of N steps and its derivatives (N, nv, nv) by small motion, by v and by v'."""
 
     tau: Array
@@ -72,7 +72,7 @@ class RelaxedPlant:
     """What of a model does not change from step to step."""
 
     model: Model
-    tree: Tree
+    tree: TreeModel
     coordinates: Coordinates
     pairs: ContactPairs
     topology: Topology
@@ -104,7 +104,7 @@ class RelaxedPlant:
         poses[:, self.carriers < 0] = np.eye(3, 4)
         return poses
 
-    def forces(self, q: Array, v: Array, v_next: Array, soft: Softness, *, slopes: bool) -> Forces:
+    def forces(self, q: Array, v: Array, v_next: Array, soft: Softness, *, slopes: bool) -> RelaxedForces:
         """At q (N, nq), v and v_next (N, nv); without `slopes` the derivatives are empty."""
         tree, h, n = self.tree, self.model.time_step, self.coordinates.nv
         a = (v_next - v) / h
@@ -116,7 +116,7 @@ class RelaxedPlant:
         push = np.zeros_like(v)
         np.add.at(push, state, (contacts.jacobian @ force[..., None])[..., 0])
         if not slopes:
-            return Forces(moved.tau + added - push, *3 * (np.empty(0),))
+            return RelaxedForces(moved.tau + added - push, *3 * (np.empty(0),))
         by_q, mass, diagonal = moved.by_q, moved.mass, np.arange(n)
         mass[:, diagonal, diagonal] += tree.reflected
         by_q[:, diagonal, diagonal] += tree.stiffness
@@ -129,7 +129,7 @@ class RelaxedPlant:
         changed = np.concatenate([velocity, normal, phi[..., None]], axis=-1) @ by_z
         np.subtract.at(by_q, state, contacts.force_change(force, point) + J @ changed.swapaxes(-1, -2))
         np.subtract.at(by_next, state, J @ by_z[:, :3].swapaxes(-1, -2) @ J.swapaxes(-1, -2))
-        return Forces(moved.tau + added - push, by_q, by_v, by_next)
+        return RelaxedForces(moved.tau + added - push, by_q, by_v, by_next)
 
     def distances(self, q: Array) -> Array:
         """(N, P) the signed distance of each pair at q (N, nq), infinite where it is further than 1e3 m."""

@@ -59,7 +59,7 @@ OPEN_LOOP, FEEDBACK = "open loop", "TVLQR"
 BROKEN = (SimulationError, ModelError, GradientError, ValueError)
 
 
-class Motion(Protocol):
+class MeasuredMotion(Protocol):
     """What is measured of a motion: times (n+1,) [s], xs (n+1, nx), us (n, nu) and penetration (n+1,) [m]."""
 
     @property
@@ -108,7 +108,7 @@ class Replay(ShowsItsRepr):
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class ReplayPlan:
     """What is replayed: `sample(m)` gives xs (m N + 1, nx) and us (m N, nu) held over each m-th part of an interval.
 
     `time_step` [s] is an interval's length; `continuous` tells that the plan is a motion in continuous time.
@@ -181,7 +181,7 @@ def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
     return sample
 
 
-def replays(plan: Plan) -> tuple[Replay, ...]:
+def replays(plan: ReplayPlan) -> tuple[Replay, ...]:
     """`plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR."""
     model = plan.problem.model
     if plan.problem.motion == CONTINUOUS:
@@ -208,12 +208,12 @@ def replays(plan: Plan) -> tuple[Replay, ...]:
     return tuple(rows)
 
 
-def finest_parts(plan: Plan) -> int:
+def finest_parts(plan: ReplayPlan) -> int:
     """In how many steps an interval of a collocated plan is cut at most."""
     return min(FINEST, max(FINER, MOST_STEPS // plan.problem.num_steps))
 
 
-def deciding(plan: Plan, rows: Sequence[Replay]) -> list[str]:
+def deciding(plan: ReplayPlan, rows: Sequence[Replay]) -> list[str]:
     """The variants in which the plan has to hold."""
     variants = list(dict.fromkeys(r.variant for r in rows))
     if plan.continuous:
@@ -221,13 +221,13 @@ def deciding(plan: Plan, rows: Sequence[Replay]) -> list[str]:
     return [v for v in variants if not any(other.startswith(f"{v} in steps of ") for other in variants)]
 
 
-def broken_variants(plan: Plan, rows: Sequence[Replay]) -> dict[str, list[Replay]]:
+def broken_variants(plan: ReplayPlan, rows: Sequence[Replay]) -> dict[str, list[Replay]]:
     """The replays of each variant in which the plan has to hold and does not, whatever the control."""
     tried = {variant: [r for r in rows if r.variant == variant] for variant in deciding(plan, rows)}
     return {variant: replays for variant, replays in tried.items() if not _any_holds(replays)}
 
 
-def judged_replay(plan: Plan, rows: Sequence[Replay]) -> Replay | None:
+def judged_replay(plan: ReplayPlan, rows: Sequence[Replay]) -> Replay | None:
     """The motion that a verdict rests on: open loop where that holds, else under TVLQR; None where neither does."""
     decides = deciding(plan, rows)
     for control in dict.fromkeys(r.control for r in rows):
@@ -241,14 +241,14 @@ def _any_holds(rows: Sequence[Replay]) -> bool:
     return any(r.holds for r in rows)
 
 
-def _replay_step(plan: Plan, parts: int) -> list[Replay]:
+def _replay_step(plan: ReplayPlan, parts: int) -> list[Replay]:
     name = f"in steps of {plan.time_step / parts:.4g} s"
     known = plan.open_loop if parts == 1 else None
     return _replay_in(plan, name, lambda: plan.model_at(parts), parts, known)
 
 
 def _replay_in(
-    plan: Plan, variant: str, make: Callable[[], Model], parts: int, known: Rollout | None = None
+    plan: ReplayPlan, variant: str, make: Callable[[], Model], parts: int, known: Rollout | None = None
 ) -> list[Replay]:
     """Both replays in one variant of the plant; open loop, whose motion may be `known`, alone without inputs."""
     controls = {OPEN_LOOP: known, FEEDBACK: None} if plan.problem.model.nu else {OPEN_LOOP: known}
@@ -260,7 +260,7 @@ def _replay_in(
         return [missing_replay(plan, variant, control, str(error)) for control in controls]
 
 
-def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:
+def _replay(plan: ReplayPlan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:
     law_is_another = model.contract.contact.approximation != plan.problem.model.contract.contact.approximation
     try:
         xs, us = plan.sample(parts)
@@ -280,7 +280,13 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
 
 
 def measured_replay(
-    plan: Plan, variant: str, control: str, model: Model, motion: Any, checks: Iterable[Check], time_step: float = -1.0
+    plan: ReplayPlan,
+    variant: str,
+    control: str,
+    model: Model,
+    motion: Any,
+    checks: Iterable[Check],
+    time_step: float = -1.0,
 ) -> Replay:
     """A replay that was taken; `time_step` [s] is the model's unless it is given."""
     bounds, feedback = plan.problem.bounds, None if control == OPEN_LOOP else control
@@ -299,7 +305,7 @@ def measured_replay(
     )
 
 
-def missing_replay(plan: Plan, variant: str, control: str, why: str) -> Replay:
+def missing_replay(plan: ReplayPlan, variant: str, control: str, why: str) -> Replay:
     """A replay that could not be taken: its measures are infinite, never zero."""
     feedback = None if control == OPEN_LOOP else control
     row = replace(check("motion", why, np.inf, 0.0, verdict="undecided"), plant=variant, feedback=feedback)
@@ -318,7 +324,7 @@ def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, c
 # Feedback.
 
 
-def regulator(plan: Plan, model: Model, xs: Array, us: Array) -> TVLQR:
+def regulator(plan: ReplayPlan, model: Model, xs: Array, us: Array) -> TVLQR:
     """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan."""
     Q, R, final = regulator_weights(plan, us)
     ratio = model.time_step / plan.time_step  # a running cost is summed over more steps where they are finer
@@ -328,7 +334,7 @@ def regulator(plan: Plan, model: Model, xs: Array, us: Array) -> TVLQR:
     return TVLQR(model, xs, us, ratio * Q, ratio * R, final, jacobians=jacobians)
 
 
-def track(plan: Plan, model: Model, xs: Array, us: Array, gains: Array | None = None) -> Policy:
+def track(plan: ReplayPlan, model: Model, xs: Array, us: Array, gains: Array | None = None) -> Policy:
     """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds and limits of its rate.
 
     The latter make it remember its last input: it is for one rollout. The `gains` (N, nu, nt) may be known.
@@ -364,7 +370,7 @@ def _about(model: Model, xs: Array, us: Array, gains: Array) -> Policy:
     return law
 
 
-def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
+def regulator_weights(plan: ReplayPlan, us: Array) -> tuple[Array, Array, Array]:
     """Q (nt, nt), R (nu, nu) and Qf by Bryson's rule, one over the square of each range; a rotation's is a radian.
 
     Where jerks are limited, the end has no weight of its own: the last steps would pull at it.
@@ -380,7 +386,7 @@ def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
 
 
 def motion_checks(
-    plan: Plan, model: Model, motion: Motion, parts: int, fraction: float, wider: float = 1.0
+    plan: ReplayPlan, model: Model, motion: MeasuredMotion, parts: int, fraction: float, wider: float = 1.0
 ) -> Iterator[Check]:
     """All that the problem asks of `motion`, of which `parts` steps make one of the plan's; energy apart.
 
@@ -402,14 +408,14 @@ def motion_checks(
         yield penetration_check(model, motion)
 
 
-def goal_check(plan: Plan, distance: Array, fraction: float = STATE_TOLERANCE) -> Check:
+def goal_check(plan: ReplayPlan, distance: Array, fraction: float = STATE_TOLERANCE) -> Check:
     """The `distance` (nx,) from the goal of the state that is furthest from it, of that part of its range."""
     i = int(np.argmax(np.nan_to_num(np.abs(distance) / plan.scale, nan=np.inf)))
     name, unit = plan.problem.state_names[i], units_of(plan.problem)[i]
     return check("goal", name, abs(distance[i]), fraction * plan.scale[i], unit)
 
 
-def bounds_check(plan: Plan, motion: Motion, wider: float = 1.0) -> Check:
+def bounds_check(plan: ReplayPlan, motion: MeasuredMotion, wider: float = 1.0) -> Check:
     """The state of the motion, but the first, that is furthest beyond a bound for its range."""
     bounds, scale, tolerance = plan.problem.bounds, plan.scale, wider * STATE_TOLERANCE * plan.scale
     excess = np.maximum(np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper), 0.0)[1:]
@@ -420,13 +426,13 @@ def bounds_check(plan: Plan, motion: Motion, wider: float = 1.0) -> Check:
     return check("bound", where, excess[k, i], tolerance[i], units_of(plan.problem)[i])
 
 
-def clearance_checks(plan: Plan, motion: Motion) -> Iterator[Check]:
+def clearance_checks(plan: ReplayPlan, motion: MeasuredMotion) -> Iterator[Check]:
     """How near the motion comes to obstacles, at its states or between them: it may use the margin up."""
     for c in clearances(plan.problem.kept):
         yield c.nearest(*along_steps(motion.times, motion.xs), c.tolerance)
 
 
-def penetration_check(model: Model, motion: Motion) -> Check:
+def penetration_check(model: Model, motion: MeasuredMotion) -> Check:
     """The deepest overlap for a quarter of the thinner of the geometries that overlap."""
     least, name = thinnest_geometry(model)
     deep = list[Check]()
@@ -454,7 +460,7 @@ def energy_tolerance(motion: Rollout) -> float:
     return max(ENERGY_TOLERANCE * motion.energy_exchanged, SMALLEST_ENERGY)
 
 
-def _miss(c: GoalConstraint, motion: Motion, plan: Plan) -> float:
+def _miss(c: GoalConstraint, motion: MeasuredMotion, plan: ReplayPlan) -> float:
     """The largest distance of a replay from a goal at the knots of the plan."""
     parts = (len(motion.xs) - 1) // plan.problem.num_steps
     knots = plan.problem.knots_of(c, input_at_end=False)
@@ -463,7 +469,7 @@ def _miss(c: GoalConstraint, motion: Motion, plan: Plan) -> float:
     return max(c.miss(motion.xs[parts * k]) for k in knots)
 
 
-def _constraint_checks(plan: Plan, xs: Array, us: Array, wider: float) -> Iterator[Check]:
+def _constraint_checks(plan: ReplayPlan, xs: Array, us: Array, wider: float) -> Iterator[Check]:
     """Of constraints, couplings and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
     problem, tolerances = plan.problem, dict[str, float]()
     planned_xs, planned_us = plan.sample(1)

@@ -25,7 +25,7 @@ from drake_diff.optimize.measure import following_checks, plan_checks
 from drake_diff.optimize.optimality import Optimality, final_state_norms, optimality
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
-from drake_diff.optimize.replay import OPEN_LOOP, Plan, Replay, held, judged_replay, replays
+from drake_diff.optimize.replay import OPEN_LOOP, Replay, ReplayPlan, held, judged_replay, replays
 from drake_diff.optimize.transcription.between import Excess, violation_between_nodes
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
@@ -451,11 +451,11 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             return Refusal(f"a step or a derivative is refused: {error}")
 
     @cached_property
-    def plan(self) -> Plan:
+    def plan(self) -> ReplayPlan:
         """What is replayed: states, and inputs held over each step, or their means over the parts of an interval."""
         continuous = self.transcribed is not None
         sample = held(self.xs, self.us) if self.transcribed is None else self.transcribed.sample
-        return Plan(self.problem, self.vector, self.time_step, sample, continuous)
+        return ReplayPlan(self.problem, self.vector, self.time_step, sample, continuous)
 
     @cached_property
     def replay(self) -> Rollout | None:

@@ -15,7 +15,7 @@ from pydrake.trajectories import BsplineTrajectory
 
 from drake_diff._base.arrays import Array, Indices, finite_array
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError, UnknownNameError
-from drake_diff.legs.inverse_kinematics import Target, Wish, inverse_kinematics
+from drake_diff.legs.inverse_kinematics import PointTarget, Wish, inverse_kinematics
 from drake_diff.legs.motion import smooth
 from drake_diff.mechanics.quantities import frame_position
 from drake_diff.model.model import Model
@@ -177,7 +177,7 @@ def _reach(robot: Robot, task: Goals, first: Array, fixed: Array) -> tuple[Array
     low, high = np.where(fixed, first, robot.lower + margin), np.where(fixed, first, robot.upper - margin)
     frames = [plant.get_frame(frame_named(model.plant, "goal", name).index()) for name in task.frames]
     goals = list(task.frames.values())
-    targets = [Target(frame, np.zeros(3), goal, tolerance) for frame, goal in zip(frames, goals, strict=True)]
+    targets = [PointTarget(frame, np.zeros(3), goal, tolerance) for frame, goal in zip(frames, goals, strict=True)]
     q = inverse_kinematics(model, np.clip(first, low, high), targets, Wish(first, np.ones(model.nv)), low, high)
     positions = [frame.CalcPoseInWorld(model.double.context).translation() for frame in frames]
     return np.clip(q, low, high), float(np.max(np.abs(np.subtract(positions, goals))))

@@ -30,9 +30,9 @@ from drake_diff.optimize.replay import (
     FEEDBACK,
     OPEN_LOOP,
     STATE_TOLERANCE,
-    Motion,
-    Plan,
+    MeasuredMotion,
     Replay,
+    ReplayPlan,
     deciding,
     energy_check,
     measured_replay,
@@ -89,12 +89,12 @@ def cross_check(solution: Solution, engines: Sequence[str] = SIMULATORS) -> Solu
     if type(solution) is not Solution or not solution.problem.has_model:
         got = f"{type(solution).__name__} of plain dynamics" if type(solution) is Solution else type(solution)
         raise InputError("solution", got=got, expected="the Solution of a problem with a model")
-    follower = Follower(solution.plan, solution.replays if solution.transcribed is not None else ())
+    follower = PlanFollower(solution.plan, solution.replays if solution.transcribed is not None else ())
     rows = [*follower.in_continuous_time(), *(row for name in engines for row in _in_simulator(follower, name))]
     return solution.told(cross_checks=tuple(rows), options=solution.options | {"cross_check": list(engines)})
 
 
-def _in_simulator(follower: "Follower", name: str) -> list[Replay]:
+def _in_simulator(follower: "PlanFollower", name: str) -> list[Replay]:
     plan, parts = follower.plan, max(1, math.ceil(follower.period / LONGEST - 1e-9))
     try:
         if not np.array_equal(plan.vector.values, select(plan.problem.model, plan.vector.names).values):
@@ -109,7 +109,7 @@ def _in_simulator(follower: "Follower", name: str) -> list[Replay]:
     return [missing_replay(plan, f"in {name}", FEEDBACK if plan.problem.model.nu else OPEN_LOOP, why)]
 
 
-def replays_in(follower: "Follower", engine: Engine) -> list[Replay]:
+def replays_in(follower: "PlanFollower", engine: Engine) -> list[Replay]:
     """A plan in a simulator; what its contract has otherwise than Drake's is a check that fails."""
     model = follower.plan.problem.model
     touch = bool(model.contract.contact.collision_pairs)
@@ -129,17 +129,19 @@ class _Moved:
     penetration: Array
 
 
-Mover = Callable[[Policy], tuple[Motion, list[Check]]]  # a motion under a law, and what is checked of it besides
+Mover = Callable[
+    [Policy], tuple[MeasuredMotion, list[Check]]
+]  # a motion under a law, and what is checked of it besides
 
 
-class Follower:
+class PlanFollower:
     """Follows a plan with the feedback of its own steps in other plants.
 
     `period` [s] is the step of the plan's own controller, and `parts` how many of them an interval of the plan has: of
     a collocated one, whose intervals need not be steps, the first in which it has to hold (by its replays `known`).
     """
 
-    def __init__(self, plan: Plan, known: Sequence[Replay] = ()):
+    def __init__(self, plan: ReplayPlan, known: Sequence[Replay] = ()):
         self.plan, self.parts = plan, 1
         if plan.continuous and plan.problem.motion != CONTINUOUS:
             known = known or replays(plan)
@@ -153,7 +155,7 @@ class Follower:
     def in_continuous_time(self) -> list[Replay]:
         """In the continuous time that Drake's steps stand for, by error control; in short steps where it has none."""
 
-        def move(law: Policy) -> tuple[Motion, list[Check]]:
+        def move(law: Policy) -> tuple[MeasuredMotion, list[Check]]:
             model = self.plan.model_at(self.parts)
             with applied(select(model, self.plan.vector.to_dict())) as set_model:
                 motion = replayed(
@@ -171,7 +173,7 @@ class Follower:
         return short if any(row.motion is not None for row in short) else rows
 
     def _steps(self, parts: int) -> Mover:
-        def move(law: Policy) -> tuple[Motion, list[Check]]:
+        def move(law: Policy) -> tuple[MeasuredMotion, list[Check]]:
             model = self.plan.model_at(self.parts * parts)
             with applied(select(model, self.plan.vector.to_dict())) as set_model:
                 motion = rollout(set_model, self.xs[0], policy=law, num_steps=parts * len(self.us))
@@ -190,7 +192,7 @@ class Follower:
         if not parts or abs(parts * time_step - self.period) > 1e-9 * self.period:
             raise InputError("time_step [s]", got=time_step, expected=f"a whole part of {self.period:.12g}")
 
-        def move(law: Policy) -> tuple[Motion, list[Check]]:
+        def move(law: Policy) -> tuple[MeasuredMotion, list[Check]]:
             count, checks = parts * len(self.us), list(unlike)
             xs, us = np.full((count + 1, self.xs.shape[1]), np.nan), np.zeros((count, self.us.shape[1]))
             xs[0] = self.xs[0]
@@ -231,7 +233,7 @@ class Follower:
                 break
         return rows
 
-    def _end_check(self, motion: Motion, wider: float) -> Iterator[Check]:
+    def _end_check(self, motion: MeasuredMotion, wider: float) -> Iterator[Check]:
         """How far the last state is from the plan's, of a problem that asks nothing of it."""
         problem, planned = self.plan.problem, self.plan.sample(1)[0][-1]
         asked = [c for c in problem.kept_goals if not isinstance(c, ClearanceConstraint)]

@@ -26,7 +26,7 @@ CONTROLS = {"open loop": "Inputs alone (open loop)", "TVLQR": "With feedback (TV
 
 
 @dataclass(frozen=True)
-class Check:
+class PageCheck:
     """One thing that was checked: its `title`, its `kind`, and what was found in words.
 
     The kind is "pass", "fail", "undecided", "info", or "warn" where something fails that the verdict does not rest on.
@@ -37,18 +37,18 @@ class Check:
     text: str
 
 
-def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[Check]:
+def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[PageCheck]:
     """What was checked of a run, in the order in which it was."""
     status, count = m.solution.status, record["solver"]["iterations"]
     rounds = f"{count} iteration{'s' * (count != 1)} of {record['solver']['solver']}"
     ended = "stopped at a solution" if status is Status.CONVERGED_NOT_VERIFIED else status.value.replace("_", " ")
     stopped = status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
-    result = [Check("Solver", "pass" if stopped else "fail", f"{ended} after {rounds}")]
+    result = [PageCheck("Solver", "pass" if stopped else "fail", f"{ended} after {rounds}")]
     decided = [m for m in (*record["metrics"], *record["invariants"]) if m["verdict"] != "info"]
     broken = [m["name"] for m in decided if m["verdict"] != "pass"]
     failed = any(m["verdict"] == "fail" for m in decided)
     text = f"not kept: {joined(broken)}" if broken else f"all {len(decided)} bounds are kept"
-    result.append(Check("Plan", "fail" if failed else "undecided" if broken else "pass", text))
+    result.append(PageCheck("Plan", "fail" if failed else "undecided" if broken else "pass", text))
     result += _of_replays(m, record["replays"])
     certificates = record["gradient"]["certificates"]
     agree = sum(c["verdict"] == "agree" for c in certificates)
@@ -59,11 +59,11 @@ def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[Check]:
             "pass",
             "that of the end is a slope of another integration",
         )  # else the plan is none
-    result.append(Check("Gradients", kind, content))
+    result.append(PageCheck("Gradients", kind, content))
     return result
 
 
-def _of_replays(m: Measurement, replays: Sequence[Mapping[str, Any]]) -> Iterator[Check]:
+def _of_replays(m: Measurement, replays: Sequence[Mapping[str, Any]]) -> Iterator[PageCheck]:
     judged = m.solution.judged_replay
     failed = judged is None and not m.solution.success  # each replay may hold by one of the two, and neither by both
     for control in dict.fromkeys(r["control"] for r in replays):
@@ -77,7 +77,7 @@ def _of_replays(m: Measurement, replays: Sequence[Mapping[str, Any]]) -> Iterato
             text = f"holds in {len(tried) - len(lost)} of {len(tried)} replays; {lost[0]['variant']}: "
             text += lost[0]["failures"][0] if lost[0]["failures"] else "it fails"
         kind = "pass" if enough or not lost else "fail" if failed else "warn"
-        yield Check(CONTROLS.get(control, control), kind, text)
+        yield PageCheck(CONTROLS.get(control, control), kind, text)
 
 
 SERIES_PER_PLOT = 6  # more lines cannot be told apart

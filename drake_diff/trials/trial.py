@@ -32,7 +32,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.replay import (
-    Plan,
+    ReplayPlan,
     bounds_check,
     clearance_checks,
     finest_parts,
@@ -48,7 +48,7 @@ MPC_HORIZON = 20  # steps
 RAISED: Mapping[str, Label] = {
     "sensor": "perception_error", "estimator": "state_error", "controller": "control_error"
 }  # fmt: skip
-MakeController = Callable[[Plan, Model, Array, Array], Controller]
+MakeController = Callable[[ReplayPlan, Model, Array, Array], Controller]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class Task:
     ... 64ths in which the unperturbed run succeeds. It is the interval itself where none does, and for MPC.
     """
 
-    def __init__(self, plan: Plan, controller: str | MPC | MakeController = "tvlqr", loop: Loop | None = None):
+    def __init__(self, plan: ReplayPlan, controller: str | MPC | MakeController = "tvlqr", loop: Loop | None = None):
         if isinstance(controller, str) and controller not in CONTROLLERS:
             raise UnknownNameError("controller", got=controller, known=CONTROLLERS)
         self.plan, self.controller, self.loop = plan, controller, loop or Loop()

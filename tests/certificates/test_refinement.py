@@ -8,7 +8,7 @@ from helpers.table import each_row
 from pydrake.multibody.tree import PdControllerGains
 
 import drake_diff as dd
-from drake_diff.certificates.displaced import Line
+from drake_diff.certificates.displaced import DisplacedDirection
 from drake_diff.certificates.truth import TrueSlope, Truth, beside_truth, judge_levels
 from drake_diff.exceptions import CertificateError, InputError, ModelError, SimulationError
 from drake_diff.motion.continuous import ContinuousMotion
@@ -131,7 +131,7 @@ def test_a_gradient_of_one_is_compared_with_the_slope_of_the_motion(case):
     known = {"value": slope[0], "error": slope[1]} if slope else {}
     exists = None if slope == () else slope is not None
     truth = Truth("Kelvin-Voigt", 0.0, 0.0, 0.0, (TrueSlope("z", (0,), 1.0, exists=exists, **known),), 1.0, touches)
-    line = Line("z", np.array([0]), 1.0, np.ones(1), 1.0)
+    line = DisplacedDirection("z", np.array([0]), 1.0, np.ones(1), 1.0)
     found = beside_truth(levels, [line], truth, touches=touches)
     assert found.converged.all() == converges
     assert found.apart == (() if converges else ("z",))

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.identification import Identification, write_model
-from drake_diff.identification.results import Asked
+from drake_diff.identification.results import Request
 
 ARM = """<?xml version="1.0"?>
 <!-- an arm -- of one link -->
@@ -45,7 +45,7 @@ def saying(model, values, *, file=None, explained=True):
         unidentifiable=(), explained=explained, reason="", sentence="Explained: so -- it is -->.", noise={},
         error_before=2.0, error_after=1.0, residuals=(), entries=(), columns=(), covariance=np.eye(count), score=0.0,
         count=9, converged=True, steps=1, motion="continuous time", motions=(),
-        asked=Asked(model, (recording,), (file,), tuple(values), {}, 0.2, "auto", 60),
+        asked=Request(model, (recording,), (file,), tuple(values), {}, 0.2, "auto", 60),
     )  # fmt: skip
 
 

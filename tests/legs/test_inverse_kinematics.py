@@ -6,7 +6,7 @@ from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.legs.feet import Legs
-from drake_diff.legs.inverse_kinematics import Target, Wish, inverse_kinematics
+from drake_diff.legs.inverse_kinematics import PointTarget, Wish, inverse_kinematics
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 
@@ -29,7 +29,7 @@ def arm(tmp_path, more=""):
 
 
 def solve(model, frame, point, position, first, tolerance=1e-8):
-    target = Target(model.double.plant.GetFrameByName(frame), point, position, tolerance)
+    target = PointTarget(model.double.plant.GetFrameByName(frame), point, position, tolerance)
     limits = np.full(model.nq, 3.0)
     return inverse_kinematics(model, first, [target], Wish(first, np.ones(model.nv)), -limits, limits)
 

@@ -10,7 +10,7 @@ from helpers.models import robot_file
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.derivatives.analytic import Reduced
+from drake_diff.derivatives.analytic import ReducedStep
 from drake_diff.exceptions import GradientError, ModelError, ModelWarning
 from drake_diff.mechanics.description import describe
 from drake_diff.model.plant import actuators
@@ -363,11 +363,11 @@ def test_steps_of_reduced_robots_have_the_derivative_of_their_own_equation(name)
 def test_a_wrong_way_back_from_the_whole_plant_is_refused(monkeypatch):
     """By a hundred thousandth."""
     model = dd.load_model(robot_file("panda.urdf"), time_step=0.02, actuators="all", mimic="reduce", contact=False)
-    right = Reduced.jacobians
+    right = ReducedStep.jacobians
 
     def wrong(self, steps, whole, of_whole):
         return right(self, steps, whole, of_whole) * 1.00001
 
-    monkeypatch.setattr(Reduced, "jacobians", wrong)
+    monkeypatch.setattr(ReducedStep, "jacobians", wrong)
     with pytest.raises(GradientError, match="differs from AutoDiffXd's"):
         dd.differentiate_step(model, model.default_state, np.ones(model.nu), method="analytic")

@@ -15,7 +15,7 @@ from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.mechanics.casadi_tree import symbolic_plant
 from drake_diff.model.parameters import ParameterCoordinates, applied, select
 from drake_diff.optimize import Options
-from drake_diff.optimize.problem.dynamics import Moved, plant_dynamics
+from drake_diff.optimize.problem.dynamics import MovedDynamics, plant_dynamics
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.optimize.transcription.program import TranscribedProgram
 
@@ -64,7 +64,7 @@ def test_an_expression_of_parameters_and_its_derivatives_are_drakes(name):
     coordinates = ParameterCoordinates(vector)
     plant = symbolic_plant(model, vector, coordinates)
     assert not isinstance(plant, Refusal), plant
-    moved = Moved(plant_dynamics(model, vector), coordinates)
+    moved = MovedDynamics(plant_dynamics(model, vector), coordinates)
     start = coordinates.from_values(np.array(vector.values))
     width = model.nx + model.nu + len(start)
     knot, weights = ca.SX.sym("knot", width), random.standard_normal(model.nx)

@@ -20,7 +20,7 @@ from drake_diff.engines.load import load_engine
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.runs import cross_check
-from drake_diff.runs.cross_check import Follower, replays_in
+from drake_diff.runs.cross_check import PlanFollower, replays_in
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.verify import verify_own
 
@@ -102,7 +102,7 @@ def test_a_slide_ends_where_friction_says_in_every_plant(tmp_path):
 def test_a_simulator_with_a_number_that_is_20_percent_off_is_told(tmp_path, quantity, speed, ends):
     """Friction of 0.8 mu lets it slide 1 / 0.8 times as far; its mass does not matter to where it stops."""
     solution, distance = slide(tmp_path, speed)
-    follower, model = Follower(solution.plan), solution.problem.model
+    follower, model = PlanFollower(solution.plan), solution.problem.model
     path = tmp_path / "other.xml"
     text = load_engine("mujoco", model, time_step=0.001).mjcf
     change = {
@@ -193,7 +193,7 @@ def test_bad_input_is_refused(write_urdf):
             cross_check(wrong)
     engine = load_engine("mujoco", solution.problem.model, time_step=0.03)
     with pytest.raises(InputError, match=r"a whole part of 0\.05"):
-        replays_in(Follower(solution.plan), engine)
+        replays_in(PlanFollower(solution.plan), engine)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from drake_diff.optimize import Options
 from drake_diff.optimize.replay import (
     FEEDBACK_TOLERANCE,
     STATE_TOLERANCE,
-    Plan,
+    ReplayPlan,
     broken_variants,
     held,
     replays,
@@ -38,7 +38,7 @@ def plan_of(problem, us):
     """The plan that the plant's own steps make of `us`."""
     us = np.asarray(us, dtype=float)
     xs = dd.rollout(problem.model, problem.x0, us).xs if problem.model.nu else None
-    return Plan(problem, select(problem.model, ()), problem.model.time_step, held(xs, us), continuous=False)
+    return ReplayPlan(problem, select(problem.model, ()), problem.model.time_step, held(xs, us), continuous=False)
 
 
 def by_name(found, variant, control):
@@ -175,7 +175,7 @@ def test_a_deep_overlap_is_told_and_another_approximation_is_tried(tmp_path):
     problem = dd.Problem(model, x0=[0.1, 0], num_steps=300, final_cost=lambda x: x[0], optimize="initial_state")
     us = np.zeros((300, 0))
     xs = dd.rollout(model, [0.1, 0], num_steps=300).xs
-    found = replays(Plan(problem, select(model, ()), 0.002, held(xs, us), continuous=False))
+    found = replays(ReplayPlan(problem, select(model, ()), 0.002, held(xs, us), continuous=False))
     steps = [f"in steps of {h:g} s" for h in (0.002, 0.001, 0.00025)]
     assert [r.variant for r in found] == [*steps, "with lagged contact"]
     assert found[3].approximation == "lagged"
@@ -206,7 +206,7 @@ def test_a_plan_that_lives_from_one_law_of_contact_is_refused_in_the_other_in_fi
     fall = dd.Problem(model, x0=[0.15, 0], num_steps=100, x_goal=[0.1, math.nan], optimize="initial_state")
     us = np.zeros((100, 0))
     xs = dd.rollout(model, [0.15, 0], num_steps=100).xs
-    plan = Plan(fall, select(model, ()), 0.002, held(xs, us), continuous=False)
+    plan = ReplayPlan(fall, select(model, ()), 0.002, held(xs, us), continuous=False)
     found = replays(plan)
     other = ["with lagged contact", "with lagged contact in steps of 0.00025 s"]
     assert [(r.variant, r.holds) for r in found[-2:]] == [(name, False) for name in other]
@@ -219,7 +219,7 @@ def test_a_plan_that_lives_from_one_law_of_contact_is_refused_in_the_other_in_fi
 def test_inputs_that_cannot_be_stepped_are_missing_not_zero(write_urdf):
     problem = block(write_urdf, final_cost=lambda x: x[0])
     us = np.full((COUNT, 1), np.nan)
-    plan = Plan(problem, select(problem.model, ()), H, held(np.zeros((COUNT + 1, 2)), us), continuous=False)
+    plan = ReplayPlan(problem, select(problem.model, ()), H, held(np.zeros((COUNT + 1, 2)), us), continuous=False)
     assert plan.open_loop is None
     for replay in replays(plan):
         assert replay.motion is None
@@ -248,7 +248,7 @@ def test_a_frame_that_has_to_be_exact_is_replayed_in_steps_that_are_fine_enough_
         times = np.linspace(0, 1, 10 * parts + 1)
         return np.column_stack([times**2, 2 * times]), np.full((10 * parts, 1), 2.0)
 
-    plan = Plan(problem, select(problem.model, ()), 0.1, sample, continuous=True)
+    plan = ReplayPlan(problem, select(problem.model, ()), 0.1, sample, continuous=True)
     found = replays(plan)
     for parts in (1, 2, 4, 8, 16, 32, 64):
         replay = by_name(found, f"in steps of {0.1 / parts:.4g} s", "open loop")

@@ -13,7 +13,7 @@ import drake_diff as dd
 from drake_diff.comparison import save_comparison
 from drake_diff.pages import html
 from drake_diff.pages.html import write_page
-from drake_diff.runs.page import Check
+from drake_diff.runs.page import PageCheck
 from drake_diff.runs.verify import recalled
 from drake_diff.trials import save_robustness
 
@@ -28,8 +28,8 @@ def poisoned(value, key=""):
     """`value` with EVIL at the end of every text in it."""
     if isinstance(value, dict):
         return {k + EVIL if key in NAMED else k: v if k in OURS else poisoned(v, k) for k, v in value.items()}
-    if isinstance(value, Check):
-        return Check(value.title + EVIL, value.kind, value.text + EVIL)
+    if isinstance(value, PageCheck):
+        return PageCheck(value.title + EVIL, value.kind, value.text + EVIL)
     if isinstance(value, tuple) and key == "colours":
         return (*value[:2], value[2] + EVIL)
     if isinstance(value, list):

@@ -313,7 +313,7 @@ class DiscreteMap(Dynamics):
             yield int(k), np.flatnonzero(every == k)
 
 
-class Moved:
+class MovedDynamics:
     """x' = f(x, u, p) at knots [x, u, c], c (np,) the coordinates in which a solver moves the parameters."""
 
     def __init__(self, dynamics: Dynamics, coordinates: ParameterCoordinates):

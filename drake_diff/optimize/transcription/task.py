@@ -27,7 +27,7 @@ from drake_diff.model.parameters import ParameterCoordinates
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, TimedCost, differentiate_cost
 from drake_diff.optimize.problem.coupling import BoundCoupling
-from drake_diff.optimize.problem.dynamics import DiscreteMap, Moved, Pointwise
+from drake_diff.optimize.problem.dynamics import DiscreteMap, MovedDynamics, Pointwise
 from drake_diff.optimize.problem.problem import Problem
 
 
@@ -178,10 +178,10 @@ class OptimalControl:
         self.is_map = scheme == MAP
         self.dynamics, self.bounds = problem.dynamics, problem.bounds
         self.horizon: tuple[float, float] = problem.horizon or (problem.start_horizon,) * 2  # (lower, upper) [s]
-        self.varied: Moved | None = None
+        self.varied: MovedDynamics | None = None
         self.parameter_cost: Pointwise | None = None
         if problem.optimizes_parameters:
-            self.varied = Moved(self.dynamics, ParameterCoordinates(problem.parameters))
+            self.varied = MovedDynamics(self.dynamics, ParameterCoordinates(problem.parameters))
             of_values = problem.parameter_cost
             if of_values is not None:
                 probe = self.varied.probe()[:, self.varied.width :]
