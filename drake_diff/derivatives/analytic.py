@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.autodiffutils import InitializeAutoDiff
 
 from drake_diff._base.arrays import Array
@@ -25,8 +24,8 @@ from drake_diff.derivatives.smooth_step import (
     differentiate_equation,
     form_of,
 )
-from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, Steps, take_steps
-from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
+from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, Steps, Trial, take_steps
+from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
 from drake_diff.mechanics.tree import CompiledTree, compiled_tree
@@ -45,6 +44,8 @@ SAME_END = 1e-10  # of x' with reduced joints: both are of Drake's own step, pro
 SAME_STEP = 1e-12  # of the largest entry of x' (or 1): the same positions, summed in another order
 CERTIFIED_STATES, STATES_TRIED = 3, 60
 FAR = 4.0  # [m or rad]
+ACTS = "contact, a limit or a constraint acts"
+BESIDE = "something else acts beside contact, joint limits and couplers"
 Led = Callable[[int, Array], Array | None]  # the Jacobian of a step, by its own equation, were x' its end
 DIFFERS, STEP_DIFFERENCES = "its Jacobian with impulses differs from", "the differences of the step solved to rounding"
 
@@ -59,7 +60,7 @@ class Analytic:
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
         """All in one call."""
-        parameters = steps.vector.parameters
+        parameters, count = steps.vector.parameters, steps.model.nx + steps.model.nu
         if parameters and any(p.kind.quantity not in QUANTITIES for p in parameters):
             return Refusal("derivatives by parameters other than of contact are asked for")
         if steps.model.coupling is not None:
@@ -67,29 +68,23 @@ class Analytic:
         smooth = analytic_of(steps.model)
         if isinstance(smooth, Refusal):
             return smooth
-        if not parameters and not steps.some_touch and not steps.model.num_constraints:
-            values, known = smooth(steps)
-            if np.count_nonzero(known) == len(known):  # as a rule; of one step in half the time of what follows
-                return Jacobians(values, {})
         impulsive = steps.touching | (steps.model.num_constraints > 0)
         free = np.flatnonzero(~impulsive)
         if len(free) == len(steps) and not parameters:
             values, known = smooth(steps)
+            if np.count_nonzero(known) == len(known):  # as a rule
+                return Jacobians(values, {})
         else:
             values, known = np.zeros((len(steps), steps.model.nx, steps.width)), np.zeros(len(steps), dtype=bool)
             if len(free):
-                values[free, :, : steps.model.nx + steps.model.nu], known[free] = smooth(steps.subset(free))
-        refused = _refusals(known, free, "contact, a limit or a constraint acts")
-        notes: dict[int, str] = {}
-        if np.count_nonzero(known) == len(known):
-            return Jacobians(values, refused, notes)
-        left = np.flatnonzero(~known & (impulsive | smooth.at_a_limit(steps)))
-        if len(left):
-            why, of_steps = _with_impulses(smooth, steps, left, values, known, notes)
-            why = why or "something else acts beside contact, joint limits and couplers"
-            refused = {k: e for k, e in refused.items() if not known[k]} | _refusals(known, left, why)
-            refused |= {k: NotSmoothError(of_step) for k, of_step in of_steps.items() if not known[k]}
-        return Jacobians(values, refused, notes)
+                values[free, :, :count], known[free] = smooth(steps.subset(free))
+        answer = Jacobians(values, {int(k): NotSmoothError(ACTS) for k in np.flatnonzero(~known)}, {})
+        pushed = ~known & (impulsive | smooth.at_a_limit(steps))
+        for touch in (True, False):
+            which = np.flatnonzero(pushed & (steps.touching == touch))
+            if len(which):
+                answer.put(which, _with_impulses(smooth, steps.subset(which), touch))
+        return answer
 
     def _of_reduced(self, steps: Steps, coupling: JointCoupling) -> Jacobians | Refusal:
         """Where mimic joints are reduced: from the whole plant's."""
@@ -106,17 +101,13 @@ class Analytic:
             return of_whole
         values, refused = reduced.jacobians(steps, whole, of_whole.values), dict(of_whole.refused)
         refused |= {int(k): NotSmoothError("it leads elsewhere") for k in np.flatnonzero(~same)}
-        trial = model.cache("trial of reduced steps", _Trial, of_structure=True)
+        trial = model.cache("trial of reduced steps", lambda: Trial(CERTIFIED_STATES), of_structure=True)
         for k in range(len(steps)):
             if k not in refused:
-                _certify(steps, k, values[k], [trial] if trial.left and not trial.refusal else [], iterated=False)
+                _certify(steps, k, values[k], [trial], iterated=False)
                 if trial.refusal:
                     return Refusal(trial.refusal)
         return Jacobians(values, refused, of_whole.notes)
-
-
-def _refusals(known: Flags, which: NDArray[np.intp], why: str) -> dict[int, DrakeDiffError]:
-    return {int(k): NotSmoothError(why) for k in which[~known[which]]}
 
 
 def analytic_of(model: Model) -> SmoothStep | Refusal:
@@ -198,55 +189,8 @@ def _random_point(model: Model, coordinates: Coordinates, random: np.random.Gene
     return np.concatenate([q, random.standard_normal(model.nv)]), random.uniform(-0.5, 0.5, model.nu) * limit
 
 
-@dataclass
-class _Trial:
-    """How many steps with one kind of impulses are still to be certified, or why none is known so."""
-
-    left: int = CERTIFIED_STATES
-    refusal: str = ""
-    note: str = ""  # by what they were certified where AutoDiffXd takes no such step
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether nothing is left to do or to say."""
-        return not (self.left or self.refusal or self.note)
-
-
-@dataclass
-class _WithImpulses:
-    """Of the steps of a part of N in which impulses act."""
-
-    values: Array  # (N, nx, nx + nu + np)
-    known: Flags  # (N,)
-    notes: dict[int, str]
-    refused: dict[int, str]
-
-
-def _with_impulses(
-    smooth: SmoothStep, steps: Steps, which: NDArray[np.intp], values: Array, known: Flags, notes: dict[int, str]
-) -> tuple[str, dict[int, str]]:
-    """Put the Jacobians of `which` (K,) of the N steps, in which impulses act, into `values`, and which are `known`.
-
-    The answer is why none with contact, or none at joint limits alone, is known, empty where the steps themselves say
-    it; and of single steps why.
-    """
-    whys: list[str] = []
-    refused: dict[int, str] = {}
-    for touch in (True, False):
-        subset = which[steps.touching[which] == touch]
-        if len(subset):
-            certified_steps = _certified_impulses(smooth, steps.subset(subset), touch)
-            if isinstance(certified_steps, Refusal):
-                whys.append(certified_steps.reason)
-            else:
-                values[subset], known[subset] = certified_steps.values, certified_steps.known
-                notes |= {int(subset[k]): note for k, note in certified_steps.notes.items()}
-                refused |= {int(subset[k]): why for k, why in certified_steps.refused.items()}
-    return "; ".join(dict.fromkeys(whys)), refused
-
-
-def _certified_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> _WithImpulses | Refusal:
-    """Of N steps, all with contact or all without."""
+def _with_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> Jacobians | Refusal:
+    """Of N steps in which impulses act, all with contact or all without."""
     model, vector = steps.model, steps.vector
     form = contact_form(model, smooth)
     if isinstance(form, Refusal):
@@ -255,46 +199,39 @@ def _certified_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> _WithI
         return Refusal(form.unknown)
     material = material_of(model, form)
     change = material_change(form.pairs, material, vector, model.double) if vector.parameters else None
-    values, known, refused, placed = contact_jacobians(form, smooth, steps, material, change)
-    result = _WithImpulses(values, known, {}, refused)
-    trials: dict[str, _Trial] = model.cache("impulse trials", dict, of_structure=True)
+    values, known, whys, placed = contact_jacobians(form, smooth, steps, material, change)
+    trials: dict[str, Trial] = model.cache("impulse trials", dict, of_structure=True)
     kinds = form.pairs.kinds(placed, len(steps)) if touch else [{JOINT_LIMITS}] * len(steps)
+    notes: dict[int, str] = {}
 
     def led(k: int, x_next: Array) -> Array | None:
-        single = steps.subset(np.array([k])) if len(steps) > 1 else steps
-        jacobians, known, *_ = contact_jacobians(form, smooth, replace(single, x_next=x_next[None]), material, change)
-        return jacobians[0] if known[0] else None
+        single = replace(steps.subset(np.array([k])), x_next=x_next[None])
+        jacobians, is_known, *_ = contact_jacobians(form, smooth, single, material, change)
+        return jacobians[0] if is_known[0] else None
 
-    for k in np.flatnonzero(result.known):
-        of_step = [trials.setdefault(kind, _Trial()) for kind in sorted(kinds[k])]
-        if all(trial.is_settled for trial in of_step):
-            continue
-        _certify(
-            steps,
-            int(k),
-            result.values[k],
-            [trial for trial in of_step if trial.left and not trial.refusal],
-            led,
-            iterated=any(map(is_iterated, kinds[k])),
-        )
-        why, note = (
-            "; ".join(dict.fromkeys(filter(None, (getattr(t, attribute) for t in of_step))))
-            for attribute in ("refusal", "note")
-        )
-        if why:
-            result.known[k], result.refused[int(k)] = False, why
+    for k in np.flatnonzero(known).tolist():
+        of_step = [trials.setdefault(kind, Trial(CERTIFIED_STATES)) for kind in sorted(kinds[k])]
+        _certify(steps, k, values[k], of_step, led, iterated=any(map(is_iterated, kinds[k])))
+        refusal, note = (_joined([getattr(t, name) for t in of_step]) for name in ("refusal", "note"))
+        if refusal:
+            whys[k] = refusal
         elif note:
-            result.notes[int(k)] = note
-    return result
+            notes[k] = note
+    whys = dict.fromkeys(np.flatnonzero(~known).tolist(), BESIDE) | whys
+    return Jacobians(values, {k: NotSmoothError(why) for k, why in whys.items()}, notes)
+
+
+def _joined(texts: list[str]) -> str:
+    return "; ".join(dict.fromkeys(filter(None, texts)))
 
 
 def _certify(
-    steps: Steps, k: int, jacobian: Array, trials: list[_Trial], led: Led | None = None, *, iterated: bool
+    steps: Steps, k: int, jacobian: Array, trials: list[Trial], led: Led | None = None, *, iterated: bool
 ) -> None:
     """Compare a step's Jacobian for the trials that are still open."""
-    if trials:
+    if still_open := [trial for trial in trials if trial.left and not trial.refusal]:
         refusal, note = _other_jacobian(steps, k, jacobian, led, iterated=iterated)
-        for trial in trials:
+        for trial in still_open:
             trial.refusal, trial.note, trial.left = refusal, note, trial.left - 1
 
 
@@ -332,22 +269,20 @@ def _unlike_differences(steps: Steps, k: int, jacobian: Array, led: Led | None, 
         central = (forward + backward) / 2
         if _gap(jacobian, central) <= SAME_DIFFERENCES:
             return "", f"with impulses equal to {STEP_DIFFERENCES}, as AutoDiffXd takes no such step"
-        if led is not None and solved is None:
-            solved = led(k, here)
-        if (
-            solved is not None
-            and _gap(jacobian, solved) <= SAME_WHERE_STOPPED
-            and _gap(solved, central) <= SAME_DIFFERENCES
-        ):
+        solved = led(k, here) if led is not None and solved is None else solved
+        ends = (
+            np.inf
+            if solved is None
+            else max(_gap(jacobian, solved) / SAME_WHERE_STOPPED, _gap(solved, central) / SAME_DIFFERENCES)
+        )
+        if ends <= 1:
             return "", f"with impulses equal to {STEP_DIFFERENCES}, but for where Drake's solver stops"
         mine = jacobian[:, : central.shape[1]]
         gaps += [np.abs(mine - side).max(axis=0) / np.abs(mine).max() for side in (forward, backward, central)]
     gap = float(np.max(np.min(gaps, axis=0)))
     if iterated and gap <= SAME_WHERE_ITERATED:
-        return (
-            "",
-            f"with impulses within {SAME_WHERE_ITERATED:g} of {STEP_DIFFERENCES}, as Drake iterates to the contact",
-        )
+        note = f"with impulses within {SAME_WHERE_ITERATED:g} of {STEP_DIFFERENCES}, as Drake iterates to the contact"
+        return "", note
     return f"{DIFFERS} {STEP_DIFFERENCES} by {gap:.2g} of its largest entry", ""
 
 
@@ -367,11 +302,8 @@ def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array, Arra
     for why in refined.refused.values():
         return why
     here = refined.x_next[-1]
-    return (
-        np.asarray(((refined.x_next[:count] - here) / size[:, None]).T),
-        np.asarray(((here - refined.x_next[count:-1]) / size[:, None]).T),
-        here,
-    )
+    forward, backward = refined.x_next[:count] - here, here - refined.x_next[count:-1]
+    return np.asarray((forward / size[:, None]).T), np.asarray((backward / size[:, None]).T), here
 
 
 @dataclass(frozen=True, eq=False)

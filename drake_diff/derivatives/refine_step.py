@@ -19,8 +19,9 @@ where A (v' - v*) = sum_c J_c' g_c(J_c v'), g_c = -dl_c / d(J_c v') being the im
 the minimum of l, of which it needs the slope alone.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -55,22 +56,32 @@ BISECTIONS = 30
 
 @dataclass(frozen=True, eq=False)
 class ContactImpulses:
-    """C contacts in each of N problems; where a problem has fewer, the Jacobians of the others are 0."""
+    """M contacts of N problems, those of one problem side by side."""
 
-    jacobian: Array  # (N, C, nv, 3) J'
-    law: ContactLaw  # of N C contacts
+    problem: Indices  # (M,)
+    jacobian: Array  # (M, nv, 3) J'
+    law: ContactLaw
 
     def subset(self, which: Indices) -> "ContactImpulses":
-        """Those of some of the problems."""
-        count = self.jacobian.shape[1]
-        rows = (which[:, None] * count + np.arange(count)).ravel()
-        return ContactImpulses(self.jacobian[which], self.law.subset(rows))
+        """Those of some of the problems, in ascending order."""
+        chosen = np.flatnonzero(np.isin(self.problem, which))
+        problem = np.searchsorted(which, self.problem[chosen])
+        return ContactImpulses(problem, self.jacobian[chosen], self.law.subset(chosen))
+
+    def sums(self, values: Array, count: int) -> Array:
+        """(count, ...) the sums of values (M, ...) over the contacts of each problem."""
+        total = np.zeros((count, *values.shape[1:]))
+        if len(values):
+            first = np.flatnonzero(np.diff(self.problem, prepend=-1))
+            total[self.problem[first]] = np.add.reduceat(values, first)
+        return total
 
     def evaluate(self, v: Array) -> tuple[Array, Array]:
-        """The impulses (N, C, 3) at the velocities v (N, nv), and their derivatives (N, C, 3, 3) by -J v'."""
-        shape = self.jacobian.shape[:2]
-        impulse, slope = self.law.impulses((v[:, None, None, :] @ self.jacobian)[:, :, 0].reshape(-1, 3))
-        return impulse.reshape(*shape, 3), -slope.reshape(*shape, 3, 3)
+        """J' g (N, nv) at the velocities v (N, nv), and the derivative of -J' g by them (N, nv, nv)."""
+        J = self.jacobian
+        impulse, slope = self.law.impulses((v[self.problem][:, None, :] @ J)[:, 0])
+        push, stiffness = (J @ impulse[..., None])[..., 0], -J @ slope @ J.swapaxes(-1, -2)
+        return self.sums(push, len(v)), self.sums(stiffness, len(v))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,31 +99,26 @@ class ConvexSteps:
 
     A: Array  # (N, nv, nv)
     momentum: Array  # (N, nv) A v*, which is better known than v* where A is ill conditioned
-    contacts: ContactImpulses | None
+    contacts: ContactImpulses
     joints: JointImpulses
     same_tree: NDArray[np.bool_]  # (nv, nv)
 
     def subset(self, which: Indices) -> "ConvexSteps":
         """Some of the problems."""
-        contacts = None if self.contacts is None else self.contacts.subset(which)
-        return ConvexSteps(self.A[which], self.momentum[which], contacts, self.joints.subset(which), self.same_tree)
+        contacts, joints = self.contacts.subset(which), self.joints.subset(which)
+        return ConvexSteps(self.A[which], self.momentum[which], contacts, joints, self.same_tree)
 
     def taking_part(self) -> NDArray[np.bool_]:
         """(N, nv) the degrees of freedom of the trees that an impulse may reach, which Drake solves for."""
-        reached = self.joints.reach()
-        if self.contacts is not None:
-            reached = reached | (self.contacts.jacobian != 0).any(axis=(1, 3))
-        return np.asarray(reached @ self.same_tree)
+        by_contacts = self.contacts.sums((self.contacts.jacobian != 0).any(axis=2).astype(float), len(self.A)) > 0
+        return np.asarray((self.joints.reach() | by_contacts) @ self.same_tree)
 
     def evaluate(self, v: Array) -> Balance:
         """The balance at v (N, nv)."""
         j, (pull, stiffness) = self.joints.direction, self.joints.evaluate(v)
-        given = (j.T @ pull[..., None])[..., 0]
-        curvature = self.A + j.T @ (stiffness[..., None] * j)
-        if self.contacts is not None:  # sums over the contacts one by one, however many there are of other problems
-            J, (impulse, slope) = self.contacts.jacobian, self.contacts.evaluate(v)
-            given += (J @ impulse[..., None])[..., 0].sum(axis=1)
-            curvature += (J @ slope @ J.swapaxes(-1, -2)).sum(axis=1)
+        by_contacts, curvature = self.contacts.evaluate(v)
+        given = (j.T @ pull[..., None])[..., 0] + by_contacts
+        curvature += self.A + j.T @ (stiffness[..., None] * j)
         had = (self.A @ v[..., None])[..., 0]
         return Balance(had - self.momentum - given, given, curvature)
 
@@ -179,7 +185,7 @@ AT_REST = 1e-14 / SAP_RELATIVE_TOLERANCE  # [J^1/2] 1e-14 is its absolute tolera
 FREE_STEP = 1e-9  # of the momentum: what no impulse reaches is not solved for, so that only rounding is left
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class RefinedSteps:
     """N steps solved to rounding; those that are refused hold NaN."""
 
@@ -188,11 +194,28 @@ class RefinedSteps:
     acts: NDArray[np.bool_]  # (N,) whether an impulse may act, so that Drake's solver has something to solve
     left: Array  # (N,) what Drake's own leaves of the momentum, which is to be at most 1e-6; NaN where not known
     missing: Array  # (N, nv) that, as a momentum, of the whole plant
-    refused: Mapping[int, Refusal]
+    refused: dict[int, Refusal] = field(default_factory=dict)
+
+    @classmethod
+    def unknown(cls, xs: Array, nv: int) -> "RefinedSteps":
+        """Steps from xs (N, nx) of which nothing is known yet."""
+        unknown, N = np.full_like(xs, np.nan), len(xs)
+        return cls(unknown, np.array(unknown), np.zeros(N, dtype=bool), np.full(N, np.nan), np.full((N, nv), np.nan))
+
+    def put(self, which: Indices, some: "RefinedSteps") -> None:
+        """Take over some of the steps."""
+        for name in ("x_next", "drake", "acts", "left", "missing"):
+            getattr(self, name)[which] = getattr(some, name)
+        self.refused |= {int(which[k]): why for k, why in some.refused.items()}
 
 
 def refine_steps(
-    model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None = None, held: Array | None = None
+    model: Model,
+    vector: ParameterVector,
+    xs: Array,
+    us: Array,
+    values: Array | None = None,
+    held: Array | None = None,
 ) -> RefinedSteps:
     """The steps from each of xs (N, nx) under each of us (N, nu); many in one call cost far less than one by one.
 
@@ -202,31 +225,18 @@ def refine_steps(
 
     Raises SimulationError where Drake cannot take a step.
     """
-    if values is None or not vector.parameters:
-        return _refine(model, vector, xs, us, None, held)
-    times = np.array([vector.time_step(row) for row in values])
-    if np.all(times == model.time_step):
-        return _refine(model, vector, xs, us, values, held)
-    x_next, drake, left, acts = np.empty_like(xs), np.empty_like(xs), np.empty(len(xs)), np.zeros(len(xs), dtype=bool)
-    missing = np.empty((len(xs), model.whole.nv))
-    refused: dict[int, Refusal] = {}
+    if values is None or vector.step_entry is None:
+        return _refine(model, vector, xs, us, values if vector.parameters else None, held)
+    times, refined = np.array([vector.time_step(row) for row in values]), RefinedSteps.unknown(xs, model.whole.nv)
     for h in np.unique(times):
         which = np.flatnonzero(times == h)
         points = xs[which], us[which], values[which], None if held is None else held[which]
         if h == model.time_step:
-            refined = _refine(model, vector, *points)
+            refined.put(which, _refine(model, vector, *points))
         else:
             with applied(vector.at(points[2][0])) as other:
-                refined = _refine(other, vector.at(points[2][0]), *points)
-        x_next[which], drake[which], left[which], acts[which] = (
-            refined.x_next,
-            refined.drake,
-            refined.left,
-            refined.acts,
-        )
-        missing[which] = refined.missing
-        refused |= {int(which[k]): why for k, why in refined.refused.items()}
-    return RefinedSteps(x_next, drake, acts, left, missing, refused)
+                refined.put(which, _refine(other, vector.at(points[2][0]), *points))
+    return refined
 
 
 def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
@@ -238,7 +248,7 @@ def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
     if model.coupling is not None or isinstance(couplers, Refusal) or form.driven:
         return False  # of reduced coordinates what Drake's solver leaves in the others is not known from `end`
     drake = advance(model.double, x, u)
-    read = _read(model, _settings(model, form), 0)
+    read = _read(model, _Settings(np.asarray(model.double.damping()), *form.gains(), {}))
     if isinstance(read, Refusal):
         return False
     v_next = np.array([drake[model.nq :], end[model.nq :]])
@@ -248,26 +258,34 @@ def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
     return not refused and bool(np.all(np.abs(moved) <= FREE_STEP * np.maximum(1.0, np.abs(end))))
 
 
+@contextmanager
+def _written(model: Model, vector: ParameterVector, values: Array | None) -> Iterator[Callable[[int], None]]:
+    """A function that applies the parameters of a step, which are the vector's again afterwards."""
+    if values is None:
+        yield lambda k: None
+        return
+    try:
+        yield lambda k: vector.write(model.double, values[k])
+    finally:
+        vector.write(model.double, vector.values)
+
+
 def _refine(
     model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None, held: Array | None
 ) -> RefinedSteps:
     """Of one time step. Reduced coordinates are read from the step of the whole plant, as in `advance`."""
     if model.coupling is None:
         return _refine_whole(model, vector, xs, us, values, held, couplers_of(model))
-    whole = _refine_whole(model.whole, vector, model.coupling.state(xs), us, values, held, couplers_of(model))
+    refined = _refine_whole(model.whole, vector, model.coupling.state(xs), us, values, held, couplers_of(model))
     drake, x_next = np.empty_like(xs), np.full_like(xs, np.nan)
-    try:
+    with _written(model, vector, values) as write:
         for k, x in enumerate(xs):
-            if values is not None:
-                vector.write(model.double, values[k])
+            write(k)
             set_state(model.double, x)
-            drake[k] = model.double.next_state(whole.drake[k])
-            if k not in whole.refused:
-                x_next[k] = model.double.next_state(whole.x_next[k])
-    finally:
-        if values is not None:
-            vector.write(model.double, vector.values)
-    return RefinedSteps(x_next, drake, whole.acts, whole.left, whole.missing, whole.refused)
+            drake[k] = model.double.next_state(refined.drake[k])
+            if k not in refined.refused:
+                x_next[k] = model.double.next_state(refined.x_next[k])
+    return replace(refined, drake=drake, x_next=x_next)
 
 
 def _refine_whole(
@@ -280,43 +298,32 @@ def _refine_whole(
     couplers: Couplers | Refusal,
 ) -> RefinedSteps:
     """With all coordinates of the plant."""
-    form = form_of(model)
+    form, refined = form_of(model), RefinedSteps.unknown(xs, model.nv)
     why = couplers.reason if isinstance(couplers, Refusal) else form.driven
-    drake, refused = np.empty_like(xs), {}
     read: list[_Read] = []
-    settings: _Settings | None = None
-    try:
+    which: list[int] = []
+    with _written(model, vector, values) as write:
         for k, (x, u) in enumerate(zip(xs, us, strict=True)):
-            if values is not None:
-                vector.write(model.double, values[k])
-            drake[k] = advance(model.double, x, u)
-            if not why:
-                if settings is None or values is not None:
-                    settings = _settings(model, form)
-                answer = _read(model, settings, k)
-                if isinstance(answer, Refusal):
-                    refused[k] = answer
-                else:
-                    read.append(answer)
-    finally:
-        if values is not None:
-            vector.write(model.double, vector.values)
-    x_next, left = np.full_like(xs, np.nan), np.full(len(xs), np.nan)
-    acts, missing = np.zeros(len(xs), dtype=bool), np.full((len(xs), model.nv), np.nan)
-    if why:
-        return RefinedSteps(x_next, drake, acts, left, missing, {k: Refusal(why) for k in range(len(xs))})
+            write(k)
+            refined.drake[k] = advance(model.double, x, u)
+            if not read or values is not None:
+                settings = _Settings(np.asarray(model.double.damping()), *form.gains(), {})
+            answer = Refusal(why) if why else _read(model, settings)
+            if isinstance(answer, Refusal):
+                refined.refused[k] = answer
+            else:
+                read.append(answer)
+                which.append(k)
     if read:
-        which = np.array([r.step for r in read], dtype=np.intp)
         problems = _problems(model, form, read, xs[which], us[which], couplers)
-        acts[which] = problems.taking_part().any(axis=1)
-        held_open = None if held is None else held[which]
-        v_next, missing[which], left[which], whys = _solved(
-            problems, xs[which, model.nq :], drake[which, model.nq :], held_open
+        refined.acts[which] = problems.taking_part().any(axis=1)
+        ends, refined.missing[which], refined.left[which], whys = _solved(
+            problems, xs[which, model.nq :], refined.drake[which, model.nq :], None if held is None else held[which]
         )
-        refused |= {int(which[i]): Refusal(why) for i, why in whys.items()}
-        x_next[which] = _states(model, xs[which], v_next)
-    x_next[list(refused)] = np.nan
-    return RefinedSteps(x_next, drake, acts, left, missing, refused)
+        refined.x_next[which] = _states(model, xs[which], ends)
+        refined.refused |= {which[i]: Refusal(reason) for i, reason in whys.items()}
+        refined.x_next[list(refined.refused)] = np.nan
+    return refined
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,32 +336,23 @@ class _Settings:
     material: dict[Any, Array]  # by geometry, read when it touches
 
 
-def _settings(model: Model, form: Form) -> _Settings:
-    return _Settings(np.asarray(model.double.damping()), *form.gains(), {})
-
-
 @dataclass(frozen=True, eq=False)
 class _Read:
     """What Drake says of one step."""
 
-    step: int
     settings: _Settings
     mass: Array  # (nv, nv)
     bias: Array  # (nv,) the force that no acceleration needs, less those that act
     contacts: list[tuple[Array, ...]]  # of both bodies `_motions`; the point, normal, phi, and material (2, 4)
 
 
-def _read(model: Model, settings: _Settings, k: int) -> _Read | Refusal:
+def _read(model: Model, settings: _Settings) -> _Read | Refusal:
     """Of the step that was taken last on the double twin."""
-    twin, plant = model.double, model.plant
-    contacts: list[tuple[Array, ...]] = []
-    if model.contract.contact.collision_pairs:
-        answer = _contacts(model, settings)
-        if isinstance(answer, Refusal):
-            return answer
-        contacts = answer
-    mass = plant.CalcMassMatrix(twin.context)
-    return _Read(k, settings, mass, twin.inverse_dynamics(np.zeros(model.nv)), contacts)
+    contacts = _contacts(model, settings) if model.contract.contact.collision_pairs else []
+    if isinstance(contacts, Refusal):
+        return contacts
+    mass = model.plant.CalcMassMatrix(model.double.context)
+    return _Read(settings, mass, model.double.inverse_dynamics(np.zeros(model.nv)), contacts)
 
 
 def _contacts(model: Model, settings: _Settings) -> list[tuple[Array, ...]] | Refusal:
@@ -448,44 +446,31 @@ def _same_tree(model: Model) -> NDArray[np.bool_]:
     return model.cache("same tree", read, of_structure=True)
 
 
-def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array) -> ContactImpulses | None:
-    columns = [[contact[i] for r in read for contact in r.contacts] for i in range(8)]
-    if not columns[0]:
-        return None
-    moves_a, origin_a, moves_b, origin_b, point, normal, phi, sides = (np.array(column) for column in columns)
-    counts = [len(r.contacts) for r in read]
-    problem = np.repeat(np.arange(len(read)), counts)
-    at_points = _at_point(moves_a, point - origin_a) - _at_point(moves_b, point - origin_b)
-    moving = (at_points != 0).any(axis=(1, 2))  # two parts of one body may overlap: Drake leaves them to no motion
-    if not moving.any():
-        return None
-    slot = problem, np.concatenate([np.arange(count) for count in counts])
-    shape = len(read), max(counts)
-    J = np.zeros((*shape, v.shape[1], 3))
-    J[slot] = at_points
+def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array) -> ContactImpulses:
+    """Of all contacts that move something: two shapes of one body may overlap, and Drake leaves them to no motion."""
+    problem = np.repeat(np.arange(len(read)), [len(r.contacts) for r in read])
+    shapes = (6, model.nv), (3,), (6, model.nv), (3,), (3,), (3,), (), (2, 4)
+    columns = ([contact[i] for r in read for contact in r.contacts] for i in range(len(shapes)))
+    moves_a, origin_a, moves_b, origin_b, point, normal, phi, sides = (
+        np.array(column, dtype=float).reshape(-1, *shape) for column, shape in zip(columns, shapes, strict=True)
+    )
+    jacobian = _at_point(moves_a, point - origin_a) - _at_point(moves_b, point - origin_b)
     material, contact = combine(sides), model.contract.contact
-
-    def placed(values: Array, empty: float) -> Array:
-        """(N C, ...) values of contacts, `empty` where a problem has no more of them, and where nothing moves."""
-        array = np.full((*shape, *values.shape[1:]), empty)
-        array[problem[moving], slot[1][moving]] = values[moving]
-        return array.reshape(-1, *values.shape[1:])
-
-    weight = weigh(at_points, weights[problem])
     law = ContactLaw(
         approximation=contact.approximation,
         time_step=model.time_step,
         near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
-        before=placed(((v[problem][:, None, :] @ at_points)[:, 0] * normal).sum(axis=1), 0.0),
-        normal=placed(normal, 0.0),
-        phi=placed(phi, 0.0),
-        weight=placed(weight, 1.0),
-        friction=placed(material.friction, 0.0),
-        stiffness=placed(material.stiffness, 1.0),
-        time=placed(material.time, 0.0),
-        dissipation=placed(material.dissipation, 0.0),
+        before=((v[problem][:, None, :] @ jacobian)[:, 0] * normal).sum(axis=1),
+        normal=normal,
+        phi=phi,
+        weight=weigh(jacobian, weights[problem]),
+        friction=material.friction,
+        stiffness=material.stiffness,
+        time=material.time,
+        dissipation=material.dissipation,
     )
-    return ContactImpulses(J, law)
+    moving = np.flatnonzero((jacobian != 0).any(axis=(1, 2)))
+    return ContactImpulses(problem[moving], jacobian[moving], law.subset(moving))
 
 
 def _at_point(motions: Array, from_origin: Array) -> Array:

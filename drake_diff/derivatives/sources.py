@@ -27,7 +27,7 @@ from drake_diff.derivatives import METHODS
 from drake_diff.derivatives.analytic import Analytic
 from drake_diff.derivatives.refine_step import refine_steps, solves_the_step
 from drake_diff.derivatives.smooth_step import Implicit, form_of
-from drake_diff.derivatives.steps import Jacobians, Source, Steps, take_step, take_steps
+from drake_diff.derivatives.steps import Jacobians, Source, Steps, Trial, take_step, take_steps
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, write_autodiff
@@ -62,7 +62,7 @@ class Autodiff:
         Raises GradientError where the AutoDiffXd step is not the double step, nor another solution of it within the
         tolerance of Drake's solver.
         """
-        values, refused = [], {}
+        values, refused = [], dict[int, DrakeDiffError]()
         for k in range(len(steps.xs)):
             try:
                 values.append(_by_autodiff(steps, k))
@@ -209,44 +209,42 @@ def step_at(model: Model, vector: ParameterVector, x: Array, u: Array, values: A
         vector.write(model.double, vector.values)
 
 
-@dataclass
-class _Trial:
-    """What came of comparing implicit with autodiff on a model, at the first smooth step that was met."""
-
-    passed: str = ""
-    refusal: str = ""
-
-
 class CertifiedImplicit(Implicit):
     """The implicit source of a model on which it was compared with autodiff."""
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
         """As by `Implicit`, where the two are equal."""
-        trial = steps.model.cache("implicit trial", _Trial, of_structure=True)
+        trial = implicit_trial(steps.model)
         if trial.refusal:
             return Refusal(trial.refusal)
         answer = super().differentiate(steps)
-        if not isinstance(answer, Refusal) and not trial.passed:
+        if not isinstance(answer, Refusal) and trial.left:
             smooth = next((k for k in range(len(steps)) if k not in answer.refused), None)
             if smooth is not None:
                 _compare(trial, steps, smooth, answer.values[smooth])
         return Refusal(trial.refusal) if trial.refusal else answer
 
 
-def _compare(trial: _Trial, steps: Steps, k: int, jacobian: Array) -> None:
+def implicit_trial(model: Model) -> Trial:
+    """Of comparing implicit with autodiff, at the first smooth step that is met."""
+    return model.cache("implicit trial", lambda: Trial(1), of_structure=True)
+
+
+def _compare(trial: Trial, steps: Steps, k: int, jacobian: Array) -> None:
+    trial.left = 0
     if not steps.taken:  # the caller's ends are less exact than parity asks for
         steps, k = take_step(steps.model, steps.vector, steps.xs[k], steps.us[k]), 0
     try:
         other = _by_autodiff(steps, k)
     except (ModelError, SimulationError) as error:
-        trial.passed = f"AutoDiffXd refuses the whole step: {error}"
+        trial.note = f"AutoDiffXd refuses the whole step: {error}"
         return
     compared = np.ones(jacobian.shape[1], dtype=bool)
     compared[steps.model.nx + steps.model.nu + steps.vector.differenced] = False  # of which AutoDiffXd knows nothing
     jacobian, other = jacobian[:, compared], other[:, compared]
     gap = float(np.abs(jacobian - other).max())
     if gap <= SAME_JACOBIAN * max(1.0, float(np.abs(other).max())):
-        trial.passed = CERTIFIED
+        trial.note = CERTIFIED
     else:
         trial.refusal = f"it differs from autodiff by {gap:.2g} on this model"
 
@@ -350,5 +348,5 @@ def _reason(source: Source, steps: Steps, method: str, why: str, note: str) -> s
     elif source is ANALYTIC:
         reason = CERTIFIED
     elif source is IMPLICIT:
-        reason = why + steps.model.cache("implicit trial", _Trial, of_structure=True).passed
+        reason = why + implicit_trial(steps.model).note
     return f"{reason}; {note}" if note else reason

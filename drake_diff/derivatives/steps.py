@@ -103,9 +103,30 @@ class Jacobians:
     """
 
     values: Array
-    refused: Mapping[int, DrakeDiffError]
+    refused: dict[int, DrakeDiffError]
     notes: Mapping[int, str] = field(default_factory=dict)
     timed: bool = False
+
+    def put(self, which: NDArray[np.intp], part: "Jacobians | Refusal") -> None:
+        """Take over those of some of the steps, or why these are refused."""
+        steps = which.tolist()
+        if isinstance(part, Refusal):
+            self.refused |= {k: NotSmoothError(part.reason) for k in steps}
+            return
+        self.values[which] = part.values
+        for k in steps:
+            self.refused.pop(k, None)
+        self.refused |= {steps[k]: why for k, why in part.refused.items()}
+        self.notes = {**self.notes, **{steps[k]: note for k, note in part.notes.items()}}
+
+
+@dataclass
+class Trial:
+    """How many steps of one kind a source is still to be compared on, or why it knows none of them."""
+
+    left: int
+    refusal: str = ""
+    note: str = ""  # what it was compared with
 
 
 class Source(Protocol):

@@ -158,26 +158,23 @@ class Topology:
     """Which degrees of freedom of a tree move which; 1 where they do, else 0."""
 
     moves: Array  # (nv, nv) j the axis of k
-    before: Array  # (nv, nv) j is moved by k, or k is of the same joint
-    turns: Array  # (nv,) 0 for the translations of free bodies
     bodies: dict[str, Array]  # (nv,) of each body, which move it
 
 
 def topology_of(description: Description) -> Topology:
     """The topology of a tree of hinges, slides and free bodies; these turn about axes that only translations move."""
     nv = description.coordinates.nv
-    moves, before, turns = np.zeros((nv, nv)), np.zeros((nv, nv)), np.ones(nv)
+    moves = np.zeros((nv, nv))
     bodies = {"world": np.zeros(nv)}
     for link in description.links:
         dofs = link.v_start + np.arange({"weld": 0, "quaternion_floating": 6}.get(link.kind, 1))
         above = np.flatnonzero(bodies[link.parent])
-        moves[np.ix_(above, dofs)] = before[np.ix_(dofs, above)] = before[np.ix_(dofs, dofs)] = 1.0
+        moves[np.ix_(above, dofs)] = 1.0
         if len(dofs) > 1:
             moves[np.ix_(dofs[3:], dofs[:3])] = 1.0
-            turns[dofs[3:]] = 0.0
         bodies[link.body] = np.array(bodies[link.parent])
         bodies[link.body][dofs] = 1.0
-    return Topology(moves, before, turns, bodies)
+    return Topology(moves, bodies)
 
 
 def weigh(J: Array, diagonal: Array) -> Array:
