@@ -4,8 +4,7 @@ The equation of a model's smooth steps (`smooth_step`) is certified when it is f
 of its steps with contact (`contact.jacobian`) at the first of them that are met.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.autodiffutils import InitializeAutoDiff
@@ -39,14 +38,12 @@ SAME_JACOBIAN = 1e-9
 # Differences of a step solved to rounding: friction turns within 1e-4 m/s, but where SceneGraph iterates to the point
 # of contact, it leaves up to 1e-8 of noise, and may jump on one side.
 SAME_DIFFERENCES, SAME_WHERE_ITERATED, DIFFERENCES = 1e-5, 3e-4, (3e-7, 1e-5, 1e-4)
-SAME_WHERE_STOPPED = 3e-4  # two ends as far apart as 1e-6 of the momentum, where friction turns within 1e-4 m/s
 SAME_END = 1e-10  # of x' with reduced joints: both are of Drake's own step, projected by the same matrix
 SAME_STEP = 1e-12  # of the largest entry of x' (or 1): the same positions, summed in another order
 CERTIFIED_STATES, STATES_TRIED = 3, 60
 FAR = 4.0  # [m or rad]
 ACTS = "contact, a limit or a constraint acts"
 BESIDE = "something else acts beside contact, joint limits and couplers"
-Led = Callable[[int, Array], Array | None]  # the Jacobian of a step, by its own equation, were x' its end
 DIFFERS, STEP_DIFFERENCES = "its Jacobian with impulses differs from", "the differences of the step solved to rounding"
 
 
@@ -204,14 +201,9 @@ def _with_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> Jacobians |
     kinds = form.pairs.kinds(placed, len(steps)) if touch else [{JOINT_LIMITS}] * len(steps)
     notes: dict[int, str] = {}
 
-    def led(k: int, x_next: Array) -> Array | None:
-        single = replace(steps.subset(np.array([k])), x_next=x_next[None])
-        jacobians, is_known, *_ = contact_jacobians(form, smooth, single, material, change)
-        return jacobians[0] if is_known[0] else None
-
     for k in np.flatnonzero(known).tolist():
         of_step = [trials.setdefault(kind, Trial(CERTIFIED_STATES)) for kind in sorted(kinds[k])]
-        _certify(steps, k, values[k], of_step, led, iterated=any(map(is_iterated, kinds[k])))
+        _certify(steps, k, values[k], of_step, iterated=any(map(is_iterated, kinds[k])))
         refusal, note = (_joined([getattr(t, name) for t in of_step]) for name in ("refusal", "note"))
         if refusal:
             whys[k] = refusal
@@ -225,17 +217,15 @@ def _joined(texts: list[str]) -> str:
     return "; ".join(dict.fromkeys(filter(None, texts)))
 
 
-def _certify(
-    steps: Steps, k: int, jacobian: Array, trials: list[Trial], led: Led | None = None, *, iterated: bool
-) -> None:
+def _certify(steps: Steps, k: int, jacobian: Array, trials: list[Trial], *, iterated: bool) -> None:
     """Compare a step's Jacobian for the trials that are still open."""
     if still_open := [trial for trial in trials if trial.left and not trial.refusal]:
-        refusal, note = _other_jacobian(steps, k, jacobian, led, iterated=iterated)
+        refusal, note = _other_jacobian(steps, k, jacobian, iterated=iterated)
         for trial in still_open:
             trial.refusal, trial.note, trial.left = refusal, note, trial.left - 1
 
 
-def _other_jacobian(steps: Steps, k: int, jacobian: Array, led: Led | None, *, iterated: bool) -> tuple[str, str]:
+def _other_jacobian(steps: Steps, k: int, jacobian: Array, *, iterated: bool) -> tuple[str, str]:
     """How a step's Jacobian with impulses differs from AutoDiffXd's, empty where it does not; and a note if not its.
 
     Where Drake takes no AutoDiffXd step, as beside shapes that it does not differentiate, it is compared with
@@ -247,36 +237,27 @@ def _other_jacobian(steps: Steps, k: int, jacobian: Array, led: Led | None, *, i
     try:
         exact = advance(model.autodiff, variables[: model.nx], variables[model.nx :])
     except (SimulationError, ModelError):
-        return _unlike_differences(steps, k, jacobian, led, iterated=iterated)
+        return _unlike_differences(steps, k, jacobian, iterated=iterated)
     gap = _gap(jacobian, gradient_rows(exact, model.nx + model.nu))
     return ("", "") if gap <= SAME_JACOBIAN else (f"{DIFFERS} AutoDiffXd's by {gap:.2g} of its largest entry", "")
 
 
-def _unlike_differences(steps: Steps, k: int, jacobian: Array, led: Led | None, *, iterated: bool) -> tuple[str, str]:
+def _unlike_differences(steps: Steps, k: int, jacobian: Array, *, iterated: bool) -> tuple[str, str]:
     """As `_other_jacobian`, of differences over the size that comes nearest.
 
-    They are of the step solved to rounding. Where impulses turn quickly, Drake's solver stops far enough beside for
-    the Jacobian to differ: then `led`, the same equation's at the solution, is compared, and may be as far from it as
-    SAME_WHERE_STOPPED. Where Drake's points of contact are `iterated`, that is of each column apart, and may be the
-    difference to one side.
+    They are of the step solved to rounding, with what Drake's solver left of the momentum held: where impulses turn
+    quickly it stops far enough beside the solution for the Jacobian to be another there. Where Drake's points of
+    contact are `iterated`, the nearest of each column counts, and may be the difference to one side.
     """
-    gaps, solved = [], None
+    gaps = []
     for size in DIFFERENCES:
         sides = _differences(steps, k, size)
         if isinstance(sides, Refusal):
             return f"neither AutoDiffXd nor differences are had to certify it by: {sides}", ""
-        forward, backward, here = sides
+        forward, backward = sides
         central = (forward + backward) / 2
         if _gap(jacobian, central) <= SAME_DIFFERENCES:
             return "", f"with impulses equal to {STEP_DIFFERENCES}, as AutoDiffXd takes no such step"
-        solved = led(k, here) if led is not None and solved is None else solved
-        ends = (
-            np.inf
-            if solved is None
-            else max(_gap(jacobian, solved) / SAME_WHERE_STOPPED, _gap(solved, central) / SAME_DIFFERENCES)
-        )
-        if ends <= 1:
-            return "", f"with impulses equal to {STEP_DIFFERENCES}, but for where Drake's solver stops"
         mine = jacobian[:, : central.shape[1]]
         gaps += [np.abs(mine - side).max(axis=0) / np.abs(mine).max() for side in (forward, backward, central)]
     gap = float(np.max(np.min(gaps, axis=0)))
@@ -292,18 +273,18 @@ def _gap(jacobian: Array, other: Array) -> float:
     return gap if np.isfinite(gap) else np.inf
 
 
-def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array, Array] | Refusal:
-    """(nx, nx + nu) forward and backward differences over `width` of the step solved to rounding, and its end (nx,)."""
-    model, count = steps.model, steps.model.nx + steps.model.nu
-    point = np.concatenate([steps.xs[k], steps.us[k]])
+def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array] | Refusal:
+    """(nx, nx + nu) forward and backward differences over `width` of the equation at Drake's own end of the step."""
+    nx, vector, point = steps.model.nx, steps.vector, np.concatenate([steps.xs[k], steps.us[k]])
     size = width * np.maximum(1.0, np.abs(point))
     points = np.concatenate([point + np.diag(size), point - np.diag(size), point[None]])
-    refined = refine_steps(model, steps.vector, points[:, : model.nx], points[:, model.nx :])
-    for why in refined.refused.values():
+    left = refine_steps(steps.model, vector, points[-1:, :nx], points[-1:, nx:])
+    held = np.repeat(np.nan_to_num(left.missing), len(points), axis=0)
+    refined = refine_steps(steps.model, vector, points[:, :nx], points[:, nx:], held=held)
+    for why in (*left.refused.values(), *refined.refused.values()):
         return why
-    here = refined.x_next[-1]
-    forward, backward = refined.x_next[:count] - here, here - refined.x_next[count:-1]
-    return np.asarray((forward / size[:, None]).T), np.asarray((backward / size[:, None]).T), here
+    ahead, behind = np.split(refined.x_next[:-1] - refined.x_next[-1], 2)
+    return np.asarray((ahead / size[:, None]).T), np.asarray((-behind / size[:, None]).T)
 
 
 @dataclass(frozen=True, eq=False)

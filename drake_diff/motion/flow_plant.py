@@ -17,7 +17,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.contact.active_contacts import ContactPairs, read_pairs
-from drake_diff.derivatives.contact.laws import QUANTITIES, Material, MaterialChange
+from drake_diff.derivatives.contact.laws import QUANTITIES, Material
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.mechanics.casadi_tree import SymbolicTree
 from drake_diff.mechanics.description import describe, names_of
@@ -271,7 +271,7 @@ def material_of(plant: FlowPlant) -> Material:
     return compliance.read_material(plant.model.double.inspector, plant.pairs.ids, plant.law)
 
 
-def numbers_of(plant: FlowPlant, material: Material | MaterialChange) -> Array:
+def numbers_of(plant: FlowPlant, material: Material) -> Array:
     """(4 P, ...) a material, or its change, as the functions take it."""
     damping = material.time if plant.law == compliance.KELVIN_VOIGT else material.dissipation
     columns = np.stack([material.friction, material.stiffness, damping, material.other_part], axis=1)

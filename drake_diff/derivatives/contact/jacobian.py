@@ -22,7 +22,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.derivatives import joint_impulses
 from drake_diff.derivatives.contact import kernel, laws
 from drake_diff.derivatives.contact.active_contacts import AllPairs, Placed, read_all_pairs, topology_of
-from drake_diff.derivatives.contact.laws import Material, MaterialChange, read_material
+from drake_diff.derivatives.contact.laws import Material, read_material
 from drake_diff.derivatives.joint_impulses import couplers_of
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.derivatives.steps import Flags, Steps
@@ -135,7 +135,7 @@ def material_of(model: Model, form: ContactForm) -> Material:
 
 
 def contact_jacobians(
-    form: ContactForm, smooth: SmoothStep, steps: Steps, material: Material, change: MaterialChange | None
+    form: ContactForm, smooth: SmoothStep, steps: Steps, material: Material, change: Material | None
 ) -> tuple[Array, Flags, dict[int, str], Placed]:
     """(N, nx, nx + nu + np) of steps, which (N,) are as Drake took them, why some are not, and where the bodies are.
 
@@ -147,7 +147,7 @@ def contact_jacobians(
     moved = form.tree(q, v, (v_next - v) / smooth.time_step)
     placed = form.pairs.locate(steps, form.poses(moved.poses))
     count = 0 if change is None else change.friction.shape[1]
-    changes = np.zeros((5, len(form.sides), 0)) if change is None else change.stacked
+    changes = np.zeros((5, len(form.sides), 0)) if change is None else np.array(change.of_pairs)
     of_pairs = kernel.Pairs(form.sides, form.by_body, *map(own_array, (*material.of_pairs, changes)))
     contacts, unknown = form.contacts(of_pairs, placed, moved.S, material)
     force, clipped = smooth.force_of(q, v, steps.us)

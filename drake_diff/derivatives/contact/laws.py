@@ -253,7 +253,10 @@ QUANTITIES = ("friction", "stiffness", "relaxation_time", "dissipation")  # whos
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Of P pairs; `sides` (P, 2, 4) is that of the sphere and of the other, in the order of QUANTITIES."""
+    """Of P pairs, or its derivative by parameters, each (P, np).
+
+    `sides` (P, 2, 4) is that of the sphere and of the other, in the order of QUANTITIES.
+    """
 
     sides: Array
     friction: Array  # (P,) mu
@@ -266,22 +269,6 @@ class Material:
     def of_pairs(self) -> tuple[Array, ...]:
         """What the two sides make."""
         return self.friction, self.stiffness, self.time, self.dissipation, self.other_part
-
-
-@dataclass(frozen=True, eq=False)
-class MaterialChange:
-    """The derivative of a Material by parameters, each (P, np)."""
-
-    friction: Array
-    stiffness: Array
-    time: Array
-    dissipation: Array
-    other_part: Array
-
-    @property
-    def stacked(self) -> Array:
-        """(5, P, np) in the order of `Material.of_pairs`."""
-        return np.array([self.friction, self.stiffness, self.time, self.dissipation, self.other_part])
 
 
 def read_material(twin: Twin, pairs: Any) -> Material:
@@ -305,7 +292,7 @@ def _harmonic(sides: Array) -> Array:
     return np.asarray(sides.prod(axis=1) / np.where(total > 0, total, 1.0))
 
 
-def material_change(pairs: Any, material: Material, vector: ParameterVector, twin: Twin) -> MaterialChange:
+def material_change(pairs: Any, material: Material, vector: ParameterVector, twin: Twin) -> Material:
     """By the entries of a vector all of whose quantities are QUANTITIES."""
     by_sides = np.zeros((len(vector.values), *material.sides.shape))
     of_label = geometries_of(twin)
@@ -316,7 +303,8 @@ def material_change(pairs: Any, material: Material, vector: ParameterVector, twi
     mu, k, _, d = np.moveaxis(material.sides, -1, 0)
     b = material.other_part[:, None]
     by_b = (by_k[:, 1] * k[:, :1] - by_k[:, 0] * k[:, 1:]) / k.sum(axis=1)[:, None] ** 2
-    return MaterialChange(
+    return Material(
+        sides=by_sides,
         friction=2 * _harmonic_change(mu, by_mu),
         stiffness=_harmonic_change(k, by_k),
         time=by_tau.sum(axis=1),
