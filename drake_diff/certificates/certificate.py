@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_diff._base.arrays import Array, Indices, finite_array, frozen
 from drake_diff._base.differences import Difference, Function, Many, one_by_one
 from drake_diff._base.values import ShowsItsRepr
-from drake_diff.certificates.differences import DIFFERENCES, TINY, Neighbourhood, look_around
+from drake_diff.certificates.differences import DIFFERENCES, TINY, Neighbourhood, line, look_around
 from drake_diff.exceptions import CertificateError, GradientError, InputError, ShapeError
 from drake_diff.model.contact import Pair
 
@@ -507,5 +507,4 @@ def unscaled(
 
 def jitter(scale: Array) -> Array:
     """(n,) entries between a half and all of 1e-9 `scale` (n,), of either sign, always the same ones."""
-    random, size = np.random.default_rng(0), len(scale)
-    return LIMITS.jitter * scale * (random.uniform(0.5, 1.0, size) * random.choice([-1.0, 1.0], size))
+    return LIMITS.jitter * scale * line(len(scale), 0)

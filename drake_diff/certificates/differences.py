@@ -96,7 +96,7 @@ def look_around(
     """
     sweep = sweep_of(f, n, DIFFERENCES.steps, minus=minus)
     centre, ahead = sweep.centre, sweep.forward
-    rows, direction = ahead.shape[1], _line(n)
+    rows, direction = ahead.shape[1], line(n)
 
     def apart(some: Array) -> Array:
         return some - centre if minus is np.subtract else np.array([minus(value, centre) for value in some])
@@ -117,7 +117,7 @@ def is_broken(changes: Many, n: int) -> str:
 
     It is a staircase, or has a corner or a jump within 1e-6 of the point; empty where it is neither.
     """
-    direction, line_changes = _line(n), changes(_along(n))
+    direction, line_changes = line(n), changes(_along(n))
     unsolved = np.zeros(line_changes.shape[1])
     along, rounding, by_spacing = _scattered(line_changes, unsolved + 1)
     still = np.maximum(by_spacing[:, 0].min(axis=0), rounding[:, DIFFERENCES.near - 1].max(axis=0))
@@ -134,7 +134,7 @@ def _along(n: int) -> Array:
     places = np.multiply.outer(
         [1.0, -1.0], np.multiply.outer(DIFFERENCES.spacings, np.arange(1, DIFFERENCES.values + 1))
     )
-    return np.asarray(places.reshape(-1, 1) * _line(n))
+    return np.asarray(places.reshape(-1, 1) * line(n))
 
 
 def _scattered(changes: Array, size: Array) -> tuple[Array, Array, Array]:
@@ -144,10 +144,10 @@ def _scattered(changes: Array, size: Array) -> tuple[Array, Array, Array]:
     return along, rounding, np.maximum(_scatter(along), rounding)
 
 
-def _line(n: int) -> Array:
-    """(n,) a direction with no small entry."""
-    random = np.random.default_rng(1)
-    return np.asarray(random.uniform(0.5, 1.0, n) * random.choice([-1.0, 1.0], n))
+def line(shape: int | tuple[int, ...], seed: int = 1) -> Array:
+    """A direction with no small entry."""
+    random = np.random.default_rng(seed)
+    return np.asarray(random.uniform(0.5, 1.0, shape) * random.choice([-1.0, 1.0], shape))
 
 
 def _scatter(values: Array) -> Array:

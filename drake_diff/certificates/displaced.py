@@ -25,6 +25,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices, finite_array
 from drake_diff._base.differences import central_differences
 from drake_diff.certificates.certify import move, solved, solver_tolerance, state_scale
+from drake_diff.certificates.differences import line
 from drake_diff.derivatives.refine_step import refine_steps
 from drake_diff.derivatives.sources import PARITY_TOLERANCE
 from drake_diff.exceptions import GradientError
@@ -341,6 +342,7 @@ def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_
     return ""
 
 
+LINE = 2  # the seed of lines along which a loss or a policy is asked
 LENGTHS = tuple(10.0**k for k in range(-4, 2))  # of the line, to each side
 OUTSIDE = (ValueError, ArithmeticError, LookupError)  # what a function may raise where it is not defined
 
@@ -349,9 +351,9 @@ Jump = tuple[float, float]  # from where to where
 
 def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
     """How the loss alone jumps around the motion of `g`; empty where it is no staircase."""
-    by_x = _line(len(g.xs), space.size)
+    by_x = line((len(g.xs), space.size), LINE)
     states = np.array([space.derivative_of_plus(x) @ d for x, d in zip(g.xs, by_x, strict=True)])
-    inputs = _line(*g.us.shape)
+    inputs = line(g.us.shape, LINE)
 
     def along(s: float) -> float:
         return evaluate_loss(loss, g.xs + s * states, g.us + s * inputs)
@@ -368,9 +370,9 @@ def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
 def stairs_of_policy(policy: Callable[..., Array], g: RolloutGradient, space: TangentSpace, time_step: float) -> str:
     """How the policy alone jumps around three states of the motion of `g`; empty where it is no staircase."""
     asked, nu = fresh(policy), g.us.shape[1]
-    weight = _line(1, nu)[0]
+    weight = line(nu, LINE)
     for k in sorted({0, len(g.us) // 2, len(g.us) - 1}):
-        x, t, direction = g.xs[k], float(k * time_step), _line(1, space.size)[0]
+        x, t, direction = g.xs[k], float(k * time_step), line(space.size, LINE)
 
         def u(s: float, x: Array = x, t: float = t, direction: Array = direction) -> Array:
             return np.asarray(asked(space.plus(x, s * direction), t), dtype=float)
@@ -386,12 +388,6 @@ def stairs_of_policy(policy: Callable[..., Array], g: RolloutGradient, space: Ta
                 f"u[{i}] by {change[i]:.3g} at {jump[0]:.3g}"
             )
     return ""
-
-
-def _line(rows: int, columns: int) -> Array:
-    """(rows, columns) a direction with no small entry."""
-    random = np.random.default_rng(2)
-    return np.asarray(random.uniform(0.5, 1.0, (rows, columns)) * random.choice([-1.0, 1.0], (rows, columns)))
 
 
 def _stairs(f: Callable[[float], float], least: float) -> tuple[float, float, int] | None:

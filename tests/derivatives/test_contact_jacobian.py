@@ -1,7 +1,5 @@
 """Steps with contact, differentiated from their own equation: against closed forms, AutoDiffXd and differences."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.robots import example_robot, state_in_contact
@@ -11,7 +9,6 @@ import drake_diff as dd
 from drake_diff.derivatives import analytic
 from drake_diff.derivatives.contact import laws, nearest_points
 from drake_diff.derivatives.contact.active_contacts import read_pairs
-from drake_diff.derivatives.contact.laws import ContactLaw
 from drake_diff.derivatives.steps import take_step
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model import contact_modes
@@ -359,88 +356,6 @@ def test_what_is_taken_for_a_single_step_with_contact_follows_the_models_size(tm
     large = _walker(tmp_path)
     ((x, u),) = _touching_states(large, 1, seed=3)
     assert dd.differentiate_step(large, x, u).method == "analytic"
-
-
-def _laws(count, seed):
-    """Contacts that stick, slide and part, compliant and near-rigid, of each approximation; and their velocities."""
-    random = np.random.default_rng(seed)
-    normal = random.standard_normal((count, 3))
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
-    velocity = 0.02 * random.standard_normal((count, 1)) * normal
-    velocity += 10 ** random.uniform(-5, 0, (count, 1)) * random.standard_normal((count, 3))
-    common = {
-        "normal": normal,
-        "phi": -1e-3 * random.random(count),
-        "weight": random.uniform(0.5, 5.0, count),
-        "friction": random.uniform(0.1, 1.5, count),
-        "time": random.uniform(0.0, 0.1, count),
-        "before": random.standard_normal(count),
-        "dissipation": random.uniform(0.0, 5.0, count),
-        "time_step": 0.005,
-        "near_rigid": 1.0,
-    }
-    stiffness = {"sap": 10 ** random.uniform(3, 8, count)}
-    stiffness["similar"] = stiffness["lagged"] = 10 ** random.uniform(2, 5, count)
-    return {a: ContactLaw(a, stiffness=k, **common) for a, k in stiffness.items()}, velocity
-
-
-def _solved(law, velocity):
-    """(M, 23) of each contact the impulse, and which branch of the law it is on: (M, 3) flags."""
-    found, constants = np.zeros((len(velocity), 23)), (1e-3, 1e-7, 1e-4)
-    for m, at in enumerate(found):
-        laws.solve_law(
-            laws.LAWS[law.approximation], law.time_step, law.near_rigid, constants, law.normal[m], law.phi[m],
-            law.friction[m], law.stiffness[m], law.time[m], law.dissipation[m], law.weight[m], velocity[m],
-            law.before[m], at,
-        )  # fmt: skip
-    return found, found[:, [15, 16, 18] if law.approximation == "sap" else [21, 22, 10]] > 0
-
-
-def _changed(law, velocity, solved, name, change):
-    """(M, 3) the derivative of the impulse along a change of one of its arguments."""
-    zero, found = np.zeros(3), np.empty_like(velocity)
-    for m in range(len(velocity)):
-        of_state, of_material = (
-            tuple(float(change[m]) if name == one else 0.0 for one in names)
-            for names in (("phi", "weight", "before"), ("friction", "stiffness", "time", "dissipation"))
-        )
-        of_velocity, of_normal = (change[m] if name == one else zero for one in ("velocity", "normal"))
-        laws.change_law(
-            laws.LAWS[law.approximation], law.time_step, 1e-3, law.normal[m], law.phi[m], law.friction[m],
-            law.stiffness[m], law.dissipation[m], law.weight[m], velocity[m], solved[m], of_velocity, of_normal,
-            of_state, of_material, found[m],
-        )  # fmt: skip
-    return found
-
-
-ARGUMENTS = ["velocity", "normal", "phi", "weight", "friction", "stiffness"]
-
-
-@each_row(
-    "approximation, name",
-    [(a, n) for a in ("sap", "similar", "lagged") for n in ARGUMENTS]
-    + [("sap", "time"), *((a, n) for a in ("similar", "lagged") for n in ("before", "dissipation"))],
-)
-def test_the_impulses_derivative_is_its_difference(approximation, name):
-    every, velocity = _laws(400, 1)
-    law, random = every[approximation], np.random.default_rng(4)
-    (solved, regime), step = _solved(law, velocity), 1e-8 if name == "velocity" else 1e-7  # soft norms turn within 1e-7
-    assert (regime.any(axis=0) & ~regime.all(axis=0)).all()  # every branch is among them
-    value = velocity if name == "velocity" else getattr(law, name)
-    change = random.standard_normal(value.shape) * (value if name == "stiffness" else 1.0)
-    sides = []
-    for moved in (value + step * change, value - step * change):
-        sides.append(_solved(law, moved) if name == "velocity" else _solved(replace(law, **{name: moved}), velocity))
-    keep = np.all([side[1] == regime for side in sides], axis=(0, 2))
-    assert keep.sum() > 350
-    differences = (sides[0][0][:, :3] - sides[1][0][:, :3]) / (2 * step)
-    found = _changed(law, velocity, solved, name, change)
-    size = np.maximum(np.abs(differences).max(axis=1), 1e-3)[:, None]
-    np.testing.assert_allclose((found / size)[keep], (differences / size)[keep], atol=2e-5)  # the step's own error
-    if name == "velocity":
-        impulse, slope = law.impulses(velocity)
-        np.testing.assert_array_equal(impulse, solved[:, :3])
-        np.testing.assert_allclose((slope @ change[:, :, None])[..., 0], found, atol=1e-12 * np.abs(found).max())
 
 
 def test_another_law_is_found_out(tmp_path, monkeypatch):

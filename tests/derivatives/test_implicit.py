@@ -28,8 +28,7 @@ import drake_diff as dd
 from drake_diff.certificates.certify import certify_inside
 from drake_diff.derivatives import sources
 from drake_diff.derivatives.smooth_step import SmoothStep
-from drake_diff.derivatives.sources import METHODS
-from drake_diff.exceptions import ModelError, ModelWarning, SimulationError, UnknownNameError
+from drake_diff.exceptions import ModelError, ModelWarning, SimulationError
 
 pytestmark = pytest.mark.solve
 
@@ -362,23 +361,6 @@ def test_a_delay_changes_nothing_about_the_choice(load, monkeypatch, slow):
     monkeypatch.setattr(place, name, late)
     assert chosen(models[1]) == expected
     assert delays  # it was asked
-
-
-@each_row("method", METHODS[1:])
-def test_every_method_is_named_where_one_is_unknown(load, method):
-    with pytest.raises(UnknownNameError, match=method):
-        dd.differentiate_step(load("pendulum.urdf"), [0.1, 0.0], [0.0], method="guess")
-
-
-def test_a_choice_made_with_parameters_is_made_once(monkeypatch):
-    """What is certified is the equation, of any values: it was compared at every step while parameters were applied."""
-    model, calls = springs_and_motors(), []
-    compare = sources._compare
-    monkeypatch.setattr(sources, "_compare", lambda *args: calls.append(compare(*args)))
-    name = next(p.name for p in dd.list_parameters(model) if p.name.endswith(".mass"))
-    for _ in range(2):
-        assert dd.differentiate_step(model, *POINT, parameters=(name,)).method == "implicit"
-    assert len(calls) == 1
 
 
 def test_a_choice_made_without_parameters_holds_with_them(load):

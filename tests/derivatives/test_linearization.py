@@ -25,7 +25,6 @@ from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.mechanics.tree import ForwardDynamics
 from drake_diff.model.parameters import applied, select
-from drake_diff.motion import TVLQR
 
 pytestmark = pytest.mark.solve
 
@@ -364,39 +363,6 @@ def test_bad_input_is_named(load, xs, us, wanted):
         dd.linearize(load("pendulum.urdf"), xs, us)
     with pytest.raises(UnknownNameError, match="analytic"):
         dd.linearize(load("pendulum.urdf"), np.zeros((2, 2)), np.zeros((2, 1)), "guess")
-
-
-# ---- who uses it ---------------------------------------------------------------------------------------------------
-
-
-def with_and_without(load, f):
-    found = []
-    for source in ("analytic", "another"):
-        model = load("double_pendulum.urdf", time_step=0.02)
-        if source == "another":
-            model.cache("analytic", lambda: Refusal("switched off by a test"))
-        assert (dd.differentiate_step(model, np.zeros(4), np.zeros(2)).method == "analytic") == (source == "analytic")
-        found.append(f(model))
-    return found
-
-
-def test_ilqr_is_the_same_with_and_without(load):
-    def solved(model):
-        cost = dd.QuadraticCost(Q=np.eye(4), R=0.1 * np.eye(2), x_ref=[0.5, -0.3, 0, 0])
-        return dd.solve(dd.Problem(model, x0=np.zeros(4), num_steps=30, running_cost=cost), method="ilqr")
-
-    ours, theirs = with_and_without(load, solved)
-    np.testing.assert_allclose(ours.xs, theirs.xs, atol=1e-9)
-    np.testing.assert_allclose(ours.us, theirs.us, atol=1e-9)
-
-
-def test_tvlqr_is_the_same_with_and_without(load):
-    def gains(model):
-        us = 0.2 * np.random.default_rng(0).standard_normal((20, 2))
-        return TVLQR(model, dd.rollout(model, [0.4, -0.9, 1.3, -0.6], us).xs, us, np.eye(4), np.eye(2)).gains
-
-    ours, theirs = with_and_without(load, gains)
-    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
 # ---- joint limits, couplers and shapes that AutoDiffXd does not know ----------------------------------------------
