@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import product
 from statistics import median
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration, ex
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.tangent import TangentSpace
 
+T = TypeVar("T")
 BROKE_OFF = "broke off"
 
 
@@ -93,14 +94,16 @@ def move(engine: Engine, x0: Array, us: Array) -> EngineMotion:
 def measured(engine: Engine, times: Array, xs: Array, us: Array, status: str = "ok") -> EngineMotion:
     """The motion `xs` (n, nx) with the energies and overlaps that `engine` finds in it."""
 
-    def where_offered(ask: Callable[[Array], float]) -> Array | None:
-        try:
-            return frozen([ask(x) for x in xs])
-        except NotOfferedError:
-            return None
+    energy, depth = ([_offered_by(ask, x) for x in xs] for ask in (engine.energy, engine.contact_depth))
+    energies, depths = (None if None in values else frozen(values) for values in (energy, depth))
+    return EngineMotion(frozen(times), frozen(xs), frozen(us), energies, depths, status)
 
-    energy, depth = where_offered(engine.energy), where_offered(engine.contact_depth)
-    return EngineMotion(frozen(times), frozen(xs), frozen(us), energy, depth, status)
+
+def _offered_by(ask: Callable[..., T], *arguments: Any) -> T | None:
+    try:
+        return ask(*arguments)
+    except NotOfferedError:
+        return None
 
 
 def seconds(call: Callable[[], Any]) -> float | None:
@@ -237,7 +240,11 @@ def attribute(
     masses, no_mass = _offered((first, second), "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
     biases, no_bias = _offered((first, second), "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
     a, b = (
-        Terms(M, *_forces_of(engine, M, bias, x, u), engine.contract.time_step)
+        Terms(
+            M,  # of a closed form the forces are what M makes of its accelerations
+            *(engine.terms(M, x, u) if isinstance(engine, ClosedForm) else (bias, *forces(engine.contract, u))),
+            engine.contract.time_step,
+        )
         for M, bias, engine in zip(masses, biases, (first, second), strict=True)
     )
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
@@ -289,20 +296,10 @@ def _offered(
     engines: tuple[Engine, Engine], name: str, ask: Callable[[Engine], Array], otherwise: Array
 ) -> tuple[list[Array], list[str]]:
     """What both say, and who says nothing: an engine that does not offer it gets the other's."""
-    answers: list[Array | None] = []
-    for engine in engines:
-        try:
-            answers.append(ask(engine))
-        except NotOfferedError:
-            answers.append(None)
+    answers = [_offered_by(ask, engine) for engine in engines]
     known = next((value for value in answers if value is not None), otherwise)
     missing = [f"{name} of {e.name}" for e, value in zip(engines, answers, strict=True) if value is None]
     return [known if value is None else value for value in answers], missing
-
-
-def _forces_of(engine: Engine, M: Array, bias: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
-    """Bias, B u and the joints' damping, (nv,) each; of a closed form what `M` makes of its accelerations."""
-    return engine.terms(M, x, u) if isinstance(engine, ClosedForm) else (bias, *forces(engine.contract, u))
 
 
 def forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
@@ -329,8 +326,7 @@ def what_is_left(
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
     push = _push(coordinates, first, x, after_b - after_a if left is None else left, after_a)
     joints = _joints_near_limits(coordinates, (first, second), x, (after_a, after_b))
-    if push and not push <= joints:  # something pushes joints that are at no limit
-        joints = set()
+    joints = joints if push <= joints else set()  # something pushes joints that are at no limit
     if _touching((first, second), (x, *steps)) and not (push and joints and len(push) < coordinates.nv):
         return CONTACT_LAW
     if joints and (push or left is None):
@@ -349,13 +345,8 @@ def _push(coordinates: Coordinates, engine: Engine, x: Array, left: Array, after
 
 
 def _touching(engines: tuple[Engine, Engine], states: tuple[Array, ...]) -> bool:
-    for engine in engines:
-        try:
-            if any(engine.contact_depth(state) > 0 for state in states):
-                return True
-        except NotOfferedError:
-            continue
-    return False
+    depths = (_offered_by(engine.contact_depth, x) for engine in engines for x in states)
+    return any(depth is not None and depth > 0 for depth in depths)
 
 
 def _joints_near_limits(

@@ -23,6 +23,18 @@ Gradient = Literal["its own step's", "not its own step's", "undecided", "none"]
 STEP_TOLERANCE: dict[Precision, float] = {"float64": 1e-10, "float32": 1e-4}
 # Relative to the largest entry: what differences of a step, which some engines offer as its derivative, leave.
 JACOBIAN_TOLERANCE: dict[Precision, float] = {"float64": 1e-8, "float32": 1e-2}
+PHRASES: Mapping[Verdict, str] = {
+    "same": "the same simulation as Drake",
+    "other law": "the same model under another law",
+    "other model": "another model: its contract is broken",
+    "unexplained": "different, and nothing explains why",
+}
+TRUST: Mapping[Gradient, str] = {
+    "its own step's": "to be trusted at the states looked at",
+    "not its own step's": "not the derivatives of their own steps",
+    "undecided": "undecided",
+    "none": "none offered",
+}
 # What the contact law, whatever its form, is applied to.
 OF_CONTACT = (
     "shapes", "poses", "contact pairs", "friction", "stiffness", "dissipation", "contact margin", "other contact terms",
@@ -31,14 +43,7 @@ OF_CONTACT = (
 TELLS: Mapping[str, tuple[str, ...]] = {
     "inertia": ("mass", "center of mass", "inertia", "frames", "armature", "joint types", "joint order and names"),
     "bias": (
-        "forces at rest",
-        "velocity products",
-        "gravity",
-        "springs",
-        "mass",
-        "center of mass",
-        "inertia",
-        "frames",
+        "forces at rest", "velocity products", "gravity", "springs", "mass", "center of mass", "inertia", "frames",
         "joint order and names",
     ),
     "actuation": ("actuator mapping", "effort limits", "forces of the inputs"),
@@ -47,7 +52,7 @@ TELLS: Mapping[str, tuple[str, ...]] = {
     "integrator": ("integrator",),
     "contact law": ("contact law", *OF_CONTACT, "solver tolerance"),
     "limit law": ("limit law", "position limits"),
-}
+}  # fmt: skip
 
 
 class StateProbe(NamedTuple):
@@ -159,52 +164,36 @@ class Compared:
 
     @property
     def sentence(self) -> str:
-        """What it is beside Drake, and why."""
-        within = f"{len(self.step_gaps)} steps within {_largest(self.step_gaps)} of Drake's"
+        """What it is beside Drake, where they part, and why."""
+        clauses, gap = [PHRASES[self.verdict]], _largest(self.step_gaps)
+        if self.first_apart is None:
+            clauses.append(f"each of {len(self.step_gaps)} steps within {gap} of Drake's")
+        else:
+            terms = _list(list(dict.fromkeys((self.first.responsible, self.largest.responsible))))
+            start = f"apart from t = {self.motion.times[self.first_apart]:.4g} s on"
+            clauses.append(f"{start}, by up to {gap} of the state in one step, by its {terms}")
+        if self.other_states:
+            i = max(self.other_states, key=lambda state: self.jacobian_gaps[state])
+            law = f", by the {self.laws[i]}" if self.laws[i] else ""
+            off = f"off by {self.jacobian_gaps[i]:.1e} of its largest entry{law}"
+            clauses.append(f"its Jacobian at the {self.jacobians[i].state} state is {off}")
+        elif self.jacobians:
+            clauses.append(f"Jacobians within {_largest(self.jacobian_gaps)} of their largest entry")
+        if self.motion.status != "ok":
+            clauses.append(self.motion.status)
+        return "; ".join([*clauses, *self._reasons()])
+
+    def _reasons(self) -> list[str]:
+        if self.verdict == "other model":
+            return [f"{line.quantity}: {line.detail}" for line in self.broken]
+        if self.verdict == "unexplained":
+            return ["no line of its contract explains it"]
         if self.verdict == "same":
             unused = [line.quantity for line in self.different if line.reason not in UNKNOWN]
-            but = f"; its contract also differs in {_list(unused)}, which played no part here" if unused else ""
-            jacobians = f", Jacobians within {_largest(self.jacobian_gaps)} of their largest entry"
-            return f"the same simulation: each of {within}{jacobians if self.jacobians else ''}{but}"
-        if self.verdict == "other model":
-            lines = [f"{line.quantity}: {line.detail}" for line in self.broken]
-            words = f"another model ({'; '.join(lines)})"
-            if self.first_apart is None:
-                return f"{words}, though each of {within}"
-            since = f"the same for {self.motion.times[self.first_apart]:.4g} s, then " if self.first_apart else ""
-            by = f"most by its {self.largest.responsible}"
-            return f"{words}; {since}a step differs by up to {_largest(self.step_gaps)}, {by}"
-        if self.verdict == "unexplained":
-            return self._unexplained()
-        if self.first_apart is None:
-            i = max(self.other_states, key=lambda state: self.jacobian_gaps[state])
-            reason = "; ".join(line.reason or line.detail for line in self.tells(self.laws[i])[:1])
-            return (
-                f"the same motion, each of {within}; another Jacobian at the {self.jacobians[i].state} state, "
-                f"by the {self.laws[i]} ({reason})"
-            )
-        k = self.first_apart
-        before = f"the same for {self.motion.times[k]:.4g} s, then apart" if k else "apart from the first step on"
-        terms = list(dict.fromkeys((self.first.responsible, self.largest.responsible)))
-        lines_of = {line.quantity: line.reason or line.detail for line in self.told}
-        why = "; ".join(lines_of[term] for term in terms if term in lines_of) or "; ".join(lines_of.values())
-        why = "; ".join(text for text in (why, self.first.as_if) if text)
-        return f"{before} by the {_list(terms)}, at most {_largest(self.step_gaps)} of the state in one step ({why})"
-
-    def _unexplained(self) -> str:
-        if self.first_apart is not None:
-            return (
-                f"apart from t = {self.motion.times[self.first_apart]:.4g} s on by up to {_largest(self.step_gaps)} "
-                f"in one step, above {STEP_TOLERANCE[self.precision]:g}; the largest part is "
-                f"{self.largest.responsible}, and no line of its contract explains it"
-            )
-        if self.motion.status != "ok":
-            return self.motion.status
-        worst = int(np.argmax(self.jacobian_gaps))
-        return (
-            f"every step is Drake's, but its Jacobian at the {self.jacobians[worst].state} state is off by "
-            f"{self.jacobian_gaps[worst]:.1e} of its largest entry"
-        )
+            return [f"its contract also differs in {_list(unused)}, which played no part here"] if unused else []
+        laws = [*self.told, *(line for i in self.other_states for line in self.tells(self.laws[i]))]
+        reasons = dict.fromkeys(line.reason or line.detail for line in laws)
+        return [*reasons, *([self.first.as_if] if self.first.as_if else [])]
 
     def __repr__(self) -> str:
         return f"{self.engine}: {self.sentence}"
@@ -261,31 +250,16 @@ class Comparison:
 
     def __str__(self) -> str:
         """Which engines are the same, which are not, and whose gradients are those of their own steps."""
-        others, parts = self.engines[1:], []
-        for verdict, phrase in (
-            ("same", "the same simulation as Drake"),
-            ("other law", "the same model under another law"),
-            ("other model", "another model: its contract is broken"),
-            ("unexplained", "different, and nothing explains why"),
-        ):
-            names = [e.engine for e in others if e.verdict == verdict]
-            parts += [f"{_list(names)}: {phrase}"] if names else []
+        others = self.engines[1:]
+        kinds = {phrase: [e.engine for e in others if e.verdict == v] for v, phrase in PHRASES.items()}
+        parts = [f"{_list(names)}: {phrase}" for phrase, names in kinds.items() if names]
+        trust = {kind: [e.engine for e in self.engines if e.gradient == kind] for kind in TRUST}
+        parts += [f"gradients of {_list(names)}: {TRUST[kind]}" for kind, names in trust.items() if names]
         after_contact = any(
             "contact law" in (e.first.responsible, e.largest.responsible) for e in others if e.verdict != "same"
         )
         note = " From the first touch on a state is only as good as the contact law: examples/studies/contact_table.py."
-        trusted, wrong, open_, blind = (
-            [e.engine for e in self.engines if e.gradient == kind]
-            for kind in ("its own step's", "not its own step's", "undecided", "none")
-        )
-        trust = (
-            [f"Gradients to trust at the states looked at: {_list(trusted)}"] if trusted else ["No gradient to trust"]
-        )
-        trust += [f"not those of {_list(wrong)}, which are not the derivatives of their own steps"] if wrong else []
-        trust += [f"those of {_list(open_)} could not be decided"] if open_ else []
-        trust += [f"{_list(blind)} {'offer' if len(blind) > 1 else 'offers'} none"] if blind else []
-        summary = f"{'; '.join(parts or ['no engine was compared'])}. {'; '.join(trust)}."
-        return f"{summary}{note if after_contact else ''}"
+        return f"{'; '.join(parts)}.{note if after_contact else ''}"
 
 
 def _breaks(line: ContractLine, touched: bool) -> bool:
