@@ -15,7 +15,6 @@ from drake_diff._base.arrays import Array
 from drake_diff.engines.formats import carried_by, inertial_urdf
 from drake_diff.engines.interface import EngineContract, EulerEngine, PlantEngine, floats, limit
 from drake_diff.exceptions import MissingDependencyError, ModelError
-from drake_diff.mechanics.coordinates import euler_acceleration
 from drake_diff.mechanics.description import Description, JointContract, Link, joint_contract
 from drake_diff.model.model import Model
 
@@ -32,7 +31,7 @@ except ImportError as error:
 NO_CONTACT = "adam's dynamics have no contact here"
 
 
-class CasadiEngine(EulerEngine, PlantEngine):
+class CasadiEngine(PlantEngine, EulerEngine):
     """Trees of hinges, slides and free bodies; no contact and no joint limits."""
 
     name, version, method = "casadi", version("adam-robotics"), "casadi"
@@ -75,17 +74,9 @@ class CasadiEngine(EulerEngine, PlantEngine):
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         return np.array(self.terms(*self._motion(q, v))[1]).ravel()
 
-    def _acceleration(self, x: Array, u: Array) -> Array:
-        q, v = x[: self.nq], x[self.nq :]
-        M, bias = (np.array(term) for term in self.terms(q, v))
-        return euler_acceleration(M, self.damping, self.time_step, v, self._effort(u) - bias.ravel())
-
-    def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
-        q, v, acceleration = x[: self.nq], x[self.nq :], self._acceleration(x, u)
-        by_q, by_v = (np.array(term) for term in self.derivatives(q, v, acceleration))
-        D = np.diag(self.damping)
-        residual = np.hstack([by_q @ self.coordinates.rate(q), by_v + D, -self._effort_by_input(u)])
-        return acceleration, np.asarray(-np.linalg.solve(self.mass_matrix(q) + self.time_step * D, residual))
+    def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
+        by_q, by_v = (np.array(term) for term in self.derivatives(q, v, a))
+        return by_q @ self.coordinates.rate(q), by_v
 
     @property
     def contract(self) -> EngineContract:

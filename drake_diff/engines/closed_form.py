@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, positive_float
 from drake_diff.engines.interface import EngineContract, EulerEngine, float_rows, floats
 from drake_diff.exceptions import ModelError
-from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration
+from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import JointContract, joint_contract
 from drake_diff.model.model import Model
 
@@ -75,16 +75,10 @@ class HandForm(ABC):
     def joints(self) -> tuple[JointContract, ...]:
         """What the contract says of the joints."""
 
-    def acceleration(self, h: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """(v' - v) / h (nv,) of the step, and its derivative by motion, v and u (nv, 2 nv + nu)."""
-        M, D, limit = self.mass_matrix(q), self.damping, np.array(self.effort_limits)
-        effort = np.clip(u, -limit, limit)
-        a = euler_acceleration(M, D, h, v, self.actuation @ effort - self.bias(q, v))
+    def needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
+        """(nv, nv) each, of M a + bias by small motion and by v."""
         by_q = _complex_steps(lambda z: self.mass_matrix(z) @ a + self.bias(z, v), q)
-        by_v = _complex_steps(lambda z: self.bias(q, z), v)
-        inside = self.actuation * (np.abs(u) <= limit)
-        residual = [by_q @ self.coordinates.rate(q), by_v + np.diag(D), -inside]
-        return a, np.asarray(-np.linalg.solve(M + h * np.diag(D), np.hstack(residual)), dtype=float)
+        return by_q @ self.coordinates.rate(q), _complex_steps(lambda z: self.bias(q, z), v)
 
     def _joint(
         self, index: int, kind: str, axis: Array, anchor: Array, mass: float, com: Array, inertia: Array = NO_INERTIA,
@@ -293,9 +287,16 @@ class NumpyEngine(EulerEngine):
             self.form, self.time_step = model, positive_float("time_step [s]", time_step)
         self.coordinates = self.form.coordinates
         self.nq, self.nv, self.nu = self.coordinates.nq, self.coordinates.nv, len(self.form.input_names)
+        self.damping, self.limits = self.form.damping, np.array(self.form.effort_limits)
 
-    def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
-        return self.form.acceleration(self.time_step, x[: self.nq], x[self.nq :], u)
+    def _effort(self, u: Array) -> Array:
+        return np.asarray(self.form.actuation @ np.clip(u, -self.limits, self.limits))
+
+    def _effort_by_input(self, u: Array) -> Array:
+        return np.asarray(self.form.actuation * (np.abs(u) <= self.limits))
+
+    def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
+        return self.form.needed_derivative(q, v, a)
 
     def energy(self, x: ArrayLike) -> float:
         _, q, v = self._state(x)

@@ -15,7 +15,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff.exceptions import SimulationError
-from drake_diff.mechanics.coordinates import Centers, Coordinates, euler_jacobian, euler_step, zero
+from drake_diff.mechanics.coordinates import (
+    Centers,
+    Coordinates,
+    euler_acceleration,
+    euler_jacobian,
+    euler_step,
+    zero,
+)
 from drake_diff.mechanics.description import (
     Description,
     GeometryContract,
@@ -170,10 +177,11 @@ class Arguments:
 
 
 class EulerEngine(Arguments):
-    """An engine whose dynamics are put into Drake's Euler step, without contact unless it says otherwise."""
+    """An engine whose M and bias are put into Drake's Euler step, without contact unless it says otherwise."""
 
     coordinates: Coordinates
     time_step: float
+    damping: Array  # (nv,) of the joints, implicit
     method: str  # by which its derivatives are taken
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
@@ -197,11 +205,36 @@ class EulerEngine(Arguments):
 
     def _acceleration(self, x: Array, u: Array) -> Array:
         """(nv,) (v' - v) / h of the step."""
-        return self._acceleration_derivative(x, u)[0]
+        q, v = x[: self.nq], x[self.nq :]
+        force = self._effort(u) - self.bias(q, v)
+        return euler_acceleration(self.mass_matrix(q), self.damping, self.time_step, v, force)
 
-    @abstractmethod
     def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
         """The acceleration, and its derivative (nv, 2 nv + nu) by small motion, by v and by u."""
+        q, v, acceleration, D = x[: self.nq], x[self.nq :], self._acceleration(x, u), np.diag(self.damping)
+        by_motion, by_v = self._needed_derivative(q, v, acceleration)
+        residual = np.hstack([by_motion, by_v + D, -self._effort_by_input(u)])
+        return acceleration, np.asarray(-np.linalg.solve(self.mass_matrix(q) + self.time_step * D, residual))
+
+    @abstractmethod
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """(nv, nv)."""
+
+    @abstractmethod
+    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """(nv,)."""
+
+    @abstractmethod
+    def _effort(self, u: Array) -> Array:
+        """(nv,) B u, cut at the effort limits."""
+
+    @abstractmethod
+    def _effort_by_input(self, u: Array) -> Array:
+        """(nv, nu) the derivative of `_effort`."""
+
+    @abstractmethod
+    def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
+        """(nv, nv) each, of the force M a + bias that `a` (nv,) needs: by small motion and by v."""
 
 
 class PlantEngine(Arguments):
@@ -212,7 +245,6 @@ class PlantEngine(Arguments):
         self.coordinates = self.description.coordinates
         self.time_step, self.status = model.time_step, "ok"
         self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
-        self._holding = np.zeros(model.nv)  # forces that act for a while beside the inputs
         self.damping, self.armature, self.stiffness, self.rest = (
             self.description.by_velocity(name) for name in ("damping", "armature", "stiffness", "rest")
         )
@@ -220,16 +252,7 @@ class PlantEngine(Arguments):
 
     def _effort(self, u: Array) -> Array:
         """(nv,) B u, cut at the effort limits."""
-        return np.asarray(self.actuation @ np.clip(u, -self.limits, self.limits)) + self._holding
-
-    @contextmanager
-    def holding(self, force: Array) -> Iterator[None]:
-        """A generalized force (nv,) acts beside the inputs, whatever the state, until it ends."""
-        self._holding = force
-        try:
-            yield
-        finally:
-            self._holding = np.zeros(self.nv)
+        return np.asarray(self.actuation @ np.clip(u, -self.limits, self.limits))
 
     def _effort_by_input(self, u: Array) -> Array:
         """(nv, nu) the derivative of `_effort`."""

@@ -88,7 +88,10 @@ TAKEN = ("drake", "pinocchio", "casadi")  # engines that a model with reduced co
 
 
 class ReducedEngine(EulerEngine):
-    """`whole` is the engine on `model.whole`, one of an Euler step of the description of its plant."""
+    """`whole` is the engine on `model.whole`, one of an Euler step of the description of its plant.
+
+    With v = E v_own the force that an acceleration needs is E' of that which E a_own needs of the whole.
+    """
 
     def __init__(self, whole: Any, model: Model):
         if model.coupling is None:
@@ -98,6 +101,7 @@ class ReducedEngine(EulerEngine):
         self.name, self.version, self.method = whole.name, whole.version, whole.method
         self.coordinates, self.time_step, self.status = coordinates_of(model), model.time_step, "ok"
         self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
+        self.damping = self.coupling.forces(self.coupling.ratio_v * whole.damping)
 
     def energy(self, x: ArrayLike) -> float:
         return float(self.whole.energy(self.coupling.state(self._state(x)[0])))
@@ -108,29 +112,21 @@ class ReducedEngine(EulerEngine):
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         q, v = self._motion(q, v)
-        return np.asarray(self.coupling.forces(self._bias(q, v)))
+        return np.asarray(
+            self.coupling.forces(self.whole.bias(self.coupling.positions(q), self.coupling.velocities(v)))
+        )
 
-    def _bias(self, q: Array, v: Array) -> Array:
-        return np.asarray(self.whole.bias(self.coupling.positions(q), self.coupling.velocities(v)))
+    def _effort(self, u: Array) -> Array:
+        return np.asarray(self.coupling.forces(self.whole._effort(u)))
 
-    def _balance(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """A (m, m), a_own (nv,), and the forces (m,) that hold all joints to E a_own."""
-        q, v, whole, coupling = x[: self.nq], x[self.nq :], self.whole, self.coupling
-        A = whole.mass_matrix(coupling.positions(q)) + self.time_step * np.diag(whole.damping)
-        force = whole._effort(u) - self._bias(q, v) - whole.damping * coupling.velocities(v)
-        acceleration = coupling.next_velocities(A, np.linalg.solve(A, force))
-        return A, acceleration, A @ coupling.velocities(acceleration) - force
+    def _effort_by_input(self, u: Array) -> Array:
+        return np.asarray(self.coupling.spread.T @ self.whole._effort_by_input(u))
 
-    def _acceleration(self, x: Array, u: Array) -> Array:
-        return self._balance(x, u)[1]
-
-    def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
-        A, acceleration, holding = self._balance(x, u)
-        with self.whole.holding(holding):
-            _, by = self.whole._acceleration_derivative(self.coupling.state(x), u)
-        E, m = self.coupling.spread, len(A)
-        by = A @ np.hstack([by[:, :m] @ E, by[:, m : 2 * m] @ E, by[:, 2 * m :]])
-        return acceleration, np.linalg.solve(E.T @ A @ E, E.T @ by)
+    def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
+        E, coupling = self.coupling.spread, self.coupling
+        whole = coupling.positions(q), coupling.velocities(v), coupling.velocities(a)
+        by_motion, by_v = self.whole._needed_derivative(*whole)
+        return E.T @ by_motion @ E, E.T @ by_v @ E
 
     @property
     def contract(self) -> EngineContract:

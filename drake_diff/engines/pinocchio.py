@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from drake_diff._base.arrays import Array
 from drake_diff.engines.interface import EngineContract, EulerEngine, PlantEngine, floats
 from drake_diff.exceptions import MissingDependencyError, ModelError
-from drake_diff.mechanics.coordinates import euler_acceleration, native_positions, turn, turn_derivatives, turning
+from drake_diff.mechanics.coordinates import native_positions, turn, turn_derivatives, turning
 from drake_diff.mechanics.description import JointContract, Link, joint_contract
 from drake_diff.model.model import Model
 
@@ -22,7 +22,7 @@ except ImportError as error:
     raise MissingDependencyError("this engine needs Pinocchio: pip install 'drake-diff[engines]'") from error
 
 
-class PinocchioEngine(EulerEngine, PlantEngine):
+class PinocchioEngine(PlantEngine, EulerEngine):
     """Trees of hinges, slides and free bodies; no contact and no joint limits."""
 
     name, version, method = "pinocchio", str(pin.__version__), "analytic (RNEA derivatives)"
@@ -49,31 +49,17 @@ class PinocchioEngine(EulerEngine, PlantEngine):
         needed = pin.rnea(self.pin, self.data, native_q, Q @ v, -Q @ turning(self.coordinates, v))
         return np.asarray(Q.T @ needed + self.stiffness * self._stretch(q))
 
-    def _acceleration(self, x: Array, u: Array) -> Array:
-        return self._drakes(x, self._native_acceleration(x, u))
-
-    def _native_acceleration(self, x: Array, u: Array) -> Array:
-        q = x[: self.nq]
-        native_q, native_v = native_positions(self.coordinates, q), turn(self.coordinates, q) @ x[self.nq :]
-        force = self._effort(u) - self.stiffness * self._stretch(q)
-        force -= pin.rnea(self.pin, self.data, native_q, native_v, np.zeros(self.nv))
-        return euler_acceleration(self._mass(native_q), self.damping, self.time_step, native_v, force)
-
-    def _drakes(self, x: Array, native: Array) -> Array:
-        return np.asarray(turn(self.coordinates, x[: self.nq]).T @ native + turning(self.coordinates, x[self.nq :]))
-
-    def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
-        q, v, native = x[: self.nq], x[self.nq :], self._native_acceleration(x, u)
-        Q, native_q, D = turn(self.coordinates, q), native_positions(self.coordinates, q), np.diag(self.damping)
-        by_q, by_v, _ = pin.computeRNEADerivatives(self.pin, self.data, native_q, Q @ v, native)
-        by_v = by_v + D
-        velocity_by_motion, out_by_motion, out_by_v = turn_derivatives(self.coordinates, Q, v, native)
-        by_motion = by_q @ Q + by_v @ velocity_by_motion + np.diag(self.stiffness)
-        residual = np.hstack([by_motion, by_v @ Q, -self._effort_by_input(u)])
-        by = -Q.T @ np.linalg.solve(self._mass(native_q) + self.time_step * D, residual)
-        by[:, : self.nv] += out_by_motion
-        by[:, self.nv : 2 * self.nv] += out_by_v
-        return self._drakes(x, native), np.asarray(by)
+    def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
+        """Of Q' tau(q, Q v, Q (a - w x v)), whose Q is that of `turn`."""
+        Q, native_q = turn(self.coordinates, q), native_positions(self.coordinates, q)
+        native_v, native_a = Q @ v, Q @ (a - turning(self.coordinates, v))
+        needed = pin.rnea(self.pin, self.data, native_q, native_v, native_a)
+        by_q, by_v, _ = pin.computeRNEADerivatives(self.pin, self.data, native_q, native_v, native_a)
+        velocity_by_motion, a_by_motion, a_by_v = turn_derivatives(self.coordinates, Q, v, native_a)
+        _, needed_by_motion, _ = turn_derivatives(self.coordinates, Q, v, needed)
+        M = self.mass_matrix(q)
+        by_motion = needed_by_motion + Q.T @ (by_q @ Q + by_v @ velocity_by_motion) - M @ a_by_motion
+        return by_motion + np.diag(self.stiffness), Q.T @ by_v @ Q - M @ a_by_v
 
     def _mass(self, native_q: Array) -> Array:
         upper = np.triu(pin.crba(self.pin, self.data, native_q))

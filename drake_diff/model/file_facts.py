@@ -8,7 +8,7 @@ and other kinds of actuators are left out.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -108,19 +108,71 @@ def _included(element: Element, path: Path) -> Path | None:
     return file if file.name.endswith((".xml", ".mjcf")) and file.is_file() else None
 
 
-@dataclass(frozen=True)
-class Joint:
-    """A joint of one coordinate, [rad] or [m]; `effort` [N or N m] is None where nothing limits it.
+Key = tuple[str, str]  # the names of a model instance and of a joint or link in it
 
-    `stiffness` is that of its spring, which is at rest at `rest`; `start` is the coordinate in the file's pose.
+
+@dataclass(frozen=True)
+class Mimic:
+    """q of `follower` = ratio * q of `leader` + offset, joints of one model instance, by their names.
+
+    `in_drake` says whether Drake's parser makes a constraint of it. MJCF's equalities of joints are such, too.
     """
 
-    name: str
-    stiffness: float
-    rest: float
-    start: float
-    armature: float
+    instance: str
+    follower: str
+    leader: str
+    ratio: float
+    offset: float
+    in_drake: bool
+
+    def __str__(self) -> str:
+        more = f" + {self.offset:g}" if self.offset else ""
+        return f"{self.follower} = {self.ratio:g} {self.leader}{more}"
+
+
+@dataclass(frozen=True)
+class JointSays:
+    """Of a joint: the effort limit [N or N m] as written, None where there is none.
+
+    `passive` says that it is not to be driven: so SDF means an effort limit of 0, where it makes a motor of each other.
+    `spring` is the stiffness [N m/rad or N/m] and the position at rest of one that Drake's parser does not read,
+    `armature` [kg m^2 or kg] MJCF's inertia of a rotor, which Drake has only where an actuator is, and `start` [rad or
+    m] the coordinate in MJCF's pose.
+    """
+
     effort: float | None
+    passive: bool = False
+    spring: tuple[float, float] | None = None
+    armature: float = 0.0
+    start: float = 0.0
+
+
+@dataclass(frozen=True)
+class LinkSays:
+    """Of a link: mass [kg] and the trace of its inertia [kg m^2], None where not given, and its collision shapes.
+
+    `defaults` is whether the format has a mass and an inertia of its own for a link without: SDF has 1 and 1.
+    """
+
+    mass: float | None
+    trace: float | None
+    collisions: int
+    defaults: bool
+
+
+@dataclass(frozen=True)
+class FileFacts:
+    """What the files say, joints and links by the names of their model instance and their own.
+
+    `followers` are the joints that mimic another one. `disabled` is what MJCF switches off and Drake has all the same:
+    contact, constraint, gravity. `left_out` are the joints of actuators of MJCF that Drake does not read.
+    """
+
+    joints: dict[Key, JointSays] = field(default_factory=dict)
+    links: dict[Key, LinkSays] = field(default_factory=dict)
+    followers: dict[Key, Mimic] = field(default_factory=dict)
+    disabled: set[str] = field(default_factory=set)
+    left_out: set[Key] = field(default_factory=set)
 
 
 @dataclass(frozen=True)
@@ -133,16 +185,6 @@ class FileActuator:
     read: bool  # by Drake
     limit: float  # [N or N m]
     gains: tuple[float, float] | None
-
-
-@dataclass(frozen=True)
-class Coupled:
-    """q of `follower` = ratio * q of `leader` + offset."""
-
-    follower: str
-    leader: str
-    ratio: float
-    offset: float
 
 
 class Mjcf:
@@ -191,7 +233,7 @@ class Mjcf:
         return self.defaults.get(name or MAIN, self.defaults[MAIN]).get(element.tag, {}) | element.attributes
 
     @cached_property
-    def joints(self) -> dict[str, Joint]:
+    def joints(self) -> dict[str, JointSays]:
         """Those of one coordinate that have a name."""
         joints = {}
         for element in (e for body in self.root.findall("worldbody") for e in body.iter("joint")):
@@ -200,13 +242,13 @@ class Mjcf:
             if kind in SCALAR and says.get("name"):
                 unit = math.pi / 180 if kind == "hinge" and self.degrees else 1.0
                 stiffness = _numbers(says.get("stiffness", "0"))
-                joints[says["name"]] = Joint(
-                    says["name"],
-                    stiffness[0] if len(stiffness) == 1 else 0.0,
-                    unit * _first(says.get("springref", "0")),
-                    unit * _first(says.get("ref", "0")),
-                    _first(says.get("armature", "0")),
+                joints[says["name"]] = JointSays(
                     self._range(says, "actuatorfrc"),
+                    spring=(stiffness[0], unit * _first(says.get("springref", "0")))
+                    if len(stiffness) == 1 and stiffness != [0.0]
+                    else None,
+                    armature=_first(says.get("armature", "0")),
+                    start=unit * _first(says.get("ref", "0")),
                 )
         return joints
 
@@ -219,7 +261,7 @@ class Mjcf:
             for element in body.iter("joint")
             if any(_numbers(self.attributes(element).get("stiffness", "0")))
         ]
-        return len(springs) > sum(joint.stiffness != 0 for joint in self.joints.values())
+        return len(springs) > sum(joint.spring is not None for joint in self.joints.values())
 
     def _range(self, says: Attributes, name: str) -> float | None:
         """The larger end of a range that holds; None where none does."""
@@ -252,15 +294,15 @@ class Mjcf:
         read = kind in KINDS and bool(joint)
         return FileActuator(kind, says.get("name", ""), joint, read, min(at_joint, default=math.inf), gains)
 
-    @property
-    def coupled(self) -> "Iterator[Coupled]":
-        """Joints that follow another one linearly."""
+    def mimics(self, instance: str) -> Iterator[Mimic]:
+        """Joints that follow another one linearly, of the robot that is called `instance`."""
         for element in (e for section in self.root.findall("equality") for e in section.findall("joint")):
             says = self.attributes(element)
-            a, b = (self.joints.get(says.get(name, "")) for name in ("joint1", "joint2"))
+            names = says.get("joint1", ""), says.get("joint2", "")
+            a, b = (self.joints.get(name) for name in names)
             terms = [*_numbers(says.get("polycoef", "0 1 0 0 0")), 0.0, 0.0]
             if a and b and says.get("active", "true") == "true" and not any(terms[2:]):
-                yield Coupled(a.name, b.name, terms[1], a.start + terms[0] - terms[1] * b.start)
+                yield Mimic(instance, *names, terms[1], a.start + terms[0] - terms[1] * b.start, in_drake=False)
 
     @property
     def disabled(self) -> tuple[str, ...]:
@@ -345,71 +387,6 @@ def _first(text: str, default: float = 0.0) -> float:
     return numbers[0] if numbers else default
 
 
-Key = tuple[str, str]  # the names of a model instance and of a joint or link in it
-
-
-@dataclass(frozen=True)
-class Mimic:
-    """q of `follower` = ratio * q of `leader` + offset, joints of one model instance, by their names.
-
-    `in_drake` says whether Drake's parser makes a constraint of it. MJCF's equalities of joints are such, too.
-    """
-
-    instance: str
-    follower: str
-    leader: str
-    ratio: float
-    offset: float
-    in_drake: bool
-
-    def __str__(self) -> str:
-        more = f" + {self.offset:g}" if self.offset else ""
-        return f"{self.follower} = {self.ratio:g} {self.leader}{more}"
-
-
-@dataclass(frozen=True)
-class JointSays:
-    """Of a joint: the effort limit [N or N m] as written, None where there is none.
-
-    `passive` says that it is not to be driven: so SDF means an effort limit of 0, where it makes a motor of each other.
-    `spring` is the stiffness [N m/rad or N/m] and the position at rest of one that Drake's parser does not read,
-    `armature` [kg m^2 or kg] MJCF's inertia of a rotor, which Drake has only where an actuator is.
-    """
-
-    effort: float | None
-    passive: bool = False
-    spring: tuple[float, float] | None = None
-    armature: float = 0.0
-
-
-@dataclass(frozen=True)
-class LinkSays:
-    """Of a link: mass [kg] and the trace of its inertia [kg m^2], None where not given, and its collision shapes.
-
-    `defaults` is whether the format has a mass and an inertia of its own for a link without: SDF has 1 and 1.
-    """
-
-    mass: float | None
-    trace: float | None
-    collisions: int
-    defaults: bool
-
-
-@dataclass(frozen=True)
-class FileFacts:
-    """What the files say, joints and links by the names of their model instance and their own.
-
-    `followers` are the joints that mimic another one. `disabled` is what MJCF switches off and Drake has all the same:
-    contact, constraint, gravity. `left_out` are the joints of actuators of MJCF that Drake does not read.
-    """
-
-    joints: dict[Key, JointSays] = field(default_factory=dict)
-    links: dict[Key, LinkSays] = field(default_factory=dict)
-    followers: dict[Key, Mimic] = field(default_factory=dict)
-    disabled: set[str] = field(default_factory=set)
-    left_out: set[Key] = field(default_factory=set)
-
-
 def read_facts(xml: XmlText, instance: str | None, facts: FileFacts) -> None:
     """Add to `facts` what a robot file, its slips mended, says of joints and links; of MJCF no links.
 
@@ -438,13 +415,9 @@ def _read_urdf(robot: Element, name: str, facts: FileFacts) -> None:
 
 def _read_mjcf(mjcf: Mjcf, name: str, facts: FileFacts) -> None:
     limits = {actuator.joint: actuator.limit for actuator in mjcf.actuators if math.isfinite(actuator.limit)}
-    for joint in mjcf.joints.values():
-        spring = (joint.stiffness, joint.rest) if joint.stiffness else None
-        effort = limits.get(joint.name, joint.effort)
-        facts.joints[name, joint.name] = JointSays(effort, spring=spring, armature=joint.armature)
-    for pair in mjcf.coupled:
-        mimic = Mimic(name, pair.follower, pair.leader, pair.ratio, pair.offset, in_drake=False)
-        facts.followers[name, pair.follower] = mimic
+    for joint, says in mjcf.joints.items():
+        facts.joints[name, joint] = replace(says, effort=limits.get(joint, says.effort))
+    facts.followers.update({(name, mimic.follower): mimic for mimic in mjcf.mimics(name)})
     facts.disabled.update(mjcf.disabled)
     facts.left_out.update((name, actuator.joint) for actuator in mjcf.actuators if not actuator.read)
 

@@ -19,7 +19,6 @@ from pydrake.multibody.tree import (
 )
 
 import drake_diff as dd
-from drake_diff.engines.closed_form import DoublePendulum, NumpyEngine, Pendulum
 from drake_diff.engines.formats import inertial_urdf, urdf
 from drake_diff.exceptions import ModelError, ModelWarning
 from drake_diff.mechanics.description import describe
@@ -78,19 +77,6 @@ def test_casadi_is_drake_with_two_free_bodies_and_an_arm_on_the_world():
     assert_free_steps_agree(model, "casadi", 1e-12, 1e-12)
     lines = dd.engines.match_contracts(dd.engines.load_engine("drake", model), engine_of("casadi", model))
     assert not [str(line) for line in lines if line.verdict == "different"]
-
-
-@pytest.mark.parametrize(("file", "form"), [("pendulum.urdf", Pendulum()), ("double_pendulum.urdf", DoublePendulum())])
-def test_casadi_is_the_hand_calculation(load, file, form):
-    model, hand, random = load(file), NumpyEngine(form, time_step=0.01), np.random.default_rng(4)
-    engine = engine_of("casadi", model)
-    for _ in range(3):
-        x, u = random.standard_normal(model.nx), random.standard_normal(model.nu)
-        one, two = engine.differentiate_step(x, u), hand.differentiate_step(x, u)
-        np.testing.assert_allclose(engine.step(x, u), hand.step(x, u), rtol=0, atol=1e-13)  # rounding
-        np.testing.assert_allclose(one.A, two.A, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(one.B, two.B, rtol=0, atol=1e-13)
-    assert one.method == "casadi"
 
 
 @pytest.mark.parametrize("wrong", [lambda real, q: real(q[[3, 0, 1, 2]]), lambda real, q: real(q).T])

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.closed_form import ORIGIN, Slider, Z
+from drake_diff.engines.closed_form import ORIGIN, NumpyEngine, Slider, Z
 from drake_diff.mechanics.description import JointContract
 
 
@@ -75,3 +75,13 @@ class SlidingBlock(Slider):
         by_w = 1 / (1 + c * s**2 / (v_next**2 + s**2) ** 1.5)
         by = np.array([[0.0, by_w - 1, by_w * h / self.mass]]) / h
         return np.array([v_next - v[0]]) / h, by
+
+
+class ContactEngine(NumpyEngine):
+    """One of these forms, whose acceleration is that of the step with its contact."""
+
+    def _acceleration(self, x, u):
+        return self._acceleration_derivative(x, u)[0]
+
+    def _acceleration_derivative(self, x, u):
+        return self.form.acceleration(self.time_step, x[: self.nq], x[self.nq :], u)
