@@ -343,7 +343,8 @@ def hull_of(points: Array, label: str) -> Hull:
     hull = _qhull(points if len(points) <= MESHES.most_points else _farthest(points, MOST_CORNERS), label)
     if len(hull.corners) > MOST_CORNERS:
         hull = _qhull(_farthest(hull.corners, MOST_CORNERS), label)
-    return replace(hull, lost=max(0.0, float(np.max(_distance(points, hull)))))
+    lost = float(np.max(_distance(points, hull)))  # rounding, where all points were taken
+    return replace(hull, lost=lost if lost > MESHES.joined * float(np.max(np.ptp(hull.corners, axis=0))) else 0.0)
 
 
 def _qhull(points: Array, label: str) -> Hull:

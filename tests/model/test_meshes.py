@@ -82,6 +82,7 @@ def saved(folder, name, text):
 def test_a_box_becomes_a_hull_of_its_volume(tmp_path, ending, scale):
     shapes().box(EDGES).export(tmp_path / f"box.{ending.lower()}")
     model = load(saved(tmp_path, "r.urdf", urdf(f'<mesh filename="box.{ending}" scale="{scale}"/>')))
+    assert "farther" not in str(model.notes)  # no corner is lost
     [(shape, _)] = shapes_of(model)
     factors = np.broadcast_to([float(n) for n in scale.split()], 3)
     assert isinstance(shape, Convex)
