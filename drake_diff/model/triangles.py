@@ -367,17 +367,19 @@ def _qhull(points: Array, label: str) -> Hull:
 
 def _distance(points: Array, hull: Hull) -> Array:
     """(n,) how far each point is outside the plane that it is farthest out of, negative inside the hull."""
-    return np.concatenate([np.max(p @ hull.normals.T - hull.offsets, axis=1) for p in _split(points)])
+    planes = np.column_stack([hull.normals, -hull.offsets]).T
+    blocks = _split(points, 500)
+    return np.concatenate([np.max(np.column_stack([p, np.ones(len(p))]) @ planes, axis=1) for p in blocks])
 
 
-def _split(points: Array) -> list[Array]:
-    return np.array_split(points, 1 + len(points) // 2000)  # a product with many vectors of more points is slow
+def _split(points: Array, size: int) -> list[Array]:
+    return np.array_split(points, 1 + len(points) // size)  # a product of more points with many vectors is slow
 
 
 def _farthest(points: Array, count: int) -> Array:
     """Those points that are farthest out along some of `count` directions."""
     among, best = directions(count), points[:0]
-    for block in _split(points):
+    for block in _split(points, 2000):
         candidates = np.concatenate([best, block])
         best = candidates[np.unique(np.argmax(among @ candidates.T, axis=1))]
     return best
