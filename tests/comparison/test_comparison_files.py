@@ -78,7 +78,7 @@ def test_a_gradient_that_is_not_its_own_steps_is_warned_of(load):
         return found._replace(A=2 * found.A)
 
     found = dd.compare(model, (Doctored(drake, name="doubled", differentiate_step=doubled),), num_steps=5)
-    assert "not those of doubled" in str(found)
+    assert "gradients of doubled: not the derivatives of their own steps" in str(found)
     assert "its Jacobian at the start state is off by" in found.engines[1].sentence
     record = record_of(found, "x")
     assert record.verdict == "fail"
