@@ -32,11 +32,6 @@ def length(v: Any) -> Any:
     return np.sqrt(_dot(v, v) + TINY)
 
 
-def along_segment(start: Any, end: Any, point: Any, squared: Any) -> Any:
-    """(...) where the segment is nearest to the point: 0 at its start, 1 at its end; its length `squared` is known."""
-    return _between_0_and_1(_dot(point - start, end - start) * _inverse(squared))
-
-
 def along_segments(a: tuple[Any, Any], b: tuple[Any, Any], squared_a: Any, squared_b: Any) -> tuple[Any, Any]:
     """Where each of two segments (start, end) is nearest to the other.
 
@@ -122,10 +117,10 @@ def in_rows(pieces: Sequence[Piece]) -> Pieces:
 
 
 class Clearance:
-    """Signed distances [m] of a robot's pieces; `labels` (m,) tell what each row is of."""
+    """Signed distances [m] of a robot's pieces: `labels` (m,) tell what each row is of, `sides` its one or two."""
 
-    def __init__(self, model: Model, kinematics: ForwardKinematics, labels: Sequence[str]):
-        self.model, self.kinematics, self.labels = model, kinematics, tuple(labels)
+    def __init__(self, model: Model, kinematics: ForwardKinematics, labels: Sequence[str], *sides: Pieces):
+        self.model, self.kinematics, self.labels, self.sides = model, kinematics, tuple(labels), sides
 
     def __call__(self, x: Any) -> Any:
         """(m,) [m] at x (nx,)."""
@@ -141,49 +136,25 @@ class Clearance:
         """(K, m) [m], and their derivatives by the state (K, m, nx), at xs (K, nx)."""
         q = xs[:, : self.model.nq]
         frames = self.kinematics(q)
-        return np.asarray(self._distances(frames)), self._slopes(q, frames)
+        slopes = np.zeros((len(xs), len(self.labels), self.model.nx))
+        for side, (points, ways) in zip(self.sides, self._ways(frames), strict=True):
+            slopes += self.kinematics.pushes(q, frames, side.at, points, ways)
+        return np.asarray(self._distances(frames)), slopes
 
     def moved(self, xs: Array) -> Array:
         """(K-1, m) [m] how far what each row is of moves from one of xs (K, nx) to the next: no distance changes more.
 
         That is the longest of the straight ways of its points.
         """
-        return np.asarray(self._ways(self.kinematics(xs[:, : self.model.nq])))
+        frames = self.kinematics(xs[:, : self.model.nq])
+        return np.asarray(sum(side.ways(frames) for side in self.sides))
 
     def _distances(self, frames: tuple[Any, Any]) -> Any:
         raise NotImplementedError
 
-    def _ways(self, frames: tuple[Array, Array]) -> Array:
+    def _ways(self, frames: tuple[Array, Array]) -> Sequence[tuple[Array, Array]]:
+        """Of each side its nearest points (K, m, 3), and the ways in which the distances grow as these move."""
         raise NotImplementedError
-
-    def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
-        raise NotImplementedError
-
-
-class FromBall(Clearance):
-    """Of capsules from a ball at `center` (3,) of a `radius` [m]."""
-
-    def __init__(
-        self, model: Model, kinematics: ForwardKinematics, pieces: Sequence[Piece], center: Array, radius: float
-    ):
-        super().__init__(model, kinematics, [p.body for p in pieces])
-        self.pieces, self.center, self.radius = in_rows(pieces), center, radius
-
-    def _nearest(self, frames: tuple[Any, Any]) -> Any:
-        """(..., m, 3)"""
-        start, end = self.pieces.ends(frames)
-        return start + along_segment(start, end, self.center, self.pieces.squared)[..., None] * (end - start)
-
-    def _distances(self, frames: tuple[Any, Any]) -> Any:
-        return length(self._nearest(frames) - self.center) - (self.pieces.radius + self.radius)
-
-    def _ways(self, frames: tuple[Array, Array]) -> Array:
-        return self.pieces.ways(frames)
-
-    def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
-        points = self._nearest(frames)
-        apart = points - self.center
-        return self.kinematics.pushes(q, frames, self.pieces.at, points, apart / length(apart)[..., None])
 
 
 class FromBox(Clearance):
@@ -202,51 +173,56 @@ class FromBox(Clearance):
         half: Array,
     ):
         balls = [ball for piece in pieces for ball in balls_of(piece)]
-        super().__init__(model, kinematics, [p.body for p in balls])
-        self.pieces, self.center, self.rotation, self.half = in_rows(balls), center, rotation, half
+        super().__init__(model, kinematics, [p.body for p in balls], in_rows(balls))
+        self.center, self.rotation, self.half = center, rotation, half
 
     def _within(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
         """(..., m, 3) the balls' centres in the world and in the box's frame."""
-        points, _ = self.pieces.ends(frames)
+        points, _ = self.sides[0].ends(frames)
         return points, (points - self.center) @ self.rotation
 
     def _distances(self, frames: tuple[Any, Any]) -> Any:
-        return to_box(self._within(frames)[1], self.half) - self.pieces.radius
+        return to_box(self._within(frames)[1], self.half) - self.sides[0].radius
 
-    def _ways(self, frames: tuple[Array, Array]) -> Array:
-        return self.pieces.ways(frames)
-
-    def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
+    def _ways(self, frames: tuple[Array, Array]) -> Sequence[tuple[Array, Array]]:
         points, local = self._within(frames)
-        return self.kinematics.pushes(
-            q, frames, self.pieces.at, points, away_from_box(local, self.half) @ self.rotation.T
-        )
+        return [(points, away_from_box(local, self.half) @ self.rotation.T)]
 
 
 class OfPairs(Clearance):
     """Of two capsules from each other, a row for each pair."""
 
-    def __init__(self, model: Model, kinematics: ForwardKinematics, pairs: Sequence[tuple[Piece, Piece]]):
-        super().__init__(model, kinematics, [f"{a.body} and {b.body}" for a, b in pairs])
-        self.first, self.second = in_rows([a for a, _ in pairs]), in_rows([b for _, b in pairs])
+    def __init__(
+        self,
+        model: Model,
+        kinematics: ForwardKinematics,
+        pairs: Sequence[tuple[Piece, Piece]],
+        labels: Sequence[str] | None = None,
+    ):
+        labels = [f"{a.body} and {b.body}" for a, b in pairs] if labels is None else labels
+        super().__init__(model, kinematics, labels, in_rows([a for a, _ in pairs]), in_rows([b for _, b in pairs]))
 
     def _nearest(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
-        first, second = self.first.ends(frames), self.second.ends(frames)
-        s, t = along_segments(first, second, self.first.squared, self.second.squared)
+        first, second = (side.ends(frames) for side in self.sides)
+        s, t = along_segments(first, second, self.sides[0].squared, self.sides[1].squared)
         return first[0] + s[..., None] * (first[1] - first[0]), second[0] + t[..., None] * (second[1] - second[0])
 
     def _distances(self, frames: tuple[Any, Any]) -> Any:
         a, b = self._nearest(frames)
-        return length(a - b) - (self.first.radius + self.second.radius)
+        return length(a - b) - (self.sides[0].radius + self.sides[1].radius)
 
-    def _ways(self, frames: tuple[Array, Array]) -> Array:
-        return self.first.ways(frames) + self.second.ways(frames)
-
-    def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
+    def _ways(self, frames: tuple[Array, Array]) -> Sequence[tuple[Array, Array]]:
         a, b = self._nearest(frames)
         way = (a - b) / length(a - b)[..., None]
-        first = self.kinematics.pushes(q, frames, self.first.at, a, way)
-        return first - self.kinematics.pushes(q, frames, self.second.at, b, way)
+        return [(a, way), (b, -way)]
+
+
+def from_ball(
+    model: Model, kinematics: ForwardKinematics, pieces: Sequence[Piece], center: Array, radius: float
+) -> OfPairs:
+    """The distances of capsules from a ball at `center` (3,) of a `radius` [m], which the world carries."""
+    ball = Piece("world", -1, center, center, radius, "sphere")
+    return OfPairs(model, kinematics, [(piece, ball) for piece in pieces], [piece.body for piece in pieces])
 
 
 class Swept(Clearance):
@@ -298,6 +274,5 @@ def balls_of(piece: Piece) -> list[Piece]:
     within = np.sqrt((1 + BALL_PART) ** 2 - 1) * piece.radius  # on both sides, a ball contains that much of the tube
     count = int(np.ceil(half_length / within))
     radius = float(np.hypot(piece.radius, half_length / count))
-    excess = piece.excess + radius - piece.radius
     centers = [piece.start + share * (piece.end - piece.start) for share in np.linspace(0, 1, count + 1)]
-    return [replace(piece, start=c, end=c, radius=radius, excess=excess) for c in centers]
+    return [replace(piece, start=c, end=c, radius=radius) for c in centers]

@@ -1,8 +1,8 @@
 """What of a robot keeps clear of things: spheres and capsules that contain the shapes of its bodies.
 
 A body's collision shapes are covered, or those that are only drawn where it has none. A sphere and a capsule are taken
-as they are. Of other shapes a few capsules contain all, and stick out by what `Piece.excess` says. A body without any
-shape gets capsules from its joint to the next ones, a skeleton: that contains nothing for certain, and is told.
+as they are. Of other shapes a few capsules contain all. A body without any shape gets capsules from its joint to the
+next ones, a skeleton: that contains nothing for certain, and is told.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,10 +30,8 @@ WORTH_A_SLAB = 0.8  # of the volume: more slabs have to save that much
 CYLINDER_PART = 0.5  # of a cylinder's radius: how far before its ends a segment ends; it sticks out sideways by 12 %
 BONE_PART, BONE_RADII = 0.2, (0.01, 0.06)  # of its length, and the limits [m]: the radius of a skeleton's capsule
 ROUNDING = 1e-9  # [m] added to a radius that is computed from corners
-WAYS = np.random.default_rng(0).standard_normal((400, 3))  # in which a cover and what it covers are compared
-SOME_WAYS = 120  # of these: the farthest points are looked at first
-AROUND = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 64, endpoint=False)]).T  # in a plane
-WAYS = np.vstack([np.eye(3), -np.eye(3), WAYS / np.linalg.norm(WAYS, axis=1)[:, None]])
+WAYS = np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(0).standard_normal((114, 3))])  # whose farthest points
+Around = tuple[Array, Array, float]  # the start, end and radius of a capsule
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +43,7 @@ class Piece:
     start: Array  # in the link's frame
     end: Array
     radius: float
-    excess: float  # [m] how far it sticks out of what it covers, at most; of a skeleton 0
-    source: str  # "sphere", "capsule", "around a box", ..., "skeleton"
+    source: str  # the shape that it covers, such as "box", or "skeleton"
 
     @property
     def squared(self) -> float:
@@ -128,24 +125,20 @@ def _around(shape: Any, pose: RigidTransform) -> Iterator[Piece]:
     """The pieces that contain a shape at `pose`; none of a half space, which no robot is made of."""
     if isinstance(shape, HalfSpace):
         return
-    for start, end, radius, excess in pieces_around(shape):
-        kind = type(shape).__name__.lower()
-        source = kind if excess == 0 else f"around a {kind}"
-        yield Piece("", -1, pose @ start, pose @ end, radius, excess, source)
+    for start, end, radius in pieces_around(shape):
+        yield Piece("", -1, pose @ start, pose @ end, radius, type(shape).__name__.lower())
 
 
-def pieces_around(shape: Any) -> list[tuple[Array, Array, float, float]]:
+def pieces_around(shape: Any) -> list[Around]:
+    """Capsules (start, end, radius) that contain a shape."""
     z = np.array([0.0, 0.0, 1.0])
     if isinstance(shape, Sphere):
-        return [(np.zeros(3), np.zeros(3), shape.radius(), 0.0)]
+        return [(np.zeros(3), np.zeros(3), shape.radius())]
     if isinstance(shape, Capsule):
-        half = shape.length() / 2
-        return [(-half * z, half * z, shape.radius(), 0.0)]
+        return [(-shape.length() / 2 * z, shape.length() / 2 * z, shape.radius())]
     if isinstance(shape, Cylinder):
-        half, r = shape.length() / 2, shape.radius()
-        short = min(half, CYLINDER_PART * r)
-        radius = float(np.hypot(r, short))
-        return [((short - half) * z, (half - short) * z, radius, max(radius - r, radius - short))]
+        half, short = shape.length() / 2, min(shape.length() / 2, CYLINDER_PART * shape.radius())
+        return [((short - half) * z, (half - short) * z, float(np.hypot(shape.radius(), short)))]
     if isinstance(shape, Box):
         return _around_box(np.asarray(shape.size()))
     if isinstance(shape, Ellipsoid):  # a capsule of the second axis, whose curvature at the tips is less
@@ -153,22 +146,20 @@ def pieces_around(shape: Any) -> list[tuple[Array, Array, float, float]]:
         longest = int(np.argmax(axes))
         radius = float(np.max(np.delete(axes, longest)))
         end = (axes[longest] - radius) * np.eye(3)[longest]
-        return [(-end, end, radius, _beyond(-end, end, radius, np.linalg.norm(WAYS * axes, axis=1)))]
+        return [(-end, end, radius)]
     if isinstance(shape, (Mesh, Convex)):
         return around_mesh(*_surface(shape))
     raise ModelError(f"shape {type(shape).__name__}: expected one that Drake's files can have")
 
 
-def _around_box(size: Array) -> list[tuple[Array, Array, float, float]]:
+def _around_box(size: Array) -> list[Around]:
     """Capsules along the longest edge, as many side by side as the second is longer than the third."""
     c, b, a = np.argsort(size)
     count = int(np.clip(np.ceil(size[b] / max(size[c], 1e-12) / 1.5), 1, MOST_STRIPS))
     corner, short = np.hypot(size[b] / count, size[c]) / 2, size[c] / 2
     radius, end = float(np.hypot(corner, short)) + ROUNDING, (size[a] / 2 - short) * np.eye(3)[a]
     places = ((np.arange(count) + 0.5) / count - 0.5) * size[b]
-    sideways = size[b] / 2 / count  # by which the outermost lie inside
-    excess = max(radius - short, radius - sideways)
-    return [(offset * np.eye(3)[b] - end, offset * np.eye(3)[b] + end, radius, excess) for offset in places]
+    return [(offset * np.eye(3)[b] - end, offset * np.eye(3)[b] + end, radius) for offset in places]
 
 
 def _surface(shape: Any) -> tuple[Array, Indices]:
@@ -190,11 +181,11 @@ def sides_of(triangles: Indices) -> Indices:
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
-def around_mesh(corners: Array, sides: Indices) -> list[tuple[Array, Array, float, float]]:
+def around_mesh(corners: Array, sides: Indices) -> list[Around]:
     """Capsules that contain a body whose surface has these corners (n, 3) and sides (e, 2), along its longest way."""
     used = corners[np.unique(sides)]
     axis = np.linalg.svd(used - np.mean(used, axis=0), full_matrices=False)[2][0]
-    best: list[tuple[Array, Array, float, float]] = []
+    best: list[Around] = []
     for count in range(1, MOST_SLABS + 1):
         capsules = [_around_slab(slab) for slab in _slabs(used, corners[sides], axis, count)]
         if best and _volume(capsules) > WORTH_A_SLAB * _volume(best):
@@ -203,8 +194,8 @@ def around_mesh(corners: Array, sides: Indices) -> list[tuple[Array, Array, floa
     return best
 
 
-def _volume(pieces: Sequence[tuple[Array, Array, float, float]]) -> float:
-    return sum(np.pi * r**2 * (float(np.linalg.norm(b - a)) + 4 / 3 * r) for a, b, r, _ in pieces)
+def _volume(pieces: Sequence[Around]) -> float:
+    return sum(np.pi * r**2 * (float(np.linalg.norm(b - a)) + 4 / 3 * r) for a, b, r in pieces)
 
 
 def _slabs(corners: Array, sides: Array, axis: Array, count: int) -> list[Array]:
@@ -224,50 +215,41 @@ def _slabs(corners: Array, sides: Array, axis: Array, count: int) -> list[Array]
     return [slab for slab in slabs if len(slab)]
 
 
-def _around_slab(points: Array) -> tuple[Array, Array, float, float]:
-    """The slimmest of some capsules that contain `points`, and how far it sticks out of their hull."""
-    outer = points[np.unique(np.argmax(points @ WAYS[:SOME_WAYS].T, axis=0))]
+def _around_slab(points: Array) -> Around:
+    """The slimmest of some capsules that contain `points`."""
+    outer = points[np.unique(np.argmax(points @ WAYS.T, axis=0))]
     turned = np.linalg.svd(outer - np.mean(outer, axis=0), full_matrices=False)[2]
     tried = [_capsule_along(outer, axis) for axis in (*np.eye(3), *turned)]
-    start, end, radius = min(tried, key=lambda c: _volume([(*c, 0.0)]))
-    squared = np.sum((end - start) ** 2)
-    along = np.clip((points - start) @ (end - start) / max(squared, 1e-300), 0, 1)[:, None] * (end - start) + start
-    radius = max(radius, float(np.max(np.linalg.norm(points - along, axis=1))) + ROUNDING)  # now around all of them
-    return start, end, radius, _beyond(start, end, radius, np.max(WAYS @ outer.T, axis=1))
+    start, end, _ = min(tried, key=lambda capsule: _volume([capsule]))
+    return start, end, _radius(start, end, points)
 
 
-def _beyond(start: Array, end: Array, radius: float, reach: Array) -> float:
-    """[m] how far a capsule sticks out of a convex shape that it contains, which reaches `reach` (W,) in each of WAYS.
-
-    The largest distance between two convex sets is the largest difference of how far they reach in any direction.
-    """
-    excess = np.max(np.maximum(WAYS @ start, WAYS @ end) + radius - reach)
-    return max(float(excess), ROUNDING)
-
-
-def _capsule_along(points: Array, axis: Array) -> tuple[Array, Array, float]:
+def _capsule_along(points: Array, axis: Array) -> Around:
     """A capsule along `axis` that contains `points` (P, 3)."""
     across = np.linalg.svd(axis[None])[2][1:]  # (2, 3)
     flat, heights = points @ across.T, points @ axis
     middle = _circle(flat)
     off = np.linalg.norm(flat - middle, axis=1)
-    radius = float(np.max(off)) + ROUNDING
-    spare = np.sqrt(np.maximum(radius**2 - off**2, 0.0))
+    spare = np.sqrt(np.max(off) ** 2 - off**2)
     low, high = float(np.min(heights + spare)), float(np.max(heights - spare))
     if low > high:  # a sphere: its centre anywhere in between contains all
         low = high = (low + high) / 2
-    foot = middle @ across
-    start, end = foot + low * axis, foot + high * axis
-    along = np.clip(heights, low, high)[:, None] * axis + foot
-    return start, end, max(radius, float(np.max(np.linalg.norm(points - along, axis=1))) + ROUNDING)
+    start, end = (middle @ across + height * axis for height in (low, high))
+    return start, end, _radius(start, end, points)
+
+
+def _radius(start: Array, end: Array, points: Array) -> float:
+    """[m] that of the capsule around a segment that contains `points` (P, 3)."""
+    way = end - start
+    share = np.clip((points - start) @ way / max(float(way @ way), 1e-300), 0, 1)
+    return float(np.max(np.linalg.norm(points - start - share[:, None] * way, axis=1))) + ROUNDING
 
 
 def _circle(points: Array) -> Array:
     """(2,) nearly the centre of the smallest circle around `points` (P, 2): steps to the farthest, ever shorter."""
-    outer = points[np.unique(np.argmax(points @ AROUND, axis=0))]  # what is inside of these hardly matters
-    center = (np.min(outer, axis=0) + np.max(outer, axis=0)) / 2
+    center = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
     for k in range(1, 101):  # Badoiu and Clarkson (2003)
-        far = outer[int(np.argmax(np.sum((outer - center) ** 2, axis=1)))]
+        far = points[int(np.argmax(np.sum((points - center) ** 2, axis=1)))]
         center = center + (far - center) / (k + 1)
     return np.asarray(center)
 
@@ -290,4 +272,4 @@ def _skeleton(model: Model, body: Any) -> Iterator[Piece]:
         ends = [np.asarray(body.default_com())]
     for end in ends:
         radius = float(np.clip(BONE_PART * np.linalg.norm(end - start), *BONE_RADII))
-        yield Piece("", -1, start, end, radius, 0.0, "skeleton")
+        yield Piece("", -1, start, end, radius, "skeleton")

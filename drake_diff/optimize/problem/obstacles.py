@@ -16,7 +16,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.mechanics.clearance import Clearance, FromBall, FromBox, OfPairs, Swept
+from drake_diff.mechanics.clearance import Clearance, FromBox, OfPairs, Swept, from_ball
 from drake_diff.mechanics.cover import Piece, cover_of
 from drake_diff.mechanics.forward_kinematics import ForwardKinematics, forward_kinematics
 from drake_diff.model.model import Model
@@ -205,7 +205,7 @@ class SphereObstacle(_Solid):
         return self.radius
 
     def clearance(self, model: Model, kinematics: ForwardKinematics, pieces: list[Piece], center: Array) -> Clearance:
-        return FromBall(model, kinematics, pieces, center, self.radius)
+        return from_ball(model, kinematics, pieces, center, self.radius)
 
     def marks(self) -> tuple[Mark, ...]:
         return (Mark(f"obstacle {self.label}", "sphere", (self.radius,), self.center, colour=RED),)
