@@ -5,11 +5,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
 from drake_diff._base.values import ShowsItsRepr
@@ -20,14 +19,13 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.model.step import advance
 from drake_diff.motion.integrate import TOLERANCE
-from drake_diff.motion.loss import Feedback, Loss, Totals, total_gradients
-from drake_diff.motion.policy import active_parameters, differentiate_policy
+from drake_diff.motion.loss import Loss, Totals, total_gradients
+from drake_diff.motion.policy import Feedback, recording_choice
 from drake_diff.motion.rollout import Policy, check_inputs
 
 if TYPE_CHECKING:
     from drake_diff.motion.undefined import Undefined
 
-EXPLODED, VANISHED = 1e6, 1e-6
 CONTINUOUS = "continuous"  # the method that takes no steps of Drake's
 FINER = 1e-3  # of its tolerance: of a motion whose derivative is not the slope that there is
 NAMED = 3  # columns of which a warning tells the numbers
@@ -57,7 +55,6 @@ class RolloutGradient(ShowsItsRepr):
     # (N+1,) |d loss / d x_k|, the later steps being functions of x_k: where it grows without bound going back the
     # gradient explodes, where it dies out the early inputs cannot be learned.
     state_gradient_norms: Array
-    step_jacobians: tuple[Array, ...]  # N of (nx, nx), each step's derivative by its state, policy included
     xs: Array  # (N+1, nx) the motion
     us: Array  # (N, nu) the inputs that were applied
     methods: tuple[str, ...]  # where the step Jacobians came from: one name, or more where a fallback was taken
@@ -89,27 +86,6 @@ class RolloutGradient(ShowsItsRepr):
         if first == 0 or last == 0:
             return float("nan")
         return float((first / last) ** (1 / (len(self.state_gradient_norms) - 1)))
-
-    @cached_property
-    def spectral_radii(self) -> Array:
-        """(N,) the largest |eigenvalue| of each step's Jacobian by the state, policy included.
-
-        Found when first asked for: eigenvalues take longer than the steps.
-        """
-        return frozen(np.abs(np.linalg.eigvals(np.array(self.step_jacobians))).max(axis=1))
-
-    @property
-    def explodes_at(self) -> int | None:
-        """The last step k at which |d loss / d x_k| is over 1e6 times the smallest after it that is not 0."""
-        norms = np.where(self.state_gradient_norms > 0, self.state_gradient_norms, np.inf)
-        smallest_after = np.minimum.accumulate(norms[::-1])[::-1]
-        return _last(self.state_gradient_norms > EXPLODED * smallest_after)
-
-    @property
-    def vanishes_at(self) -> int | None:
-        """The last step k at which |d loss / d x_k| is below 1e-6 of the largest after it; None if there is none."""
-        largest_after = np.maximum.accumulate(self.state_gradient_norms[::-1])[::-1]
-        return _last(self.state_gradient_norms < VANISHED * largest_after)
 
 
 def differentiate_rollout(
@@ -176,7 +152,7 @@ def differentiate_rollout(
             steps = positive_int("num_steps", num_steps)
             linearization, feedback, inputs = _close_the_loop(set_model, x0, policy, steps, vector, method)
     value, totals = total_gradients(loss, x0, inputs, policy, linearization, feedback)
-    return _collected(value, totals, x0, inputs, linearization, feedback)
+    return _collected(value, totals, x0, inputs, linearization)
 
 
 def _collected(
@@ -185,12 +161,8 @@ def _collected(
     x0: Array,
     inputs: Array,
     linearization: Sequence[StepDerivatives],
-    feedback: Sequence[Feedback],
 ) -> RolloutGradient:
     """What the steps of a motion make of its loss."""
-    closed = [d.A for d in linearization]
-    if feedback:
-        closed = [d.A + d.B @ by_x for d, (by_x, _, _) in zip(linearization, feedback, strict=True)]
     return RolloutGradient(
         loss=value,
         by_x0=frozen(totals.states[0]),
@@ -200,7 +172,6 @@ def _collected(
         parameter_sources=linearization[0].sources,
         by_policy=frozen(totals.policy),
         state_gradient_norms=frozen(np.linalg.norm(totals.states, axis=1)),
-        step_jacobians=tuple(closed),
         xs=frozen(np.vstack([x0, [d.x_next for d in linearization]])),
         us=frozen(inputs),
         methods=tuple(sorted({d.method for d in linearization})),
@@ -227,8 +198,9 @@ def _in_continuous_time(
         given = np.zeros((positive_int("num_steps", num_steps), model.nu))
     with applied(vector) as set_model:
         beside = Beside(model, x0, given, policy, loss, vector, FlowSteps(set_model, vector))
+    still = np.zeros(beside.space.size + len(beside.given) + len(vector.values))
     for tolerance in (TOLERANCE, FINER * TOLERANCE):
-        linearization, feedback, inputs = beside.linearize(tolerance)
+        linearization, feedback, inputs = beside.linearize(still, tolerance)
         value, totals = total_gradients(loss, x0, inputs, policy, linearization, feedback)
         undefined = undefined_columns(beside, totals)
         if not any(column.missed for column in undefined):
@@ -242,7 +214,7 @@ def _in_continuous_time(
             GradientWarning,
             stacklevel=3,
         )
-    gradient = _collected(value, totals, x0, inputs, linearization, feedback)
+    gradient = _collected(value, totals, x0, inputs, linearization)
     return replace(gradient, undefined=undefined)
 
 
@@ -250,17 +222,10 @@ def _close_the_loop(
     model: Model, x0: Array, policy: Policy, count: int, vector: ParameterVector, method: str
 ) -> tuple[list[StepDerivatives], list[Feedback], Array]:
     """The motion first, then the derivatives of all its steps at once."""
-    feedback: list[Feedback] = []
+    feedback = list[Feedback]()
+    choose = recording_choice(policy, model, feedback)
     x, xs, inputs = x0, np.empty((count, model.nx)), np.empty((count, model.nu))
     for k in range(count):
-        t, xs[k] = k * model.time_step, x
-        inputs[k], by_x, by_parameters = differentiate_policy(policy, x, t, model.nu)
-        active = active_parameters(policy, t)
-        feedback.append((by_x, by_parameters[:, active].copy(), active))
+        xs[k], inputs[k] = x, choose(x, k)
         x = advance(model.double, x, inputs[k])
     return derivatives_along(model, x0, inputs, vector=vector, method=method, xs=xs), feedback, inputs
-
-
-def _last(where: NDArray[np.bool_]) -> int | None:
-    indices = np.flatnonzero(where)
-    return int(indices[-1]) if len(indices) else None

@@ -11,12 +11,10 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_of, traced_gradient
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, InputError
-from drake_diff.motion.policy import policy_parameters
+from drake_diff.motion.policy import Feedback, policy_parameters
 
 Loss = Callable[..., Any]
 AUTOGRAD, AUTODIFF = "autograd", "autodiff"  # the methods that differentiate a loss
-# A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
-Feedback = tuple[Array, Array, slice]
 
 
 @dataclass(frozen=True, eq=False)

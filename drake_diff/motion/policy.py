@@ -32,6 +32,8 @@ from drake_diff.model.tangent import tangent_space
 FIXED_POINT_TOLERANCE = 1e-6
 # How far x and the parameters are moved to see whether a plain number that a policy returns is a constant.
 NUDGE = 1e-6
+# A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
+Feedback = tuple[Array, Array, slice]
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,6 +294,19 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
     by_parameters = np.zeros((nu, len(parameters)))
     by_parameters[:, active] = rows[:, len(x) :]
     return u, np.array(rows[:, : len(x)]), by_parameters
+
+
+def recording_choice(policy: Any, model: Model, feedback: list[Feedback]) -> Callable[[Array, int], Array]:
+    """What chooses u (nu,) at the state x (nx,) and the step k, and adds the policy's derivatives to `feedback`."""
+
+    def choose(x: Array, k: int) -> Array:
+        t = k * model.time_step
+        u, by_x, by_parameters = differentiate_policy(policy, x, t, model.nu)
+        active = active_parameters(policy, t)
+        feedback.append((by_x, by_parameters[:, active].copy(), active))
+        return u
+
+    return choose
 
 
 def _call(policy: Any, x: Any, t: float, parameters: Any) -> Any:

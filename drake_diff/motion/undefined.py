@@ -34,13 +34,8 @@ from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.flow import FlowSteps
 from drake_diff.motion.integrate import TOLERANCE
-from drake_diff.motion.loss import Feedback, Loss, Totals, evaluate_loss, total_gradients
-from drake_diff.motion.policy import (
-    ParametricPolicy,
-    active_parameters,
-    differentiate_policy,
-    policy_parameters,
-)
+from drake_diff.motion.loss import Loss, Totals, evaluate_loss, total_gradients
+from drake_diff.motion.policy import Feedback, ParametricPolicy, policy_parameters, recording_choice
 from drake_diff.motion.smoothing import Gaussian, Smoothed, smooth
 
 WIDE, BETWEEN, MIDDLE, NARROW = 1e-2, 5e-3, 1e-3, 1e-4  # of a column's unit, to both sides
@@ -56,6 +51,7 @@ NEGLIGIBLE = 1e-2  # of the largest column: what is smaller is judged as if it w
 FORGOTTEN = 2e-3  # of the loss's own derivative by the last state: likewise, of a start that the motion forgets
 NOISE = 0.1  # of the tolerance, times how much of an error comes through to the loss: its change between two motions
 GROUPS = 3
+TURN = 1e-5  # of a displacement: the start is linear in it but for a turn
 MANY = 24  # parameters of a policy: more are one column, along their own gradient
 SMOOTHED = tuple(float(f"{width:.2g}") for width in 10 ** np.arange(-3.0, 0.25, 0.5))  # widths that are tried
 KNOWN = 0.2  # of a smoothed slope: its standard error at most
@@ -141,9 +137,10 @@ MISSED = "the slopes settle, and the derivative is not what they settle at"
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """Motions in continuous time beside one, by displacements (n,): of the first state on the tangent space, of the
+    """Motions in continuous time beside one, by displacements (n,).
 
-    inputs (N, nu) or the policy's parameters, and of the model's parameters.
+    These are of the first state on the tangent space, of the inputs (N, nu) or the policy's parameters, and of the
+    model's parameters.
     """
 
     model: Model
@@ -153,24 +150,22 @@ class Beside:
     loss: Loss
     vector: ParameterVector
     steps: FlowSteps  # of the motion itself, whose equations are made
-    known: dict[tuple[bytes, float], tuple[float, bool]] = field(default_factory=dict)  # losses beside
 
     @cached_property
     def space(self) -> Any:
         return tangent_space(self.model)
 
     @cached_property
-    def _given(self) -> Array:
+    def given(self) -> Array:
         return self.us.ravel() if self.policy is None else policy_parameters(self.policy)
 
     def _moved(self, displacement: Array) -> tuple[Array, Array, Any, ParameterVector]:
-        size, given = self.space.size, len(self._given)
-        x0 = self.space.plus(self.x0, displacement[:size])
-        values = self._given + displacement[size : size + given]
-        vector = self.vector.at(self.vector.values + displacement[size + given :])
+        start, given, parameters = np.split(displacement, np.cumsum([self.space.size, len(self.given)]))
+        x0, values = self.space.plus(self.x0, start), self.given + given
+        vector = self.vector.at(self.vector.values + parameters)
         if self.policy is None:
             return x0, values.reshape(self.us.shape), None, vector
-        return x0, self.us, ParametricPolicy(self.policy, values) if given else self.policy, vector
+        return x0, self.us, ParametricPolicy(self.policy, values) if len(values) else self.policy, vector
 
     def _steps(self, vector: ParameterVector, tolerance: float) -> FlowSteps:
         """Those of the motion itself, which have its materials, unless parameters are moved."""
@@ -180,19 +175,8 @@ class Beside:
         self.steps.integrator.tolerance = tolerance
         return self.steps
 
-    def linearize(self, tolerance: float) -> tuple[list[StepDerivatives], list[Feedback], Array]:
-        """The motion itself and the derivatives of its intervals; see `along_the_flow`."""
-        with applied(self.vector):
-            return along_the_flow(self._steps(self.vector, tolerance), self.x0, self.us, self.policy)
-
     def value(self, displacement: Array, tolerance: float) -> tuple[float, bool]:
         """The loss at a displacement (n,), and whether anything touches on the way."""
-        key = displacement.tobytes(), tolerance
-        if key not in self.known:
-            self.known[key] = self._value(displacement, tolerance)
-        return self.known[key]
-
-    def _value(self, displacement: Array, tolerance: float) -> tuple[float, bool]:
         x0, us, policy, vector = self._moved(displacement)
 
         def choose(x: Array, k: int) -> Array:
@@ -202,48 +186,54 @@ class Beside:
         touches = any(step.pushing or step.events for step, _ in flow.steps)
         return evaluate_loss(self.loss, flow.xs, flow.us), touches
 
-    def gradient(self, displacement: Array) -> tuple[float, Array]:
-        """The loss, and its derivative (n,) by the displacement."""
+    def linearize(self, displacement: Array, tolerance: float) -> tuple[list[StepDerivatives], list[Feedback], Array]:
+        """The derivatives of the intervals of the motion at a displacement (n,), of its policy, and its inputs."""
         x0, us, policy, vector = self._moved(displacement)
-        steps = self._steps(vector, TOLERANCE)
+        choose, feedback = (lambda x, k: us[k]), list[Feedback]()
+        if policy is not None:
+            choose = recording_choice(policy, self.model, feedback)
+        steps = self._steps(vector, tolerance)
         with applied(vector):
-            linearization, feedback, inputs = along_the_flow(steps, x0, us, policy)
-        value, totals = total_gradients(self.loss, x0, inputs, policy, linearization, feedback)
-        return value, self._flat(totals, self._derivative_of_start(displacement[: self.space.size]))
+            flow = steps.roll(x0, choose, len(us))
+            return steps.differentiate(flow), feedback, flow.us
 
-    def _flat(self, totals: Totals, by_displacement: Array) -> Array:
-        """(n,) by displacements, of which those of the start move x0 by (nx, size)."""
+    def slope(self, displacement: Array, way: Array) -> tuple[float, float]:
+        """The loss at a displacement (n,), and its derivative as that moves along `way` (n,)."""
+        linearization, feedback, inputs = self.linearize(displacement, TOLERANCE)
+        value, totals = total_gradients(
+            self.loss, self._moved(displacement)[0], inputs, self.policy, linearization, feedback
+        )
+        ahead, behind = (self._moved(displacement + sign * TURN * way)[0] for sign in (1, -1))
+        return value, self._flat(totals, float(totals.states[0] @ (ahead - behind)) / (2 * TURN), way)
+
+    def _flat(self, totals: Totals, by_start: float, way: Array) -> float:
+        """The derivative along `way`, of which that of the start is known."""
         given = totals.inputs.ravel() if self.policy is None else totals.policy
-        return np.concatenate([totals.states[0] @ by_displacement, given, totals.parameters])
-
-    def _derivative_of_start(self, d: Array, step: float = 1e-5) -> Array:
-        """(nx, size): of x0 moved by d (size,), which is linear but for a turn; to 1e-10."""
-        ends = [[self.space.plus(self.x0, d + sign * step * e) for e in np.eye(len(d))] for sign in (1, -1)]
-        return np.asarray((np.array(ends[0]) - np.array(ends[1])).T / (2 * step))
+        return by_start + float(np.concatenate([given, totals.parameters]) @ way[self.space.size :])
 
     def lines(self, totals: Totals) -> "Iterator[Line]":
         """A line for each column."""
-        size, given, (count, nu) = self.space.size, len(self._given), self.us.shape
-        flat = self._flat(totals, self.space.derivative_of_plus(self.x0))
-        eye = np.eye(len(flat))
-        for j, name in enumerate(self.space.names):
-            yield Line(self, f"{name}[0]", eye[j], 1.0, flat[j])
+        size, given, (count, nu) = self.space.size, len(self.given), self.us.shape
+        by_start = totals.states[0] @ self.space.derivative_of_plus(self.x0)
+        eye = np.eye(size + given + len(self.vector.values))
+
+        def line(name: str, way: Array, unit: float = 1.0) -> Line:
+            return Line(self, name, way, unit, self._flat(totals, by_start @ way[:size], way))
+
+        yield from (line(f"{name}[0]", eye[j]) for j, name in enumerate(self.space.names))
         if self.policy is None:
             for j, name in enumerate(self.model.input_names):
-                rows = slice(size + j, size + count * nu, nu)
-                unit = max(1.0, float(np.max(np.abs(self.us[:, j]))))
-                yield Line(self, f"{name} at all times", eye[rows].sum(axis=0), unit, flat[rows].sum())
+                at_all_times = eye[size + j : size + count * nu : nu].sum(axis=0)
+                yield line(f"{name} at all times", at_all_times, max(1.0, float(np.max(np.abs(self.us[:, j])))))
         elif given > MANY:
-            along = np.zeros(len(flat))
-            along[size : size + given] = totals.policy / (np.linalg.norm(totals.policy) or 1.0)
-            yield Line(self, f"the policy's {given} parameters, along their gradient", along, 1.0, float(flat @ along))
+            along = totals.policy / (np.linalg.norm(totals.policy) or 1.0)
+            yield line(f"the policy's {given} parameters, along their gradient", along @ eye[size : size + given])
         else:
-            for i in range(given):
-                unit = max(1.0, abs(float(self._given[i])))
-                yield Line(self, f"policy[{i}]", eye[size + i], unit, flat[size + i])
+            for i, value in enumerate(self.given):
+                yield line(f"policy[{i}]", eye[size + i], max(1.0, abs(float(value))))
         if self.vector.parameters:
             for i, (name, unit) in enumerate(zip(self.vector.names, self.vector.difference_scale(), strict=True)):
-                yield Line(self, name, eye[size + given + i], float(unit), flat[size + given + i])
+                yield line(name, eye[size + given + i], float(unit))
 
 
 @dataclass(eq=False)
@@ -256,7 +246,7 @@ class Line:
     unit: float
     slope: float
     touches: bool = field(default=False, init=False)  # whether anything does in a motion along it
-    _last: tuple[float, Array] = field(default=(float("nan"), np.zeros(0)), init=False)
+    _last: tuple[float, float] = field(default=(float("nan"), 0.0), init=False)
 
     @property
     def change(self) -> float:
@@ -272,34 +262,15 @@ class Line:
 
     def value(self, z: Array) -> float:
         """The loss at z (1,); keeps its derivative, for which it is asked next."""
-        value, gradient = self.beside.gradient(z[0] * self.vector)
-        self._last = float(z[0]), gradient
+        value, slope = self.beside.slope(z[0] * self.vector, self.vector)
+        self._last = float(z[0]), slope
         return value
 
     def derivative(self, z: Array) -> Array:
         """(1,) the derivative at z (1,)."""
         if self._last[0] != z[0]:
             self.value(z)
-        return np.array([self._last[1] @ self.vector])
-
-
-def along_the_flow(
-    steps: FlowSteps, x0: Array, us: Array, policy: Any
-) -> tuple[list[StepDerivatives], list[Feedback], Array]:
-    """The motion in continuous time first, then the derivatives of its intervals; a policy takes the length of `us`."""
-    feedback, nu = list[Feedback](), steps.model.nu
-
-    def choose(x: Array, k: int) -> Array:
-        if policy is None:
-            return us[k]
-        t = k * steps.model.time_step
-        u, by_x, by_parameters = differentiate_policy(policy, x, t, nu)
-        active = active_parameters(policy, t)
-        feedback.append((by_x, by_parameters[:, active].copy(), active))
-        return u
-
-    flow = steps.roll(x0, choose, len(us))
-    return steps.differentiate(flow), feedback, flow.us
+        return np.array([self._last[1]])
 
 
 def undefined_columns(beside: Beside, totals: Totals) -> tuple[Undefined, ...]:

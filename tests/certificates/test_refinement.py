@@ -224,44 +224,25 @@ def test_two_balls_resolved_tend_to_the_rigid_gradient():
     assert gradient.by_x0 == pytest.approx([1.0, 0.0, h * count - half, half], abs=0.05)
 
 
-def test_growth_rate_and_spectral_radii_of_a_block_have_their_closed_form(write_urdf):
-    """Free, |d x_N / d (x_k, v_k)| = |(1, (N - k) h)|, so that the rate over N steps is |(1, N h)|^(1/N), and the
-    eigenvalues of a step are 1. Under u = -kp x - kd v a step has the determinant 1 - h kd / m and the trace
-    2 - h^2 kp / m - h kd / m, so where they are complex its eigenvalues are of the size sqrt(1 - h kd / m)."""
-    h, m, count, kp, kd = 0.1, 2.0, 7, 30.0, 4.0
-    model = write_urdf(mass=m, time_step=h)
+def test_growth_rate_of_a_block_has_its_closed_form(write_urdf):
+    """|d x_N / d (x_k, v_k)| = |(1, (N - k) h)|, so that the rate over N steps is |(1, N h)|^(1/N)."""
+    h, count = 0.1, 7
+    model = write_urdf(mass=2.0, time_step=h)
     free = dd.differentiate_rollout(model, [0.5, -1.0], np.zeros((count, 1)), lambda x: x[0])
     assert free.growth_rate == pytest.approx(np.hypot(1, count * h) ** (1 / count), rel=1e-12)
-    assert free.spectral_radii == pytest.approx(np.ones(count), rel=1e-7)  # a double eigenvalue: sqrt of rounding
-    held = dd.differentiate_rollout(
-        model, [0.5, -1.0], None, lambda x: x[0], policy=dd.PD(model, kp, kd), num_steps=count
-    )
-    assert held.spectral_radii == pytest.approx(np.full(count, np.sqrt(1 - h * kd / m)), rel=1e-12)
     early = dd.differentiate_rollout(model, [0.5, -1.0], np.zeros((count, 1)), lambda xs, us: xs[0][0] + 0 * xs[1][0])
     assert np.isnan(early.growth_rate)
 
 
-def test_horizon_diagnostics_of_a_growing_motion(load):
-    """An inverted pendulum: |dx_N / dx_k| grows by the spectral radius of its step."""
+def test_a_gradient_grows_with_a_motion_that_falls_over_and_dies_out_where_friction_stops_one(load):
+    """An inverted pendulum: |dx_N / dx_k| grows by the spectral radius of its step. A ball that has stopped forgets."""
     model = load("pendulum.urdf", time_step=0.01)
     gradient = dd.differentiate_rollout(model, [np.pi, 0], np.zeros((600, 1)), lambda x: x[0])
-    A = dd.differentiate_step(model, [np.pi, 0], [0]).A
-    radius = np.abs(np.linalg.eigvals(A)).max()
-    assert gradient.spectral_radii == pytest.approx(np.full(600, radius), rel=1e-9)
+    radius = np.abs(np.linalg.eigvals(dd.differentiate_step(model, [np.pi, 0], [0]).A)).max()
     assert gradient.growth_rate == pytest.approx(radius, rel=1e-2)  # the ends are no eigenvectors
-    first = gradient.explodes_at
-    norms = gradient.state_gradient_norms
-    assert norms[first] > 1e6 * norms[first:].min()
-    assert norms[first + 1] <= 1e6 * norms[first + 1 :].min()
-    assert gradient.vanishes_at is None
-
-
-def test_horizon_diagnostics_of_a_vanishing_gradient():
-    """A ball that friction has stopped does not know how fast it was."""
     plant = Plant(0.01, "lagged")
     plant.ball("ball", 1.0, 0.1, contact_properties(2e4, 10.0, 0.5), "x", "z")
     plant.ground(contact_properties(2e4, 10.0, 0.5))
     x0 = [0.0, 0.1 - 9.81 / 1e4, 1.0, 0.0]
-    gradient = dd.differentiate_rollout(plant.model(), x0, None, lambda x: x[2], num_steps=60)
-    assert gradient.vanishes_at is not None
-    assert gradient.explodes_at is None
+    norms = dd.differentiate_rollout(plant.model(), x0, None, lambda x: x[2], num_steps=60).state_gradient_norms
+    assert norms[0] < 1e-6 * norms[-1]
