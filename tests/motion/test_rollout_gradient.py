@@ -87,23 +87,6 @@ def test_momentum_invariants_of_a_collision(masses, approximation):
     assert m @ product[:2, 2:] == pytest.approx(m * count * h, rel=1e-9)
 
 
-def saltation(v_before, restitution, gravity=9.81):
-    """How a rigid bounce maps a variation of (z, v)."""
-    return np.array([[-restitution, 0], [-(1 + restitution) * gravity / v_before, -restitution]])
-
-
-def test_the_rigid_bounce_has_the_oracles_numbers():
-    """A drop of 0.5 m with e = 1, 0.5 s: fall, bounce, flight."""
-    assert saltation(-3, 0.8) == pytest.approx(np.array([[-0.8, 0], [5.886, -0.8]]), rel=1e-12)
-    g, drop, horizon = 9.81, 0.5, 0.5
-    t = math.sqrt(2 * drop / g)
-    fall, flight = np.array([[1, t], [0, 1]]), np.array([[1, horizon - t], [0, 1]])
-    total = flight @ saltation(-g * t, 1.0) @ fall
-    expected = [[0.1320919527, -0.1385508568], [6.2641839056, 1.0]]
-    # A change of v0 at fixed z0 and the impact's time are in the saltation; 1e-9 is the digits given.
-    assert total == pytest.approx(np.array(expected), abs=1e-9)
-
-
 def bouncing_ball(k):
     plant = Plant(1 / 480, "lagged", gravity=0.0)
     plant.ball("ball", 1.0, 0.1, contact_properties(2 * k), "z")

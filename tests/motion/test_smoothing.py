@@ -9,7 +9,7 @@ from helpers.models import Plant, contact_properties
 from helpers.table import each_row, slow_after
 
 import drake_diff as dd
-from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
+from drake_diff.exceptions import GradientError, InputError, ShapeError
 from drake_diff.motion.smoothing import Barrier, Gaussian, smooth, smooth_step
 
 pytestmark = pytest.mark.solve
@@ -30,6 +30,10 @@ def integral(f, breaks, panels=20, order=20):
     edges = np.append(edges, breaks[-1])
     half, middle = np.diff(edges)[:, None] / 2, (edges[1:] + edges[:-1])[:, None] / 2
     return float(np.sum(f(middle + half * nodes) * half * weights))
+
+
+def density(t):
+    return math.exp(-t * t / 2) / math.sqrt(2 * math.pi)
 
 
 def ball(theta, g, d, height):
@@ -95,41 +99,21 @@ def smooth_ball(theta, g, d, height, sigma, **options):
     )
 
 
-@each_row(
-    "theta, value, truth, first, bias",
-    [
-        (0.3, -0.00307709811, -0.01115833969, -0.01115833969, 0),
-        (0.6, -0.00380439500, -0.00923031040, -0.00018531449, 0.00904499591),
-        (0.7, -0.00728360895, -0.05318651088, -0.00226092970, 0.05092558118),
-        (1.0, -0.00852432022, 0.01541917168, 0.01541591526, -3.2564e-6),
-    ],
-)
-def test_the_quadrature_gives_the_published_ball_with_wall(theta, value, truth, first, bias):
-    exact = exact_ball(theta, *SUH)
-    assert exact["value"] == pytest.approx(value, abs=1e-11)
-    assert exact["truth"] == pytest.approx(truth, abs=1e-11)
-    assert exact["first"] == pytest.approx(first, abs=1e-11)
-    assert exact["first"] - exact["truth"] == pytest.approx(bias, abs=1e-10)
-
-
-@each_row("case", [(0.6, *SUH), (0.7, *SUH), (0.5, 3.7, 0.09, 0.03, 0.08), (0.45, 20, 0.02, 0.005, 0.03)])
-def test_the_bias_of_the_quadrature_is_what_the_jumps_make(case):
-    """Bias = -sum over the jumps b of [J(b+) - J(b-)] times the density of b."""
-    theta, g, d, height, sigma = case
-    bias = 0.0
-    for b in ball_breaks(g, d, height)[0]:
-        jump = ball(b + 1e-9, g, d, height)[0] - ball(b - 1e-9, g, d, height)[0]
-        bias -= jump * math.exp(-(((b - theta) / sigma) ** 2) / 2) / (sigma * math.sqrt(2 * math.pi))
-    exact = exact_ball(*case)
-    assert exact["first"] - exact["truth"] == pytest.approx(bias, abs=1e-8)
-
-
 @pytest.mark.parametrize(
-    ("case", "biased"),
-    slow_after(2, [((0.3, *SUH), False), ((0.7, *SUH), True), ((0.45, 20, 0.02, 0.005, 0.03), True)]),
+    ("case", "published"),
+    slow_after(
+        2, [((0.3, *SUH), -0.01115833969), ((0.7, *SUH), -0.05318651088), ((0.45, 20, 0.02, 0.005, 0.03), None)]
+    ),
 )
-def test_ball_with_wall(case, biased):
-    found, exact = smooth_ball(*case, seed=3), exact_ball(*case)
+def test_ball_with_wall(case, published):
+    """First order is biased by -sum over the jumps b of [J(b+) - J(b-)] times the density of b, where there are any."""
+    found, exact, sigma, jumps = smooth_ball(*case, seed=3), exact_ball(*case), case[-1], 0.0
+    assert published is None or exact["truth"] == pytest.approx(published, abs=1e-11)
+    for b in ball_breaks(*case[1:-1])[0]:
+        jump = ball(b + 1e-9, *case[1:-1])[0] - ball(b - 1e-9, *case[1:-1])[0]
+        jumps -= jump * density((b - case[0]) / sigma) / sigma
+    assert exact["first"] - exact["truth"] == pytest.approx(jumps, abs=1e-8)
+    biased = abs(jumps) > 1e-3
     assert within(found.value, exact["value"], found.value_variance)
     assert within(found.zeroth, exact["truth"], found.zeroth_variance)
     assert within(found.first, exact["first"], found.first_variance)
@@ -160,7 +144,7 @@ def heaviside(theta, sigma, **options):
 @each_row("theta, sigma", [(0.0, 0.05), (0.02, 0.05), (-0.3, 0.4), (7.0, 11.0)])
 def test_heaviside_is_biased_and_the_blend_follows_zeroth_order(theta, sigma):
     """First order is 0 always, the truth is the normal density of theta, F its distribution function."""
-    truth = math.exp(-((theta / sigma) ** 2) / 2) / (sigma * math.sqrt(2 * math.pi))
+    truth = density(theta / sigma) / sigma
     found = heaviside(theta, sigma, samples=5000)
     assert not found.first.any()
     assert not found.first_variance.any()
@@ -198,10 +182,6 @@ KINK = (lambda z: abs(z[0])), (lambda z: [float(np.sign(z[0]))])
 SQUARE = (lambda z: z[0] ** 2), (lambda z: 2 * z)
 SINE = (lambda z: math.sin(z[0])), (lambda z: np.cos(z))
 ROUGH = (lambda z: z[0] + 0.1 * math.sin(1e4 * z[0])), (lambda z: [1 + 1e3 * math.cos(1e4 * z[0])])
-
-
-def density(t):
-    return math.exp(-t * t / 2) / math.sqrt(2 * math.pi)
 
 
 @pytest.mark.slow
@@ -346,25 +326,19 @@ def one(z):
     [
         ({"method": "second"}, "expected one of blend, first, zeroth"),
         ({"samples": 1}, "at least 2"),
-        ({"samples": 0}, "samples"),
-        ({"samples": 2.5}, "samples"),
         ({"seed": -1}, "seed"),
-        ({"seed": None}, "seed"),
         ({"noise": 0.1}, "a Gaussian or a Barrier"),
         ({"noise": Gaussian([0.1, 0.1])}, r"the numbers of Gaussian: expected shape \(1,\), got shape \(2,\)"),
-        ({"noise": Barrier([0.1, 0.1])}, "the numbers of Barrier"),
-        ({"x": 1.0}, "x: expected shape"),
         ({"x": [np.nan]}, "x"),
         ({"x": [], "f": np.sum}, "at least one of each"),
-        ({"f": lambda z: []}, "at least one of each"),
-        ({"f": lambda z: [[1.0]]}, r"f\(x\): expected shape"),
-        ({"f": lambda z: None}, r"f\(x\)"),
         ({"f": lambda z: [[1.0], [1.0, 2.0]]}, r"f\(x\): expected an array of numbers"),
         ({"f": lambda z: [1.0] * (1 + (z[0] != 0))}, r"f\(x\): expected shape \(1,\), got shape \(2,\)"),
         ({"jacobian": None}, "jacobian: expected a function"),
-        ({"jacobian": None, "method": "first"}, "jacobian: expected a function"),
         ({"jacobian": lambda z: [1.0, 2.0]}, r"jacobian\(x\): expected shape \(1, 1\), got shape \(1, 2\)"),
-        ({"f": lambda z: [1.0, 2.0], "jacobian": lambda z: [1.0, 2.0]}, r"expected shape \(2, 1\)"),
+        (
+            {"x": [0, 0], "jacobian": None, "noise": Gaussian([0.1, 0]), "method": "zeroth"},
+            "jacobian: expected a function",
+        ),
     ],
 )
 def test_bad_input_is_refused(changes, message):
@@ -373,13 +347,8 @@ def test_bad_input_is_refused(changes, message):
         smooth(arguments.pop("f"), arguments.pop("x"), arguments.pop("jacobian"), **arguments)
 
 
-def test_zeroth_order_needs_a_derivative_where_noise_does_not_move():
-    with pytest.raises(InputError, match="jacobian"):
-        smooth(np.sum, [0.0, 0.0], noise=Gaussian([0.1, 0.0]), method="zeroth")
-
-
 @each_row("kind", [Gaussian, Barrier])
-@each_row("scale", [0.0, -1.0, np.nan, np.inf, True, "1", None, [], [0.0, 0.0], [0.1, -0.1], [np.nan]])
+@each_row("scale", [0.0, -1.0, np.inf, True, "1", [], [0.0, 0.0], [0.1, -0.1]])
 def test_noise_of_no_size_is_refused(kind, scale):
     with pytest.raises(InputError, match=f"{kind.__name__}.(sigma|c)"):
         kind(scale)
@@ -448,13 +417,6 @@ def test_steps_that_cannot_be_smoothed_are_refused(load):
     with pytest.raises(InputError, match=r"the quaternion \(ball_qw, ball_qx, ball_qy, ball_qz\)"):
         smooth_step(model, model.default_state, noise=Gaussian(0.1))
     model = load("pendulum.urdf")
-    with pytest.raises(ShapeError, match="x"):
-        smooth_step(model, [0.0], [0.0], noise=Gaussian(0.1))
-    with pytest.raises(ShapeError, match="u"):
-        smooth_step(model, [0.0, 0.0], noise=Gaussian(0.1))
-    with pytest.raises(ShapeError, match="the numbers of Gaussian"):
-        smooth_step(model, [0.0, 0.0], [0.0], noise=Gaussian([0.1, 0.1]))
-    with pytest.raises(UnknownNameError):
-        smooth_step(model, [0.0, 0.0], [0.0], noise=Gaussian(0.1), method="third")
-    with pytest.raises(InputError, match="a Gaussian or a Barrier"):
-        smooth_step(model, [0.0, 0.0], [0.0], noise=None, method="zeroth")
+    for x, u, noise in (([0.0], [0.0], 0.1), ([0.0, 0.0], [], 0.1), ([0.0, 0.0], [0.0], [0.1, 0.1])):
+        with pytest.raises(ShapeError):
+            smooth_step(model, x, u, noise=Gaussian(noise))
