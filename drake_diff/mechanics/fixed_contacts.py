@@ -66,38 +66,42 @@ class FixedContactPlant:
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
         """(K, nx) the rates and (K, nx, nx + nu) their Jacobians, these by CasADi."""
-        return self.values(knots), np.array([self.rates.jacobian(knot) for knot in knots])
+        return self.values(knots), np.array([self.expressions["rates"].jacobian(knot) for knot in knots])
 
     def jump_at(self, x: Array) -> tuple[Array, Array]:
         """(nv,) what an impact adds to the velocities so that it stops the points, and its impulses (m,), by Drake."""
-        model, m = self.model, len(self.rows)
-        speeds = np.asarray(self.speeds(InitializeAutoDiff(x).ravel())).ravel()[self.rows]
-        J = gradient_rows(speeds, model.nx)[:, model.nv :]
-        set_state(model.double, x)
-        whole = np.block([[model.double.mass_matrix(), -J.T], [J, np.zeros((m, m))]])
-        found = np.linalg.solve(whole, np.concatenate([np.zeros(model.nv), -J @ x[model.nv :]]))
-        return found[: model.nv], found[model.nv :]
+        n = self.model.nv
+        J = speed_slopes(self.model, self.speeds, x)[self.rows, n:]
+        set_state(self.model.double, x)
+        return self._solve(J, np.zeros(n), -J @ x[n:])
 
     def _solved(self, knot: Array) -> tuple[Array, Array]:
-        model, n, m = self.model, self.model.nv, len(self.rows)
+        """(nx,) the rates and (m,) the holding forces."""
+        model, n = self.model, self.model.nv
         if not np.all(np.isfinite(knot)):
-            return np.full(model.nx, np.nan), np.full(m, np.nan)
+            return np.full(model.nx, np.nan), np.full(len(self.rows), np.nan)
         x, u = knot[: model.nx], knot[model.nx :]
-        slopes = gradient_rows(np.asarray(self.speeds(InitializeAutoDiff(x).ravel())).ravel()[self.rows], model.nx)
-        J, bias = slopes[:, n:], slopes[:, :n] @ x[n:]
-        twin = model.double
-        set_state(twin, x)
-        force, mass = self.equations.actuation @ u - twin.inverse_dynamics(np.zeros(n)), twin.mass_matrix()
-        whole = np.block([[mass, -J.T], [J, np.zeros((m, m))]])
+        slopes = speed_slopes(model, self.speeds, x)[self.rows]
+        set_state(model.double, x)
+        force = self.equations.actuation @ u - model.double.inverse_dynamics(np.zeros(n))
+        acceleration, forces = self._solve(slopes[:, n:], force, -slopes[:, :n] @ x[n:])
+        return np.concatenate([x[n:], acceleration]), forces
+
+    def _solve(self, J: Array, top: Array, bottom: Array) -> tuple[Array, Array]:
+        """The two rows of the equations above in the context's state."""
+        whole = np.block([[self.model.double.mass_matrix(), -J.T], [J, np.zeros((len(J), len(J)))]])
         try:
-            found = np.linalg.solve(whole, np.concatenate([force, -bias]))
+            solution = np.linalg.solve(whole, np.concatenate([top, bottom]))
         except np.linalg.LinAlgError:
-            found = np.full(n + m, np.nan)
-        return np.concatenate([x[n:], found[:n]]), found[n:]
+            solution = np.full(len(whole), np.nan)
+        return solution[: len(top)], solution[len(top) :]
 
     @cached_property
-    def _symbolic(self) -> dict[str, Any]:
-        """Expressions of a knot: rates and forces, and the change of velocities and the impulses of an impact."""
+    def expressions(self) -> dict[str, _Expression]:
+        """Of a knot: the `rates` (nx,) and holding `forces` (m,).
+
+        Of an impact that stops the points, whatever the input: the `jump` of velocities (nv,), the `impulses` (m,).
+        """
         model, n = self.model, self.model.nv
         knot = ca.SX.sym("knot", model.nx + model.nu)
         q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
@@ -110,29 +114,14 @@ class FixedContactPlant:
         inner = ca.ldl(ca.densify(J @ pushed))
         forces = ca.ldl_solve(-(ca.jacobian(speed, q) @ v + J @ free), *inner)
         impulses = -ca.ldl_solve(speed, *inner)
-        found = {"rates": ca.vertcat(v, free + pushed @ forces), "forces": forces}
-        found |= {"jump": pushed @ impulses, "impulses": impulses}
-        return {name: (knot, value) for name, value in found.items()}
+        values = {"rates": ca.vertcat(v, free + pushed @ forces), "forces": forces}
+        values |= {"jump": pushed @ impulses, "impulses": impulses}
+        return {name: _Expression(knot, value) for name, value in values.items()}
 
-    @cached_property
-    def rates(self) -> _Expression:
-        """dx/dt of a knot."""
-        return _Expression(*self._symbolic["rates"])
 
-    @cached_property
-    def forces(self) -> _Expression:
-        """(m,) the holding forces of a knot."""
-        return _Expression(*self._symbolic["forces"])
-
-    @cached_property
-    def jump(self) -> _Expression:
-        """(nv,) what an impact that stops the points adds to the velocities of a knot; its input has no part in it."""
-        return _Expression(*self._symbolic["jump"])
-
-    @cached_property
-    def impulses(self) -> _Expression:
-        """(m,) [N s] the impulses of such an impact."""
-        return _Expression(*self._symbolic["impulses"])
+def speed_slopes(model: Model, speeds: Callable[[Any], Any], x: Array) -> Array:
+    """(P, nx) of the points' velocities by the state."""
+    return gradient_rows(np.asarray(speeds(InitializeAutoDiff(x).ravel())).ravel(), model.nx)
 
 
 def fixed_contact_plant(
@@ -152,10 +141,7 @@ def fixed_contact_plant(
         return Refusal("its mimic joints are reduced")
     random, here, n = np.random.default_rng(2), model.double.state(), model.nv
     states = 0.5 * random.standard_normal((TRIED, model.nx))
-    every = np.array(
-        [gradient_rows(np.asarray(speeds(InitializeAutoDiff(x).ravel())).ravel(), model.nx) for x in states]
-    )
-    J = every[:, :, n:]
+    J = np.array([speed_slopes(model, speeds, x) for x in states])[:, :, n:]
     size = np.max(np.abs(J), initial=0.0)
     rows = np.flatnonzero(np.max(np.abs(J), axis=(0, 2)) > NO_WAY * max(size, 1.0))
     if not len(rows):
@@ -168,9 +154,9 @@ def fixed_contact_plant(
         )
     plant = FixedContactPlant(model, places, speeds, rows, EquationsOfMotion(model), tree)
     probe = np.hstack([states, random.standard_normal((TRIED, model.nu))])
-    same = agrees(plant.rates.function, probe, plant.values(probe), SAME_PLANT)
+    same = agrees(plant.expressions["rates"].function, probe, plant.values(probe), SAME_PLANT)
     wanted = np.array([plant.forces_at(knot) for knot in probe])
-    same = same and agrees(plant.forces.function, probe, wanted, SAME_PLANT)
+    same = same and agrees(plant.expressions["forces"].function, probe, wanted, SAME_PLANT)
     set_state(model.double, here)
     return plant if same else Refusal("its symbolic form differs from Drake's plant")
 

@@ -8,7 +8,7 @@ vectors [angular; linear] in world about its origin (Featherstone, "Rigid Body D
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -107,8 +107,10 @@ class FlowPart:
 class FlowPlant:
     """A model's motion in continuous time; ModelError, which says why, where it has none.
 
-    `switches` (x, u, materials) -> (2 P,) are of each of P pairs -phi, above 0 where it overlaps, and the bracket;
-    `watched` (x, u, materials, x') -> those, edges of the shapes of `edge_pairs`, and the rates of all.
+    `watched` (x, u, materials, x') -> the switches, which are of each of P pairs -phi, above 0 where it overlaps, and
+    the bracket; edges of the shapes of `edge_pairs`; and the rates of all. `part(pushing)` are the equations where
+    these pairs push and no others, `powers(pushing)` (x, u, materials) -> (3,) [W] of actuators, damping and contact,
+    `switch_slope(i)` (x, u, materials) -> (1, nx + nu + 4 P) of a switch.
     """
 
     def __init__(self, model: Model):
@@ -141,12 +143,10 @@ class FlowPlant:
         self.edge_pairs = np.array([i for i, t in enumerate(self.touches) for _ in t.edges], dtype=int)
         watched = ca.vertcat(switches, *[edge for t in self.touches for edge in t.edges])
         both = [ca.densify(watched), ca.densify(ca.jtimes(watched, self.x, ahead))]
-        self.switches = self._function("switches", switches)
         self.watched = ca.Function("watched", [self.x, self.u, self.materials, ahead], both)
         self._switches = switches
-        self._switch_slopes: dict[int, Any] = {}
-        self._parts: dict[tuple[int, ...], FlowPart] = {}
-        self._powers: dict[tuple[int, ...], Any] = {}
+        keep = lru_cache(MOST_PARTS)
+        self.part, self.powers, self.switch_slope = keep(self._part), keep(self._powers), keep(self._switch_slope)
 
     def _touch(self, i: int, material: Any) -> "_Touch":
         """Pair `i`, of `material` (4,)."""
@@ -177,12 +177,9 @@ class FlowPlant:
     def num_pairs(self) -> int:
         return len(self.pairs.ids)
 
-    def switch_slope(self, switch: int) -> Any:
-        """(x, u, materials) -> (1, nx + nu + 4 P) of one of the switches."""
-        if switch not in self._switch_slopes:
-            by = ca.vertcat(self.x, self.u, self.materials)
-            self._switch_slopes[switch] = self._function("switch_slope", ca.jacobian(self._switches[switch], by))
-        return self._switch_slopes[switch]
+    def _switch_slope(self, switch: int) -> Any:
+        by = ca.vertcat(self.x, self.u, self.materials)
+        return self._function("switch_slope", ca.jacobian(self._switches[switch], by))
 
     @cached_property
     def contacts(self) -> Any:
@@ -190,15 +187,11 @@ class FlowPlant:
         columns = [ca.horzcat(t.point, t.normal, t.push, ca.vertcat(t.depth, t.speed, 0)) for t in self.touches]
         return ca.Function("contacts", [self.x, self.materials], [ca.densify(ca.horzcat(*columns))])
 
-    def powers(self, pushing: tuple[int, ...]) -> Any:
-        """(x, u, materials) -> (3,) [W] of actuators, damping and contact where the pairs `pushing` push."""
-        if pushing not in self._powers:
-            driven = ca.DM(self.description.actuation) @ self.effort
-            push = sum((self.touches[i].force for i in pushing), ca.SX.zeros(self.model.nv))
-            damping, v = ca.DM(self.description.by_velocity("damping")), self.tree.v
-            power = ca.vertcat(ca.dot(v, driven), ca.dot(damping * v, v), ca.dot(v, push))
-            self._powers[pushing] = self._function("powers", power)
-        return self._powers[pushing]
+    def _powers(self, pushing: tuple[int, ...]) -> Any:
+        driven = ca.DM(self.description.actuation) @ self.effort
+        push = sum((self.touches[i].force for i in pushing), ca.SX.zeros(self.model.nv))
+        damping, v = ca.DM(self.description.by_velocity("damping")), self.tree.v
+        return self._function("powers", ca.vertcat(ca.dot(v, driven), ca.dot(damping * v, v), ca.dot(v, push)))
 
     def check(self, x: Array) -> None:
         """SimulationError where shapes overlap at `x` (nx,) that are no pair here."""
@@ -220,15 +213,7 @@ class FlowPlant:
                     "motion in continuous time is not known here; see contact_geometry of load_model"
                 )
 
-    def part(self, pushing: tuple[int, ...]) -> FlowPart:
-        """The equations where the pairs `pushing` push, and no others."""
-        if pushing not in self._parts:
-            if len(self._parts) >= MOST_PARTS:
-                self._parts.pop(next(iter(self._parts)))
-            self._parts[pushing] = self._make(pushing)
-        return self._parts[pushing]
-
-    def _make(self, pushing: tuple[int, ...]) -> FlowPart:
+    def _part(self, pushing: tuple[int, ...]) -> FlowPart:
         """dv/dt = M^-1 F(q, v, dv/dt = 0), and M d(dv/dt) = dF at that dv/dt."""
         nq, force, push = self.model.nq, self._force, ca.SX.zeros(self.model.nv)
         by_x = ca.SX(self.model.nv, self.model.nx)

@@ -13,10 +13,7 @@ from drake_diff._base.arrays import Array, own_array
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.smooth_step import SmoothStep
-from drake_diff.exceptions import ModelError
 from drake_diff.mechanics import tree_kernel
-from drake_diff.mechanics.description import describe_tree
-from drake_diff.mechanics.tree import compiled_tree
 from drake_diff.model.model import Model
 from drake_diff.model.step import stepped
 
@@ -53,7 +50,7 @@ class SmoothRoll:
 
 
 def smooth_roll_of(model: Model) -> SmoothRoll | None:
-    """None where the plant is another, its steps are not certified, or Numba is not installed."""
+    """None where the plant is another, or its steps are not certified."""
     if model.has_other_parameters:
         return None
     return model.cache("smooth roll", lambda: _make(model))
@@ -67,13 +64,6 @@ def _make(model: Model) -> SmoothRoll | None:
         return None
     if model.nq != model.nv or not np.array_equal(smooth.positions, np.arange(model.nv)):
         return None
-    try:
-        description = describe_tree(model)
-    except ModelError:
-        return None
-    tree = compiled_tree(description)
-    if tree is None:
-        return None
     arrays = (
         smooth.dynamics.armature,
         smooth.stiffness,
@@ -85,4 +75,4 @@ def _make(model: Model) -> SmoothRoll | None:
     forces = tree_kernel.Forces(
         float(model.time_step), *(own_array(np.asarray(array, dtype=float)) for array in arrays)
     )
-    return SmoothRoll(smooth, tree.tables, forces)
+    return SmoothRoll(smooth, smooth.dynamics.tree.tables, forces)

@@ -86,7 +86,7 @@ class FixedContacts(Dynamics):
 
     def forces(self, x: Any, u: Any) -> Any:
         """(m,) [N] the forces on the model that hold the points, one for each of `rows`, in any arithmetic."""
-        return self.plant.forces(np.concatenate([np.asarray(x), np.asarray(u)]))
+        return self.plant.expressions["forces"](np.concatenate([np.asarray(x), np.asarray(u)]))
 
     def places(self, x: Any) -> Any:
         """(m,) [m] the coordinates that are fixed."""
@@ -226,12 +226,14 @@ class Impact:
     def __call__(self, x: Any) -> Any:
         """(nx,) the state after the impact, from the state `x` (nx,) before, in any arithmetic."""
         x, nq = np.asarray(x), self.contacts.plant.model.nq
-        jump = self.contacts.plant.jump(np.concatenate([x, np.zeros(self.contacts.nu)]))
+        jump = self.contacts.plant.expressions["jump"](np.concatenate([x, np.zeros(self.contacts.nu)]))
         return np.concatenate([x[:nq], x[nq:] + (1 + self.restitution) * jump])
 
     def impulses(self, x: Any) -> Any:
         """(m,) [N s] on the points, one for each of `contacts.rows`, in any arithmetic."""
-        impulses = self.contacts.plant.impulses(np.concatenate([np.asarray(x), np.zeros(self.contacts.nu)]))
+        impulses = self.contacts.plant.expressions["impulses"](
+            np.concatenate([np.asarray(x), np.zeros(self.contacts.nu)])
+        )
         return (1 + self.restitution) * impulses
 
     def gaps(self, x: Any) -> Any:
@@ -271,7 +273,9 @@ class Impact:
         """(nx, nx) of the rates (nx,) before and after; the reset's own derivative where no single gap closes."""
         nx, nq = self.contacts.nx, self.contacts.plant.model.nq
         reset = np.eye(nx)
-        slopes = self.contacts.plant.jump.jacobian(np.concatenate([x, np.zeros(self.contacts.nu)]))[:, :nx]
+        slopes = self.contacts.plant.expressions["jump"].jacobian(np.concatenate([x, np.zeros(self.contacts.nu)]))[
+            :, :nx
+        ]
         reset[nq:] += (1 + self.restitution) * slopes
         if len(self.gap_rows) != 1:
             return reset

@@ -404,7 +404,7 @@ def _dynamics(task: OptimalControl) -> KnotFunction:
     if isinstance(form, PlantKnots):
         function = symbolic_plant(form.model, dynamics.parameters, None if moved is None else moved.coordinates)
     elif isinstance(form, FixedContactPlant):
-        function = form.rates.function
+        function = form.expressions["rates"].function
     elif isinstance(form, Pointwise):
         start = dynamics.parameters.values
 
