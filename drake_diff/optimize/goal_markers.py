@@ -51,22 +51,20 @@ def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn,
 
 def _shapes(mark: Mark, path: str, pose: RigidTransform, above: bool) -> list[Drawn]:
     """The shapes of one mark at `pose` on the body of that path; those of a goal are `above` what hides them."""
-    return [replace(shape, above=above) for shape in _shapes_of(mark, path, pose, above)]
-
-
-def _shapes_of(mark: Mark, path: str, pose: RigidTransform, above: bool) -> list[Drawn]:
     frame = pose @ RigidTransform(RotationMatrix(np.array(mark.rotation)), np.zeros(3))
     colour = Rgba(*mark.colour)
     if above and mark.shape in ("sphere", "box") and max(mark.size) / 2 > LARGE:
         colour = Rgba(*mark.colour[:3], 0.2)
     if mark.shape == "sphere":
-        return [_drawn(path, Sphere(mark.size[0]), frame, colour, mark.size[0])]
-    if mark.shape == "box":
-        return [_drawn(path, Box(*mark.size), frame, colour, float(np.linalg.norm(mark.size)) / 2)]
-    if mark.shape == "axes":
-        parts = zip(np.eye(3) * mark.size[0], AXES, strict=True)
-        return [drawn for along, shade in parts for drawn in _arrow(path, frame, along, shade)[:1]]
-    return _arrow(path, frame, np.array(mark.size), colour)
+        shapes = [_drawn(path, Sphere(mark.size[0]), frame, colour, mark.size[0])]
+    elif mark.shape == "box":
+        shapes = [_drawn(path, Box(*mark.size), frame, colour, float(np.linalg.norm(mark.size)) / 2)]
+    elif mark.shape == "axes":
+        axes = zip(np.eye(3) * mark.size[0], AXES, strict=True)
+        shapes = [_arrow(path, frame, along, shade)[0] for along, shade in axes]
+    else:
+        shapes = _arrow(path, frame, np.array(mark.size), colour)
+    return [replace(shape, above=above) for shape in shapes]
 
 
 def _arrow(path: str, frame: RigidTransform, along: Array, colour: Rgba) -> list[Drawn]:

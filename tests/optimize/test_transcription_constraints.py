@@ -44,8 +44,8 @@ def test_a_refined_mesh_keeps_the_waypoints_place():
 @each_row(
     "waypoints, message",
     [
-        ({0: [0, 0]}, "knots of waypoints: expected whole numbers from 1 to 9"),
-        ({10: [0, 0]}, "knots of waypoints: expected whole numbers from 1 to 9"),
+        ({0: [0, 0]}, "knots of waypoints.*at least 1"),
+        ({10: [0, 0]}, "knots of waypoints.*at least 1"),
         ({True: [0, 0]}, "knots of waypoints"),
         ({0.5: [0, 0]}, "knots of waypoints"),
         ({3: [0]}, r"waypoint at knot 3: expected shape \(2,\)"),

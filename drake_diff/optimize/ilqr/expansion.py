@@ -1,4 +1,4 @@
-"""The linear-quadratic problem around a motion: Drake's step Jacobians, the cost's derivatives, learned curvature.
+"""The linear-quadratic problem around a motion: Drake's step Jacobians, cost's derivatives and dynamics' curvature.
 
 All in Drake's own coordinates, quaternions included: the discrete step lets a quaternion's norm grow, so that the norm
 is a state that inputs move, and on the rotations' tangent space the gradient would be wrong by what is left out.
@@ -25,8 +25,6 @@ from drake_diff.optimize.problem.problem import Problem
 
 # Of a state, or of 1: Jacobians are known to 1e-12, so that this leaves 1e-6 of their derivative.
 DIFFERENCE_STEP = 1e-6
-SMALLEST_MOVE = 1e-7  # below it rounding of the Jacobians, 1e-12, is too large a part of their difference
-SAFE_DIVISOR = 1e-6  # of |dz| |r|: SR1 is not defined where dz' r vanishes
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,31 +202,3 @@ def _differences(jacobians: Callable[[Array], Array], xs: Array, v: Array) -> Ar
         curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
     curvature[:, :nx, nx:] = curvature[:, nx:, :nx].swapaxes(1, 2)
     return (curvature + curvature.swapaxes(1, 2)) / 2
-
-
-class DynamicsCurvature:
-    """The dynamics' second derivatives, learned from the Jacobians of successive motions, for no simulation at all.
-
-    iLQR leaves out sum_i v_i d2 f_i / d z2, v being the multipliers of the dynamics, and crawls where that is large
-    beside the cost's curvature. M (N+1, n + m, n + m) stands for it, 0 at the end: symmetric, corrected once for each
-    motion by symmetric rank one (SR1; Nocedal and Wright, "Numerical Optimization", 2006, section 6.2) so that
-    M_k dz = (F_k(new) - F_k(old))' v; it stays 0 where the dynamics are linear. If more is known of M, it is set.
-    """
-
-    def __init__(self) -> None:
-        self.M = np.zeros(0)
-        self._F = np.zeros(0)
-
-    def update(self, problem: LinearQuadratic, dz: Array) -> None:
-        """Learn from the problem around the new motion, dz (N, n + m) being how far it has moved."""
-        if not self._F.size:
-            self.M, self._F = np.zeros_like(problem.hessians), problem.F
-            return
-        v = problem.multipliers()
-        r = np.einsum("kij,ki->kj", problem.F - self._F, v) - np.einsum("kij,kj->ki", self.M[:-1], dz)
-        divisor = np.einsum("ki,ki->k", r, dz)
-        length = np.linalg.norm(dz, axis=1)
-        safe = (length > SMALLEST_MOVE) & (np.abs(divisor) > SAFE_DIVISOR * length * np.linalg.norm(r, axis=1))
-        r, divisor = r[safe], divisor[safe]
-        self.M[:-1][safe] += r[:, :, None] * r[:, None, :] / divisor[:, None, None]
-        self._F = problem.F

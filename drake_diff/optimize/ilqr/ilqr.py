@@ -3,8 +3,7 @@
 Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
 the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020: the guess need not be a rollout, and a step of size a
 leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). What must hold is an augmented Lagrangian (`constraints`).
-The dynamics' second derivatives, which iLQR leaves out, are learned on the way, or taken by differences where a smooth
-motion converges slowly (`expansion`).
+The dynamics' second derivatives, which iLQR leaves out, are added where a smooth motion converges slowly (`expansion`).
 """
 
 import math
@@ -23,7 +22,6 @@ from drake_diff.motion.rollout import STEPS
 from drake_diff.motion.smooth_roll import SmoothRoll, smooth_roll_of
 from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import (
-    DynamicsCurvature,
     Motion,
     curvature_along,
     expand,
@@ -171,7 +169,6 @@ class _Search:
         self.motion = self._take_in(xs, us, np.clip(begin, *self.design.limits))
         self.guess, self.tried_by = self.motion, _smooth_roll(problem)
         self.policy: AffinePolicy | None = None  # that of the last step
-        self.expanded, self.curvature = self.motion, DynamicsCurvature()
         self.cost = self._objective(self.motion)
         self.constraints.start(*self.motion.point, self.cost, float(np.sum(self.motion.gaps**2)))
         self.jacobians: Array | None = None
@@ -255,19 +252,21 @@ class _Search:
                 return Outcome.TIME_LIMIT
 
     def _expand(self) -> LinearQuadratic:
-        new, old = self.motion, self.expanded
         if self.jacobians is None:
-            self.jacobians = jacobians_along(self.problem, new)
-        model = expand(self.problem, new, self.jacobians, self.constraints)
-        moved = np.tile(new.c - old.c, (len(new.us), 1))
-        self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], moved, new.us - old.us]))
-        if new.is_rollout and self.gains[1] > OPTIONS.slow * self.gains[0]:  # steps with gaps are short for these
-            estimate = curvature_along(self.problem, new, model.multipliers())
-            if estimate is not None:
-                curvature, known = estimate
-                self.curvature.M[:-1][known] = curvature
-        self.expanded = new
-        return model
+            self.jacobians = jacobians_along(self.problem, self.motion)
+        return expand(self.problem, self.motion, self.jacobians, self.constraints)
+
+    def _curved(self, model: LinearQuadratic) -> tuple[LinearQuadratic, ...]:
+        """The model with the dynamics' second derivatives, where a rollout converges slowly without and has them."""
+        if not self.motion.is_rollout or self.gains[1] <= OPTIONS.slow * self.gains[0]:
+            return ()  # steps with gaps are short for these
+        estimate = curvature_along(self.problem, self.motion, model.multipliers())
+        if estimate is None:
+            return ()
+        curvature, known = estimate
+        hessians = np.array(model.hessians)
+        hessians[:-1][known] += curvature
+        return (replace(model, hessians=hessians),)
 
     def _step(self, model: LinearQuadratic, final: bool) -> Outcome | None:
         """Take one step that lowers the merit; an outcome if there is none left to take."""
@@ -276,8 +275,7 @@ class _Search:
         left_over = self.limits.tolerance**2 * scale
         if not final:
             left_over = max(left_over, OPTIONS.left_over * self.constraints.unrest(*self.motion.point))
-        curved = (replace(model, hessians=model.hessians + self.curvature.M),) if self.curvature.M.any() else ()
-        models = (*curved, model)
+        models = (*self._curved(model), model)
         solve = cache(solve_riccati)  # no policy is sought twice
 
         def is_reached(limit: float) -> bool:

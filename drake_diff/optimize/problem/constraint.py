@@ -237,6 +237,15 @@ class Constraint:
         return np.atleast_1d(result)
 
 
+def several(subject: str, given: Any, kind: type | tuple[type, ...], expected: str) -> tuple[Any, ...]:
+    """One or several of a kind as a tuple; InputError of anything else."""
+    every = tuple(given) if isinstance(given, (tuple, list)) else (given,)
+    for value in every:
+        if not isinstance(value, kind):
+            raise InputError(subject, got=type(value).__name__, expected=expected)
+    return every
+
+
 def arguments_of(function: Any) -> int:
     """How many arguments without a default a function takes; 0 of one that does not say."""
     try:

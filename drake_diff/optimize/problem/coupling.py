@@ -243,17 +243,6 @@ class Periodic(Joins):
         return coupling.bound(num_steps, nx, nu, input_at_end=input_at_end)
 
 
-def checked_couplings(given: Any) -> tuple[Couples, ...]:
-    """One or several as a tuple; InputError of anything else."""
-    several = tuple(given) if isinstance(given, (tuple, list)) else (given,)
-    for coupling in several:
-        if not isinstance(coupling, Couples):
-            raise InputError(
-                "couplings", got=type(coupling).__name__, expected="Periodic, Coupling, InputRate, Jerk, or several"
-            )
-    return several
-
-
 def excess_of(couplings: Sequence[BoundCoupling], xs: Array, us: Array, where: Indices) -> dict[str, tuple[float, int]]:
     """The largest excess of each by its label, and the row of its last knot; see `BoundCoupling.excess`."""
     excesses: dict[str, tuple[float, int]] = {}

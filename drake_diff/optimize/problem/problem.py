@@ -25,7 +25,14 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
 from drake_diff.motion.intervals import Intervals, intervals_of
 from drake_diff.motion.rollout import MOTIONS, STEPS
-from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
+from drake_diff.optimize.problem.constraint import (
+    Constraint,
+    check_inside,
+    plant_limits,
+    resolve_bounds,
+    several,
+    short,
+)
 from drake_diff.optimize.problem.cost import (
     ConstantCost,
     FinalCost,
@@ -38,7 +45,7 @@ from drake_diff.optimize.problem.cost import (
     quadratic_along,
     running_cost_of,
 )
-from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, RateLimit, checked_couplings, excess_of
+from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, RateLimit, excess_of
 from drake_diff.optimize.problem.design import Design
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, bounds_of, plant_dynamics, state_of
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
@@ -466,12 +473,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         mask = np.asarray(self.initial_state_mask)
         if mask.shape != (self.nx,):
             raise ShapeError("initial_state_mask", got=mask.shape, expected=(self.nx,))
-        if mask.dtype != bool:
-            raise InputError("initial_state_mask", got=f"dtype {mask.dtype}", expected="booleans")
-        if free and not mask.any():
-            raise InputError("initial_state_mask", got="no True entry", expected="at least one free entry")
-        if not free and mask.any():
-            raise InputError("initial_state_mask", got="a mask", expected='"initial_state" in optimize')
+        if mask.dtype != bool or mask.any() != free:
+            expected = "booleans, of which some are True" if free else 'none, without "initial_state" in optimize'
+            raise InputError("initial_state_mask", got=f"{mask.tolist()}", expected=expected)
         return mask
 
     def _check_state(self, subject: str, given: Any) -> Array:
@@ -484,30 +488,20 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return state
 
     def _check_waypoints(self) -> dict[int, Array]:
-        waypoints = {}
-        if not (self.waypoints is None or isinstance(self.waypoints, Mapping)):
-            got = f"{self.waypoints!r:.80}"
-            raise InputError("waypoints", got=got, expected="a mapping from knots to states")
-        for knot, state in (self.waypoints or {}).items():
-            whole = isinstance(knot, (int, np.integer)) and not isinstance(knot, (bool, np.timedelta64))
-            if not whole or not 0 < knot < self.num_steps:
-                expected = f"whole numbers from 1 to {self.num_steps - 1} (the last state's is x_goal)"
-                raise InputError("knots of waypoints", got=f"{knot!r:.80}", expected=expected)
-            waypoints[int(knot)] = self._check_state(f"waypoint at knot {knot}", state)
-        return dict(sorted(waypoints.items()))
+        given = {} if self.waypoints is None else self.waypoints
+        if not isinstance(given, Mapping):
+            raise InputError("waypoints", got=f"{given!r:.80}", expected="a mapping from knots to states")
+        subject = "knots of waypoints (the last state's is x_goal)"
+        knots = {count(subject, k, 1, self.num_steps - 1): state for k, state in given.items()}
+        return {k: self._check_state(f"waypoint at knot {k}", state) for k, state in sorted(knots.items())}
 
     def _check_constraints(self) -> tuple[Constraint, ...]:
-        given = self.constraints if isinstance(self.constraints, (tuple, list)) else (self.constraints,)
-        for constraint in given:
-            if not isinstance(constraint, Constraint):
-                where = "; couplings= takes it" if isinstance(constraint, Couples) else ""
-                raise InputError(
-                    "constraints", got=type(constraint).__name__, expected=f"a Constraint or several{where}"
-                )
+        where = "; couplings= takes it" if isinstance(self.constraints, Couples) else ""
+        given = several("constraints", self.constraints, Constraint, f"a Constraint or several{where}")
         return tuple(constraint.resolved(self.x0, np.zeros(self.nu)) for constraint in given)
 
     def _check_couplings(self) -> tuple[Couples, ...]:
-        couplings = checked_couplings(self.couplings)
+        couplings = several("couplings", self.couplings, Couples, "Periodic, Coupling, InputRate, Jerk, or several")
         self._set("couplings", couplings)
         taken = {c.label for c in self.constraints}
         for c in couplings:
@@ -531,15 +525,12 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             raise InputError(f"coupling {bound.label}", got=f"states that break it by {excess:.3g}", expected="0")
 
     def _check_goals(self) -> tuple[Goal, ...]:
-        given = self.goals if isinstance(self.goals, (tuple, list)) else (self.goals,)
-        for goal in given:
-            if not isinstance(goal, Goal):
-                raise InputError("goals", got=type(goal).__name__, expected="a goal such as FrameGoal, or several")
+        given = several("goals", self.goals, Goal, "a goal such as FrameGoal, or several")
         if given and not self.has_model:
             raise InputError("goals", got="given", expected="none for plain dynamics: a goal is a model's")
         for doubt in doubts_of(given, self.model) if given else ():
             warnings.warn(doubt, ModelWarning, stacklevel=4)
-        return tuple(given)
+        return given
 
     def _check_kept(self) -> None:
         """Bind the goals, which checks their names, and look at the knots of all that is kept."""
@@ -625,31 +616,22 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             self._check_parameter_cost(self.parameter_cost)
         if not self.parameters.parameters or not self.has_model:
             return
-        x, u = self.x0, np.zeros(self.nu)
+        xs = np.tile(self.x0, (self.num_steps + 1, 1))
         with applied(self.parameters), np.errstate(all="ignore"):
-            for constraint in self.kept:
-                constraint(x, u)
-            self.constraint_excess(np.tile(x, (self.num_steps + 1, 1)), self.us)
-            if self.total_running_cost is not None:
-                cost_at(self.total_running_cost, 0.0)(x, u)
-            if self.total_final_cost is not None:
-                self.total_final_cost(x)
-            if self.trajectory_cost is not None:
-                self.trajectory_cost(np.tile(x, (self.num_steps + 1, 1)), self.us)
+            self.constraint_excess(xs, self.us)
+            self.objective(xs, self.us)
 
 
 def _check_optimize(nu: int, optimize: Sequence[str]) -> tuple[str, ...]:
-    if not isinstance(optimize, (str, tuple, list, set, frozenset)):
-        raise InputError("optimize", got=repr(optimize), expected="names out of " + ", ".join(OPTIMIZABLE))
-    names = (optimize,) if isinstance(optimize, str) else tuple(optimize)
-    if not names:
-        raise InputError("optimize", got="nothing", expected="at least one of " + ", ".join(OPTIMIZABLE))
+    names = (optimize,) if isinstance(optimize, str) else optimize
+    if not isinstance(names, (tuple, list, set, frozenset)) or not names:
+        raise InputError("optimize", got=repr(optimize), expected="at least one of " + ", ".join(OPTIMIZABLE))
     for name in names:
         if name not in OPTIMIZABLE:
             raise UnknownNameError("optimize", got=name, known=OPTIMIZABLE)
     if "controls" in names and nu == 0:
         raise InputError("optimize", got='"controls", but the model has no actuators', expected="an actuated model")
-    return names
+    return tuple(names)
 
 
 def _check_horizon(given: Any) -> tuple[float, float]:

@@ -7,8 +7,7 @@ they have converged, and the level is lowered until as many as are asked for hav
 "Simulation-based LQR-trees with input and state constraints", ICRA 2010).
 """
 
-from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -202,37 +201,30 @@ def _found(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
     slowest = float(np.max(np.abs(np.linalg.eigvals(d.A - d.B @ K))))
     steps = min(int(np.ceil(PATIENCE * np.log(SLOWEST) / np.log(min(slowest, 1 - 1e-12)))) + 1, MOST_STEPS)
 
-    def at(level: float, samples: int) -> Region:
-        return Region(x_goal, u_goal, K, S, level, most, samples, model.time_step, steps, bounds)
-
-    wanted = asked.level
-    if wanted is not None and wanted > most:
+    level = most if asked.level is None else asked.level
+    if level > most:
         expected = f"at most {most:.4g}, within which limits are kept"
-        raise InputError("TerminalSet.level", got=f"{wanted:g}", expected=expected)
-    level = _sampled(model, at, most if wanted is None else wanted, asked.samples, asked.seed, fixed=wanted is not None)
-    return at(level, asked.samples)
+        raise InputError("TerminalSet.level", got=f"{level:g}", expected=expected)
+    region = Region(x_goal, u_goal, K, S, level, most, asked.samples, model.time_step, steps, bounds)
+    return _sampled(model, region, asked)
 
 
-def _sampled(
-    model: Model, region_at: Callable[[float, int], Region], level: float, samples: int, seed: int, *, fixed: bool
-) -> float:
-    """The level, lowered until `samples` random states in a row converge; a `fixed` one that fails is refused."""
-    random, least, most = np.random.default_rng(seed), 1e-12 * level, level
-    in_a_row = 0
-    while in_a_row < samples:
-        region = region_at(level, 0)
-        x = region.random_state(random)
+def _sampled(model: Model, region: Region, asked: TerminalSet) -> Region:
+    """The region, lowered until the random states in a row converge; a level that was asked for is refused instead."""
+    random, first, in_a_row = np.random.default_rng(asked.seed), region.level, 0
+    while in_a_row < asked.samples:
+        x, level = region.random_state(random), region.level
         if region.converges(model, x):
             in_a_row += 1
             continue
-        got = f"a state at {float(region.value(x)):.2g} of it that does not converge, {x.round(4).tolist()}"
-        if fixed:
-            raise InputError("TerminalSet.level", got=got, expected="a level from which all random states converge")
-        level = min(LOWERED * level, WITHIN * float(region.value(x)) * level) if in_a_row < TRIED else WITHIN * level
-        in_a_row = 0
-        if level < least:
-            raise InputError("TerminalSet", got=got, expected=f"a level below {most:.3g} that converges")
-    return level if fixed or level == most else WITHIN * level
+        value = float(region.value(x))
+        got = f"a state at {value:.2g} of it that does not converge, {x.round(4).tolist()}"
+        level = min(LOWERED * level, WITHIN * value * level) if in_a_row < TRIED else WITHIN * level
+        if asked.level is not None or level < 1e-12 * first:
+            expected = f"a level up to {first:.3g} from which all random states converge"
+            raise InputError("TerminalSet.level", got=got, expected=expected)
+        region, in_a_row = replace(region, level=level), 0
+    return region if region.level == first else replace(region, level=WITHIN * region.level)
 
 
 def linear_level(K: Array, S: Array, x_goal: Array, u_goal: Array, bounds: Bounds, nq: int) -> float:
