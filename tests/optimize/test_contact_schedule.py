@@ -9,7 +9,7 @@ from helpers.legged import LEGGED, SOLO_FEET, legged_model, rest, robot_on_feet
 import drake_diff as dd
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.legs.feet import Legs
-from drake_diff.legs.motion import LANDS, _slow_phases, _sunk, plan_forces, swings, touching
+from drake_diff.legs.motion import plan_forces, swings, touching
 from drake_diff.model.parameters import select
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
@@ -201,25 +201,6 @@ def test_solo_hops_and_lands(solo, standing):
     feet = [solo.plant.GetBodyByName(foot) for foot in SOLO_FEET]
     heights = [solo.plant.EvalBodyPoseInWorld(context, foot).translation()[2] - 0.016 for foot in feet]
     assert min(heights) > 0.02
-
-
-def test_a_phase_is_slow_where_it_lasts_twice_as_long_as_a_fall():
-    carries = np.ones((60, 4), dtype=bool)
-    carries[10:25, 0] = carries[30:48, 1] = False  # 0.3 s and 0.36 s; twice a fall of 0.25 m is 0.32 s
-    assert _slow_phases(carries, 0.02, 0.25, 9.81) == [(30, 48)]
-    assert _slow_phases(carries, 0.02, 0.25, 0.0) == []  # nothing falls
-    carries[30:48] = False
-    assert _slow_phases(carries, 0.02, 0.25, 9.81) == []  # it flies
-
-
-def test_a_sole_sinks_by_its_share_of_the_weight():
-    landing = np.zeros((41, 4), dtype=bool)
-    sunk = _sunk(1e-3, np.tile([0.5, 0.25, 0.25, 0.0], (40, 1)), landing)
-    assert np.allclose(sunk[-1], [1e-3, 0.0, 0.0, -1e-3], atol=1e-8)  # 0.7 to the power of 40 is left, 6e-7 of it
-    assert np.all(np.diff(sunk[:, 0]) > 0)
-    landing[40, 3] = True
-    landed = _sunk(1e-3, np.tile([0.5, 0.25, 0.25, 0.0], (40, 1)), landing)
-    assert np.allclose(landed[-1] - sunk[-1], [0.0, 0.0, 0.0, LANDS], atol=1e-15)
 
 
 @pytest.fixture(scope="module", params=range(2))

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, finite_array, positive_float
-from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints, labelled
 from drake_diff.optimize.problem.constraint import Constraint, Described, arguments_of, short
-from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics
+from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, by_place
 
 FORM = "a function of the states at its knots, or of these and of the inputs there, that gives numbers (m,)"
 
@@ -281,13 +281,7 @@ class RateLimit(Couples):
                 raise InputError(kind, got="one limit", expected="limits by name: plain dynamics have no velocities")
             places = sorted(set(known.values()))
             return np.array(places), np.full(len(places), self.limit)
-        limits = dict[int, float]()
-        for name, limit in self.limit.items():
-            if name not in known:
-                raise UnknownNameError(kind, got=name, known=known)
-            if known[name] in limits:
-                raise InputError(kind, got=name, expected="each once: two names are the same")
-            limits[known[name]] = limit
+        limits = by_place(kind, known, self.limit)
         return np.array(list(limits)), np.array(list(limits.values()))
 
     def of_steps(self, system: System, num_steps: int, time_step: float) -> BoundCoupling:

@@ -459,11 +459,16 @@ def _names(subject: str, given: Sequence[str] | None, letter: str, count: int) -
 
 
 def coordinates(system: Model | Dynamics, subject: str, given: Mapping[str, Any]) -> dict[int, Any]:
-    """`given` by the places in the state that its names are of; see `places_of`.
+    """`given` by the places in the state that its names are of; see `places_of` and `by_place`."""
+    return by_place(subject, places_of(system), given)
 
-    Raises UnknownNameError of a name that is none, InputError where two are the same coordinate.
+
+def by_place(subject: str, known: Mapping[str, int], given: Mapping[str, Any]) -> dict[int, Any]:
+    """`given` by the places that its names are `known` at.
+
+    Raises UnknownNameError of a name that is none, InputError where two are of the same place.
     """
-    known, values = places_of(system), dict[int, Any]()
+    values = dict[int, Any]()
     for name, value in given.items():
         if name not in known:
             raise UnknownNameError(subject, got=name, known=known)

@@ -193,7 +193,7 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
     solved = _solve(stretch, expansion)
     if isinstance(solved, Refusal):
         return solved
-    expansion, moves = solved.expansion, solved.moves
+    expansion, moves, whole, feedback = solved
     gap_prices = OPTIONS.gap_price * np.max(np.abs(moves.dynamics), axis=0)
     before = merit(stretch, expansion, motion, gap_prices)
     slope, curvature = slope_along(expansion.quadratic, moves.dxs, moves.dus)
@@ -202,7 +202,7 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
         slope -= float(np.sum(rows.prices * (rows.beyond - slack)))
     promised = -(slope + curvature / 2)
     rounding = OPTIONS.rounding * (1 + abs(before))
-    step = Step(stretch, motion, 0.0, promised, before, expansion, moves, solved.whole, solved.feedback)
+    step = Step(stretch, motion, 0.0, promised, before, expansion, moves, whole, feedback)
     if stretch.rolls and not motion.is_rollout:
         return _first_rollout(step)
     for size in OPTIONS.rolled_sizes if stretch.rolls else OPTIONS.step_sizes:
@@ -257,34 +257,23 @@ def _first_rollout(step: Step) -> Step:
     return replace(step, motion=best[0], size=1.0, merit=best[1])
 
 
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """The program with prices that are dear enough, its solution, whether no limit pushes, and gains (N, nu, nx)."""
+def _solve(stretch: Stretch, expansion: Expansion) -> tuple[Expansion, Moves, bool, Array | None] | Refusal:
+    """The program with prices that are dear enough, its solution, whether no limit pushes, and gains (N, nu, nx).
 
-    expansion: Expansion
-    moves: Moves
-    whole: bool
-    feedback: Array | None
-
-
-def _solve(stretch: Stretch, expansion: Expansion) -> _Solved | Refusal:
-    """The quadratic program; where motions are rolled out and bounds of inputs alone push, by Riccati's sweep."""
+    Where motions are rolled out and bounds of inputs alone push it is by Riccati's sweep, which has gains.
+    """
     quadratic = expansion.quadratic
     nothing = tuple(np.zeros_like(rows.lower) for rows in expansion.limited)
     free = _swept(quadratic.unbounded())
     if free is not None:
-        moves, policy = free
-        within = _within_bounds(quadratic, moves)
-        if within and _is_kept(expansion, moves):
-            return _Solved(expansion, replace(moves, slacks=nothing, multipliers=nothing), True, policy.feedback)
-        if stretch.rolls and not within:
-            boxed = _swept(quadratic)
-            if boxed is not None and _is_kept(expansion, boxed[0]):
-                boxed_moves = replace(boxed[0], slacks=nothing, multipliers=nothing)
-                return _Solved(expansion, boxed_moves, False, boxed[1].feedback)
-        expansion = replace(expansion, limited=_dear_enough(expansion.limited, moves.dynamics))
+        within = np.all((quadratic.lower <= free[0].dus) & (free[0].dus <= quadratic.upper))
+        swept = free if within else _swept(quadratic) if stretch.rolls else None
+        if swept is not None and _is_kept(expansion, swept[0]):
+            moves = replace(swept[0], slacks=nothing, multipliers=nothing)
+            return expansion, moves, bool(within), swept[1].feedback
+        expansion = replace(expansion, limited=_dear_enough(expansion.limited, free[0].dynamics))
     priced = stretch.program.solve(quadratic, expansion.limited)
-    return priced if isinstance(priced, Refusal) else _Solved(expansion, priced, False, None)
+    return priced if isinstance(priced, Refusal) else (expansion, priced, False, None)
 
 
 def expand(stretch: Stretch, motion: Motion) -> Expansion:
@@ -318,10 +307,6 @@ def _swept(quadratic: LinearQuadratic) -> tuple[Moves, AffinePolicy] | None:
     by_input += np.einsum("kij,ki->kj", quadratic.F, dynamics)
     bounds = -by_input[:, quadratic.num_states :]
     return Moves(dxs, dus, (), (), bounds, dynamics), policy
-
-
-def _within_bounds(quadratic: LinearQuadratic, moves: Moves) -> bool:
-    return not (np.any(moves.dus < quadratic.lower) or np.any(moves.dus > quadratic.upper))
 
 
 def _is_kept(expansion: Expansion, moves: Moves) -> bool:
