@@ -31,7 +31,7 @@ class SmoothRoll:
     ) -> tuple[Array, Array] | None:
         """(xs (N+1, nx), us (N, nu)), us = wanted + gains (xs - old) within bounds, each step less its gap (N, nx).
 
-        `gains` (N, nu, nx), `bounds` a `tree_kernel.JointBounds`. None where a joint comes to its limit, or anything
+        `gains` (N, nu, nx), `bounds` a `tree_kernel.Bounds`. None where a joint comes to its limit, or anything
         is not finite.
         """
         (count, nu), nx = wanted.shape, len(x0)
@@ -39,7 +39,7 @@ class SmoothRoll:
         xs[0] = x0
         stepped(count)
         old, gaps, wanted, gains = (np.array(array, float, order="C") for array in (old, gaps, wanted, gains))
-        limits = tree_kernel.JointBounds(*(np.array(array, float, order="C") for array in bounds))
+        limits = tree_kernel.Bounds(*(np.array(array, float, order="C") for array in bounds))
         is_solved = tree_kernel.roll(self.tree, self.forces, limits, old, gaps, wanted, gains, xs, us)
         if not is_solved or not np.isfinite(xs).all():
             return None
