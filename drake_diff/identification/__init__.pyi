@@ -1,6 +1,6 @@
-from .base import BaseParameter as BaseParameter
-from .base import base_parameters as base_parameters
+from .excite import BaseParameter as BaseParameter
 from .excite import Excitation as Excitation
+from .excite import base_parameters as base_parameters
 from .excite import excite as excite
 from .explain import explain as explain
 from .identify import identify as identify

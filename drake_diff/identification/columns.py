@@ -5,7 +5,7 @@ motion say which of them come nearer to the model than the columns as they are. 
 nothing but their first states, and one is named where it leaves noise and the columns as they are do not.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -21,18 +21,15 @@ from drake_diff.identification.judge import HOPELESS, likelihood_of, noise_of
 from drake_diff.identification.motion import ContinuousMotion, EulerMotion, Law
 from drake_diff.identification.recordings import Chart, Piece, guess_states, noise_by_differences
 from drake_diff.identification.results import Explanation
-from drake_diff.identification.tree import Mask, Tree
+from drake_diff.identification.tree import Tree
 from drake_diff.identification.unknowns import Unknowns
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 
 SEGMENTS = 12  # of the recording, by which mistakes are compared
-AT_ONCE = 64  # mistakes whose segments move side by side
 FITTED = 3  # mistakes that are fitted whole, of those that come nearest
 NEARER = 0.5  # of what the columns as they are leave: a mistake that leaves more is not fitted
-FAR = (
-    3.0  # more than a mistake that explains leaves: columns as they are that leave 20 times its squares are not fitted
-)
+FAR = 3.0  # more than a mistake that explains leaves: columns as they are that leave 20 times its squares
 EVIDENCE = 20.0  # by which -2 log of the likelihood must fall: of 100 mistakes, by chance in 0.5 % of recordings
 SAME = 6.0  # of the same: evidence of 20 to 1, below which two mistakes are not told apart
 STEPS, FEW = 20, 8  # of Gauss and Newton
@@ -57,77 +54,42 @@ Fitted = Callable[[Sequence[Piece]], tuple[float, bool]]  # (-2 log of the likel
 
 
 def mistakes(model: Model, chart: Chart, pieces: Sequence[Piece]) -> list[Mistake]:
-    """Everything that is tried; of what was not measured, nothing."""
-    seen = np.any([np.isfinite(piece.ys).any(axis=0) for piece in pieces], axis=0)
-    return list(_columns(model, chart, seen).every())
-
-
-@dataclass(frozen=True, eq=False)
-class _Columns:
-    """The columns of a model's recordings, and which of them were measured."""
-
-    names: tuple[str, ...]  # of states, then of inputs
-    inputs: range
-    seen: Mask
-    along: list[tuple[int, int]]  # position and velocity of what moves along lines
-    turning: list[tuple[int, int]]  # of what turns
-    rates: list[int]  # velocities of what turns, those of free bodies too
-
-    def every(self) -> Iterator[Mistake]:
-        yield from self.exchanges()
-        yield from self.mirrors()
-        yield from self.degrees()
-
-    def exchanges(self) -> Iterator[Mistake]:
-        for alike in (self.along, self.turning):
-            for first, second in combinations(alike, 2):
-                pairs = [pair for pair in zip(first, second, strict=True) if self.seen[list(pair)].all()]
-                yield from (self.exchanged(pair) for pair in pairs)
-                if len(pairs) > 1:
-                    yield self.exchanged(*pairs)
-        yield from map(self.exchanged, combinations(self.inputs, 2))
-
-    def mirrors(self) -> Iterator[Mistake]:
-        for pair in (*self.along, *self.turning):
-            both = tuple(column for column in pair if self.seen[column])
-            yield from (self.scaled(columns, "the other sign", -1.0) for columns in _parts(both, *((i,) for i in both)))
-        yield from (self.scaled((i,), "the other sign", -1.0) for i in self.inputs)
-
-    def degrees(self) -> Iterator[Mistake]:
-        angles = tuple(i for i, _ in self.turning if self.seen[i])
-        rates = tuple(i for i in self.rates if self.seen[i])
-        for columns in _parts(angles + rates, angles, rates):
-            yield self.scaled(columns, "degrees, not radians", np.pi / 180)
-
-    def made(self, words: str, columns: Sequence[int], sources: Sequence[int], factor: float) -> Mistake:
-        order, factors = np.arange(len(self.names)), np.ones(len(self.names))
-        order[list(columns)], factors[list(columns)] = sources, factor
-        return Mistake(words, order, factors)
-
-    def exchanged(self, *pairs: tuple[int, int]) -> Mistake:
-        words = " and ".join(f"{self.names[i]} and {self.names[k]}" for i, k in pairs)
-        columns, sources = [i for pair in pairs for i in pair], [i for a, b in pairs for i in (b, a)]
-        return self.made(f"columns {words} are exchanged", columns, sources, 1.0)
-
-    def scaled(self, columns: Sequence[int], what: str, factor: float) -> Mistake:
-        return self.made(f"{_listed([self.names[i] for i in columns])} {what}", columns, columns, factor)
-
-
-def _parts(*groups: tuple[int, ...]) -> list[tuple[int, ...]]:
-    """Each set of columns once, without those that have none."""
-    return [columns for columns in dict.fromkeys(groups) if columns]
-
-
-def _columns(model: Model, chart: Chart, seen: Mask) -> _Columns:
-    """Those of quaternions are in no group."""
+    """Everything that is tried; of what was not measured, and of quaternions, nothing."""
     nq, nx = model.nq, model.nx
+    seen = np.any([np.isfinite(piece.ys).any(axis=0) for piece in pieces], axis=0)
     sliding = {model.places(joint)[0].start for joint in joints(model.plant) if joint.type_name() == "prismatic"}
     along = [(i, nq + j) for i, j in chart.coordinates.single if i in sliding]
     along += [(i + 4 + k, nq + j + 3 + k) for i, j in chart.coordinates.free for k in range(3)]
     turning = [(i, nq + j) for i, j in chart.coordinates.single if i not in sliding]
-    rates = [j for _, j in turning] + [nq + j + k for _, j in chart.coordinates.free for k in range(3)]
-    names = (*model.state_names, *model.input_names)
-    return _Columns(names, range(nx, nx + model.nu), seen, along, turning, rates)
+    spins = [nq + j + k for _, j in chart.coordinates.free for k in range(3)]
+    inputs, names, found = range(nx, nx + model.nu), (*model.state_names, *model.input_names), list[Mistake]()
+
+    def add(words: str, columns: Sequence[int], sources: Sequence[int], factor: float = 1.0) -> None:
+        order, factors = np.arange(len(names)), np.ones(len(names))
+        order[list(columns)], factors[list(columns)] = sources, factor
+        found.append(Mistake(words, order, factors))
+
+    for first, second in (pair for alike in (along, turning) for pair in combinations(alike, 2)):
+        pairs = [pair for pair in zip(first, second, strict=True) if seen[list(pair)].all()]
+        for some in (*([pair] for pair in pairs), *([pairs] if len(pairs) > 1 else [])):
+            words = " and ".join(f"{names[i]} and {names[k]}" for i, k in some)
+            columns, sources = [i for pair in some for i in pair], [i for a, b in some for i in (b, a)]
+            add(f"columns {words} are exchanged", columns, sources)
+    for a, b in combinations(inputs, 2):
+        add(f"columns {names[a]} and {names[b]} are exchanged", (a, b), (b, a))
+    measured = [[i for i in pair if seen[i]] for pair in (*along, *turning)]
+    for alone in (*_sets(*((both, *([i] for i in both)) for both in measured)), *((i,) for i in inputs)):
+        add(f"{_listed([names[i] for i in alone])} the other sign", alone, alone, -1.0)
+    angles = [i for i, _ in turning if seen[i]]
+    rates = [i for i in (*(j for _, j in turning), *spins) if seen[i]]
+    for group in _sets((angles + rates, angles, rates)):
+        add(f"{_listed([names[i] for i in group])} degrees, not radians", group, group, np.pi / 180)
+    return found
+
+
+def _sets(*groups: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
+    """Each set of columns of each group once, without those that have none."""
+    return [columns for group in groups for columns in dict.fromkeys(map(tuple, group)) if columns]
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -192,44 +154,23 @@ def mistaken_in_the_air(
 
 def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], candidates: Sequence[Mistake]) -> list[float]:
     """What some short segments leave without each mistake, from states that are guessed: mean log of 1 + squares."""
-    s, nx = cut_segments(law, pieces, model.nu), model.nx
+    s, nx, losses = cut_segments(law, pieces, model.nu), model.nx, list[float]()
     some = np.unique(np.linspace(0, len(s.first) - 1, SEGMENTS).round().astype(int))
-    losses: list[float] = []
-    for first in range(0, len(candidates), AT_ONCE):
-        batch = candidates[first : first + AT_ONCE]
-        mended = [[candidate.mended(piece) for piece in pieces] for candidate in batch]
-        starts = [
-            guess_states(model, chart, mended_pieces[s.of_piece[k]], np.array([s.first[k]], dtype=np.intp))
-            for mended_pieces in mended
-            for k in some
-        ]
-        us = [s.us[some][:, :, candidate.order[nx:] - nx] * candidate.factors[nx:] for candidate in batch]
+    for candidate in candidates:
+        mended = [candidate.mended(piece) for piece in pieces]
+        starts = [guess_states(model, chart, mended[s.of_piece[k]], s.first[k : k + 1]) for k in some]
+        us = s.us[some][:, :, candidate.order[nx:] - nx] * candidate.factors[nx:]
+        noise = noise_by_differences(chart, mended)
         with np.errstate(all="ignore"):
-            count = len(some)
-            firsts = [np.concatenate(starts[count * i : count * (i + 1)]) for i in range(len(batch))]
-            xs = side_by_side(law, firsts, s.hs[some], us)
-            for mended_pieces, moved in zip(mended, xs, strict=True):
-                noise = noise_by_differences(chart, mended_pieces)
-                misses = [
-                    chart.minus(mended_pieces[s.of_piece[k]].ys[s.samples[k]], moved[i, s.at[k]]) / noise
-                    for i, k in enumerate(some)
-                ]
-                squares = np.concatenate(misses) ** 2
-                known = np.log1p(squares[np.isfinite(squares)])
-                losses.append(float(np.mean(known)) if len(known) else np.inf)
+            xs = law.run(np.zeros(0), np.concatenate(starts), s.hs[some], us)
+            misses = [
+                chart.minus(mended[s.of_piece[k]].ys[s.samples[k]], x[s.at[k]]) / noise
+                for k, x in zip(some, xs, strict=True)
+            ]
+        squares = np.concatenate(misses) ** 2
+        known = np.log1p(squares[np.isfinite(squares)])
+        losses.append(float(np.mean(known)) if len(known) else np.inf)
     return losses
-
-
-def side_by_side(law: Law, starts: Sequence[Array], hs: Array, us: Sequence[Array]) -> list[Array]:
-    """The motion of each mistake's segments; NaN of those that grow beyond what numbers hold."""
-    try:
-        xs = law.run(np.zeros(0), np.concatenate(starts), np.tile(hs, (len(starts), 1)), np.concatenate(us))
-    except np.linalg.LinAlgError:
-        if len(starts) == 1:
-            return [np.full((*hs.shape[:1], hs.shape[1] + 1, starts[0].shape[1]), np.nan)]
-        half = len(starts) // 2
-        return [*side_by_side(law, starts[:half], hs, us[:half]), *side_by_side(law, starts[half:], hs, us[half:])]
-    return list(xs.reshape(len(starts), len(hs), *xs.shape[1:]))
 
 
 def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequence[Piece]) -> tuple[float, bool]:

@@ -1,4 +1,4 @@
-"""What is tried where bodies touch: one parameter alone, by the model's own steps over whole recordings.
+"""What is tried where bodies touch: one parameter alone, by the model's own steps over the recordings.
 
 Through an impact a small error of the first state grows, so the end of a recording is reached in stages. The model as
 it is goes first, up to the stage at which it leaves more than noise. Each change begins there, from several values.
@@ -14,12 +14,12 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.exceptions import DrakeDiffError, SimulationError
+from drake_diff.identification.candidates import Ranking, Tried
 from drake_diff.identification.columns import mistaken_columns
 from drake_diff.identification.fit import Fit, Point, Solved
 from drake_diff.identification.judge import HOPELESS
 from drake_diff.identification.messages import NO_CHANGE
 from drake_diff.identification.motion import DiscreteMotion, discrete_motion
-from drake_diff.identification.ranking import Ranking, Tried
 from drake_diff.identification.recordings import Chart, Piece, guess_states
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.unknowns import BIAS, CENTER, MASS, Unknown, Unknowns, choose_unknowns
@@ -31,7 +31,7 @@ from drake_diff.model.step import set_state
 FIRST, LONGER = 3, 1.5  # samples of the first stage; how many times as long each is as the one before
 BEGIN = (0.1, -0.1, 0.3, -0.3, 0.8, -0.8)  # where a change of one number begins, of its logarithm or of HEIGHT
 HEIGHT = 0.02  # [m] of a ground
-FOLLOWED = 2  # of where a change may begin
+BEST = 2  # of where a change may begin
 STEPS, FEW = 8, 3  # of Gauss and Newton, at the end and in the stages before
 TOLD_APART = 20.0  # of the squares: what leaves so much more than a change that explains is given up
 MORE = 1.3  # times the squares of the stage before: other first states are tried
@@ -41,6 +41,7 @@ OF_CONTACT = ("friction", "stiffness", "dissipation", "radius")
 OF_MOTION = (MASS, CENTER, "damping", "gravity")
 SEGMENT = 0.1  # [s] by which mistakes of columns are compared
 LARGER = 1.2  # radii with which bodies are looked at that nearly touch
+NOTHING = Unknowns(())
 
 
 def may_touch(model: Model, chart: Chart, pieces: Sequence[Piece]) -> bool:
@@ -52,17 +53,16 @@ def may_touch(model: Model, chart: Chart, pieces: Sequence[Piece]) -> bool:
     lower = [model.position_names.index(name) for name in _heights(model, chart)]
     radii = {p.name: p.value for p in list_parameters(model) if p.name.endswith(".radius") and "/" not in p.name}
     with applied(select(model, {name: LARGER * value for name, value in radii.items()})) as larger:
-        for piece in pieces:
-            for x in guess_states(model, chart, piece, np.arange(len(piece.times))):
-                x[lower] -= HEIGHT
-                set_state(larger.double, x)
-                if larger.double.overlaps():
-                    return True
+        for x in (x for p in pieces for x in guess_states(model, chart, p, np.arange(len(p.times)))):
+            x[lower] -= HEIGHT
+            set_state(larger.double, x)
+            if larger.double.overlaps():
+                return True
     return False
 
 
-class Followed(NamedTuple):
-    """How far a change follows the recordings."""
+class Stage(NamedTuple):
+    """How a change fits the recordings up to a stage."""
 
     stage: int
     fit: Fit
@@ -78,18 +78,16 @@ class Touching(Ranking):
     jumps = True
 
     def __post_init__(self) -> None:
-        self.model = discrete_motion(self.model, Unknowns(()), self.pieces).model
+        self.model = discrete_motion(self.model, NOTHING, self.pieces).model
 
     def explanation(self) -> Explanation:
-        nothing = Unknowns(())
-        every = list(self.followed(nothing, 0, np.zeros(0), None))
-        begin = every[0]
-        for followed in every:
-            if followed.left < NOISY**2 * min(1.0, begin.left):
-                begin = followed
-        base = self.judged((), nothing, every[-1])
+        stages = list(self.stages_of(NOTHING, 0, np.zeros(0), None))
+        begin = stages[0]
+        for stage in stages:
+            begin = stage if stage.left < NOISY**2 * min(1.0, begin.left) else begin
+        base = self.judged((), NOTHING, stages[-1])
         if not base.explains:
-            law = replace(self.law(nothing), segment=SEGMENT)
+            law = replace(self.law(NOTHING), segment=SEGMENT)
             columns = mistaken_columns(self.model, self.chart, self.pieces, law, [self.unchanged])
             if columns is not None:
                 return columns
@@ -97,8 +95,14 @@ class Touching(Ranking):
         for unknown, points in sorted(self.first_points(begin), key=lambda pair: pair[1][0].value):
             candidate = None if self.is_late else self.tried(unknown, begin, points)
             tried += [] if candidate is None else [candidate]
-        base = self.from_best(base, tried)
-        none = [candidate for candidate in tried if candidate.explains and self.is_nothing(candidate)]
+        explaining = [candidate for candidate in tried if candidate.explains]
+        end = None  # of the model as it is from first states of the best change, which may lead it to less
+        if explaining:
+            starts = min(explaining, key=self.bic).starts
+            end = self.to_end(NOTHING, len(self.stages) - 1, np.zeros(0), starts)
+        again = [] if end is None else [self.judged((), NOTHING, end)]
+        none = [candidate for candidate in explaining if self.is_nothing(candidate)]
+        base = min([base, *again], key=lambda fitted: fitted.score)
         base = min([base, *none], key=lambda fitted: (not fitted.explains, fitted.score))
         self.evidence.update({candidate.names[0]: base.score - candidate.score for candidate in tried})
         changed = [candidate for candidate in tried if not any(candidate is other for other in none)]
@@ -111,15 +115,6 @@ class Touching(Ranking):
         what = f"with {near.names[0]}, {near.doubt}" if near and near.doubt else "none comes near it"
         return self.unexplained(f"{NO_CHANGE}; {what}.")
 
-    def from_best(self, base: Tried, tried: Sequence[Tried]) -> Tried:
-        """The model as it is, from first states of the best change too: they may lead it to less than its own."""
-        best = min((candidate for candidate in tried if candidate.explains), key=self.bic, default=None)
-        if best is None:
-            return base
-        nothing = Unknowns(())
-        end = self.to_end(nothing, len(self.stages) - 1, np.zeros(0), best.starts)
-        return base if end is None else min(base, self.judged((), nothing, end), key=lambda fitted: fitted.score)
-
     def is_nothing(self, candidate: Tried) -> bool:
         """Whether the model's own value is within the interval: the search led the model to a better motion."""
         (name,) = candidate.names
@@ -127,9 +122,9 @@ class Touching(Ranking):
         low, high = np.atleast_2d(candidate.intervals[name]).T
         return bool(np.all(np.isfinite(high - low) & (low <= start) & (start <= high)))
 
-    @property
+    @cached_property
     def stages(self) -> list[float]:
-        """Parts of the recordings, up to the whole."""
+        """Shares of the recordings, the last 1."""
         longest = max(len(piece.times) for piece in self.pieces)
         count = max(0, int(np.ceil(np.log(longest / FIRST) / np.log(LONGER))))
         return [min(1.0, FIRST * LONGER**k / longest) for k in range(count)] + [1.0]
@@ -140,65 +135,63 @@ class Touching(Ranking):
     def fit(self, law: DiscreteMotion, unknowns: Unknowns, stage: int) -> Fit:
         last = [round(self.stages[stage] * len(piece.times)) - 1 for piece in self.pieces]
         parts = [p.part(0, min(max(k, FIRST - 1), len(p.times) - 1)) for p, k in zip(self.pieces, last, strict=True)]
-        return self.problem(unknowns, parts).fit(law, parts, self.problem(unknowns, parts).first_noise)
+        problem = self.problem(unknowns, parts)
+        return problem.fit(law, parts, problem.first_noise)
 
-    def followed(
-        self, unknowns: Unknowns, first: int, z: Array, starts: Array | None, before: Followed | None = None
-    ) -> Iterator[Followed]:
-        """How a change follows stage after stage, for as long as it leaves no more than HOPELESS."""
+    def stages_of(
+        self, unknowns: Unknowns, first: int, z: Array, starts: Array | None, before: Stage | None = None
+    ) -> Iterator[Stage]:
+        """How a change fits stage after stage, for as long as it leaves no more than HOPELESS."""
         law = self.law(unknowns)
         for stage in range(first, len(self.stages)):
             fit = self.fit(law, unknowns, stage)
             starts = self.problem(unknowns, fit.segments.pieces).guess(fit) if starts is None else starts
             steps = STEPS if stage == len(self.stages) - 1 else FEW
-            followed = self.solved(fit, stage, z, starts, steps)
-            if before is not None and (followed is None or followed.left > MORE * max(before.left, 1.0)):
+            now = self.solved(fit, stage, z, starts, steps)
+            if before is not None and (now is None or now.left > MORE * max(before.left, 1.0)):
                 others = (self.solved(fit, stage, z, x, steps) for x in self.other_starts(fit, z, before))
-                every = [end for end in (followed, *others) if end is not None]
-                followed = min(every, key=lambda end: end.left, default=None)
-            if followed is None:
+                now = min((end for end in (now, *others) if end), key=lambda end: end.left, default=None)
+            if now is None:
                 return
-            if self.is_behind(followed):
-                followed = self.solved(fit, stage, followed.solved.z, followed.solved.starts, STEPS) or followed
-            z, starts, before = followed.solved.z, followed.solved.starts, followed
-            yield followed
-            if followed.left > HOPELESS**2 or self.is_behind(followed):
+            if self.is_behind(now):
+                now = self.solved(fit, stage, now.solved.z, now.solved.starts, STEPS) or now
+            z, starts, before = now.solved.z, now.solved.starts, now
+            yield now
+            if now.left > HOPELESS**2 or self.is_behind(now):
                 return
 
-    def is_behind(self, followed: Followed) -> bool:
+    def is_behind(self, now: Stage) -> bool:
         """Whether a change leaves clearly more in a stage than one that explains."""
-        best = self.least_left.get(followed.stage, np.inf)
-        return (followed.left - best) * followed.fit.count > TOLD_APART * max(best, 1.0)
+        best = self.least_left.get(now.stage, np.inf)
+        return (now.left - best) * now.fit.count > TOLD_APART * max(best, 1.0)
 
     @staticmethod
-    def solved(fit: Fit, stage: int, z: Array, starts: Array, most: int) -> Followed | None:
+    def solved(fit: Fit, stage: int, z: Array, starts: Array, most: int) -> Stage | None:
         """Where the least squares of a stage lead; None where there is no motion."""
         try:
             solved = fit.solve(z, starts, most)
         except SimulationError:
             return None
         residuals = np.concatenate([rows[np.isfinite(rows)] for rows in solved.reduced.residuals])
-        return Followed(stage, fit, solved, float(np.mean(residuals**2)))
+        return Stage(stage, fit, solved, float(np.mean(residuals**2)))
 
-    def other_starts(self, fit: Fit, z: Array, before: Followed) -> list[Array]:
+    def other_starts(self, fit: Fit, z: Array, before: Stage) -> list[Array]:
         """The best of first states that the stage before allows too: through impacts steps by slopes may stop early."""
         random, size = np.random.default_rng(0), np.sqrt(max(before.left, 1.0))
         spreads = [np.linalg.pinv(R, rcond=LEAST_SEEN) for R, _, _ in before.solved.reduced.own]
-        points = []
-        for _ in range(DRAWS):
-            moves = np.array([size * spread @ random.standard_normal(len(spread)) for spread in spreads])
-            points.append(fit.at(z, self.chart.plus(before.solved.starts, moves)))
+        moves = (
+            np.array([size * spread @ random.standard_normal(len(spread)) for spread in spreads]) for _ in range(DRAWS)
+        )
+        points = [fit.at(z, self.chart.plus(before.solved.starts, move)) for move in moves]
         best = sorted((point for point in points if point is not None), key=lambda point: point.value)
-        return [point.starts for point in best[:FOLLOWED]]
+        return [point.starts for point in best[:BEST]]
 
-    def to_end(self, unknowns: Unknowns, first: int, z: Array, starts: Array | None) -> Followed | None:
-        """The last of `followed`, if that is the end of the recordings."""
-        last = None
-        for followed in self.followed(unknowns, first, z, starts):
-            last = followed
-        return last if last is not None and last.stage == len(self.stages) - 1 else None
+    def to_end(self, unknowns: Unknowns, first: int, z: Array, starts: Array | None) -> Stage | None:
+        """The last stage, if the change reaches the end of the recordings."""
+        stages = list(self.stages_of(unknowns, first, z, starts))
+        return stages[-1] if stages and stages[-1].stage == len(self.stages) - 1 else None
 
-    def first_points(self, begin: Followed) -> Iterator[tuple[Unknown, list[Point]]]:
+    def first_points(self, begin: Stage) -> Iterator[tuple[Unknown, list[Point]]]:
         """Where changes may begin, best first."""
         for unknown in self.changes:
             unknowns = Unknowns((unknown,))
@@ -208,66 +201,62 @@ class Touching(Ranking):
             if there:
                 yield unknown, there
 
-    def tried(self, unknown: Unknown, begin: Followed, points: Sequence[Point]) -> Tried | None:
+    def tried(self, unknown: Unknown, begin: Stage, points: Sequence[Point]) -> Tried | None:
         """A change where it fits, from where it leaves least that comes to the end; None where none does."""
         unknowns, stage = Unknowns((unknown,)), min(begin.stage + 1, len(self.stages) - 1)
-        for point in points[:FOLLOWED]:
-            every = list(self.followed(unknowns, stage, point.z, point.starts, begin))
-            if every and every[-1].stage == len(self.stages) - 1:
-                candidate = self.judged((unknown.name,), unknowns, every[-1])
-                if candidate.explains:
-                    for followed in every:
-                        least = self.least_left.get(followed.stage, np.inf)
-                        self.least_left[followed.stage] = min(least, followed.left)
+        for point in points[:BEST]:
+            stages = list(self.stages_of(unknowns, stage, point.z, point.starts, begin))
+            if stages and stages[-1].stage == len(self.stages) - 1:
+                candidate = self.judged((unknown.name,), unknowns, stages[-1])
+                for now in stages if candidate.explains else ():
+                    self.least_left[now.stage] = min(self.least_left.get(now.stage, np.inf), now.left)
                 return candidate
         return None
 
     @staticmethod
     def beginnings(unknown: Unknown) -> list[Array]:
         """(k,) changes of z with which the search begins."""
-        none, scales = np.zeros(len(unknown.start)), np.array(BEGIN)
-        if len(none) > 1 or (unknown.size == 0 and unknown.quantity != BIAS):
-            return [none]
+        none, scales = np.zeros(len(unknown.start)), np.array(BEGIN)[:, None]
         if unknown.quantity == BIAS:
-            return [none, *(HEIGHT * scales)[:, None]]
-        return [none, *(scales if unknown.quantity == MASS else unknown.start * np.expm1(scales))[:, None]]
+            return [none, *(HEIGHT * scales)]
+        if len(none) > 1 or unknown.size == 0:
+            return [none]
+        return [none, *(scales if unknown.quantity == MASS else unknown.start * np.expm1(scales))]
 
-    def judged(self, names: tuple[str, ...], unknowns: Unknowns, followed: Followed) -> Tried:
+    def judged(self, names: tuple[str, ...], unknowns: Unknowns, stage: Stage) -> Tried:
         """With the noise that is left; of a change that did not come to the end, one that does not explain."""
-        solved = replace(followed.solved, converged=True)  # on ragged ground the last step is judged by what it leaves
-        candidate = self.judge(names, self.problem(unknowns, followed.fit.segments.pieces), followed.fit, solved)
-        if followed.stage == len(self.stages) - 1:
+        solved = replace(stage.solved, converged=True)  # on ragged ground the last step is judged by what it leaves
+        candidate = self.judge(names, self.problem(unknowns, stage.fit.segments.pieces), stage.fit, solved)
+        if stage.stage == len(self.stages) - 1:
             return candidate
         return candidate._replace(score=np.inf, doubt="its motion leaves the recordings")
 
     def unchanged(self, pieces: Sequence[Piece]) -> tuple[float, bool]:
         """How well the model as it is goes through other pieces."""
-        other, nothing = Touching(self.model, self.chart, list(pieces), self.stated), Unknowns(())
-        end = other.to_end(nothing, 0, np.zeros(0), None)
-        base = None if end is None else other.judged((), nothing, end)
+        other = Touching(self.model, self.chart, list(pieces), self.stated)
+        end = other.to_end(NOTHING, 0, np.zeros(0), None)
+        base = None if end is None else other.judged((), NOTHING, end)
         return (np.inf, False) if base is None else (base.score, base.explains)
 
     @cached_property
     def changes(self) -> list[Unknown]:
         """Everything that is tried: what touches first, then what moves."""
-        known = {p.name: p.value for p in list_parameters(self.model)}
+        known, plant = {p.name: p.value for p in list_parameters(self.model)}, self.model.plant
         names = [n for q in OF_CONTACT for n in known if n.endswith(f".{q}") and "/" not in n and np.all(known[n] > 0)]
         names += [f"{height}.{BIAS}" for height in _heights(self.model, self.chart)]
         names += [n for q in OF_MOTION for n in known if n.endswith(f".{q}")]
+        fixed = {body.index() for body in plant.GetBodiesWeldedTo(plant.world_body())}
+        moving = {label for label, body in labelled(bodies(plant)).items() if body.index() not in fixed}
         unknowns: list[Unknown] = []
         for name in names:
+            label, quantity = name.rsplit(".", 1)
+            if quantity in (MASS, CENTER) and label not in moving:
+                continue
             try:
                 unknowns += choose_unknowns(self.model, None, [name]).each
             except DrakeDiffError:  # a body without mass
                 continue
-        moved = self.moved_by_weight()
-        return [unknown for unknown in unknowns if unknown.quantity not in (MASS, CENTER) or unknown.label in moved]
-
-    def moved_by_weight(self) -> set[str]:
-        """Bodies that are not fixed to the world."""
-        plant = self.model.plant
-        fixed = {body.index() for body in plant.GetBodiesWeldedTo(plant.world_body())}
-        return {label for label, body in labelled(bodies(plant)).items() if body.index() not in fixed}
+        return unknowns
 
     def of_model(self, name: str) -> tuple[Array, str]:
         unknown = next(unknown for unknown in self.changes if unknown.name == name)

@@ -26,13 +26,13 @@ from drake_diff.identification.candidates import (
     Candidates,
     Promise,
     Runner,
+    Tried,
     View,
 )
 from drake_diff.identification.columns import mistaken_in_the_air
 from drake_diff.identification.contact import Touching, may_touch
 from drake_diff.identification.identify import TOUCH, what_acts
 from drake_diff.identification.messages import NO_CHANGE
-from drake_diff.identification.ranking import Tried
 from drake_diff.identification.recordings import Chart, given_noise, read_pieces
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import tree_for_identification

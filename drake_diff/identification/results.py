@@ -101,8 +101,6 @@ def identification(
     **rest: Any,
 ) -> Identification:
     """Of values (np,) with intervals (np, 2), explained where there is no `reason` against it."""
-    why = reason or NOISE_IS_LEFT
-    sentence = identification_sentence(unknowns, values, intervals, open_, errors, explained=not reason, reason=why)
     return Identification(
         values=unknowns.named(values),
         start=unknowns.named(unknowns.start),
@@ -110,8 +108,8 @@ def identification(
         units={unknown.name: unknown.unit for unknown in unknowns.each},
         unidentifiable=open_,
         explained=not reason,
-        reason=why,
-        sentence=sentence,
+        reason=reason or NOISE_IS_LEFT,
+        sentence=identification_sentence(unknowns, values, intervals, open_, errors, reason),
         error_before=errors[0],
         error_after=errors[1],
         columns=unknowns.columns,

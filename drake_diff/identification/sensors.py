@@ -1,25 +1,26 @@
 """What sensors read that are no coordinates: where a point is, how a body turns and accelerates, a joint's force.
 
-Readings are functions of positions, velocities, accelerations and the tree's numbers. Accelerations follow from the
-equations of motion, with their derivatives; the rest is kinematics, which is differentiated by complex steps.
+Accelerations and forces have the derivatives of the equations of motion; kinematics is differentiated by differences.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from pydrake.math import RollPitchYaw
 
-from drake_diff._base.arrays import Array, finite_array, skew
+from drake_diff._base.arrays import Array, cross, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.tree import Dynamics, Numbers, Tree
+from drake_diff.identification.recordings import Chart
+from drake_diff.identification.tree import Dynamics, Tree
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
 
 AXES = ("x", "y", "z")
 OF_BODY = ("position", "gyro", "accel")  # [m] in world; [rad/s] and [m/s^2] in the sensor's frame
 FORCE = "force"  # [N m] or [N] of a joint
-TINY = 1e-30  # of a complex step
+STEP = 1e-5  # [rad, m] of a central difference
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,35 +105,7 @@ def _mounted(label: str, given: Any) -> tuple[str, Array, Array]:
         raise InputError(f"sensor {label}", got=given, expected=expected)
     finite_array(f"sensor {label}", numbers, (len(numbers),))
     roll, pitch, yaw = numbers[3:] if len(numbers) == 6 else np.zeros(3)
-    turn = (
-        _about(np.array([0, 0, 1.0]), yaw) @ _about(np.array([0, 1.0, 0]), pitch) @ _about(np.array([1.0, 0, 0]), roll)
-    )
-    return body, turn, numbers[:3]
-
-
-def _about(axis: Array, angle: Any) -> Any:
-    """(..., 3, 3) by angles (...,), complex or float."""
-    hat, angle = skew(axis), np.asarray(angle)[..., None, None]
-    return np.eye(3) + np.sin(angle) * hat + (1 - np.cos(angle)) * (hat @ hat)
-
-
-@dataclass(frozen=True, eq=False)
-class _At:
-    """Where a frame is and how it moves, in world; acceleration less gravity."""
-
-    R: Any
-    p: Any
-    w: Any
-    v: Any
-    w_dot: Any
-    a: Any
-
-    def to(self, turn: Any, point: Any) -> "_At":
-        """A frame that is fixed on it."""
-        r = (self.R @ point[..., None])[..., 0] if point.ndim > 1 else self.R @ point
-        v = self.v + np.cross(self.w, r)
-        a = self.a + np.cross(self.w_dot, r) + np.cross(self.w, np.cross(self.w, r))
-        return _At(self.R @ turn, self.p + r, self.w, v, self.w_dot, a)
+    return body, RollPitchYaw(roll, pitch, yaw).ToRotationMatrix().matrix(), numbers[:3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,143 +120,62 @@ class Sensors:
     def count(self) -> int:
         return len(self.columns)
 
-    def _entries(self) -> list[int]:
-        every = [column for sensor in self.each for column in sensor.columns]
-        return [every.index(column) for column in self.columns]
-
     def read(self, dynamics: Dynamics, x: Array, u: Array) -> Array:
         """(N, m) at x (N, nx) under u (N, nu)."""
-        q, v = self._split(x)
-        a = dynamics.accelerate(x, u) if self._accelerates else np.zeros_like(v)
-        forces = dynamics.inverse_dynamics(q, v, a)[0] if self._forces else None
-        return np.asarray(self._read(dynamics.numbers, q, v, a, forces).real)
-
-    def _split(self, x: Array) -> tuple[Array, Array]:
-        nv = self._tree.n
-        return x[:, : x.shape[1] - nv], x[:, x.shape[1] - nv :]
-
-    @property
-    def _tree(self) -> Tree:
-        if self.tree is None:
-            raise ModelError("sensors without motion in continuous time")
-        return self.tree
-
-    @property
-    def _accelerates(self) -> bool:
-        return any(sensor.quantity in ("accel", FORCE) for sensor in self.each)
-
-    @property
-    def _forces(self) -> list[tuple[int, int]]:
-        """(column, degree of freedom) of each force."""
-        tree = self._tree
-        sensors = [sensor for sensor in self.each if sensor.quantity == FORCE]
-        return [(self.columns.index(sensor.columns[0]), int(tree.first[sensor.link])) for sensor in sensors]
+        q, v, a = x[:, : x.shape[1] - dynamics.nv], x[:, -dynamics.nv :], dynamics.accelerate(x, u)
+        read = self._of_links(dynamics, q, v, a)
+        for i, k in self._forces(dynamics):
+            read[:, i] = dynamics.inverse_dynamics(q, v, a)[0][:, k]
+        return read
 
     def slopes(self, dynamics: Dynamics, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
         """(N, m, 2 nv) by small motions of the state, and (N, m, np) by parameters, of which `by` moves the numbers."""
-        q, v = self._split(x)
-        nv, numbers = v.shape[1], dynamics.numbers
-        a, by_state = dynamics.acceleration_jacobians(x, u, by) if self._accelerates else (np.zeros_like(v), None)
-        moved = np.zeros((len(q), self.count, 2 * nv))
-        by_a = np.zeros((len(q), self.count, nv))
-        used = np.flatnonzero(self._above())
-        for j in used:
-            step = np.zeros(nv, dtype=complex)
-            step[j] = 1j * TINY
-            moved[..., j] = self._read(numbers, q, v, a, small=step).imag / TINY
-            moved[..., nv + j] = self._read(numbers, q, v + step, a).imag / TINY
-            if by_state is not None:
-                by_a[..., j] = self._read(numbers, q, v, a + step).imag / TINY
-        by_parameters = np.zeros((len(q), self.count, by.shape[1]))
-        for column in range(by.shape[1]):
-            if np.any(by[:, column] != 0):
-                turned = numbers.moved(1j * TINY * by[:, column])
-                by_parameters[..., column] = self._read(turned, q, v, a).imag / TINY
-        if self._forces:
+        nv, plus = dynamics.nv, Chart(dynamics.tree.coordinates).plus
+        a, by_state = dynamics.acceleration_jacobians(x, u, by)
+        q, v, numbers = x[:, : x.shape[1] - nv], x[:, -nv:], dynamics.numbers
+        moved, by_a = np.zeros((len(x), self.count, 2 * nv)), np.zeros((len(x), self.count, nv))
+        for j, e in enumerate(np.eye(nv)):  # quadratic in v and linear in a: of these central differences are exact
+            turned = [plus(x, np.tile(np.append(sign * STEP * e, 0 * e), (len(x), 1)))[:, :-nv] for sign in (1, -1)]
+            ahead, back = (self._of_links(dynamics, q_end, v, a) for q_end in turned)
+            moved[..., j] = (ahead - back) / (2 * STEP)
+            ahead, back = (self._of_links(dynamics, q, v + sign * e, a) for sign in (1, -1))
+            moved[..., nv + j] = (ahead - back) / 2
+            ahead, back = (self._of_links(dynamics, q, v, a + sign * e) for sign in (1, -1))
+            by_a[..., j] = (ahead - back) / 2
+        by_parameters = np.zeros((len(x), self.count, by.shape[1]))
+        frames = np.concatenate([numbers.places("offset").ravel(), numbers.places("gravity")])
+        for p in np.flatnonzero(np.any(by[frames] != 0, axis=0)):  # in which readings are linear
+            moved_trees = (replace(dynamics, numbers=numbers.moved(sign * by[:, p])) for sign in (1, -1))
+            ahead, back = (self._of_links(there, q, v, a) for there in moved_trees)
+            by_parameters[..., p] = (ahead - back) / 2
+        for i, k in self._forces(dynamics):
             _, mass, slopes = dynamics.inverse_dynamics(q, v, a, by)
-            for i, k in self._forces:
-                moved[:, i], by_a[:, i], by_parameters[:, i] = (
-                    slopes[:, k, : 2 * nv],
-                    mass[:, k],
-                    slopes[:, k, 2 * nv :],
-                )
-        if by_state is not None:
-            moved += by_a @ by_state[..., : 2 * nv]
-            by_parameters += by_a @ by_state[..., 2 * nv :]
-        return moved, by_parameters
+            moved[:, i], by_a[:, i], by_parameters[:, i] = slopes[:, k, : 2 * nv], mass[:, k], slopes[:, k, 2 * nv :]
+        return moved + by_a @ by_state[..., : 2 * nv], by_parameters + by_a @ by_state[..., 2 * nv :]
 
-    def _above(self) -> Array:
-        """(nv,) which coordinates any of the sensors sees by its place or motion."""
-        tree = self._tree
-        seen = np.zeros(tree.n, dtype=bool)
+    def _forces(self, dynamics: Dynamics) -> list[tuple[int, int]]:
+        """(column, degree of freedom) of each force."""
+        forces = (sensor for sensor in self.each if sensor.quantity == FORCE)
+        return [(self.columns.index(f"{s.label}.{FORCE}"), int(dynamics.tree.first[s.link])) for s in forces]
+
+    def _of_links(self, dynamics: Dynamics, q: Array, v: Array, a: Array) -> Array:
+        """(N, m) but for forces, which are 0."""
+        frames, columns = dynamics.frames(q, v, a), dict[str, Array]()
         for sensor in self.each:
-            i = sensor.link
-            while i >= 0:
-                start = tree.first[i]
-                seen[start : start + (6 if tree.links[i].free else 1)] = True
-                i = tree.links[i].parent
-        return seen
+            pose, motion, change = (values[:, sensor.link] for values in frames)
+            columns.update(zip(sensor.columns, _reading(sensor, pose, motion, change).T, strict=True))
+        return np.array([columns[name] for name in self.columns]).T
 
-    def _read(self, numbers: Numbers, q: Any, v: Any, a: Any, forces: Array | None = None, small: Any = None) -> Any:
-        """(N, m), complex where anything is; `small` (nv,) is a small motion of the positions. Forces are given."""
-        small = np.zeros(v.shape[1]) if small is None else small
-        known: dict[int, _At] = {}
-        every = []
-        for sensor in self.each:
-            if sensor.quantity == FORCE:
-                k = int(self._tree.first[sensor.link])
-                every.append(np.zeros((len(q), 1)) if forces is None else forces[:, [k]])
-                continue
-            frame = self._frame(sensor.link, numbers, q, v, a, small, known).to(sensor.turn, sensor.point)
-            if sensor.quantity == "position":
-                every.append(frame.p)
-            else:
-                vector = frame.w if sensor.quantity == "gyro" else frame.a
-                every.append((np.swapaxes(frame.R, -1, -2) @ vector[..., None])[..., 0])
-        return np.concatenate(every, axis=1)[:, self._entries()]
 
-    def _frame(self, i: int, numbers: Numbers, q: Any, v: Any, a: Any, small: Any, known: dict[int, _At]) -> _At:
-        """Of link i."""
-        if i in known:
-            return known[i]
-        tree = self._tree
-        link, k = tree.links[i], tree.first[i]
-        if link.free:
-            s = link.joint.q_start
-            quaternion, position = q[:, s : s + 4], q[:, s + 4 : s + 7] + small[k + 3 : k + 6]
-            vector = skew(quaternion[:, 1:])
-            scale = 2 / np.sum(quaternion * quaternion, axis=1)[:, None, None]
-            R = np.eye(3) + scale * (quaternion[:, :1, None] * vector + vector @ vector)
-            w = small[k : k + 3]
-            R = R + np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]) @ R
-            frame = _At(
-                R,
-                position,
-                v[:, k : k + 3],
-                v[:, k + 3 : k + 6],
-                a[:, k : k + 3],
-                a[:, k + 3 : k + 6] - numbers.gravity,
-            )
-        else:
-            zero = np.zeros((len(q), 3))
-            ground = _At(np.broadcast_to(np.eye(3), (len(q), 3, 3)), zero, zero, zero, zero, zero - numbers.gravity)
-            before = self._frame(link.parent, numbers, q, v, a, small, known) if link.parent >= 0 else ground
-            joint_frame = before.to(link.on_parent.rotation().matrix(), numbers.offset[i])
-            angle, speed, change = q[:, link.joint.q_start] + small[k], v[:, k, None], a[:, k, None]
-            axis = joint_frame.R @ link.axis
-            if link.joint.kind == "revolute":
-                w_dot = joint_frame.w_dot + axis * change + np.cross(joint_frame.w, axis * speed)
-                frame = _At(
-                    joint_frame.R @ _about(link.axis, angle),
-                    joint_frame.p,
-                    joint_frame.w + axis * speed,
-                    joint_frame.v,
-                    w_dot,
-                    joint_frame.a,
-                )
-            else:
-                moved = joint_frame.to(np.eye(3), angle[:, None] * link.axis)
-                acceleration = moved.a + 2 * np.cross(joint_frame.w, axis * speed) + axis * change
-                frame = _At(moved.R, moved.p, moved.w, moved.v + axis * speed, moved.w_dot, acceleration)
-        known[i] = frame
-        return frame
+def _reading(sensor: MountedSensor, pose: Array, motion: Array, change: Array) -> Array:
+    """(N, 3) of a sensor on a link at `pose` (N, 3, 4) that moves so (N, 6) in its frame; (N, 1) of 0 for a force."""
+    w, point = motion[:, :3], np.broadcast_to(sensor.point, motion[:, :3].shape)
+    if sensor.quantity == FORCE:
+        return np.zeros((len(pose), 1))
+    if sensor.quantity == "position":
+        return np.asarray(pose[:, :, :3] @ sensor.point + pose[:, :, 3])
+    if sensor.quantity == "gyro":
+        return np.asarray(w @ sensor.turn)
+    at_origin = change[:, 3:] + cross(w, motion[:, 3:])
+    acceleration = at_origin + cross(change[:, :3], point) + cross(w, cross(w, point))
+    return np.asarray(acceleration @ sensor.turn)

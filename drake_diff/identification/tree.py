@@ -298,11 +298,20 @@ class Dynamics:
             by_parameters[..., p] += (ahead - back) / (2 * SHIFT)
         return moved.tau, moved.mass, np.concatenate([moved.by_q, moved.by_v, by_parameters], axis=2)
 
-    def regressors(self, q: Array, v: Array, a: Array) -> Array:
-        """(N, n, L, 10) the force of inverse dynamics at q, v and a of all joints by the ten numbers of each link."""
-        return self._regressors(self.links(q, v, a, derivatives=False), v, a)
+    def frames(self, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
+        """Of each link the pose (N, L, 3, 4), and its motion and the change of that (N, L, 6) in its frame.
 
-    def _regressors(self, moved: Moved, v: Array, a: Array) -> Array:
+        At q, v and a of all joints; the change is that in a frame that falls freely.
+        """
+        moved = self.links(q, v, a, derivatives=False)
+        motion, change, _ = self._motions(moved, v, a)
+        joints = self.links.tables.joint
+        X = moved.poses.reshape(-1, 3, 4)
+        V, A = (_in_frame(X, m[:, joints].reshape(-1, 1, 6)).reshape(len(q), -1, 6) for m in (motion, change))
+        return moved.poses, V, A
+
+    def _motions(self, moved: Moved, v: Array, a: Array) -> tuple[Array, Array, Mask]:
+        """Of each joint (N, J, 6) motion and its change about the world's origin, and (J, n) what carries it."""
         t, (N, n), S = self.links.tables, v.shape, moved.S
         J = len(t.parent)
         V, A = np.zeros((2, N, J + 1, 6))  # the last is the world's, which -1 finds
@@ -315,10 +324,19 @@ class Dynamics:
             A[:, j] = A[:, up] + np.sum(a[:, s, None] * S[:, s] + v[:, s, None] * turned, axis=1)
             carries[j] = carries[up]
             carries[j, s] = True
-        regressors = np.zeros((N, n, len(t.kind), 10))
-        for link, j in enumerate(t.joint):
+        return V, A, carries
+
+    def regressors(self, q: Array, v: Array, a: Array) -> Array:
+        """(N, n, L, 10) the force of inverse dynamics at q, v and a of all joints by the ten numbers of each link."""
+        return self._regressors(self.links(q, v, a, derivatives=False), v, a)
+
+    def _regressors(self, moved: Moved, v: Array, a: Array) -> Array:
+        V, A, carries = self._motions(moved, v, a)
+        joints = self.links.tables.joint
+        regressors = np.zeros((*v.shape, len(joints), 10))
+        for link, j in enumerate(joints):
             columns, X = np.flatnonzero(carries[j]), moved.poses[:, link]
-            along = [_in_frame(X, motion) for motion in (V[:, None, j], A[:, None, j], S[:, columns])]
+            along = [_in_frame(X, motion) for motion in (V[:, None, j], A[:, None, j], moved.S[:, columns])]
             regressors[:, columns, link] = along[2] @ _wrench(along[0][:, 0], along[1][:, 0])
         return regressors
 

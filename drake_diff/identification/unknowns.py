@@ -102,15 +102,6 @@ class Unknowns:
         return np.concatenate([unknown.start for unknown in self.each]) if self.each else np.zeros(0)
 
     @property
-    def sizes(self) -> Array:
-        """(np,) what counts as 100 % of each entry; 0 where nothing says it."""
-        return (
-            np.concatenate([np.full(len(unknown.start), unknown.size) for unknown in self.each])
-            if self.each
-            else np.zeros(0)
-        )
-
-    @property
     def z_start(self) -> Array:
         z = self.start.copy()
         for unknown, s in self.items():
@@ -278,29 +269,29 @@ def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
     """The lower and the upper bound: those that were given, within what is possible."""
     if given is None:
         return lower, np.inf
+    subject = f"bounds of {name}"
     try:
         low, high = (float(value) for value in given)
     except (TypeError, ValueError) as error:
-        raise InputError(f"bounds of {name}", got=given, expected="a lower and an upper number") from error
+        raise InputError(subject, got=given, expected="a lower and an upper number") from error
     if name.endswith(f".{INERTIA}"):
-        raise InputError(f"bounds of {name}", got=given, expected="none: an inertia is kept possible; give a prior")
-    low = max(low, lower)
-    if not low < high:
-        raise InputError(f"bounds of {name}", got=given, expected=f"a lower one below the upper, from {lower:g}")
-    return low, high
+        raise InputError(subject, got=given, expected="none: an inertia is kept possible; give a prior")
+    if not max(low, lower) < high:
+        raise InputError(subject, got=given, expected=f"a lower one below the upper, from {lower:g}")
+    return max(low, lower), high
 
 
 def _prior_of(name: str, given: Any, count: int) -> tuple[Array, Array]:
     """Mean and standard deviation (count,)."""
-    expected = f"a mean and a standard deviation above 0, of 1 or {count} numbers each"
+    above = ", the mean above 0" if name.endswith(f".{MASS}") else ""
+    expected = f"a mean and a standard deviation above 0, of 1 or {count} numbers each{above}"
     try:
         mean, deviation = (np.array(np.broadcast_to(np.asarray(values, dtype=float), count)) for values in given)
     except (TypeError, ValueError) as error:
         raise InputError(f"prior of {name}", got=given, expected=expected) from error
-    if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(deviation)) and np.all(deviation > 0)):
+    is_finite = np.all(np.isfinite([*mean, *deviation]))
+    if not is_finite or np.any(deviation <= 0) or (above and mean[0] <= 0):
         raise InputError(f"prior of {name}", got=given, expected=expected)
-    if name.endswith(f".{MASS}") and mean[0] <= 0:
-        raise InputError(f"prior of {name}", got=given, expected="a mean above 0")
     return mean, deviation
 
 

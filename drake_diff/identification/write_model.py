@@ -5,7 +5,7 @@ A comment at each changed element says what it was, what it is, with which inter
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -182,17 +182,15 @@ class _Corrected:
             label, quantity = name.rsplit(".", 1)
             by_label.setdefault(label, {})[quantity] = value
         for label, values in by_label.items():
-            body = [quantity for quantity in values if quantity in BODY]
-            if body:
-                self._write_body(label, body)
-            joint = {q: v for q, v in values.items() if q == "damping" or q in SPRING}
-            if joint:
-                self._write_dynamics(label, joint)
-            rotor = {q: v for q, v in values.items() if q in ROTOR}
-            if rotor:
-                self._write_rotor(label, rotor)
-            if "offset" in values:
-                self._write_offset(label, values["offset"])
+            for quantities, write in (
+                (BODY, self._write_body),
+                (("damping", *SPRING), self._write_dynamics),
+                (ROTOR, self._write_rotor),
+                (("offset",), self._write_offset),
+            ):
+                some = {q: v for q, v in values.items() if q in quantities}
+                if some:
+                    write(label, some, self._comment_on(label, some))
         top = _comment(f"{self.e.sentence} By drake_diff from {self.data}; {self.e.motion}.")
         self.xml.before(self.xml.root, top + "\n")
         return str(self.xml)
@@ -206,24 +204,23 @@ class _Corrected:
             raise InputError(label, got=where, expected="one, in the model's own file and not in one that it includes")
         return elements[0]
 
-    def _told(self, label: str, quantities: Sequence[str]) -> str:
-        parts = []
+    def _comment_on(self, label: str, quantities: Iterable[str]) -> str:
+        """What each number was and is, with its interval."""
+        texts = []
         for name in (f"{label}.{quantity}" for quantity in quantities):
-            was, now, limits = (
-                np.atleast_1d(self.e.start[name]),
-                np.atleast_1d(self.e.values[name]),
-                np.reshape(self.e.intervals[name], (-1, 2)),
-            )
-            for i, (low, high) in enumerate(limits):
+            was, now = np.atleast_1d(self.e.start[name]), np.atleast_1d(self.e.values[name])
+            for i, (low, high) in enumerate(np.reshape(self.e.intervals[name], (-1, 2))):
                 entry, unit = (name if len(now) == 1 else f"{name}[{i}]"), self.e.units[name]
-                known = np.isfinite(low) and np.isfinite(high)
-                sure = (
-                    f"95 % interval {low:.5g} to {high:.5g}" if known else "by itself not known from these recordings"
+                is_known = np.isfinite(low) and np.isfinite(high)
+                known = (
+                    f"95 % interval {low:.5g} to {high:.5g}"
+                    if is_known
+                    else "by itself not known from these recordings"
                 )
-                parts.append(f"{entry} was {was[i]:.6g} {unit}, is {now[i]:.6g} ({sure})")
-        return _comment(f"drake_diff: {'; '.join(parts)}; from {self.data}") + "\n"
+                texts.append(f"{entry} was {was[i]:.6g} {unit}, is {now[i]:.6g} ({known})")
+        return _comment(f"drake_diff: {'; '.join(texts)}; from {self.data}") + "\n"
 
-    def _write_body(self, label: str, quantities: Sequence[str]) -> None:
+    def _write_body(self, label: str, values: dict[str, Any], comment: str) -> None:
         inertial = self._element(label, "link").find("inertial")
         if inertial is None:
             raise InputError(f"{label}.mass", got="a link without inertial", expected="one with it, to be changed")
@@ -236,75 +233,64 @@ class _Corrected:
         else:
             rows = " ".join(f'{name}="{_number(value)}"' for name, value in entries.items())
             inside = f'<origin xyz="{_row(center)}" rpy="0 0 0"/><mass value="{_number(mass)}"/><inertia {rows}/>'
-        self.xml.replace(inertial, f"{self._told(label, quantities)}<inertial>{inside}</inertial>")
+        self.xml.replace(inertial, f"{comment}<inertial>{inside}</inertial>")
 
-    def _write_dynamics(self, label: str, values: dict[str, Any]) -> None:
-        joint, comment = self._element(label, "joint"), self._told(label, list(values))
+    def _write_dynamics(self, label: str, values: dict[str, Any], comment: str) -> None:
+        joint = self._element(label, "joint")
         tags = {SPRING.get(quantity, quantity): _number(float(value)) for quantity, value in values.items()}
-        if not self.is_sdf:
-            dynamics = joint.find("dynamics")
-            if dynamics is None:
-                self.xml.append(joint, f'{comment}<dynamics damping="{tags["damping"]}"/>')
-                return
-            self.xml.before(dynamics, comment)
-            self.xml.set(dynamics, "damping", tags["damping"])
-            return
-        axis = joint.find("axis")
-        if axis is None:
+        parent = joint.find("axis") if self.is_sdf else joint
+        if parent is None:
             raise InputError(f"{label}.damping", got="a joint without axis", expected="one with it, to be changed")
-        dynamics = axis.find("dynamics")
+        dynamics = parent.find("dynamics")
         if dynamics is None:
             inside = "".join(f"<{tag}>{value}</{tag}>" for tag, value in tags.items())
-            self.xml.append(axis, f"{comment}<dynamics>{inside}</dynamics>")
+            attribute = f'<dynamics damping="{tags.get("damping")}"/>'
+            self.xml.append(
+                parent, f"{comment}<dynamics>{inside}</dynamics>" if self.is_sdf else f"{comment}{attribute}"
+            )
             return
         self.xml.before(dynamics, comment)
-        self._set_children(dynamics, tags)
+        if self.is_sdf:
+            self._set_children(dynamics, tags)
+        else:
+            self.xml.set(dynamics, "damping", tags["damping"])
 
     def _set_children(self, element: Element, tags: dict[str, str]) -> None:
+        """Texts of an SDF element's children, values of a URDF's; those that it lacks are appended."""
         missing = []
         for tag, value in tags.items():
-            child = element.find(tag)
+            child, text = element.find(tag), f"<{tag}>{value}</{tag}>" if self.is_sdf else f'<{tag} value="{value}"/>'
             if child is None:
-                missing.append(f"<{tag}>{value}</{tag}>")
+                missing.append(text)
             else:
-                self.xml.replace(child, f"<{tag}>{value}</{tag}>")
+                self.xml.replace(child, text)
         if missing:
             self.xml.append(element, "".join(missing))
 
-    def _write_rotor(self, label: str, values: dict[str, Any]) -> None:
-        comment, tags = self._told(label, list(values)), {f"drake:{q}": _number(float(v)) for q, v in values.items()}
+    def _write_rotor(self, label: str, values: dict[str, Any], comment: str) -> None:
+        tags = {f"drake:{q}": _number(float(v)) for q, v in values.items()}
         if not self.xml.root.get("xmlns:drake"):
             self.xml.set(self.xml.root, "xmlns:drake", "http://drake.mit.edu")
         if self.is_sdf:
-            joint = self._element(label, "joint")
-            self.xml.before(joint, comment)
-            self._set_children(joint, tags)
-            return
-        actuators = [
-            a for t in self.xml.root.iter("transmission") for a in t.findall("actuator") if a.get("name") == label
-        ]
-        if len(actuators) != 1:
-            got = f"{len(actuators)} transmissions in the file that have this actuator"
-            raise InputError(f"{label}.{next(iter(values))}", got=got, expected="one, to be changed")
-        self.xml.before(actuators[0], comment)
-        missing = []
-        for tag, value in tags.items():
-            child = actuators[0].find(tag)
-            if child is None:
-                missing.append(f'<{tag} value="{value}"/>')
-            else:
-                self.xml.set(child, "value", value)
-        if missing:
-            self.xml.append(actuators[0], "".join(missing))
+            element = self._element(label, "joint")
+        else:
+            transmissions = (a for t in self.xml.root.iter("transmission") for a in t.findall("actuator"))
+            actuators = [actuator for actuator in transmissions if actuator.get("name") == label]
+            if len(actuators) != 1:
+                got = f"{len(actuators)} transmissions in the file that have this actuator"
+                raise InputError(f"{label}.{next(iter(values))}", got=got, expected="one, to be changed")
+            element = actuators[0]
+        self.xml.before(element, comment)
+        self._set_children(element, tags)
 
-    def _write_offset(self, label: str, value: Array) -> None:
-        joint = self._element(label, "joint")
-        origin, comment = joint.find("origin"), self._told(label, ["offset"])
+    def _write_offset(self, label: str, values: dict[str, Any], comment: str) -> None:
+        joint, xyz = self._element(label, "joint"), _row(values["offset"])
+        origin = joint.find("origin")
         if origin is None:
-            self.xml.append(joint, f'{comment}<origin xyz="{_row(value)}"/>')
+            self.xml.append(joint, f'{comment}<origin xyz="{xyz}"/>')
             return
         self.xml.before(origin, comment)
-        self.xml.set(origin, "xyz", _row(value))
+        self.xml.set(origin, "xyz", xyz)
 
 
 def _own(model: Model, e: Identification) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
 
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification import base_parameters
-from drake_diff.identification.base import NAMES
+from drake_diff.identification.excite import NAMES
 from drake_diff.identification.tree import ten_numbers, tree_for_identification
 
 

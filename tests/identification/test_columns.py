@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.identification.columns import side_by_side
 
 pytestmark = pytest.mark.solve
 
@@ -70,20 +69,3 @@ def test_what_a_mirror_does_not_change_is_told_as_it_is(load):
         (f"column {name} has the other sign",) for name in (model.position_names[0], model.input_names[0])
     }
     assert w.sentence.endswith("the recording cannot tell.")
-
-
-def test_a_mistake_whose_motion_cannot_be_computed_leaves_the_others_theirs():
-    """A law whose mass matrix is singular for one of three: LAPACK then refuses all that are solved at once."""
-
-    class Law:
-        def run(self, values, starts, hs, us):
-            if np.any(starts > 10):
-                raise np.linalg.LinAlgError("Singular matrix")
-            return np.repeat(starts[:, None], hs.shape[1] + 1, axis=1)
-
-    starts = [np.full((2, 4), value) for value in (1.0, 11.0, 3.0)]
-    one, other, third = side_by_side(Law(), starts, np.ones((2, 5)), [np.zeros((2, 5, 1))] * 3)
-    assert np.all(one == 1.0)
-    assert np.all(np.isnan(other))
-    assert np.all(third == 3.0)
-    assert one.shape == other.shape == third.shape == (2, 6, 4)

@@ -5,7 +5,7 @@ import pytest
 from helpers.contact_recordings import recorded
 
 import drake_diff as dd
-from drake_diff.identification import contact, ranking
+from drake_diff.identification import candidates, contact
 from drake_diff.identification.motion import discrete_motion
 from drake_diff.identification.recordings import read_pieces
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
@@ -52,7 +52,7 @@ def test_a_right_model_is_not_blamed_where_its_motion_is_hard_to_find():
 def contact_alone(monkeypatch):
     """Masses and gravity are not tried, which takes half of the time; a busy machine says the same."""
     monkeypatch.setattr(contact, "OF_MOTION", ())
-    monkeypatch.setattr(ranking, "LONGEST_SEARCH", np.inf)
+    monkeypatch.setattr(candidates, "LONGEST_SEARCH", np.inf)
 
 
 @pytest.mark.slow
