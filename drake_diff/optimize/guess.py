@@ -3,6 +3,7 @@
 What has another length or other knots is stretched to the problem's: its first state is the first, its last the last.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +16,7 @@ from drake_diff.exceptions import DrakeDiffError, InputError, ShapeError
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.cost import TimedCost
+from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Multipliers
 from drake_diff.optimize.solution import Solution
@@ -43,6 +45,45 @@ class Guess:
     line: bool = False
     parameters: Array | None = None
     multipliers: Multipliers | None = None  # of the motion on its mesh
+
+
+def first_guesses(problem: Problem | PhasedProblem, method: str, given: Any, seed: int) -> list[Guess]:
+    """One for each phase: of `given`, a solution or one for each, or straight lines."""
+    if isinstance(problem, Problem):
+        return [first_guess(problem, method, given, seed)]
+    parts: Sequence[Any] = [None] * len(problem.phases)
+    if isinstance(given, Solution):
+        parts = given.phases
+    elif given is not None:
+        parts = given if isinstance(given, (tuple, list)) else [given]
+    if len(parts) != len(problem.phases):
+        expected = f"None, a PhasedSolution, or {len(problem.phases)} guesses, one for each phase"
+        raise InputError("initial_guess", got=f"{len(parts)} guesses", expected=expected)
+    pairs = zip(_aimed(problem), parts, strict=True)
+    return [first_guess(phase, method, sampled(phase, method, guess), seed) for phase, guess in pairs]
+
+
+def other_guess(problem: Problem | PhasedProblem, seed: int, number: int) -> Any:
+    """Another first guess, a random one by `seed`, of each phase where there are several."""
+    if isinstance(problem, Problem):
+        return another_guess(problem, seed, number)
+    return [another_guess(phase, seed * len(problem.phases) + i, number) for i, phase in enumerate(_aimed(problem))]
+
+
+def _aimed(problem: PhasedProblem) -> list[Problem]:
+    """The phases, for guesses alone: one that has no goal ends where the next one's first guess begins.
+
+    That is its state before a linear reset; before another it is the same state, where there are as many.
+    """
+    phases = list(problem.phases)
+    for switch in problem.switches:
+        phase, other = phases[switch.before], problem.phases[switch.after]
+        if switch.after == 0 or (switch.matrix is None and phase.nx != other.nx):
+            continue
+        end = other.x0 if switch.matrix is None else np.linalg.lstsq(switch.matrix, other.x0, rcond=None)[0]
+        end = np.clip(end, phase.bounds.x_lower, phase.bounds.x_upper)
+        phases[switch.before] = replace(phase, x_goal=np.where(np.isnan(phase.goal), end, phase.goal))
+    return phases
 
 
 def first_guess(problem: Problem, method: str, given: Any, seed: int) -> Guess:

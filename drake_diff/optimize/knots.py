@@ -1,11 +1,13 @@
-"""Costs and constraints at the knots z = [x, u] of motions: values and exact derivatives of many knots in one call.
+"""Functions of points such as the knots z = [x, u] of a motion: values and exact derivatives of many in one call.
 
-A function is traced to a CasADi expression where that is possible, and else called knot by knot with AutoDiffXd.
+A function is traced to a CasADi expression where that is possible, and else called point by point with AutoDiffXd.
 Hessians of costs are positive semidefinite: negative eigenvalues are cut to 0.
 """
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
@@ -33,6 +35,11 @@ from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import Problem
 
 SAME_VALUES = 1e-10  # of the largest value at a knot: the same operations, rounded in another order
+THREAD_WORTH = 500_000  # instructions of 1 to 5 ns; to start a thread costs 50 us
+DIFFERENCE = 1e-5  # of max(1, |z|): of exact Jacobians, known to 1e-12
+Values = Callable[[Array], Array]  # points (K, w) -> (K, m)
+Linearize = Callable[[Array], tuple[Array, Array]]  # -> (K, m), (K, m, w)
+Pattern = tuple[Indices, Indices]  # rows and columns of the nonzeros of a matrix
 
 
 def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) -> Any | Refusal:
@@ -52,6 +59,196 @@ def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) ->
     if not agrees(function, probe, wanted, SAME_VALUES):
         return Refusal("its symbolic form gives other values")
     return function
+
+
+class Mapped:
+    """A CasADi function at many points in one call: rows (K, .) in, the nonzeros (K, .) of every output out."""
+
+    def __init__(self, function: Any):
+        self.function = function
+        self._maps: dict[int, Any] = {}
+
+    def __call__(self, *rows: Array) -> list[Array]:
+        count = len(rows[0])
+        if count not in self._maps:
+            self._maps[count] = self._mapped(count)
+        (buffer, evaluate), arrays, _ = self._maps[count]
+        given = [np.ascontiguousarray(array, dtype=float).reshape(-1) for array in rows]
+        for i, array in enumerate(given):
+            buffer.set_arg(i, array.data)
+        evaluate()
+        return [np.array(array) for array in arrays]
+
+    def _mapped(self, count: int) -> Any:
+        """On as many cores as have enough to do: their threads start anew at every call."""
+        f = self.function
+        threads = min(os.cpu_count() or 1, count * f.n_instructions() // THREAD_WORTH)
+        mapped = f.map(count, *(("thread", threads) if threads > 1 else ()))
+        buffer, evaluate = mapped.buffer()
+        arrays = [np.empty((count, f.nnz_out(i))) for i in range(f.n_out())]
+        for i, array in enumerate(arrays):
+            buffer.set_res(i, array.reshape(-1).data)
+        return (buffer, evaluate), arrays, mapped
+
+
+class PointFunction:
+    """m numbers of a point of `width` entries; `why_not` says why it has no exact second derivative, "" if it has.
+
+    `jacobian_at` and `hessian_at`, of the upper triangle, are where the nonzeros of one point are.
+    """
+
+    rows: int
+    width: int
+    why_not: str = ""
+    jacobian_at: Pattern
+    hessian_at: Pattern
+
+    def values(self, points: Array) -> Array:
+        """(K, m) at points (K, width)."""
+        raise NotImplementedError
+
+    def jacobian(self, points: Array) -> Array:
+        """(K, nonzeros) of the Jacobians."""
+        raise NotImplementedError
+
+    def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
+        """(K, nonzeros) of the second derivatives of weights (K, m) times the values, whose `jacobian` is known."""
+        raise NotImplementedError
+
+    def linearize(self, points: Array) -> tuple[Array, Array]:
+        """(K, m), and the Jacobians (K, m, width)."""
+        dense = np.zeros((len(points), self.rows, self.width))
+        dense[:, self.jacobian_at[0], self.jacobian_at[1]] = self.jacobian(points)
+        return self.values(points), dense
+
+    @cached_property
+    def columns(self) -> Indices:
+        """The entries of a point that it depends on."""
+        return np.unique(self.jacobian_at[1])
+
+
+class Traced(PointFunction):
+    """A function of which CasADi has the expression; `known` (K, p) are its second argument."""
+
+    def __init__(self, function: Any, *known: Array):
+        self.function, self.known = function, known
+        self.rows, self.width = function.size1_out(0), function.size1_in(0)
+
+    def values(self, points: Array) -> Array:
+        return self._values(points, *self.known)[0]
+
+    def jacobian(self, points: Array) -> Array:
+        return self._slopes(points, *self.known)[0]
+
+    def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
+        return self._curves(points, weights, *self.known)[0]
+
+    @cached_property
+    def jacobian_at(self) -> Pattern:  # type: ignore[override]
+        return _places(self._slopes.function.sparsity_out(0))
+
+    @cached_property
+    def hessian_at(self) -> Pattern:  # type: ignore[override]
+        return _places(self._curves.function.sparsity_out(0))
+
+    @cached_property
+    def _values(self) -> Mapped:
+        inputs = self._symbols()
+        return Mapped(ca.Function("values", inputs, [ca.densify(self.function(*inputs))]))
+
+    @cached_property
+    def _slopes(self) -> Mapped:
+        inputs = self._symbols()
+        return Mapped(ca.Function("jacobian", inputs, [ca.jacobian(self.function(*inputs), inputs[0])]))
+
+    @cached_property
+    def _curves(self) -> Mapped:
+        (point, *known), weights = self._symbols(), ca.SX.sym("weights", self.rows)
+        hessian, _ = ca.hessian(ca.dot(weights, self.function(point, *known)), point)
+        return Mapped(ca.Function("hessian", [point, weights, *known], [ca.triu(hessian)]))
+
+    def _symbols(self) -> list[Any]:
+        return [ca.SX.sym(f"z{i}", self.function.size1_in(i)) for i in range(self.function.n_in())]
+
+
+class Called(PointFunction):
+    """A function that is called, and depends on the entries `depends` of a point, on all where None.
+
+    Its second derivatives are differences of its Jacobians.
+    """
+
+    def __init__(
+        self, why_not: str, values: Values, linearize: Linearize, rows: int, width: int, depends: Indices | None = None
+    ):
+        self.why_not, self.rows, self.width = why_not, rows, width
+        self._evaluate, self._linearize = values, linearize
+        self._depends = np.arange(width) if depends is None else depends
+        self.jacobian_at = np.repeat(np.arange(rows), len(self._depends)), np.tile(self._depends, rows)
+        above, right = np.triu_indices(len(self._depends))
+        self.hessian_at = self._depends[above], self._depends[right]
+
+    def values(self, points: Array) -> Array:
+        return self._evaluate(points)
+
+    def jacobian(self, points: Array) -> Array:
+        return self._linearize(points)[1][:, :, self._depends].reshape(len(points), -1)
+
+    def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
+        size = len(self._depends)
+        full, pushed = np.zeros((len(points), size, size)), np.flatnonzero(np.any(weights, axis=1))
+        points, weights = points[pushed], weights[pushed]
+        for j, column in enumerate(self._depends if len(pushed) else ()):
+            step = np.zeros_like(points)
+            step[:, column] = DIFFERENCE * np.maximum(1.0, np.abs(points[:, column]))
+            low, high = (self.jacobian(points + side * step).reshape(len(points), -1, size) for side in (-1, 1))
+            full[pushed, :, j] = np.einsum("km,kmi->ki", weights, high - low) / (2 * step[:, column, None])
+        full = (full + full.swapaxes(1, 2)) / 2
+        return np.asarray(full[:, *np.triu_indices(size)])
+
+
+def _places(sparsity: Any) -> Pattern:
+    return np.array(sparsity.row(), dtype=np.intp), np.array(sparsity.get_col(), dtype=np.intp)
+
+
+def constraint_function(c: Constraint, nx: int, probe: Array) -> PointFunction:
+    """What a constraint limits; `probe` (P, nx + nu) are points [x, u] at which its expression is compared with it."""
+    values = c.along(probe[:, :nx], probe[:, nx:])
+    with np.errstate(all="ignore"):
+        function = trace(c.function if c.takes_input else lambda x, u: c.function(x), nx, probe, values)
+    if not isinstance(function, Refusal):
+        return Traced(function)
+    return _called(c, function.reason, nx, probe, np.arange(probe.shape[1] if c.takes_input else nx))
+
+
+def knot_function(c: Constraint, nx: int, nu: int, probe: Array) -> PointFunction:
+    """The same of a knot [x, u], but clearances, which have many rows of which few are near, are called."""
+    if isinstance(c, ClearanceConstraint):
+        return _called(c, "called", nx, np.empty((0, nx + nu)), np.arange(c.clearance.model.nq))
+    return constraint_function(c, nx, probe)
+
+
+def _called(c: Constraint, why_not: str, nx: int, probe: Array, depends: Indices) -> Called:
+    def values(knots: Array) -> Array:
+        return c.along(knots[:, :nx], knots[:, nx:])
+
+    def linearize(knots: Array) -> tuple[Array, Array]:
+        return values(knots), c.slopes(knots[:, :nx], knots[:, nx:])
+
+    return Called(why_not, values, linearize, len(c.lower), probe.shape[1], depends)
+
+
+class Selected(PointFunction):
+    """Entries of a point of `width` numbers."""
+
+    def __init__(self, which: Indices, width: int):
+        self.rows, self.width = len(which), width
+        self.jacobian_at = np.arange(len(which)), which
+
+    def values(self, points: Array) -> Array:
+        return points[:, self.jacobian_at[1]]
+
+    def jacobian(self, points: Array) -> Array:
+        return np.ones((len(points), self.rows))
 
 
 class KnotCost(Protocol):
@@ -153,7 +350,7 @@ class _Function:
                 return self.timed.of(x, rest[:nu], rest[nu:])
             return cost(x, rest) if nu else cost(x)
 
-        self.of, self.columns = of, None
+        self.of, self.mapped = of, None
         knots = self._with_known(probe, np.zeros(len(probe)))
         with np.errstate(all="ignore"):
             function = trace(of, nx, knots, self._called(knots)[:, None])
@@ -162,7 +359,11 @@ class _Function:
         z, known = ca.SX.sym("z", self.n), ca.SX.sym("known", knots.shape[1] - self.n)
         inputs, value = [ca.vertcat(z, known)], function(ca.vertcat(z, known))
         hessian, gradient = ca.hessian(value, z)
-        self.columns = Columns(inputs, [value]), Columns(inputs, [gradient, hessian])
+        both = [ca.densify(gradient), ca.densify(hessian)]
+        self.mapped = (
+            Mapped(ca.Function("value", inputs, [ca.densify(value)])),
+            Mapped(ca.Function("slopes", inputs, both)),
+        )
 
     def _with_known(self, knots: Array, times: Array) -> Array:
         return knots if self.timed is None else np.hstack([knots, self.timed.known_at(times)])
@@ -172,15 +373,15 @@ class _Function:
 
     def values(self, knots: Array, times: Array) -> Array:
         rows = self._with_known(knots, times)
-        if self.columns is None:
+        if self.mapped is None:
             return self._called(rows)
-        return np.asarray(self.columns[0](rows)[0][:, 0, 0])
+        return np.asarray(self.mapped[0](rows)[0][:, 0])
 
     def expand(self, knots: Array, times: Array) -> tuple[Array, Array]:
         rows = self._with_known(knots, times)
-        if self.columns is not None:
-            gradients, hessians = self.columns[1](rows)
-            return gradients[:, 0], not_negative(hessians)
+        if self.mapped is not None:
+            gradients, hessians = self.mapped[1](rows)
+            return gradients, not_negative(hessians.reshape(len(rows), self.n, self.n))
         gradients, hessians = np.empty(knots.shape), np.empty((*knots.shape, self.n))
         for k, (z, row) in enumerate(zip(knots, rows, strict=True)):
 
@@ -263,97 +464,3 @@ def costs_of(problem: Problem, xs: Array, us: Array, time_step: float | None = N
     times = h * np.arange(N + 1.0)
     final = Stage(costs[1], slice(N, N + 1), times[N:], 1.0, final=True)
     return Costs((Stage(costs[0], slice(0, N), times[:N], h), final))
-
-
-class KnotFunction(Protocol):
-    """What a constraint limits, at knots (K, nx + nu)."""
-
-    columns: Indices  # of a knot: those that it depends on
-
-    def values(self, knots: Array) -> Array:
-        """(K, m)"""
-        ...
-
-    def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K, m), and the Jacobians (K, m, nx + nu)."""
-        ...
-
-
-def knot_function(constraint: Constraint, nx: int, nu: int, probe: Array) -> KnotFunction:
-    """What `constraint` limits; `probe` (P, nx + nu) are knots at which its expression is compared with it."""
-    if isinstance(constraint, ClearanceConstraint):
-        return _CalledRows(constraint, nx, np.arange(constraint.clearance.model.nq))
-
-    def f(x: Any, u: Any) -> Any:
-        return constraint.function(x, u) if constraint.takes_input else constraint.function(x)
-
-    with np.errstate(all="ignore"):
-        traced = trace(f, nx, probe, constraint.along(probe[:, :nx], probe[:, nx:]))
-    if isinstance(traced, Refusal):
-        return _CalledRows(constraint, nx, np.arange(nx + nu if constraint.takes_input else nx))
-    return _TracedRows(traced)
-
-
-class Selected:
-    """Entries of a knot of `width` numbers."""
-
-    def __init__(self, which: Indices, width: int):
-        self.columns = which
-        self._rows = np.eye(width)[which]
-
-    def values(self, knots: Array) -> Array:
-        return knots[:, self.columns]
-
-    def linearize(self, knots: Array) -> tuple[Array, Array]:
-        return knots[:, self.columns], np.broadcast_to(self._rows, (len(knots), *self._rows.shape))
-
-
-class _TracedRows:
-    def __init__(self, function: Any):
-        z = ca.SX.sym("z", function.size1_in(0))
-        value = function(z)
-        jacobian = ca.jacobian(value, z)
-        self.columns = np.unique(np.array(jacobian.sparsity().get_col(), dtype=np.intp))
-        self._values, self._both = Columns([z], [value]), Columns([z], [value, jacobian])
-
-    def values(self, knots: Array) -> Array:
-        return self._values(knots)[0][:, 0]
-
-    def linearize(self, knots: Array) -> tuple[Array, Array]:
-        values, jacobians = self._both(knots)
-        return values[:, 0], jacobians.swapaxes(1, 2)
-
-
-class _CalledRows:
-    def __init__(self, constraint: Constraint, nx: int, columns: Indices):
-        self.constraint, self.nx, self.columns = constraint, nx, columns
-
-    def values(self, knots: Array) -> Array:
-        return self.constraint.along(knots[:, : self.nx], knots[:, self.nx :])
-
-    def linearize(self, knots: Array) -> tuple[Array, Array]:
-        return self.values(knots), self.constraint.slopes(knots[:, : self.nx], knots[:, self.nx :])
-
-
-class Columns:
-    """A CasADi function of columns at many of them in one call: rows (K, .) in, dense (K, columns, rows) out."""
-
-    def __init__(self, inputs: list[Any], outputs: list[Any]):
-        self.function = ca.Function("columns", inputs, [ca.densify(output) for output in outputs])
-        self._maps: dict[int, Any] = {}
-
-    def __call__(self, *rows: Array) -> list[Array]:
-        count = len(rows[0])
-        if count not in self._maps:
-            mapped, f = self.function.map(count), self.function
-            buffer, evaluate = mapped.buffer()
-            arrays = [np.empty((count, f.size2_out(i), f.size1_out(i))) for i in range(f.n_out())]
-            for i, array in enumerate(arrays):
-                buffer.set_res(i, array.reshape(-1).data)
-            self._maps[count] = buffer, evaluate, arrays, mapped
-        buffer, evaluate, arrays, _ = self._maps[count]
-        given = [np.ascontiguousarray(array, dtype=float).reshape(-1) for array in rows]
-        for i, array in enumerate(given):
-            buffer.set_arg(i, array.data)
-        evaluate()
-        return [np.array(array) for array in arrays]

@@ -39,7 +39,9 @@ from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.plant import bodies, joints
 from drake_diff.model.step import set_state
 from drake_diff.motion.continuous import ContinuousMotion
+from drake_diff.motion.loss import differentiate_loss
 from drake_diff.optimize.ilqr.riccati import minimize_in_box
+from drake_diff.optimize.knots import costs_of
 from drake_diff.optimize.problem.cost import cost_at, final_cost_hessian, running_cost_hessian
 from drake_diff.optimize.problem.design import ShootingVariables, final_sensitivity
 from drake_diff.optimize.problem.problem import Problem
@@ -95,7 +97,7 @@ def optimality(problem: Problem, xs: Array, us: Array, values: Array) -> Optimal
     program = StepProgram(problem)
     z = program.pack(xs, us, values)
     program.require(z)
-    derivatives, count = program.derivatives(), problem.num_steps * problem.nx
+    derivatives, count = program.derivatives(exact=False), problem.num_steps * problem.nx
     slope = np.asarray(derivatives["grad_f"](z, [])[1]).ravel()
     rows, jacobian = derivatives["jac_g"](z, [])
     if not (np.all(np.isfinite(slope)) and np.all(np.isfinite(jacobian.nonzeros()))):
@@ -283,10 +285,13 @@ class _Plan:
     @cached_property
     def _slopes(self) -> tuple[float, Array, Array]:
         """The cost, and its derivatives by the states (N+1, nx) and the inputs (N, nu) themselves, the steps apart."""
-        program = StepProgram(self.problem)
-        z = program.pack(self.xs, self.us, self.variables.parameters(self.z).values)
-        cost, slope = program.gradient(z)
-        return cost, slope[program.states_at], slope[program.inputs_at]
+        problem, h, nx = self.problem, self.variables.time_step(self.z), self.problem.nx
+        slopes = costs_of(problem, self.xs, self.us, h).expand(self.xs, self.us)[0]
+        by_xs, by_us = slopes[:, :nx], slopes[:-1, nx:]
+        if problem.trajectory_cost is not None:
+            _, of_xs, of_us, _ = differentiate_loss(problem.trajectory_cost, self.xs, self.us)
+            by_xs, by_us = by_xs + of_xs, by_us + of_us
+        return problem.objective(self.xs, self.us, h), by_xs, by_us
 
     def _left_to_ask(self, slope: Array, hessian: Array, still: NDArray[np.intp]) -> tuple[Array, Array]:
         """The cost's slope and curvature by the coordinates that are `still`, at the best of all that is not."""

@@ -5,43 +5,32 @@ open loop or under TVLQR whose cost to go is led back through the resets too. An
 closes, by Drake's mass matrix, and the cost to go is led back through its saltation matrix.
 """
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.clock import now
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
-from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError, UnknownNameError
+from drake_diff.exceptions import ModelError
 from drake_diff.optimize.checks import Check, Checks, check
-from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
-from drake_diff.optimize.measure import INTEGRATION_TOLERANCE, certify_equations, derivative_check
+from drake_diff.optimize.knots import PointFunction
+from drake_diff.optimize.measure import INTEGRATION_TOLERANCE, derivative_check
 from drake_diff.optimize.messages import under
-from drake_diff.optimize.options import Options
 from drake_diff.optimize.problem.fixed_contacts import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
-from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Limits, NlpResult, Report
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult
 from drake_diff.optimize.replay import FEEDBACK, OPEN_LOOP, Replay
-from drake_diff.optimize.run import PLANS, Run, SoFar, arrays_of
-from drake_diff.optimize.solution import Solution, Status, Trajectories
-from drake_diff.optimize.transcription.between import violation_between_nodes
+from drake_diff.optimize.solution import PLANS, Solution, Status, Trajectories
 from drake_diff.optimize.transcription.collocation import (
     FOUND,
     SUBSTEPS,
     Collocated,
-    Transcribed,
     Transcription,
-    finer_mesh,
-    kept,
-    solve_program,
 )
-from drake_diff.optimize.transcription.task import MAP, SCHEMES, default_scheme
-from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, status_of
+from drake_diff.optimize.verification import ended, status_of
 
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 LATE = 0.1  # of a phase's time: so long after it an impact is waited for
@@ -351,247 +340,11 @@ def _across(switch: Switch, before: Collocated, after: Collocated) -> Array:
     return impact.saltation(x, rates, after.task.moved(first, np.array([0]))[0])
 
 
-def may_mend(solution: PhasedSolution, refine: bool | None) -> bool:
-    """Whether another first guess may do better: nothing was found, or a plan that no mesh made hold."""
-    if solution.status is not Status.CONVERGED_NOT_VERIFIED or refine is False:
-        return solution.status in NOT_FOUND
-    certificates = [*solution.certificates, *(c for phase in solution.phases for c in phase.certificates)]
-    return all(c.verdict == "agree" for c in certificates)
-
-
-def first_guesses(problem: PhasedProblem, given: Any, seed: int) -> list[Guess]:
-    """One for each phase: of `given`, a PhasedSolution or one of each, or straight lines."""
-    parts: Sequence[Any] = [None] * len(problem.phases)
-    if isinstance(given, PhasedSolution):
-        parts = given.phases
-    elif given is not None:
-        parts = given if isinstance(given, (tuple, list)) else [given]
-    if len(parts) != len(problem.phases):
-        expected = f"None, a PhasedSolution, or {len(problem.phases)} guesses, one for each phase"
-        raise InputError("initial_guess", got=f"{len(parts)} guesses", expected=expected)
-    pairs = zip(_aimed(problem), parts, strict=True)
-    return [first_guess(phase, "collocation", sampled(phase, "collocation", guess), seed) for phase, guess in pairs]
-
-
-def other_guesses(problem: PhasedProblem, seed: int, number: int) -> list[Any]:
-    """Other first guesses of all phases, random ones by `seed`."""
-    every = enumerate(_aimed(problem))
-    return [another_guess(phase, seed * len(problem.phases) + i, number) for i, phase in every]
-
-
-def _aimed(problem: PhasedProblem) -> list[Problem]:
-    """The phases, for guesses alone: one that has no goal ends where the next one's first guess begins.
-
-    That is its state before a linear reset; before another it is the same state, where there are as many.
-    """
-    phases = list(problem.phases)
-    for switch in problem.switches:
-        phase, other = phases[switch.before], problem.phases[switch.after]
-        if switch.after == 0 or (switch.matrix is None and phase.nx != other.nx):
-            continue
-        end = other.x0 if switch.matrix is None else np.linalg.lstsq(switch.matrix, other.x0, rcond=None)[0]
-        end = np.clip(end, phase.bounds.x_lower, phase.bounds.x_upper)
-        phases[switch.before] = replace(phase, x_goal=np.where(np.isnan(phase.goal), end, phase.goal))
-    return phases
-
-
-def check_phases(problem: PhasedProblem, method: str, options: Options) -> str:
-    """The scheme; refuses what phases cannot be asked."""
-    if method not in ("auto", "collocation"):
-        raise InputError("method", got=repr(method), expected='"auto" or "collocation" for a PhasedProblem')
-    if options.solver not in (None, "ipopt"):
-        raise InputError("solver", got=repr(options.solver), expected='"ipopt" for a PhasedProblem')
-    options.check_method("collocation")
-    scheme = options.scheme or default_scheme(problem.phases[0])
-    if scheme not in SCHEMES:
-        raise UnknownNameError("scheme", got=scheme, known=[name for name in SCHEMES if name != MAP])
-    if scheme == "drake" or (scheme == MAP) != problem.is_map:
-        expected = repr(MAP) if problem.is_map else '"hermite_simpson" or "trapezoid" for a PhasedProblem in time'
-        raise InputError("scheme", got=repr(scheme), expected=expected)
-    if problem.is_map and options.refine:
-        raise InputError("refine", got=True, expected="None or False: a DiscreteMap has no intervals to split")
-    return scheme
-
-
-@dataclass(frozen=True, eq=False)
-class PhasedMotion:
-    """The motions of all phases that one solve found."""
-
-    phases: tuple[Transcribed, ...]
-    result: NlpResult
-    refinements: tuple[tuple[int, ...], ...] = ()
-    cleared = ()
-
-    @property
-    def count(self) -> list[int]:
-        """How many intervals each phase has."""
-        return [motion.count for motion in self.phases]
-
-    @property
-    def largest_error(self) -> float:
-        """Of an interval of all phases and of its part of the cost."""
-        return max(motion.largest_error for motion in self.phases)
-
-    @property
-    def row(self) -> tuple[int, ...]:
-        """What `refinements` say of it."""
-        return tuple(self.count)
-
-    def told(self, **fields: Any) -> "PhasedMotion":
-        """With another `result`."""
-        return replace(self, **fields)
-
-
-class PhasedTranscription:
-    """The phases of a problem in a scheme, solved as one program; see `Transcription`."""
-
-    def __init__(self, problem: PhasedProblem, scheme: str):
-        from drake_diff.optimize.transcription.coupled import link_functions  # loads CasADi
-
-        self.problem, self.links = problem, link_functions(problem)
-        self.phases = [Transcription(phase, scheme) for phase in problem.phases]
-
-    def solve(
-        self, guess: Sequence[Guess], *, limits: Limits, report: Report | None, refinement: Options | None
-    ) -> PhasedMotion:
-        """From a guess of each phase; with a `refinement` on meshes that are split until their errors are small."""
-        nodes, horizons, start = [], [], now()
-        for t, g in zip(self.phases, guess, strict=True):
-            us_end = g.us[-1:] if g.u_final is None else g.u_final[None]
-            nodes.append(t.nodes_at(t.mesh, g.motion or (g.xs, np.vstack([g.us, us_end]))))
-            horizons.append(t.problem.start_horizon if g.horizon is None else g.horizon)
-        motion = self._solve_on([t.mesh for t in self.phases], nodes, horizons, limits, report)
-        rounds = [motion.row]
-        while refinement is not None and len(rounds) <= refinement.mesh_rounds and motion.result.outcome in FOUND:
-            coarse = [phase.largest_error > refinement.error_tolerance for phase in motion.phases]
-            left = replace(limits, time_limit=max(0.0, limits.time_limit - (now() - start)))
-            finer = self.finer(motion, coarse, refinement.max_num_steps, left, report) if any(coarse) else None
-            if finer is None or finer.result.outcome not in FOUND:
-                motion = motion if finer is None else kept(motion, finer)
-                break
-            motion = finer
-            rounds.append(motion.row)
-        return replace(motion, refinements=tuple(rounds))
-
-    def finer(
-        self, motion: PhasedMotion, coarse: Sequence[bool], most: int, limits: Limits, report: Report | None
-    ) -> PhasedMotion | None:
-        """The problem on finer meshes of the `coarse` phases; None where one has more than `most` intervals."""
-        meshes = []
-        for phase, wanted in zip(motion.phases, coarse, strict=True):
-            mesh = finer_mesh(phase, violation_between_nodes(phase).intervals, most) if wanted else phase.mesh
-            if mesh is None:
-                return None
-            meshes.append(mesh)
-        if report is not None:
-            report.say(f"what is found does not hold: refined to {[len(mesh) - 1 for mesh in meshes]} intervals")
-        nodes = [t.nodes_at(mesh, m) for t, mesh, m in zip(self.phases, meshes, motion.phases, strict=True)]
-        return self._solve_on(meshes, nodes, [phase.horizon for phase in motion.phases], limits, report)
-
-    def _solve_on(
-        self,
-        meshes: Sequence[Array],
-        nodes: Sequence[Array],
-        horizons: Sequence[float],
-        limits: Limits,
-        report: Report | None,
-    ) -> PhasedMotion:
-        from drake_diff.optimize.transcription.coupled import PhasedProgram
-        from drake_diff.optimize.transcription.program import TranscribedProgram
-
-        parts = zip(self.phases, meshes, strict=True)
-        programs = [TranscribedProgram(t.task, mesh, t.functions) for t, mesh in parts]
-        program = PhasedProgram(self.problem, programs, self.links)
-        inside = [float(np.clip(T, *t.task.horizon)) for T, t in zip(horizons, self.phases, strict=True)]
-        guess = np.concatenate([p.pack(z, T) for p, z, T in zip(programs, nodes, inside, strict=True)])
-        result, derivatives = solve_program(program, guess, limits, report)
-        motions = []
-        for p, mesh, z in zip(programs, meshes, program.split(result.z), strict=True):
-            values, horizon = p.unpack(z)
-            motions.append(Transcribed(p.task, frozen(mesh), frozen(values), horizon, result, derivatives))
-        return PhasedMotion(tuple(motions), result)
-
-
-@dataclass(frozen=True, eq=False)
-class PhasedRun(Run):
-    """One solve of a problem in phases by collocation; see `Run`."""
-
-    problem: Any
-
-    def _of_guess(self, guess: Any) -> Any:
-        drafts = []
-        for problem, g in zip(self.problem.phases, guess, strict=True):
-            last = g.us[-1] if g.u_final is None else np.ravel(g.u_final)
-            drafts.append(self._draft_of(problem, g.xs, g.us, u_final=None if problem.is_map else frozen(last)))
-        return self._joined(drafts)
-
-    def _transcribe(self) -> Any:
-        return PhasedTranscription(self.problem, self.scheme)
-
-    def _certify_guess(self, transcription: Any, guess: Any) -> tuple[Certificate, ...]:
-        return ()  # of the result alone
-
-    def _begin(self, transcription: Any, guess: Any) -> dict[str, Any]:
-        return {"guess": guess}
-
-    def _draft_of(self, problem: Problem, xs: Array, us: Array, **fields: Any) -> Solution:
-        by = problem, self.method, self.solver, Status.FAILED, ""
-        return Solution(*by, frozen(xs), frozen(us), scheme=self.scheme, options=dict(self.options), **fields)
-
-    def _joined(self, phases: Sequence[Solution], **fields: Any) -> Any:
-        fields |= {"options": self.options, "wall_time": time.monotonic() - self.begun}
-        return PhasedSolution.joined(self.problem, phases, **fields)
-
-    def _judge_collocated(self, transcription: Any, motion: Any, certificates: tuple[Certificate, ...]) -> Any:
-        self.options["derivatives"] = motion.phases[0].derivatives
-        drafts, error = [], None
-        for phase in motion.phases:
-            drafts.append(self._draft_of(phase.task.problem, phase.xs, phase.us[:-1], **arrays_of(phase)))
-        self._offer(self._joined(drafts), motion.result)
-        self._reach(2, self._joined(drafts), motion.result)
-        links = tuple[Certificate, ...]()
-        try:
-            for i, (t, plan) in enumerate(zip(transcription.phases, list(drafts), strict=True)):
-                if np.all(np.isfinite(plan.xs)):
-                    equations = certify_equations(t.problem, t.jacobian, plan.xs, plan.us, t.task)
-                    drafts[i] = replace(plan, certificates=equations)
-            links = _certified_links(transcription, motion.phases)
-        except (GradientError, SimulationError) as refusal:
-            error = refusal
-        solution = self._judge(self._joined(drafts, certificates=links), motion.result)
-        if error is not None and solution.status in PLANS:
-            return ended(solution, Status.NO_GRADIENT, str(error))
-        return solution
-
-    def _judge(self, draft: Any, result: NlpResult) -> Any:
-        self._reach(3, draft, result)
-        phases = tuple(judged(phase, result) for phase in draft.phases)
-        fields = {"phases": phases, "iterations": result.iterations, "solver_message": result.message}
-        return judged_phases(replace(draft, **fields), result)
-
-    def _with_rounds(self, solution: Any, rounds: Sequence[Any]) -> Any:
-        return solution
-
-    def _finer(self, transcription: Any, motion: Any, solution: Any) -> Any:
-        if self.problem.is_map or solution.status not in PLANS:
-            return None
-        of_phases = [may_be_too_coarse(phase) for phase in solution.phases]
-        drifts = solution.status is not Status.CONVERGED and not any(of_phases) and not solution.chain.passes
-        until = self.asked.error_tolerance
-        coarse = [
-            (wanted or drifts) and (phase.largest_error > until or bool(violation_between_nodes(phase).intervals))
-            for wanted, phase in zip(of_phases, motion.phases, strict=True)
-        ]
-        if not any(coarse):
-            return None
-        self.reached.append(SoFar(1, solution, judged=solution))
-        return transcription.finer(motion, coarse, self.asked.max_num_steps, self._left(), self.report)
-
-
-def _certified_links(transcription: PhasedTranscription, motions: Sequence[Transcribed]) -> tuple[Certificate, ...]:
+def certified_links(transcription: Transcription, motions: Sequence[Collocated]) -> tuple[Certificate, ...]:
     """GradientError where a derivative is refused."""
     certificates = []
-    for s, function in zip(transcription.problem.switches, transcription.links, strict=True):
+    switches = transcription.problem.switches if transcription.links else ()
+    for s, function in zip(switches, transcription.links, strict=True):
         point, count = np.concatenate([motions[s.before].xs[-1], motions[s.after].xs[0]]), len(s.columns)
         if not np.all(np.isfinite(point)):
             continue
@@ -599,7 +352,7 @@ def _certified_links(transcription: PhasedTranscription, motions: Sequence[Trans
             certificate = certify_jacobian(
                 lambda x, s=s, count=count: s.link(x[:count], x[count:]),
                 point,
-                function.jacobian_of,
+                partial(_jacobian_of, function),
                 rows=s.rows,
                 columns=[*(f"last {name}" for name in s.columns), *(f"first {name}" for name in s.rows)],
                 method="reset",
@@ -607,6 +360,10 @@ def _certified_links(transcription: PhasedTranscription, motions: Sequence[Trans
             )
         certificates.append(certificate)
     return tuple(certificates)
+
+
+def _jacobian_of(function: PointFunction, z: Array) -> Array:
+    return np.asarray(function.linearize(z[None])[1][0])
 
 
 def judged_phases(draft: PhasedSolution, result: NlpResult) -> Any:

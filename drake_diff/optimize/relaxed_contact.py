@@ -166,7 +166,7 @@ def _law() -> Any:
     """The force (3,) on the sphere's side, and its Jacobian by z: v' of that side less the other's, normal and phi."""
     import casadi as ca
 
-    from drake_diff.optimize.knots import Columns
+    from drake_diff.optimize.knots import Mapped
 
     z, constants = ca.SX.sym("z", 7), ca.SX.sym("constants", 6)
     velocity, normal, phi = z[:3], z[3:6], z[6]
@@ -178,7 +178,8 @@ def _law() -> Any:
     tangent = velocity - vn * normal
     slide = tangent / ca.sqrt(ca.sumsqr(tangent) + slip**2)
     force = elastic * damping * (normal - friction * slide)
-    return Columns([z, constants], [force, ca.jacobian(force, z)])
+    slopes = ca.densify(ca.jacobian(force, z))
+    return Mapped(ca.Function("law", [z, constants], [ca.densify(force), slopes]))
 
 
 def contact_forces(z: Array, constants: Array) -> tuple[Array, Array]:
@@ -190,7 +191,7 @@ def contact_forces(z: Array, constants: Array) -> tuple[Array, Array]:
     padded = [np.ones((1 << count.bit_length(), rows.shape[1])) for rows in (z, constants)]
     padded[0][:count], padded[1][:count] = z, constants
     force, jacobian = (result[:count] for result in _law()(*padded))
-    return force[:, 0], jacobian
+    return force, jacobian.reshape(count, 7, 3)
 
 
 def _within(pairs: ContactPairs, poses: Array, far: float) -> Touches:

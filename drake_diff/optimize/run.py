@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,15 +27,19 @@ from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through
 from drake_diff.optimize.measure import certify_equations, first_knots, telling_knots
 from drake_diff.optimize.optimality import HOLDS, doubt_of_the_slope, out_of_reach, why_blind
 from drake_diff.optimize.options import Options
+from drake_diff.optimize.phased import PhasedSolution, certified_links, judged_phases
 from drake_diff.optimize.problem.design import ShootingVariables
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import SelfCollision, lacking_between, swept
+from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report, heard
-from drake_diff.optimize.solution import Solution, Status
+from drake_diff.optimize.solution import PLANS, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
     FOUND,
+    Begun,
+    Collocated,
     Transcribed,
     Transcription,
     kept,
@@ -46,7 +51,6 @@ from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, r
 GRACE = 0.05  # of the time limit, beyond it: for measures of what a search found that the limit ended
 # What a solve is made of, in this order; a time limit names what it cut.
 STAGES = ("certificates of the guess", "the search", "certificates of the result", "replays and other measures")
-PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 
 Searcher = Callable[[Problem, Array, Array, Array], tuple[NlpResult, Array, Array]]
 
@@ -65,7 +69,7 @@ class SoFar:
 class Run:
     """One solve by one method: certify at the guess, search, certify at the result, measure, judge."""
 
-    problem: Problem
+    problem: Any  # a Problem, or for collocation a PhasedProblem
     method: str
     scheme: str
     solver: str
@@ -95,12 +99,21 @@ class Run:
         except TimeIsUpError as error:
             return self._cut(self.reached[-1], interrupted=isinstance(error, StoppedError))
 
-    def _of_guess(self, guess: Guess) -> Solution:
+    def _of_guess(self, guesses: Sequence[Guess]) -> Solution:
         """The draft of a solve that found nothing: its guess, by collocation with an input at the last knot."""
-        if self.scheme == "step" or self.problem.is_map:
-            return self._draft(guess.xs, guess.us)
-        last = guess.us[-1] if guess.u_final is None else np.ravel(guess.u_final)
-        return self._draft(guess.xs, guess.us, u_final=last)
+        drafts = []
+        for problem, guess in zip(self.problem.phases, guesses, strict=True):
+            last = guess.us[-1] if guess.u_final is None else np.ravel(guess.u_final)
+            has_last = self.scheme != "step" and not problem.is_map
+            drafts.append(self._draft(guess.xs, guess.us, problem, u_final=last if has_last else None))
+        return self._joined(drafts)
+
+    def _joined(self, drafts: Sequence[Solution], **fields: Any) -> Solution:
+        """The draft of all phases."""
+        if not isinstance(self.problem, PhasedProblem):
+            return drafts[0]
+        fields |= {"options": self.options, "wall_time": time.monotonic() - self.begun}
+        return PhasedSolution.joined(self.problem, drafts, **fields)
 
     def _cut(self, reached: SoFar, *, interrupted: bool) -> Solution:
         if reached.judged is not None:
@@ -123,63 +136,59 @@ class Run:
         left = self.limits.time_limit - (now() - self.start)
         return dataclasses.replace(self.limits, time_limit=max(left, 0.0))
 
-    def collocate(self, guess: Any) -> Any:
+    def collocate(self, guesses: Sequence[Guess]) -> Solution:
         """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation.
 
         The mesh is refined where `refine` is True; where it is None, for as long as the plan does not hold.
         """
         refine = self.asked.refine
         if self.solver == "snopt":
-            return self._collocate_in_drake(guess)
+            return self._collocate_in_drake(guesses)
         with noted_interrupts() as interrupted:  # one that comes before the search ends it at its start
             try:
                 with until_set(interrupted):
-                    transcription = self._transcribe()
-                    before = self._certify_guess(transcription, guess)
+                    transcription = Transcription(self.searched or self.problem, self.scheme)
+                    before = self._certify_guess(transcription, guesses)
             except (GradientError, SimulationError) as error:
-                return refused(self._of_guess(guess), error)
+                return refused(self._of_guess(guesses), error)
             self._reach(1)
+            begun = [self._begin(transcription, i, guess) for i, guess in enumerate(guesses)]
             refinement = self.asked if refine else None
-            motion = transcription.solve(
-                **self._begin(transcription, guess), limits=self._left(), report=self.report, refinement=refinement
-            )
-            motion = motion.told(result=heard(motion.result, interrupted))
+            motion = transcription.solve(begun, limits=self._left(), report=self.report, refinement=refinement)
+            motion = dataclasses.replace(motion, result=heard(motion.result, interrupted))
         if refine:
             self.options["refinements"] = [list(row) for row in motion.refinements]
         if motion.cleared:
             self.options["clearance_rounds"] = [list(row) for row in motion.cleared]
-
         solution = self._judge_collocated(transcription, motion, before)
         return solution if refine is not None else self._refined(transcription, motion, solution, before)
 
-    def _transcribe(self) -> Any:
-        return Transcription(self.searched or self.problem, self.scheme)
-
-    def _certify_guess(self, transcription: Any, guess: Guess) -> tuple[Certificate, ...]:
-        point = transcription.jacobian, guess.xs, guess.us, transcription.task
+    def _certify_guess(self, transcription: Transcription, guesses: Sequence[Guess]) -> tuple[Certificate, ...]:
+        """Of a problem in phases the result alone is certified."""
+        if isinstance(self.problem, PhasedProblem):
+            return ()
+        guess, task = guesses[0], transcription.tasks[0]
+        point = transcription.jacobian, guess.xs, guess.us, task
         return certify_equations(self.problem, *point, knots=first_knots(guess.us))
 
-    def _begin(self, transcription: Any, guess: Any) -> dict[str, Any]:
-        """What a transcription solves from."""
-        us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
-        begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
-        known = self._known(transcription, guess, finer=self.asked.refine is not False)
-        fields = {"horizon": guess.horizon, "parameters": guess.parameters, "far": guess.line}
-        return {"guess": begun, **fields, **known}
+    def _begin(self, transcription: Transcription, phase: int, guess: Guess) -> Begun:
+        """Where a phase begins: a motion by the same scheme and in as many steps on its mesh, with its multipliers."""
+        fields: dict[str, Any] = {"horizon": guess.horizon, "parameters": guess.parameters, "far": guess.line}
+        task, motion = transcription.tasks[phase], guess.motion
+        if motion is None:
+            us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
+            return transcription.begin(phase, (guess.xs, np.vstack([guess.us, us_end])), **fields)
+        steps = task.problem.num_steps
+        is_equal = len(motion.mesh) == steps + 1 or self.asked.refine is not False
+        if motion.task.scheme is task.scheme and motion.task.problem.num_steps == steps and is_equal:
+            fields |= {"mesh": np.asarray(motion.mesh), "multipliers": guess.multipliers}
+        return transcription.begin(phase, motion, **fields)
 
-    def _known(self, transcription: Transcription, guess: Guess, *, finer: bool) -> dict[str, Any]:
-        """The mesh and the multipliers of a guess by the same scheme and in as many steps; `finer` may it be."""
-        motion = guess.motion
-        if motion is None or motion.task.scheme is not transcription.task.scheme:
-            return {}
-        same = motion.task.problem.num_steps == self.problem.num_steps
-        if not same or (len(motion.mesh) > self.problem.num_steps + 1 and not finer):
-            return {}
-        return {"mesh": np.asarray(motion.mesh), "multipliers": guess.multipliers}
-
-    def _refined(self, transcription: Any, motion: Any, solution: Any, before: Any) -> Any:
+    def _refined(
+        self, transcription: Transcription, motion: Transcribed, solution: Solution, before: tuple[Certificate, ...]
+    ) -> Solution:
         """`solution`, or that on a mesh which is made finer for as long as the plan does not hold."""
-        rounds = list(motion.refinements)
+        rounds, first = list(motion.refinements), motion.count
         for _ in range(self.asked.mesh_rounds):
             finer = self._finer(transcription, motion, solution)
             if finer is None:
@@ -193,24 +202,31 @@ class Run:
             rounds.append(finer.row)
             self.options["refinements"] = [list(row) for row in rounds]
             solution = self._judge_collocated(transcription, motion, before)
-        return self._with_rounds(solution, rounds) if len(rounds) > 1 else solution
-
-    def _with_rounds(self, solution: Any, rounds: Sequence[Any]) -> Any:
-        note = f"the mesh was refined from {rounds[0][0]} to {rounds[-1][0]} intervals"
+        if motion.count == first:
+            return solution
+        note = f"the mesh was refined from {first} to {motion.count} intervals"
         return solution.told(message=f"{solution.message}; {note}")
 
-    def _finer(self, transcription: Any, motion: Any, solution: Any) -> Any:
-        """The motion on a finer mesh; None where the plan holds, or where what does not hold is not the mesh's."""
-        if not may_be_too_coarse(solution):
+    def _finer(self, transcription: Transcription, motion: Transcribed, solution: Solution) -> Transcribed | None:
+        """The motion on finer meshes; None where the plan holds, or where what does not hold is not a mesh's."""
+        if solution.status not in PLANS:
             return None
-        exceeded = violation_between_nodes(motion).intervals
-        if motion.largest_error <= self.asked.error_tolerance and not exceeded:
+        coarse = [may_be_too_coarse(phase) for phase in solution.phases]
+        if isinstance(solution, PhasedSolution) and not solution.success and not any(coarse):
+            coarse = [not solution.chain.passes] * len(coarse)
+        exceeded: list[Sequence[int] | None] = []
+        for phase, is_coarse in zip(motion.phases, coarse, strict=True):
+            beyond = violation_between_nodes(phase).intervals if is_coarse else ()
+            errs = is_coarse and phase.largest_error > self.asked.error_tolerance
+            exceeded.append(beyond if errs or beyond else None)
+        if all(beyond is None for beyond in exceeded):
             return None
         self.reached.append(SoFar(1, solution, judged=solution))
         return transcription.finer(motion, exceeded, self.asked.max_num_steps, self._left(), self.report)
 
-    def _collocate_in_drake(self, guess: Guess) -> Solution:
+    def _collocate_in_drake(self, guesses: Sequence[Guess]) -> Solution:
         """By Drake's own DirectCollocation."""
+        guess = guesses[0]
         jacobian = EquationsOfMotion(self.problem.model).jacobian
         with noted_interrupts() as interrupted:
             try:
@@ -218,7 +234,7 @@ class Run:
                     first = first_knots(guess.us)
                     certificates = certify_equations(self.problem, jacobian, guess.xs, guess.us, knots=first)
             except (GradientError, SimulationError) as error:
-                return refused(self._of_guess(guess), error)
+                return refused(self._of_guess(guesses), error)
             self._reach(1)
             result, xs, us, u_final = solve_collocation(
                 self.problem, guess.xs, guess.us, limits=self._left(), report=self.report
@@ -229,27 +245,43 @@ class Run:
             certificates += certify_equations(self.problem, jacobian, xs, us)
         return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates), result)
 
-    def _judge_collocated(self, transcription: Any, motion: Any, certificates: tuple[Certificate, ...]) -> Any:
-        xs, us = motion.xs, motion.us[:-1]
+    def _judge_collocated(
+        self, transcription: Transcription, motion: Transcribed, before: tuple[Certificate, ...]
+    ) -> Solution:
+        result, problems = motion.result, self.problem.phases
         self.options["derivatives"] = motion.derivatives
-        fields = arrays_of(motion) | {
-            "parameters": frozen(motion.task.parameters),
-            "multipliers": motion.result.multipliers,
-        }
-        self._offer(self._draft(xs, us, **fields), motion.result)
-        self._reach(2, self._draft(xs, us, certificates=certificates, **fields), motion.result)
-        if np.all(np.isfinite(xs)):
-            certificates += certify_equations(self.problem, transcription.jacobian, xs, us, motion.task)
-        draft = self._draft(xs, us, certificates=certificates, **fields)
-        if self.searched is None and draft.transcribed is not None:  # else it was measured under another cost
-            draft.transcribed.measured_as(motion)
-        return self._judge(draft, motion.result)
+        drafts = []
+        for phase, problem in zip(motion.phases, problems, strict=True):
+            multipliers = result.multipliers if len(problems) == 1 else None
+            fields = arrays_of(phase) | {"multipliers": multipliers, "certificates": before}
+            drafts.append(self._draft(phase.xs, phase.us[:-1], problem, **fields))
+        self._offer(self._joined(drafts), result)
+        self._reach(2, self._joined(drafts), result)
+        links, error = tuple[Certificate, ...](), None
+        try:
+            for i, (task, plan) in enumerate(zip(transcription.tasks, drafts, strict=True)):
+                if np.all(np.isfinite(plan.xs)):
+                    jacobian = partial(transcription.jacobian, phase=i)
+                    task = motion.phases[i].task if task.varied else task
+                    equations = certify_equations(plan.problem, jacobian, plan.xs, plan.us, task)
+                    drafts[i] = dataclasses.replace(plan, certificates=before + equations)
+            links = certified_links(transcription, motion.phases)
+        except (GradientError, SimulationError) as refusal:
+            error = refusal
+        for plan, phase in zip(drafts, motion.phases, strict=True):
+            if self.searched is None and plan.transcribed is not None:  # else it was measured under another cost
+                plan.transcribed.measured_as(phase)
+        solution = self._judge(self._joined(drafts, certificates=links), result)
+        if error is not None and solution.status in PLANS:
+            return ended(solution, Status.NO_GRADIENT, str(error))
+        return solution
 
-    def sweep(self, guess: Guess, *, given: bool, stages: Stages) -> Solution:
+    def sweep(self, guesses: Sequence[Guess], *, given: bool, stages: Stages) -> Solution:
         """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`.
 
         With `stages` it need not have a gradient.
         """
+        guess = guesses[0]
         xs, us = guess.xs, guess.us
         report, first = self.report, iter([xs] if given else [])
 
@@ -270,7 +302,7 @@ class Run:
         around = given and not stages  # a robot that falls open loop says nothing of the motion that was given
         return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages), around=around)
 
-    def shoot(self, guess: Guess, *, given: bool) -> Solution:
+    def shoot(self, guesses: Sequence[Guess], *, given: bool) -> Solution:
         """The sparse program through the steps, from the states of the guess.
 
         Where no guess is `given`, a few steps of iLQR come first, from the rollout of the inputs and without couplings,
@@ -279,7 +311,7 @@ class Run:
         any case. A design that is optimized with the inputs goes without iLQR, which far from its goal leads a jumping
         leg to a short one, of half the height.
         """
-        problem = self.problem
+        problem, guess = self.problem, guesses[0]
         co_design = problem.optimizes_controls and problem.optimizes_parameters
         multipliers = guess.multipliers if given else None
         rolled = not given and (not problem.optimizes_controls or bool(np.any(problem.us)) or problem.motion != STEPS)
@@ -436,7 +468,15 @@ class Run:
     def _judge(self, draft: Solution, result: NlpResult) -> Solution:
         """`judged`, and no success where the cost asks for a motion that nothing here could have begun."""
         self._reach(3, draft, result)
-        solution, problem = judged(draft, result), self.problem
+        if isinstance(draft, PhasedSolution):
+            phases = tuple(judged(phase, result) for phase in draft.phases)
+            fields: dict[str, Any] = {
+                "phases": phases,
+                "iterations": result.iterations,
+                "solver_message": result.message,
+            }
+            return judged_phases(dataclasses.replace(draft, **fields), result)
+        solution, problem = judged(draft, result), draft.problem
         if solution.status not in PLANS or not problem.has_model:
             return solution
         if problem.motion != STEPS and solution.success:
@@ -455,11 +495,12 @@ class Run:
             return ended(solution, Status.NO_GRADIENT, reach.silent)
         return solution.told(message=f"{solution.message}; {reach.constant}") if reach.constant else solution
 
-    def _draft(self, xs: Array, us: Array, **fields: Any) -> Solution:
+    def _draft(self, xs: Array, us: Array, problem: Problem | None = None, **fields: Any) -> Solution:
         arrays = ("u_final", "us_mid", "mesh")
         fields |= {name: frozen(fields[name]) for name in arrays if fields.get(name) is not None}
         fields |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.begun}
-        return Solution(self.problem, self.method, self.solver, Status.FAILED, "", frozen(xs), frozen(us), **fields)
+        by = problem or self.problem, self.method, self.solver, Status.FAILED, ""
+        return Solution(*by, frozen(xs), frozen(us), **fields)
 
     def _look_at(
         self, variables: ShootingVariables, z: Array, *, found: bool
@@ -487,14 +528,15 @@ class Run:
         return xs, us, certificates, why_blind(self.problem, variables, z)
 
 
-def arrays_of(motion: Transcribed) -> dict[str, Any]:
-    """The arrays of a Solution that are beside its states and inputs."""
+def arrays_of(motion: Collocated) -> dict[str, Any]:
+    """What a Solution has beside its states and inputs."""
     task, problem = motion.task, motion.task.problem
     return {
         "u_final": None if problem.is_map else frozen(motion.us[-1]),
         "us_mid": None if task.scheme.input_is_linear else motion.us_mid,
         "free_horizon": motion.horizon if problem.horizon else None,
-        "mesh": motion.mesh if motion.count > problem.num_steps else None,
+        "mesh": motion.mesh if len(motion.mesh) > problem.num_steps + 1 else None,
+        "parameters": frozen(task.parameters),
     }
 
 

@@ -23,8 +23,9 @@ from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import FOUND
 from drake_diff.optimize.transcription.expressions import knot_functions
 from drake_diff.optimize.transcription.kkt import NEAREST, WEAK, Change, Held, HeldPlan, KnotProgram
-from drake_diff.optimize.transcription.program import TranscribedProgram, solve_ipopt
-from drake_diff.optimize.transcription.steps import CALLED_BACK, StepProgram
+from drake_diff.optimize.transcription.nodes import Phase, TranscribedProgram
+from drake_diff.optimize.transcription.program import solve_ipopt
+from drake_diff.optimize.transcription.steps import WITHIN, StepProgram
 from drake_diff.optimize.transcription.task import OptimalControl
 
 ENDS = ("x0", "goal")
@@ -170,7 +171,7 @@ class _Plan:
         """Where the second derivatives came from."""
         if not isinstance(program, StepProgram):
             return "symbolic"
-        return f"the steps' Jacobians by {' and '.join(sorted(program.methods))}"
+        return f"the steps' Jacobians by {' and '.join(sorted(program.steps.methods))}"
 
 
 def _plan(solution: Solution) -> _Plan:
@@ -182,12 +183,12 @@ def _plan(solution: Solution) -> _Plan:
 
         def collocated(problem: Problem) -> TranscribedProgram:
             task = OptimalControl(problem, scheme)
-            return TranscribedProgram(task, mesh, knot_functions(task))
+            return TranscribedProgram([Phase(task, mesh, knot_functions(task))])
 
         program = collocated(problem)
-        if program.functions.why_not:
-            raise ModelError(f"{problem.name}: no second derivatives: {program.functions.why_not}")
-        z = program.pack(np.asarray(motion.nodes), motion.horizon, motion.task.coordinates)
+        if program.why_not:
+            raise ModelError(f"{problem.name}: no second derivatives: {program.why_not}")
+        z = program.phases[0].pack(np.asarray(motion.nodes), motion.horizon, motion.task.parameters)
         return _Plan(problem, collocated, z, False)
     if problem.trajectory_cost is not None:
         raise InputError("trajectory_cost", got="given", expected="none: it joins all states, and no step does")
@@ -306,7 +307,7 @@ def _one_sided(plan: _Plan, held: HeldPlan, change: Change, column: int, step: f
 
 def _resolved(program: KnotProgram, z: Array, multipliers: Multipliers) -> tuple[Array, bool]:
     """What IPOPT finds from a plan, and whether that is a solution."""
-    more = CLOSE | (CALLED_BACK if isinstance(program, StepProgram) else {})
-    exact = not program.functions.why_not
+    more = CLOSE | (WITHIN if isinstance(program, StepProgram) else {})
+    exact = not program.why_not
     result = solve_ipopt(program, z, EXACT, None, exact=exact, begun=multipliers, more=more)
     return result.z, result.outcome in FOUND

@@ -73,6 +73,9 @@ _SENTENCES = {
 }
 
 
+PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
+
+
 @dataclass(frozen=True, eq=False)
 class Search:
     """What `solve` was called with, so that it can be called again.

@@ -18,16 +18,16 @@ from drake_diff.model.step import set_state
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.optimize.continuation import check_schedule
-from drake_diff.optimize.guess import another_guess, first_guess, sampled
+from drake_diff.optimize.guess import another_guess, first_guesses, other_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, takes
 from drake_diff.optimize.options import Options
-from drake_diff.optimize.phased import PhasedRun, PhasedSolution, check_phases, first_guesses, may_mend, other_guesses
+from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.cost import TimedCost
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, Report
-from drake_diff.optimize.run import PLANS, Run, is_kept_apart, kept_apart
-from drake_diff.optimize.solution import Search, Solution, Status, distinct
+from drake_diff.optimize.run import Run, is_kept_apart, kept_apart
+from drake_diff.optimize.solution import PLANS, Search, Solution, Status, distinct
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
 from drake_diff.optimize.verification import advice, overlaps
 
@@ -180,6 +180,9 @@ def _solved(
     if isinstance(problem, PhasedProblem):
         if restarts:
             raise InputError("restarts", got=restarts, expected="0 for a PhasedProblem")
+        asked.options.check_method("collocation")
+        method = "collocation" if asked.method == "auto" else asked.method
+        asked = replace(asked, method=method, reason="a straight line" if initial_guess is None else "given")
         return _solve_in_chain(task, asked, initial_guess).told(search=report.asked)
     if asked.method == "auto" and asked.options.continuation is not None:
         asked = replace(asked, method="ilqr", reason="a continuation is asked for")
@@ -270,10 +273,7 @@ class _Task:
         """Check that `attempt` can be made from the guess `given`; what is returned makes it."""
         problem, method = self.problem, attempt.method
         scheme = _check_attempt(problem, attempt)
-        if isinstance(problem, PhasedProblem):
-            return self._prepare_phases(problem, attempt, scheme, given)
-        guess = first_guess(problem, method, given, self.seed)
-        xs, us = guess.xs, guess.us
+        guesses = first_guesses(problem, method, given, self.seed)
         continuation = attempt.options.continuation
         if continuation is not None and problem.design.vector.parameters:
             given_too = "with parameters or a horizon"
@@ -287,29 +287,28 @@ class _Task:
             "tolerance": self.limits.tolerance,
             "seed": self.seed,
             "method_reason": attempt.reason,
-            "initial_guess": "default" if given is None else "given",
-            "initial_guess_sha256": sha256(xs.tobytes() + us.tobytes()).hexdigest(),
+            "initial_guess": "default" if self._is_default(given) else "given",
+            "initial_guess_sha256": sha256(b"".join(g.xs.tobytes() + g.us.tobytes() for g in guesses)).hexdigest(),
         }
+        if isinstance(problem, PhasedProblem):
+            options = {name: options[name] for name in ("initial_guess", "seed")}
         solver = attempt.options.solver or DEFAULT_SOLVERS[method]
         run = Run(problem, method, scheme, solver, limits, attempt.options, options, self.report, searched)
 
         def make() -> Solution:
             if method == "collocation":
-                search = partial(run.collocate, guess)
+                search = partial(run.collocate, guesses)
             elif method == "ilqr":
-                search = partial(run.sweep, guess, given=given is not None, stages=stages)
+                search = partial(run.sweep, guesses, given=given is not None, stages=stages)
             else:
-                search = partial(run.shoot, guess, given=given is not None)
-            return run.within_time(search, guess, self.begin)
+                search = partial(run.shoot, guesses, given=given is not None)
+            return run.within_time(search, guesses, self.begin)
 
         return make
 
-    def _prepare_phases(self, problem: PhasedProblem, attempt: Attempt, scheme: str, given: Any) -> Callable[[], Any]:
-        guesses = first_guesses(problem, given, self.seed)
-        options = {"initial_guess": "default" if self.report.asked.guess is None else "given", "seed": self.seed}
-        limits, asked = self._limits_of(attempt), attempt.options
-        run = PhasedRun(problem, "collocation", scheme, "ipopt", limits, asked, options, self.report)
-        return lambda: run.within_time(partial(run.collocate, guesses), guesses, self.begin)
+    def _is_default(self, given: Any) -> bool:
+        """Whether a search begins from the guess that is made where none is asked for; in phases, from any such."""
+        return (self.report.asked.guess if isinstance(self.problem, PhasedProblem) else given) is None
 
     def _limits_of(self, attempt: Attempt) -> Limits:
         """What is left for an attempt."""
@@ -326,7 +325,7 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Any:
     solutions: list[Any] = []
     chain: list[dict[str, str]] = []
     in_phases = isinstance(task.problem, PhasedProblem)
-    for attempt, guess in (_in_phases if in_phases else _attempts)(task.problem, asked, given, solutions):
+    for attempt, guess in _attempts(task.problem, asked, given, solutions):
         if solutions and task.is_late:
             chain.append({**attempt.told(in_phases), "ended": "not begun: time limit"})
             break
@@ -412,9 +411,9 @@ def _preference(solution: Solution) -> tuple[int, float, float]:
     return rank, 0.0 if solution.success else solution.defect + solution.goal_error, solution.cost
 
 
-def _attempts(problem: Problem, asked: Attempt, given: Any, solutions: list[Any]) -> Iterator[tuple[Attempt, Any]]:
+def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) -> Iterator[tuple[Attempt, Any]]:
     """What to try next and from which guess, by what the attempts before, in `solutions`, came to."""
-    if asked.method == "collocation":
+    if asked.method == "collocation" or isinstance(problem, PhasedProblem):
         yield asked, given
         yield from _other_guesses(problem, asked, given, solutions)
         yield from _kept_apart(problem, asked, solutions)
@@ -451,19 +450,6 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, solutions: list[Any]
         yield asked.by(after, "from the motion that iLQR found"), begun
 
 
-def _in_phases(
-    problem: PhasedProblem, asked: Attempt, given: Any, solutions: list[Any]
-) -> Iterator[tuple[Attempt, Any]]:
-    """Collocation of all phases from the guess, and where none is given from others, for as long as that may help."""
-    yield replace(asked, reason="a straight line" if given is None else "given"), given
-    options = asked.options
-    for number in range(1, options.other_guesses + 1) if given is None else ():
-        if not may_mend(solutions[-1], options.refine):
-            return
-        begun = other_guesses(problem, asked.seed, number)
-        yield replace(asked, reason=f"random {number}", max_iterations=options.other_iterations), begun
-
-
 def _in_continuous_time(
     problem: Problem, first: Attempt, given: Any, solutions: list[Solution]
 ) -> Iterator[tuple[Attempt, Any]]:
@@ -496,23 +482,36 @@ def _rolled_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
 
 
 def _other_guesses(
-    problem: Problem, attempt: Attempt, given: Any, solutions: list[Solution]
+    problem: Problem | PhasedProblem, attempt: Attempt, given: Any, solutions: list[Any]
 ) -> Iterator[tuple[Attempt, Any]]:
     """A collocation from other first guesses than a straight line, from which no motion was found."""
     if given is not None or attempt.options.solver == "snopt":
         return
     most = attempt.options.other_guesses
     for number in range(1, most + 1):
-        if solutions[-1].status not in NOT_FOUND:
+        if not _another_may_do(solutions[-1], attempt.options):
             return
         reason = f"no motion was found: {OTHER_GUESS} ({number} of {most})"
-        begun = another_guess(problem, attempt.seed, number)
+        if isinstance(problem, PhasedProblem):
+            reason = f"random {number}"
+        begun = other_guess(problem, attempt.seed, number)
         yield replace(attempt, reason=reason, max_iterations=attempt.options.other_iterations), begun
+
+
+def _another_may_do(solution: Solution, options: Options) -> bool:
+    """Whether nothing was found, or in phases a plan that no mesh made hold."""
+    in_phases = isinstance(solution, PhasedSolution)
+    if not in_phases or solution.status is not Status.CONVERGED_NOT_VERIFIED or options.refine is False:
+        return solution.status in NOT_FOUND
+    certificates = [*solution.certificates, *(c for phase in solution.phases for c in phase.certificates)]
+    return all(c.verdict == "agree" for c in certificates)
 
 
 def _kept_apart(problem: Problem, attempt: Attempt, solutions: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
     """A collocation whose links went through each other, from where it ended, with these kept apart."""
     last = solutions[-1]
+    if isinstance(problem, PhasedProblem):
+        return
     if attempt.options.solver == "snopt" or last.status is not Status.CONVERGED_NOT_VERIFIED or is_kept_apart(problem):
         return
     if overlaps(last):
@@ -548,7 +547,7 @@ def _check_attempt(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
     """The scheme, "step" of the discrete methods; refuses what the method cannot take, and what is another's."""
     method = attempt.method
     if isinstance(problem, PhasedProblem):
-        return check_phases(problem, method, attempt.options)
+        return _check_phases(problem, attempt)
     if problem.motion == CONTINUOUS:
         _check_motion(attempt)
     if method == "collocation":
@@ -610,7 +609,18 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
     return scheme
 
 
-def _check_scheme(problem: Problem, attempt: Attempt) -> str:
+def _check_phases(problem: PhasedProblem, attempt: Attempt) -> str:
+    if attempt.method != "collocation":
+        raise InputError("method", got=repr(attempt.method), expected='"auto" or "collocation" for a PhasedProblem')
+    if attempt.options.solver not in (None, "ipopt"):
+        raise InputError("solver", got=repr(attempt.options.solver), expected='"ipopt" for a PhasedProblem')
+    scheme = _check_scheme(problem, attempt)
+    if scheme == "drake":
+        raise InputError("scheme", got=repr(scheme), expected="another one for a PhasedProblem")
+    return scheme
+
+
+def _check_scheme(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
     scheme = attempt.options.scheme or default_scheme(problem)
     if scheme not in SCHEMES:
         raise UnknownNameError("scheme", got=scheme, known=[name for name in SCHEMES if name != MAP])

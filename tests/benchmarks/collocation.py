@@ -37,9 +37,10 @@ def ours(problem: dd.Problem, scheme: str) -> Row:
         np.zeros((problem.num_steps + 1, problem.nu)),
     )
     start = time.process_time()
-    motion = Transcription(problem, scheme).solve(guess, limits=LIMITS, report=None)
+    transcription = Transcription(problem, scheme)
+    motion = transcription.solve([transcription.begin(0, guess)], limits=LIMITS, report=None)
     seconds = time.process_time() - start
-    return seconds, motion.result.outcome.value, motion.cost, len(motion.result.iterations) - 1
+    return seconds, motion.result.outcome.value, motion.phases[0].cost, len(motion.result.iterations) - 1
 
 
 def verified(problem: dd.Problem, scheme: str) -> Row:

@@ -142,7 +142,7 @@ class Peer:
 @contextmanager
 def search_seconds() -> Iterator[list[float]]:
     """Adds up what transcribing and solving take, without certificates and measures."""
-    spent, own = [0.0], {name: getattr(Transcription, name) for name in ("__init__", "solve_on")}
+    spent, own = [0.0], {name: getattr(Transcription, name) for name in ("__init__", "_solve_on")}
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*given: Any, **named: Any) -> Any:

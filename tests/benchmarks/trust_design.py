@@ -61,7 +61,7 @@ def of_equations(random):
     )
     transcription = Transcription(problem, "hermite_simpson")
     xs, us = random.uniform(-1, 1, (2, model.nx)), random.uniform(-1, 1, (1, model.nu))
-    found = certify_equations(problem, transcription.jacobian, xs, us, transcription.task)[0]
+    found = certify_equations(problem, transcription.jacobian, xs, us, transcription.tasks[0])[0]
     return found, len(problem.parameters.names)
 
 

@@ -22,8 +22,7 @@ from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.transcription.collocation import Transcription
-from drake_diff.optimize.transcription.expressions import SymbolicPlant, trace
-from drake_diff.optimize.transcription.program import TranscribedProgram
+from drake_diff.optimize.transcription.expressions import PlantRates, trace
 
 pytestmark = pytest.mark.solve
 
@@ -126,40 +125,16 @@ def test_a_plants_expression_and_its_derivative_are_drakes(name):
         )
 
 
-def test_a_programs_hessian_takes_the_jacobian_of_its_own_knots():
-    """Against central differences, good to 1e-6 of the largest entry, and asked for in an order that no solver has."""
-    model = random_tree(1)
-    problem = dd.Problem(model, x0=np.zeros(model.nx), x_goal=np.full(model.nx, 0.1), num_steps=2)
-    transcription = Transcription(problem, "hermite_simpson")
-    program = TranscribedProgram(transcription.task, transcription.mesh, transcription.functions)
-    made, random = program.derivatives(exact=True), np.random.default_rng(2)
-    weights = random.standard_normal(program.num_links)
-
-    def slope(z):
-        return weights @ made["jac_g"](z, [])[1].full()
-
-    for z in random.uniform(-1, 1, (2, len(program.lower))):
-        wanted = np.triu(np.array([(slope(z + e) - slope(z - e)) / 2e-6 for e in 1e-6 * np.eye(len(z))]).T)
-        made["jac_g"](z + 1, [])
-        found = made["hess_lag"](z, [], 0.0, weights).full()
-        assert found == pytest.approx(wanted, abs=1e-6 * np.abs(wanted).max())
-
-
 def test_a_solve_computes_each_jacobian_once(monkeypatch):
     """The solver asks for Jacobian and Hessian at each iterate: as many as iterates, and the two it asks ahead."""
     model, calls = model_named("acrobot.xml"), []
-    compute = SymbolicPlant._compute
-
-    def counted(self, count):
-        evaluate = compute(self, count)
-        return lambda knots: (calls.append(count), evaluate(knots))[1]
-
-    monkeypatch.setattr(SymbolicPlant, "_compute", counted)
+    compute = PlantRates.jacobian
+    monkeypatch.setattr(PlantRates, "jacobian", lambda self, knots: (calls.append(len(knots)), compute(self, knots))[1])
     cost = dd.QuadraticCost(Q=np.eye(4), R=np.eye(1))
     problem = dd.Problem(model, x0=[0.5, 0, 0, 0], running_cost=cost, num_steps=10)
-    motion = Transcription(problem, "hermite_simpson").solve(
-        (np.zeros((11, 4)), np.zeros((11, 1))), limits=Limits(100, 10.0, 1e-8), report=None
-    )
+    transcription = Transcription(problem, "hermite_simpson")
+    begun = transcription.begin(0, (np.zeros((11, 4)), np.zeros((11, 1))))
+    motion = transcription.solve([begun], limits=Limits(100, 10.0, 1e-8), report=None)
     assert motion.result.outcome is Outcome.SOLVED
     assert motion.derivatives == EXACT
     assert set(calls) == {21}

@@ -16,8 +16,6 @@ from drake_diff.mechanics.casadi_tree import symbolic_plant
 from drake_diff.model.parameters import ParameterCoordinates, applied, select
 from drake_diff.optimize import Options
 from drake_diff.optimize.problem.dynamics import MovedDynamics, plant_dynamics
-from drake_diff.optimize.transcription.collocation import Transcription
-from drake_diff.optimize.transcription.program import TranscribedProgram
 
 pytestmark = pytest.mark.solve
 
@@ -78,44 +76,6 @@ def test_an_expression_of_parameters_and_its_derivatives_are_drakes(name):
         curves = by_casadi(at).full()
         found = plant.hessian(at, weights, plant.jacobian(at)).full()
         assert found == pytest.approx(curves, abs=1e-9 * max(1, np.abs(curves).max()))
-
-
-def test_a_programs_derivatives_by_parameters_and_horizon_are_those_of_casadi():
-    """The whole program's: parameters have one column each for all nodes, beside that of the horizon."""
-    model = named("cart_pole.urdf")
-    problem = dd.Problem(
-        model,
-        x0=np.zeros(4),
-        x_goal=[0.5, 0.2, 0, 0],
-        num_steps=3,
-        running_cost=EFFORT,
-        horizon=(0.5, 2.0),
-        optimize=BOTH,
-        parameters=("pole.mass", "cart.mass", "pole.center_of_mass"),
-        parameter_cost=lambda p: p[0] ** 3 + p[1] * p[2],
-        bounds=dd.Bounds(x_upper=[1, 2, 3, 4], u_upper=[5], u_lower=[-5]),
-    )
-    transcription = Transcription(problem, "hermite_simpson")
-    program = TranscribedProgram(transcription.task, transcription.mesh, transcription.functions)
-    made, random = program.derivatives(exact=True), np.random.default_rng(0)
-    z = random.uniform(0.5, 1, len(program.lower))
-    multipliers, step = random.standard_normal(program.nlp["g"].numel()), 1e-6
-
-    def lagrangian_slope(z):
-        jacobian = made["jac_g"](z, [])[1].full()
-        return 0.7 * made["grad_f"](z, [])[1].full().ravel() + multipliers @ jacobian
-
-    def of(function, z):
-        return np.asarray(function(z, [])[0]).ravel()
-
-    for function, rows in (("grad_f", made["grad_f"](z, [])[1].full().T), ("jac_g", made["jac_g"](z, [])[1].full())):
-        wanted = np.array(
-            [(of(made[function], z + e) - of(made[function], z - e)) / (2 * step) for e in step * np.eye(len(z))]
-        ).T
-        assert rows == pytest.approx(wanted, abs=1e-7 * max(1, np.abs(wanted).max()))
-    wanted = np.array([(lagrangian_slope(z + e) - lagrangian_slope(z - e)) / (2 * step) for e in step * np.eye(len(z))])
-    found = made["hess_lag"](z, [], 0.7, multipliers).full()
-    assert found == pytest.approx(np.triu(wanted), abs=1e-6 * np.abs(wanted).max())
 
 
 # ------------------------------------------------------------------------------ closed forms

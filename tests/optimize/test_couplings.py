@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from helpers.models import MODELS
@@ -10,8 +9,6 @@ from helpers.models import MODELS
 import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.optimize import Coupling, Options, Periodic
-from drake_diff.optimize.transcription.collocation import Transcription
-from drake_diff.optimize.transcription.program import TranscribedProgram
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 BLOCK = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -50,31 +47,6 @@ def test_a_spring_that_repeats_at_no_effort_does_so_in_its_own_period():
     assert solution.success, solution.message
     assert solution.horizon == pytest.approx(np.pi, abs=2e-5)  # of order 4 in 30 intervals: (0.2)^4 / 180 * pi / 2
     assert solution.cost < 1e-10
-
-
-@pytest.mark.parametrize("horizon", [1.0, (0.5, 2.0)])
-@pytest.mark.parametrize("scheme", ["hermite_simpson", "trapezoid"])
-def test_its_jacobian_and_hessian_are_those_of_casadi(scheme, horizon):
-    several = [
-        Coupling(lambda a, b, c: [a[0] * b[1] * c[0], b[0] ** 3], knots=(7, 2, -1), upper=[0.4, 1.0], name="states"),
-        Coupling(lambda a, b, u, w: np.sin(b[0]) * u[0] * w[0] - a[1], knots=(3, 9), lower=0.0, name="inputs"),
-        Periodic(M=[[0.0, 1.0]], offset=[0.3], entries=[0]),
-    ]
-    problem = dd.Problem(
-        BLOCK, x0=[0, 0], num_steps=10, horizon=horizon, running_cost=EFFORT, couplings=several, optimize=BOTH
-    )
-    transcription = Transcription(problem, scheme)
-    program = TranscribedProgram(transcription.task, transcription.mesh, transcription.functions)
-    assert transcription.functions.why_not == ""
-    own, z, g = program.derivatives(exact=True), program.z, program.nlp["g"]
-    weights = ca.MX.sym("weights", g.numel())
-    lagrangian = program.nlp["f"] + ca.dot(weights, g)
-    found = ca.Function("d", [z, weights], [ca.jacobian(g, z), ca.triu(ca.hessian(lagrangian, z)[0])])
-    random = np.random.default_rng(0)
-    at, weigh = random.uniform(0.5, 1.5, z.numel()), random.standard_normal(g.numel())
-    jacobian, hessian = found(at, weigh)
-    assert np.max(np.abs(np.asarray(own["jac_g"](at, [])[1] - jacobian))) < 1e-12
-    assert np.max(np.abs(np.asarray(own["hess_lag"](at, [], 1.0, weigh) - hessian))) < 1e-12
 
 
 def test_what_cannot_be_traced_is_called_back():

@@ -25,8 +25,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
+from drake_diff.optimize.knots import Traced, trace
 from drake_diff.optimize.problem.goals import AIMED
-from drake_diff.optimize.transcription.expressions import Symbolic, trace
 
 pytestmark = pytest.mark.solve
 
@@ -267,12 +267,14 @@ def check_symbols(model, states, random):
     knots = np.hstack([states, np.zeros((len(states), model.nu))])
     for f in quantities_of(model, random):
         wanted = np.array([f(x) for x in states])
-        function = Symbolic(trace(lambda x, u, f=f: f(x), model.nx, knots, wanted))  # values to 1e-10, or it refuses
+        function = Traced(trace(lambda x, u, f=f: f(x), model.nx, knots, wanted))  # values to 1e-10, or it refuses
         constraint = dd.Constraint(f, lower=0.0)
         for x, knot in zip(states, knots, strict=True):
             jacobian = constraint.differentiate(x, knot[model.nx :])[1]
             largest = max(1.0, np.max(np.abs(jacobian)))
-            np.testing.assert_allclose(function.jacobian_of(knot), jacobian, rtol=0, atol=1e-12 * largest)  # rounding
+            np.testing.assert_allclose(
+                function.linearize(knot[None])[1][0], jacobian, rtol=0, atol=1e-12 * largest
+            )  # rounding
             way = random.standard_normal(model.nx)
             slope = (f(x + 1e-6 * way) - f(x - 1e-6 * way)) / 2e-6
             # Central differences of 1e-6 leave 1e-16 / 1e-6 of rounding and 1e-12 of curvature.
@@ -320,9 +322,9 @@ def test_half_a_turn_away_is_no_gap_in_the_derivatives(pendulum):
     """From hanging to upright is half a turn, where a rotation's axis may have either sign."""
     f = dd.quantities.frame_rotation_error(pendulum, "pole", np.diag([-1.0, 1.0, -1.0]))
     probe = np.array([[0.3, 0, 0.0], [1.0, 0, 0], [2.0, 0, 0]])
-    function = Symbolic(trace(lambda x, u: f(x), 2, probe, np.array([f(k[:2]) for k in probe])))
+    function = Traced(trace(lambda x, u: f(x), 2, probe, np.array([f(k[:2]) for k in probe])))
     at = np.zeros(3)
-    assert np.all(np.isfinite(function.jacobian_of(at)))
+    assert np.all(np.isfinite(function.linearize(at[None])[1][0]))
     np.testing.assert_allclose(np.linalg.norm(f(at[:2])), 2.0, rtol=1e-12)
 
 

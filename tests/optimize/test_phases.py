@@ -148,41 +148,6 @@ def test_a_reset_without_an_expression_is_differentiated_too():
     assert solution.phases[-1].xs[-1, 0] == pytest.approx(0.64, rel=1e-6)
 
 
-def test_the_program_has_the_derivatives_of_its_differences():
-    """Jacobian and Hessian of phases, resets and durations together, against central differences."""
-    from drake_diff.optimize.transcription.collocation import Transcription
-    from drake_diff.optimize.transcription.coupled import PhasedProgram, link_functions
-    from drake_diff.optimize.transcription.program import TranscribedProgram
-
-    step = gait().phases[0]
-    step = dd.Problem(
-        step.system, x0=step.x0, num_steps=2, horizon=(2, 5), running_cost=step.running_cost,
-        optimize=("controls", "initial_state"),
-    )  # fmt: skip
-    problem = dd.optimize.PhasedProblem([step, step], resets=[heel_strike], periodic=heel_strike, horizon=(5, 9))
-    parts = [Transcription(phase, "hermite_simpson") for phase in problem.phases]
-    programs = [TranscribedProgram(t.task, t.mesh, t.functions) for t in parts]
-    program = PhasedProgram(problem, programs, link_functions(problem))
-    functions = program.derivatives(exact=True)
-    random = np.random.default_rng(3)
-    z, h = random.uniform(0.2, 0.6, len(program.lower)), 1e-5
-    multipliers = random.standard_normal(len(program.sides[0]))
-
-    def rows(z):
-        return np.asarray(functions["jac_g"](z, [])[0]).ravel()
-
-    def slope(z):
-        gradient = np.asarray(functions["grad_f"](z, [])[1]).ravel()
-        return gradient + np.asarray(functions["jac_g"](z, [])[1].full()).T @ multipliers
-
-    every = np.eye(len(z))
-    differences = np.array([(rows(z + h * e) - rows(z - h * e)) / (2 * h) for e in every]).T
-    np.testing.assert_allclose(functions["jac_g"](z, [])[1].full(), differences, atol=1e-8)  # O(h^2) and rounding / h
-    hessian = np.asarray(functions["hess_lag"](z, [], 1.0, multipliers).full())
-    differences = np.array([(slope(z + h * e) - slope(z - h * e)) / (2 * h) for e in every])
-    np.testing.assert_allclose(hessian + np.triu(hessian, 1).T, differences, atol=1e-7)
-
-
 def rejudged(solution, phases):
     """The same with other phases, judged as after a solver that says it found a solution."""
     result = NlpResult(np.zeros(0), Outcome.SOLVED, "IPOPT: Solve Succeeded", ())

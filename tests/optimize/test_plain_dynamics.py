@@ -155,12 +155,12 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
     swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
     problem = dd.Problem(swing, x0=[0, 0], x_goal=[np.pi, 0], num_steps=4, horizon=2.0, running_cost=EFFORT)
     coarse = dd.solve(problem, options=Options(refine=False))
-    honest = Transcription.solve_on
+    honest = Transcription._solve_on
 
     def fails_later(outcome):
-        def solve_on(self, mesh, *arguments, **named):
-            found = honest(self, mesh, *arguments, **named)
-            if len(mesh) == 5:
+        def solve_on(self, begun, *arguments, **named):
+            found = honest(self, begun, *arguments, **named)
+            if len(begun[0].mesh) == 5:
                 return found
             return dataclasses.replace(found, result=dataclasses.replace(found.result, outcome=outcome))
 
@@ -168,7 +168,7 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
 
     for outcome in (Outcome.INFEASIBLE, Outcome.TIME_LIMIT, Outcome.INTERRUPTED):
         with monkeypatch.context() as patched:
-            patched.setattr(Transcription, "solve_on", fails_later(outcome))
+            patched.setattr(Transcription, "_solve_on", fails_later(outcome))
             solution = dd.solve(problem, options=Options(refine=refine), method="collocation", time_limit=60)
         np.testing.assert_array_equal(solution.xs, coarse.xs)
         if outcome is Outcome.INFEASIBLE:

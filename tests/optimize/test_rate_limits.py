@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from helpers.models import MODELS
@@ -11,8 +10,6 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.optimize import InputRate, Jerk
-from drake_diff.optimize.transcription.collocation import Transcription
-from drake_diff.optimize.transcription.program import TranscribedProgram
 
 pytestmark = pytest.mark.solve
 
@@ -37,34 +34,6 @@ def test_the_least_time_from_rest_to_rest_is_that_of_the_s_curve(way, limit):
     assert solution.success
     assert solution.horizon == pytest.approx(wanted, rel=1e-3)  # its switches are not at the knots of 40 intervals
     assert solution.horizon > wanted * (1 - 1e-6)
-
-
-@pytest.mark.slow
-@each_row("scheme", ["hermite_simpson", "trapezoid", "drake"])
-@each_row("horizon", [None, (0.3, 2.0)])
-def test_rows_of_rates_have_the_derivatives_of_differences(scheme, horizon):
-    model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.05)
-    limits = [Jerk({"elbow": 80.0}, name="elbow"), InputRate(50.0), Jerk(100.0)]
-    cost = dd.QuadraticCost(R=np.eye(2))
-    problem = dd.Problem(model, x0=np.zeros(4), num_steps=6, horizon=horizon, running_cost=cost, couplings=limits)
-    transcription = Transcription(problem, scheme)
-    program = TranscribedProgram(transcription.task, transcription.mesh, transcription.functions)
-    own = program.derivatives(exact=True)
-    random = np.random.default_rng(0)
-    z, step = random.uniform(0.3, 1.0, program.z.numel()), 1e-6
-    weigh = random.standard_normal(program.nlp["g"].numel())
-
-    def rows(z):
-        return np.asarray(own["jac_g"](z, [])[0]).ravel()
-
-    def pulled(z):
-        return np.asarray(own["jac_g"](z, [])[1]).T @ weigh
-
-    jacobian, hessian = np.asarray(own["jac_g"](z, [])[1]), own["hess_lag"](z, [], 0.0, weigh)
-    hessian = np.asarray(ca.triu2symm(hessian))
-    for found, f in ((jacobian, rows), (hessian, pulled)):
-        wanted = np.array([(f(z + step * e) - f(z - step * e)) / (2 * step) for e in np.eye(len(z))]).T
-        assert np.max(np.abs(found - wanted)) < 1e-8 * np.max(np.abs(wanted))  # of central differences
 
 
 @pytest.mark.slow

@@ -73,47 +73,19 @@ def everything(**changes):
 JOINED = {"trajectory_cost": lambda xs, us: xs[3, 0] * xs[9, 1] + us[2, 0] ** 3}
 
 
-@pytest.mark.parametrize("changes", [{}, JOINED], ids=["plain", "trajectory_cost"])
-def test_every_derivative_of_the_program_is_its_difference(changes):
-    """Differences of 1e-6 leave 1e-8 or so; steps do not lead from state to state, as in the midst of a search."""
-    program, random = steps.StepProgram(everything(**changes)), np.random.default_rng(0)
-    z = program.pack(0.3 * random.standard_normal((31, 2)), 0.3 * random.standard_normal((30, 1)))
-    multipliers, sigma = random.standard_normal(len(program.sides[0])), np.array([0.7])
-
-    def both(z):
-        cost, rows = program._values(z)
-        return np.append(rows, cost)
-
-    def slope(z):
-        rows = np.array(program._jacobian(z, None)[1])
-        return sigma[0] * program._gradient(z, None)[1] + multipliers @ rows
-
-    columns = 1e-6 * np.eye(len(z))
-    differences = np.array([(both(z + d) - both(z - d)) / 2e-6 for d in columns]).T
-    np.testing.assert_allclose(np.array(program._jacobian(z, None)[1]), differences[:-1], rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(program._gradient(z, None)[1], differences[-1], rtol=1e-6, atol=1e-6)
-    if not changes:
-        upper = np.array(program._hessian(z, None, sigma, multipliers)[0])
-        curvature = np.array([(slope(z + d) - slope(z - d)) / 2e-6 for d in columns])
-        found = upper + upper.T - np.diag(np.diag(upper))
-        cut = np.zeros(len(z), dtype=bool)
-        cut[program.states_at[-1]] = True  # a final cost's curvature is cut where it is negative
-        np.testing.assert_allclose(found[~cut][:, ~cut], curvature[~cut][:, ~cut], rtol=1e-4, atol=1e-4)
-
-
 @pytest.mark.parametrize("error", [GradientError, SimulationError])
 def test_a_point_without_a_derivative_is_a_step_that_was_too_long(monkeypatch, error):
     """A swing-up whose trial points go faster than guess and optimum ever do: halfway there derivatives end."""
-    true, limit, fastest = steps.StepProgram._steps, [np.inf], []
+    true, limit, fastest = steps.Steps.along, [np.inf], []
 
-    def some(self, z):
-        found = true(self, z)
-        fastest.append(np.abs(z[self.states_at][:, 1]).max())
+    def some(self, points):
+        found = true(self, points)
+        fastest.append(np.abs(points[:, 1]).max())
         if fastest[-1] > limit[0]:
             raise error("no derivative here")
         return found
 
-    monkeypatch.setattr(steps.StepProgram, "_steps", some)
+    monkeypatch.setattr(steps.Steps, "along", some)
     problem = pendulum(num_steps=60)
     random = np.random.default_rng(0)
     guess = np.zeros((61, 2)), 5 * random.standard_normal((60, 1))
@@ -131,7 +103,7 @@ def test_a_guess_without_a_derivative_is_the_end(monkeypatch):
     def none(self, z):
         raise GradientError("no derivative here")
 
-    monkeypatch.setattr(steps.StepProgram, "_steps", none)
+    monkeypatch.setattr(steps.Steps, "along", none)
     guess, limits = (np.zeros((11, 2)), np.zeros((10, 1))), Limits(50, 60.0, 1e-8)
     with pytest.raises(GradientError, match="no derivative here"):
         steps.solve_shooting(pendulum(num_steps=10), *guess, limits=limits, report=None)

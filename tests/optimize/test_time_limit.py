@@ -133,13 +133,13 @@ def test_no_other_method_is_begun_after_the_limit(monkeypatch):
 
 def test_no_iteration_is_begun_that_would_end_after_the_limit(monkeypatch):
     """A derivative by thousands of variables takes seconds, and nothing can interrupt it."""
-    clock, real, each = stopped(monkeypatch), steps.StepProgram._hessian, 3.0
+    clock, real, each = stopped(monkeypatch), steps.StepProgram.hessian, 3.0
 
     def slow(self, *at):
         clock.now += each
         return real(self, *at)
 
-    monkeypatch.setattr(steps.StepProgram, "_hessian", slow)
+    monkeypatch.setattr(steps.StepProgram, "hessian", slow)
     begun = clock.now
     found = dd.solve(swing(), method="shooting", time_limit=10.0, options=Options(tolerance=1e-14))
     assert found.status is STATUS

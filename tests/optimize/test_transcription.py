@@ -9,14 +9,13 @@ import dataclasses
 import itertools
 import math
 
-import casadi as ca
 import numpy as np
 import pytest
 from helpers.models import MODELS, random_state
 from helpers.plants import block, floating
 from helpers.solving import solve_with
 from helpers.table import each_row
-from helpers.transcription import BLOCK, collocate, effort, heavy_pendulum, move, own_derivatives, push, unit_inputs
+from helpers.transcription import BLOCK, collocate, effort, heavy_pendulum, move, push, unit_inputs
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.tree import QuaternionFloatingJoint
 
@@ -26,8 +25,7 @@ from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import collocated
-from drake_diff.optimize.transcription.expressions import knot_functions
-from drake_diff.optimize.transcription.program import TranscribedProgram
+from drake_diff.optimize.transcription.nodes import TranscribedProgram
 from drake_diff.optimize.transcription.task import SCHEMES as SCHEMES_OF
 
 pytestmark = pytest.mark.solve
@@ -186,7 +184,7 @@ def test_a_bound_holds_between_the_nodes_wherever_they_lie(count, scheme):
 
 def at_nodes_alone(monkeypatch):
     """A solver that keeps bounds at the nodes alone, as all did."""
-    monkeypatch.setattr(TranscribedProgram, "_add_linear", lambda *_: None)
+    monkeypatch.setattr(TranscribedProgram, "_add_inputs", lambda *_: None)
     for name, scheme in SCHEMES_OF.items():
         none = np.zeros((0, scheme.nodes + 1))
         monkeypatch.setitem(SCHEMES_OF, name, dataclasses.replace(scheme, hull_states=none, hull_slopes=none))
@@ -417,54 +415,6 @@ def test_what_cannot_be_is_infeasible():
 
 
 # ------------------------------------------------------------------------------ derivatives
-
-
-@each_row("scheme", SCHEMES)
-@each_row("horizon", [2.0, (1.0, 3.0)])
-@each_row("form", ["symbolic", "called"])
-def test_the_programs_derivatives_are_differences(scheme, horizon, form):
-    """Gradient and Jacobian of its values, Hessian of theirs, with every kind of term; errors of differences 1e-7."""
-    pendulum = heavy_pendulum(0.1)
-    keep = dd.Constraint(lambda x, u: np.array([x[0] * u[0], x[1] ** 3]), upper=[9, 9])
-    motion = collocate(
-        pendulum if form == "symbolic" else Dynamics(own_derivatives(pendulum), 2, 1),
-        x0=[0, 0],
-        x_goal=[np.pi, np.nan],
-        num_steps=5,
-        horizon=horizon,
-        running_cost=lambda x, u: u[0] ** 2 * np.cos(x[1]),
-        final_cost=lambda x: np.sin(x[1]) * x[0] ** 2,
-        constraints=[keep, dataclasses.replace(keep, knots=[2, -1])],
-        waypoints={3: [np.nan, 1.0]},
-        scheme=scheme,
-        max_iterations=3,
-        time_limit=9.0,
-        tolerance=1e-9,
-    )
-    task = motion.transcribed.task
-    program = TranscribedProgram(task, motion.transcribed.mesh, knot_functions(task))
-    made, rng = program.derivatives(exact=form == "symbolic"), np.random.default_rng(0)
-    z, steps = rng.uniform(0.5, 2, len(program.lower)), 1e-6 * np.eye(len(program.lower))
-
-    def differences(f):
-        return np.array([(f(z + e) - f(z - e)) / 2e-6 for e in steps]).T
-
-    plain = ca.Function("plain", [program.nlp["x"]], [program.nlp["f"], program.nlp["g"]])
-    (f, gradient), (g, jacobian) = made["grad_f"](z, []), made["jac_g"](z, [])
-    assert float(f) == float(plain(z)[0])
-    assert np.array_equal(g.full(), plain(z)[1].full())
-    assert gradient.full().ravel() == pytest.approx(differences(lambda z: float(plain(z)[0])), abs=1e-6)
-    assert jacobian.full() == pytest.approx(differences(lambda z: plain(z)[1].full().ravel()), abs=1e-6)
-    assert jacobian.nnz() < 0.5 * jacobian.numel()
-    assert bool(program.functions.why_not) == (form == "called")
-    if form == "symbolic":
-        sigma, weights = 0.7, rng.standard_normal(jacobian.shape[0])
-
-        def slope(z):
-            return sigma * made["grad_f"](z, [])[1].full().ravel() + weights @ made["jac_g"](z, [])[1].full()
-
-        hessian = made["hess_lag"](z, [], sigma, weights).full()
-        assert hessian == pytest.approx(np.triu(differences(slope)), abs=1e-6)
 
 
 @each_row("name", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "floating"])

@@ -31,7 +31,6 @@ from drake_diff._base import files
 from drake_diff._base.clock import check_time
 from drake_diff.exceptions import ArtifactError, InputError, ModelError
 from drake_diff.logs.mcap_file import read_mcap
-from drake_diff.optimize import phased
 from drake_diff.optimize import run as optimize_run
 from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.panels import run_panel
@@ -46,12 +45,12 @@ pytestmark = pytest.mark.solve
 OLD, NEW = 0.2, 0.3  # the goals of the two runs
 SEARCHES = {
     "collocation": (Transcription, "solve"),
-    "in phases": (phased.PhasedTranscription, "solve"),
+    "in phases": (Transcription, "solve"),
     "shooting": (optimize_run, "solve_shooting"),
 }
 BUILT = {
     "collocation": "optimize.run.Transcription",
-    "in phases": "optimize.phased.PhasedTranscription",
+    "in phases": "optimize.run.Transcription",
     "ilqr": "optimize.run.certify_steps",
 }
 

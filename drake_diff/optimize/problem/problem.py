@@ -283,6 +283,11 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """[s] the model's time step; for plain dynamics an interval of `start_horizon`."""
         return self.system.time_step if isinstance(self.system, Model) else self.start_horizon / self.num_steps
 
+    @property
+    def phases(self) -> tuple["Problem", ...]:
+        """Itself: a problem that is not a `PhasedProblem` is one phase."""
+        return (self,)
+
     @cached_property
     def kept(self) -> tuple[Constraint, ...]:
         """All that a motion has to keep beside its bounds: the constraints, and those that the goals come to."""

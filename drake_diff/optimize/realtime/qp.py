@@ -22,7 +22,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.derivatives.steps import Flags
 from drake_diff.exceptions import GradientError
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
-from drake_diff.optimize.knots import KnotFunction
+from drake_diff.optimize.knots import PointFunction
 
 ACCURATE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 50}
 # The second is slower and solves what the first may not, whose numbers differ widely.
@@ -37,7 +37,7 @@ class Limits:
     """Rows lower <= f(z) <= upper at the K knots from `first` on, infinite where there is no limit."""
 
     labels: tuple[str, ...]  # (m,)
-    function: KnotFunction
+    function: PointFunction
     first: int
     lower: Array  # (K, m)
     upper: Array
@@ -48,7 +48,7 @@ class Limits:
 
     @classmethod
     def unpriced(
-        cls, labels: tuple[str, ...], function: KnotFunction, first: int, lower: Array, upper: Array
+        cls, labels: tuple[str, ...], function: PointFunction, first: int, lower: Array, upper: Array
     ) -> "Limits":
         """At prices of 1."""
         has_lower, has_upper = (np.any(np.isfinite(side), axis=0) for side in (lower, upper))

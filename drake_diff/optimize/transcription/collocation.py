@@ -6,6 +6,7 @@
 too coarse for the best input, only a finer one tells.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,10 +20,11 @@ from drake_diff.optimize.options import Options
 from drake_diff.optimize.problem.coupling import RateLimit
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearances
+from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.lead import Lead
-from drake_diff.optimize.transcription.task import OptimalControl
+from drake_diff.optimize.transcription.task import OptimalControl, Scheme
 
 SLOPED = np.linspace(0, 1, 11)  # where slopes are looked at within an interval, its ends among them
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
@@ -33,7 +35,6 @@ ACCURATE = 1e-4  # of an interval, in the states' units
 SMALLEST_ERROR = 1e-12  # of an interval: rounding, which no finer mesh makes less
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
-MEASURED = ("_integrated", "_rates", "_held", "_open_loop")  # of a motion, whatever is told about it
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +171,20 @@ class Collocated:
     def at(self, times: Any) -> tuple[Array, Array]:
         """xs (S, nx) and us (S, nu) at `times` (S,) [s] by the scheme's own polynomials."""
         return self.between(*self._place(np.asarray(times, dtype=float) / self.horizon))
+
+    def on(self, mesh: Array, task: OptimalControl) -> Array:
+        """(K, nx + nu) the motion at the nodes of a mesh in the scheme of `task`, inputs within its bounds."""
+        return task.within(np.hstack(self.at(self.horizon * task.scheme.node_fractions(mesh))))
+
+    @property
+    def worst(self) -> Array:
+        """(N,) the larger of `errors` and `cost_errors`."""
+        return np.maximum(self.errors, self.cost_errors)
+
+    @property
+    def largest_error(self) -> float:
+        """Of an interval and of its part of the cost."""
+        return float(np.max(self.worst))
 
     @property
     def rates(self) -> Array:
@@ -344,34 +359,52 @@ class Collocated:
 
 
 @dataclass(frozen=True, eq=False)
-class Transcribed(Collocated):
-    """What a solver found, and how it ended; `refinements` are (intervals, largest error) of each round."""
+class Transcribed:
+    """The motions of all phases that a solver came to, and how it ended."""
 
+    phases: tuple[Collocated, ...]
     result: NlpResult
     derivatives: str  # where the solver's came from, and why there is no Hessian where there is none
-    refinements: tuple[tuple[int, float], ...] = ()
-    cleared: tuple[tuple[int, float], ...] = ()  # the same, with what was lacking of a margin [m]; empty if nothing was
+    refinements: tuple[tuple[float, ...], ...] = ()  # of each round, see `row`
+    cleared: tuple[tuple[int, float], ...] = ()  # intervals, and what was lacking of a margin [m]; empty if nothing was
 
     @property
     def count(self) -> int:
-        """How many intervals there are."""
-        return len(self.mesh) - 1
+        """How many intervals there are in all."""
+        return sum(len(phase.mesh) - 1 for phase in self.phases)
 
     @property
-    def row(self) -> tuple[int, float]:
-        """What `refinements` say of it."""
-        return self.count, self.largest_error
+    def row(self) -> tuple[float, ...]:
+        """The number of intervals and the largest error, in phases the numbers of intervals."""
+        if len(self.phases) == 1:
+            return self.count, self.largest_error
+        return tuple(len(phase.mesh) - 1 for phase in self.phases)
 
     @property
     def largest_error(self) -> float:
         """Of an interval and of its part of the cost."""
-        return float(np.max(_worst(self)))
+        return max(phase.largest_error for phase in self.phases)
 
-    def told(self, **fields: Any) -> "Transcribed":
-        """With other words about the same motion, and what was measured of it."""
-        transcribed = replace(self, **fields)
-        vars(transcribed).update({name: value for name, value in vars(self).items() if name in MEASURED})
-        return transcribed
+
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """Where a search of one phase begins: nodes (K, nx + nu) on a mesh, a duration [s] and parameters (np,).
+
+    `multipliers` are those of a plan there; nodes on a line are `far` from a motion.
+    """
+
+    mesh: Array
+    nodes: Array
+    horizon: float
+    parameters: Array | None = None
+    multipliers: Multipliers | None = None
+    far: bool = False
+
+    def on(self, mesh: Array, scheme: Scheme) -> "Begun":
+        """The same on another mesh."""
+        these, then = scheme.node_fractions(mesh), scheme.node_fractions(self.mesh)
+        nodes = np.array([np.interp(these, then, column) for column in self.nodes.T]).T
+        return replace(self, mesh=mesh, nodes=nodes, multipliers=None)
 
 
 def _finite(values: Array) -> Array:
@@ -406,138 +439,133 @@ def collocated(
 
 
 class Transcription:
-    """A `Problem` in a scheme, on its own `num_steps` equal intervals to begin with."""
+    """A problem in a scheme, its phases on their own `num_steps` equal intervals to begin with."""
 
-    def __init__(self, problem: Problem, scheme: str):
+    def __init__(self, problem: Problem | PhasedProblem, scheme: str):
         from drake_diff.optimize.transcription.expressions import knot_functions  # loads CasADi
+        from drake_diff.optimize.transcription.nodes import link_functions
 
-        self.problem, self.task = problem, OptimalControl(problem, scheme)
-        self.mesh = np.linspace(0, 1, problem.num_steps + 1)
-        self.functions = knot_functions(self.task)
+        self.problem: Any = problem
+        self.tasks = [OptimalControl(phase, scheme) for phase in problem.phases]
+        self.functions = [knot_functions(task) for task in self.tasks]
+        self.links = link_functions(problem)
 
-    def jacobian(self, knot: Array, k: int = 0) -> Array:
-        """(nx, nx + nu) of the rates at `knot` (nx + nu,), or of a map's step `k`, as the solver gets it.
+    def jacobian(self, knot: Array, k: int = 0, phase: int = 0) -> Array:
+        """(nx, nx + nu) of a phase's rates at `knot` (nx + nu,), or of a map's step `k`, as the solver gets it.
 
         A knot has the coordinates of parameters where they are optimized."""
-        return np.asarray(self.functions.dynamics.jacobian_of(knot, k))
+        f = self.functions[phase].dynamics
+        return np.asarray(getattr(f, "functions", [f] * (k + 1))[k].linearize(knot[None])[1][0])
 
-    def nodes_at(self, mesh: Array, guess: Any) -> Array:
-        """(K, nx + nu) the nodes of a guess, xs (N+1, nx) and us (N+1, nu) or a motion, within the input's bounds."""
-        f, where = self.task.dynamics, self.task.scheme.node_fractions(mesh)
+    def begin(self, phase: int, guess: Any, *, horizon: float | None = None, mesh: Any = None, **more: Any) -> Begun:
+        """Where a phase begins, inputs within bounds: at xs (N+1, nx), us (N+1, nu) on a mesh, or along a motion."""
+        task = self.tasks[phase]
+        mesh = np.linspace(0, 1, task.problem.num_steps + 1) if mesh is None else mesh
         if isinstance(guess, Collocated):
-            nodes = np.hstack(guess.at(guess.horizon * where))
+            nodes = guess.on(mesh, task)
         else:
-            nodes = np.array([np.interp(where, mesh, column) for column in np.hstack(guess).T]).T
-        nodes[:, f.nx :] = np.clip(nodes[:, f.nx :], self.task.bounds.u_lower, self.task.bounds.u_upper)
-        return nodes
+            where = task.scheme.node_fractions(mesh)
+            nodes = task.within(np.array([np.interp(where, mesh, column) for column in np.hstack(guess).T]).T)
+        first = task.problem.start_horizon if horizon is None else horizon
+        return Begun(mesh, nodes, float(np.clip(first, *task.horizon)), **more)
+
+    def program(self, meshes: Sequence[Array] | None = None) -> Any:
+        """The `TranscribedProgram` of the phases on meshes, on their own intervals where None."""
+        from drake_diff.optimize.transcription.nodes import Phase, TranscribedProgram
+
+        if meshes is None:
+            meshes = [np.linspace(0, 1, task.problem.num_steps + 1) for task in self.tasks]
+        phases = [Phase(*parts) for parts in zip(self.tasks, meshes, self.functions, strict=True)]
+        return TranscribedProgram(phases, self.problem if isinstance(self.problem, PhasedProblem) else None, self.links)
 
     def solve(
-        self,
-        guess: Any,
-        *,
-        horizon: float | None = None,
-        limits: Limits,
-        report: Report | None,
-        refinement: Options | None = None,
-        parameters: Array | None = None,
-        mesh: Array | None = None,
-        multipliers: Multipliers | None = None,
-        far: bool = False,
+        self, begun: Sequence[Begun], *, limits: Limits, report: Report | None, refinement: Options | None = None
     ) -> Transcribed:
-        """From a guess that `nodes_at` takes, and of `horizon` [s]; `limits.max_iterations` hold for each round.
+        """From where each phase begins; `limits.max_iterations` hold for each round.
 
-        Parameters that are optimized start at `parameters` (np,), at the problem's own where None. The first mesh is
-        the problem's own where none is given; `multipliers` are those of the guess on it. A guess that is a line is
-        `far` from a motion.
-
-        A refinement splits the intervals whose error is above its tolerance and solves again from what was found.
+        A `refinement` splits the intervals whose error is above its tolerance and solves again from what was found.
         Intervals that come nearer to an obstacle than a plan may are split in any case, up to CLEARANCE_ROUNDS times.
         """
-        start, mesh = now(), self.mesh if mesh is None else mesh
-        coarse = mesh
-        first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
-        begun = self.nodes_at(mesh, guess)
-        motion = self.solve_on(mesh, begun, first, limits, report, parameters, multipliers, far=far)
+        start, motion = now(), self._solve_on(begun, limits, report)
         if motion.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):  # there is no time to measure it
             return motion
-        tolerance, most = np.inf, MOST_INTERVALS
+        tolerance, most, left = np.inf, MOST_INTERVALS, math.inf
         if refinement is not None:
             tolerance, most = refinement.error_tolerance, refinement.max_num_steps
-        rounds, near = [(len(mesh) - 1, motion.largest_error)], [_nearer(motion)]
-        while motion.result.outcome in FOUND:
-            (count, error), lacking = rounds[-1], near[-1] if len(near) <= CLEARANCE_ROUNDS else np.zeros(1)
-            if error <= tolerance and not np.any(lacking > 0):
+            left = math.inf if len(self.tasks) == 1 else refinement.mesh_rounds
+        rounds, near = [motion.row], [[_nearer(phase) for phase in motion.phases]]
+        while motion.result.outcome in FOUND and len(rounds) <= left:
+            error, count = motion.largest_error, motion.count
+            lacking = near[-1] if len(near) <= CLEARANCE_ROUNDS else [np.zeros(1)] * len(near[-1])
+            if error <= tolerance and not any(np.any(short > 0) for short in lacking):
                 break
-            entered = bool(np.max(lacking) > _largest_margin(self.problem))
-            mesh = _split(motion, tolerance, np.ones_like(lacking) if entered else lacking)
-            missing = f"{in_words(float(np.max(lacking)), 'm')} too near to an obstacle"
+            entered = any(np.max(s) > _largest_margin(t.problem) for s, t in zip(lacking, self.tasks, strict=True))
+            wanted = [np.ones_like(short) if entered else short for short in lacking]
+            meshes = [_split(phase, tolerance, s) for phase, s in zip(motion.phases, wanted, strict=True)]
+            missing = f"{in_words(float(max(np.max(short) for short in lacking)), 'm')} too near to an obstacle"
             reason = f"error {error:.2g}" if error > tolerance else missing
-            if len(mesh) - 1 > most:
+            if max(len(mesh) for mesh in meshes) - 1 > most:
                 reason = f"{reason} still, with {count} intervals: raise max_num_steps"
-                motion = motion.told(result=replace(motion.result, note=reason))
+                motion = replace(motion, result=replace(motion.result, note=reason))
                 break
             if report is not None:
-                report.say(f"{reason} with {count} intervals: refined to {len(mesh) - 1}")
-            left, last = _left(limits, start), motion
-            if entered:  # what goes through an obstacle is no place to go on from
-                these, then = (self.task.scheme.node_fractions(grid) for grid in (mesh, coarse))
-                nodes = np.array([np.interp(these, then, column) for column in begun.T]).T
-                motion = self.solve_on(mesh, nodes, first, left, report, parameters, far=far)
-            else:
-                values = motion.task.parameters
-                motion = self.solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report, values)
+                report.say(f"{reason} with {count} intervals: refined to {sum(len(mesh) - 1 for mesh in meshes)}")
+            # What goes through an obstacle is no place to go on from.
+            again = [b.on(m, t.scheme) for b, m, t in zip(begun, meshes, self.tasks, strict=True)] if entered else None
+            last, motion = motion, self._solve_on(again or _from(motion, meshes), _left(limits, start), report)
             if motion.result.outcome not in FOUND and not entered:
                 motion = kept(last, motion)
                 break
-            rounds.append((len(mesh) - 1, motion.largest_error))
-            near.append(_nearer(motion))
-        cleared = tuple((count, float(np.max(shortfalls))) for (count, _), shortfalls in zip(rounds, near, strict=True))
-        return motion.told(refinements=tuple(rounds), cleared=cleared if np.any(near[0] > 0) else ())
+            rounds.append(motion.row)
+            near.append([_nearer(phase) for phase in motion.phases])
+        worst = [max(float(np.max(short)) for short in shortfalls) for shortfalls in near]
+        cleared = [(int(row[0]), short) for row, short in zip(rounds, worst, strict=True)]
+        return replace(motion, refinements=tuple(rounds), cleared=tuple(cleared) if worst[0] > 0 else ())
 
     def finer(
-        self, motion: Transcribed, exceeded: Sequence[int], most: int, limits: Limits, report: Report | None
-    ) -> Transcribed | None:
-        """The problem on a mesh with the coarsest intervals of `motion` split, those `exceeded` among them.
-
-        None where that has more than `most` intervals.
-        """
-        mesh = finer_mesh(motion, exceeded, most)
-        if mesh is None:
-            return None
-        if report is not None:
-            report.say(f"what is found does not hold with {len(motion.mesh) - 1} intervals: refined to {len(mesh) - 1}")
-        values = motion.task.parameters
-        return self.solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, limits, report, values)
-
-    def solve_on(
         self,
-        mesh: Array,
-        nodes: Array,
-        horizon: float,
+        motion: Transcribed,
+        exceeded: Sequence[Sequence[int] | None],
+        most: int,
         limits: Limits,
         report: Report | None,
-        parameters: Array | None = None,
-        multipliers: Multipliers | None = None,
-        *,
-        far: bool = False,
-    ) -> Transcribed:
-        """IPOPT on one mesh, from `nodes` (K, nx + nu), `horizon` [s] and `parameters` (np,), the problem's if None.
+    ) -> Transcribed | None:
+        """The problem on meshes with the coarsest intervals of `motion` split, those `exceeded` among them.
 
-        These may be `far` from a motion: a line. For `multipliers` see `solve_program`.
+        A phase for which these are None keeps its mesh. None where one has more than `most` intervals then.
         """
-        from drake_diff.optimize.transcription.program import FAR, TranscribedProgram
+        pairs = list(zip(motion.phases, exceeded, strict=True))
+        meshes = [phase.mesh if beyond is None else finer_mesh(phase, beyond, most) for phase, beyond in pairs]
+        finer = [mesh for mesh in meshes if mesh is not None]
+        if len(finer) < len(meshes):
+            return None
+        if report is not None:
+            counts = [sum(len(mesh) - 1 for mesh in grids) for grids in ([p.mesh for p in motion.phases], finer)]
+            report.say(f"what is found does not hold with {counts[0]} intervals: refined to {counts[1]}")
+        return self._solve_on(_from(motion, finer), limits, report)
 
-        program = TranscribedProgram(self.task, mesh, self.functions)
-        moved = None if parameters is None else self.task.at(self._inside(parameters)).coordinates
-        guess = program.pack(nodes, horizon, moved)
-        more = FAR if far and program.free else None
-        result, derivatives = solve_program(program, guess, limits, report, multipliers, more)
-        solution_nodes, horizon = program.unpack(result.z)
-        task = self.task.at(program.parameter_values(result.z)) if self.task.varied else self.task
-        return Transcribed(task, frozen(mesh), frozen(solution_nodes), horizon, result, derivatives)
+    def _solve_on(self, begun: Sequence[Begun], limits: Limits, report: Report | None) -> Transcribed:
+        """IPOPT on meshes."""
+        from drake_diff.optimize.transcription.program import FAR
 
-    def _inside(self, values: Array) -> Array:
-        return np.clip(values, *self.problem.bounds_of_parameters())
+        program = self.program([b.mesh for b in begun])
+        guess = np.concatenate(
+            [phase.pack(b.nodes, b.horizon, b.parameters) for phase, b in zip(program.phases, begun, strict=True)]
+        )
+        more = FAR if begun[0].far and len(begun) == 1 and program.phases[0].free else None
+        result, derivatives = solve_program(program, guess, limits, report, begun[0].multipliers, more)
+        motions = []
+        for phase in program.phases:
+            (nodes, horizon), task = phase.unpack(result.z), phase.task
+            task = task.at(phase.parameters(result.z)) if task.varied else task
+            motions.append(Collocated(task, frozen(phase.mesh), frozen(np.array(nodes)), horizon))
+        return Transcribed(tuple(motions), result, derivatives)
+
+
+def _from(motion: Transcribed, meshes: Sequence[Array]) -> list[Begun]:
+    """Where a search on other meshes begins."""
+    pairs = zip(motion.phases, meshes, strict=True)
+    return [Begun(mesh, p.on(mesh, p.task), p.horizon, np.asarray(p.task.parameters)) for p, mesh in pairs]
 
 
 def solve_program(
@@ -554,10 +582,9 @@ def solve_program(
     """
     from drake_diff.optimize.transcription.program import NOT_FINITE, solve_ipopt
 
-    why, start = program.functions.why_not, now()
+    why, start = program.why_not, now()
     derivatives = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-    sizes = len(program.lower), len(program.sides[0])
-    begun = multipliers if multipliers and multipliers.sizes == sizes else None
+    begun = multipliers if multipliers and multipliers.sizes == (program.size, len(program.sides[0])) else None
     options: dict[str, Any] = {"more": more, "motions": program.iterates}
     result = solve_ipopt(program, guess, limits, report, exact=not why, begun=begun, **options)
     if begun and result.outcome not in (*FOUND, Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
@@ -571,7 +598,7 @@ def solve_program(
     return result, derivatives
 
 
-def finer_mesh(motion: Transcribed, exceeded: Sequence[int], most: int) -> Array | None:
+def finer_mesh(motion: Collocated, exceeded: Sequence[int], most: int) -> Array | None:
     """The mesh of `motion` with its coarsest intervals split, those `exceeded` among them.
 
     Where a jerk is limited and the motion is accurate, those `exceeded` alone: the jerk is beyond its limit where it
@@ -592,23 +619,19 @@ def _left(limits: Limits, start: float) -> Limits:
     return replace(limits, time_limit=max(0.0, limits.time_limit - (now() - start)))
 
 
-def kept(last: Any, failed: Any) -> Any:
+def kept(last: Transcribed, failed: Transcribed) -> Transcribed:
     """The last motion that was found, with a note on the finer mesh on which none was.
 
     Where that was cut short, by Ctrl-C or by the time limit, the whole search was: where it leads is not known.
     """
     if failed.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
-        return last.told(result=replace(failed.result, z=last.result.z))
+        return replace(last, result=replace(failed.result, z=last.result.z))
     failure = f"on {failed.count} intervals no motion was found ({failed.result.message})"
     note = f"{failure}: that on {last.count} is kept"
-    return last.told(result=replace(last.result, note="; ".join(filter(None, (last.result.note, note)))))
+    return replace(last, result=replace(last.result, note="; ".join(filter(None, (last.result.note, note)))))
 
 
-def _worst(motion: Transcribed) -> Array:
-    return np.maximum(motion.errors, motion.cost_errors)
-
-
-def _nearer(motion: Transcribed) -> Array:
+def _nearer(motion: Collocated) -> Array:
     """(N,) [m] how much more than its tolerance each interval lacks of a margin, 0 where nothing does."""
     lacking = np.zeros(len(motion.mesh) - 1)
     for c in clearances(motion.task.problem.kept):
@@ -622,12 +645,12 @@ def _largest_margin(problem: Problem) -> float:
     return max((c.margin for c in clearances(problem.kept)), default=0.0)
 
 
-def _split(motion: Transcribed, tolerance: float, lacking: Array) -> Array:
+def _split(motion: Collocated, tolerance: float, lacking: Array) -> Array:
     """The mesh with intervals above the tolerance in as many pieces as the scheme's order asks for, at most 4.
 
     Those that come too near to an obstacle, by `lacking`, at least in two.
     """
-    errors = _worst(motion)
+    errors = motion.worst
     wanted = (errors / tolerance) ** (1 / (motion.task.scheme.order + 1))
     pieces = np.where(errors > tolerance, np.clip(np.ceil(wanted), 2, MOST_PIECES), 1).astype(int)
     near = lacking > 0

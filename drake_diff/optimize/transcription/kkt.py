@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -24,7 +24,8 @@ from drake_diff.exceptions import GradientError
 from drake_diff.model.parameters import Parameters, applied, select
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Multipliers
-from drake_diff.optimize.transcription.program import Program
+from drake_diff.optimize.transcription.nodes import TranscribedProgram
+from drake_diff.optimize.transcription.steps import StepProgram
 
 NEAR_BOUND = 1e-4  # of max(1, |bound|): a value this near may lie on it: an interior point method leaves sqrt(mu)
 WEAK = 1e-4  # of the cost's largest slope: a smaller multiplier may hold nothing
@@ -62,23 +63,7 @@ class Change:
         yield replace(problem, x0=state) if first else replace(problem, x_goal=state)
 
 
-class KnotProgram(Program, Protocol):
-    """A program whose variables have names; the knots' states (N+1, nx) and inputs (M, nu) are at these places in it.
-
-    `horizon_at` is where a free horizon is, in `horizon_unit`s [s].
-    """
-
-    horizon_at: int | None
-    horizon_unit: float
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def states_at(self) -> Indices: ...
-
-    @property
-    def inputs_at(self) -> Indices: ...
+KnotProgram = TranscribedProgram | StepProgram
 
 
 @dataclass(frozen=True, eq=False)

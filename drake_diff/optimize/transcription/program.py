@@ -1,25 +1,26 @@
-"""Optimal control by collocation as a sparse program, its exact derivatives, and IPOPT, which CasADi carries, on it.
+"""A sparse program made of functions at many points, its exact derivatives, and IPOPT, which CasADi carries, on it.
 
-With the rates F and their Jacobians J at all nodes, each computed once, the rest is linear in them:
+With z the variables, F_i the values of a function at points that are entries of z, and A, D_i, E_i constant and sparse,
 
-    g = S z - T D F,    dg = S - T D J,    d^2 (lambda' g) = -T sum_k d^2 (nu_k' f),    nu = D' lambda
+    [f; g] = A z + sum_i (D_i + z_t E_i) F_i(z),
 
-with constant sparse S and D from the scheme's states and slopes, so that the Hessian has one block a node, and a column
-for a free final time T. The Bernstein coefficients of bounded states are rows of the same form, those of bounded inputs
-linear ones. Path constraints add rows to g and terms to the blocks of their nodes, couplings between them.
+where z_t may be a duration. Jacobians J_i and Hessians H_i are computed point by point, all points of a function in one
+call, and summed up: the weights of F_i in the Lagrangian's second derivative are (D_i + z_t E_i)' [sigma; lambda].
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy import sparse
 
-from drake_diff._base.arrays import Array, Indices, frozen
+from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.clock import Pace, StoppedError, TimeIsUpError, check_time, noted_interrupts, now, until_set
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
+from drake_diff.optimize.knots import PointFunction
 from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,
     Iterate,
@@ -31,9 +32,6 @@ from drake_diff.optimize.program import (
     Report,
     Watch,
 )
-from drake_diff.optimize.transcription.coupled import SlopeRows, SparseSum, rows_of, slopes_of, sparse
-from drake_diff.optimize.transcription.expressions import KnotFunctions, Timed
-from drake_diff.optimize.transcription.task import OptimalControl
 
 OUTCOMES = {
     "Solve_Succeeded": Outcome.SOLVED,
@@ -52,6 +50,7 @@ OPTIONS = {
     "print_time": False,
     "show_eval_warnings": False,
     "calc_lam_p": False,
+    "no_nlp_grad": True,  # CasADi makes no derivatives of what is called back
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.print_user_options": "no",
@@ -69,332 +68,277 @@ BEGUN = {
 NOT_FINITE = "IPOPT: Invalid Number Detected"
 
 
-class TranscribedProgram:
-    """The program of an `OptimalControl` on a mesh (N+1,) of fractions of the horizon: z = [nodes row by row, c, T].
+COST = -1  # the row of the cost
 
-    c (np,) are the coordinates of parameters that are optimized.
+
+class Term:
+    """A function at points whose entries are z[columns], columns (K, width), and the rows that its values go into."""
+
+    def __init__(self, function: PointFunction, columns: Indices, time_at: int | None, time: float):
+        self.function, self.columns, self.time_at, self.time = function, columns, time_at, time
+        self._entries: dict[bool, list[Any]] = {False: [], True: []}
+
+    def weigh(self, rows: Any, places: Any, weights: Any, *, by_time: bool = False) -> None:
+        """Add to `rows` what `weights` make of the values at `places`, counted point by point; times the duration."""
+        timed = by_time and self.time_at is not None
+        weights = weights * self.time if by_time and not timed else weights
+        self._entries[timed].append([a.ravel() for a in np.broadcast_arrays(rows, places, weights)])
+
+    def matrix(self, count: int, *, by_time: bool) -> Any:
+        """(1 + count, K m) the weights, row 0 those of the cost; None where there are none."""
+        if not self._entries[by_time]:
+            return None
+        rows, places, weights = (np.concatenate(parts) for parts in zip(*self._entries[by_time], strict=True))
+        shape = 1 + count, len(self.columns) * self.function.rows
+        matrix = sparse.csr_matrix((weights, (rows + 1, places)), shape=shape)
+        matrix.eliminate_zeros()
+        return matrix
+
+
+class BlockProgram:
+    """A program that grows by `add`, `add_rows` and `add_linear` until it is first evaluated; see the module.
+
+    An error of the kinds `backs_off` makes an evaluation NaN, from which a search backs off: `refusals` counts them and
+    `refusal` is the last. The first other one is `error`, which ends the search. `why_not` says why there is no exact
+    Hessian.
     """
 
-    def __init__(self, task: OptimalControl, mesh: Array, functions: KnotFunctions):
-        self.task, self.mesh, self.functions = task, mesh, functions
-        self.nx, self.width = task.dynamics.nx, task.dynamics.nx + task.dynamics.nu
-        self.weights = task.scheme.node_weights(mesh)
-        self.every = np.arange(len(self.weights))
-        self.free = int(task.horizon[0] < task.horizon[1])
-        self.first_parameter = self.every.size * self.width  # where in z they are
-        limits = zip(task.node_limits(mesh), task.coordinate_limits(), task.horizon, strict=True)
-        self.lower, self.upper = (np.concatenate([a.ravel(), c, [time] * self.free]) for a, c, time in limits)
-        self.z = ca.MX.sym("z", len(self.lower))
-        self.knots = ca.reshape(self.z[: self.first_parameter], self.width, self.every.size)
-        self.parameters = self.z[self.first_parameter : self.first_parameter + len(task.coordinates)]
-        tails = ca.repmat(self.parameters, 1, self.every.size)
-        self.moved = ca.vertcat(self.knots, tails) if task.varied else self.knots
-        self.time = self.z[-1] if self.free else ca.MX(task.horizon[0])
-        paths = zip(functions.paths, task.problem.kept, strict=True)
-        self.paths = [(f, task.nodes_of(constraint, mesh), constraint) for f, constraint in paths]
-        couplings = zip(task.couplings, functions.joined, strict=True)
-        knots = task.nodes_at(range(task.problem.num_steps + 1), mesh)
-        self.coupled = [rows_of(c, function, knots, self.nx, self.width) for c, function in couplings]
-        self.slopes = [slopes_of(limit, task, mesh) for limit in task.problem.rate_limits]
-        times = task.horizon[0] * task.scheme.node_fractions(mesh)  # of a cost that changes in time, which fixes it
-        self.rate = functions.rate.at(times) if isinstance(functions.rate, Timed) else functions.rate
-        self.rates, self.costs = functions.dynamics.values(self.moved), self.rate.values(self.knots)
-        self.rate_rows, self.cost_rows = functions.dynamics.jacobian(self.moved), self.rate.jacobian(self.knots)
-        self._set_links()
-        self.horizon_at, self.horizon_unit = len(self.lower) - 1 if self.free else None, 1.0
+    why_not = ""
+    backs_off: tuple[type[Exception], ...] = ()
 
-    @property
-    def states_at(self) -> Indices:
-        """(N+1, nx) where the states at the knots are in z."""
-        return self.every[:: self.task.scheme.nodes, None] * self.width + np.arange(self.nx)
+    def __init__(self, lower: Array, upper: Array):
+        self.lower, self.upper, self.size = lower, upper, len(lower)
+        self.terms: list[Term] = []
+        self.error: Exception | None = None
+        self.refusals, self.refusal = 0, ""
+        self.z = ca.MX.sym("z", self.size)
+        self._sides: list[tuple[Array, Array]] = []
+        self._linear: list[Any] = []
+        self._at, self._known = b"", dict[str, Any]()
+        self._callbacks: list[Any] = []  # CasADi holds no reference to its callbacks
 
-    @property
-    def inputs_at(self) -> Indices:
-        """(N+1, nu)"""
-        return self.every[:: self.task.scheme.nodes, None] * self.width + np.arange(self.nx, self.width)
+    def add(self, function: PointFunction, columns: Indices, time_at: int | None = None, time: float = 1.0) -> Term:
+        """A function at points of z; `time_at` is where in z the duration is that `by_time` multiplies with."""
+        self.terms.append(Term(function, np.asarray(columns), time_at, time))
+        return self.terms[-1]
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """(n,) of the variables."""
-        names = (*self.task.dynamics.state_names, *self.task.dynamics.input_names)
-        others = self.task.problem.parameters.names if self.task.varied else ()
-        return (*[f"{name} at node {k}" for k in self.every for name in names], *others, *["horizon"] * self.free)
+    def add_rows(self, lower: Array, upper: Array) -> Indices:
+        """The numbers of new rows."""
+        first = sum(len(side) for side, _ in self._sides)
+        self._sides.append((lower, upper))
+        return np.arange(first, first + len(lower))
 
-    def iterates(self, z: Array) -> tuple[Iterate, ...]:
-        """The motion at z, for callbacks."""
-        problem = self.task.problem
-        vector = problem.parameters.at(self.parameter_values(z)) if self.task.varied else problem.parameters
-        times = frozen(self.unpack(z)[1] * self.mesh)
-        xs, us = frozen(z[self.states_at]), frozen(z[self.inputs_at[:-1]])
-        return (Iterate(problem, times, xs, us, vector, by_steps=False),)
-
-    def pack(self, nodes: Array, horizon: float, coordinates: Array | None = None) -> Array:
-        """The decision variables of `nodes` (K, nx + nu), `horizon` [s] and `coordinates` (np,), the task's if None."""
-        values = self.task.coordinates if coordinates is None else coordinates
-        return np.concatenate([nodes.ravel(), values, [horizon] * self.free])
-
-    def parameter_values(self, z: Array) -> Array:
-        """The values (np,) of the problem's parameters at the decision variables."""
-        moved = self.task.varied
-        if moved is None:
-            return self.task.parameters
-        c = z[self.first_parameter : self.first_parameter + len(self.task.coordinates)]
-        return np.clip(moved.coordinates.to_values(c), *self.task.problem.bounds_of_parameters())
-
-    def column(self, node: Any, columns: Any) -> Any:
-        """Where in z the entries `columns` of a knot [x, u, c] at `node` are."""
-        return np.where(columns < self.width, node * self.width + columns, self.first_parameter + columns - self.width)
-
-    def unpack(self, z: Array) -> tuple[Array, float]:
-        """The nodes (K, nx + nu) and the horizon [s] of the decision variables."""
-        nodes = z[: self.every.size * self.width].reshape(-1, self.width)
-        return nodes, float(z[-1]) if self.free else self.task.horizon[0]
+    def add_linear(self, rows: Any, columns: Any, weights: Any) -> None:
+        """Add `weights` times z[columns] to rows."""
+        self._linear.append([a.ravel() for a in np.broadcast_arrays(rows, columns, weights)])
 
     @cached_property
     def sides(self) -> tuple[Array, Array]:
-        """(lower, upper) of g: 0 for the defects, each path constraint's own, node by node, and each coupling's."""
-        parts = [(b.lower, b.upper) for b in self._links]
-        parts += [(np.tile(c.lower, len(nodes)), np.tile(c.upper, len(nodes))) for _, nodes, c in self.paths]
-        parts += [*(c.sides for c in self.coupled), *(c.sides for c in self.slopes), self._linear_sides]
-        lower, upper = zip(*parts, strict=True)
+        """(lower, upper) of the rows."""
+        lower, upper = zip(*self._sides, strict=True) if self._sides else ((np.zeros(0),), (np.zeros(0),))
         return np.concatenate(lower), np.concatenate(upper)
 
     @cached_property
-    def _slope_weights(self) -> list[Any]:
-        """Sparse, of the rates of all nodes or of z."""
-        sizes = {True: self.every.size * self.nx, False: self.z.numel()}
-        return [sparse(*c.entries, (c.count, sizes[c.of_rates])) for c in self.slopes]
+    def _weights(self) -> list[tuple[Any, Any]]:
+        count = len(self.sides[0])
+        return [(term.matrix(count, by_time=False), term.matrix(count, by_time=True)) for term in self.terms]
+
+    @cached_property
+    def _of_linear(self) -> tuple[Indices, Indices, Array]:
+        parts = self._linear or [[np.zeros(0, dtype=int)] * 2 + [np.zeros(0)]]
+        rows, columns, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
+        nonzero = weights != 0
+        return rows[nonzero] + 1, columns[nonzero], weights[nonzero]
+
+    def _once(self, z: Array, name: str, make: Callable[[Term, Array], Array]) -> list[Array]:
+        """What `make` gives of each term at its points, computed once for each z."""
+        key = z.tobytes()
+        if key != self._at:
+            self._at, self._known = key, {}
+        if name not in self._known:
+            self._known[name] = [make(term, z[term.columns]) for term in self.terms]
+        values: list[Array] = self._known[name]
+        return values
+
+    def _values(self, z: Array) -> list[Array]:
+        return self._once(z, "values", lambda term, points: np.asarray(term.function.values(points)))
+
+    def _slopes(self, z: Array) -> list[Array]:
+        return self._once(z, "slopes", lambda term, points: np.asarray(term.function.jacobian(points)))
+
+    def evaluate(self, z: Array) -> tuple[float, Array]:
+        """The cost and the rows (m,) at z (n,)."""
+        rows, columns, weights = self._of_linear
+        total = np.bincount(rows, weights * z[columns], 1 + len(self.sides[0]))
+        for term, (plain, timed), values in zip(self.terms, self._weights, self._values(z), strict=True):
+            if plain is not None:
+                total += plain @ values.ravel()
+            if timed is not None:
+                total += z[term.time_at] * (timed @ values.ravel())
+        return float(total[0]), total[1:]
+
+    def gradient(self, z: Array) -> tuple[float, Array]:
+        """The cost and its gradient (n,)."""
+        return self.evaluate(z)[0], self._jacobian_at[0] @ self._jacobian_parts(z)
+
+    def jacobian(self, z: Array) -> Array:
+        """The nonzeros of the rows' Jacobian, where `jac_g` of `derivatives` has them."""
+        return np.asarray(self._jacobian_at[1].matrix @ self._jacobian_parts(z))
+
+    def _jacobian_parts(self, z: Array) -> Array:
+        """What the entries of the Jacobian are sums of: 1, and for each term what it adds to it."""
+        parts = [np.ones(1)]
+        of_terms = zip(self.terms, self._weights, self._values(z), self._slopes(z), strict=True)
+        for term, (plain, timed), values, slopes in of_terms:
+            parts += [slopes.ravel()] * (plain is not None)
+            parts += [z[term.time_at] * slopes.ravel(), values.ravel()] if timed is not None else []
+        return np.concatenate(parts)
+
+    @cached_property
+    def _jacobian_at(self) -> tuple[Any, "_Sums"]:
+        """Of the gradient and of the Jacobian."""
+        rows, columns, weights = self._of_linear
+        entries, first = [(rows, columns, weights, np.zeros(len(rows), dtype=int))], 1
+        for term, (plain, timed) in zip(self.terms, self._weights, strict=True):
+            value_rows, point_columns = term.function.jacobian_at
+            values = (np.arange(len(term.columns))[:, None] * term.function.rows + value_rows).ravel()
+            where, ones = term.columns[:, point_columns].ravel(), np.ones(len(values))
+            count = len(term.columns) * term.function.rows
+            spread = sparse.csr_matrix((ones, (values, np.arange(len(values)))), shape=(count, len(values)))
+            for weight in (plain, timed):
+                if weight is not None:
+                    by = (weight @ spread).tocoo()
+                    entries.append((by.row, where[by.col], by.data, first + by.col))
+                    first += len(values)
+            if timed is not None:
+                by = timed.tocoo()
+                entries.append((by.row, np.full(by.nnz, term.time_at), by.data, first + by.col))
+                first += count
+        rows, columns, weights, sources = (np.concatenate(part) for part in zip(*entries, strict=True))
+        cost = rows == 0
+        gradient = sparse.csr_matrix((weights[cost], (columns[cost], sources[cost])), shape=(self.size, first))
+        shape, others = (len(self.sides[0]), self.size), ~cost
+        return gradient, _Sums(rows[others] - 1, columns[others], weights[others], sources[others], first, shape)
+
+    def hessian(self, z: Array, sigma: float, multipliers: Array) -> Array:
+        """The nonzeros of the upper triangle of d^2 (sigma f + multipliers' g) / dz^2."""
+        pushed, parts = np.concatenate([[sigma], multipliers]), []
+        for term, (plain, timed), slopes in zip(self.terms, self._weights, self._slopes(z), strict=True):
+            f, shape = term.function, (len(term.columns), term.function.rows)
+            weights = np.zeros(shape) if plain is None else (plain.T @ pushed).reshape(shape)
+            if timed is not None:
+                by_time = (timed.T @ pushed).reshape(shape)
+                weights = weights + z[term.time_at] * by_time
+                parts.append((by_time[:, f.jacobian_at[0]] * slopes).ravel())
+            parts.append(f.hessian(z[term.columns], weights, slopes).ravel())
+        return np.asarray(self._hessian_at.matrix @ np.concatenate(parts))
+
+    @cached_property
+    def _hessian_at(self) -> "_Sums":
+        ends: list[Any] = []
+        for term, (_, timed) in zip(self.terms, self._weights, strict=True):
+            if timed is not None:
+                columns = term.columns[:, term.function.jacobian_at[1]].ravel()
+                ends.append((columns, np.full(len(columns), term.time_at)))
+            ends.append(tuple(term.columns[:, side].ravel() for side in term.function.hessian_at))
+        first, other = (np.concatenate(part) for part in zip(*ends, strict=True))
+        rows, columns, count = np.minimum(first, other), np.maximum(first, other), len(first)
+        return _Sums(rows, columns, np.ones(count), np.arange(count), count, (self.size, self.size))
 
     @cached_property
     def nlp(self) -> dict[str, Any]:
         """x, f and g as CasADi's nlpsol takes them."""
-        f = self.time * ca.dot(self.costs, ca.DM(self.weights).T)
-        if self.functions.final is not None:
-            f += self.functions.final.values(self.knots[:, -1])
-        if self.functions.parameters is not None:
-            f += self.functions.parameters.values(self.parameters)
-        g = [ca.mtimes(self._S, self.z) - self.time * ca.mtimes(self._D, ca.vec(self.rates))]
-        g += [ca.vec(f.values(self.knots[:, nodes.tolist()])) for f, nodes, _ in self.paths]
-        g += [c.values(self.z) for c in self.coupled]
-        for c, weights in zip(self.slopes, self._slope_weights, strict=True):
-            g.append(ca.mtimes(weights, ca.vec(self.rates) if c.of_rates else self.z))
-            g[-1] += ca.DM(c.by_time) * self.time if self.free else 0
-        if self._linear is not None:
-            g.append(ca.mtimes(self._linear, self.z))
-        return {"x": self.z, "f": f, "g": ca.vertcat(*g)}
+        dense = [ca.Sparsity.dense(1, 1), ca.Sparsity.dense(len(self.sides[0]), 1)]
+        f, g = self._callback("values", [self.size], dense, self.evaluate)(self.z)
+        return {"x": self.z, "f": f, "g": g}
 
-    def derivatives(self, exact: bool) -> dict[str, Any]:
+    def derivatives(self, exact: bool = True) -> dict[str, Any]:
         """CasADi Functions by the names of nlpsol's options, "hess_lag" only where `exact`."""
-        pace, p, sigma = Pace(), ca.MX.sym("p", 0), ca.MX.sym("sigma")
-        multipliers = ca.MX.sym("multipliers", self.nlp["g"].numel())
+        n, m, pace = self.size, len(self.sides[0]), Pace()
+        scalar, vector, rows = (ca.Sparsity.dense(count, 1) for count in (1, n, m))
+
+        def jacobian(z: Array) -> tuple[Array, Array]:
+            return self.evaluate(z)[1], self.jacobian(z)
+
+        def hessian(z: Array, sigma: Array, multipliers: Array) -> tuple[Array]:
+            return (self.hessian(z, float(sigma[0]), multipliers),)
+
         pace.go_on()
-        functions = {"grad_f": ca.Function("grad_f", [self.z, p], [self.nlp["f"], self._gradient()])}
+        functions = {
+            "grad_f": self._callback("grad_f", [n, 0], [scalar, vector], self.gradient),
+            "jac_g": self._callback("jac_g", [n, 0], [rows, self._jacobian_at[1].sparsity], jacobian),
+        }
         pace.go_on()
-        functions["jac_g"] = ca.Function("jac_g", [self.z, p], [self.nlp["g"], self._jacobian()])
         if exact:
-            pace.go_on()
-            hessian = self._hessian(sigma, multipliers)
-            pace.go_on()
-            functions["hess_lag"] = ca.Function("hess_lag", [self.z, p, sigma, multipliers], [hessian])
+            functions["hess_lag"] = self._callback("hess_lag", [n, 0, 1, m], [self._hessian_at.sparsity], hessian)
+        pace.go_on()
         return functions
 
-    def _set_links(self) -> None:
-        """The defects and the Bernstein coefficients of bounded states, and those of bounded inputs."""
-        scheme, b = self.task.scheme, self.task.bounds
-        bounded = np.flatnonzero((np.isfinite(b.x_lower) | np.isfinite(b.x_upper)) & (b.x_lower < b.x_upper))
-        defects = _Links(self, 0, scheme.states, scheme.slopes, np.arange(self.nx))
-        hull = _Links(self, defects.count, scheme.hull_states, scheme.hull_slopes, bounded)
-        hull.set_limits(b.x_lower[bounded], b.x_upper[bounded])
-        self._relax_what_is_given(hull)
-        self._links, self.num_links = (defects, hull), defects.count + hull.count
-        rows, columns, states, slopes, rates = (
-            np.concatenate([np.broadcast_to(getattr(link, name), link.rows.shape).ravel() for link in self._links])
-            for name in ("rows", "columns", "state", "slope", "rates")
-        )
-        self._S = sparse(rows, columns, states, (self.num_links, self.z.numel()))
-        self._D = sparse(rows, rates, slopes, (self.num_links, self.every.size * self.nx))
-        self._linear: Any = None
-        self._linear_sides = np.zeros(0), np.zeros(0)
-        inputs = np.arange(self.task.dynamics.nu)
-        if scheme.input_is_linear:  # 2 u_mid - u_0 - u_1 = 0 in all intervals
-            self._add_linear(inputs, (2.0, -1.0, -1.0), np.zeros(len(inputs)), np.zeros(len(inputs)))
-        elif scheme.nodes == 2:  # the parabola's inner Bernstein coefficient
-            free = (np.isfinite(b.u_lower) | np.isfinite(b.u_upper)) & (b.u_lower < b.u_upper)
-            self._add_linear(inputs[free], (2.0, -0.5, -0.5), b.u_lower[free], b.u_upper[free])
+    def _callback(self, name: str, sizes: list[int], outputs: list[Any], evaluate: Callable[..., Any]) -> Any:
+        self._callbacks.append(_Callback(name, sizes, outputs, evaluate, self))
+        return self._callbacks[-1]
 
-    def _add_linear(self, inputs: Indices, weights: tuple[float, float, float], lower: Array, upper: Array) -> None:
-        """Rows that keep each interval's weighted sum of the `inputs` at its middle, start and end within limits."""
-        if not len(inputs):
-            return
-        middle = np.arange(1, self.every.size, 2)[:, None] * self.width + self.nx + inputs
-        rows = np.arange(middle.size).reshape(middle.shape)
-        columns = np.stack([middle, middle - self.width, middle + self.width])
-        values = np.array(weights)[:, None, None]
-        self._linear = sparse(rows, columns, values, (middle.size, self.z.numel()))
-        self._linear_sides = np.tile(lower, len(middle)), np.tile(upper, len(middle))
 
-    def _relax_what_is_given(self, hull: "_Links") -> None:
-        """No limit for a coefficient of given numbers alone: nothing that is searched for can keep it."""
-        count = self.every.size * self.width
-        lower, upper = (side[:count].reshape(-1, self.width) for side in (self.lower, self.upper))
-        rows, columns = self.functions.dynamics.jacobian_at
-        moved = slice(count, count + len(self.task.coordinates))
-        for node in (0, self.every[-1]):
-            given = np.append(lower[node] == upper[node], self.lower[moved] == self.upper[moved])
-            for position, state in enumerate(hull.each):
-                if given[state] and np.all(given[columns[rows == state]]):
-                    indices = hull.rows[(hull.node == node) & (hull.state[:, 0] != 0), position] - hull.first
-                    hull.lower[indices], hull.upper[indices] = -np.inf, np.inf
+class _Sums:
+    """A sparse matrix, its nonzeros column by column `matrix` (nonzeros, sources) times a vector of sources."""
 
-    def _gradient(self) -> Any:
-        total, last = SparseSum((self.z.numel(), 1)), self.every[-1:]
-        b = _Blocks(self.rate.jacobian_at, self.every, self.width)
-        total.add(b.column, 0, self.weights[b.node], self.time * self.cost_rows, b.index)
-        if self.free:
-            total.add(self.z.numel() - 1, 0, self.weights, ca.vec(self.costs), self.every)
-        if self.functions.final is not None:
-            b = _Blocks(self.functions.final.jacobian_at, last, self.width)
-            total.add(b.column, 0, 1.0, self.functions.final.jacobian(self.knots[:, -1]), b.index)
-        if self.functions.parameters is not None:
-            parameter_cost = self.functions.parameters
-            places = self.first_parameter + parameter_cost.jacobian_at[1]
-            total.add(places, 0, 1.0, parameter_cost.jacobian(self.parameters), np.arange(len(places)))
-        return ca.densify(total.matrix())
+    def __init__(
+        self, rows: Indices, columns: Indices, weights: Array, sources: Indices, count: int, shape: tuple[int, int]
+    ):
+        places, targets = np.unique(columns * shape[0] + rows, return_inverse=True)
+        across, down = np.divmod(places, max(shape[0], 1))
+        starts = np.searchsorted(across, np.arange(shape[1] + 1))
+        self.sparsity = ca.Sparsity(*shape, starts.tolist(), down.tolist())
+        self.matrix = sparse.csr_matrix((weights, (targets, sources)), shape=(len(places), count))
 
-    def _jacobian(self) -> Any:
-        f, total = self.functions.dynamics, SparseSum((self.nlp["g"].numel(), self.z.numel()))
-        rows, columns = f.jacobian_at
-        for links in self._links:
-            total.add(links.rows, links.columns, links.state, ca.DM(1), 0)
-            positions = np.full(self.nx, -1)
-            positions[links.each] = np.arange(len(links.each))
-            entries = np.flatnonzero(positions[rows] >= 0)
-            index = links.node[:, None] * len(rows) + entries
-            targets = (
-                links.starts[:, None] + positions[rows[entries]],
-                self.column(links.node[:, None], columns[entries]),
-            )
-            total.add(*targets, -links.slope, self.time * self.rate_rows, index)
-            if self.free:
-                total.add(links.rows, self.z.numel() - 1, -links.slope, ca.vec(self.rates), links.rates)
-        first = self.num_links
-        for path, nodes, _ in self.paths:
-            b = _Blocks(path.jacobian_at, nodes, self.width)
-            source = path.jacobian(self.knots[:, nodes.tolist()])
-            total.add(first + b.place * path.rows + b.rows, b.column, 1.0, source, b.index)
-            first += path.rows * len(nodes)
-        for c in self.coupled:
-            (rows, columns, index), source = c.jacobian(self.z)
-            total.add(first + rows, columns, 1.0, source, index)
-            first += c.count
-        for slopes in self.slopes:
-            self._add_slopes(total, first, slopes)
-            first += slopes.count
-        if self._linear is not None:
-            rows, columns = (np.array(a) for a in self._linear.sparsity().get_triplet())
-            total.add(first + rows, columns, np.array(self._linear.nonzeros()), ca.DM(1), 0)
-        return total.matrix()
 
-    def _add_slopes(self, total: "SparseSum", first: int, c: SlopeRows) -> None:
-        """The Jacobian of the rows of a rate limit, which begin at `first`."""
-        rows, places, weights = c.entries
-        if self.free:
-            total.add(first + np.arange(c.count), self.z.numel() - 1, c.by_time, ca.DM(1), 0)
-        if not c.of_rates:
-            total.add(first + rows, places, weights, ca.DM(1), 0)
-            return
-        derivative_rows, columns = self.functions.dynamics.jacobian_at
-        nodes, entries = np.divmod(places, self.nx)
-        for entry in np.unique(entries):
-            here, nonzeros = entries == entry, np.flatnonzero(derivative_rows == entry)
-            node = nodes[here][:, None]
-            targets = first + rows[here][:, None], self.column(node, columns[nonzeros])
-            total.add(*targets, weights[here][:, None], self.rate_rows, node * len(derivative_rows) + nonzeros)
+class _Callback(ca.Callback):  # type: ignore[misc]
+    """A function of vectors, of which those without entries are left out; for errors see `BlockProgram`."""
 
-    def pulled(self, multipliers: Any, horizon: Any) -> Any:
-        """(K nx,) what the rows' multipliers (m,) weigh the rates of all nodes by; MX or DM."""
-        rate_weights = -horizon * ca.mtimes(self._D.T, multipliers[: self.num_links])
-        for first, weights in self._of_rates():
-            rate_weights += ca.mtimes(weights.T, multipliers[first : first + weights.shape[0]])
-        return rate_weights
+    def __init__(
+        self, name: str, sizes: list[int], outputs: list[Any], evaluate: Callable[..., Any], owner: BlockProgram
+    ):
+        ca.Callback.__init__(self)
+        self.sizes, self.outputs, self.evaluate, self.owner = sizes, outputs, evaluate, owner
+        self.construct(name, {})
 
-    def pushed(self, rates: Array, horizon: float) -> Array:
-        """(m,) the part of all rows that is linear in the `rates` (K nx,) of all nodes; 0 of the others."""
-        values = np.zeros(self.nlp["g"].numel())
-        values[: self.num_links] = -horizon * np.asarray(ca.mtimes(self._D, ca.DM(rates))).ravel()
-        for first, weights in self._of_rates():
-            values[first : first + weights.shape[0]] = np.asarray(ca.mtimes(weights, ca.DM(rates))).ravel()
-        return values
+    def get_n_in(self) -> int:
+        return len(self.sizes)
 
-    def _of_rates(self) -> Iterator[tuple[int, Any]]:
-        """Where the rows of limits of accelerations begin, and the weights of the rates in them."""
-        first = (
-            self.num_links + sum(f.rows * len(nodes) for f, nodes, _ in self.paths) + sum(c.count for c in self.coupled)
-        )
-        for c, weights in zip(self.slopes, self._slope_weights, strict=True):
-            if c.of_rates:
-                yield first, weights
-            first += c.count
+    def get_n_out(self) -> int:
+        return len(self.outputs)
 
-    def _hessian(self, sigma: Any, multipliers: Any) -> Any:
-        """The upper triangle of d^2 (sigma f + multipliers' g) / dz^2."""
-        f, rate, total = self.functions.dynamics, self.rate, SparseSum((self.z.numel(), self.z.numel()))
-        nu = ca.mtimes(self._D.T, multipliers[: self.num_links])
-        weights = ca.DM(self.weights).T
-        terms: list[tuple[Any, Indices, Any]] = [
-            (f, self.every, ca.reshape(self.pulled(multipliers, self.time), self.nx, self.every.size)),
-            (rate, self.every, sigma * self.time * weights),
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.sizes[i], 1)
+
+    def get_sparsity_out(self, i: int) -> Any:
+        return self.outputs[i]
+
+    def has_eval_buffer(self) -> bool:
+        return True
+
+    def eval_buffer(self, arguments: Any, results: Any) -> int:
+        """1 where an error ends the search, which must not go through C++."""
+        given = [
+            np.array(np.frombuffer(argument, float)) if size else np.zeros(0)
+            for argument, size in zip(arguments, self.sizes, strict=True)
         ]
-        if self.functions.final is not None:
-            terms.append((self.functions.final, self.every[-1:], sigma))
-        first = self.num_links
-        for path, nodes, _ in self.paths:
-            last = first + path.rows * len(nodes)
-            terms.append((path, nodes, ca.reshape(multipliers[first:last], path.rows, len(nodes))))
-            first = last
-        for c in self.coupled:
-            (rows, columns, index), source = c.hessian(self.z, multipliers[first : first + c.count])
-            total.add(rows, columns, 1.0, source, index)
-            first += c.count
-        for function, nodes, seeds in terms:
-            b = _Blocks(function.hessian_at, nodes, self.width)
-            knots = self.moved if function is f else self.knots
-            source = function.hessian(knots[:, nodes.tolist()], seeds)
-            columns = function.hessian_at[1]
-            total.add(self.column(b.node, b.rows), self.column(b.node, columns), 1.0, source, b.index)
-        if self.functions.parameters is not None:
-            parameter_cost: Any = self.functions.parameters
-            rows, columns = (self.first_parameter + places for places in parameter_cost.hessian_at)
-            total.add(rows, columns, 1.0, parameter_cost.hessian(self.parameters, sigma), np.arange(len(rows)))
-        if self.free:
-            b = _Blocks(f.jacobian_at, self.every, self.width)
-            source = self.rate_rows * nu[(b.node * self.nx + b.rows).ravel().tolist()]
-            total.add(self.column(b.node, f.jacobian_at[1]), self.z.numel() - 1, -1.0, source, b.index)
-            b = _Blocks(rate.jacobian_at, self.every, self.width)
-            source = sigma * self.cost_rows
-            total.add(b.column, self.z.numel() - 1, self.weights[b.node], source, b.index)
-        return total.matrix()
-
-
-class Program(Protocol):
-    """What IPOPT solves; see `TranscribedProgram`."""
-
-    z: Any
-    lower: Array
-    upper: Array
-    functions: Any
-
-    @property
-    def sides(self) -> tuple[Array, Array]: ...
-
-    @property
-    def nlp(self) -> dict[str, Any]: ...
-
-    def derivatives(self, exact: bool) -> dict[str, Any]: ...
+        values: Any = [np.nan] * len(results)
+        try:
+            values = self.evaluate(*[a for i, a in enumerate(given) if self.sizes[i] or i > 1])
+        except self.owner.backs_off as error:
+            self.owner.refusals, self.owner.refusal = self.owner.refusals + 1, str(error)
+        except Exception as error:
+            self.owner.error = self.owner.error or error
+            return 1
+        for result, value in zip(results, values, strict=True):
+            if result is not None and len(result):
+                np.frombuffer(result, float)[:] = value
+        return 0
 
 
 def solve_ipopt(
-    program: Program,
+    program: BlockProgram,
     guess: Array,
     limits: Limits,
     report: Report | None,
@@ -436,7 +380,7 @@ def solve_ipopt(
         stats = solver.stats()
     columns = [stats.get("iterations", {}).get(name, ()) for name in ("obj", "inf_pr", "inf_du", "alpha_pr")]
     table = tuple(Iteration(i, *map(float, row)) for i, row in enumerate(zip(*columns, strict=True)))
-    error = callback.error or program.functions.error
+    error = callback.error or program.error
     if error is not None:
         if isinstance(error, TimeIsUpError):
             ended = Outcome.INTERRUPTED if interrupted.is_set() else Outcome.TIME_LIMIT
@@ -456,7 +400,7 @@ def solve_ipopt(
     return NlpResult(z, outcome, message, table, stationarity=left, multipliers=multipliers)
 
 
-def _stationarity(program: Program, derivatives: Any, solution: Any) -> float:
+def _stationarity(program: BlockProgram, derivatives: Any, solution: Any) -> float:
     """What IPOPT's multipliers leave of the Lagrangian's gradient, those of what does not hold the plan left out."""
     z, slope = solution["x"], ca.DM(derivatives["grad_f"](solution["x"], [])[1])
     rows, jacobian = derivatives["jac_g"](z, [])
@@ -484,7 +428,7 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
 
     def __init__(
         self,
-        program: Program,
+        program: BlockProgram,
         watch: Watch,
         report: Report | None,
         motions: Callable[[Array], tuple[Iterate, ...]],
@@ -492,7 +436,7 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
         ca.Callback.__init__(self)
         self.program, self.watch, self.report, self.motions = program, watch, report, motions
         size = len(program.lower)
-        self.sizes = {"x": size, "f": 1, "g": program.nlp["g"].numel(), "lam_x": size}
+        self.sizes = {"x": size, "f": 1, "g": len(program.sides[0]), "lam_x": size}
         self.sizes |= {"lam_g": self.sizes["g"], "lam_p": 0}
         self.iterates, self.called = 0, now()
         self.error: Exception | None = None
@@ -527,40 +471,6 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
                 check_time(ahead=self.called - before)
         except Exception as error:  # of `report`; must not go through C++, the solve raises it
             self.error = error
-        stop = self.watch.stopped_by is not None or self.error is not None or self.program.functions.error is not None
+        stop = self.watch.stopped_by is not None or self.error is not None or self.program.error is not None
         np.frombuffer(results[0], float)[:] = float(stop)
         return 0
-
-
-class _Links:
-    """Rows states @ x - T h slopes @ f of each interval and row of a tableau, for the states `each`.
-
-    One entry of node, state and slope for each interval, row and node of it; `starts` are where their rows begin.
-    """
-
-    def __init__(self, program: TranscribedProgram, first: int, states: Array, slopes: Array, coordinates: Indices):
-        lengths, (groups, nodes) = np.diff(program.mesh), states.shape
-        k, i, j = (a.ravel() for a in np.indices((len(lengths), groups, nodes)))
-        self.first, self.each, self.count = first, coordinates, len(lengths) * groups * len(coordinates)
-        self.node = k * program.task.scheme.nodes + j
-        self.state, self.slope = states[i, j][:, None], (lengths[k] * slopes[i, j])[:, None]
-        self.starts = first + (k * groups + i) * len(coordinates)
-        self.rows = self.starts[:, None] + np.arange(len(coordinates))
-        self.columns, self.rates = (self.node[:, None] * size + coordinates for size in (program.width, program.nx))
-        self.lower, self.upper = np.zeros(self.count), np.zeros(self.count)
-
-    def set_limits(self, lower: Array, upper: Array) -> None:
-        """The same limits of the states `each` in all rows."""
-        times = self.count // max(len(self.each), 1)
-        self.lower, self.upper = np.tile(lower, times), np.tile(upper, times)
-
-
-class _Blocks:
-    """The nonzeros at `pattern` (rows, columns) of one block a node, as (nodes, nonzeros); `column` is of all z."""
-
-    def __init__(self, pattern: tuple[Indices, Indices], nodes: Indices, width: int):
-        self.rows, columns = (np.tile(a, (len(nodes), 1)) for a in pattern)
-        self.place = np.repeat(np.arange(len(nodes))[:, None], len(pattern[0]), axis=1)
-        self.node = np.repeat(nodes[:, None], len(pattern[0]), axis=1)
-        self.column = self.node * width + columns
-        self.index = np.arange(self.rows.size).reshape(self.rows.shape)

@@ -9,12 +9,11 @@ one step's Jacobian but the first and the last of it: known, or central differen
 iteration to iteration. The same program says what is an optimum of plans by iLQR and by shooting alike.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
@@ -24,14 +23,15 @@ from drake_diff.model.parameters import ParameterVector
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.loss import differentiate_loss
 from drake_diff.optimize.ilqr.expansion import Motion, curvature_along
-from drake_diff.optimize.knots import costs_of
+from drake_diff.optimize.knots import DIFFERENCE, Called, KnotCost, PointFunction, costs_of, knot_function
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import differentiate_final_cost
+from drake_diff.optimize.problem.dynamics import PROBED
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iterate, Iteration, Limits, Multipliers, NlpResult, Outcome, Report
-from drake_diff.optimize.transcription.program import solve_ipopt
+from drake_diff.optimize.transcription.expressions import joined_function
+from drake_diff.optimize.transcription.program import COST, BlockProgram, solve_ipopt
 
-DIFFERENCE = 1e-5  # of max(1, |z|): of exact Jacobians, known to 1e-12
 ROUGH_DIFFERENCE = 1e-4  # of Jacobians that are differences themselves
 ROUGH = "finite_difference"
 CHEAP = {
@@ -39,8 +39,7 @@ CHEAP = {
     "implicit",
 }  # of all steps in one call: second derivatives by differences cost less than iterations
 SMALLEST_MOVE, SAFE_DIVISOR = 1e-7, 1e-6  # where symmetric rank one is not defined, or of rounding
-# Beyond a limit the plant cuts inputs off; CasADi makes no derivatives of what is called back.
-CALLED_BACK = {"ipopt.bound_relax_factor": 0.0, "no_nlp_grad": True}
+WITHIN = {"ipopt.bound_relax_factor": 0.0}  # beyond a limit the plant cuts inputs off
 SAME_MOTION = 1e-8  # of a state's range: a rollout that stays so near to the states of a program is its motion
 
 
@@ -66,11 +65,11 @@ def solve_shooting(
     guess = np.clip(program.pack(xs, us, values), program.lower, program.upper)
     program.require(guess)
     known = begun if begun is not None and begun.sizes == (program.size, len(program.sides[0])) else None
-    exact = not program.functions.why_not
+    exact = not program.why_not
     result = program.optimum_at(guess, limits.tolerance)
     if result is None:
         result = solve_ipopt(
-            program, guess, limits, report, exact=exact, begun=known, more=CALLED_BACK, motions=program.iterates
+            program, guess, limits, report, exact=exact, begun=known, more=WITHIN, motions=program.iterates
         )
     elif report is not None:
         report.row(result.iterations[0], lambda: program.iterates(guess))
@@ -91,46 +90,100 @@ def solve_shooting(
     return result, rolled if is_same else xs, us
 
 
-@dataclass(eq=False)
-class Called:
-    """What a program calls back: it has second derivatives, and keeps the first error that is none of a step."""
+class StepProgram(BlockProgram):
+    """The program of a `Problem` whose model takes discrete steps.
 
-    why_not: str = ""
-    error: Exception | None = None
-
-
-class StepProgram:
-    """The program of a `Problem` whose model takes discrete steps, with derivatives as CasADi's nlpsol takes them.
-
-    `states_at` (N+1, nx), `inputs_at` (N, nu) and `parameters_at` (np,) say where in z they are. `refusals` counts the
-    points that could not be stepped or differentiated, and `refusal` says why the last one could not. If `lenient`, the
-    Hessian goes without the steps' curvature where a point beside z is such a point.
+    `states_at` (N+1, nx), `inputs_at` (N, nu) and `parameters_at` (np,) say where in z they are. If `lenient`, the
+    Hessian goes without the steps' curvature where a point beside z cannot be stepped or differentiated.
     """
 
+    backs_off = (GradientError, SimulationError)
+
     def __init__(self, problem: Problem, *, lenient: bool = False):
-        self.problem, self.lenient, self.refusals, self.refusal = problem, lenient, 0, ""
+        self.problem, self.design = problem, problem.design
         nx, nu, count = problem.nx, problem.nu, problem.num_steps
-        self.design = problem.design
-        width, free = nx + nu, self.design.count
-        self.states_at = np.arange(count + 1)[:, None] * width + np.arange(nx)
-        self.inputs_at = np.arange(count)[:, None] * width + nx + np.arange(nu)
-        self.parameters_at = count * width + nx + np.arange(free)
-        self.size = count * width + nx + free
-        self.horizon_at: int | None = self.size - 1 if self.design.moves_step else None
-        self.horizon_unit = count * float(self._by_step(self.design.start)[-1]) if self.design.moves_step else 1.0
-        single = [(c, np.array([k])) for c in problem.kept for k in problem.knots_of(c, input_at_end=False)]
-        several = [(c.rows, knots) for c in problem.coupled_steps() for knots in c.knots]
-        self.paths = [_Path(self, rows, knots) for rows, knots in (*single, *several)]
-        joins_all = problem.trajectory_cost is not None
-        self.functions: Any = Called("trajectory_cost joins all states" if joins_all else "")
-        self.z = ca.MX.sym("z", self.size)
-        self.lower, self.upper = self._bounds(0), self._bounds(1)  # equal where a variable is given
-        self.methods: set[str] = set()  # where Jacobians came from
-        self._kept: tuple[bytes, list[StepDerivatives]] = b"", []
-        self._last: tuple[Array, Array, Array] | None = None  # a point, its Jacobians, and the curvature learned so far
-        self._callbacks: list[Any] = []  # CasADi holds no reference to its callbacks
-        self._blocks = [self._block(k) for k in range(count + 1)]
-        self._set_places()
+        self.states_at = np.arange(count + 1)[:, None] * (nx + nu) + np.arange(nx)
+        self.inputs_at = np.arange(count)[:, None] * (nx + nu) + nx + np.arange(nu)
+        self.parameters_at = self.states_at[-1, -1] + 1 + np.arange(self.design.count)
+        super().__init__(self._bounds(0), self._bounds(1))
+        self.steps = Steps(self, lenient=lenient)
+        knots = np.hstack([self.states_at, self.inputs_at[np.minimum(np.arange(count + 1), count - 1)]])
+        self.blocks = np.hstack([knots[:-1], np.tile(self.parameters_at, (count, 1))])
+        rows = self.add_rows(np.zeros(count * nx), np.zeros(count * nx))
+        self.add_linear(rows, self.states_at[1:].ravel(), 1.0)
+        self.add(self.steps, self.blocks).weigh(rows, np.arange(count * nx), -1.0)
+        probe = np.random.default_rng(0).uniform(0.5, 1.5, (PROBED, nx + nu))
+        probe[:, nx:] = np.clip(probe[:, nx:], problem.bounds.u_lower, problem.bounds.u_upper)
+        self._add_costs(knots[:-1], probe)
+        for c in problem.kept:
+            at_knots = np.array(problem.knots_of(c, input_at_end=False))
+            self._add_values(knot_function(c, nx, nu, probe), knots[at_knots], c)
+        for coupling in problem.coupled_steps():
+            sides = knots[coupling.knots][:, :, :nx], knots[coupling.knots][:, :, nx:]
+            columns = np.hstack([side.reshape(len(side), -1) for side in sides])
+            self._add_values(joined_function(coupling, nx, probe), columns, coupling.rows)
+
+    def _add_values(self, function: PointFunction, columns: Indices, c: Constraint) -> None:
+        rows = self.add_rows(np.tile(c.lower, len(columns)), np.tile(c.upper, len(columns)))
+        self.add(function, columns).weigh(rows, np.arange(len(rows)), 1.0)
+
+    def _add_costs(self, knots: Indices, probe: Array) -> None:
+        problem, design, nx = self.problem, self.design, self.problem.nx
+        h = design.time_step(np.asarray(design.vector.values))
+        running, final = (stage.cost for stage in costs_of(problem, probe[:, :nx], probe[:, nx:]).stages)
+        times = h * np.arange(len(knots) + 1.0)
+        term = self.add(_KnownCost(running, knots.shape[1], times[:-1]), knots, self.horizon_at, h)
+        unit = self.horizon_unit / len(knots) if design.moves_step else 1.0  # of a step's length, which is linear in c
+        term.weigh(COST, np.arange(len(knots)), unit, by_time=True)
+        self.add(_KnownCost(final, nx, times[-1:]), self.states_at[-1:]).weigh(COST, 0, 1.0)
+        if problem.trajectory_cost is not None:
+            self.why_not = "trajectory_cost joins all states"
+            columns = np.concatenate([self.states_at.ravel(), self.inputs_at.ravel()])
+            self.add(self._whole_motion(len(columns)), columns[None]).weigh(COST, 0, 1.0)
+        if problem.parameter_cost is not None:
+            self.add(self._parameter_cost(), self.parameters_at[None]).weigh(COST, 0, 1.0)
+
+    def _whole_motion(self, width: int) -> Called:
+        """`trajectory_cost` of all states and inputs."""
+        cost: Any = self.problem.trajectory_cost
+
+        def motion(points: Array) -> tuple[Array, Array]:
+            xs, us = np.split(points[0], [self.states_at.size])
+            return xs.reshape(self.states_at.shape), us.reshape(self.inputs_at.shape)
+
+        def linearize(points: Array) -> tuple[Array, Array]:
+            value, by_xs, by_us, _ = differentiate_loss(cost, *motion(points))
+            return np.array([[value]]), np.concatenate([by_xs.ravel(), by_us.ravel()])[None, None]
+
+        return Called(self.why_not, lambda z: np.array([[float(cost(*motion(z)))]]), linearize, 1, width)
+
+    def _parameter_cost(self) -> Called:
+        """`parameter_cost` of the coordinates."""
+        cost: Any = self.problem.parameter_cost
+
+        def linearize(points: Array) -> tuple[Array, Array]:
+            values = self.design.values(points[0])
+            value, slope = differentiate_final_cost(cost, np.array(self.design.own(values)))
+            by_values = np.append(slope, np.zeros(len(values) - len(slope)))
+            return np.array([[value]]), self.design.pull_back(points[0], by_values)[None, None]
+
+        def at(points: Array) -> Array:
+            return np.array([[self.problem.cost_of_parameters(self.design.own(self.design.values(points[0])))]])
+
+        return Called("", at, linearize, 1, self.design.count)
+
+    @property
+    def horizon_at(self) -> int | None:
+        """Where the coordinate of a step's length is, in `horizon_unit`s [s] of all steps."""
+        return self.size - 1 if self.design.moves_step else None
+
+    @cached_property
+    def horizon_unit(self) -> float:
+        if not self.design.moves_step:
+            return 1.0
+        by_values = np.zeros(len(self.design.vector.values))
+        by_values[self.design.own_count] = self.problem.num_steps
+        return float(self.design.pull_back(self.design.start, by_values)[-1])
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -147,7 +200,7 @@ class StepProgram:
 
     def pack(self, xs: Array, us: Array, values: Array | None = None) -> Array:
         """z (n,) of xs (N+1, nx), us (N, nu) and the values of the problem's `design`, its own where None."""
-        z = np.empty(self.size)
+        z = np.empty(self.states_at.size + self.inputs_at.size + len(self.parameters_at))
         z[self.states_at], z[self.inputs_at] = xs, us
         z[self.parameters_at] = self.design.of_values(self.design.vector.values if values is None else values)
         return z
@@ -156,9 +209,13 @@ class StepProgram:
         """xs (N+1, nx), us (N, nu) and the values (np,) of the problem's `design` at z (n,)."""
         return z[self.states_at], z[self.inputs_at], self.design.values(z[self.parameters_at])
 
+    def vector(self, z: Array) -> ParameterVector:
+        """The parameters of the steps at z (n,)."""
+        return self.design.at(z[self.parameters_at])
+
     def require(self, z: Array) -> None:
         """Raise GradientError or SimulationError where a step at z (n,) cannot be taken or differentiated."""
-        self._steps(z)
+        self.steps.along(z[self.blocks])
 
     def optimum_at(self, z: Array, tolerance: float) -> NlpResult | None:
         """z (n,) with multipliers of 0 if it keeps every row and the cost has no slope there; None else.
@@ -166,7 +223,7 @@ class StepProgram:
         An interior-point method would leave such a point for the middle of the bounds.
         """
         cost, gradient = self.gradient(z)
-        rows, (lower, upper) = self._values(z)[1], self.sides
+        rows, (lower, upper) = self.evaluate(z)[1], self.sides
         violation = float(np.max(np.maximum(lower - rows, rows - upper), initial=0.0))
         if np.any(gradient) or not violation <= tolerance:
             return None
@@ -187,184 +244,97 @@ class StepProgram:
         inputs = inputs if problem.optimizes_controls else np.asarray(problem.us)
         return self.pack(problem.state_limits()[side], inputs, (self.design.lower, self.design.upper)[side])
 
-    @cached_property
-    def sides(self) -> tuple[Array, Array]:
-        """(lower, upper) of the rows: 0 of the steps, then those of the constraints and of the couplings."""
-        steps = np.zeros(self.problem.num_steps * self.problem.nx)
-        lower, upper = ([steps, *(getattr(p.rows, s) for p in self.paths)] for s in ("lower", "upper"))
-        return np.concatenate(lower), np.concatenate(upper)
 
-    @cached_property
-    def nlp(self) -> dict[str, Any]:
-        """x, f and g as CasADi's nlpsol takes them."""
-        rows = len(self.sides[0])
-        dense = [ca.Sparsity.dense(1, 1), ca.Sparsity.dense(rows, 1)]
-        f, g = self._callback("values", [self.size], dense, self._values)(self.z)
-        return {"x": self.z, "f": f, "g": g}
+class _KnownCost(PointFunction):
+    """A cost at the knots of known `times`."""
 
-    def derivatives(self, exact: bool = True) -> dict[str, Any]:
-        """CasADi Functions by the names of nlpsol's options; the Hessian is there in any case."""
-        n, m = self.size, len(self.sides[0])
-        scalar, vector, rows = ca.Sparsity.dense(1, 1), ca.Sparsity.dense(n, 1), ca.Sparsity.dense(m, 1)
-        return {
-            "grad_f": self._callback("grad_f", [n, 0], [scalar, vector], self._gradient),
-            "jac_g": self._callback("jac_g", [n, 0], [rows, self._rows_at.sparsity], self._jacobian),
-            "hess_lag": self._callback("hess_lag", [n, 0, 1, m], [self._hessian_at.sparsity], self._hessian),
-        }
+    rows = 1
 
-    def _callback(self, name: str, sizes: list[int], outputs: list[Any], evaluate: Callable[..., list[Any]]) -> Any:
-        self._callbacks.append(_Callback(name, sizes, outputs, evaluate, self))
-        return self._callbacks[-1]
+    def __init__(self, cost: KnotCost, width: int, times: Array):
+        self.cost, self.width, self.times = cost, width, times
+        self.jacobian_at = np.zeros(width, dtype=int), np.arange(width)
+        self.hessian_at = np.triu_indices(width)
 
-    def _block(self, k: int) -> Indices:
-        """Where in z the variables of knot `k` are, parameters last; of the last knot its state alone."""
-        if k == self.problem.num_steps:
-            return self.states_at[k]
-        return np.concatenate([self.states_at[k], self.inputs_at[k], self.parameters_at])
+    def values(self, points: Array) -> Array:
+        return self.cost.values(points, self.times)[:, None]
 
-    def _set_places(self) -> None:
-        nx, rows, columns = self.problem.nx, [], []
-        for k, block in enumerate(self._blocks[:-1]):
-            here = k * nx + np.arange(nx)
-            rows += [here, np.repeat(here, len(block))]
-            columns += [self.states_at[k + 1], np.tile(block, nx)]
-        first = self.problem.num_steps * nx
-        for path in self.paths:
-            here = first + np.arange(path.count)
-            rows.append(np.repeat(here, len(path.columns)))
-            columns.append(np.tile(path.columns, path.count))
-            first += path.count
-        self._rows_at = _Places(rows, columns, (first, self.size))
-        pairs = [entries[np.array(np.triu_indices(len(entries)))] for entries in self._hessian_blocks]
-        ends = [np.min(pair, axis=0) for pair in pairs], [np.max(pair, axis=0) for pair in pairs]
-        self._hessian_at = _Places(*ends, (self.size, self.size))
+    def jacobian(self, points: Array) -> Array:
+        gradients = self.cost.expand(points, self.times)[0]
+        if not np.all(np.isfinite(gradients)):
+            raise GradientError("the cost's derivative is not finite along the motion")
+        return gradients
 
-    @property
-    def _hessian_blocks(self) -> list[Indices]:
-        """Which variables have second derivatives by each other: those of a knot, and of a constraint."""
-        return [*self._blocks, *(path.columns for path in self.paths)]
+    def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
+        return np.asarray(weights * self.cost.expand(points, self.times)[1][:, *self.hessian_at])
 
-    # ------------------------------------------------------------------------------ what it evaluates
 
-    def vector(self, z: Array) -> ParameterVector:
-        """The parameters of the steps at z (n,)."""
-        return self.design.at(z[self.parameters_at])
+class Steps(PointFunction):
+    """The next states of N points [x, u, c], which share the coordinates c of the problem's design."""
 
-    def _read(self, z: Array) -> tuple[Array, Array, float]:
-        """xs (N+1, nx), us (N, nu) and the length of a step [s]; inputs are taken inside their bounds by rounding.
+    def __init__(self, program: StepProgram, *, lenient: bool):
+        problem = program.problem
+        self.program, self.problem, self.design, self.lenient = program, problem, program.design, lenient
+        self.rows, self.knot, self.width = (
+            problem.nx,
+            problem.nx + problem.nu,
+            problem.nx + problem.nu + self.design.count,
+        )
+        self.jacobian_at = np.repeat(np.arange(self.rows), self.width), np.tile(np.arange(self.width), self.rows)
+        self.hessian_at = np.triu_indices(self.width)
+        self.methods: set[str] = set()  # where Jacobians came from
+        self._kept: tuple[bytes, list[StepDerivatives]] = b"", []
+        self._last: tuple[Array, Array, Array] | None = None  # a point, its Jacobians, and the curvature learned so far
 
-        A bound is often an actuator's limit, beyond which the plant cuts an input off.
-        """
-        b, us = self.problem.bounds, z[self.inputs_at]
-        us = np.where(us >= b.u_upper, np.nextafter(b.u_upper, b.u_lower), us)
-        us = np.where(us <= b.u_lower, np.nextafter(b.u_lower, b.u_upper), us)
-        return z[self.states_at], us, self.design.time_step(self.design.values(z[self.parameters_at]))
-
-    def _by_step(self, coordinates: Array) -> Array:
-        """(nc,) the derivative of the length of a step by the coordinates."""
-        by_values = np.zeros(len(self.design.vector.values))
-        if self.design.moves_step:
-            by_values[self.design.own_count] = 1.0
-        return self.design.pull_back(coordinates, by_values)
-
-    def _steps(self, z: Array) -> list[StepDerivatives]:
-        if self._kept[0] != z.tobytes():
-            (xs, us, _), vector = self._read(z), self.vector(z)
-            with self.problem.intervals(vector) as intervals:
-                derivatives = intervals.derivatives(xs[0], us, xs[:-1])
-            self.methods |= {d.method for d in derivatives}
-            self._kept = z.tobytes(), derivatives
+    def along(self, points: Array) -> list[StepDerivatives]:
+        """The derivatives of the N steps, computed once; GradientError or SimulationError where one is refused."""
+        if self._kept[0] != points.tobytes():
+            self._kept = points.tobytes(), self._taken(points)
         return self._kept[1]
 
-    def _values(self, z: Array) -> list[Any]:
-        xs, us = self._read(z)[:2]
-        ends = np.array([d.x_next for d in self._steps(z)])
-        with np.errstate(all="ignore"):
-            paths = [path.rows(*path.packed(xs, us)) for path in self.paths]
-            return [self._cost(z), np.concatenate([(xs[1:] - ends).ravel(), *paths])]
+    def _taken(self, points: Array) -> list[StepDerivatives]:
+        xs = points[:, : self.rows]
+        with self.problem.intervals(self.design.at(points[0, self.knot :])) as intervals:
+            derivatives: list[StepDerivatives] = intervals.derivatives(xs[0], self._inputs(points), xs)
+        self.methods |= {d.method for d in derivatives}
+        return derivatives
 
-    def _cost(self, z: Array) -> float:
-        parameters = self.design.own(self.design.values(z[self.parameters_at]))
-        return self.problem.objective(*self._read(z)) + self.problem.cost_of_parameters(parameters)
+    def _inputs(self, points: Array) -> Array:
+        """(N, nu) taken inside their bounds by rounding: beyond an actuator's limit the plant cuts an input off."""
+        b, us = self.problem.bounds, points[:, self.rows : self.knot]
+        us = np.where(us >= b.u_upper, np.nextafter(b.u_upper, b.u_lower), us)
+        return np.where(us <= b.u_lower, np.nextafter(b.u_lower, b.u_upper), us)
 
-    def gradient(self, z: Array) -> tuple[float, Array]:
-        """The cost and its derivatives (n,) by all variables, the steps apart."""
-        cost, slope = self._gradient(z, z)
-        return float(cost), np.asarray(slope)
+    def values(self, points: Array) -> Array:
+        return np.array([d.x_next for d in self.along(points)])
 
-    def _gradient(self, z: Array, _: Array) -> list[Any]:
-        xs, us, h = self._read(z)
-        gradient, coordinates, nx = np.zeros(self.size), z[self.parameters_at], self.problem.nx
-        costs = costs_of(self.problem, xs, us, h)
-        by_nodes = costs.expand(xs, us)[0]
-        gradient[self.states_at], gradient[self.inputs_at] = by_nodes[:, :nx], by_nodes[:-1, nx:]
-        if self.problem.trajectory_cost is not None:
-            _paid, by_xs, by_us, _method = differentiate_loss(self.problem.trajectory_cost, xs, us)
-            gradient[self.states_at] += by_xs
-            gradient[self.inputs_at] += by_us
-        paid = float(np.sum(costs.values(xs, us)[:-1])) / h  # of a running cost, whose steps are all of one length
-        gradient[self.parameters_at] = self._by_coordinates(coordinates) + paid * self._by_step(coordinates)
-        return [self._cost(z), gradient]
+    def jacobian(self, points: Array) -> Array:
+        return self._dense(points[0], self.along(points)).reshape(len(points), -1)
 
-    def _by_coordinates(self, coordinates: Array) -> Array:
-        """(nc,) the gradient of `parameter_cost` by the coordinates."""
-        cost, values = self.problem.parameter_cost, self.design.values(coordinates)
-        by_values = np.zeros(len(values))
-        if cost is not None:
-            by_values[: self.design.own_count] = differentiate_final_cost(cost, np.array(self.design.own(values)))[1]
-        return self.design.pull_back(coordinates, by_values)
+    def _dense(self, point: Array, steps: Sequence[StepDerivatives]) -> Array:
+        """(N, nx, w) the Jacobians."""
+        c = point[self.knot :]
+        return np.array([np.hstack([d.A, d.B, self.design.pull_back(c, d.C)]) for d in steps])
 
-    def _jacobians(self, z: Array) -> Array:
-        """(N, nx, nx + nu + np) of the steps."""
-        coordinates = z[self.parameters_at]
-        return np.array([np.hstack([d.A, d.B, self.design.pull_back(coordinates, d.C)]) for d in self._steps(z)])
-
-    def _jacobian(self, z: Array, _: Array) -> list[Any]:
-        xs, us = self._read(z)[:2]
-        ones, values = np.ones(self.problem.nx), []
-        for rows in self._jacobians(z):
-            values += [ones, -rows.ravel()]
-        values += [path.jacobian(*path.packed(xs, us)).ravel() for path in self.paths]
-        return [self._values(z)[1], self._rows_at.matrix(values)]
-
-    def _hessian(self, z: Array, _: Array, sigma: Array, multipliers: Array) -> list[Any]:
-        xs, us, h = self._read(z)
-        count, nx, nu = self.problem.num_steps, self.problem.nx, self.problem.nu
-        blocks = list(-self._curvature(z, multipliers[: count * nx].reshape(count, nx)))
-        blocks.append(np.zeros((nx, nx)))
-        coordinates, width = z[self.parameters_at], nx + nu
-        by_step = self._by_step(coordinates)
-        slopes, costs = costs_of(self.problem, xs, us, h).expand(xs, us)
-        for block, slope, cost in zip(blocks[:-1], slopes, costs, strict=False):
-            block[:width, :width] += sigma[0] * cost
-            block[:width, width:] += sigma[0] * np.outer(slope / h, by_step)
-        blocks[-1] += sigma[0] * costs[-1, :nx, :nx]
-        for j, step in enumerate(np.diag(DIFFERENCE * np.maximum(1.0, np.abs(coordinates)))):
-            apart = self._by_coordinates(coordinates + step) - self._by_coordinates(coordinates - step)
-            blocks[0][width:, width + j] += sigma[0] * apart / (2 * step[j])
-        first = count * nx
-        for path in self.paths:
-            blocks.append(path.curvature(*path.packed(xs, us), multipliers[first : first + path.count]))
-            first += path.count
-        return [self._hessian_at.matrix([b[np.triu_indices(len(b))] for b in blocks])]
-
-    def _curvature(self, z: Array, weights: Array) -> Array:
-        """(N, w, w), w = nx + nu + np: the second derivatives of weights (N, nx) times the steps."""
-        steps, (xs, us) = self._steps(z), self._read(z)[:2]
+    def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
+        """Known where it can be, else differences of Jacobians, or learned where these are not cheap."""
+        steps, xs, known = self.along(points), points[:, : self.rows], None
         if not self.design.vector.parameters and self.problem.has_model:
-            known = curvature_along(self.problem, Motion(xs, us, np.array([d.x_next for d in steps]) - xs[1:]), weights)
-            if known is not None and known[1].all():
-                return known[0]
-        if self.lenient and not {d.method for d in steps} <= CHEAP:
-            return self._learned(z, weights)
-        return self._differences(z, weights)
+            ends = np.array([d.x_next for d in steps])
+            states = np.vstack([xs, ends[-1:]])
+            known = curvature_along(self.problem, Motion(states, self._inputs(points), ends - states[1:]), weights)
+        if known is not None and known[1].all():
+            curvature = known[0]
+        elif self.lenient and not {d.method for d in steps} <= CHEAP:
+            curvature = self._learned(points, jacobian.reshape(len(points), self.rows, -1), weights)
+        else:
+            curvature = self._differences(points, weights)
+        return np.asarray(curvature[:, *self.hessian_at])
 
-    def _learned(self, z: Array, weights: Array) -> Array:
+    def _learned(self, points: Array, jacobians: Array, weights: Array) -> Array:
         """The same as far as the Jacobians at the points before tell, block by block, by symmetric rank one.
 
         Griewank and Toint, "Partitioned variable metric updates for large structured optimization problems", 1982.
         """
-        points, jacobians = z[np.array(self._blocks[:-1])], self._jacobians(z)
         if self._last is None:
             self._last = points, jacobians, np.zeros((*points.shape, points.shape[1]))
         before, old, learned = self._last
@@ -376,109 +346,27 @@ class StepProgram:
         self._last = points, jacobians, learned
         return np.array(learned)
 
-    def _differences(self, z: Array, weights: Array) -> Array:
-        """The same by central differences of the Jacobians."""
-        points, b = np.array(self._blocks[:-1]), self.problem.bounds
-        lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
-        lower[self.inputs_at], upper[self.inputs_at] = b.u_lower, b.u_upper  # beyond them the plant may cut off
+    def _differences(self, points: Array, weights: Array) -> Array:
+        """(N, w, w) the same by central differences of the Jacobians."""
+        lower, upper = np.full(self.width, -np.inf), np.full(self.width, np.inf)
+        inputs = slice(self.rows, self.knot)  # beyond their bounds the plant may cut them off
+        lower[inputs], upper[inputs] = self.problem.bounds.u_lower, self.problem.bounds.u_upper
         fraction = ROUGH_DIFFERENCE if ROUGH in self.methods else DIFFERENCE
-        curvature = np.zeros((*points.shape, points.shape[1]))
-        for j, column in enumerate(points.T):
-            where, ends = np.unique(column), []
+        curvature = np.zeros((*points.shape, self.width))
+        for j in range(self.width):
+            step, ends = np.zeros_like(points), []
+            step[:, j] = fraction * np.maximum(1.0, np.abs(points[:, j]))
             for side in (-1, 1):
-                moved = np.array(z)
-                moved[where] += side * fraction * np.maximum(1.0, np.abs(z[where]))
-                moved = np.clip(moved, lower, upper)
+                moved = np.clip(points + side * step, lower, upper)
                 try:
-                    slopes = self._jacobians(moved)
+                    slopes = self._dense(moved[0], self._taken(moved))
                 except (GradientError, SimulationError) as error:
                     if not self.lenient:
                         raise
-                    self.refusals, self.refusal, self._kept = self.refusals + 1, str(error), (b"", [])
+                    self.program.refusals, self.program.refusal = self.program.refusals + 1, str(error)
                     return np.zeros_like(curvature)
-                ends.append((moved[column], np.einsum("kij,ki->kj", slopes, weights)))
+                ends.append((moved[:, j], np.einsum("kij,ki->kj", slopes, weights)))
             (low, before), (high, after) = ends
             apart = np.where(high > low, high - low, np.inf)
             curvature[:, :, j] = (after - before) / apart[:, None]
-        self._kept = b"", []
         return (curvature + curvature.swapaxes(1, 2)) / 2
-
-
-class _Path:
-    """A constraint on the states at the knots `at` (n,) side by side, and on the inputs there."""
-
-    def __init__(self, program: StepProgram, rows: Constraint, knots: Indices):
-        self.rows, self.at, self.count = rows, knots, len(rows.lower)
-        self.columns = program.states_at[knots].ravel()
-        if rows.takes_input:
-            self.columns = np.concatenate([self.columns, program.inputs_at[knots].ravel()])
-
-    def packed(self, xs: Array, us: Array) -> tuple[Array, Array]:
-        """What `rows` takes; a function of states alone takes any input."""
-        return xs[self.at].ravel(), us[np.minimum(self.at, len(us) - 1)].ravel()
-
-    def jacobian(self, x: Array, u: Array) -> Array:
-        """(m, w) by the columns."""
-        return np.asarray(self.rows.differentiate(x, u)[1][:, : len(self.columns)])
-
-    def curvature(self, x: Array, u: Array, weights: Array) -> Array:
-        """(w, w) the second derivative of weights (m,) times the values, by differences of their Jacobian."""
-        z, curvature = np.concatenate([x, u]), np.zeros((len(self.columns), len(self.columns)))
-        if not np.any(weights):
-            return curvature
-        for j in range(len(curvature)):
-            step = np.zeros(len(z))
-            step[j] = DIFFERENCE * max(1.0, abs(z[j]))
-            low, high = (self.jacobian(*np.split(z + side * step, [len(x)])) for side in (-1, 1))
-            curvature[j] = weights @ (high - low) / (2 * step[j])
-        return (curvature + curvature.T) / 2
-
-
-class _Places:
-    """A sparse matrix whose entries are sums of values in one order."""
-
-    def __init__(self, rows: list[Any], columns: list[Any], shape: tuple[int, int]):
-        positions = np.concatenate(columns) * shape[0] + np.concatenate(rows)
-        places, self.targets = np.unique(positions, return_inverse=True)
-        down, across = places % shape[0], places // shape[0]
-        starts = np.searchsorted(across, np.arange(shape[1] + 1))
-        self.sparsity = ca.Sparsity(*shape, starts.tolist(), down.tolist())
-
-    def matrix(self, values: list[Array]) -> Any:
-        """A DM of the entries, in parts."""
-        return ca.DM(self.sparsity, np.bincount(self.targets, np.concatenate(values), self.sparsity.nnz()))
-
-
-class _Callback(ca.Callback):  # type: ignore[misc]
-    """A function of vectors; NaN where a step cannot be taken or differentiated, so that a search shortens its step."""
-
-    def __init__(
-        self, name: str, sizes: list[int], outputs: list[Any], evaluate: Callable[..., list[Any]], owner: StepProgram
-    ):
-        ca.Callback.__init__(self)
-        self.sizes, self.outputs, self.evaluate, self.owner = sizes, outputs, evaluate, owner
-        self.construct(name, {})
-
-    def get_n_in(self) -> int:
-        return len(self.sizes)
-
-    def get_n_out(self) -> int:
-        return len(self.outputs)
-
-    def get_sparsity_in(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.sizes[i], 1)
-
-    def get_sparsity_out(self, i: int) -> Any:
-        return self.outputs[i]
-
-    def eval(self, arguments: Any) -> Any:
-        """The outputs; an error that is none of a step is kept for the solve to raise, as C++ must not see it."""
-        try:
-            values = self.evaluate(*[np.asarray(a).ravel() for a in arguments])
-        except (GradientError, SimulationError) as error:
-            self.owner.refusals, self.owner.refusal = self.owner.refusals + 1, str(error)
-            return [ca.DM(sparsity, np.nan) for sparsity in self.outputs]
-        except Exception as error:
-            self.owner.functions.error = self.owner.functions.error or error
-            return [ca.DM(sparsity, np.nan) for sparsity in self.outputs]
-        return [ca.DM(value) for value in values]

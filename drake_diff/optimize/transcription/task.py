@@ -19,6 +19,7 @@ import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -120,7 +121,7 @@ INSIDE = 2e-8  # of a bound of parameters: twice what IPOPT relaxes it by, which
 DEFAULT_SCHEME = "hermite_simpson"
 
 
-def default_scheme(problem: Problem) -> str:
+def default_scheme(problem: Any) -> str:
     """The scheme where none is asked for."""
     return MAP if problem.is_map else DEFAULT_SCHEME
 
@@ -215,6 +216,11 @@ class OptimalControl:
     def interval_of(self, count: int) -> Indices:
         """(K,) the interval that each of `count` nodes begins or lies in; the last node is the last interval's."""
         return np.minimum(np.arange(count) // self.scheme.nodes, (count - 1) // self.scheme.nodes - 1)
+
+    def within(self, nodes: Array) -> Array:
+        """`nodes` (K, nx + nu), their inputs within bounds."""
+        nodes[:, self.dynamics.nx :] = np.clip(nodes[:, self.dynamics.nx :], self.bounds.u_lower, self.bounds.u_upper)
+        return nodes
 
     @property
     def parameters(self) -> Array:
