@@ -26,9 +26,25 @@ def compiled(function: Function) -> Function:
 
     time_compilations()
     try:
-        return cast(Function, njit(cache=True, error_model="numpy")(function))
+        dispatcher = njit(cache=True, error_model="numpy")(function)
     except RuntimeError:  # Numba finds no folder for a cache
         return cast(Function, njit(error_model="numpy")(function))
+    ignore_unreadable_index(dispatcher)
+    return cast(Function, dispatcher)
+
+
+def ignore_unreadable_index(dispatcher: Any) -> None:
+    """Compile anew where the cache's index names a class of an older version: Numba would raise AttributeError."""
+    cached = dispatcher._cache._cache_file
+    load_index = cached._load_index
+
+    def read() -> Any:
+        try:
+            return load_index()
+        except (AttributeError, ImportError):
+            return {}
+
+    cached._load_index = read
 
 
 def inner(function: Function) -> Function:

@@ -1,6 +1,7 @@
 """Compiled functions against other forms of the same: NumPy's of a tree, AutoDiffXd of a step."""
 
 import importlib
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -106,3 +107,19 @@ def test_a_function_without_a_folder_for_its_cache_is_compiled_all_the_same(monk
     monkeypatch.syspath_prepend(str(tmp_path))
     double = compiled(importlib.import_module("kernel_without_cache").double)
     assert (double(1.5), double.stats.cache_path) == (3.0, None)
+
+
+@pytest.mark.solve
+def test_a_cache_that_names_a_class_of_an_older_version_is_compiled_anew(tmp_path, monkeypatch):
+    """Numba unpickles the index of a cache, with the classes of its signatures, before it looks at the source."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    text = (
+        "from typing import NamedTuple\nfrom drake_diff._base.compiled import compiled\n"
+        "class {0}(NamedTuple):\n    x: float\n@compiled\ndef double(bounds):\n    return 2 * bounds.x\n"
+    )
+    for name in ("Limits", "Range"):
+        (tmp_path / "upgraded_kernel.py").write_text(text.format(name))
+        importlib.invalidate_caches()
+        sys.modules.pop("upgraded_kernel", None)
+        module = importlib.import_module("upgraded_kernel")
+        assert module.double(getattr(module, name)(1.5)) == 3.0

@@ -139,7 +139,8 @@ def test_a_run_of_version_3_1_is_verified_as_before(tmp_path):
     folder = ROOT / "tests" / "data" / "pendulum_3_1"
     found = dd.verify(folder)
     assert found.record.schema_version == "3.1.0"
-    assert found.holds or found.notes
+    assert found.complaints == ()
+    assert found.holds or found.notes or all("steps that the search takes" in line for line in found.undecided)
     assert len(found.record.gradient.final_state_norms) == 21
     assert found.record.gradient.stationarity < 1e-6
     for name, change in {
