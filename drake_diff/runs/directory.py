@@ -168,7 +168,8 @@ def parse_record(path: Path, fields: Mapping[str, Any]) -> SealedRecord:
         options_of_search(known)
     gradient = known.get("gradient")
     if isinstance(gradient, dict) and isinstance(gradient.get("stationarity"), dict):  # before version 4
-        gradient["stationarity"] = gradient["stationarity"].get("value")
+        quantities = {"stationarity": "stationarity", "solver_tolerance": "solver_tolerance", "horizon": "horizon_s"}
+        gradient |= {new: (gradient.pop(old, None) or {}).get("value") for old, new in quantities.items()}
         known["data"] = None  # which followed from the other sections
     kind = KINDS.get(str(known.get("kind")))
     if kind is None:

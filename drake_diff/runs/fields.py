@@ -261,6 +261,14 @@ class ParameterEvidence(Fields):
     upper: float | None
 
 
+class GradientColumn(Fields):
+    """A variable by which the motion is differentiated, and the method that gives its column of derivatives."""
+
+    name: str
+    unit: str
+    source: str
+
+
 class GradientEvidence(Fields):
     """The gradient along the motion, by knot, how stationary the plan is, and how far it agrees with differences.
 
@@ -268,9 +276,15 @@ class GradientEvidence(Fields):
     `lagrangian_norms` are |d L / d x_k|, in the cost's unit per the state's: L is the cost plus multipliers times the
     goal, bounds and constraints that the plan lies on, and x_k changes all later states. `stationarity` is the largest
     |d L / d z| of an optimized variable that no bound holds, over the largest sum of magnitudes of its terms: 0 at an
-    optimum; multipliers are by least squares, not the solver's.
+    optimum; multipliers are by least squares, not the solver's. `solver_tolerance` is relative, of Drake's contact
+    solver, and null without one. The final loss is the first of the record's metrics.
     """
 
+    columns: list[GradientColumn] = Field(default_factory=list)
+    smoothing: str = "none"
+    regularization: str = "none"
+    solver_tolerance: float | None = None
+    horizon_s: float | None = None
     final_state_norms: list[float | None] = Field(default_factory=list)  # null where one is not finite
     lagrangian_norms: list[float | None] = Field(default_factory=list)  # the same
     stationarity: float | None = None

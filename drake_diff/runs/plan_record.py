@@ -21,6 +21,38 @@ from drake_diff.runs.fields import (
     Solver,
 )
 
+# Units of the numbers in `problem` and `contract`, by their keys.
+PROBLEM_UNITS = {
+    "horizon_s, time_step_s, free_horizon_s": "s",
+    "x0, x_goal, x_lower, x_upper, waypoints": "of `gradient.columns`, entry by entry: the states are the first",
+    "u_lower, u_upper": "of `gradient.columns`, entry by entry: the inputs follow the states",
+    "goals": "m and rad, per s for velocities",
+    "constraints": "of the values of the constraint's function",
+    "couplings": "of the states and inputs, per s for rates",
+    "Q, R, rate": "cost per s and squared unit of the state or input; of a final cost without the s; rate: cost per s",
+    "num_steps": "1",
+}
+CONTRACT_UNITS = {
+    "time_step, relaxation_time": "s",
+    "gravity": "m/s^2",
+    "lower, upper": "the `unit` beside them",
+    "mass": "kg",
+    "center_of_mass": "m",
+    "inertia, rotor_inertia": "kg m^2",
+    "damping, kd": "N s/m or N m s/rad",
+    "effort_limit": "N or N m",
+    "kp": "N/m or N m/rad",
+    "stiffness": "N/m",
+    "dissipation": "s/m",
+    "hydroelastic_modulus": "Pa",
+    "gear_ratio, friction, solver_relative_tolerance, sap_near_rigid_threshold, collision_pairs, constraints": "1",
+}
+
+
+def units_of_keys(units: dict[str, str]) -> str:
+    """The description of a table of numbers in the JSON Schema."""
+    return f"Units: {'; '.join(f'{keys}: {unit}' for keys, unit in units.items())}."
+
 
 class PhaseEvidence(Fields):
     """One phase: its name, the directory of its own record, how it ended, its cost and duration."""
@@ -279,8 +311,8 @@ class PlanRecord(SealedRecord):
 
     kind: Literal["plan"] = "plan"
     inputs: Inputs = Inputs()
-    problem: FiniteTable = Field(default_factory=dict)
-    contract: FiniteTable = Field(default_factory=dict)
+    problem: FiniteTable = Field(default_factory=dict, description=units_of_keys(PROBLEM_UNITS))
+    contract: FiniteTable = Field(default_factory=dict, description=units_of_keys(CONTRACT_UNITS))
     solver: Solver | None = None
     parameters: list[ParameterEvidence] = Field(default_factory=list)
     metrics: list[Metric] = Field(default_factory=list)
@@ -319,6 +351,22 @@ class PlanRecord(SealedRecord):
         if broken:
             raise ValueError(f'a verdict "pass" with {", ".join(broken)}')
         return self
+
+    def as_row(self) -> dict[str, str]:
+        """The textbook's view of the record: section, tool, observation, action, metric, perturbation."""
+        units = {c.name: c.unit for c in self.gradient.columns} if self.gradient else {}
+        observed, commanded = (
+            ", ".join(f"{name} [{units.get(name, '?')}]" for name in self.problem.get(key, []))
+            for key in ("state_names", "input_names")
+        )
+        return {
+            "section": "differentiable physics",
+            "tool": f"drake {self.provenance.packages.get('drake', '?')}, {self.solver.method if self.solver else '-'}",
+            "observation": observed,
+            "action": commanded,
+            "metric": "; ".join(f"{m.name} {m.value} {m.unit}" for m in self.metrics),
+            "perturbation": "; ".join(dict.fromkeys(f"replayed {r.variant}" for r in self.replays)) or "none",
+        }
 
     def facts(self) -> dict[str, str]:
         """The section's, or the cost; the solver and the failures."""

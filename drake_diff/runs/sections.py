@@ -18,6 +18,7 @@ from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost, SumOfCosts, TrackingCost
 from drake_diff.optimize.problem.coupling import InputRate, Jerk, Periodic
+from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.problem.fixed_contacts import QUANTITIES, FixedContacts, recorded_quantity
 from drake_diff.optimize.problem.goals import (
     CenterOfMassGoal,
@@ -33,7 +34,16 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.schedule import ContactSchedule
 from drake_diff.optimize.problem.terminal import TerminalSet
 from drake_diff.optimize.solution import Solution
-from drake_diff.runs.fields import GradientEvidence, Inputs, ParameterEvidence, Solver, evidence, finite, plain
+from drake_diff.runs.fields import (
+    GradientColumn,
+    GradientEvidence,
+    Inputs,
+    ParameterEvidence,
+    Solver,
+    evidence,
+    finite,
+    plain,
+)
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.provenance import gradient_evidence, model_input
 
@@ -115,9 +125,26 @@ def _parameters(solution: Solution) -> list[ParameterEvidence]:
 
 
 def _gradient(solution: Solution) -> GradientEvidence:
+    """The settings of the derivatives and the norms; states and inputs have the source of the certificates."""
+    problem, vector = solution.problem, solution.vector
+    contact = problem.model.contract.contact if problem.has_model else None
+    methods = "; ".join(dict.fromkeys(c.method for c in solution.certificates)) or "no certificate was reached"
+    if problem.motion != STEPS:
+        methods = "continuous: saltation along the accepted steps of the integration"
+    names = (*problem.state_names, *problem.input_names, *vector.names)
+    units = (*units_of(problem), *(p.unit for p in vector.parameters for _ in p.value))
+    sources = (*[methods] * (problem.nx + problem.nu), *vector.sources)
+    columns = zip(names, units, sources, strict=True)
+    regularization = "none"
+    if contact is not None and contact.collision_pairs:
+        regularization = f"{contact.approximation} contact, whose compliance and stiction are part of the model"
     ends, result = solution.final_state_norms, solution.optimality
     reasons = [str(value) for value in (ends, result) if isinstance(value, Refusal)]
     return GradientEvidence(
+        columns=[GradientColumn(name=name, unit=unit, source=source) for name, unit, source in columns],
+        regularization=regularization,
+        solver_tolerance=None if contact is None else contact.solver_relative_tolerance,
+        horizon_s=solution.horizon,
         final_state_norms=[] if isinstance(ends, Refusal) else plain(ends),
         lagrangian_norms=[] if isinstance(result, Refusal) else plain(result.state_norms),
         stationarity=None if isinstance(result, Refusal) else finite(result.ratio),

@@ -20,7 +20,7 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.runs import measure
 from drake_diff.runs.directory import KINDS, parse_record
 from drake_diff.runs.fields import SCHEMA_VERSION, DataBoundary, Metric, canonical, own_sha256
-from drake_diff.runs.plan_record import PlanRecord
+from drake_diff.runs.plan_record import CONTRACT_UNITS, PROBLEM_UNITS, PlanRecord
 from drake_diff.runs.provenance import named_files
 
 pytestmark = pytest.mark.solve
@@ -324,3 +324,31 @@ def test_all_the_energy_that_damping_takes_is_counted(tmp_path):
         found = {m.name: m.value for m in measure(other).metrics}
         # What is missing grows with the dissipation: its drift is between half of the end's and all of it.
         assert 0.5 * drift * lost - 1e-12 <= abs(found["energy drift"]) <= drift * lost + 1e-12
+
+
+def test_every_number_of_a_contract_and_a_problem_has_a_unit_in_the_schema(record):
+    def keys(value):
+        if isinstance(value, dict):
+            for key, item in value.items():
+                if isinstance(item, (int, float)) and not isinstance(item, bool):
+                    yield key
+                yield from keys(item)
+        elif isinstance(value, list):
+            for item in value:
+                yield from keys(item)
+
+    for table, units in ((record.contract, CONTRACT_UNITS), (record.problem, PROBLEM_UNITS)):
+        assert {*keys(table)} <= {name.strip() for names in units for name in names.split(",")}
+        assert all(unit in PlanRecord.published_schema().decode() for unit in units.values())
+
+
+def test_the_settings_of_the_gradient_stand_beside_its_norms(record):
+    gradient = record.gradient
+    assert [(c.name, c.unit) for c in gradient.columns] == [("hinge_q", "rad"), ("hinge_w", "rad/s"), ("motor", "N m")]
+    assert {c.source for c in gradient.columns} == {c.method for c in gradient.certificates}
+    assert (gradient.smoothing, gradient.regularization, gradient.solver_tolerance) == ("none", "none", 1e-6)
+    assert gradient.horizon_s == pytest.approx(0.8, rel=1e-15)
+    row = record.as_row()
+    assert list(row) == ["section", "tool", "observation", "action", "metric", "perturbation"]
+    assert (row["observation"], row["action"]) == ("hinge_q [rad], hinge_w [rad/s]", "motor [N m]")
+    assert row["metric"].startswith(f"cost {record.metrics[0].value} 1")
