@@ -1,7 +1,7 @@
 """The record of a plan: one solve, in one phase or several, and what was certified or tried of a plan or its model."""
 
 from collections.abc import Iterator
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
@@ -355,8 +355,9 @@ class PlanRecord(SealedRecord):
     def as_row(self) -> dict[str, str]:
         """The textbook's view of the record: section, tool, observation, action, metric, perturbation."""
         units = {c.name: c.unit for c in self.gradient.columns} if self.gradient else {}
+        problem: dict[str, Any] = self.problem
         observed, commanded = (
-            ", ".join(f"{name} [{units.get(name, '?')}]" for name in self.problem.get(key, []))
+            ", ".join(f"{name} [{units.get(name, '?')}]" for name in problem.get(key, []))
             for key in ("state_names", "input_names")
         )
         return {
