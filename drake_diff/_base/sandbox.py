@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 GIB = 2**30
 LARGEST_ANSWER = 64 * 2**20  # bytes, also of any other file that the child writes
-START_UP = 60.0  # [s] in which Python has imported Drake, on a busy machine too
+START_UP = 180.0  # [s] in which Python has imported Drake and Numba has compiled, on a busy machine too
 LAST_WORDS = 300  # characters of what a process wrote before it ended
 COMMAND = "from drake_diff._base.sandbox import serve; serve()"
 REQUEST, ANSWER, OUTPUT = "request.json", "answer.json", "output.txt"
@@ -43,7 +43,7 @@ def call(function: str, arguments: Mapping[str, Any], seconds: float = 60.0, mem
     Args:
         function: The module is imported before the limits hold.
         arguments: By keyword, as JSON has them.
-        seconds: How long the call may take.
+        seconds: How long the call may take, without what Numba compiles.
         memory: How much memory the child may have, in GiB.
     """
     request = {"function": function, "arguments": dict(arguments), "seconds": seconds, "memory": int(memory * GIB)}

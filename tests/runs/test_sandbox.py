@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 from helpers.models import MODELS, ROOT
 from helpers.table import each_row
+from numba.core import event
 
 import drake_diff as dd
+from drake_diff._base.compiled import time_compilations
 from drake_diff._base.sandbox import call
 from drake_diff.exceptions import InputError
 
@@ -36,6 +38,13 @@ def touch_nothing():
 def never_end():
     while True:
         pass
+
+
+def compile_for_long():
+    time_compilations()
+    with event.trigger_event("numba:compile"):
+        time.sleep(1.5)
+    return "compiled"
 
 
 def take_memory():
@@ -76,6 +85,10 @@ def test_a_call_that_never_ends_is_ended(monkeypatch):
     start = time.monotonic()
     assert "within 0.5 s" in ask(never_end, monkeypatch, seconds=0.5).error
     assert time.monotonic() - start < 60
+
+
+def test_what_numba_compiles_does_not_count(monkeypatch):
+    assert ask(compile_for_long, monkeypatch, seconds=1.0).value == "compiled"
 
 
 @pytest.fixture(scope="module")
