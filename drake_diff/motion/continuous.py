@@ -25,7 +25,6 @@ from drake_diff.motion import compliance
 from drake_diff.motion.integrate import TOLERANCE, Flags, Integrator, Pairs, Step, System, deepest_contacts
 from drake_diff.motion.rollout import Policy, Rollout, continuous_rollout
 
-OF_STEP = 0.1  # of the tolerance: what the error of a step may be, as those of several bounces add up
 NUDGE = 1e-9  # of a state's entries, which the slopes of the rates are differences over: a millionth of v_s
 LOOK, LOOKS = 1e-3, 8  # [s] how often a step in the air is looked at for what touches, and how many times at most
 Chooser = Callable[[Array, int], Array]  # the state (nx,) and the number of the step -> the input (nu,)
@@ -65,6 +64,8 @@ class ContinuousMotion(System):
     actuators, what damping took and the work of contact [J]. Raises ModelError, which says why, where the model has no
     such motion: contact that is no point contact, PD controllers, constraints.
     """
+
+    contact_is_stiff = True
 
     def __init__(self, model: Model, law: str | None = None, *, works: bool = False):
         plant, contact = model.plant, model.contract.contact
@@ -115,7 +116,7 @@ class ContinuousMotion(System):
         self, x0: Array, choose: Chooser, count: int, tolerance: float = TOLERANCE, deadline: float = np.inf
     ) -> Iterator[tuple[Array, list[Step]]]:
         """The input (nu,) and the steps of each of the model's own steps from the state `x0`."""
-        integrator, x = Integrator(self, OF_STEP * tolerance, deadline), x0
+        integrator, x = Integrator(self, tolerance, deadline), x0
         for k in range(count):
             u = choose(x[: self.model.nx], k)
             self.set_input(u)
@@ -290,7 +291,7 @@ def replayed(
 ) -> Rollout:
     """The motion over `count` of the model's steps under us (N, nu) or a policy; raises what `ContinuousMotion` does.
 
-    It is too stiff where it takes more than `evaluations` of the equations of motion to the `tolerance`.
+    It is too stiff where it takes more than `evaluations` of the equations of motion to the `tolerance` of each step.
     """
     motion, nx = ContinuousMotion(model, works=True), model.nx
     motion.most = evaluations or motion.most

@@ -54,6 +54,7 @@ class System:
     per_pair = 1
     slack: Any = 0.0  # (switches,) by how much the wrong sign is none
     pushing: Pairs = ()
+    contact_is_stiff = False  # whether steps are implicit wherever a pair pushes
     used = 0  # evaluations of the rates
     most = 1_000_000  # of these
 
@@ -148,8 +149,8 @@ class Integrator:
         """Stand at `x` (n,)."""
         system, x = self.system, np.array(x, dtype=float)
         system.used, self._length = 0, system.time_step
-        self._is_stiff, self._hits = False, 0
         self._set(system.watch(x, np.zeros(len(x)))[0] > 0)
+        self._choose_method()
         self._stand(x)
 
     def advance(self, duration: float) -> list[Step]:
@@ -276,7 +277,8 @@ class Integrator:
     def _accept(self, end: _Reach) -> Step:
         if self._is_stiff:
             self._left -= 1
-            if self._left == 0 and self._jacobian is not None:
+            stays = self.system.contact_is_stiff and bool(self.system.pushing)
+            if self._left <= 0 and self._jacobian is not None and not stays:
                 self._left = LOOK
                 self._is_stiff = bool(end.h * np.max(np.abs(np.linalg.eigvals(self._jacobian))) > STABLE)
         else:
@@ -301,7 +303,7 @@ class Integrator:
             events.append(Event(int(turned[turned // width == pair][0]), self.system.pushing_where(between)))
         self._set(on)
         if self.system.pushing != before:
-            self._is_stiff, self._hits = False, 0
+            self._choose_method()
             self._stand(self._here.x)
         return tuple(events)
 
@@ -311,6 +313,9 @@ class Integrator:
         pushing = self.system.pushing_where(on)
         if pushing != self.system.pushing:
             self.system.push(pushing)
+
+    def _choose_method(self) -> None:
+        self._is_stiff, self._hits, self._left = bool(self.system.contact_is_stiff and self.system.pushing), 0, LOOK
 
     def _stand(self, x: Array) -> None:
         rates = self.system.rates(x)
