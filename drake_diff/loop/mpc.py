@@ -244,6 +244,8 @@ class MPC:
         remarks = []
         if not step.size and not step.is_reached:
             remarks.append(f"{FOLLOWED}: no step lowers what is paid, though the derivatives promise it")
+        elif step.size and step.is_doubtful:
+            remarks.append("the derivatives are not those of the plant's steps")
         elif 0 < step.size < 1:
             remarks.append(f"a step of {step.size:g}: the plant does not follow its derivatives further")
         if step.given_way is not None:

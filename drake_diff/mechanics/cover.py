@@ -230,7 +230,7 @@ def _capsule_along(points: Array, axis: Array) -> Around:
     flat, heights = points @ across.T, points @ axis
     middle = _circle(flat)
     off = np.linalg.norm(flat - middle, axis=1)
-    spare = np.sqrt(np.max(off) ** 2 - off**2)
+    spare = np.sqrt(np.maximum(np.max(off) ** 2 - off**2, 0.0))  # powers of one number and of arrays round apart
     low, high = float(np.min(heights + spare)), float(np.max(heights - spare))
     if low > high:  # a sphere: its centre anywhere in between contains all
         low = high = (low + high) / 2

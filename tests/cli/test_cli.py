@@ -172,7 +172,7 @@ def test_a_signal_before_the_search_leaves_a_record_that_says_so(tmp_path, monke
     indent = "\n    " if place.startswith("def") else "\n"
     path.write_text(path.read_text().replace(place, f"{place}{indent}{signalled}"))
     if place == "the search":
-        monkeypatch.setattr(solving, "first_guess", lambda *_: signal.raise_signal(signal.SIGTERM))
+        monkeypatch.setattr(solving, "first_guesses", lambda *_: signal.raise_signal(signal.SIGTERM))
     monkeypatch.chdir(tmp_path)
     with kept_handlers():
         assert exit_of(monkeypatch, "run", path) == 130

@@ -117,7 +117,8 @@ def thrown(model, **more):
 @pytest.mark.slow
 def test_a_ball_is_thrown_to_bounce_into_its_target():
     """Down at v it comes to the ground at V, is there for 2 (pi - atan(omega V / g)) / omega, and leaves at V."""
-    solution = dd.solve(thrown(ball_on_rails(gravity=9.81, time_step=0.02)))
+    low = dd.Constraint(lambda x, u: x[3:], lower=[-np.inf], upper=[2.0], knots=[0], name="no lob over the ground")
+    solution = dd.solve(thrown(ball_on_rails(gravity=9.81, time_step=0.02), constraints=[low]))
     assert solution.status is dd.Status.CONVERGED, solution.message
     across, down = solution.xs[0, 2:]
     assert across == pytest.approx(1 / 0.8, abs=1e-6)

@@ -126,7 +126,7 @@ CONSTANTS = {
         "1000": "drake_diff.model.triangles:MOST_CORNERS",
         "30000": "drake_diff.pages.shapes:MOST_FACES",
         "1e-6": SAP,
-        "1e-3": "drake_diff.motion.flow.plant:STICTION_SPEED",
+        "1e-3": "drake_diff.motion.compliance:STICTION_SPEED",
         "24": "drake_diff.motion.undefined:MANY",
     },
     "docs/limitations.md": {

@@ -46,6 +46,11 @@ class StepOptions:
     gap_price: float = 2.0  # over the largest multiplier of the dynamics
     rounding: float = 1e-12  # of the merit: a change below this is lost in the sum
     solved_to: float = 1e-9  # the same of a quadratic program with limits that push
+    # Of the plant's motion in a step: a larger error is measured again over a part of the step, where it has to shrink.
+    suspect: float = 0.1
+    short_part: float = 1e-2
+    still: float = 0.5
+    unseen: float = 1e-5  # of a state: Drake solves contact to 1e-6
     # Of a multiplier over its price: a row between the two holds the motion, others do not or give way.
     holds: float = 1e-6
     gives: float = 1 - 1e-6
@@ -133,6 +138,7 @@ class Step:
     moves: Moves
     whole: bool  # whether no limit pushed
     swept: Array | None = None  # (N, nu, nx) the gains of the sweep that solved it, if one did
+    is_doubtful: bool = False  # whether the derivatives seem not to be those of the plant's steps
 
     @cached_property
     def policy(self) -> AffinePolicy | None:
@@ -212,8 +218,25 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
         except SimulationError:
             continue
         if after <= before + OPTIONS.sufficient_decrease * size * min(slope, 0.0) + rounding:
-            return replace(step, motion=tried, size=size, merit=after)
+            step = replace(step, motion=tried, size=size, merit=after)
+            return replace(step, is_doubtful=not stretch.rolls and _is_doubtful(step, motion))
     return step
+
+
+def _is_doubtful(step: Step, before: Motion) -> bool:
+    """Whether the plant departs from its derivatives by an error that does not shrink with the step."""
+    dxs, dus = step.motion.xs - before.xs, step.motion.us - before.us
+    linear = np.einsum("kij,kj->ki", step.expansion.quadratic.F, np.hstack([dxs[:-1], dus]))
+    change = float(np.max(np.abs(linear - dxs[:-1])))  # beside the motion of a state without inputs
+
+    def error(motion: Motion, fraction: float) -> float:
+        return float(np.max(np.abs(motion.ends - before.ends - fraction * linear)))
+
+    large = error(step.motion, 1.0)
+    if large <= max(OPTIONS.suspect * change, OPTIONS.unseen * (1 + float(np.max(np.abs(before.ends))))):
+        return False
+    short = step.stretch.motion(before.xs + OPTIONS.short_part * dxs, before.us + OPTIONS.short_part * dus)
+    return error(short, OPTIONS.short_part) > OPTIONS.still * OPTIONS.short_part * large
 
 
 def merit(stretch: Stretch, expansion: Expansion, motion: Motion, gap_prices: Array) -> float:
