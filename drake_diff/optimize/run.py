@@ -38,8 +38,8 @@ from drake_diff.optimize.solution import PLANS, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
     FOUND,
-    Begun,
     Collocated,
+    Initial,
     Transcribed,
     Transcription,
     kept,
@@ -79,7 +79,7 @@ class Run:
     report: Report | None
     searched: Problem | None = None  # what is solved where that is more than what is asked
     start: float = field(default_factory=now)
-    begun: float = field(default_factory=time.monotonic)
+    started: float = field(default_factory=time.monotonic)
     certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
     reached: list[SoFar] = field(default_factory=list)  # the last is where it is
 
@@ -112,7 +112,7 @@ class Run:
         """The draft of all phases."""
         if not isinstance(self.problem, PhasedProblem):
             return drafts[0]
-        fields |= {"options": self.options, "wall_time": time.monotonic() - self.begun}
+        fields |= {"options": self.options, "wall_time": time.monotonic() - self.started}
         return PhasedSolution.joined(self.problem, drafts, **fields)
 
     def _cut(self, reached: SoFar, *, interrupted: bool) -> Solution:
@@ -152,9 +152,9 @@ class Run:
             except (GradientError, SimulationError) as error:
                 return refused(self._of_guess(guesses), error)
             self._reach(1)
-            begun = [self._begin(transcription, i, guess) for i, guess in enumerate(guesses)]
+            starts = [self._begin(transcription, i, guess) for i, guess in enumerate(guesses)]
             refinement = self.asked if refine else None
-            motion = transcription.solve(begun, limits=self._left(), report=self.report, refinement=refinement)
+            motion = transcription.solve(starts, limits=self._left(), report=self.report, refinement=refinement)
             motion = dataclasses.replace(motion, result=heard(motion.result, interrupted))
         if refine:
             self.options["refinements"] = [list(row) for row in motion.refinements]
@@ -171,7 +171,7 @@ class Run:
         point = transcription.jacobian, guess.xs, guess.us, task
         return certify_equations(self.problem, *point, knots=first_knots(guess.us))
 
-    def _begin(self, transcription: Transcription, phase: int, guess: Guess) -> Begun:
+    def _begin(self, transcription: Transcription, phase: int, guess: Guess) -> Initial:
         """Where a phase begins: a motion by the same scheme and in as many steps on its mesh, with its multipliers."""
         fields: dict[str, Any] = {"horizon": guess.horizon, "parameters": guess.parameters, "far": guess.line}
         task, motion = transcription.tasks[phase], guess.motion
@@ -297,7 +297,7 @@ class Run:
             if touches:
                 return solve_through_jumps(problem, begin, us, limits=limits, report=report, values=values)
             known = guess.multipliers
-            return solve_ilqr(problem, begin, us, limits=limits, report=report, values=values, begun=known)
+            return solve_ilqr(problem, begin, us, limits=limits, report=report, values=values, multipliers=known)
 
         around = given and not stages  # a robot that falls open loop says nothing of the motion that was given
         return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages), around=around)
@@ -324,7 +324,7 @@ class Run:
                 result, xs, us = swept
                 self.options["initial_guess"] = f"default, then {result.message}"
                 values = values if result.parameters is None else result.parameters
-            options: dict[str, Any] = {"values": values, "begun": multipliers}
+            options: dict[str, Any] = {"values": values, "multipliers": multipliers}
             return solve_shooting(problem, xs, us, limits=self._left(), report=self.report, **options)
 
         return self._through_steps(guess.xs, guess.us, search, guess, around=not rolled)
@@ -376,7 +376,7 @@ class Run:
 
         Of the guess at its rollout, or `around` its states as they are.
         """
-        values, begun = self._first_values(guess), xs
+        values, first_states = self._first_values(guess), xs
         try:
             with until_set(interrupted):
                 ends = self._with_its_end(xs, us, values) if around else None
@@ -388,7 +388,7 @@ class Run:
                 xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values), found=False)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us), error)
-        xs = begun if around else xs
+        xs = first_states if around else xs
         if blindness and not may_be_blind:
             return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
         self._reach(1, self._draft(xs, us, certificates=before))
@@ -498,7 +498,7 @@ class Run:
     def _draft(self, xs: Array, us: Array, problem: Problem | None = None, **fields: Any) -> Solution:
         arrays = ("u_final", "us_mid", "mesh")
         fields |= {name: frozen(fields[name]) for name in arrays if fields.get(name) is not None}
-        fields |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.begun}
+        fields |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.started}
         by = problem or self.problem, self.method, self.solver, Status.FAILED, ""
         return Solution(*by, frozen(xs), frozen(us), **fields)
 

@@ -309,5 +309,5 @@ def _resolved(program: KnotProgram, z: Array, multipliers: Multipliers) -> tuple
     """What IPOPT finds from a plan, and whether that is a solution."""
     more = CLOSE | (WITHIN if isinstance(program, StepProgram) else {})
     exact = not program.why_not
-    result = solve_ipopt(program, z, EXACT, None, exact=exact, begun=multipliers, more=more)
+    result = solve_ipopt(program, z, EXACT, None, exact=exact, multipliers=multipliers, more=more)
     return result.z, result.outcome in FOUND

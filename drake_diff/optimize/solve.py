@@ -381,11 +381,11 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> S
         which = f"{OTHER_GUESS}, number {used + number} of seed {asked.seed}"
         attempt = replace(base, reason=f"restart {number} of {restarts}: {which}")
         if first.method == "collocation":
-            begun = another_guess(task.problem, asked.seed, used + number)
+            guess = another_guess(task.problem, asked.seed, used + number)
         else:
-            begun = _rolled_guess(task.problem, asked.seed, used + number)
+            guess = _rolled_guess(task.problem, asked.seed, used + number)
         try:
-            attempts.append((task.prepare(attempt, begun)(), which))
+            attempts.append((task.prepare(attempt, guess)(), which))
             ended = attempts[-1][0].status.value
         except DrakeDiffError as error:
             ended = f"not possible: {error}"
@@ -443,11 +443,11 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
         reason = "collocation was not verified: a guess for it"
         yield replace(asked.by("ilqr", reason), max_iterations=asked.options.guess_iterations), given
     if np.all(np.isfinite(solutions[-1].xs)):
-        begun: Any = (solutions[-1].xs, solutions[-1].us)
+        guess: Any = (solutions[-1].xs, solutions[-1].us)
         if problem.design.vector.parameters:
-            begun = solutions[-1]
+            guess = solutions[-1]
         after = "collocation" if method == "collocation" else "shooting"
-        yield asked.by(after, "from the motion that iLQR found"), begun
+        yield asked.by(after, "from the motion that iLQR found"), guess
 
 
 def _in_continuous_time(
@@ -494,8 +494,8 @@ def _other_guesses(
         reason = f"no motion was found: {OTHER_GUESS} ({number} of {most})"
         if isinstance(problem, PhasedProblem):
             reason = f"random {number}"
-        begun = other_guess(problem, attempt.seed, number)
-        yield replace(attempt, reason=reason, max_iterations=attempt.options.other_iterations), begun
+        guess = other_guess(problem, attempt.seed, number)
+        yield replace(attempt, reason=reason, max_iterations=attempt.options.other_iterations), guess
 
 
 def _another_may_do(solution: Solution, options: Options) -> bool:

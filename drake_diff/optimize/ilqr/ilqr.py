@@ -106,20 +106,20 @@ def solve_ilqr(
     patience: float = math.inf,
     least_penalty: float = 0.0,
     values: Array | None = None,
-    begun: Multipliers | None = None,
+    multipliers: Multipliers | None = None,
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
 
     After `patience` short steps in a row that gain little, with no better between them, the search ends as inaccurate:
-    it crawls along a jump. `least_penalty` is what constraints weigh from the start, `values` (np,) are those of the
-    problem's `design` to begin with, its own where None; `begun` are the multipliers of a search like this one. A
-    motion on the way that cannot be stepped or differentiated is a step that is too long, which the message counts;
-    raises GradientError or SimulationError if the guess is such a motion.
+    it crawls along a jump. `least_penalty` weighs constraints from the start. The search starts from the
+    parameters `values` (np,), by default those of the problem's `design`, and from `multipliers`, those of a similar
+    search. A motion on the way that cannot be stepped or differentiated is a step that is too long, which the message
+    counts; raises GradientError or SimulationError if the guess is such a motion.
     """
     search = _Search(problem, xs, us, limits, report, patience, values)
     search.constraints.penalty = max(search.constraints.penalty, least_penalty)
-    if begun is not None and begun.sizes == (0, len(search.constraints.forces)):
-        search.constraints.forces = begun.rows
+    if multipliers is not None and multipliers.sizes == (0, len(search.constraints.forces)):
+        search.constraints.forces = multipliers.rows
     with noted_interrupts() as interrupted:
         outcome = search.run(interrupted)
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps{search.told_of_refusals}"

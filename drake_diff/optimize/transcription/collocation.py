@@ -387,7 +387,7 @@ class Transcribed:
 
 
 @dataclass(frozen=True, eq=False)
-class Begun:
+class Initial:
     """Where a search of one phase begins: nodes (K, nx + nu) on a mesh, a duration [s] and parameters (np,).
 
     `multipliers` are those of a plan there; nodes on a line are `far` from a motion.
@@ -400,7 +400,7 @@ class Begun:
     multipliers: Multipliers | None = None
     far: bool = False
 
-    def on(self, mesh: Array, scheme: Scheme) -> "Begun":
+    def on(self, mesh: Array, scheme: Scheme) -> "Initial":
         """The same on another mesh."""
         these, then = scheme.node_fractions(mesh), scheme.node_fractions(self.mesh)
         nodes = np.array([np.interp(these, then, column) for column in self.nodes.T]).T
@@ -457,7 +457,7 @@ class Transcription:
         f = self.functions[phase].dynamics
         return np.asarray(getattr(f, "functions", [f] * (k + 1))[k].linearize(knot[None])[1][0])
 
-    def begin(self, phase: int, guess: Any, *, horizon: float | None = None, mesh: Any = None, **more: Any) -> Begun:
+    def begin(self, phase: int, guess: Any, *, horizon: float | None = None, mesh: Any = None, **more: Any) -> Initial:
         """Where a phase begins, inputs within bounds: at xs (N+1, nx), us (N+1, nu) on a mesh, or along a motion."""
         task = self.tasks[phase]
         mesh = np.linspace(0, 1, task.problem.num_steps + 1) if mesh is None else mesh
@@ -467,7 +467,7 @@ class Transcription:
             where = task.scheme.node_fractions(mesh)
             nodes = task.within(np.array([np.interp(where, mesh, column) for column in np.hstack(guess).T]).T)
         first = task.problem.start_horizon if horizon is None else horizon
-        return Begun(mesh, nodes, float(np.clip(first, *task.horizon)), **more)
+        return Initial(mesh, nodes, float(np.clip(first, *task.horizon)), **more)
 
     def program(self, meshes: Sequence[Array] | None = None) -> Any:
         """The `TranscribedProgram` of the phases on meshes, on their own intervals where None."""
@@ -479,14 +479,14 @@ class Transcription:
         return TranscribedProgram(phases, self.problem if isinstance(self.problem, PhasedProblem) else None, self.links)
 
     def solve(
-        self, begun: Sequence[Begun], *, limits: Limits, report: Report | None, refinement: Options | None = None
+        self, starts: Sequence[Initial], *, limits: Limits, report: Report | None, refinement: Options | None = None
     ) -> Transcribed:
         """From where each phase begins; `limits.max_iterations` hold for each round.
 
         A `refinement` splits the intervals whose error is above its tolerance and solves again from what was found.
         Intervals that come nearer to an obstacle than a plan may are split in any case, up to CLEARANCE_ROUNDS times.
         """
-        start, motion = now(), self._solve_on(begun, limits, report)
+        start, motion = now(), self._solve_on(starts, limits, report)
         if motion.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):  # there is no time to measure it
             return motion
         tolerance, most, left = np.inf, MOST_INTERVALS, math.inf
@@ -511,7 +511,7 @@ class Transcription:
             if report is not None:
                 report.say(f"{reason} with {count} intervals: refined to {sum(len(mesh) - 1 for mesh in meshes)}")
             # What goes through an obstacle is no place to go on from.
-            again = [b.on(m, t.scheme) for b, m, t in zip(begun, meshes, self.tasks, strict=True)] if entered else None
+            again = [b.on(m, t.scheme) for b, m, t in zip(starts, meshes, self.tasks, strict=True)] if entered else None
             last, motion = motion, self._solve_on(again or _from(motion, meshes), _left(limits, start), report)
             if motion.result.outcome not in FOUND and not entered:
                 motion = kept(last, motion)
@@ -544,16 +544,16 @@ class Transcription:
             report.say(f"what is found does not hold with {counts[0]} intervals: refined to {counts[1]}")
         return self._solve_on(_from(motion, finer), limits, report)
 
-    def _solve_on(self, begun: Sequence[Begun], limits: Limits, report: Report | None) -> Transcribed:
+    def _solve_on(self, starts: Sequence[Initial], limits: Limits, report: Report | None) -> Transcribed:
         """IPOPT on meshes."""
         from drake_diff.optimize.transcription.program import FAR
 
-        program = self.program([b.mesh for b in begun])
+        program = self.program([b.mesh for b in starts])
         guess = np.concatenate(
-            [phase.pack(b.nodes, b.horizon, b.parameters) for phase, b in zip(program.phases, begun, strict=True)]
+            [phase.pack(b.nodes, b.horizon, b.parameters) for phase, b in zip(program.phases, starts, strict=True)]
         )
-        more = FAR if begun[0].far and len(begun) == 1 and program.phases[0].free else None
-        result, derivatives = solve_program(program, guess, limits, report, begun[0].multipliers, more)
+        more = FAR if starts[0].far and len(starts) == 1 and program.phases[0].free else None
+        result, derivatives = solve_program(program, guess, limits, report, starts[0].multipliers, more)
         motions = []
         for phase in program.phases:
             (nodes, horizon), task = phase.unpack(result.z), phase.task
@@ -562,10 +562,10 @@ class Transcription:
         return Transcribed(tuple(motions), result, derivatives)
 
 
-def _from(motion: Transcribed, meshes: Sequence[Array]) -> list[Begun]:
+def _from(motion: Transcribed, meshes: Sequence[Array]) -> list[Initial]:
     """Where a search on other meshes begins."""
     pairs = zip(motion.phases, meshes, strict=True)
-    return [Begun(mesh, p.on(mesh, p.task), p.horizon, np.asarray(p.task.parameters)) for p, mesh in pairs]
+    return [Initial(mesh, p.on(mesh, p.task), p.horizon, np.asarray(p.task.parameters)) for p, mesh in pairs]
 
 
 def solve_program(
@@ -584,12 +584,12 @@ def solve_program(
 
     why, start = program.why_not, now()
     derivatives = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-    begun = multipliers if multipliers and multipliers.sizes == (program.size, len(program.sides[0])) else None
+    usable = multipliers if multipliers and multipliers.sizes == (program.size, len(program.sides[0])) else None
     options: dict[str, Any] = {"more": more, "motions": program.iterates}
-    result = solve_ipopt(program, guess, limits, report, exact=not why, begun=begun, **options)
-    if begun and result.outcome not in (*FOUND, Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
+    result = solve_ipopt(program, guess, limits, report, exact=not why, multipliers=usable, **options)
+    if usable and result.outcome not in (*FOUND, Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
         result = solve_ipopt(program, guess, _left(limits, start), report, exact=not why, **options)
-    elif begun:
+    elif usable:
         result = replace(result, message=f"{result.message}, from the guess's multipliers")
     if not why and result.message == NOT_FINITE:
         again = solve_ipopt(program, guess, limits, report, exact=False, **options)

@@ -59,7 +59,7 @@ OPTIONS = {
 # that takes half as long again as another one.
 FAR = dict.fromkeys(["ipopt.bound_push", "ipopt.bound_frac"], 0.2)
 # From multipliers: a point that lies on its bounds stays there, and what is nearly right is not made wrong first.
-BEGUN = {
+WARM_START = {
     "ipopt.warm_start_init_point": "yes",
     "ipopt.mu_init": 1e-6,
     **dict.fromkeys([f"ipopt.warm_start_{part}" for part in ("bound_push", "bound_frac", "mult_bound_push")], 1e-6),
@@ -344,19 +344,19 @@ def solve_ipopt(
     report: Report | None,
     *,
     exact: bool,
-    begun: Multipliers | None = None,
+    multipliers: Multipliers | None = None,
     more: dict[str, Any] | None = None,
     motions: Callable[[Array], tuple[Iterate, ...]] = lambda z: (),
 ) -> NlpResult:
     """Solve `program` from `guess` (n,), with its `exact` Hessian or IPOPT's limited-memory one.
 
-    With multipliers `begun` the guess is taken for nearly optimal. `more` are options of nlpsol.
+    With `multipliers` the guess is taken for nearly optimal. `more` are options of nlpsol.
 
     `report` gets a line of progress a few times a second, with what `motions` makes of the iterate. Ctrl-C ends the
     solve with the best iterate so far. An error that a function of the user's raised is raised again, but that of a
     simulation or gradient is told.
     """
-    options = OPTIONS | (BEGUN if begun else {}) | (more or {})
+    options = OPTIONS | (WARM_START if multipliers else {}) | (more or {})
     options |= {
         "ipopt.tol": limits.tolerance,
         "ipopt.constr_viol_tol": limits.tolerance,
@@ -374,7 +374,7 @@ def solve_ipopt(
             return NlpResult(guess, Outcome.INTERRUPTED, f"stopped: {stopped}", ())
         solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
         lower, upper = program.sides
-        known = {} if begun is None else {"lam_x0": begun.variables, "lam_g0": begun.rows}
+        known = {} if multipliers is None else {"lam_x0": multipliers.variables, "lam_g0": multipliers.rows}
         with until_set(interrupted):
             solution = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper, **known)
         stats = solver.stats()

@@ -51,25 +51,25 @@ def solve_shooting(
     limits: Limits,
     report: Report | None,
     values: Array | None = None,
-    begun: Multipliers | None = None,
+    multipliers: Multipliers | None = None,
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from the guess xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us).
 
-    `values` (np,) are those of the problem's `design` to begin with, its own where None; `begun` the multipliers of a
-    search like this one. The states are the rollout of the inputs where that stays at those of the program, and else
-    these themselves, which steps lead from to within the tolerance: an unstable motion leaves them open loop. A point
-    that cannot be stepped or differentiated is a step that was too long, which the message counts; raises GradientError
-    or SimulationError if the guess is such a point.
+    The search starts from the parameters `values` (np,), by default those of the problem's `design`, and from
+    `multipliers`, those of a similar search. The states are the rollout of the inputs where that stays at those of the
+    program, and else these themselves, which steps lead from to within the tolerance: an unstable motion leaves them
+    open loop. A point that cannot be stepped or differentiated is a step that was too long, which the message counts;
+    raises GradientError or SimulationError if the guess is such a point.
     """
     program = StepProgram(problem, lenient=True)
     guess = np.clip(program.pack(xs, us, values), program.lower, program.upper)
     program.require(guess)
-    known = begun if begun is not None and begun.sizes == (program.size, len(program.sides[0])) else None
+    known = multipliers if multipliers and multipliers.sizes == (program.size, len(program.sides[0])) else None
     exact = not program.why_not
     result = program.optimum_at(guess, limits.tolerance)
     if result is None:
         result = solve_ipopt(
-            program, guess, limits, report, exact=exact, begun=known, more=WITHIN, motions=program.iterates
+            program, guess, limits, report, exact=exact, multipliers=known, more=WITHIN, motions=program.iterates
         )
     elif report is not None:
         report.row(result.iterations[0], lambda: program.iterates(guess))
