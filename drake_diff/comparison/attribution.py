@@ -95,7 +95,7 @@ def measured(engine: Engine, times: Array, xs: Array, us: Array, status: str = "
     """The motion `xs` (n, nx) with the energies and overlaps that `engine` finds in it."""
 
     energy, depth = ([_offered_by(ask, x) for x in xs] for ask in (engine.energy, engine.contact_depth))
-    energies, depths = (None if None in values else frozen(values) for values in (energy, depth))
+    energies, depths = (None if None in values else frozen(np.array(values)) for values in (energy, depth))
     return EngineMotion(frozen(times), frozen(xs), frozen(us), energies, depths, status)
 
 

@@ -274,7 +274,7 @@ class Dynamics:
         right = free * (E.T @ np.concatenate(columns, axis=2))
         M = E.T @ (mass + np.diag(numbers.reflected)) @ E
         M = M * free * np.swapaxes(free, 1, 2) + np.eye(nv) * (1 - free)
-        return a, -np.linalg.solve(M, right)
+        return a, np.asarray(-np.linalg.solve(M, right), dtype=float)
 
     def inverse_dynamics(self, q: Array, v: Array, a: Array, by: Array | None = None) -> tuple[Array, Array, Array]:
         """tau (N, n) of the links, mass (N, n, n), and tau by small motion, by v and by parameters (N, n, 2 n + P).

@@ -169,7 +169,7 @@ class BlockProgram:
     def evaluate(self, z: Array) -> tuple[float, Array]:
         """The cost and the rows (m,) at z (n,)."""
         rows, columns, weights = self._of_linear
-        total = np.bincount(rows, weights * z[columns], 1 + len(self.sides[0]))
+        total = np.bincount(rows, weights * z[columns], 1 + len(self.sides[0])).astype(float, copy=False)
         for term, (plain, timed), values in zip(self.terms, self._weights, self._values(z), strict=True):
             if plain is not None:
                 total += plain @ values.ravel()
