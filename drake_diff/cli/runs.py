@@ -1,4 +1,4 @@
-"""Commands on runs: run, recover, verify, list, compare-runs, schema, view, export, `mcap info | check | recover`."""
+"""Commands on runs: run, recover, verify, list, compare-runs, schema, view, export."""
 
 import importlib.util
 import inspect
@@ -26,14 +26,10 @@ from drake_diff.cli.text import (
     show_table,
     show_written,
 )
-from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError, WriteError
-
-LogFile = Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that drake_diff wrote.")]
+from drake_diff.exceptions import InputError, UnknownNameError, WriteError
 
 OURS = ("problem", "progress", "view")  # arguments of `solve` that a script does not give
 MOST_MEMORY = 4 * 2**30  # bytes
-
-mcap = typer.Typer(no_args_is_help=True, help="Look at, check and repair trace.mcap.")
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -42,10 +38,6 @@ def add_commands(app: typer.Typer) -> None:
         app.command()(command)
     app.command("list")(list_all)
     app.command("recover")(recover_run)
-    mcap.command()(info)
-    mcap.command()(check)
-    mcap.command()(recover)
-    app.add_typer(mcap, name="mcap")
 
 
 def run(
@@ -356,56 +348,3 @@ def export(
     folder = out or run.resolve().with_name(f"{run.resolve().name}_ros2")
     counts = export_ros2(run, folder)
     show(f"wrote {folder}: {', '.join(f'{topic} {count}' for topic, count in counts.items())}")
-
-
-@memory_at_most(MOST_MEMORY)
-def info(file: LogFile) -> None:
-    """List the channels of FILE with their messages and units, its metadata and its attachments."""
-    from drake_diff.logs.mcap_file import read_mcap
-
-    log = read_mcap(file, links=False)
-    rows = []
-    for topic, messages in log.messages.items():
-        ends = [f"{messages[i][0] / 1e9:g}" for i in (0, -1)] if messages else ["", ""]
-        rows.append((topic, log.message_types[topic].DESCRIPTOR.full_name, len(messages), *ends))
-    show_table(("channel", "schema", "messages", "from [s]", "to [s]"), rows, left=2)
-    for topic, metadata in log.channel_metadata.items():
-        show(f"units of {topic}: {_units(metadata.get('units', {}))}")
-    for name, record in log.metadata.items():
-        for key, value in record.items():
-            show(f"{name}.{key} = {value}")
-    for name, data in log.attachments.items():
-        show(f"attached {name}, {len(data)} bytes")
-
-
-def _units(units: dict[str, Any]) -> str:
-    return ", ".join(f"{k} [{v}]" if isinstance(v, str) else f"{k} ({_units(v)})" for k, v in units.items())
-
-
-@memory_at_most(MOST_MEMORY)
-def check(file: LogFile) -> None:
-    """Check every checksum and schema of FILE. Exit status 1 if one fails."""
-    from drake_diff.logs.mcap_file import read_mcap
-
-    if not file.is_file():
-        raise InputError("FILE", got=str(file), expected="a file that exists")
-    try:
-        log = read_mcap(file, links=False)
-    except ArtifactError as error:
-        show(judged("damaged"), f" {error}")
-        raise typer.Exit(1) from error
-    count = sum(len(messages) for messages in log.messages.values())
-    contents = f"{count} messages in {len(log.messages)} channels, {len(log.attachments)} attachments"
-    show(plain("whole", "bold green"), f" {file}: {contents}, every checksum holds")
-
-
-@memory_at_most(MOST_MEMORY)
-def recover(
-    file: LogFile, out: Annotated[Path, typer.Argument(metavar="OUT", help="The file to write.", dir_okay=False)]
-) -> None:
-    """Copy all of FILE that can be read, up to the first damage, to OUT; OUT's metadata say so."""
-    from drake_diff.logs.mcap_file import recover_mcap
-
-    done = recover_mcap(file, out)
-    stopped = f"stopped at {done.stopped_at}" if done.stopped_at else "it was whole"
-    show(f"{done.messages} messages and {done.attachments} attachments to {out}; {stopped}")

@@ -1,7 +1,7 @@
-"""MCAP files of protobuf channels: written byte for byte the same for the same content, read, and saved when damaged.
+"""MCAP files of protobuf channels: written byte for byte the same for the same content, and read back.
 
-The `mcap` package skips three of the format's checksums (of attachments, of the data section, of the summary), so that
-this module walks through the records itself. Reading asks for every one of them.
+The `mcap` package does not check the checksums of attachments, of the data section and of the summary, and unpacks
+whatever a chunk says that it holds: this module checks all of that before it reads.
 """
 
 import json
@@ -21,7 +21,7 @@ import zstandard
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap import records as kinds
 from mcap.data_stream import ReadDataStream
-from mcap.stream_reader import breakup_chunk, get_chunk_data_stream
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -33,7 +33,6 @@ from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 
 CHUNK_SIZE = 64 * 1024  # the most that is lost if a process is killed or a file damaged
 LIBRARY = "drake_diff"
-RECOVERED = "recovered"  # the name of the metadata record that a recovered file gets
 MOST_UNPACKED = GIB  # of all chunks of a file
 PACKED_AT_MOST, PACKED_APART = 100, 16 * MIB  # what unpacks to more times its size, and this, is a bomb: ours 20 times
 MOST_MESSAGES, MOST_CHANNELS = 5_000_000, 10_000
@@ -46,7 +45,6 @@ CRC = struct.Struct("<I")
 FOOTER_OPCODE, CHUNK, ATTACHMENT, METADATA, DATA_END_OPCODE = 0x02, 0x06, 0x09, 0x0C, 0x0F
 SCHEMA, CHANNEL, MESSAGE_OPCODE, STATISTICS = 0x03, 0x04, 0x05, 0x0B
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-READERS: dict[int, Any] = {CHUNK: kinds.Chunk, ATTACHMENT: kinds.Attachment, METADATA: kinds.Metadata}
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,10 @@ def write_mcap(
     Written chunk by chunk beside `path`, and moved into place once it is whole. InputError if a time decreases.
     """
     with whole_file(path) as file:
-        writer = start(file)
+        writer = Writer(
+            file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
+        )
+        writer.start(profile="", library=LIBRARY)
         writer.add_metadata("run", dict(metadata))
         for name, (media_type, data) in attachments.items():
             writer.add_attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
@@ -85,15 +86,6 @@ def write_mcap(
             data = message.SerializeToString(deterministic=True)
             writer.add_message(ids[rank], log_time=time, data=data, publish_time=time, sequence=sequence)
         writer.finish()
-
-
-def start(file: Any) -> Writer:
-    """The writer of all our files: small chunks, every checksum."""
-    writer = Writer(
-        file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
-    )
-    writer.start(profile="", library=LIBRARY)
-    return writer
 
 
 def _timed(rank: int, channel: Channel) -> Iterator[tuple[int, int, int, Any]]:
@@ -191,52 +183,11 @@ def fields_of(message: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield from fields_of(value, name)
 
 
-def recover_mcap(path: str | Path, out: str | Path) -> "Recovered":
-    """Copy what is before the first damage in `path` to the whole file `out`, which says so in its metadata.
-
-    Chunks and attachments are copied only where their checksum holds; a metadata record has none of its own.
-    Raises ArtifactError if `path` is no MCAP file, InputError if `out` exists.
-    """
-    path, out = Path(path), Path(out)
-    if out.exists() or not out.parent.is_dir():
-        raise InputError("OUT", got=str(out), expected="a file that does not exist, in a directory that does")
-    data = read_plain(path)
-    if not data.startswith(MAGIC):
-        raise ArtifactError(f"{path} is no MCAP file: it does not begin as one does")
-    with whole_file(out) as file:
-        copy, stopped_at = _Copy(start(file)), ""
-        try:
-            for opcode, body in records(data):
-                if opcode in READERS:
-                    record = READERS[opcode].read(ReadDataStream(BytesIO(body)))
-                    for piece in breakup_chunk(record, validate_crc=True) if opcode == CHUNK else [record]:
-                        copy.add(piece)
-        except Exception as error:  # damage makes the reader fail in many ways; all of them end the copy
-            stopped_at = f"{type(error).__name__}: {error}"
-        content = {"from": path.name, "messages": str(copy.messages), "stopped_at": stopped_at or "the end"}
-        copy.writer.add_metadata(RECOVERED, content)
-        copy.writer.finish()
-    return Recovered(copy.messages, copy.attachments, stopped_at)
-
-
-@dataclass(frozen=True)
-class Recovered:
-    """How much was saved, and what it stopped at ("" if the file was whole)."""
-
-    messages: int
-    attachments: int
-    stopped_at: str
-
-
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, body) of each record of a file, from its start to the first that is not whole.
+    """(opcode, body) of each record of a file, from its start; what chunks unpack to is checked before they are.
 
-    Attachments' checksums are checked: the `mcap` package skips them. So is what chunks unpack to, before they are
-    unpacked. ValueError if a checksum does not hold or that is too much, and at the end if the last record is cut
-    short.
+    ValueError where that is too much, and at the end where the last record is cut short.
     """
-    if not data.startswith(MAGIC):
-        raise ValueError("it does not begin as an MCAP file does")
     position, unpacked, most = len(MAGIC), 0, min(MOST_UNPACKED, PACKED_AT_MOST * len(data) + PACKED_APART)
     while position + RECORD.size <= len(data):
         opcode, length = RECORD.unpack_from(data, position)
@@ -404,30 +355,3 @@ def _column(field: Any, values: list[Any], width: int) -> Any:
     lists = [np.array(value, dtype=kind) for value in values]
     same = len({len(value) for value in lists}) == 1
     return np.array(lists) if same else lists or np.zeros((0, width), dtype=kind)
-
-
-class _Copy:
-    """Writes the records of one file into another, schemas and channels under new numbers, each once."""
-
-    def __init__(self, writer: Writer):
-        self.writer, self.messages, self.attachments = writer, 0, 0
-        self.schemas: dict[int, int] = {0: 0}
-        self.channels: dict[int, int] = {}
-
-    def add(self, record: Any) -> None:
-        if isinstance(record, kinds.Message):
-            times = {"log_time": record.log_time, "publish_time": record.publish_time}
-            number = self.channels[record.channel_id]
-            self.writer.add_message(number, data=record.data, sequence=record.sequence, **times)
-            self.messages += 1
-        elif isinstance(record, kinds.Schema) and record.id not in self.schemas:
-            self.schemas[record.id] = self.writer.register_schema(record.name, record.encoding, record.data)
-        elif isinstance(record, kinds.Channel) and record.id not in self.channels:
-            self.channels[record.id] = self.writer.register_channel(
-                record.topic, record.message_encoding, self.schemas[record.schema_id], record.metadata
-            )
-        elif isinstance(record, kinds.Metadata):
-            self.writer.add_metadata(record.name, record.metadata)
-        elif isinstance(record, kinds.Attachment):
-            self.writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
-            self.attachments += 1

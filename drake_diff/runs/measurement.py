@@ -14,6 +14,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
+from drake_diff.model.contract import CoordinateTerms
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameter, ParameterVector, applied
 from drake_diff.model.plant import FLOATING, bodies, joints
@@ -55,23 +56,13 @@ FAILURES: dict[Status, tuple[Label, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column of the states or inputs: its name and unit, and the bounds that the problem sets."""
-
-    name: str
-    unit: str
-    lower: float
-    upper: float
-
-
 @dataclass(frozen=True, eq=False)
 class Measurement(ShowsItsRepr):
     """What a solution is on Drake's plant; `measure` makes it.
 
     Attributes:
         solution: The plan, and how the solver came to it.
-        positions, velocities, inputs: The columns of its states and inputs.
+        positions, velocities, inputs: The columns of its states and inputs, with the bounds that the problem sets.
         times, xs, us: (N+1,), (N+1, nx), and (N, nu) or (N+1, nu): the plan at the problem's own knots.
         motion: The plant's own motion under the planned inputs; None where it could not be taken.
         integrated: (N+1, nx) where the equations lead from the first state, for a plan in continuous time.
@@ -92,9 +83,9 @@ class Measurement(ShowsItsRepr):
     """
 
     solution: Solution
-    positions: tuple[Column, ...]
-    velocities: tuple[Column, ...]
-    inputs: tuple[Column, ...]
+    positions: tuple[CoordinateTerms, ...]
+    velocities: tuple[CoordinateTerms, ...]
+    inputs: tuple[CoordinateTerms, ...]
     times: Array
     xs: Array
     us: Array
@@ -147,7 +138,7 @@ def measure(solution: Solution) -> Measurement:
     problem, motion, knots, us = solution.problem, solution.replay, solution.knots, solution.inputs_at_knots
     names, b = (*problem.state_names, *problem.input_names), problem.bounds
     limits = np.append(b.x_lower, b.u_lower).tolist(), np.append(b.x_upper, b.u_upper).tolist()
-    columns = tuple(Column(*column) for column in zip(names, units_of(problem), *limits, strict=True))
+    columns = tuple(CoordinateTerms(*column) for column in zip(names, units_of(problem), *limits, strict=True))
     states, inputs = columns[: problem.nx], columns[problem.nx :]
     count = problem.model.nq if problem.has_model else problem.nx  # all states of plain dynamics are positions
     positions, velocities = states[:count], states[count:]
@@ -179,12 +170,14 @@ def measure(solution: Solution) -> Measurement:
     )
 
 
-def _unit(columns: Sequence[Column | Parameter]) -> str:
+def _unit(columns: Sequence[CoordinateTerms | Parameter]) -> str:
     """The units of the worst of several numbers: "rad or m"."""
     return " or ".join(dict.fromkeys(column.unit for column in columns))
 
 
-def _metrics_of_the_plan(s: Solution, states: Sequence[Column], inputs: Sequence[Column]) -> Iterator[Metric]:
+def _metrics_of_the_plan(
+    s: Solution, states: Sequence[CoordinateTerms], inputs: Sequence[CoordinateTerms]
+) -> Iterator[Metric]:
     tolerance, x = FEASIBILITY_TOLERANCE, _unit(states)
     bounded = _unit((*states, *inputs, *s.vector.parameters))
     worst = int(np.argmax(s.defects)) if len(s.defects) else 0
@@ -217,7 +210,7 @@ def _metrics_of_the_plan(s: Solution, states: Sequence[Column], inputs: Sequence
 
 
 def _metrics_of_the_replay(
-    solution: Solution, motion: Rollout | None, states: Sequence[Column], positions: Sequence[Column]
+    solution: Solution, motion: Rollout | None, states: Sequence[CoordinateTerms], positions: Sequence[CoordinateTerms]
 ) -> Iterator[Metric]:
     here, x, position = ON_THE_PLANT[solution.problem.motion], _unit(states), _unit(positions)
     measures = (

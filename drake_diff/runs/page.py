@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.model.contract import CoordinateTerms
 from drake_diff.optimize.goal_markers import Colour, colours_of, meaning_of
 from drake_diff.optimize.live import differ, scene_of_plan
 from drake_diff.optimize.solution import Status
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay
 from drake_diff.pages.scene import Scene
-from drake_diff.runs.measurement import Column, Measurement, gradient_norms
+from drake_diff.runs.measurement import Measurement, gradient_norms
 from drake_diff.runs.messages import asked_for, joined
 
 CONTROLS = {"open loop": "Inputs alone (open loop)", "TVLQR": "With feedback (TVLQR)"}
@@ -157,7 +158,7 @@ def plots_of(m: Measurement) -> Iterator[Plot]:
     yield from _solver_plots(m)
 
 
-def _state_plots(m: Measurement, group: str, start: int, columns: Sequence[Column]) -> Iterator[Plot]:
+def _state_plots(m: Measurement, group: str, start: int, columns: Sequence[CoordinateTerms]) -> Iterator[Plot]:
     """A plot for each column: the motion, and the plan where it is another. Plain dynamics have "states" alone."""
     shown = m.shown[0]
     motion = m.integrated if shown is None else shown.xs[:: _parts(m)]

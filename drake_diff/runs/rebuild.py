@@ -7,8 +7,8 @@ their bytes. As a record may name any file, this is only done below a folder tha
 
 import io
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -23,14 +23,19 @@ from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, Mod
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
 from drake_diff.optimize.options import Options
+from drake_diff.optimize.phased import PhasedSolution
+from drake_diff.optimize.problem.fixed_contacts import FixedContacts, Impact
+from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.solve import solve
+from drake_diff.runs.directory import load_plan_record
 from drake_diff.runs.fields import ModelInput, file_evidence
-from drake_diff.runs.plan_record import PlanRecord
+from drake_diff.runs.plan_record import PhasesSection, PlanRecord
 from drake_diff.runs.provenance import named_files, names_in
 from drake_diff.runs.sections import rebuild_problem
+from drake_diff.runs.trace import read_trace
 
 ANYWHERE = Path("/")  # the folder of models of a directory that is one's own
 PLAN = "plan.npz"
@@ -42,6 +47,11 @@ START = "start_us"  # the first guess of the inputs that the problem has
 REMOVED = ("segments",)  # options of `solve` that records of before 3 have
 GUESS = "guess_"  # before the name of an array of the guess that `solve` was given
 GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps", "multipliers", "row_multipliers")
+
+
+def directory_of(i: int) -> str:
+    """The directory of a phase."""
+    return f"phase_{i}"
 
 
 def write_plan(path: Path, solution: Solution, *, partial: bool = False) -> None:
@@ -186,25 +196,86 @@ def resolve(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Solutio
         )
 
 
-def solve_again(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Solution:
+def phase_records(folder: Path, record: PlanRecord) -> list[tuple[Path, PlanRecord]]:
+    """The folder and the record of each phase; of a solve in one phase its own."""
+    if record.phases is None:
+        return [(folder, record)]
+    for i, phase in enumerate(record.phases.phases):
+        if phase.directory != directory_of(i):
+            raise ArtifactError(f"{record.FILE}: phase {i} is in {phase.directory!r}, expected {directory_of(i)!r}")
+    folders = [folder / phase.directory for phase in record.phases.phases]
+    return [(inner, load_plan_record(inner)) for inner in folders]
+
+
+@contextmanager
+def recorded_solution(folder: Path, record: PlanRecord, models: Path | None) -> Iterator[Solution]:
+    """The solution in a run directory, its models built again for as long as the block runs; see `rebuilt`."""
+    with ExitStack() as stack:
+        phases = []
+        for inner, phase in phase_records(folder, record):
+            attachments = read_trace(inner / TRACE).attachments
+            model = stack.enter_context(rebuilt(phase.model, phase.contract.get("source"), attachments, models))
+            phases.append(resolve(phase, model, read_plan(inner / PLAN)))
+        if record.phases is None:
+            yield phases[0]
+            return
+        with _refusing_a_problem():
+            problem = _phased_problem(record.phases, phases)
+            status = Status(record.solver.status if record.solver else "")
+            whole = PhasedSolution.joined(problem, phases, status=status, message=record.sentence)
+        yield whole
+
+
+def _phased_problem(section: PhasesSection, solutions: Sequence[Solution]) -> PhasedProblem:
+    """The problem in phases of a record; a reset that is a user's function leads to zero."""
+    resets: list[Any] = []
+    for link in section.links:
+        system: Any = solutions[link.after].problem.system
+        if link.reset is None:
+            resets.append(np.zeros((system.nx, solutions[link.before].problem.nx)))
+            continue
+        reset: dict[str, Any] = dict(link.reset)
+        if "impact" not in reset:
+            resets.append(None if "identity" in reset else np.array(reset["matrix"]["rows"], dtype=float))
+        elif reset["impact"]:
+            model: Any = system.model if isinstance(system, FixedContacts) else system
+            resets.append(Impact.from_dict(reset["impact"], model))
+        else:  # as records of 2.x say that it stops the fixed points
+            resets.append(system.impact)
+    closing: Any = False
+    if len(resets) == len(solutions):
+        last = resets.pop()
+        closing = True if last is None else last
+    return PhasedProblem(
+        [solution.problem for solution in solutions],
+        resets=resets,
+        periodic=closing,
+        horizon=None if section.horizon_s is None else tuple(section.horizon_s),
+        names=[phase.name for phase in section.phases],
+    )
+
+
+def solve_again(record: PlanRecord, recorded: Solution, plan: dict[str, Array]) -> Solution:
     """What `solve` comes to when it is called as the record says, from the guess that the plan has.
 
     It gets all the time that it needs. ArtifactError where that is no problem that can be solved.
     """
-    search = record.inputs.search
-    if search is None:
-        raise ArtifactError("record.json: it does not say what solve was called with")
-    _check_shapes(record, model, plan)
     with _refusing_a_problem():
-        arguments: dict[str, Any] = dict(search)
-        kind, options = arguments.pop("initial_guess"), arguments.pop("options")
+        arguments: dict[str, Any] = dict(search_of(record) or {})
+        kind, options = arguments.pop("initial_guess", None), arguments.pop("options")
         chosen = Options.from_dict({name: value for name, value in options.items() if name not in REMOVED})
-        problem = rebuild_problem(record, model, plan["us"], plan.get(START))
-        limit, guess = arguments.pop("time_limit"), _rebuild_guess(problem, kind, plan)
+        limit, guess = arguments.pop("time_limit"), _rebuild_guess(recorded.problem, kind, plan)
         limit = None if limit is None else positive_float("time_limit [s]", limit)
-        solution = solve(problem, initial_guess=guess, options=chosen, **arguments)
+        solution: Solution = solve(recorded.problem, initial_guess=guess, options=chosen, **arguments)
     asked = {**arguments, "options": options, "time_limit": limit}
-    return solution.told(options=solution.options | {"time_limit": limit}, search=Search(asked, guess))
+    given = {"time_limit": limit} if "time_limit" in solution.options else {}
+    return solution.told(options=solution.options | given, search=Search(asked, guess))
+
+
+def search_of(record: PlanRecord) -> dict[str, Any] | None:
+    """The arguments of `solve`; None where the record does not have them."""
+    search = record.inputs.search if record.phases is None else record.phases.search
+    return None if search is None else dict(search)
 
 
 def _rebuild_guess(problem: Problem, kind: Any, plan: dict[str, Array]) -> Any:

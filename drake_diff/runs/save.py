@@ -39,7 +39,6 @@ from drake_diff.runs.directory import (
 from drake_diff.runs.fields import (
     Event,
     SealedRecord,
-    Solver,
     canonical,
     evidence,
     files_below,
@@ -50,13 +49,18 @@ from drake_diff.runs.measurement import Measurement, failure_of, measure, replay
 from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.plan_record import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesSection, PlanRecord
 from drake_diff.runs.provenance import gradient_evidence, header
-from drake_diff.runs.rebuild import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve, rows_of, write_plan
-from drake_diff.runs.sections import asked, found, unknown_functions
-
-
-def directory_of(i: int) -> str:
-    """The directory of a phase."""
-    return f"phase_{i}"
+from drake_diff.runs.rebuild import (
+    ANYWHERE,
+    PLAN,
+    TRACE,
+    directory_of,
+    read_plan,
+    rebuilt,
+    resolve,
+    rows_of,
+    write_plan,
+)
+from drake_diff.runs.sections import asked, found, solver_of, unknown_functions
 
 
 def unfinished_record(folder: Path, problem: Problem | PhasedProblem, sentence: str, **fields: Any) -> PlanRecord:
@@ -75,20 +79,10 @@ def _asked_of_all(problem: PhasedProblem) -> dict[str, Any]:
 def record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
     """The record of a solution in phases, but for the files; `folder` is where they are written."""
     given = None if solution.search is None else solution.search.guess
-    options = json.loads(json.dumps(solution.options, default=str), parse_constant=str)
     return PlanRecord(
         verdict="pass" if solution.success else "fail",
         sentence=solution.message,
-        solver=Solver(
-            method="collocation",
-            solver="ipopt",
-            scheme=solution.phases[0].scheme,
-            status=solution.status.value,
-            message=solution.message,
-            solver_message=solution.solver_message,
-            options=options,
-            iterations=len(solution.iterations),
-        ),
+        solver=solver_of(solution),
         phases=PhasesSection(
             search=None if solution.search is None else solution.search.arguments,
             initial_guess=None if given is None else type(given).__name__,
@@ -207,12 +201,22 @@ def _save_other(result: Any, directory: str | Path) -> FitRecord:
 def write_run(solution: Solution | PhasedSolution, folder: Path) -> PlanRecord:
     """Write what `save` does into `folder`, which `written_whole` gave."""
     keep_plan(solution, folder)  # what is measured next may take long
+    return write_measured(solution, folder)
+
+
+def write_measured(
+    solution: Solution | PhasedSolution,
+    folder: Path,
+    amend: Callable[[PlanRecord, Path], PlanRecord] = lambda record, folder: record,
+) -> PlanRecord:
+    """Measure `solution` and write it to `folder`; `amend` changes each record before anything has it."""
     if isinstance(solution, PhasedSolution):
         for i, phase in enumerate(solution.phases):
-            write_run(phase, folder / directory_of(i))
-        return record_of_phases(folder, solution).write(folder)
+            write_measured(phase, folder / directory_of(i), amend)
+        return amend(record_of_phases(folder, solution), folder).write(folder)
     measurement = measure(solution)
-    record = record_of(measurement, folder)
+    record = amend(record_of(measurement, folder), folder)
+    make_folder(folder)
     write_files(folder, measurement, record)
     return record.write(folder)
 

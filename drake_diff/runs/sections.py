@@ -91,24 +91,25 @@ def _search(solution: Solution) -> dict[str, Any] | None:
 
 def found(solution: Solution, *, measured: bool = True) -> dict[str, Any]:
     """The sections that say how a solution was found; norms of gradients take time, and are of what is `measured`."""
-    solver = evidence(
-        Solver,
-        solution,
-        status=solution.status.value,
-        options={name: plain(_scalar(value)) for name, value in solution.options.items() if name not in GUESS},
-        iterations=len(solution.iterations),
-    )
     gradient = _gradient(solution) if measured else GradientEvidence(reason="not measured yet")
     certificates = [gradient_evidence(c) for c in solution.certificates]
     return {
-        "solver": solver,
+        "solver": solver_of(solution),
         "parameters": _parameters(solution),
         "gradient": gradient.model_copy(update={"certificates": certificates}),
     }
 
 
-def _scalar(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
+def solver_of(solution: Solution) -> Solver:
+    """What solved the problem, and how it ended; an option that is no finite number is null."""
+    options = {name: value for name, value in solution.options.items() if name not in GUESS}
+    return evidence(
+        Solver,
+        solution,
+        status=solution.status.value,
+        options={k: plain(v.item() if isinstance(v, np.generic) else v) for k, v in options.items()},
+        iterations=len(solution.iterations),
+    )
 
 
 def _parameters(solution: Solution) -> list[ParameterEvidence]:

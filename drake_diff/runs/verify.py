@@ -1,6 +1,7 @@
 """`verify`: make a directory again and compare all of it. `recalled` takes a run up again."""
 
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -24,25 +25,25 @@ from drake_diff.runs.differences import (
     compare_traces,
 )
 from drake_diff.runs.directory import FILES as OLD_FILES
-from drake_diff.runs.directory import is_partial, load_plan_record, load_record, read_checked, record_path
-from drake_diff.runs.fields import SCHEMA_VERSION, SealedRecord
+from drake_diff.runs.directory import is_partial, load_plan_record, load_record, parse_record, read_checked, record_path
+from drake_diff.runs.fields import SCHEMA_VERSION, SealedRecord, read_fields
 from drake_diff.runs.messages import claims_of
 from drake_diff.runs.other_records import ComparisonRecord, FitRecord, is_trial_file
-from drake_diff.runs.plan_record import PhasesSection, PlanRecord
+from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.provenance import packages_here
-from drake_diff.runs.rebuild import ANYWHERE, PLAN, TRACE, read_plan, rebuilt, resolve
+from drake_diff.runs.rebuild import ANYWHERE, PLAN, TRACE, phase_records, read_plan, recorded_solution
 from drake_diff.runs.reproduce import (
     OF_RECOVERED,
     SAME_PLAN,
     SEARCH_TOPICS,
     SEARCHED,
+    SEARCHED_IN_PHASES,
+    contradictions,
     is_below,
     odd_metrics,
-    odd_trace,
     reproduce,
 )
-from drake_diff.runs.save import FILES
-from drake_diff.runs.trace import CONFIGURATION, read_trace
+from drake_diff.runs.trace import CONFIGURATION
 
 MOST = 16  # lines of a kind that are printed
 SAME_VALUES = ("3.1.", SCHEMA_VERSION)  # versions of the schema whose values are those of this one
@@ -56,7 +57,7 @@ UNCHECKED = (
     "name and contract.source: what it was called, and where the model file was",
 )
 WAITED = 60.0  # [s] for a run to be made again, where nobody says else
-WITHIN_PHASES = "the record does not say what solve was called with"  # of a phase: that of all says it
+HASHED = ("schema_version", "files", "record_sha256")  # of a record
 OF_FUNCTIONS = (
     "all that rests on the functions: only the plan's first and last state and its bounds were compared with the "
     "metrics, and the plan with the trace"
@@ -296,12 +297,9 @@ def _run_again(verification: Verification, record: SealedRecord, models: Path | 
         made = reproduce(verification.directory, record, models)
         if made is None:
             return replace(verification, unchecked=(f"every number: {NOT_RERUN[record.subject]}",))
-        compared = _compared(verification, record, made)
-        if isinstance(record, PlanRecord) and record.phases is not None and not made.problems:
-            return _with_phases(compared, record.phases, models)
-        return compared
+        return _compared(verification, record, made)
     except (ModelError, MissingDependencyError) as error:
-        return _without_its_functions(verification, record, error)
+        return _without_its_model(verification, record, error)
     except ArtifactError as error:
         return _judged(verification, [str(error)], [])
     except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
@@ -309,45 +307,20 @@ def _run_again(verification: Verification, record: SealedRecord, models: Path | 
         return _judged(verification, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
 
 
-def _with_phases(verification: Verification, section: PhasesSection, models: Path | None) -> Verification:
-    """What was found of all phases, and of the directory of each."""
-    complaints, undecided, unchecked, rounded = (
-        [*verification.complaints],
-        [*verification.undecided],
-        [*verification.unchecked],
-        [*verification.rounded],
-    )
-    checked = verification.checked
-    for name in (phase.directory for phase in section.phases):
-        inner, problems = read_checked(verification.directory / name / PlanRecord.FILE)
-        phase = _run_again(Verification(verification.directory / name, inner), inner, models)
-        complaints += [f"{name}: {line}" for line in (*problems, *phase.complaints)]
-        undecided += [f"{name}: {line}" for line in phase.undecided if WITHIN_PHASES not in line]
-        unchecked += [f"{name}: {line}" for line in phase.unchecked if line.startswith(OF_FUNCTIONS)]
-        rounded += [f"{name}: {line}" for line in phase.rounded]
-        checked += phase.checked
-    content = replace(verification, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
-    return _judged(content, complaints, undecided)
-
-
 def has_recordings(record: SealedRecord) -> bool:
     """Whether it is a comparison with recordings that can be compared again."""
     return isinstance(record, ComparisonRecord) and bool(record.recordings)
 
 
-def _without_its_functions(verification: Verification, record: SealedRecord, error: Exception) -> Verification:
+def _without_its_model(verification: Verification, record: SealedRecord, error: Exception) -> Verification:
     """What the files of a run that cannot be made again say of each other."""
-    content = (f"not run again: {error}",)
-    if not isinstance(record, PlanRecord) or record.subject != "plan":
+    content, folder = (f"not run again: {error}",), verification.directory
+    if not isinstance(record, PlanRecord) or record.subject not in ("plan", "phases"):
         return replace(verification, undecided=content, unchecked=("everything but the hashes",))
-    plan = read_plan(verification.directory / PLAN)
     try:
-        trace = read_trace(verification.directory / TRACE)
-        problems = [
-            *_odd_schema(record),
-            *odd_trace(verification.directory, trace, plan, record),
-            *odd_metrics(record, plan),
-        ]
+        problems = [*_odd_schema(record), *contradictions(folder, record)]
+        for inner, phase in phase_records(folder, record):
+            problems += odd_metrics(phase, read_plan(inner / PLAN))
     except (ArtifactError, KeyError, LookupError, TypeError, ValueError) as wrong:
         problems = [f"its files do not go together: {type(wrong).__name__}: {wrong}"]
     return _judged(replace(verification, unchecked=(OF_FUNCTIONS,)), problems, content)
@@ -383,10 +356,10 @@ def _recalled(folder: Path, models: Path | None) -> Iterator[Solution]:
     record = load_plan_record(folder)
     _refuse(folder, read_checked(folder / record.FILE)[1])
     _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
-    plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
-    with rebuilt(record.model, record.contract.get("source"), trace.attachments, models) as model:
-        _refuse(folder, (*odd_trace(folder, trace, plan, record), *_odd_contract(record, model.contract.to_dict())))
-        yield resolve(record, model, plan)
+    _refuse(folder, tuple(contradictions(folder, record)))
+    with recorded_solution(folder, record, models) as solution:
+        _refuse(folder, tuple(_odd_contract(record, solution.problem.model.contract.to_dict())))
+        yield solution
 
 
 def _refuse(folder: Path, problems: Sequence[str]) -> None:
@@ -397,39 +370,45 @@ def _refuse(folder: Path, problems: Sequence[str]) -> None:
 def _compared(verification: Verification, record: SealedRecord, again: Reproduced) -> Verification:
     """Record and files of a directory beside the same made again."""
     converted = record.schema_version != SCHEMA_VERSION
-    recorded, fields = record.model_dump(mode="json"), Compared(record.FILE)
-    made = {**again.fields, **({"schema_version": record.schema_version} if "schema_version" in again.fields else {})}
-    if made:
-        compare_fields(fields, again.recorded or {key: recorded[key] for key in made}, made)
-    reworded = [d for d in fields.differing if converted and d.key.split(".")[-1] in WORDS]
-    fields.differing = [d for d in fields.differing if d not in reworded]
-    nothing = record.subject in NOT_RERUN and not made
+    fields = Compared(record.FILE)
+    if again.fields:
+        recorded = record.model_dump(mode="json")
+        _compare_records(fields, again.recorded or {key: recorded[key] for key in again.fields}, again.fields)
+    nothing = record.subject in NOT_RERUN and not again.fields
     why = (f"every number: {NOT_RERUN[record.subject]}",) if nothing else (*UNCHECKED, *_others(record, again.written))
     compared, unchecked = [fields], [*why, *again.unchecked]
-    unchecked += [f"{d.key}: schema {record.schema_version} has other words" for d in reworded]
-    unchecked += [f"what schema {record.schema_version} has and {SCHEMA_VERSION} has not"] * converted
-    for name in (name for name in again.written if name in again.files or (again.files and name in FILES)):
+    unchecked += [f"sentences, pages and whatever else schema {SCHEMA_VERSION} has otherwise"] * converted
+    for name in dict.fromkeys((*again.files, *again.written)):
         if name not in record.files:
             unchecked += [f"{name}: the directory has none"] * (name in again.files)
         elif name not in again.files:
-            unchecked.append(f"{name}: it has what was not run again")
-        elif converted and name.endswith(".html"):
-            unchecked.append(f"{name}: schema {record.schema_version} wrote it, whose pages are not those of this one")
-        else:
-            compared.append(_compared_file(verification.directory / name, again))
+            unchecked += [f"{name}: it has what was not run again"] * bool(again.files)
+        elif not (converted and name.endswith((".html", record.SCHEMA_FILE))):
+            compared.append(_compared_file(verification.directory, name, again))
+    for item in compared if converted else ():
+        item.differing = [d for d in item.differing if d.key.split(".")[-1] not in WORDS]
     return _told_of_a_solve(verification, again, [*_odd_schema(record), *again.problems], compared, unchecked)
 
 
-def _compared_file(path: Path, again: Reproduced) -> Compared:
-    compared, recorded = Compared(path.name), read_plain(path)
-    if path.suffix == ".mcap":
+def _compare_records(compared: Compared, recorded: Mapping[str, Any], again: Mapping[str, Any]) -> None:
+    """Two records, but for their version, and the hashes of files, which are compared by themselves."""
+    old, new = ({key: v for key, v in side.items() if key not in HASHED} for side in (recorded, again))
+    compare_fields(compared, old, new)
+
+
+def _compared_file(folder: Path, name: str, again: Reproduced) -> Compared:
+    compared, made = Compared(name), again.files[name]
+    if Path(name).name == SealedRecord.FILE:
+        recorded = parse_record(folder / name, read_fields(folder / name)).model_dump(mode="json")
+        _compare_records(compared, recorded, json.loads(made))
+    elif name.endswith(".mcap"):
         skip = SEARCH_TOPICS if again.unrepeated else ()
         alike = (SealedRecord.FILE, CONFIGURATION) if again.unrepeated else (SealedRecord.FILE,)
-        compare_traces(compared, recorded, again.files[path.name], alike=alike, skip=skip)
-    elif path.suffix == ".html":
-        compare_text(compared, recorded, again.files[path.name])
+        compare_traces(compared, read_plain(folder / name), made, alike=alike, skip=skip)
+    elif name.endswith(".html"):
+        compare_text(compared, read_plain(folder / name), made)
     else:
-        compare_bytes(compared, recorded, again.files[path.name])
+        compare_bytes(compared, read_plain(folder / name), made)
     return compared
 
 
@@ -467,7 +446,7 @@ def _told_of_a_solve(
     if 0 < again.apart <= SAME_PLAN:
         rounded.append(f"{PLAN}: that of the search, run again, is {again.apart:.2g} of its largest number away")
     for d in differing:
-        if is_below(d.key, again.missing) and d.file == SealedRecord.FILE:
+        if is_below(d.key, again.missing) and d.file.endswith(SealedRecord.FILE):
             continue
         if d.allowed:
             rounded.append(str(d))
@@ -485,9 +464,9 @@ def _told_of_a_solve(
 
 def _is_searched(d: Difference) -> bool:
     """Whether a difference is in what the search tells of itself, or in a page, which shows that too."""
-    if d.file == SealedRecord.FILE:
-        return is_below(d.key, SEARCHED)
-    return d.file != TRACE or d.key.startswith((*SEARCH_TOPICS, "attachment ", "metadata "))
+    if d.file.endswith(SealedRecord.FILE):
+        return is_below(d.key, (*SEARCHED, *SEARCHED_IN_PHASES))
+    return not d.file.endswith(TRACE) or d.key.startswith((*SEARCH_TOPICS, "attachment ", "metadata "))
 
 
 def _judged(verification: Verification, problems: Sequence[str], undecided: Sequence[str]) -> Verification:

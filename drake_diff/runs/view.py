@@ -11,20 +11,19 @@ from pydrake.geometry import Meshcat, MeshcatParams, Rgba
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ArtifactError, ModelError
-from drake_diff.logs.mcap_file import McapLog, read_mcap
+from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.parameters import applied
-from drake_diff.optimize.goal_markers import drawn_goals
-from drake_diff.optimize.live import differ
-from drake_diff.optimize.solution import Solution
+from drake_diff.optimize.live import scene_of_plan
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import draw, write_replay
-from drake_diff.pages.scene import BLUE, Force, Poses, Scene, longest_path, scene_of
+from drake_diff.pages.scene import Poses, Scene, longest_path
 from drake_diff.runs.differences import READ, differences, is_near, is_number
 from drake_diff.runs.directory import is_partial, load_plan_record, load_record, record_path
 from drake_diff.runs.other_records import TRIALS, ComparisonRecord, is_trial_file
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.rebuild import TRACE
 from drake_diff.runs.save import REPLAY
+from drake_diff.runs.trace import read_trace
 from drake_diff.runs.verify import recalled
 
 PLAN, WITHOUT = "plan", "without_feedback"  # the names of ghosts
@@ -224,36 +223,16 @@ def scene_of_run(directory: str | Path, *, models: str | Path | None = None) -> 
     if not load_plan_record(folder).contract:
         raise ArtifactError(f"{folder} is a run of plain dynamics: there is no body to draw")
     try:
-        with recalled(folder, models=models) as solution:
-            return _scene(solution, read_mcap(folder / TRACE, links=False))
+        with recalled(folder, models=models) as solution, applied(solution.vector):
+            scene = scene_of_plan(solution, solution.replay)
+            rests_on = read_trace(folder / TRACE).metadata.get("verdict_rests_on", OPEN_LOOP)
+            if rests_on.startswith(OPEN_LOOP) or not scene.ghosts:
+                return scene
+            (plan,), trail = scene.ghosts, scene_of_plan(solution, None).trail
+            without = replace(plan, name=WITHOUT, poses=scene.poses, framed=False)
+            return replace(scene, poses=plan.poses, ghosts=(without,), trail=trail, contacts=(), thrusts=())
     except ModelError as error:
         raise ArtifactError(f"{folder}: {error}. {REPLAY} in it shows the motion without the model") from error
-
-
-def _scene(solution: Solution, log: McapLog) -> Scene:
-    state, knots = log.arrays("/state"), len(solution.xs[solution.knots])
-    times, xs = state["time"], np.hstack([state["q"], state["v"]])
-    if len(times) < 2:
-        raise ArtifactError(f"{TRACE} has no motion: the plant could not be stepped along the inputs")
-    planned = solution.plan.sample((len(xs) - 1) // (knots - 1))[0]
-    pushes = {time: _forces(message) for time, message in log.messages.get("/contacts", [])}
-    contacts = [pushes.get(time, ()) for time, _ in log.messages["/state"][:-1]]
-    rests_on = log.metadata.get("run", {}).get("verdict_rests_on", OPEN_LOOP)
-    with applied(solution.vector):
-        model = solution.problem.model
-        marks = drawn_goals(model.plant, model.double.context, solution.problem.goals)
-        if rests_on.startswith(OPEN_LOOP):
-            us = log.arrays("/input")["u"]
-            ghosts = {PLAN: (planned, BLUE)} if differ(xs, planned) else None
-            return scene_of(model, times, xs, us=us, contacts=contacts, ghosts=ghosts, marks=marks)
-        scene = scene_of(model, times, planned, ghosts={WITHOUT: (xs, BLUE)}, marks=marks)
-        return replace(scene, ghosts=tuple(replace(ghost, framed=False) for ghost in scene.ghosts))
-
-
-def _forces(message: Any) -> tuple[Force, ...]:
-    points = np.array([message.px, message.py, message.pz]).T
-    forces = np.array([message.fx, message.fy, message.fz]).T
-    return tuple(Force(point, force) for point, force in zip(points, forces, strict=True))
 
 
 SECOND = Rgba(0.85, 0.4, 0.05, 0.45)  # near the colour of its lines

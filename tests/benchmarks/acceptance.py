@@ -112,8 +112,6 @@ COMMANDS: dict[str, list[tuple[str, tuple[int, ...]]]] = {
         ("verify swing --time-limit 600", (0,)),
         ("list .", (0,)),
         ("compare-runs swing swing", (0,)),
-        ("mcap info swing/trace.mcap", (0,)),
-        ("mcap check swing/trace.mcap", (0,)),
         ("export --ros2 swing", (0,)),
         ("robustness swing --trials 3 --perturbations mass --out trials", (0, 1)),
     ],

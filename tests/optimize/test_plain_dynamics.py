@@ -202,7 +202,7 @@ def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):
     verification = dd.verify(tmp_path / "run")
     assert verification.verdict == "undecided"  # for the constraint's function alone
     assert verification.complaints == ()
-    assert verification.checked > 800
+    assert verification.checked > 700
     assert record.problem["num_steps"] == 20
     again = np.load(tmp_path / "run" / "plan.npz")
     assert np.array_equal(again["mesh"], fine.mesh)

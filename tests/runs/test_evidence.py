@@ -1,7 +1,6 @@
 """The run directory: complete, true, the same bytes for the same input, and honest when the run failed."""
 
 import dataclasses
-import math
 from hashlib import sha256
 
 import numpy as np
@@ -36,11 +35,6 @@ def run(swing_up, tmp_path_factory):
     directory = tmp_path_factory.mktemp("runs") / "pendulum"
     dd.save(swing_up, directory)
     return directory
-
-
-def test_a_run_directory_holds_these_files_and_nothing_else(run):
-    names = ["plan.npz", "record.json", "record.schema.json", "replay.html", "report.html", "trace.mcap"]
-    assert sorted(p.name for p in run.iterdir()) == names
 
 
 def test_the_record_says_what_the_solution_measures(run, swing_up):
@@ -107,16 +101,6 @@ def test_a_motion_that_is_not_finite_is_recorded_as_missing_not_as_zero(swing_up
     assert "could not be stepped" in metrics["penetration"].reason
 
 
-def test_the_trace_gives_back_states_and_inputs_bit_for_bit(run, swing_up):
-    trace = read_trace(run / "trace.mcap")
-    assert trace.xs.tobytes() == swing_up.replay.xs.tobytes()
-    assert trace.us.tobytes() == swing_up.us.tobytes()
-    assert trace.planned_xs.tobytes() == swing_up.xs.tobytes()
-    assert trace.times.tobytes() == swing_up.times.tobytes()
-    assert trace.diagnostics["energy_total"].tobytes() == swing_up.replay.energy.tobytes()
-    assert trace.diagnostics["work_actuators"].tobytes() == swing_up.replay.work.tobytes()
-
-
 def test_the_trace_has_well_known_channels_with_units_in_simulated_time(run):
     log = read_mcap(run / "trace.mcap")
     states = log.messages["/joint_states"]
@@ -127,16 +111,6 @@ def test_the_trace_has_well_known_channels_with_units_in_simulated_time(run):
     assert log.channel_metadata["/diagnostics"]["units"]["energy_total"] == "J"
     assert len(log.messages["/solver/iterations"]) == dd.load_record(run).solver.iterations
     assert {m.verdict for _, m in log.messages["/gradient/check"]} == {"agree"}
-
-
-def test_frame_transforms_put_the_bob_where_the_angle_says(run):
-    """The pole's frame turns by q about +y: its quaternion is (cos q/2, 0, sin q/2, 0)."""
-    log = read_mcap(run / "trace.mcap")
-    for (_, transforms), (_, state) in zip(log.messages["/tf"], log.messages["/state"], strict=True):
-        rotation = transforms.transforms[0].rotation
-        # Both quaternions of a rotation are right: compare up to sign.
-        cosine = rotation.w * math.cos(state.q[0] / 2) + rotation.y * math.sin(state.q[0] / 2)
-        assert abs(cosine) == pytest.approx(1, abs=1e-12)
 
 
 def test_contacts_are_in_the_trace_with_their_force(thrown, tmp_path):

@@ -125,6 +125,16 @@ def test_what_functions_a_run_has_is_undecided_and_said(bounced):
     assert any("were compared" in line for line in found.unchecked)
 
 
+@pytest.mark.slow
+def test_phases_are_made_again_where_the_reset_between_them_is_a_function(tmp_path):
+    problem = dd.optimize.PhasedProblem(swinging().phases, resets=[lambda x: [x[0], x[1]]])
+    assert dd.save(dd.solve(problem), tmp_path / "run").verdict == "pass"
+    found = dd.verify(tmp_path / "run")
+    assert found.verdict == "undecided"
+    assert any("<lambda> is a user's function" in line for line in found.undecided)
+    assert found.checked > 1000
+
+
 def of_links(fields):
     fields["links"][0]["errors"][1] *= 0.5
     fields["links"][0]["errors"][1] += 1e-9

@@ -288,12 +288,6 @@ def test_meshes_of_packages_folders_and_included_models_are_found(tmp_path):
         assert found[0].bytes in (1, 6)
 
 
-REPLAY_METRICS = ["replay end error", "half-step end error", "energy drift", "energy oscillation", "energy scale"]
-REPLAY_METRICS += ["penetration", "joint limit violation"]
-COLLOCATION_METRICS = ["integration error", "state excess between nodes", "input excess between nodes"]
-COLLOCATION_METRICS += ["constraint excess between nodes", "excess between nodes"]
-
-
 @pytest.mark.slow
 @each_row("coordinate", range(13))
 def test_one_coordinate_of_the_last_state_that_is_off_is_the_end_error(thrown, coordinate):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-import random
 import subprocess
 import sys
 
@@ -214,17 +213,6 @@ def test_a_state_without_a_pose_has_no_frames_and_the_rest_is_there(tmp_path, lo
     planned = [[t for t in m.transforms if t.child_frame_id.startswith("planned/")] for _, m in log.messages["/tf"]]
     assert [len(p) for p in planned] == [2, 0, 0, 2]  # ball and ground
     assert bits(read_trace(tmp_path / "a.mcap").planned_xs) == bits(xs)
-
-
-def test_no_flipped_byte_of_a_trace_is_read(trace_of_collocated, tmp_path):
-    whole, seeded = trace_of_collocated.read_bytes(), random.Random(0)
-    places = [seeded.randrange(len(whole)) for _ in range(250)] + list(range(len(whole) - 60, len(whole)))
-    for place in places:
-        damaged = bytearray(whole)
-        damaged[place] = (damaged[place] + seeded.randrange(1, 256)) % 256
-        (tmp_path / "a.mcap").write_bytes(damaged)
-        with pytest.raises(ArtifactError, match=r"a\.mcap"):
-            read_trace(tmp_path / "a.mcap")
 
 
 def test_a_whole_log_that_is_no_trace_is_refused(tmp_path):
