@@ -55,6 +55,7 @@ class FixedContactPlant:
     rows: Indices  # (m,) of those, that some joint moves
     equations: EquationsOfMotion
     tree: TreeModel
+    may_jump = False
 
     def values(self, knots: Array) -> Array:
         """(K, nx) dx/dt at `knots` (K, nx + nu), by Drake's own mass matrix, bias and velocities."""

@@ -9,7 +9,7 @@ CLAUSES = {
     "chain": "through all phases, {where}, {value} of its range, tolerance {tolerance}",
     "clearance": "{name} come {value} nearer than their margin at {time}, tolerance {tolerance}",
     "constraint": "{name} is broken by {value} at {time}, tolerance {tolerance}",
-    "cost": "the cost is not finite",
+    "cost": "the cost that was minimized is {value} from that of the motion, tolerance {tolerance}",
     "defect": "defect {value} is above {tolerance}: the motion does not follow the dynamics after {where}",
     "depth": "{name} is broken at {time}, {value} of the ranges of states and inputs from where it holds",
     "derivative": "a certificate of derivatives does not agree: {where}",

@@ -26,10 +26,10 @@ from drake_diff.optimize.replay import FEEDBACK, OPEN_LOOP, Replay
 from drake_diff.optimize.solution import PLANS, Solution, Status, Trajectories
 from drake_diff.optimize.transcription.collocation import (
     FOUND,
-    SUBSTEPS,
     Collocated,
     Transcription,
 )
+from drake_diff.optimize.transcription.lead import SUBSTEPS
 from drake_diff.optimize.verification import ended, status_of
 
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)

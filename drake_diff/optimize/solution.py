@@ -213,7 +213,10 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def cost(self) -> float:
-        """The objective of xs and us, as `Problem` defines it; inf where it is not finite."""
+        """The objective of xs and us, as `Problem` defines it; inf where it is not finite.
+
+        In collocation the running cost is integrated along the motion that the dynamics make from each knot.
+        """
         if not self._is_whole:
             return float("inf")
         total = float("nan")
@@ -223,6 +226,31 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             total = self.problem.objective(self.xs, self.us, self.time_step)
             total += self.problem.cost_of_parameters(self.vector.values)
         return total if np.isfinite(total) else float("inf")
+
+    @cached_property
+    def cost_error(self) -> float:
+        """How far `cost` may be from what was minimized and from its own true value; inf where it is not known.
+
+        Of a collocated plan, the distance of the scheme's quadrature from the integral along the motion of the
+        dynamics, and what is left of that integral's errors: of features that are wider than a 1e-4 of each state's
+        range along the motion. Of a plan in steps, a bound of the rounding of its sum.
+        """
+        if not np.isfinite(self.cost):
+            return float("inf")
+        if self.transcribed is not None:
+            return self.transcribed.cost_error
+        return float(np.finfo(float).eps * (len(self.xs) + 2) * self.cost_scale)
+
+    @cached_property
+    def cost_scale(self) -> float:
+        """What the parts of the cost come to without their signs."""
+        if self.transcribed is not None:
+            return max(abs(self.cost), self.transcribed.cost_scale)
+        parts = [
+            *self.problem.cost_terms(self.xs, self.us, self.time_step),
+            self.problem.cost_of_parameters(self.vector.values),
+        ]
+        return float(np.sum(np.abs(parts)))
 
     @property
     def times(self) -> Array:

@@ -63,7 +63,7 @@ def _holding(s: Solution) -> list[str]:
 
 def _remedy(draft: Solution, failing: list[Check]) -> str:
     """What to try against what fails between knots."""
-    if draft.problem.is_map or not any(c.what == "integration" or c.plant != PLAN for c in failing):
+    if draft.problem.is_map or not any(c.what in ("cost", "integration") or c.plant != PLAN for c in failing):
         return ""
     if draft.transcribed is None:
         return SHORTER
@@ -93,7 +93,7 @@ def may_be_too_coarse(solution: Solution) -> bool:
     motion = solution.transcribed
     if solution.status is not Status.CONVERGED_NOT_VERIFIED or motion is None or motion.task.is_map:
         return False
-    final = (*ASKED, "overlap", "derivative")
+    final = (*(what for what in ASKED if what != "cost" or not np.isfinite(solution.cost)), "overlap", "derivative")
     return all(c.passes for c in solution.plan_checks if c.plant == PLAN and c.what in final)
 
 

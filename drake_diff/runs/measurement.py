@@ -183,6 +183,9 @@ def _metrics_of_the_plan(
     worst = int(np.argmax(s.defects)) if len(s.defects) else 0
     when = float(s.times[min(worst, len(s.times) - 1)])
     yield measured("cost", "objective of the states and inputs as the problem defines it", s.cost, "1")
+    yield measured(
+        "cost error", "distance of the cost from what was minimized and from its true value", s.cost_error, "1"
+    )
     yield measured("defect", "largest distance from the dynamics over one step", s.defect, x, tolerance, t_s=when)
     yield measured("goal error", "largest distance of the final state from the goal", s.goal_error, x, tolerance)
     yield measured("bound violation", "largest excess over a bound", s.bound_violation, bounded, tolerance)

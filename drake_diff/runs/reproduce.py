@@ -273,7 +273,7 @@ def _without_the_search(
     for record in records.values():
         costs, constraints = unknown_functions(record)
         if costs:
-            missing += ["metrics[cost]", "phases.cost", *(f"problem.{name}" for name in COSTS)]
+            missing += ["metrics[cost]", "metrics[cost error]", "phases.cost", *(f"problem.{name}" for name in COSTS)]
         if constraints:
             missing += [*CONSTRAINED, *(f"replays[{i}].{key}" for i in range(len(record.replays)) for key in JUDGED)]
         if record.phases is not None:

@@ -93,3 +93,49 @@ def test_a_plan_is_followed_under_feedback_as_in_closed_form():
     assert led == pytest.approx(0.3 * np.exp(-3 * times), abs=1e-9)
     assert motion.led_from(np.array([-2.0]), gains)[:, 0] == pytest.approx(-2 + times, abs=1e-12)
     assert motion.led_from(np.array([0.3]), None)[:, 0] == pytest.approx(0.3, abs=1e-15)
+
+
+def narrow(random):
+    """(f, its area, its place, the rest's speed there): a bump of 0.1 to 10 mm on the way from 0 to 1 m in 1 s."""
+    width, at = 10 ** random.uniform(-4, -2), random.uniform(0.1, 0.9)
+    time = np.roots([-2, 3, 0, -at])
+    time = float(np.real(time[(np.real(time) > 0) & (np.real(time) < 1)][0]))
+    height = random.choice([-1, 1]) * 0.5 / width
+    if random.random() < 0.5:
+        bump = lambda x: height * np.exp(-(((x - at) / width) ** 2))  # noqa: E731
+        return bump, height * width * np.sqrt(np.pi), 6 * time * (1 - time)
+    box = lambda x: height if abs(x - at) < width / 2 else 0.0  # noqa: E731
+    return box, height * width, 6 * time * (1 - time)
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize("seed", range(8))
+def test_a_gust_between_two_nodes_is_seen(seed):
+    """The input of a block's move from rest to rest, 6 - 12 t; the gust's work changes its speed in one interval."""
+    random = np.random.default_rng(seed)
+    gust, work, speed = narrow(random)
+    pushed = dd.Dynamics(lambda x, u: [x[1], u[0] + gust(x[0])], nx=2, nu=1)
+    problem = dd.Problem(
+        pushed, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=dd.QuadraticCost(R=[[1.0]]), horizon=1.0
+    )
+    t = np.linspace(0, 1, 21)
+    xs, us = np.column_stack([3 * t**2 - 2 * t**3, 6 * t * (1 - t)]), (6 - 12 * t)[:, None]
+    motion = collocated(problem, "hermite_simpson", xs, us, None, 1.0, t)
+    expected = abs(np.sqrt(max(speed**2 + 2 * work, 0.0)) - speed)
+    assert np.max(motion.gaps) > 0.02  # twice the tolerance of an interval
+    if work > 0:
+        assert np.max(motion.gaps[:, 1]) == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_peak_of_the_cost_between_two_nodes_counts(seed):
+    random = np.random.default_rng(100 + seed)
+    peak, area, speed = narrow(random)
+    block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+    problem = dd.Problem(
+        block, x0=[0, 0], num_steps=20, running_cost=lambda x, u: u[0] ** 2 + 40 * peak(x[0]), horizon=1.0
+    )
+    t = np.linspace(0, 1, 21)
+    xs, us = np.column_stack([3 * t**2 - 2 * t**3, 6 * t * (1 - t)]), (6 - 12 * t)[:, None]
+    motion = collocated(problem, "hermite_simpson", xs, us, None, 1.0, t)
+    assert motion.cost == pytest.approx(12 + 40 * area / speed, rel=0.03)

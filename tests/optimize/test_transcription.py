@@ -43,7 +43,7 @@ def half_effort(x, u):
 @each_row("count", [2, 5, 10, 20])
 def test_the_blocks_move_has_each_schemes_own_optimum(count):
     by_trapezoid = move(count, scheme="trapezoid")
-    assert 12 / by_trapezoid.cost == pytest.approx(1 - 4 / count**2 + 3 / count**3, rel=1e-9)
+    assert 12 / by_trapezoid.transcribed.quadrature == pytest.approx(1 - 4 / count**2 + 3 / count**3, rel=1e-9)
     by_simpson = move(count)
     assert by_simpson.cost == pytest.approx(12, rel=1e-9)
     t = by_simpson.times
@@ -58,7 +58,7 @@ def test_the_blocks_move_has_each_schemes_own_optimum(count):
 def test_the_cart_pole_from_its_file_swings_up(scheme, count, optimum):
     dynamics = plant_dynamics(dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04))
     motion = move(count, dynamics, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], horizon=2.0, scheme=scheme)
-    assert motion.cost == pytest.approx(optimum, rel=1e-7)
+    assert motion.transcribed.quadrature == pytest.approx(optimum, rel=1e-7)
     if count == 50:  # the largest input is between two nodes
         xs, us = motion.transcribed.at(np.linspace(0, 2, 2001))
         assert np.abs(us).max() == pytest.approx(13.98, abs=0.01)
@@ -84,7 +84,7 @@ def test_the_simple_pendulum_with_a_free_final_time(scheme, count, optimum):
         lambda x, u: np.array([x[1], -0.1 * x[1] - np.sin(x[0]) + u[0]]), 2, 1, u_lower=[-5], u_upper=[5]
     )
     motion = move(count, pendulum, x_goal=[np.pi, 0], horizon=(0.5, 2.5), scheme=scheme)
-    assert motion.cost == pytest.approx(optimum, rel=1e-7)
+    assert motion.transcribed.quadrature == pytest.approx(optimum, rel=1e-7)
     assert motion.horizon == pytest.approx(2.5, abs=1e-6)
     if scheme == "hermite_simpson":
         assert np.abs(motion.inputs_at_knots).max() == pytest.approx(2.968, abs=5e-3)
@@ -100,7 +100,8 @@ def test_the_simple_pendulum_with_a_free_final_time(scheme, count, optimum):
 def test_the_cost_converges_at_the_schemes_order(scheme, errors, orders):
     """Between 20, 40 and 80 intervals the trapezoid's order goes from 1.79 to 1.91, Hermite-Simpson's is 4."""
     found = [
-        move(n, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0, scheme=scheme).cost - 72.126618030
+        move(n, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0, scheme=scheme).transcribed.quadrature
+        - 72.126618030
         for n in (20, 40, 80)
     ]
     assert np.abs(found) == pytest.approx(errors, rel=1e-4)
@@ -165,7 +166,9 @@ def test_bryson_and_denham():
     assert motion.cost == pytest.approx(4, rel=1e-7)
     assert motion.inputs_at_knots[0, 0] == pytest.approx(-6, abs=1e-4)
     assert violation_between_nodes(motion.transcribed).state < 1e-7
-    assert 4.0035267 < bryson_denham(100, "trapezoid").cost < 4.0036  # the first keeps its bound at the nodes alone
+    assert (
+        4.0035267 < bryson_denham(100, "trapezoid").transcribed.quadrature < 4.0036
+    )  # the first keeps its bound at the nodes alone
 
 
 @each_row("count", [5, 7, 10, 11])
@@ -175,11 +178,10 @@ def test_a_bound_holds_between_the_nodes_wherever_they_lie(count, scheme):
     motion = bryson_denham(count, scheme)
     dense = motion.transcribed.at(np.linspace(0, 1, 5001))[0][:, 0].max() - 1 / 9
     assert dense < 1e-7
-    assert motion.cost > 4 * (1 - 1e-7)
-    if scheme == "trapezoid":  # what it calls the motion is a parabola, but not that of the block
-        assert "an accurate integration from knot" in motion.message
-    else:
-        assert motion.success, motion.message
+    assert motion.transcribed.quadrature > 4 * (1 - 1e-7)
+    # What a trapezoid calls the motion is a parabola, but not that of the block; and its rule is off by 2 % and more.
+    missed = {"trapezoid": "an accurate integration from knot", "drake": "the cost that was minimized is"}
+    assert missed[scheme] in motion.message if scheme in missed else motion.success, motion.message
 
 
 def at_nodes_alone(monkeypatch):
@@ -518,16 +520,16 @@ def test_a_running_cost_without_derivatives_is_refused():
 # ------------------------------------------------------------------------------ times, printed
 
 
-@each_row("end, error", [(1.0, 1 / 6), (2.0, 1 / 3)])
-def test_the_trapezoids_error_of_a_parabola_is_a_part_of_the_cost_or_of_1(end, error):
-    """x = end t: end^2 / 2 by the rule, end^2 / 3 in truth; the difference is judged by max(1, end^2 / 2)."""
+@each_row("end, error", [(1.0, 1 / 3), (2.0, 1 / 3)])
+def test_the_trapezoids_error_of_a_parabola_is_a_part_of_the_cost(end, error):
+    """x = end t: end^2 / 2 by the rule, end^2 / 3 in truth."""
     problem = dd.Problem(
         dd.Dynamics(lambda x, u: [u[0]], 1, 1), x0=[0], num_steps=1, horizon=1.0, running_cost=lambda x, u: x[0] ** 2
     )
     found = collocated(
         problem, "trapezoid", np.array([[0], [end]]), np.full((2, 1), end), None, 1.0, np.array([0.0, 1.0])
     )
-    assert found.cost_errors == pytest.approx([error], rel=1e-12)
+    assert found.cost_errors == pytest.approx([error], rel=1e-5)
 
 
 @each_row("row", [0, 2, -1])

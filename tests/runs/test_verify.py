@@ -156,8 +156,8 @@ def test_corruptions_are_found_and_the_message_names_the_file(run, other_run, tm
 
 def test_a_number_edited_and_hashed_again_is_not_what_the_trace_carries(run, copy):
     record = dd.load_record(copy)
-    lie = record.metrics[8].model_copy(update={"value": 1e-7})
-    changed = record.model_copy(update={"metrics": [*record.metrics[:8], lie, *record.metrics[9:]]})
+    lie = record.metrics[9].model_copy(update={"value": 1e-7})
+    changed = record.model_copy(update={"metrics": [*record.metrics[:9], lie, *record.metrics[10:]]})
     changed.write(copy)
     found = dd.verify(copy)
     assert found.verdict == "broken"

@@ -314,6 +314,10 @@ class TrackingCost(TimedCost):
     def at(self, time: float) -> QuadraticCost:
         return self._with(self.known_at(np.array([time]))[0])
 
+    def along(self, times: Array) -> QuadraticCost:
+        """The cost at `times` (K,) [s], of K rows of states and inputs."""
+        return self._with(self.known_at(times))
+
     def _with(self, known: Any) -> QuadraticCost:
         """The cost with the references `known` (p,), or with those (K, p) of K rows."""
         nx = self.reference[1].shape[1]
@@ -327,7 +331,7 @@ class TrackingCost(TimedCost):
 def quadratic_along(cost: Any, times: Array) -> QuadraticCost | None:
     """A running cost at `times` (K,) [s] as one QuadraticCost, its references of all or of each; None if it is none."""
     if isinstance(cost, TrackingCost):
-        return cost._with(cost.known_at(times))
+        return cost.along(times)
     return cost if isinstance(cost, QuadraticCost) else None
 
 

@@ -440,9 +440,12 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         Inputs (N+1, nu) are at the knots, and the running cost is integrated by the trapezoid rule. Steps have the
         length `time_step` [s], that of the model where None.
         """
+        return float(np.sum(self.cost_terms(xs, inputs, time_step)))
+
+    def cost_terms(self, xs: Array, inputs: Array, time_step: float | None = None) -> Array:
+        """The terms of `objective`: of the knots, of the end and of the whole motion."""
         h = self.time_step if time_step is None else time_step
-        running, final = self.total_running_cost, self.total_final_cost
-        total = 0.0 if final is None else float(final(xs[-1]))
+        running, final, rates = self.total_running_cost, self.total_final_cost, np.zeros(0)
         if running is not None:
             before = xs[: len(inputs)]
             quadratic = quadratic_along(running, h * np.arange(float(len(inputs))))
@@ -453,10 +456,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
                 rates = np.array([float(cost_at(running, k * h)(x, u)) for k, (x, u) in along])
             if len(inputs) == len(xs):
                 rates[0], rates[-1] = rates[0] / 2, rates[-1] / 2
-            total += h * float(np.sum(rates))
-        if self.trajectory_cost is not None:
-            total += float(self.trajectory_cost(xs, inputs))
-        return total
+        ends = [] if final is None else [float(final(xs[-1]))]
+        whole = [] if self.trajectory_cost is None else [float(self.trajectory_cost(xs, inputs))]
+        return np.concatenate([h * rates, ends, whole])
 
     def _check_parameters(self) -> None:
         vector, given = self.parameters, self.parameter_bounds or {}

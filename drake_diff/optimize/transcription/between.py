@@ -14,7 +14,8 @@ from drake_diff.optimize.problem.goals import GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
-from drake_diff.optimize.transcription.collocation import SUBSTEPS, Collocated
+from drake_diff.optimize.transcription.collocation import Collocated
+from drake_diff.optimize.transcription.lead import SUBSTEPS
 
 DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two knots
 # Of a number's range along the motion: how far beyond its bound it may be between nodes. The solver keeps the scheme's

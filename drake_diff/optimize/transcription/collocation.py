@@ -23,17 +23,17 @@ from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearance
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome, Report
-from drake_diff.optimize.transcription.lead import Lead
+from drake_diff.optimize.transcription.lead import SUBSTEPS, Lead, Within
 from drake_diff.optimize.transcription.task import OptimalControl, Scheme
 
 SLOPED = np.linspace(0, 1, 11)  # where slopes are looked at within an interval, its ends among them
-SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # where a plan comes too near to an obstacle between its knots
 ROUNDED = 1e-9  # of an interval: so near to its end is the end
+SMALLEST_COST = 1e-6  # of the running cost's change where states or inputs are a range away: what a solver may leave
 ACCURATE = 1e-4  # of an interval, in the states' units
 SMALLEST_ERROR = 1e-12  # of an interval: rounding, which no finer mesh makes less
-MOST_PIECES = 4  # of one interval in one round of refinement
+MOST_PIECES, NARROW_PIECES = 4, 8  # of one interval in one round of refinement; where something narrow is in it
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
 
 
@@ -91,12 +91,55 @@ class Collocated:
         within = lengths[k] * np.einsum("sj,sju->su", scheme.integrated(tau), inputs[k])
         return np.asarray(np.diff(before + within, axis=0) / np.diff(ends)[:, None])
 
-    @cached_property
+    @property
     def cost(self) -> float:
-        """The scheme's own quadrature of the running cost, and the final cost."""
-        weights = self.horizon * self.task.scheme.node_weights(self.mesh)
+        """The integral of the running cost along the motion that the dynamics make from each knot, and the others."""
+        return float(np.sum(self._integrated[-1, :, -1])) + sum(self._other_costs)
+
+    @property
+    def cost_error(self) -> float:
+        """By how much the scheme's own quadrature differs from that integral, and what is left of its errors."""
+        return float(_finite(np.abs(self.quadrature - self.cost) + np.sum(self._within.errors[:, -1])))
+
+    @cached_property
+    def quadrature(self) -> float:
+        """The cost by the scheme's own quadrature, which a solver minimizes."""
+        return float(self._node_weights @ self._cost_rates) + sum(self._other_costs)
+
+    @cached_property
+    def cost_scale(self) -> float:
+        """What the parts of the cost come to without their signs, at the nodes.
+
+        It is no less than a millionth of what the running cost changes by where a state or input is a range away.
+        """
+        middle = self.nodes[len(self.nodes) // 2]
+        ranges = self.task.problem.ranges(self.xs), np.maximum(np.ptp(self.us, axis=0), SMALLEST_RANGE)
+        knots = np.vstack([middle, *(middle + side * np.diag(np.concatenate(ranges)) for side in (-1, 1))])
+        apart = self.task.rates(knots, np.full(len(knots), self.horizon / 2))
+        floor = SMALLEST_COST * self.horizon * float(np.nanmax(np.abs(apart - apart[0]), initial=0.0))
+        parts = [float(self._node_weights @ np.abs(self._cost_rates)), *np.abs(self._other_costs), floor]
+        return float(_finite(np.array(sum(parts)))) or 1.0
+
+    @property
+    def _other_costs(self) -> tuple[float, float]:
+        """Of the last state, and of the parameters."""
         final = 0.0 if self.task.final is None else float(self.task.final.values(self.nodes[-1:])[0, 0])
-        return float(weights @ self._cost_rates) + final + self.task.problem.cost_of_parameters(self.task.parameters)
+        return final, self.task.problem.cost_of_parameters(self.task.parameters)
+
+    @property
+    def _node_weights(self) -> Array:
+        """(K,) [s] of the nodes in the scheme's quadrature."""
+        return self.horizon * self.task.scheme.node_weights(self.mesh)
+
+    @property
+    def narrow(self) -> Any:
+        """(N,) whether a force or cost acts in a small part of an interval."""
+        return self._within.narrow
+
+    @property
+    def smallest_width(self) -> float:
+        """Of forces and costs that are seen between the knots: of each state's range along the motion; see `lead`."""
+        return self._within.width
 
     @property
     def rate_excess(self) -> dict[str, tuple[float, int]]:
@@ -145,7 +188,7 @@ class Collocated:
     def errors(self) -> Array:
         """(N,) distance of knot k+1 from an integration from knot k under the scheme's input; inf where it diverges.
 
-        Ten steps of the classical Runge-Kutta method, in the worst coordinate's unit.
+        By the steps of `Within`, in the worst coordinate's unit.
         """
         return np.asarray(np.max(self.gaps, axis=1))
 
@@ -163,10 +206,10 @@ class Collocated:
 
     @property
     def cost_errors(self) -> Array:
-        """(N,) the same of the running cost's quadrature, as a part of the whole cost (of 1 where that is less)."""
+        """(N,) the same of the running cost's quadrature, as a part of `cost_scale`."""
         scheme = self.task.scheme
         quadrature = self.lengths * (scheme.per_interval(self._cost_rates) @ scheme.weights)
-        return _finite(np.abs(self._integrated[-1, :, -1] - quadrature) / max(1.0, abs(self.cost)))
+        return _finite(np.abs(self._integrated[-1, :, -1] - quadrature) / self.cost_scale)
 
     def at(self, times: Any) -> tuple[Array, Array]:
         """xs (S, nx) and us (S, nu) at `times` (S,) [s] by the scheme's own polynomials."""
@@ -256,7 +299,7 @@ class Collocated:
 
     @cached_property
     def _lead(self) -> Lead:
-        return Lead(self, SUBSTEPS)
+        return Lead(self, SUBSTEPS, self._within.least)
 
     def gains(self, at_end: Array | None = None) -> tuple[Array, Array]:
         """(N, nu, nx) of each interval, by Riccati's recursion with Bryson's weights, as a replay's TVLQR has them.
@@ -278,31 +321,14 @@ class Collocated:
             P = h * Q + A.T @ P @ (A - B @ gains[k])
         return gains, P
 
-    @cached_property
+    @property
     def _integrated(self) -> Array:
-        """(11, N, nx + 1) where each knot leads within its interval, in ten steps, and what that costs."""
-        nx, task, held = self.task.dynamics.nx, self.task, self._held
-        k = np.arange(len(self.mesh) - 1)
-        z = np.column_stack([self.xs[:-1], np.zeros(len(k))])
-        dt, states = self.lengths[:, None] / SUBSTEPS, [z]
+        """(11, N, nx + 1) where each knot leads within its interval, at its tenths, and what that costs."""
+        return self._within.states
 
-        def rate(z: Array, half: int) -> Array:
-            knots = np.concatenate((z[:, :nx], held[:, half, nx:]), axis=1)
-            times = self.times(k, np.full(len(k), half / (2 * SUBSTEPS)))
-            return np.column_stack([task.moved(knots, k), task.rates(knots, times)])
-
-        with np.errstate(all="ignore"):
-            if task.is_map:  # the state is held until the next step
-                stepped = rate(z, 0)
-                stepped[:, nx:] += z[:, nx:]
-                return np.array([z] * SUBSTEPS + [stepped])
-            for i in range(0, 2 * SUBSTEPS, 2):
-                k1 = rate(z, i)
-                k2 = rate(z + dt / 2 * k1, i + 1)
-                k3 = rate(z + dt / 2 * k2, i + 1)
-                z = z + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + dt * k3, i + 2))
-                states.append(z)
-        return np.array(states)
+    @cached_property
+    def _within(self) -> Within:
+        return Within(self, self._held)
 
     def measured_as(self, other: "Collocated") -> None:
         """Take over where the knots of `other` lead, which has the same dynamics and cost; nothing of another motion.
@@ -311,8 +337,8 @@ class Collocated:
         """
         ours, theirs = ((m.mesh, m.xs, m.inputs, np.array([m.horizon]), m.task.parameters) for m in (self, other))
         same = all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
-        if same and self.task.scheme is other.task.scheme and "_integrated" in vars(other):
-            vars(self)["_integrated"] = other._integrated
+        if same and self.task.scheme is other.task.scheme and "_within" in vars(other):
+            vars(self)["_within"] = other._within
 
     @property
     def inputs(self) -> Array:
@@ -653,6 +679,7 @@ def _split(motion: Collocated, tolerance: float, lacking: Array) -> Array:
     errors = motion.worst
     wanted = (errors / tolerance) ** (1 / (motion.task.scheme.order + 1))
     pieces = np.where(errors > tolerance, np.clip(np.ceil(wanted), 2, MOST_PIECES), 1).astype(int)
+    pieces[(errors > tolerance) & motion.narrow] = NARROW_PIECES
     near = lacking > 0
     near[1:], near[:-1] = near[1:] | (lacking[:-1] > 0), near[:-1] | (lacking[1:] > 0)  # where it goes next, elsewhere
     pieces = np.maximum(pieces, 1 + near)

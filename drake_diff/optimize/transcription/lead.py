@@ -1,7 +1,13 @@
-"""Where the dynamics lead along a collocated motion from a state, with error control; open loop or under feedback.
+"""Where the dynamics lead along a collocated motion with error control: from each knot, or from one state through all.
 
-Each interval is taken in equal steps of the pair of Dormand and Prince, in twice as many wherever one of them has an
-error above its tolerance, so that an interval in which nothing bends costs six evaluations of the dynamics.
+`Lead` takes each interval in equal steps of the pair of Dormand and Prince, in twice as many wherever one of them has
+an error above its tolerance, so that an interval in which nothing bends costs six evaluations of the dynamics.
+
+No integrator sees a force or cost that acts between the points at which it evaluates them. So the functions of users
+are looked at so often that nothing moves by more than `WIDTH` in between: of a state's or input's range along
+the motion, or of a quarter of the way that it goes where that is longer, and of the duration where the cost depends on
+time. `Within` integrates intervals in which they do something in steps as short as that. A feature that is narrower
+than `WIDTH` may be missed.
 """
 
 from functools import cache
@@ -9,13 +15,20 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff.motion.tableaus import AT, DENSE, ERROR, STAGES
 from drake_diff.optimize.transcription.task import OptimalControl
 
 TOLERANCE = 1e-6  # of a state's range along the motion, in a step: a ten-thousandth of how far it may be off at all
 MOST_STEPS = 16  # of an interval, whatever their errors: stable where ten of the classical Runge-Kutta method are
 EASY = 1e-2  # of what is allowed: half as many steps would have 32 times the error
+SUBSTEPS = 10  # of the classical Runge-Kutta method in an interval in which nothing narrow is seen
+WIDTH = 1e-4  # of the scale of a state or input: the features that are seen
+LONGEST = 4.0  # ranges: what goes a longer way has a quarter of that for its scale
+MOST_PLACES = 400_000  # at which a motion is looked at; a longer one has a larger WIDTH
+FEATURE = 1e-5  # of a state's range, or of the cost: what is between the points of an integration and changes less
+NARROW = 8  # steps of a tenth of an interval: what needs as many is narrow there
+MOST_HALVINGS = 5  # of steps that are as short as the places at which a motion is looked at
 STAGE_WEIGHTS = tuple(np.array(weights) for weights in STAGES)
 
 
@@ -29,16 +42,160 @@ class Motion(Protocol):
     @property
     def lengths(self) -> Array: ...
     @property
+    def cost_scale(self) -> float: ...
+    @property
     def input_limits(self) -> tuple[Array, Array]: ...
     def between(self, k: Any, tau: Array) -> tuple[Array, Array]: ...
     def cut_off(self, us: Array) -> Array: ...
+    def times(self, k: Indices, tau: Array) -> Array: ...
+
+
+class Places:
+    """Where a motion is looked at: `points` (nx + nu, S) at `times` (S,) [s] in order, each for `dt` (S,) [s].
+
+    There are `counts` (10 N,) in each tenth of an interval, from its `starts` on, on the parabola through its ends and
+    middle. `width` is that of the features that are seen.
+    """
+
+    def __init__(self, motion: Motion, held: Array):
+        """`held` (N, 21, nx + nu) is the motion at every half of an interval's ten steps."""
+        count, parts = len(motion.lengths), 2 * SUBSTEPS
+        moved = np.abs(np.diff(held, axis=1))
+        scale = np.maximum(np.ptp(held, axis=(0, 1)), np.sum(moved, axis=(0, 1)) / LONGEST)
+        far = np.max(moved / np.where(scale > 0, scale, np.inf), axis=2)
+        if motion.task.is_timed:
+            far = np.maximum(far, motion.lengths[:, None] / parts / np.sum(motion.lengths))
+        every = far.ravel() / WIDTH
+        self.width = WIDTH * max(1.0, float(np.sum(every)) / MOST_PLACES)
+        counts = np.maximum(np.ceil(every * WIDTH / self.width), 1).astype(np.intp)
+        part, starts = np.repeat(np.arange(count * parts), counts), np.cumsum(counts) - counts
+        inside = (np.arange(len(part)) - starts[part] + 0.5) / counts[part]
+        theta = (part % 2 + inside) / 2
+        self.counts, self.starts = counts.reshape(-1, 2).sum(axis=1), starts[::2]
+        self.dt = np.repeat(np.repeat(motion.lengths / parts, parts) / counts, counts)
+        self.times = motion.times(part // parts, (part % parts + inside) / parts) if motion.task.is_timed else theta
+        first = (2 * SUBSTEPS + 1) * np.arange(count)[:, None] + 2 * np.arange(SUBSTEPS)
+        self._ends = [(first + i).ravel() for i in range(3)]
+        self._weights = (1 - theta) * (1 - 2 * theta), 4 * theta * (1 - theta), theta * (2 * theta - 1)
+        self.points = self.parabolas(np.ascontiguousarray(held.reshape(-1, held.shape[2]).T))
+
+    def parabolas(self, base: Array) -> Array:
+        """(r, S) by what `base` (r, 21 N) is at every half of an interval's ten steps."""
+        parts = zip(self._weights, self._ends, strict=True)
+        return np.asarray(sum(w * np.repeat(base[:, ends], self.counts, axis=1) for w, ends in parts))
+
+
+class Within:
+    """Where each knot of a motion leads within its interval, in ten or more steps of the classical Runge-Kutta method.
+
+    Attributes:
+        states: (11, N, nx + 1) the states at every tenth of the intervals, and what the way there costs.
+        errors: (N, nx + 1) what is left of their errors at the ends, where that was measured, else 0.
+        least: (N,) the fewest steps in an interval that see what the dynamics do there.
+        narrow: (N,) the intervals in which something acts over a small part of a tenth.
+        width: of the features that are seen, see above.
+    """
+
+    def __init__(self, motion: Motion, held: Array):
+        self.motion, self.held, task, count = motion, held, motion.task, len(motion.lengths)
+        self.nx, self.width, self.least = task.dynamics.nx, 0.0, np.ones(count, dtype=np.intp)
+        self.narrow = np.zeros(count, dtype=bool)
+        self.allowed = FEATURE * np.append(task.problem.ranges(motion.xs), motion.cost_scale)
+        if task.is_map:  # the state is held until the next step
+            z, k = held[:, 0], np.arange(count)
+            stepped = np.column_stack([task.moved(z, k), task.rates(z, motion.times(k, np.zeros(count)))])
+            before = np.column_stack([z[:, : self.nx], np.zeros(count)])
+            self.states, self.errors = np.array([before] * SUBSTEPS + [stepped]), np.zeros(stepped.shape)
+            return
+        with np.errstate(all="ignore"):
+            self.states, rates = self._through(np.arange(count), np.ones(SUBSTEPS, dtype=np.intp))
+            halved = motion.lengths / SUBSTEPS / 3 * (np.array([1, *[4, 2] * (SUBSTEPS // 2 - 1), 4, 1]) @ rates)
+            self.errors = np.zeros(self.states.shape[1:])
+            self.errors[:, -1] = np.abs(self.states[-1, :, -1] - halved) / 15  # by Simpson's rule over twice the steps
+            rows, steps = self._seen()
+            if len(rows):
+                self._refine(rows, steps)
+
+    def _through(self, rows: Indices, steps: Indices) -> tuple[Array, Array]:
+        """(11, R, nx + 1) as `states`, in so many `steps` (10,) of each tenth; and (11, R) the running cost there."""
+        motion, task, nx = self.motion, self.motion.task, self.nx
+        z, lengths = np.column_stack([motion.xs[rows], np.zeros(len(rows))]), motion.lengths[rows, None]
+        states, costs = [z], list[Array]()
+
+        def rate(z: Array, us: Array, tau: float) -> Array:
+            knots = np.concatenate((z[:, :nx], us), axis=1)
+            times = motion.times(rows, np.full(len(rows), tau))
+            return np.column_stack([task.moved(knots, rows), task.rates(knots, times)])
+
+        for s, n in enumerate(steps.tolist()):
+            tau = (s + np.arange(2 * n + 1) / (2 * n)) / SUBSTEPS
+            us = self.held[rows, 2 * s : 2 * s + 3, nx:]
+            if n > 1:
+                between = motion.between(np.repeat(rows, len(tau)), np.tile(tau, len(rows)))[1]
+                us = motion.cut_off(between).reshape(len(rows), len(tau), -1)
+            dt = lengths / (SUBSTEPS * n)
+            for i in range(0, 2 * n, 2):
+                k1 = rate(z, us[:, i], tau[i])
+                k2 = rate(z + dt / 2 * k1, us[:, i + 1], tau[i + 1])
+                k3 = rate(z + dt / 2 * k2, us[:, i + 1], tau[i + 1])
+                k4 = rate(z + dt * k3, us[:, i + 2], tau[i + 2])
+                z = z + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+                if i == 0:
+                    costs.append(k1[:, nx])
+            states.append(z)
+        return np.array(states), np.array([*costs, k4[:, nx]])
+
+    def _seen(self) -> tuple[Indices, Indices]:
+        """The intervals in which something is between the points of an integration, and (10,) the steps that see it."""
+        motion, task, nx, none = self.motion, self.motion.task, self.nx, np.zeros(0, dtype=np.intp)
+        functions = [f for f in (task.user_dynamics, task.user_rate) if f is not None]
+        if not functions:
+            return none, none
+        places = Places(motion, self.held)
+        self.width = places.width
+        count, halves = len(motion.lengths), 2 * SUBSTEPS + 1
+        base = self.held.reshape(count * halves, -1)
+        then = motion.times(np.arange(count).repeat(halves), np.tile(np.arange(halves) / (halves - 1), count))
+        wanted = np.ones((count, SUBSTEPS), dtype=np.intp)
+        for f in functions:
+            allowed = self.allowed[:nx] if f is task.user_dynamics else self.allowed[nx:]
+            values = np.ascontiguousarray(f(places.points.T, places.times).T)
+            off = np.abs(values - places.parabolas(np.ascontiguousarray(f(base, then).T)))
+            off = np.nan_to_num((off / allowed[:, None]).max(axis=0), nan=np.inf)
+            change = np.add.reduceat(off * places.dt, places.starts).reshape(count, SUBSTEPS)
+            turns = np.append(np.abs(np.diff(off)), 0.0)
+            largest = (np.maximum.reduceat(column, places.starts) for column in (turns, off))
+            sharp = np.clip(np.nan_to_num(np.divide(*largest), nan=1.0), 0.0, 1.0)
+            steps = np.ceil(places.counts * sharp).astype(np.intp).reshape(count, SUBSTEPS)
+            bends = (np.sum(change, axis=1) > 1)[:, None] & (change > 1 / (10 * SUBSTEPS))
+            wanted = np.where(bends, np.maximum(np.maximum(wanted, steps), 2), wanted)
+            if f is task.user_dynamics:
+                self.least = np.maximum(SUBSTEPS * np.max(np.where(bends, steps, 0), axis=1) // 2, 1)
+        self.narrow = np.max(wanted, axis=1) >= NARROW
+        rows = np.flatnonzero(np.max(wanted, axis=1) > 1)
+        return rows, np.max(wanted[rows], axis=0, initial=1)
+
+    def _refine(self, rows: Indices, steps: Indices) -> None:
+        """Integrate the intervals `rows` in `steps` (10,), in half as long ones until that changes nothing."""
+        last, finer = self._through(rows, steps)[0], steps > 1
+        for _ in range(MOST_HALVINGS):
+            steps = np.where(finer, 2 * steps, steps)
+            states = self._through(rows, steps)[0]
+            changed = np.abs(states[-1] - last[-1])
+            self.states[:, rows], self.errors[rows] = states, changed
+            going_on = np.max(changed / self.allowed, axis=1) > 1
+            rows, last = rows[going_on], states[:, going_on]
+            if not len(rows):
+                return
 
 
 class Lead:
     """Where `motion` leads at every `substeps`-th part of its intervals, which start and end at its knots."""
 
-    def __init__(self, motion: Motion, substeps: int):
+    def __init__(self, motion: Motion, substeps: int, least: Any = None):
+        """`least` (N,) are the fewest steps in each interval, 1 where None."""
         self.motion, self.substeps = motion, substeps
+        self.least = np.ones(len(motion.lengths), dtype=np.intp) if least is None else least
         self.nx = motion.task.dynamics.nx
         self.allowed = TOLERANCE * motion.task.problem.ranges(motion.xs)
         self.lower, self.upper = motion.input_limits
@@ -59,10 +216,12 @@ class Lead:
         self, k: int, x: Array, gain: Array | None, steps: int, slope: Array | None
     ) -> tuple[Array, int, Array]:
         """(substeps, nx) through the interval `k`; in how many steps the next may be taken, and x' at the end."""
-        steps = MOST_STEPS if not np.all(np.isfinite(x)) else steps
+        least = int(self.least[k])
+        most = max(MOST_STEPS, 2 * least)
+        steps = MOST_STEPS if not np.all(np.isfinite(x)) else max(steps, least)
         while True:
             states, slopes, error = self._in_steps(k, x, gain, steps, slope)
-            if error <= 1 or steps >= MOST_STEPS:
+            if error <= 1 or steps >= most:
                 break
             slope, steps = slopes[0][0], 2 * steps
         samples = np.empty((self.substeps, self.nx))
@@ -70,7 +229,8 @@ class Lead:
         for (rows, weights), start, step_slopes in zip(_shown(self.substeps, steps), states, slopes, strict=False):
             samples[rows] = start + dt * (weights @ step_slopes)
         samples[-1] = states[-1]
-        return samples, max(steps // 2, 1) if error <= EASY else steps, slopes[-1][-1]
+        after = MOST_STEPS if steps > MOST_STEPS else max(steps // 2, 1) if error <= EASY else steps
+        return samples, after, slopes[-1][-1]
 
     def _in_steps(
         self, k: int, x: Array, gain: Array | None, steps: int, slope: Array | None
@@ -92,7 +252,7 @@ class Lead:
             every.append(slopes)
             error = np.abs(dt * (ERROR @ slopes)) / self.allowed
             worst = max(worst, float(np.max(np.nan_to_num(error, nan=np.inf))))
-            if not worst <= 1 and steps < MOST_STEPS:
+            if not worst <= 1 and steps < max(MOST_STEPS, 2 * self.least[k]):
                 break
         return states, every, worst
 

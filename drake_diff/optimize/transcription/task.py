@@ -16,7 +16,7 @@ its values, 2 u_mid - (u_0 + u_1) / 2. Bounds of the nodes alone let an input be
 """
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -24,12 +24,23 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.values import Refusal
 from drake_diff.model.parameters import ParameterCoordinates
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, TimedCost, differentiate_cost
+from drake_diff.optimize.problem.cost import (
+    ConstantCost,
+    QuadraticCost,
+    SumOfCosts,
+    TimedCost,
+    TrackingCost,
+    differentiate_cost,
+)
 from drake_diff.optimize.problem.coupling import BoundCoupling
-from drake_diff.optimize.problem.dynamics import DiscreteMap, MovedDynamics, Pointwise
+from drake_diff.optimize.problem.dynamics import PROBED, DiscreteMap, MovedDynamics, Pointwise
+from drake_diff.optimize.problem.goals import WithGoals
 from drake_diff.optimize.problem.problem import Problem
+
+AtPlaces = Callable[[Array, Array], Array]  # knots (S, nx + nu) and times (S,) [s] -> (S, r)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +176,26 @@ class TimedRate:
         return values, rows[:, :, : self.width]
 
 
+def values_of_many(form: Any, points: Array) -> Array:
+    """(S, r) a function at very many points: by its expression where it has one and does not take columns."""
+    if not isinstance(form, Pointwise) or form.takes_columns:
+        return np.asarray(form.values(points))
+    from drake_diff.optimize.knots import Traced, trace  # loads CasADi
+
+    probe = points[:: max(1, len(points) // PROBED)]
+    expression = trace(form.f, form.nx, probe, form.values(probe))
+    return np.asarray(form.values(points) if isinstance(expression, Refusal) else Traced(expression).values(points))
+
+
+def _parts_of(cost: Any) -> list[Any]:
+    """The terms of a running cost of which nothing is known."""
+    if isinstance(cost, SumOfCosts):
+        return [part for term in cost.costs for part in _parts_of(term)]
+    if isinstance(cost, WithGoals):
+        return _parts_of(cost.own)
+    return [] if cost is None or isinstance(cost, (ConstantCost, QuadraticCost)) else [cost]
+
+
 class OptimalControl:
     """What `problem` asks of a collocation scheme; ModelError where its model has no continuous form.
 
@@ -247,6 +278,40 @@ class OptimalControl:
         lower_in, upper_in = lower + inside[0], upper - inside[1]
         apart = lower_in < upper_in
         return np.where(apart, lower_in, lower), np.where(apart, upper_in, upper)
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the running cost depends on time."""
+        return isinstance(self.rate, TimedRate)
+
+    @cached_property
+    def user_dynamics(self) -> AtPlaces | None:
+        """(S, nx) the rates at knots (S, nx + nu) and times (S,) [s]; None of equations that bend nowhere suddenly.
+
+        Those are a model's own, unless systems of its diagram exert forces.
+        """
+        form = self.dynamics.form
+        if self.is_map or (not isinstance(form, Pointwise) and not getattr(form, "may_jump", True)):
+            return None
+        return lambda knots, times: values_of_many(form, self.dynamics.whole(knots))
+
+    @cached_property
+    def user_rate(self) -> AtPlaces | None:
+        """(S, 1) what functions and tables of the user are of the running cost; None where there are none."""
+        parts = (
+            [self._user_part(cost) for cost in _parts_of(self.problem.total_running_cost)] if not self.is_map else []
+        )
+        return None if not parts else lambda knots, times: np.asarray(sum(part(knots, times) for part in parts))
+
+    def _user_part(self, cost: Any) -> AtPlaces:
+        nx, nu, probe = self.dynamics.nx, self.dynamics.nu, self.dynamics.probe()
+        if isinstance(cost, TrackingCost):
+            return lambda knots, times: cost.along(times)(knots[:, :nx], knots[:, nx:])[:, None]
+        if isinstance(cost, TimedCost):
+            timed = TimedRate(cost, nx, nu, probe)
+            return lambda knots, times: values_of_many(timed.inner, timed.with_known(knots, times))
+        plain = Pointwise("running_cost", cost, nx, (), probe)
+        return lambda knots, times: values_of_many(plain, knots)
 
     def rates(self, knots: Array, times: Array) -> Array:
         """(K,) the running cost at `knots` (K, nx + nu) and `times` (K,) [s]."""
