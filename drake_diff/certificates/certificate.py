@@ -37,6 +37,9 @@ class VerdictOptions:
     negligible: float = 1e-4  # of the largest of the row and of the column
     unseen: float = 1e-8  # of the largest of the row, whatever the column's
     visible: float = 1e-12  # of a value: a smaller jump is rounding
+    products: float = 3.3e-15  # of the products in a row: what sums of 30 of them may be off
+    nearer: float = 0.5  # of the gap to wide differences: a derivative so much nearer to narrow ones is theirs
+    gone: float = 0.1  # of a gap over the next larger step: what a jump between the two steps leaves
     rounded: float = 1e-6  # of the largest of the row: rounding excuses no more
     vanishing: float = 1e-5  # of the quotient over the widest step
     resolved: float = 1e-4  # of an entry: a smaller corner is none
@@ -54,6 +57,7 @@ EPS = float(np.finfo(float).eps)
 AGREE, UNDECIDED, NOT_CONVERGED, DISAGREE, DISCONTINUOUS = range(len(VERDICTS))
 
 Flags = NDArray[np.bool_]
+Codes = NDArray[np.int64]
 Scales = tuple[Array, Array]
 
 
@@ -68,7 +72,7 @@ class Judgement:
     tolerance: Array
     noticeable: Array
     size: Array
-    codes: NDArray[np.int64]
+    codes: Codes
     reasons: dict[tuple[int, int], str]  # of every entry that is discontinuous
 
 
@@ -87,6 +91,7 @@ def judge(
     largest = np.abs(difference).max(axis=1, keepdims=True, initial=0)
     early = LIMITS.early * stopped * largest
     exact = LIMITS.exact * np.abs(difference) + LIMITS.trusted * doubt + LIMITS.power * least / 100
+    exact += LIMITS.products * around.products[:, None]
     doubtful = exact + np.minimum(early, LIMITS.doubtful * size)
     tolerance = exact + np.minimum(early, LIMITS.stopped * size)
     gap = np.abs(a - difference)
@@ -100,7 +105,8 @@ def judge(
     codes[left_out] = AGREE
     size = np.where(left_out, np.maximum(size, noticeable / LIMITS.power), size)
     codes[(gap > doubtful) & (tells | (gap > LIMITS.doubtless * tolerance))] = DISAGREE
-    reasons = _stairs(around, size) | _broken(around, a, difference, size)
+    reasons = _beside(around, a, gap, codes)
+    reasons |= _stairs(around, size) | _broken(around, a, difference, size)
     if beside is not None:
         jittery = np.argwhere(_jittery(around, a, beside)).tolist()
         reasons = {(i, j): f"1e-9 beside the point the derivative is {beside[i, j]:.6g}" for i, j in jittery} | reasons
@@ -139,13 +145,17 @@ def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales 
       negligible both so and in seconds: h in x' = x + h v is small in seconds, h k / m in v' in steps, and both matter;
     - 1e-5 of its own quotient over the widest step, a hundredth of that scale, where the slope is zero at the point;
     - the rounding of the largest entry of all, where a row is nothing but rounding, as of a moment that is zero;
+    - what rounding leaves of a row in which products cancel, as of two opposite thrusters on a satellite: 3.3e-15 of
+      what the row's second differences over 1e-2 show of these products. That scales as the row does;
     - what the smallest step of the widest plateau leaves of the rounding of the value, which is measured, up to 1e-6
       of the largest entry of the row.
     """
     largest = np.abs(difference).max(axis=1, keepdims=True, initial=0)
     rounding = (LIMITS.significant * around.finest / DIFFERENCES.steps[3] / LIMITS.power)[:, None]
     widest = LIMITS.vanishing * np.maximum(np.abs(around.forward[0]), np.abs(around.backward[0]))
-    return weigh(a, difference, second, np.maximum(widest, np.minimum(rounding, LIMITS.rounded * largest)))
+    products = 4 / LIMITS.power * LIMITS.products * around.products[:, None]  # which leaves differences three of four
+    floor = np.maximum(np.maximum(widest, products), np.minimum(rounding, LIMITS.rounded * largest))
+    return weigh(a, difference, second, floor)
 
 
 def weigh(a: Array, difference: Array, second: Scales | None, floor: Array | float = 0.0) -> tuple[Array, Array]:
@@ -164,6 +174,26 @@ def _small(magnitude: Array) -> Array:
     """(m, n) what is negligible beside the largest of the row and of the column."""
     by_row, by_column = magnitude.max(axis=1, keepdims=True, initial=0), magnitude.max(axis=0, keepdims=True, initial=0)
     return np.asarray(LIMITS.negligible * np.minimum(by_row, by_column))
+
+
+def _beside(around: Neighbourhood, a: Array, gap: Array, codes: Codes) -> dict[tuple[int, int], str]:
+    """Entries of which the derivative is that over small steps and not over larger ones.
+
+    There is a break beside the point, nearer than differences resolve. It is a steep slope, a corner or a jump where
+    the differences' value is another one, by `gap` (m, n): the smallest step counts at which scatter cannot bridge that
+    gap, so that what is wrong there too stays wrong. Where they have no value it is a jump alone, of which the gap
+    grows as the step shrinks, and then is gone.
+    """
+    steps, apart = np.array(DIFFERENCES.steps)[:, None, None], np.abs((around.forward + around.backward) / 2 - a)
+    scatter = LIMITS.significant * np.maximum(around.finest, DIFFERENCES.last_place * around.size)[:, None]
+    last = (gap * steps > scatter).sum(axis=0) - 1
+    nearest = np.take_along_axis(apart, np.maximum(last, 0)[None], axis=0)[0]
+    steep = (codes == DISAGREE) & (last >= 0) & (nearest <= LIMITS.nearer * gap)
+    grows = (LIMITS.nearer * apart[1:-1] > apart[:-2]) & (apart[1:-1] * steps[2:] > scatter)
+    jumps = (codes == UNDECIDED) & np.any(grows & (apart[2:] <= LIMITS.gone * apart[1:-1]), axis=0)
+    why = "it is the slope over small steps and not over larger ones: {} beside the point"
+    kinds = [(steep, "there is a break"), (jumps, "the value jumps")]
+    return {(i, j): why.format(what) for where, what in kinds for i, j in np.argwhere(where).tolist()}
 
 
 def _broken(around: Neighbourhood, a: Array, difference: Array, size: Array) -> dict[tuple[int, int], str]:
@@ -285,7 +315,9 @@ class Certificate(ShowsItsRepr):
     - "not_converged": it agrees, but a rollout's gradient changes at a finer time step or in stiffer contact;
     - "disagree": it is another value than the differences';
     - "discontinuous": the function has a corner, a jump or stairs at the point, or the derivative is another one 1e-9
-      beside it; the entry's `reason` says which.
+      beside it; or the derivative is the slope over small steps, and not the one that larger steps settle at; or a jump
+      is nearer than 1e-6, which differences do not resolve. The entry's `reason` says which. A jump or a corner farther
+      away does not matter: the derivative is judged by the steps that do not reach it.
 
     Example:
         >>> from drake_diff.certificates import certify_jacobian
@@ -303,7 +335,7 @@ class Certificate(ShowsItsRepr):
     tolerance: Array
     noticeable: Array
     size: Array
-    codes: NDArray[np.int64]
+    codes: Codes
     method: str
     subject: str
     scale: Array  # (n,) of the displacements by which entries are compared

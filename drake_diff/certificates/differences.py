@@ -38,6 +38,7 @@ class DifferenceOptions:
     shrinks: float = 0.7  # or more at a corner; 0.56 of |x|^1.5, which has none, 0.32 of what is smooth
     near: int = 2  # spacings at which what is no scatter, but a corner or stairs, is as a rule not met
     halvings: int = 24
+    seeds: tuple[int, ...] = (2, 3, 4, 5)  # of lines of second differences, of which products cancel along few
     stairs: int = 3  # jumps to each side, each in another interval, make a staircase: one alone is a contact's onset
 
 
@@ -56,6 +57,7 @@ class Neighbourhood:
     backward: Array  # (s, m, n)
     scatter: Array  # (m,) of a value, over 1e-6, or what a solver leaves
     finest: Array  # (m,) over 1e-8
+    products: Array  # (m,) second derivatives along random lines, over 1e-2: how large terms are that may cancel
     stairs: dict[int, str]  # rows that jump to both sides of the point, and how
 
     def plateaus(self) -> tuple[Array, Array]:
@@ -108,8 +110,11 @@ def look_around(
         unknown = np.maximum(unknown, DIFFERENCES.rounded_point * np.nan_to_num(np.abs(ahead[0])) @ np.abs(point))
     scatter = np.maximum(by_spacing[:, : DIFFERENCES.near].max(axis=(0, 1)), unknown / DIFFERENCES.safety)
     finest = np.maximum(by_spacing[:, 0].max(axis=0), unknown / DIFFERENCES.safety)
+    lines = DIFFERENCES.steps[0] * np.array([line(n, seed) for seed in DIFFERENCES.seeds])
+    ends = apart(np.asarray(f(np.vstack([lines, -lines])), dtype=float)).reshape(2, len(lines), rows)
+    products = np.abs(ends.sum(axis=0)).max(axis=0) / DIFFERENCES.steps[0] ** 2
     stairs = _stairs(lambda t: apart(f(np.multiply.outer(t, direction))), along, by_spacing, rounding, unknown)
-    return Neighbourhood(centre, size, ahead, sweep.backward, scatter, finest, stairs)
+    return Neighbourhood(centre, size, ahead, sweep.backward, scatter, finest, products, stairs)
 
 
 def is_broken(changes: Many, n: int) -> str:

@@ -102,6 +102,29 @@ def test_a_kink_beside_the_point_does_no_harm(distance):
     assert verdict(lambda x: np.abs(x - distance), 1.0) == "disagree"
 
 
+def step_beside(distance):
+    return lambda x: x + 1e-3 * (x > distance)
+
+
+@each_row(
+    "f, slope, expected",
+    [
+        *[(step_beside(d), 1.0, "agree") for d in (1e-6, 1e-4, 1e-2)],
+        *[(step_beside(d), 1.0, "discontinuous") for d in (2e-8, 1e-7)],
+        *[(step_beside(d), 1.01, "disagree") for d in (1e-6, 1e-4, 1e-2)],
+        # friction that turns round within 1e-7, as a smooth curve does: beyond it the slope is 1
+        (lambda v: v + np.tanh(v / 1e-7), 1 + 1e7, "discontinuous"),
+        (lambda v: v + np.tanh(v / 1e-7) + 1e3, 1 + 1e7, "discontinuous"),
+        (lambda v: v + np.tanh(v / 1e-7), -1.0, "undecided"),
+        # contact that begins within the width, of a stiffness of 1e4: a kink, which is no jump
+        (lambda z: z + 1e4 * np.maximum(z - 1e-5, 0), 1.0, "agree"),
+        (lambda z: z + 1e4 * np.maximum(z - 3e-8, 0), 1.0, "undecided"),
+    ],
+)
+def test_a_derivative_that_is_right_over_the_smallest_widths_alone_is_discontinuous_and_not_wrong(f, slope, expected):
+    assert verdict(f, slope) == expected
+
+
 def test_a_derivative_that_jumps_beside_the_point_is_caught():
     """Zero at the point only, like Drake's on a cylinder's axis: differences agree by symmetry."""
     assert verdict(lambda x: x**2, lambda x: np.array([[0.0 if x[0] == 0 else 6.5]])) == "discontinuous"
@@ -421,6 +444,38 @@ def test_a_row_of_rounding_alone_is_zero():
         f = lambda x, size=size: np.array([10 * x[0], size * np.sin(x[1])])  # noqa: E731
         zero = np.array([[10.0, 0.0], [0.0, 0.0]])
         assert certify_jacobian(f, np.zeros(2), zero).verdict == verdict_of_zero
+
+
+@each_row("unit", [1e-6, 1.0, 1e6])
+def test_a_derivative_that_is_the_rounding_of_terms_that_cancel_is_zero(unit):
+    """Two opposite thrusters of the same force, 3.3, and a derivative that adds both terms: 3e-15 beside 0."""
+    f = lambda z: unit * np.array([np.sin(z[0]) * (z[1] - z[2]) / 10, z[0], z[1] + z[2]])  # noqa: E731
+    for stated, expected in ((3e-15, "agree"), (3e-12, "disagree")):
+        jacobian = unit * np.array([[stated, 0, 0], [1, 0, 0], [0, 1, 1]])
+        assert certify_jacobian(f, [0.0, 3.3, 3.3], jacobian).verdict == expected
+
+
+@pytest.mark.slow
+def test_the_exactly_optimal_slew_of_a_satellite_is_verified(tmp_path):
+    """By 90 degrees in 4 s: the least integral of the squares of two forces at 0.5 m is 24 I^2 angle^2 / T^3."""
+    (tmp_path / "sat.sdf").write_text(
+        '<sdf version="1.9"><model name="sat"><link name="bus"><inertial><mass>10</mass><inertia><ixx>0.4</ixx>'
+        "<iyy>0.7</iyy><izz>0.9</izz></inertia></inertial></link></model></sdf>"
+    )
+    ends = {"left": 1, "right": -1}
+    pair = [
+        dd.model.BodyForce(name, "bus", point=(0, s / 2, 0), direction=(-s, 0, 0), lower=-50.0, upper=50.0)
+        for name, s in ends.items()
+    ]
+    model = dd.load_model(tmp_path / "sat.sdf", time_step=0.05, gravity=(0, 0, 0), body_forces=pair)
+    x0, goal = model.default_state, model.default_state
+    goal[[0, 3]] = np.sqrt(0.5)
+    cost = dd.QuadraticCost(R=np.eye(2))
+    problem = dd.Problem(model, x0=x0, num_steps=80, running_cost=cost, x_goal=goal)
+    solution = dd.solve(problem, method="collocation", progress=False)
+    assert {c.verdict for c in solution.certificates} == {"agree"}, solution.message
+    assert solution.success
+    assert solution.cost == pytest.approx(24 * 0.9**2 * (np.pi / 2) ** 2 / 4**3, rel=1e-4)
 
 
 def test_what_does_not_agree_at_a_joint_limit_says_so(tmp_path):
