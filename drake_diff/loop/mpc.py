@@ -25,7 +25,7 @@ from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.ilqr.expansion import Motion
 from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST
-from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.realtime.rolling import Rolling, Staying
 from drake_diff.optimize.realtime.step import Step, Stretch, roll, take_step
 from drake_diff.optimize.replay import ReplayPlan, held, regulator_weights
@@ -280,8 +280,8 @@ class MPC:
         stretch, paid = rolling.stretch(0, problem.num_steps), np.inf
         xs, us = np.array(xs), np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
         xs[0] = problem.x0
-        motion, ranges = stretch.motion(xs, us), problem.ranges(xs)
-        efforts = np.maximum(np.ptp(us, axis=0), SMALLEST_RANGE)
+        motion, ranges = stretch.motion(xs, us), problem.state_scales(xs)
+        efforts = problem.input_scales(us)
         if np.max(np.abs(motion.gaps) / ranges) > GAP and problem.model.contract.contact.collision_pairs:
             stretch = replace(stretch, rolls=True)  # what is no motion says nothing of what touches
         unit = abs(stretch.cost(xs, us)) / problem.num_steps / np.concatenate([ranges, efforts]) ** 2

@@ -201,7 +201,7 @@ class _Stages:
             for weight in RELAXED.weights:
                 motion = follow(problem, states, result.motion.us, weight)
                 if motion is not None:
-                    off = np.mean(((motion[0] - states) / problem.ranges(states)) ** 2)
+                    off = np.mean(((motion[0] - states) / problem.state_scales(states)) ** 2)
                     followed.append((float(off) + result.gap + result.violation, *motion))
             if self.is_over():
                 break
@@ -323,7 +323,7 @@ def follow(problem: Problem, xs: Array, us: Array, weight: float) -> tuple[Array
     us = np.clip(us, bounds.u_lower, bounds.u_upper)
     limit = np.minimum(np.abs(bounds.u_lower), np.abs(bounds.u_upper))
     size = np.where(np.isfinite(limit), limit, np.maximum(np.max(np.abs(us), axis=0), 1.0))
-    Q, R = np.diag(1 / tangent_space(model).scale(problem.ranges(xs)) ** 2), np.diag(weight / size**2)
+    Q, R = np.diag(1 / tangent_space(model).scale(problem.state_scales(xs)) ** 2), np.diag(weight / size**2)
     try:
         regulator = TVLQR(model, xs, off_bounds(bounds, us), Q, R)
         states, inputs = np.array(xs), np.array(us)

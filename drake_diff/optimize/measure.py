@@ -17,14 +17,14 @@ from drake_diff.model.step import set_state
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.dynamics import DiscreteMap, units_of
 from drake_diff.optimize.problem.obstacles import along_steps, clearances
-from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.transcription.between import passed_between_steps
 from drake_diff.optimize.transcription.collocation import Collocated
 from drake_diff.optimize.transcription.lead import SUBSTEPS
 from drake_diff.optimize.transcription.task import OptimalControl
 
-# Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
+# Of a state's scale: between two knots the transcription is a cubic, and further than this from an accurate integration
 # its motion is not the model's.
 INTEGRATION_TOLERANCE = 1e-2
 # Of the cost: by how much the quadrature that was minimized may differ from its integral. A step of refinement makes it
@@ -51,36 +51,53 @@ def plan_checks(s: Any) -> Iterator[Check]:
 
 def _knot_checks(s: Any) -> Iterator[Check]:
     """Equations, ends, bounds and constraints."""
-    units, names, limit = units_of(s.problem), s.problem.state_names, FEASIBILITY_TOLERANCE
-    knots = np.flatnonzero(~(s.defects <= limit))
-    after = (
-        f"knots {_spans(knots)}" if len(knots) else f"knot {int(np.argmax(s.defects))}" if len(s.defects) else "none"
-    )
-    yield check("defect", after, s.defect, limit)
-    off = np.nan_to_num(np.abs(s.problem.goal_error(s.xs[-1])), nan=np.inf)
-    i = int(np.argmax(off))
-    if not np.all(np.isnan(s.problem.goal)):
-        yield check("goal", names[i], s.goal_error, limit, units[i])
-    yield from _excess_checks("bound", s.bound_excess)
-    yield from _excess_checks("constraint", s.constraint_excess)
-    yield check("start", "the motion", s.initial_state_error, limit)
+    problem, xs = s.problem, np.asarray(s.xs)
+    with np.errstate(all="ignore"):
+        scales = problem.feasibility_scales(xs, s.us, s.vector.values)
+    limits = FEASIBILITY_TOLERANCE * np.array([scales[name] for name in problem.state_names])
+    knots = np.flatnonzero(~np.all(s.defects_of_states <= limits, axis=1))
+    worst, i = _worst(s.defects_of_states, limits)
+    after = f"knots {_spans(knots)}" if len(knots) else f"knot {worst}" if len(s.defects) else "none"
+    yield check("defect", after, s.defects_of_states[worst, i], limits[i])
+    wanted = {"goal": (-1, problem.goal), "start": (0, problem.start)}
+    wanted |= {f"waypoint at knot {k}": (int(s.knots[k]), x) for k, x in problem.waypoints.items()}
+    for name, (row, x) in wanted.items():
+        off = np.nan_to_num(np.where(np.isnan(x), 0.0, np.abs(xs[row] - x)), nan=np.inf)
+        _, i = _worst(off[None], limits)
+        if name == "start" or not np.all(np.isnan(x)):
+            is_end = name in ("goal", "start")
+            what, where = (name, problem.state_names[i]) if is_end else ("constraint", f"{name} at knot {row}")
+            yield check(what, where, off[i], limits[i], units_of(problem)[i])
+    yield from _excess_checks("bound", s.bound_excess, scales)
+    rest = {name: excess for name, excess in s.constraint_excess.items() if name not in wanted}
+    yield from _excess_checks("constraint", rest, scales)
     where = "the whole motion"
     if s.transcribed is not None:
         where += f", between knots in features wider than {s.transcribed.smallest_width:.1g} of its ranges"
     yield check("cost", where, s.cost_error, COST_TOLERANCE * s.cost_scale)
 
 
-def _excess_checks(what: str, excesses: Mapping[str, tuple[float, int]]) -> Iterator[Check]:
+def _worst(values: Array, limits: Array) -> tuple[int, int]:
+    """The row and column of the largest of values (M, n) for the limits (n,) of its column."""
+    if not values.size:
+        return 0, 0
+    row, i = np.unravel_index(int(np.argmax(np.nan_to_num(values / limits, nan=np.inf))), values.shape)
+    return int(row), int(i)
+
+
+def _excess_checks(
+    what: str, excesses: Mapping[str, tuple[float, int]], scales: Mapping[str, float]
+) -> Iterator[Check]:
     for name, (excess, knot) in excesses.items():
-        yield check(what, f"{name} at knot {knot}", excess, FEASIBILITY_TOLERANCE)
+        yield check(what, f"{name} at knot {knot}", excess, FEASIBILITY_TOLERANCE * scales[name])
     if not excesses:
-        yield check(what, "all at all knots", 0.0, FEASIBILITY_TOLERANCE)
+        yield check(what, "all at all knots", 0.0, 0.0)
 
 
 def _interval_checks(s: Any, motion: Collocated) -> Iterator[Check]:
     """Whether the motion between nodes is that of the dynamics, and within its bounds and constraints."""
-    tolerance = INTEGRATION_TOLERANCE * np.minimum(s.problem.ranges(motion.xs), 1.0)
-    knot, i = np.unravel_index(int(np.argmax(motion.gaps / tolerance)), motion.gaps.shape)
+    tolerance = INTEGRATION_TOLERANCE * s.problem.state_scales(motion.xs)
+    knot, i = _worst(motion.gaps, tolerance)
     where = f"{s.problem.state_names[i]} at knot {knot}"
     yield check("integration", where, motion.gaps[knot, i], tolerance[i], units_of(s.problem)[i])
     yield from s.between_nodes.checks
@@ -114,7 +131,7 @@ def _verdict(certified: str) -> Any:
 
 def following_checks(s: Any, motion: Collocated) -> list[Check]:
     """Whether the dynamics follow the plan from its first knot to its last: open loop, and where not, under TVLQR."""
-    names, ranges, units = s.problem.state_names, s.problem.ranges(motion.xs), units_of(s.problem)
+    names, ranges, units = s.problem.state_names, s.problem.state_scales(motion.xs), units_of(s.problem)
     rows = list[Check]()
     for control in ("open loop", "TVLQR"):
         xs = motion.led(control)
@@ -152,13 +169,13 @@ def first_knots(us: Array) -> Indices:
     return np.unique(np.linspace(0, len(us) - 1, FIRST_KNOTS).astype(np.intp))
 
 
-def telling_knots(xs: Array) -> Indices:
+def telling_knots(problem: Problem, xs: Array) -> Indices:
     """The knots of the motion xs (N+1, nx) at which derivatives are certified: both ends, and where it bends most.
 
     Forces change there: touches begin or end, or an input switches.
     """
     count = len(xs) - 1
-    bends = np.abs(np.diff(xs, n=2, axis=0)) / np.maximum(np.ptp(xs, axis=0), SMALLEST_RANGE)
+    bends = np.abs(np.diff(xs, n=2, axis=0)) / problem.state_scales(xs)
     knots = 1 + np.argsort(-np.max(bends, axis=1, initial=0.0), kind="stable")[:BENDS]
     return np.unique([0, *knots.tolist(), count - 1]).astype(np.intp)
 
@@ -193,7 +210,7 @@ def certify_equations(
         "subject": f"the map of {problem.name}" if is_map else f"the equations of motion of {problem.name}",
     }
     certificates = []
-    for k in (telling_knots(xs[: len(us) + 1]) if knots is None else knots).tolist():
+    for k in (telling_knots(problem, xs[: len(us) + 1]) if knots is None else knots).tolist():
         knot = np.concatenate([xs[k], us[k]])
         point, scale = np.concatenate([knot, tail]), np.concatenate([np.maximum(1.0, np.abs(knot)), sizes])
         f = system.at_step(k).values if isinstance(system, DiscreteMap) else values

@@ -231,7 +231,11 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
     gains = [None] * len(motions) if control == OPEN_LOOP else _gains(problem, motions)
     x, worst, where = np.asarray(motions[0].xs[0]), -1.0, ""
     for i, (name, motion) in enumerate(zip(problem.names, motions, strict=True)):
-        b, ranges, names = motion.task.bounds, motion.task.problem.ranges(motion.xs), motion.task.dynamics.state_names
+        b, ranges, names = (
+            motion.task.bounds,
+            motion.task.problem.state_scales(motion.xs),
+            motion.task.dynamics.state_names,
+        )
         xs, wanted = motion.led_from(x, gains[i]), motion.xs
         switch = next((s for s in problem.switches if s.before == i), None)
         impact = None if switch is None else _impact_of(switch)
@@ -252,7 +256,7 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
                 x = switch(xs[-1]) if impact is None else impact.by_drake(xs[-1])
             if switch.after == 0:
                 deviations.append((f"{{:.2g}} from its first value after {name}", np.abs(x - motions[0].xs[0])))
-                ranges = np.concatenate([ranges, motions[0].task.problem.ranges(motions[0].xs)])
+                ranges = np.concatenate([ranges, motions[0].task.problem.state_scales(motions[0].xs)])
         for k, (sentence, values) in enumerate(deviations):
             scale = ranges[-len(values) :] if k == 2 else ranges[: len(values)]
             fractions = np.nan_to_num(values / scale, nan=np.inf)
@@ -389,8 +393,10 @@ def _link_checks(draft: PhasedSolution) -> Iterator[Check]:
     """Resets that the plan keeps, derivatives that agree, and a sum of durations."""
     for s in draft.problem.switches:
         errors = draft.link_errors[s.label]
-        i = int(np.argmax(errors))
-        yield check("link", f"{s.label} at {s.rows[i]}", errors[i], FEASIBILITY_TOLERANCE)
+        after = draft.phases[s.after]
+        limits = FEASIBILITY_TOLERANCE * after.problem.state_scales(np.asarray(after.xs))
+        i = int(np.argmax(errors / limits))
+        yield check("link", f"{s.label} at {s.rows[i]}", errors[i], limits[i])
         impact = _impact_of(s)
         if impact is not None:
             for rule in impact.broken_rules(draft.phases[s.before].xs[-1]):
@@ -398,7 +404,7 @@ def _link_checks(draft: PhasedSolution) -> Iterator[Check]:
     if draft.problem.horizon is not None:
         lower, upper = draft.problem.horizon
         beyond = max(lower - draft.horizon, draft.horizon - upper, 0.0)
-        yield check("horizon", "all phases", beyond, FEASIBILITY_TOLERANCE, "s")
+        yield check("horizon", "all phases", beyond, FEASIBILITY_TOLERANCE * draft.problem.horizon[1], "s")
     for certificate in draft.certificates:
         row = derivative_check(certificate)
         yield replace(row, where=f"{certificate.subject}: {row.where}")

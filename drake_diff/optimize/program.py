@@ -18,7 +18,7 @@ from drake_diff.model.step import advance
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.problem import Problem
 
-FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, in the state's and input's own units
+FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, of the scale of the state, input or constraint itself
 REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluation of every constraint
 
 

@@ -36,7 +36,7 @@ from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.problem.goals import GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, along_steps, clearances
-from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.terminal import TerminalConstraint
 from drake_diff.optimize.transcription.collocation import EFFORT_WEIGHT, FINAL_WEIGHT
 
@@ -48,6 +48,7 @@ STATE_TOLERANCE = 0.05
 FEEDBACK_TOLERANCE = 0.03
 SMALLEST_ENERGY = 1e-9  # [J] less is rounding
 ENERGY_TOLERANCE = 0.1  # of the energy that the motion exchanges: what no force accounts for
+HELD = 1e-3  # of a constraint's scale: it moves at least that far, where a plan stays on it
 PENETRATION_PART = 0.25  # of the thinnest geometry's thickness: beyond half of it contact may push out the other way
 OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tamsi": "sap"}
 FINE = 8  # parts of a step: what is left of an error of O(h) from there on is a seventh of what is seen up to there
@@ -122,8 +123,8 @@ class ReplayPlan:
 
     @cached_property
     def scale(self) -> Array:
-        """(nx,) the range of each state along the plan, see `Problem.ranges`."""
-        return self.problem.ranges(self.sample(1)[0])
+        """(nx,) see `Problem.state_scales`."""
+        return self.problem.state_scales(self.sample(1)[0])
 
     @cached_property
     def open_loop(self) -> Rollout | None:
@@ -376,7 +377,7 @@ def regulator_weights(plan: ReplayPlan, us: Array) -> tuple[Array, Array, Array]
     Where jerks are limited, the end has no weight of its own: the last steps would pull at it.
     """
     space = tangent_space(plan.problem.model)
-    effort = np.maximum(np.max(np.abs(us), axis=0), SMALLEST_RANGE)
+    effort = plan.problem.input_scales(us)
     Q = np.diag(1 / space.scale(plan.scale) ** 2)
     smooth = any(not limit.of_inputs for limit in plan.problem.rate_limits)
     return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), (1.0 if smooth else FINAL_WEIGHT) * Q
@@ -473,14 +474,17 @@ def _constraint_checks(plan: ReplayPlan, xs: Array, us: Array, wider: float) -> 
     """Of constraints, couplings and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
     problem, tolerances = plan.problem, dict[str, float]()
     planned_xs, planned_us = plan.sample(1)
+    spans = problem.spans(planned_xs, planned_us)
     for c in problem.constraints:  # its range is that along the whole plan: at a single knot it has none
         with np.errstate(all="ignore"):
             values = np.array([c(x, u) for x, u in zip(planned_xs, [*planned_us, planned_us[-1]], strict=True)])
         values = values[np.isfinite(values).all(axis=1)]
-        tolerances[c.label] = STATE_TOLERANCE * max(float(np.ptp(values, axis=0).max()), SMALLEST_RANGE)
+        reach = max(float(np.ptp(values, axis=0).max()), HELD * float(c.scales(planned_xs, planned_us, spans).max()))
+        tolerances[c.label] = STATE_TOLERANCE * reach
     couplings = problem.coupled_steps(plan.time_step)
     for coupling in couplings:
-        reach = max(coupling.reach(planned_xs, planned_us), SMALLEST_RANGE)
+        held_at = HELD * float(np.max(coupling.scales(planned_xs, planned_us, spans), initial=0.0))
+        reach = max(coupling.reach(planned_xs, planned_us), held_at)
         tolerances[coupling.label] = max(STATE_TOLERANCE * reach, tolerances.get(coupling.label, 0.0))
     goals = {c.label for c in problem.kept_goals}.difference(tolerances)  # they say themselves how near is near enough
     for name, (excess, knot) in problem.constraint_excess(xs, us, coupled=couplings).items():

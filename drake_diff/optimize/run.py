@@ -517,7 +517,7 @@ class Run:
 
         keys: dict[int, bytes] = {}
         if self.problem.motion == STEPS:  # else see `slope`, of the whole plan
-            knots = telling_knots(xs[: len(us) + 1]) if found else first_knots(us)
+            knots = telling_knots(self.problem, xs[: len(us) + 1]) if found else first_knots(us)
             keys = {k: xs[k].tobytes() + us[k].tobytes() + repr(parameters).encode() for k in knots.tolist()}
         # That of a search which ends where it began is known.
         new = [k for k, key in keys.items() if key not in self.certified]

@@ -306,22 +306,27 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             raise ModelError(f"{self.problem.name}: no trajectory: the solution has entries that are no numbers")
         return trajectories(self)
 
-    @cached_property
+    @property
     def defects(self) -> Array:
         """(N,) how far each interval is from the dynamics, as a state change, in the worst coordinate's unit.
 
         Discrete: |x_(k+1) - step(x_k, u_k)|, the step being that of the problem's `motion`. Collocation: the scheme's
         own equations.
         """
+        return np.max(self.defects_of_states, axis=1)
+
+    @cached_property
+    def defects_of_states(self) -> Array:
+        """(N, nx) the same of each state, in its unit."""
         if not self._is_whole:
-            return np.full(self._num_intervals, np.inf)
+            return np.full((self._num_intervals, self.problem.nx), np.inf)
         if self.transcribed is not None:
-            return np.nan_to_num(self.transcribed.defects, nan=np.inf)
-        defects = np.full(len(self.us), np.inf)
+            return np.nan_to_num(self.transcribed.defects_of_states, nan=np.inf)
+        defects = np.full((len(self.us), self.problem.nx), np.inf)
         with self.problem.intervals(self.step_vector) as intervals:
             for k, u in enumerate(self.us):
                 with suppress(SimulationError):
-                    defects[k] = _largest(np.abs(self.xs[k + 1] - intervals.end(self.xs[k], u)))
+                    defects[k] = np.nan_to_num(np.abs(self.xs[k + 1] - intervals.end(self.xs[k], u)), nan=np.inf)
         return defects
 
     @property
@@ -576,7 +581,7 @@ def _are_same(solution: Solution, other: Solution) -> bool:
     if abs(solution.cost - other.cost) > SAME_COST * max(1.0, abs(solution.cost), abs(other.cost)):
         return False
     first, second = (np.asarray(s.xs)[s.knots] for s in (solution, other))
-    apart = np.abs(first - second) / solution.problem.ranges(np.vstack([first, second]))
+    apart = np.abs(first - second) / solution.problem.state_scales(np.vstack([first, second]))
     return bool(np.max(np.sqrt(np.mean(apart**2, axis=0))) <= SAME_MOTION)
 
 

@@ -18,8 +18,8 @@ FINER = "pass refine=True, or take more steps (num_steps)"
 REFINED = "raise max_num_steps, or take more steps (num_steps)"  # where it was refined
 SHORTER = "take a smaller time step"
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
-# Where the solver stopped short of its own tolerance, or gave up: our own measures say at what.
-STOPPED = (Outcome.INACCURATE, Outcome.INFEASIBLE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)
+# Where the solver stopped short of its own tolerance: our own measures say at what.
+STOPPED = (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)
 STATIONARY = 1e-6  # of the terms of the Lagrangian's gradient: what is left to gain is of its square
 _STATUSES = {Outcome.UNBOUNDED: Status.DIVERGED, **{Outcome[name]: Status[name] for name in _ALIKE}}
 

@@ -20,9 +20,8 @@ from drake_diff.model.parameters import Parameter, ParameterVector, applied
 from drake_diff.model.plant import FLOATING, bodies, joints
 from drake_diff.model.step import set_state
 from drake_diff.motion.rollout import CONTINUOUS, STEPS, Rollout, drift, smooth_mean
-from drake_diff.optimize.measure import INTEGRATION_TOLERANCE
+from drake_diff.optimize.measure import ASKED, INTEGRATION_TOLERANCE
 from drake_diff.optimize.problem.dynamics import units_of
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.runs.fields import Event, Failure, Label, Metric, ReplayEvidence, evidence, finite
@@ -178,7 +177,8 @@ def _unit(columns: Sequence[CoordinateTerms | Parameter]) -> str:
 def _metrics_of_the_plan(
     s: Solution, states: Sequence[CoordinateTerms], inputs: Sequence[CoordinateTerms]
 ) -> Iterator[Metric]:
-    tolerance, x = FEASIBILITY_TOLERANCE, _unit(states)
+    rows, x = {what: [c for c in s.plan_checks if c.what == what] for what in ASKED}, _unit(states)
+    most = {what: max((c.tolerance for c in checks), default=0.0) for what, checks in rows.items()}
     bounded = _unit((*states, *inputs, *s.vector.parameters))
     worst = int(np.argmax(s.defects)) if len(s.defects) else 0
     when = float(s.times[min(worst, len(s.times) - 1)])
@@ -186,12 +186,14 @@ def _metrics_of_the_plan(
     yield measured(
         "cost error", "distance of the cost from what was minimized and from its true value", s.cost_error, "1"
     )
-    yield measured("defect", "largest distance from the dynamics over one step", s.defect, x, tolerance, t_s=when)
-    yield measured("goal error", "largest distance of the final state from the goal", s.goal_error, x, tolerance)
-    yield measured("bound violation", "largest excess over a bound", s.bound_violation, bounded, tolerance)
-    yield measured("initial state error", "distance of the first state from x0", s.initial_state_error, x, tolerance)
+    yield measured("defect", "largest distance from the dynamics over one step", s.defect, x, most["defect"], t_s=when)
+    yield measured("goal error", "largest distance of the final state from the goal", s.goal_error, x, most["goal"])
+    yield measured("bound violation", "largest excess over a bound", s.bound_violation, bounded, most["bound"])
+    yield measured(
+        "initial state error", "distance of the first state from x0", s.initial_state_error, x, most["start"]
+    )
     excess = "largest excess over a bound of a constraint, or distance from a waypoint"
-    yield measured("constraint violation", excess, s.constraint_violation, "the constraint's", tolerance)
+    yield measured("constraint violation", excess, s.constraint_violation, "the constraint's", most["constraint"])
     yield measured("horizon", "time from the first state to the last", s.horizon, "s")
     between = s.between_nodes
     if between is None:

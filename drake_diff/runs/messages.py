@@ -82,6 +82,8 @@ def _of_a_problem(p: Mapping[str, Any]) -> Iterator[str]:
     names, inputs, horizon = p.get("state_names"), p.get("input_names"), p.get("free_horizon_s") or p.get("horizon_s")
     count = f"{p.get('num_steps')} intervals of {shown(p.get('time_step_s'))} s, horizon {shown(horizon)} s"
     yield f"from {_named(names, p.get('x0'))} to {_named(names, p.get('x_goal')) or 'no goal'} in {count}"
+    if p.get("goal_tolerance"):
+        yield f"within {_named(names, p['goal_tolerance'])} of the goal"
     bounds = [
         (side, _named(listed, p.get(side))) for side, listed in zip(LIMITS, (names, names, inputs, inputs), strict=True)
     ]

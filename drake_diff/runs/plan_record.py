@@ -24,7 +24,7 @@ from drake_diff.runs.fields import (
 # Units of the numbers in `problem` and `contract`, by their keys.
 PROBLEM_UNITS = {
     "horizon_s, time_step_s, free_horizon_s": "s",
-    "x0, x_goal, x_lower, x_upper, waypoints": "of `gradient.columns`, entry by entry: the states are the first",
+    "x0, x_goal, goal_tolerance, x_lower, x_upper, waypoints": "of `gradient.columns`: the states are the first",
     "u_lower, u_upper": "of `gradient.columns`, entry by entry: the inputs follow the states",
     "goals": "m and rad, per s for velocities",
     "constraints": "of the values of the constraint's function",

@@ -326,9 +326,9 @@ def _odd_phases(section: PhasesSection, records: Sequence[PlanRecord], plans: Se
         if (phase.status, phase.cost, phase.duration) != expected:
             yield f"{file}: {phase.name} has status, cost and duration {expected} in {phase.directory}"
     total, duration = (sum(getattr(p, name) or 0.0 for p in section.phases) for name in ("cost", "duration"))
-    lower, upper = section.horizon_s or (0.0, np.inf)
+    lower, upper = section.horizon_s or (0.0, np.finfo(float).max)
     converged = all(phase.status == "converged" for phase in section.phases)
-    if converged and not lower - FEASIBILITY_TOLERANCE <= duration <= upper + FEASIBILITY_TOLERANCE:
+    if converged and not lower - FEASIBILITY_TOLERANCE * upper <= duration <= (1 + FEASIBILITY_TOLERANCE) * upper:
         yield f"{file}: phases.horizon_s is {section.horizon_s}, and the phases take {duration!r} s"
     if section.cost is not None and not is_near(section.cost, total, ROUNDED, ROUNDED):
         yield f"{file}: phases.cost is {section.cost!r}, and the phases cost {total!r}"

@@ -23,7 +23,6 @@ from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.fixed_contacts import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs.directory import (
     is_partial,
@@ -113,7 +112,9 @@ def _link(solution: PhasedSolution, i: int, switch: Switch) -> LinkEvidence:
         switch,
         reset=_reset(switch, solution.problem),
         errors=[finite(error) for error in solution.link_errors[switch.label]],
-        tolerance=FEASIBILITY_TOLERANCE,
+        tolerance=next(
+            c.tolerance for c in solution.link_checks if c.what == "link" and c.where.startswith(switch.label)
+        ),
         certificate=certificates.get(switch.label),
     )
 

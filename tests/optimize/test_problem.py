@@ -147,3 +147,34 @@ def test_a_models_speed_limit_applies(tmp_path):
 def test_controls_without_actuators_are_refused(load):
     with pytest.raises(InputError, match="an actuated model"):
         dd.Problem(load("projectile.sdf"), x0=np.eye(13)[0], num_steps=3, final_cost=lambda x: x[4])
+
+
+def test_a_tolerance_is_of_a_state_itself_and_of_its_way(load):
+    """A wheel that turns 1,000 rad gives a pole nothing; what does not travel has 1 % of its own range."""
+    xs = np.linspace([0.0, 0.0, 0.0, 0.0], [1.0, np.pi, 0.2, 1000.0], 11)
+    xs[5, 2] = 3.0
+    problem = cart_pole(load, goal_tolerance={"slide_x": 0.002})
+    assert problem.state_scales(xs) == pytest.approx([1.0, np.pi, 3.0, 1000.0], rel=1e-12)
+    assert problem.goal_tolerances(xs) == pytest.approx([0.002, 0.01 * np.pi, 0.03, 10.0], rel=1e-12)
+    assert "to within 0.002 of slide_x" in str(problem)
+    still = problem.state_scales(np.zeros((11, 4)))[3]  # a millionth of the hinge's goal over the horizon
+    assert still == pytest.approx(np.pi * 1e-6 / problem.start_horizon, rel=1e-9)
+
+
+@each_row(
+    "given, words",
+    [
+        ({"slide_x": 0.0}, "positive"),
+        ({"slide_x": math.inf}, "positive|finite"),
+        ({"nothing": 0.1}, "slide_x"),
+        ([0.1, 0.1], "4"),
+    ],
+)
+def test_a_goal_tolerance_is_refused_by_name(load, given, words):
+    with pytest.raises(InputError, match=words):
+        cart_pole(load, goal_tolerance=given)
+
+
+def test_no_goal_has_no_tolerance(load):
+    with pytest.raises(InputError, match="goal"):
+        cart_pole(load, x_goal=[1, np.nan, 0, 0], goal_tolerance=[0.1, 0.1, np.nan, np.nan])

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from drake_diff._base.autodiff import chain_rows, gradient_rows
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.model.model import Model
 
+LOOKED_AT = 5  # states at which the slopes of a constraint are taken
 FORM = "a function of x, or of x and u, in ordinary arithmetic that gives a number or numbers (m,)"
 
 
@@ -207,6 +209,18 @@ class Constraint:
         if bad.any():
             raise GradientError(f"the derivative of constraint {self.label} is not finite at x = {xs[bad][0].tolist()}")
         return np.concatenate([by_x, np.zeros((*by_x.shape[:2], us.shape[1]))], axis=2)
+
+    def scales(self, xs: Array, us: Array, spans: Array) -> Array:
+        """(m,) how far the values go as each state and input goes its own way `spans` (nx + nu,), by their slopes.
+
+        At some of xs (K, nx), us (K, nu). Of a value without slopes it is the magnitude of its bound.
+        """
+        scales = np.zeros(len(self.lower))
+        for k in np.unique(np.linspace(0, len(us) - 1, LOOKED_AT).astype(int)):
+            with suppress(GradientError):
+                scales = np.maximum(scales, np.abs(self.differentiate(xs[k], us[k])[1]) @ spans)
+        bounds = np.where(np.isfinite(self.lower), np.abs(self.lower), np.abs(self.upper))
+        return np.where(scales > 0, scales, np.where(np.isfinite(bounds), bounds, 0.0))
 
     def excess(self, x: Array, u: Array) -> float:
         """The largest excess over a bound at x (nx,), u (nu,); inf where a value is not a number."""

@@ -80,6 +80,15 @@ class BoundCoupling:
                 (self.rows.excess(*self.packed(xs, us, where[knots])), int(where[knots[-1]])) for knots in self.knots
             )
 
+    def scales(self, xs: Array, us: Array, spans: Array) -> Array:
+        """(m,) how far the values go as states and inputs go their way `spans` (nx + nu,) along a motion."""
+        if not len(self.knots):
+            return np.zeros(len(self.rows.lower))
+        states, inputs = zip(*(self.packed(xs, us, knots) for knots in self.knots), strict=True)
+        apart = np.split(spans, [xs.shape[1]])
+        sides = [np.tile(side, self.knots.shape[1]) for side in apart]
+        return self.rows.scales(np.array(states), np.array(inputs), np.concatenate(sides))
+
     def reach(self, xs: Array, us: Array) -> float:
         """The largest range of a value as the last knot of a place moves along a motion: a tolerance's scale."""
         values = []

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
-from drake_diff._base.arrays import Array, array_with_gaps, finite_array, frozen, positive_int
+from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
 from drake_diff.mechanics.tree import tree_for
@@ -526,6 +526,23 @@ def bounds_of(system: Model | Dynamics, given: Any) -> Any:
                     raise InputError(f"bounds of {name}", got=repr(pair)[:80], expected="numbers, None for no bound")
                 sides[f"{kind}_{side}"][index] = bound
     return Bounds(**sides)
+
+
+def vectors_of(model: Model) -> list[tuple[Indices, Indices, bool]]:
+    """Where a model's state has the translation or rotation of each joint and its rate, and whether it is a rotation.
+
+    The entries of each are one quantity: which of them moves depends on the axes.
+    """
+    vectors, units = list[tuple[Indices, Indices, bool]](), [c.unit for c in model.contract.positions]
+    rates = [c.unit for c in model.contract.velocities]
+    for joint in joints(model.plant):
+        q, v = model.places(joint)
+        for turns in (True, False):
+            places = [i for i in q if (units[i] != "m") == turns]
+            moving = [model.nq + i for i in v if (rates[i] != "m/s") == turns]
+            if places and moving:
+                vectors.append((np.array(places), np.array(moving), turns))
+    return vectors
 
 
 def units_of(problem: Any) -> tuple[str, ...]:

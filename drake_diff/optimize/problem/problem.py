@@ -47,7 +47,7 @@ from drake_diff.optimize.problem.cost import (
 )
 from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, RateLimit, excess_of
 from drake_diff.optimize.problem.design import Design
-from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, bounds_of, plant_dynamics, state_of
+from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, bounds_of, plant_dynamics, state_of, vectors_of
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
 
@@ -56,9 +56,9 @@ OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
 SMALLEST_PART = 1e-3
 SAME_STATE = 1e-6  # [the coupling's unit] of states that are typed by hand
-SMALLEST_RANGE = 1e-3  # of a number along a motion: less counts as this, in its unit
+STILL = 1e-6  # of a state's largest magnitude, or of a radian: what moves less stands still
+GOAL_PART = 0.01  # of what a state has to travel: how far from its goal it may end where nothing else is given
 TRIED, NO_SLOPE = 3, 1e-9  # states at which a goal's slopes are looked at, and what counts as none: rounding
-SMALLEST_SHARE = 0.2  # of the largest range of its kind (positions, velocities): a state's own is at least that
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,6 +79,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             with 1.0 the cost is the time itself.
         final_cost: a function x -> scalar, or a QuadraticCost.
         x_goal: (nx,) final state, a hard equality; NaN entries are free. Or a mapping as `x0`, the rest free.
+        goal_tolerance: how far from `x_goal` a state may end where the plan is replayed: a mapping from names, as `x0`,
+            or (nx,), NaN where not given, in the states' units. Elsewhere 1 % of what the state has to travel.
         waypoints: mapping from knots (1 ... N-1) to states (nx,), with NaN where free, or mappings as `x_goal`.
         constraints: a `Constraint`, or several.
         couplings: what joins several knots, such as `optimize.Periodic`, or several of these; for collocation and
@@ -126,6 +128,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
     running_cost: Any = None  # becomes a RunningCost
     final_cost: FinalCost | None = None
     x_goal: Any = None
+    goal_tolerance: Any = None  # becomes an array, or stays None
     waypoints: Any = None  # becomes a dict
     constraints: Any = ()  # becomes a tuple of Constraints
     couplings: Any = ()  # becomes a tuple of Couples
@@ -174,6 +177,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         check_inside("x0", self.x0, bounds.x_lower, bounds.x_upper, self.state_names)
         if self.x_goal is not None:
             self._set("x_goal", self._check_state("x_goal", self.x_goal))
+        if self.goal_tolerance is not None:
+            self._set("goal_tolerance", self._check_goal_tolerance())
         self._set("waypoints", self._check_waypoints())
         self._set("constraints", self._check_constraints())
         self._set("couplings", self._check_couplings())
@@ -200,6 +205,11 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         time = "" if self.is_map else f" in {time} s"
         goal = "" if self.x_goal is None else f" to x_goal = {short(self.x_goal)}"
         lines = [f"Problem of {self.name}: {sizes}{time}", f"from x0 = {short(self.x0)}{goal}"]
+        if self.goal_tolerance is not None:
+            given = np.flatnonzero(~np.isnan(self.goal_tolerance))
+            lines.append(
+                f"to within {', '.join(f'{self.goal_tolerance[i]:g} of {self.state_names[i]}' for i in given)}"
+            )
         for name in ("running_cost", "final_cost", "trajectory_cost", "parameter_cost"):
             cost = getattr(self, name)
             if cost is not None:
@@ -417,13 +427,66 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             excesses[f"waypoint at knot {knot}"] = (float(np.max(distance, initial=0.0)), int(where[knot]))
         return excesses | excess_of(self.coupled_steps() if coupled is None else coupled, xs, us, where)
 
-    def ranges(self, xs: Array) -> Array:
-        """(nx,) the range of each state along xs (M, nx), a tolerance's scale; see SMALLEST_RANGE, SMALLEST_SHARE."""
-        ranges = np.ptp(xs, axis=0)
-        parts = [slice(0, self.model.nq), slice(self.model.nq, None)] if self.has_model else []
-        for kind in parts:
-            ranges[kind] = np.maximum(ranges[kind], SMALLEST_SHARE * np.max(ranges[kind], initial=0.0))
-        return np.maximum(ranges, SMALLEST_RANGE)
+    def state_scales(self, xs: Array) -> Array:
+        """(nx,) how far each state goes along xs (M, nx), the scale of its tolerances, in its unit.
+
+        That is its own range; of a joint of several directions, that of the one which moves most. A state that stands
+        still has 1e-6 of its largest magnitude, what is asked of it among them, or of a radian, and its velocity that
+        over the horizon; where all that is 0, of its bound.
+        """
+        asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
+        scales, least = np.ptp(xs, axis=0), STILL * np.max(np.nan_to_num(np.abs(asked)), axis=0)
+        for q, v, turns in self._vectors:
+            for places in (q, v):
+                scales[places], least[places] = np.max(scales[places]), np.max(least[places])
+            least[q] = np.maximum(least[q], STILL * turns)
+            least[v] = np.maximum(least[v], least[q[0]] / self.start_horizon)
+        return _not_zero(np.maximum(scales, least), self.bounds.x_lower, self.bounds.x_upper)
+
+    def input_scales(self, us: Array) -> Array:
+        """(nu,) the largest magnitude of each input along us (M, nu); of one that is 0, 1e-6 of its bound."""
+        return _not_zero(np.max(np.abs(us), axis=0, initial=0.0), self.bounds.u_lower, self.bounds.u_upper)
+
+    def spans(self, xs: Array, us: Array) -> Array:
+        """(nx + nu,) `state_scales` and `input_scales` side by side."""
+        return np.concatenate([self.state_scales(xs), self.input_scales(us)])
+
+    def feasibility_scales(self, xs: Array, us: Array, values: Array) -> dict[str, float]:
+        """The scale of each state, input, parameter (by `values` (np,)), constraint, coupling and the horizon.
+
+        By the names that excesses have, along xs (M, nx) under us (M, nu). What a solver leaves is a part of these.
+        """
+        spans, us = self.spans(xs, us), np.vstack([us, np.tile(us[-1:], (len(xs) - len(us), 1))])
+        scales = dict(zip((*self.state_names, *self.input_names), spans, strict=True))
+        scales |= dict(
+            zip(self.parameters.names, np.maximum(np.abs(values), np.abs(self.parameters.values)), strict=True)
+        )
+        scales["horizon"] = self.start_horizon
+        for c in self.kept:
+            scales[c.label] = max(float(np.max(c.scales(xs, us, spans))), scales.get(c.label, 0.0))
+        if len(xs) == self.num_steps + 1:
+            for bound in self.coupled_steps():
+                scales[bound.label] = float(np.max(bound.scales(xs, us, spans), initial=0.0))
+        return scales
+
+    def goal_tolerances(self, xs: Array) -> Array:
+        """(nx,) how far from the goal each state may end: as given, else 1 % of what it has to travel.
+
+        That is the range of its values at x0, waypoints and goal, and where these are one its own along xs (M, nx).
+        """
+        scales = self.state_scales(xs)
+        way = _spread(
+            np.vstack([np.where(self.initial_state_mask, xs[0], self.x0), *self.waypoints.values(), self.goal])
+        )
+        for q, v, _ in self._vectors:
+            way[q], way[v] = np.max(way[q]), np.max(way[v])
+        tolerances = GOAL_PART * np.where(way > STILL * scales, way, scales)
+        given = np.nan if self.goal_tolerance is None else self.goal_tolerance
+        return np.where(np.isnan(given), tolerances, given)
+
+    @cached_property
+    def _vectors(self) -> list[tuple[Indices, Indices, bool]]:
+        return [] if self.moved is None else vectors_of(self.moved)
 
     def goal_error(self, x: Array) -> Array:
         """(nx,) the distance of `x` from the goal, 0 where the goal is free."""
@@ -493,6 +556,17 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             raise InputError(subject, got=state, expected="finite numbers, NaN where free")
         check_inside(subject, state, self.bounds.x_lower, self.bounds.x_upper, self.state_names)
         return state
+
+    def _check_goal_tolerance(self) -> Array:
+        subject = "goal_tolerance"
+        named = state_of(self.system, subject, self.goal_tolerance, np.full(self.nx, np.nan))
+        tolerance = array_with_gaps(subject, named, (self.nx,))
+        for i in np.flatnonzero(~np.isnan(tolerance)):
+            if not 0 < tolerance[i] < np.inf:
+                raise InputError(f"{subject}, {self.state_names[i]}", got=tolerance[i], expected="a positive number")
+            if np.isnan(self.goal[i]):
+                raise InputError(f"{subject}, {self.state_names[i]}", got=tolerance[i], expected="none without a goal")
+        return tolerance
 
     def _check_waypoints(self) -> dict[int, Array]:
         given = {} if self.waypoints is None else self.waypoints
@@ -627,6 +701,20 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         with applied(self.parameters), np.errstate(all="ignore"):
             self.constraint_excess(xs, self.us)
             self.objective(xs, self.us)
+
+
+def _spread(values: Array) -> Array:
+    """(n,) the range of each column of values (M, n), NaN left out; 0 of one that is NaN alone."""
+    lowest, highest = (np.nan_to_num(sign * values, nan=np.inf).min(axis=0) for sign in (1, -1))
+    return np.where(np.isnan(values).all(axis=0), 0.0, -highest - lowest)
+
+
+def _not_zero(scales: Array, lower: Array, upper: Array) -> Array:
+    """`scales` (n,), and for those that are 0 the rounding of a finite bound, else of the largest of all, else of 1."""
+    sides = [np.where(np.isfinite(side), np.abs(side), 0.0) for side in (lower, upper)]
+    for others in (np.max(sides, axis=0), np.max(scales, initial=0.0), 1.0):
+        scales = np.where(scales == 0, STILL * others, scales)
+    return scales
 
 
 def _check_optimize(nu: int, optimize: Sequence[str]) -> tuple[str, ...]:

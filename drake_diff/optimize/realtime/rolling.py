@@ -114,7 +114,7 @@ class Rolling:
             raise InputError(
                 "running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum"
             )
-        ranges = problem.ranges(xs)
+        ranges = problem.state_scales(xs)
         for side in (b.x_lower, b.x_upper):
             apart = np.max(np.abs(xs - side), axis=0)
             ranges = np.where(np.isfinite(apart), np.maximum(ranges, apart), ranges)

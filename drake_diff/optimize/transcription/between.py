@@ -12,7 +12,7 @@ from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.goals import GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
-from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.transcription.collocation import Collocated
 from drake_diff.optimize.transcription.lead import SUBSTEPS
@@ -25,7 +25,7 @@ EXCESS_TOLERANCE = 1e-3
 # interval's length more than the polynomials do.
 JERK_TOLERANCE = 1e-2
 DEPTH_TOLERANCE = 1e-3  # of the ranges of states and inputs: how far away a constraint that does not hold may hold
-SOLVED = 1e-8  # of max(1, |bound|): what the solver may leave of a constraint that it keeps
+SOLVED = 1e-8  # of a constraint's scale or bound: what the solver may leave of a constraint that it keeps
 CLOSER, CLOSER_ROUNDS = 9, 2  # places about a constraint's nearest approach to its bound, and how often
 KINDS = ("state", "input", "constraint")
 
@@ -34,9 +34,10 @@ KINDS = ("state", "input", "constraint")
 class Excess:
     """The largest excess over a bound of a state, an input and a constraint between the nodes.
 
-    The tolerance of each is 1e-3 of its range along the motion, or 1e-5 where that is more. A constraint has to hold
-    within 1e-3 of the ranges of states and inputs besides. `worst` is the largest excess as a part of its tolerance,
-    `where` that is, and `checks` has one for each bound and constraint; what fails does so in one of the `intervals`.
+    The tolerance of each is 1e-3 of its range along the motion, or 1e-5 of its scale where that is more. A constraint
+    has to hold within 1e-3 of the ranges of states and inputs besides. `worst` is the largest excess as a part of its
+    tolerance, `where` that is, and `checks` has one for each bound and constraint; what fails does so in one of the
+    `intervals`.
     """
 
     state: float
@@ -58,23 +59,26 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     if task.is_map:
         return Excess(0.0, 0.0, 0.0, 0.0, "nowhere", (), ())
     states, inputs = task.dynamics.state_names, task.dynamics.input_names
-    ranges, (times, xs) = task.problem.ranges(motion.xs), motion.between_knots
-    groups = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
+    ranges, (times, xs) = task.problem.state_scales(motion.xs), motion.between_knots
+    spans = np.concatenate([ranges, task.problem.input_scales(motion.us)])
+    groups = [_beyond("state", states, xs, b.x_lower, b.x_upper, _tolerance(ranges, ranges), times)]
     for c in task.problem.kept:
         if isinstance(c, ClearanceConstraint):
             groups.append([_too_near(motion, c)])
         elif isinstance(c, GoalConstraint) and c.dwells:
             groups.append([_of_stay(motion, c)])
         elif c.knots is None:
-            groups.append(_of_constraint(motion, c, ranges))
+            groups.append(_of_constraint(motion, c, spans))
     for limit in task.problem.rate_limits:
         _, most = limit.entries(task.problem.system)
         rates, when = motion.rates_of(limit)
         extent = _extent(rates) if limit.of_inputs else JERK_TOLERANCE / EXCESS_TOLERANCE * most
-        groups.append(_beyond("constraint", (limit.label,) * len(most), rates, -most, most, extent, when))
+        tolerance = _tolerance(extent, most)
+        groups.append(_beyond("constraint", (limit.label,) * len(most), rates, -most, most, tolerance, when))
     k, tau = np.repeat(np.arange(count), len(DENSE)), np.tile(DENSE, count)
     us = motion.between(k, tau)[1]
-    groups.append(_beyond("input", inputs, us, b.u_lower, b.u_upper, _extent(us), motion.times(k, tau)))
+    tolerance = _tolerance(_extent(us), spans[len(ranges) :])
+    groups.append(_beyond("input", inputs, us, b.u_lower, b.u_upper, tolerance, motion.times(k, tau)))
     every = [excess for kind in groups for excess in kind]
     largest = {kind: max((e.excess for e in every if e.kind == kind), default=0.0) for kind in KINDS}
     worst = max(every, key=lambda e: e.part)
@@ -93,7 +97,7 @@ def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -
     every = np.unique(
         np.concatenate([times, np.interp(np.arange(0, len(us), 1 / SUBSTEPS), np.arange(len(xs)), times)])
     )
-    scale = np.concatenate([problem.ranges(xs), np.maximum(np.ptp(us, axis=0), SMALLEST_RANGE)])
+    spans = problem.spans(xs, us)
 
     def at(when: Array) -> tuple[Array, Array]:
         held = np.clip(np.searchsorted(times, when, side="right") - 1, 0, len(us) - 1)
@@ -103,7 +107,7 @@ def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -
         if c.knots is None:
             moments, between, applied = _looked_at(c, every, *at(every), at)
             excess = _excess(_values(c, between, applied), c.lower, c.upper)
-            through = np.any(_depth(c, between, applied, excess, scale)[1], axis=1)
+            through = np.any(_depth(c, between, applied, excess, spans, c.scales(xs, us, spans))[1], axis=1)
             first = int(np.argmax(through))
             passed = float(np.max(excess[first])) if through[first] else 0.0
             yield check("passage", f"{c.label} at {moments[first]:.4g} s", passed, 0.0)
@@ -121,15 +125,14 @@ class _Beyond:
 
 
 def _beyond(
-    kind: str, names: Sequence[str], values: Array, lower: Array, upper: Array, ranges: Array, times: Array
+    kind: str, names: Sequence[str], values: Array, lower: Array, upper: Array, tolerance: Array, times: Array
 ) -> list[_Beyond]:
     """One for each column of `values` (S, n)."""
-    excess, tolerance = _excess(values, lower, upper), _tolerance(ranges)
-    excesses = []
+    excess, excesses = _excess(values, lower, upper), list[_Beyond]()
     for i, k in enumerate(np.argmax(excess, axis=0).tolist()):
         far, limit = float(excess[k, i]), float(tolerance[i])
         row = _between("bound", f"{names[i]} at {times[k]:.4g} s", far, limit)
-        excesses.append(_Beyond(kind, far, far / limit, times[~(excess[:, i] <= limit)], row))
+        excesses.append(_Beyond(kind, far, row.ratio, times[~(excess[:, i] <= limit)], row))
     return excesses
 
 
@@ -144,11 +147,17 @@ def _excess(values: Array, lower: Array, upper: Array) -> Array:
 
 
 def _extent(values: Array) -> Array:
-    return np.maximum(np.ptp(values, axis=0), SMALLEST_RANGE)
+    return np.ptp(values, axis=0)
 
 
-def _tolerance(ranges: Array) -> Array:
-    return np.maximum(EXCESS_TOLERANCE * ranges, FEASIBILITY_TOLERANCE)
+def _tolerance(ranges: Array, scales: Array) -> Array:
+    return np.maximum(EXCESS_TOLERANCE * ranges, FEASIBILITY_TOLERANCE * scales)
+
+
+def _parts(excess: Array, tolerance: Array) -> Array:
+    """`excess` over `tolerance`; 0 where there is none of either."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(excess > 0, excess / tolerance, 0.0)
 
 
 def _too_near(motion: Collocated, c: ClearanceConstraint) -> _Beyond:
@@ -173,7 +182,7 @@ def _of_stay(motion: Collocated, c: GoalConstraint) -> _Beyond:
     return _Beyond("constraint", far, row.ratio, times[misses > c.tolerance], row)
 
 
-def _of_constraint(motion: Collocated, c: Constraint, ranges: Array) -> list[_Beyond]:
+def _of_constraint(motion: Collocated, c: Constraint, spans: Array) -> list[_Beyond]:
     """One for each number of a constraint of all knots.
 
     Its range tells little where its slope is small at the bound: (x - a)^2 >= r^2 is a wall of any width. So it must
@@ -192,11 +201,11 @@ def _of_constraint(motion: Collocated, c: Constraint, ranges: Array) -> list[_Be
 
     times, xs, us = _looked_at(c, times, xs, motion.applied_at(times), at)
     values = _values(c, xs, us)
-    excess, tolerance = _excess(values, c.lower, c.upper), _tolerance(_extent(np.nan_to_num(values)))
-    scale = np.concatenate([ranges, np.maximum(np.ptp(motion.us, axis=0), SMALLEST_RANGE)])
-    depth, through = _depth(c, xs, us, excess, scale)
+    scales = c.scales(xs, us, spans)
+    excess, tolerance = _excess(values, c.lower, c.upper), _tolerance(_extent(np.nan_to_num(values)), scales)
+    depth, through = _depth(c, xs, us, excess, spans, scales)
     depth = np.where(through, 1.0, depth)
-    fraction = np.maximum(excess / tolerance, depth / DEPTH_TOLERANCE)
+    fraction = np.maximum(_parts(excess, tolerance), depth / DEPTH_TOLERANCE)
     excesses = []
     for i in range(values.shape[1]):
         k = int(np.lexsort((excess[:, i], fraction[:, i]))[-1])
@@ -204,7 +213,7 @@ def _of_constraint(motion: Collocated, c: Constraint, ranges: Array) -> list[_Be
         row = _between("bound", where, far, float(tolerance[i]))
         if through[k, i]:
             row = replace(row, what="passage", verdict="fail")
-        elif depth[k, i] / DEPTH_TOLERANCE > far / tolerance[i]:
+        elif depth[k, i] / DEPTH_TOLERANCE > row.ratio:
             row = _between("depth", where, float(depth[k, i]), DEPTH_TOLERANCE)
         excesses.append(_Beyond("constraint", far, float(fraction[k, i]), times[~(fraction[:, i] <= 1)], row))
     return excesses
@@ -243,20 +252,22 @@ def _looked_at(
     return times, xs, us
 
 
-def _depth(c: Constraint, xs: Array, us: Array, excess: Array, scale: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """(S, m) how far it is to where the constraint holds, as a part of `scale` (nx + nu,), and where motions pass it.
+def _depth(
+    c: Constraint, xs: Array, us: Array, excess: Array, spans: Array, scales: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(S, m) how far it is to where the constraint holds, as a part of `spans` (nx + nu,), and where motions pass it.
 
     The less of two: to first order in its slope, and half of the way between the places before and after on the motion
     at which it holds. Where the slopes at the first and the last place between these point against each other, the
     motion has gone through what is forbidden.
     """
-    z, depth, through = np.hstack([xs, us]) / scale, np.zeros_like(excess), np.zeros(excess.shape, dtype=bool)
-    bound = np.maximum(1.0, np.where(np.isfinite(c.lower), np.abs(c.lower), np.abs(c.upper)))
-    outside = excess > SOLVED * bound
-    slopes = np.zeros((*excess.shape, len(scale)))
+    z, depth, through = np.hstack([xs, us]) / spans, np.zeros_like(excess), np.zeros(excess.shape, dtype=bool)
+    bound = np.where(np.isfinite(c.lower), np.abs(c.lower), np.abs(c.upper))
+    outside = excess > SOLVED * np.maximum(scales, bound)
+    slopes = np.zeros((*excess.shape, len(spans)))
     for k in np.flatnonzero(np.any(outside, axis=1)):
         try:
-            slopes[k] = c.differentiate(xs[k], us[k])[1] * scale
+            slopes[k] = c.differentiate(xs[k], us[k])[1] * spans
         except GradientError:  # it has none here: then the way along the motion tells
             continue
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -21,7 +21,7 @@ from drake_diff.optimize.problem.coupling import RateLimit
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearances
 from drake_diff.optimize.problem.phases import PhasedProblem
-from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.lead import SUBSTEPS, Lead, Within
 from drake_diff.optimize.transcription.task import OptimalControl, Scheme
@@ -113,8 +113,8 @@ class Collocated:
         It is no less than a millionth of what the running cost changes by where a state or input is a range away.
         """
         middle = self.nodes[len(self.nodes) // 2]
-        ranges = self.task.problem.ranges(self.xs), np.maximum(np.ptp(self.us, axis=0), SMALLEST_RANGE)
-        knots = np.vstack([middle, *(middle + side * np.diag(np.concatenate(ranges)) for side in (-1, 1))])
+        spans = self.task.problem.spans(self.xs, self.us)
+        knots = np.vstack([middle, *(middle + side * np.diag(spans) for side in (-1, 1))])
         apart = self.task.rates(knots, np.full(len(knots), self.horizon / 2))
         floor = SMALLEST_COST * self.horizon * float(np.nanmax(np.abs(apart - apart[0]), initial=0.0))
         parts = [float(self._node_weights @ np.abs(self._cost_rates)), *np.abs(self._other_costs), floor]
@@ -177,12 +177,12 @@ class Collocated:
         return np.asarray(by_tau / self.lengths[:, None, None])
 
     @cached_property
-    def defects(self) -> Array:
-        """(N,) how far each interval is from the scheme's equations, in the worst coordinate's unit."""
+    def defects_of_states(self) -> Array:
+        """(N, nx) how far each interval is from the scheme's equations, in the states' units."""
         xs = self.task.scheme.per_interval(self.nodes[:, : self.task.dynamics.nx])
         rates = self.task.scheme.per_interval(self._rates)
         defects = self.task.scheme.interval_defects(self.lengths, xs, rates)
-        return np.asarray(np.max(np.abs(defects), axis=(1, 2)))
+        return np.asarray(np.max(np.abs(defects), axis=1))
 
     @property
     def errors(self) -> Array:
@@ -307,8 +307,8 @@ class Collocated:
         And (nx, nx) what a distance from the first state then costs; `at_end` (nx, nx) is what one from the last does.
         """
         nx, nu, is_map = self.task.dynamics.nx, self.task.dynamics.nu, self.task.is_map
-        effort = np.maximum(np.max(np.abs(self.us), axis=0), SMALLEST_RANGE)
-        Q, R = np.diag(1 / self.task.problem.ranges(self.xs) ** 2), EFFORT_WEIGHT * np.diag(1 / effort**2)
+        effort = self.task.problem.input_scales(self.us)
+        Q, R = np.diag(1 / self.task.problem.state_scales(self.xs) ** 2), EFFORT_WEIGHT * np.diag(1 / effort**2)
         count = len(self.xs) - 1
         by_knot = self.task.linearized(np.hstack([self.xs, self.us])[:-1], np.arange(count))
         P, gains = FINAL_WEIGHT * Q if at_end is None else at_end, np.empty((count, nu, nx))

@@ -100,7 +100,7 @@ class Within:
         self.motion, self.held, task, count = motion, held, motion.task, len(motion.lengths)
         self.nx, self.width, self.least = task.dynamics.nx, 0.0, np.ones(count, dtype=np.intp)
         self.narrow = np.zeros(count, dtype=bool)
-        self.allowed = FEATURE * np.append(task.problem.ranges(motion.xs), motion.cost_scale)
+        self.allowed = FEATURE * np.append(task.problem.state_scales(motion.xs), motion.cost_scale)
         if task.is_map:  # the state is held until the next step
             z, k = held[:, 0], np.arange(count)
             stepped = np.column_stack([task.moved(z, k), task.rates(z, motion.times(k, np.zeros(count)))])
@@ -197,7 +197,7 @@ class Lead:
         self.motion, self.substeps = motion, substeps
         self.least = np.ones(len(motion.lengths), dtype=np.intp) if least is None else least
         self.nx = motion.task.dynamics.nx
-        self.allowed = TOLERANCE * motion.task.problem.ranges(motion.xs)
+        self.allowed = TOLERANCE * motion.task.problem.state_scales(motion.xs)
         self.lower, self.upper = motion.input_limits
         self._planned: dict[int, Array] = {}
 

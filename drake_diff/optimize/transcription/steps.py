@@ -86,7 +86,7 @@ def solve_shooting(
             rolled = roll(intervals, xs[0], us)
     except SimulationError:
         return result, xs, us
-    is_same = np.all(np.abs(rolled - xs) <= SAME_MOTION * problem.ranges(xs))
+    is_same = np.all(np.abs(rolled - xs) <= SAME_MOTION * problem.state_scales(xs))
     return result, rolled if is_same else xs, us
 
 
