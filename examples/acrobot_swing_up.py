@@ -33,7 +33,7 @@ def problem() -> dd.Problem:
 
 def main() -> None:
     solution = dd.solve(problem(), **solve_options)
-    print(f"{solution.status.value}: {solution.message}")
+    print(f"{solution.message}")
     print(f"the elbow gives {np.abs(solution.us).max():.1f} N m at most, {STRONGEST:.0f} allowed")
     for replay in solution.replays:
         if replay.control != "open loop" and replay.motion is not None:

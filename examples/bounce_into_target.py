@@ -43,7 +43,7 @@ def main() -> None:
         raise SystemExit(solution.message)
     contacts = solution.replay.contacts
     touched = [k * TIME_STEP for k, now in enumerate(contacts) if now]
-    print(f"{solution.status.value}: {solution.message}")
+    print(f"{solution.message}")
     print(f"thrown at {solution.xs[0][[VX, VZ]]} m/s, on the ground from {touched[0]:.2f} to {touched[-1]:.2f} s,")
     print(f"at {solution.replay.xs[-1][[X, Z]]} m in the end, where another integration leads it")
 

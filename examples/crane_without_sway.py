@@ -32,7 +32,7 @@ def main() -> None:
     for sway in (SWAY, np.pi):
         solution = dd.solve(problem(sway))
         print(f"{np.abs(solution.xs[:, 1]).max():.3f} rad at most, {sway:.2f} allowed: cost {solution.cost:.2f} N^2 s")
-        print(f"  {solution.status.value}: {solution.message}")
+        print(f"  {solution.message}")
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def main() -> None:
     for stage in solution.options["continuation"]:
         reach = "" if stage["distance"] is None else f" {1000 * stage['distance']:.1f} mm"
         print(f"  stage {stage['number']}  {stage['kind'] + reach:18s}  {stage['status']}, {stage['iterations']} steps")
-    print(f"{solution.status.value}: {solution.message}")
+    print(f"{solution.message}")
     motion: Any = solution.replay  # None only of a search without a plan
     ground = [k for k, found in enumerate(motion.contacts) if any("ground" in str(c) for c in found)]
     print(f"off the ground from {(max(ground) + 1) * TIME_STEP:.2f} s; at the end z = {motion.xs[-1][1]:.4f} m")

@@ -43,7 +43,7 @@ def main() -> None:
     for stage in solution.options["continuation"]:
         reach = "" if stage["distance"] is None else f" {1000 * stage['distance']:.1f} mm"
         print(f"  stage {stage['number']}  {stage['kind'] + reach:18s}  {stage['status']}, {stage['iterations']} steps")
-    print(f"{solution.status.value}: {solution.message}")
+    print(f"{solution.message}")
     motion: Any = solution.replay  # None only of a search without a plan
     flight = [k * TIME_STEP for k, contacts in enumerate(motion.contacts) if not contacts]
     print(f"in the air from {flight[0]:.2f} s to {flight[-1]:.2f} s; at the end x = {motion.xs[-1][0]:.6f} m")

@@ -35,7 +35,7 @@ def main() -> None:
     clear: Any = problem().kept_goals[1]
     for name, goals in {"with the ball": (BALL,), "without": ()}.items():
         solution = dd.solve(problem(goals))
-        print(f"{name}: {solution.status.value}, {solution.message}")
+        print(f"{name}: {solution.message}")
         print(f"  at its knots it comes within {np.min(clear.clearance.values(solution.xs)):.3f} m of the ball's place")
 
 

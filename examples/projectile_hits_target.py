@@ -72,7 +72,7 @@ def main() -> None:
         vx -= 0.1 * hand_built(vx)[1]
     solution = dd.solve(problem())
     print(f"gradient descent by hand: vx = {vx:.9f}; through Drake: vx = {solution.xs[0][VX]:.9f} (exact: 2)")
-    print(f"{solution.status.value}: {solution.message}")
+    print(f"{solution.message}")
 
 
 if __name__ == "__main__":

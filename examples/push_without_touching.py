@@ -48,7 +48,7 @@ def main() -> None:
             f"  stage {stage['number']}  {contact:22s}  {stage['status']:16s} {stage['iterations']:3d} steps  "
             f"cost {stage['cost']:.6f}  goal error {stage['goal_error']:.1e}"
         )
-    print(f"{solution.status.value}: {solution.message}")
+    print(f"{solution.message}")
     motion: Any = solution.replay  # None only of a search without a plan
     touches = [k for k, contacts in enumerate(motion.contacts) if contacts]
     x = motion.xs[-1][BALL]

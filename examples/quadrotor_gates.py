@@ -51,7 +51,7 @@ def problem(num_steps: int = NUM_STEPS) -> dd.Problem:
 
 def main() -> None:
     solution = dd.solve(problem(), **solve_options)
-    print(f"{solution.status.value}: {solution.message}")
+    print(f"{solution.message}")
     for knot, gate in GATES.items():
         print(f"at {knot * HORIZON / NUM_STEPS:.2f} s at {solution.xs[knot, 4:7].round(2)} m, the gate at {gate}")
 

@@ -350,8 +350,8 @@ def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
         if constraint.miss(goal) > constraint.tolerance:
             got = f"{constraint.told(constraint.miss(goal))} where inputs can hold the model"
             raise InputError(f"goal {constraint.label}", got=got, expected="one that can be stayed at")
-    plan = ReplayPlan(problem, problem.parameters, model.time_step, held(xs, us), False)
     cost = problem.objective(xs, us)
+    plan = ReplayPlan(problem, problem.parameters, model.time_step, held(xs, us), False, cost)
     cost = cost if cost > 0 else 1.0
     Q, R, _ = (STAY * cost / problem.num_steps * weight for weight in regulator_weights(plan, us))
     regulator, to_tangent = LQR(model, goal, u, Q, R), tangent_space(model).derivative_of_minus(goal)

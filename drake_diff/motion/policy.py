@@ -170,11 +170,13 @@ class LQR:
 
 
 class TVLQR:
-    """u = us[k] - K_k minus(x, xs[k]), k = round(t / time_step) within 0..N-1: LQR along a trajectory.
+    """u = us[k] - K_k minus(x, xs[k]) - l_k, k = round(t / time_step) within 0..N-1: LQR along a trajectory.
 
-    With A_k, B_k the step's Jacobians there in the tangent space (nt,), from P_N = Qf backward
+    With A_k, B_k the step's Jacobians there in the tangent space (nt,), from P_N = Qf and p_N = 0 backward
         K_k = (R + B' P B)^-1 B' P A,  P_k = Q + A' P (A - B K_k)   with P = P_(k+1),
-    which minimizes sum_k d_k' Q d_k + e_k' R e_k + d_N' Qf d_N (no time step in it) of the linearized motion.
+        l_k = (R + B' P B)^-1 B' r,    p_k = (A - B K_k)' r         with r = P c_k + p_(k+1),
+    which minimizes sum_k d_k' Q d_k + e_k' R e_k + d_N' Qf d_N (no time step in it) of the linearized motion. Its
+    `defects` c_k are how far a step from xs[k] under us[k] leads from xs[k + 1]: l_k is 0 along the model's own motion.
     `gains` (N, nu, nt), `cost_to_go` (N+1, nt, nt), `parameters` the gains flattened (N * nu * nt,).
 
     Args:
@@ -185,6 +187,7 @@ class TVLQR:
         R: (nu, nu) symmetric and positive definite.
         Qf: (nt, nt) the weight of the end; Q where left out.
         jacobians: (N, nx, nx + nu) of what leads from state to state where these are no steps of the model.
+        defects: (N, nt) the c_k; 0 where left out.
 
     Raises:
         InputError: The arrays do not fit one another or the model, or a weight is not as said.
@@ -208,6 +211,7 @@ class TVLQR:
         Qf: ArrayLike | None = None,
         *,
         jacobians: Array | None = None,
+        defects: ArrayLike | None = None,
     ):
         self.us = finite_array("us", us, ("N", model.nu))
         if not len(self.us):
@@ -223,20 +227,28 @@ class TVLQR:
         if self._space.quaternions:
             points = zip(self.xs[:-1], self.xs[1:], A, B, strict=True)
             A, B = np.split(np.array([self._space.jacobian(*point) for point in points]), [self._space.size], axis=2)
+        shape = (len(self.us), self._space.size)
+        c = np.zeros(shape) if defects is None else finite_array("defects", defects, shape)
         gains, cost_to_go = list[Array](), [Q if Qf is None else _weight("Qf", Qf, self._space.size)]
-        for A_k, B_k in zip(A[::-1], B[::-1], strict=True):
+        offsets, p = list[Array](), np.zeros(self._space.size)
+        for A_k, B_k, c_k in zip(A[::-1], B[::-1], c[::-1], strict=True):
             P = cost_to_go[-1]
             BP = B_k.T.dot(P)
-            gains.append(np.linalg.solve(R + BP.dot(B_k), BP.dot(A_k)))
+            r = P.dot(c_k) + p
+            solved = np.linalg.solve(R + BP.dot(B_k), np.column_stack([BP.dot(A_k), B_k.T.dot(r)]))
+            gains.append(solved[:, :-1])
+            offsets.append(solved[:, -1])
+            p = (A_k - B_k.dot(gains[-1])).T.dot(r)
             before = Q + A_k.T.dot(P).dot(A_k - B_k.dot(gains[-1]))
             cost_to_go.append((before + before.T) / 2)
         self.gains, self.cost_to_go = frozen(gains[::-1]), frozen(cost_to_go[::-1])
+        self.offsets = frozen(offsets[::-1])
         self.parameters = frozen(self.gains.ravel())
 
     def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
         k = self._index(t)
         gain = self.gains[k] if parameters is None else parameters[self.active(t)].reshape(self.gains[k].shape)
-        return self.us[k] - gain @ self._space.minus(x, self.xs[k])
+        return self.us[k] - gain @ self._space.minus(x, self.xs[k]) - self.offsets[k]
 
     def active(self, t: float) -> slice:
         """The parameters that act at time t [s]; the derivative by all others is zero."""

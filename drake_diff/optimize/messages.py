@@ -3,6 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
+FEW = 4  # names of a list that are written out
+LONGEST = 160  # characters of a message: a line that is read at once
+
 # {name} and {time} are the two parts of a check's `where` that " at " joins.
 CLAUSES = {
     "bound": "{name} is {value} beyond its bound at {time}, tolerance {tolerance}",
@@ -10,10 +13,10 @@ CLAUSES = {
     "clearance": "{name} come {value} nearer than their margin at {time}, tolerance {tolerance}",
     "constraint": "{name} is broken by {value} at {time}, tolerance {tolerance}",
     "cost": "the cost that was minimized is {value} from that of the motion, tolerance {tolerance}",
+    "replayed cost": "the cost is {value} from the plan's, tolerance {tolerance}",
     "defect": "defect {value} is above {tolerance}: the motion does not follow the dynamics after {where}",
     "depth": "{name} is broken at {time}, {value} of the ranges of states and inputs from where it holds",
     "derivative": "a certificate of derivatives does not agree: {where}",
-    "end": "{where} ends {value} from the plan's end, tolerance {tolerance}",
     "energy": "{value} of energy are {where}, tolerance {tolerance}",
     "following": "{name} is {value} from the plan at {time}, tolerance {tolerance}",
     "goal": "{where} ends {value} from its goal, tolerance {tolerance}",
@@ -46,42 +49,25 @@ def clause(c: Any) -> str:
     return f"{c.plant} {text}" if c.plant in BETWEEN else text
 
 
-def under(control: str) -> str:
+def under(control: str | None) -> str:
     """The words of a control: "open loop", "under TVLQR"."""
-    return control if control == "open loop" else f"under {control}"
+    return "open loop" if control in (None, "open loop") else f"under {control}"
 
 
-def followed(checks: Sequence[Any]) -> str:
-    """Where the dynamics lead from the first state of a plan, under each feedback that was tried."""
-    verdicts = "; ".join(f"{under(c.feedback or 'open loop')}, {c}" for c in checks)
-    return f"integrated from its first state the plan does not hold: {verdicts}"
+def in_milliseconds(seconds: float) -> str:
+    """A time step: "20 ms"."""
+    return f"{1e3 * seconds:.4g} ms"
 
 
-def broken_variant(variant: str, replays: Sequence[Any]) -> str:
-    """Why a plan holds in a variant of the plant under no control."""
-    reasons = "; ".join(f"{r.control}, {r.failures[0]}" for r in replays)
-    return f"replayed {variant} it does not hold: {reasons}"
+def headline(status: str, text: str) -> str:
+    """The status and what is most worth saying of it, in at most LONGEST characters."""
+    line = f"{status}: {text}" if text else status
+    return line if len(line) <= LONGEST else f"{line[: LONGEST - 3].rstrip()}..."
 
 
-def controls(replays: Sequence[Any], decides: Sequence[str], *, finest: bool) -> str:
-    """Under which controls a plan that holds does so, and under which it does not and why.
-
-    `finest` says that `decides` are the finest steps that were tried.
-    """
-    if not replays:
-        return ""
-    if not decides:
-        return "on the plant nothing was replayed in finer steps, which a diagram does not allow"
-    tried = list(dict.fromkeys(r.control for r in replays))
-    good = [c for c in tried if all(r.holds for r in replays if r.control == c and r.variant in decides)]
-    if not good:
-        where = ", ".join(f"{r.variant} {under(r.control)}" for r in replays if r.holds and r.variant in decides)
-        return f"on the plant, {where}; nowhere under both"
-    text = "on the plant " + " and ".join(map(under, good)) + (f" {decides[0]} or less" if finest else "")
-    for control in tried:
-        failed = [r for r in replays if r.control == control and not r.holds]
-        if failed and control in good:  # in steps that do not decide
-            text += f"; {under(control)} {failed[0].variant}, where steps are longer, not: {failed[0].failures[0]}"
-        elif failed:
-            text += f", not {under(control)}: {failed[0].variant}, {failed[0].failures[0]}"
-    return text
+def joined(words: Sequence[str]) -> str:
+    """Joined by commas and one "and"; of many the first, and how many more."""
+    words = list(dict.fromkeys(words))
+    if len(words) > FEW + 1:
+        words = [*words[:FEW], f"{len(words) - FEW} more"]
+    return ", ".join(words[:-1]) + " and " + words[-1] if len(words) > 1 else words[0]

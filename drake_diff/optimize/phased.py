@@ -78,7 +78,7 @@ class PhasedSolution(Solution):
         )
 
     def __repr__(self) -> str:
-        lines = [f"PhasedSolution of {self.problem.name}: {self.status.value}", self.message]
+        lines = [f"PhasedSolution of {self.problem.name}: {self.status.value}", self.message, *self.notes]
         lines.append(f"cost {self.cost:.6g}, link error {self.link_error:.2g}")
         for name, phase in zip(self.problem.names, self.phases, strict=True):
             lasts = f"{len(phase.us)} steps" if phase.problem.is_map else f"{phase.horizon:.4g} s"
@@ -374,19 +374,22 @@ def judged_phases(draft: PhasedSolution, result: NlpResult) -> Any:
     """The draft, whose phases are judged, with the status that they, the links and the chain allow."""
     statuses, complaints = [phase.status for phase in draft.phases], [str(c) for c in draft.link_checks.failing]
     details = [
-        f"{name}: {phase.message.removeprefix(phase.status.sentence).removeprefix(': ')}"
+        f"{name}: {sentence}"
         for name, phase in zip(draft.problem.names, draft.phases, strict=True)
         if phase.status is not Status.CONVERGED
+        for sentence in (phase.message.removeprefix(f"{phase.status.words}: "), *phase.notes)
     ]
     failed = next((status for status in statuses if status not in PLANS), None)
     if failed is None and complaints and result.outcome not in FOUND:
         failed = status_of(result.outcome)
     if failed is not None:
-        return ended(draft, failed, "; ".join([*complaints, *details] or [result.message]))
+        return ended(draft, failed, *([*complaints, *details] or [result.message]))
     if complaints or details:
-        return ended(draft, Status.CONVERGED_NOT_VERIFIED, "; ".join([*complaints, *details]))
-    status = Status.CONVERGED if draft.chain.passes else Status.CONVERGED_NOT_VERIFIED
-    return ended(draft, status, f"integrated {under(draft.chain.feedback or OPEN_LOOP)} {draft.chain}")
+        return ended(draft, Status.CONVERGED_NOT_VERIFIED, *complaints, *details)
+    control = under(draft.chain.feedback)
+    if draft.chain.passes:
+        return ended(draft, Status.CONVERGED, f"holds {control} in continuous time", str(draft.chain))
+    return ended(draft, Status.CONVERGED_NOT_VERIFIED, f"in continuous time {control}, {draft.chain}")
 
 
 def _link_checks(draft: PhasedSolution) -> Iterator[Check]:

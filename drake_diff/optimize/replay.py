@@ -27,6 +27,7 @@ from drake_diff.model.contact import deepest_overlap, thinnest_geometry
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import set_state
+from drake_diff.model.step import step as step_of
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.continuous import replayed
 from drake_diff.motion.intervals import intervals_of
@@ -46,6 +47,8 @@ STATE_TOLERANCE = 0.05
 # The same under TVLQR, of the goal alone: where the effort weighs a fourth, a saturated motion was seen to end three
 # times as far off. Who repeats the plan has other weights.
 FEEDBACK_TOLERANCE = 0.03
+SAME = 1e-2  # the same in the plan's own plant, of every state at every knot, and of the cost
+ANOTHER_PLANT = 0.2  # the same of positions on the way, and of the cost, in another plant, in which a goal decides
 SMALLEST_ENERGY = 1e-9  # [J] less is rounding
 ENERGY_TOLERANCE = 0.1  # of the energy that the motion exchanges: what no force accounts for
 HELD = 1e-3  # of a constraint's scale: it moves at least that far, where a plan stays on it
@@ -112,7 +115,8 @@ class Replay(ShowsItsRepr):
 class ReplayPlan:
     """What is replayed: `sample(m)` gives xs (m N + 1, nx) and us (m N, nu) held over each m-th part of an interval.
 
-    `time_step` [s] is an interval's length; `continuous` tells that the plan is a motion in continuous time.
+    `time_step` [s] is an interval's length; `continuous` tells that the plan is a motion in continuous time. `cost` is
+    the plan's.
     """
 
     problem: Problem
@@ -120,11 +124,31 @@ class ReplayPlan:
     time_step: float
     sample: Callable[[int], tuple[Array, Array]]
     continuous: bool
+    cost: float
 
     @cached_property
     def scale(self) -> Array:
         """(nx,) see `Problem.state_scales`."""
         return self.problem.state_scales(self.sample(1)[0])
+
+    def cost_of(self, xs: Array, us: Array, parts: int) -> float:
+        """The objective of xs (m N + 1, nx) and us (m N, nu), `parts` m of whose steps make an interval of the plan.
+
+        Of a plan in steps that is the sum over its own knots.
+        """
+        every = 1 if self.continuous and self.problem.trajectory_cost is None else parts
+        total = self.problem.objective(xs[::every], us[::every], self.time_step * every / parts)
+        return total + self.problem.cost_of_parameters(self.vector.values)
+
+    def cost_tolerance(self, fraction: float) -> float:
+        """How much the cost changes where each state and input is off by that `fraction` of its range all along."""
+        xs, us = self.sample(1)
+        cost, total = self.cost_of(xs, us, 1), 0.0
+        for values, scale in ((xs, self.scale), (us, np.ptp(us, axis=0))):
+            for direction in np.diag(fraction * scale):
+                moved = (xs + direction, us) if values is xs else (xs, us + direction)
+                total += abs(self.cost_of(moved[0], moved[1], 1) - cost)
+        return total
 
     @cached_property
     def open_loop(self) -> Rollout | None:
@@ -164,6 +188,12 @@ class ReplayPlan:
         first = np.minimum(places.astype(int), len(known) - 2)
         ahead = (places - first)[:, None, None]
         return np.asarray((1 - ahead) * known[first] + ahead * known[first + 1])
+
+    @property
+    def own_plant(self) -> str:
+        """The variant in which a plan by steps is made; empty of a collocated one, which no step makes."""
+        steps = f"in steps of {self.time_step:.4g} s"
+        return "" if self.continuous else ANOTHER_INTEGRATION if self.problem.motion == CONTINUOUS else steps
 
     def model_at(self, parts: int) -> Model:
         """The model at the m-th part of an interval."""
@@ -222,12 +252,6 @@ def deciding(plan: ReplayPlan, rows: Sequence[Replay]) -> list[str]:
     return [v for v in variants if not any(other.startswith(f"{v} in steps of ") for other in variants)]
 
 
-def broken_variants(plan: ReplayPlan, rows: Sequence[Replay]) -> dict[str, list[Replay]]:
-    """The replays of each variant in which the plan has to hold and does not, whatever the control."""
-    tried = {variant: [r for r in rows if r.variant == variant] for variant in deciding(plan, rows)}
-    return {variant: replays for variant, replays in tried.items() if not _any_holds(replays)}
-
-
 def judged_replay(plan: ReplayPlan, rows: Sequence[Replay]) -> Replay | None:
     """The motion that a verdict rests on: open loop where that holds, else under TVLQR; None where neither does."""
     decides = deciding(plan, rows)
@@ -276,7 +300,11 @@ def _replay(plan: ReplayPlan, variant: str, control: str, model: Model, parts: i
         return missing_replay(plan, variant, control, str(error))
     # Feedback corrects what the laws of contact differ by: there nothing tighter can be asked of it.
     fraction = STATE_TOLERANCE if control == OPEN_LOOP or law_is_another else FEEDBACK_TOLERANCE
-    checks = (*motion_checks(plan, model, motion, parts, fraction), energy_check(motion))
+    if variant == plan.own_plant:
+        fraction = SAME
+    checks = [*motion_checks(plan, model, motion, parts, fraction)]
+    if plan.continuous or parts == FINE or not model.can_rebuild:  # a coarse step gains and loses some, an artefact all
+        checks.append(energy_check(motion))
     return measured_replay(plan, variant, control, model, motion, checks)
 
 
@@ -332,7 +360,12 @@ def regulator(plan: ReplayPlan, model: Model, xs: Array, us: Array) -> TVLQR:
     jacobians = None
     if plan.problem.motion == CONTINUOUS:
         jacobians = intervals_of(model, select(model, ()), CONTINUOUS).jacobians(xs, us)
-    return TVLQR(model, xs, us, ratio * Q, ratio * R, final, jacobians=jacobians)
+    defects = None
+    if not plan.continuous and ratio < 1:  # a finer step does not lead from one of the plan's states to the next
+        space = tangent_space(model)
+        ends = [step_of(model, x, u) for x, u in zip(xs, us, strict=False)]
+        defects = [space.minus(end, x) for end, x in zip(ends, xs[1:], strict=True)]
+    return TVLQR(model, xs, us, ratio * Q, ratio * R, final, jacobians=jacobians, defects=defects)
 
 
 def track(plan: ReplayPlan, model: Model, xs: Array, us: Array, gains: Array | None = None) -> Policy:
@@ -393,7 +426,9 @@ def motion_checks(
 
     It may end `fraction` of each state's range from x_goal; every other tolerance is `wider` than a replay's.
     """
-    problem = plan.problem
+    problem, law = plan.problem, model.contract.contact.approximation
+    if law == problem.model.contract.contact.approximation:
+        yield from comparison_checks(plan, motion, parts, same=fraction == SAME)
     if not np.all(np.isnan(problem.goal)):
         yield goal_check(plan, problem.goal_error(motion.xs[-1]), fraction)
     yield bounds_check(plan, motion, wider)
@@ -407,6 +442,32 @@ def motion_checks(
     yield from clearance_checks(plan, motion)
     if model.contract.contact.collision_pairs:
         yield penetration_check(model, motion)
+
+
+def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, same: bool) -> Iterator[Check]:
+    """The states at the plan's knots and the cost beside the plan's.
+
+    In the `same` plant all states and the cost agree to SAME. In another one the goal decides where there is one. Else
+    positions, the last state and the cost are compared to ANOTHER_PLANT: impacts come at other times there, and a step
+    of another length leads elsewhere by its own error.
+    """
+    problem, wanted, fraction = plan.problem, plan.sample(1)[0], SAME if same else ANOTHER_PLANT
+    asked = [c for c in problem.kept_goals if not isinstance(c, ClearanceConstraint)]
+    if not same and (asked or not np.all(np.isnan(problem.goal))):
+        return  # what is asked decides: feedback costs what it has to
+    apart = np.abs(motion.xs[::parts] - wanted[: len(motion.xs[::parts])])
+    if not same:
+        apart[:-1, problem.model.nq :] = 0.0
+    with np.errstate(invalid="ignore"):  # a plan whose states are not finite
+        k, i = divmod(int(np.argmax(np.nan_to_num(apart / plan.scale, nan=np.inf))), apart.shape[1])
+    where, unit = f"{problem.state_names[i]} at knot {k}", units_of(problem)[i]
+    yield check("following", where, apart[k, i], fraction * plan.scale[i], unit)
+    with np.errstate(all="ignore"):
+        difference = abs(plan.cost_of(motion.xs, motion.us, parts) - plan.cost)
+        tolerance = fraction * abs(plan.cost)
+        if not difference <= tolerance:  # as a rule that much is enough
+            tolerance += plan.cost_tolerance(SAME if same else STATE_TOLERANCE)
+    yield check("replayed cost", "the whole motion", difference, tolerance)
 
 
 def goal_check(plan: ReplayPlan, distance: Array, fraction: float = STATE_TOLERANCE) -> Check:

@@ -28,11 +28,12 @@ from drake_diff.optimize.measure import certify_equations, first_knots, telling_
 from drake_diff.optimize.optimality import HOLDS, doubt_of_the_slope, out_of_reach, why_blind
 from drake_diff.optimize.options import Options
 from drake_diff.optimize.phased import PhasedSolution, certified_links, judged_phases
+from drake_diff.optimize.problem.cost import QuadraticCost, TrackingCost
 from drake_diff.optimize.problem.design import ShootingVariables
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import SelfCollision, lacking_between, swept
 from drake_diff.optimize.problem.phases import PhasedProblem
-from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report, heard
 from drake_diff.optimize.solution import PLANS, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
@@ -118,7 +119,7 @@ class Run:
     def _cut(self, reached: SoFar, *, interrupted: bool) -> Solution:
         if reached.judged is not None:
             why = Status.INTERRUPTED.sentence if interrupted else "the time limit came first"
-            return reached.judged.told(message=f"{reached.judged.message}; no finer mesh: {why}")
+            return reached.judged.noted(f"no finer mesh: {why}")
         result, cut = reached.result, f"not made within the time limit: {', '.join(STAGES[reached.stage :])}"
         if interrupted:  # which is looked for before a search alone
             plan = ended(reached.draft, Status.INTERRUPTED, cut.replace("within the time limit", "before that"))
@@ -128,8 +129,8 @@ class Run:
         if result is None:
             return ended(reached.draft, Status.TIME_LIMIT, cut)
         status, table = status_of(result.outcome) or Status.TIME_LIMIT, result.iterations
-        detail = f"{result.message}; {cut}"
-        return ended(reached.draft, status, detail, iterations=table, solver_message=result.message)
+        fields = {"iterations": table, "solver_message": result.message}
+        return ended(reached.draft, status, result.message, cut, **fields)
 
     def _left(self) -> Limits:
         """The limits of a search that begins now."""
@@ -197,15 +198,14 @@ class Run:
                 last = kept(motion, finer).result
                 if last.outcome not in FOUND:
                     return self._judge(solution, last)
-                return solution.told(message=f"{solution.message}; {last.note}")
+                return solution.noted(last.note)
             motion = finer
             rounds.append(finer.row)
             self.options["refinements"] = [list(row) for row in rounds]
             solution = self._judge_collocated(transcription, motion, before)
         if motion.count == first:
             return solution
-        note = f"the mesh was refined from {first} to {motion.count} intervals"
-        return solution.told(message=f"{solution.message}; {note}")
+        return solution.noted(f"the mesh was refined from {first} to {motion.count} intervals")
 
     def _finer(self, transcription: Transcription, motion: Transcribed, solution: Solution) -> Transcribed | None:
         """The motion on finer meshes; None where the plan holds, or where what does not hold is not a mesh's."""
@@ -438,7 +438,7 @@ class Run:
 
     def _keeping_clear(self, search: Searcher, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
         """What `search` finds; where it comes too near to an obstacle between two states, again with these in view."""
-        problem, rounds, guess = self.problem, list[list[float]](), (xs, us)
+        problem, rounds, guess = self.searched or self.problem, list[list[float]](), (xs, us)
         result, xs, us = search(problem, xs, us, values)
         for parts in self.asked.clearance_parts:
             lacking, enters = lacking_between(problem.kept, xs)
@@ -483,7 +483,7 @@ class Run:
             doubt = doubt_of_the_slope(problem, solution.step_vector, solution.xs[0], solution.us)
             if doubt is not None:
                 return ended(solution, Status(doubt[0]), doubt[1])
-            solution = solution.told(message=f"{solution.message}; {HOLDS}")
+            solution = solution.noted(HOLDS)
         xs, us = solution.plan.sample(1)
         variables = ShootingVariables(problem, around=xs)
         try:
@@ -493,7 +493,7 @@ class Run:
             return ended(solution, Status.CONVERGED_NOT_VERIFIED, detail)
         if reach.silent:
             return ended(solution, Status.NO_GRADIENT, reach.silent)
-        return solution.told(message=f"{solution.message}; {reach.constant}") if reach.constant else solution
+        return solution.noted(reach.constant) if reach.constant else solution
 
     def _draft(self, xs: Array, us: Array, problem: Problem | None = None, **fields: Any) -> Solution:
         arrays = ("u_final", "us_mid", "mesh")
@@ -550,6 +550,20 @@ def kept_apart(problem: Problem) -> Problem:
     ends = [problem.x0] + [goal] * (not np.any(np.isnan(goal[: problem.model.nq])))
     more = SelfCollision().apart_but_at(problem.model, np.nan_to_num(np.array(ends)))
     return dataclasses.replace(problem, constraints=(*problem.constraints, *more))
+
+
+def closest_to(problem: Problem, plan: Solution) -> Problem:
+    """`problem` with the squared distance from `plan`, each state and input for its range, in place of its costs."""
+    xs, us = plan.plan.sample(1)
+    Q = np.diag(1 / plan.plan.scale**2)
+    R = np.diag(1 / np.maximum(np.max(np.abs(us), axis=0), SMALLEST_RANGE) ** 2)
+    reference = plan.time_step * np.arange(len(xs)), xs, np.vstack([us, us[-1:]])
+    return dataclasses.replace(
+        problem,
+        running_cost=TrackingCost(reference, Q=Q, R=R),
+        final_cost=QuadraticCost(Q=plan.time_step * Q, x_ref=xs[-1]),
+        goals=tuple(goal for goal in problem.goals if goal.weight is None),
+    )
 
 
 def is_kept_apart(problem: Problem) -> bool:

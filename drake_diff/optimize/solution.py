@@ -32,7 +32,7 @@ from drake_diff.optimize.transcription.collocation import Collocated, collocated
 SAME_COST = 1e-2  # of the larger one, or of 1: what searches that stop at one optimum on other meshes may differ by
 SAME_MOTION = 5e-2  # of each state's range, the root of the mean square over the knots
 # Fields that no measure depends on.
-TOLD = ("cross_checks", "iterations", "message", "optima", "options", "search", "solver_message", "status")
+TOLD = ("cross_checks", "iterations", "message", "notes", "optima", "options", "search", "solver_message", "status")
 
 
 class Status(enum.Enum):
@@ -55,8 +55,13 @@ class Status(enum.Enum):
 
     @property
     def sentence(self) -> str:
-        """What it means; a solution's message says what to try."""
+        """What it means; a solution's notes say what to try."""
         return _SENTENCES[self]
+
+    @property
+    def words(self) -> str:
+        """How a message begins: "converged", "not verified", "time limit"."""
+        return "not verified" if self is Status.CONVERGED_NOT_VERIFIED else self.value.replace("_", " ")
 
 
 _SENTENCES = {
@@ -98,7 +103,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
     Attributes:
         problem: what was asked.
         method, solver, scheme: how it was solved; `scheme` is "step" for the discrete methods.
-        status, message: how it ended, as a `Status` and in words.
+        status, message: how it ended, as a `Status` and in at most 160 characters.
         xs: (N+1, nx) states at the knots, in the states' units.
         us: (N, nu) inputs, held over each step by a discrete method. Those of collocation are at the knots and
             linear in between, or the parabola through `us_mid` (N, nu) at the midpoints (hermite_simpson).
@@ -114,6 +119,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         optima: with `restarts`, the verified solutions that differ in cost or motion, the cheapest first.
         search: the arguments of `solve`, None of a solution that it did not make.
         cross_checks: replays in other plants, of a solution that `artifact.cross_check` returned.
+        notes: sentences about the search: what the solver says, what other guesses came to, what to try.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -146,13 +152,10 @@ class Solution(PicklesItsFields, ShowsItsRepr):
     multipliers: Multipliers | None = None
     optima: tuple["Solution", ...] = ()
     cross_checks: tuple[Replay, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        measures = f"cost {self.cost:.6g}, defect {self.defect:.2g}, goal error {self.goal_error:.2g}"
-        control = ""
-        if self.success and "replays" in vars(self) and (shown := self.judged_replay) is not None:
-            control = "" if shown.control == "open loop" else f" under {shown.control}, not open loop"
-        return f"{self.problem.name} by {self.method}: {self.status.value}{control}, {measures}"
+        return f"{self.message}\n{self.problem.name} by {self.method}: cost {self.cost:.6g}"
 
     def __repr__(self) -> str:
         how = ", ".join(name for name in (self.scheme, self.solver) if name not in ("step", ""))
@@ -162,12 +165,14 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         lines = [
             f"Solution of {self.problem.name} by {self.method}{f' ({how})' if how else ''}: {self.status.value}",
             self.message,
+            *self.notes,
             f"cost {self.cost:.6g} over {length}{len(self.us)} intervals",
             *(str(c) for c in self.plan_checks.failing),
             f"{len(self.iterations)} iterations in {self.wall_time:.2g} s; certificates: {certified}",
         ]
         if "replays" in vars(self) and self.replays:  # they take time: a printed line starts none
             lines.append(f"replays: {sum(r.holds for r in self.replays)} of {len(self.replays)} hold")
+            lines += [str(r) for r in self.replays if not r.holds]
         lines += [f"cross-checked {row}" for row in self.cross_checks]
         return "\n  ".join(lines)
 
@@ -180,6 +185,10 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         vars(changed).update(fields)
         return changed
 
+    def noted(self, *notes: str) -> "Solution":
+        """The same motion with more `notes`."""
+        return self.told(notes=(*self.notes, *notes))
+
     @property
     def phases(self) -> tuple["Solution", ...]:
         """Itself: a problem that is not a `PhasedProblem` is one phase."""
@@ -189,6 +198,22 @@ class Solution(PicklesItsFields, ShowsItsRepr):
     def success(self) -> bool:
         """Whether the solver converged and everything measured again holds."""
         return self.status is Status.CONVERGED
+
+    @property
+    def plant(self) -> str:
+        """Where the plan is to hold: in the "steps" of the model or map, or in "continuous" time."""
+        if self.scheme == "step":
+            return "steps" if self.problem.motion == STEPS else "continuous"
+        return "steps" if self.problem.is_map else "continuous"
+
+    @property
+    def feedback(self) -> str | None:
+        """The feedback that the plan needs in its plant: None where it holds open loop there, else "TVLQR".
+
+        Replays of the plan are taken for it. `success` says whether it holds under that feedback.
+        """
+        rows = self.following or [c for r in self.replays[:1] for c in r.checks]
+        return None if all(c.passes for c in rows if c.feedback is None) else "TVLQR"
 
     @property
     def vector(self) -> ParameterVector:
@@ -491,7 +516,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         """What is replayed: states, and inputs held over each step, or their means over the parts of an interval."""
         continuous = self.transcribed is not None
         sample = held(self.xs, self.us) if self.transcribed is None else self.transcribed.sample
-        return ReplayPlan(self.problem, self.vector, self.time_step, sample, continuous)
+        return ReplayPlan(self.problem, self.vector, self.time_step, sample, continuous, self.cost)
 
     @cached_property
     def replay(self) -> Rollout | None:

@@ -26,16 +26,17 @@ from drake_diff.optimize.problem.cost import TimedCost
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, Report
-from drake_diff.optimize.run import Run, is_kept_apart, kept_apart
+from drake_diff.optimize.run import Run, closest_to, is_kept_apart, kept_apart
 from drake_diff.optimize.solution import PLANS, Search, Solution, Status, distinct
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
-from drake_diff.optimize.verification import advice, overlaps
+from drake_diff.optimize.verification import advice, not_in_steps, overlaps
 
 COMPILED = 0.5  # [s] that are worth a word
 DEFAULTS = Options()
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": "ipopt", "ilqr": "riccati"}
 OTHER_GUESS = "another first guess"
+REFINING = 30  # iterations from a collocated plan to the optimum in steps; well-posed problems take ten
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 BLIND = (Status.NO_GRADIENT, Status.DIVERGED)
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
@@ -81,7 +82,7 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
             `Solution.trajectory` gives, or (xs, us) with shapes (N+1, nx) and (N, nu). Collocation also takes us
             (N+1, nu), and a third entry, the horizon [s]. In phases: a PhasedSolution, or a list, one for each phase.
         max_iterations: of the solver, and of each round of a refinement.
-        time_limit: [s] of the whole solve, but for what Numba compiles, once on a machine; the message says how long.
+        time_limit: [s] of the whole solve, but for what Numba compiles, once on a machine; a note says how long.
         seed: of the noise in a default guess, and of the other first guesses.
         restarts: how many more first guesses are tried, one after the other, smooth random ones by `seed`, also where
             one was verified: the cheapest verified plan is kept, and `Solution.optima` has those that differ.
@@ -97,7 +98,7 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
             dynamics and phases have no such page.
 
     Returns:
-        A `Solution`, whatever happened: how the solve ended is its `status` and `message`.
+        A `Solution`, whatever happened: how the solve ended is its `status`, `message` and `notes`.
 
     Raises:
         InputError: something that was asked for does not fit; nothing ran.
@@ -152,14 +153,14 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
 
 
 def _with_compilation(solution: Solution | PhasedSolution, seconds: float, report: Report) -> Solution | PhasedSolution:
-    """Say for how long Numba compiled, where that is worth a word; the message of a solve that the limit ended does."""
+    """Say for how long Numba compiled, where that is worth a word; a note of a solve that the limit ended does."""
     if seconds < COMPILED:
         return solution
     note = f"Numba compiled for {seconds:.2g} s, once on this machine, which no time limit counts"
     report.say(note)
     if solution.status is not Status.TIME_LIMIT:
         return solution
-    return solution.told(message=f"{solution.message}; {note}")
+    return solution.noted(note)
 
 
 def _print_address(address: str) -> None:
@@ -196,8 +197,8 @@ def _solved(
     suggestion = advice(
         solution, arguments, [other for other in METHODS[1:] if other not in tried and _takes(problem, other)]
     )
-    message = f"{solution.message}; {suggestion}" if suggestion else solution.message
-    return solution.told(message=message, search=Search(arguments, initial_guess))
+    notes = (suggestion,) if suggestion else ()
+    return solution.noted(*notes).told(search=Search(arguments, initial_guess))
 
 
 def _check_common(problem: Any, seed: Any, callback: Any, progress: Any, view: Any) -> None:
@@ -237,6 +238,7 @@ class Attempt:
     seed: int = 0
     max_iterations: int | None = None
     apart: bool = False  # whether links are kept from each other that nothing else keeps apart
+    closest: bool = False  # whether the motion nearest to the guess is searched, whatever it costs
 
     def told(self, in_phases: bool) -> dict[str, str]:
         """What the chain says of it."""
@@ -279,7 +281,7 @@ class _Task:
             given_too = "with parameters or a horizon"
             raise InputError("continuation", got=given_too, expected="none of them: leave the continuation out")
         stages = () if continuation is None else check_schedule(problem, continuation)
-        searched = kept_apart(problem) if attempt.apart else None
+        searched = kept_apart(problem) if attempt.apart else closest_to(problem, given) if attempt.closest else None
         limits = self._limits_of(attempt)
         options = {
             "max_iterations": limits.max_iterations,
@@ -322,8 +324,23 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Any:
 
     A collocation that was asked for is tried from other first guesses alone.
     """
-    solutions: list[Any] = []
     chain: list[dict[str, str]] = []
+    in_phases = isinstance(task.problem, PhasedProblem)
+    solutions = _attempted(task, asked, given, chain)
+    best = _best_of(solutions)
+    if asked.method == "auto" and not in_phases:
+        best = _in_steps(task, asked, best, chain)
+    if asked.method != "auto" and len(chain) == 1 and not in_phases:
+        return best
+    by_collocation = in_phases or all(s.method == "collocation" for s in solutions)
+    if len(solutions) > 1 and best.status not in PLANS and by_collocation:
+        best = best.noted(f"from none of {len(solutions)} first guesses was a plan found")
+    return best.told(options=best.options | {"chain": chain})
+
+
+def _attempted(task: _Task, asked: Attempt, given: Any, chain: list[dict[str, str]]) -> list[Any]:
+    """The solutions of all attempts, the last of which may be verified; `chain` gets a row for each attempt."""
+    solutions: list[Any] = []
     in_phases = isinstance(task.problem, PhasedProblem)
     for attempt, guess in _attempts(task.problem, asked, given, solutions):
         if solutions and task.is_late:
@@ -345,21 +362,49 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Any:
             chain[-1]["continuation"] = "auto"
         if last.status in ENDED:
             break
+    return solutions
 
-    best = _best_of(solutions)
-    if asked.method != "auto" and len(chain) == 1 and not in_phases:
-        return best
-    by_collocation = in_phases or all(s.method == "collocation" for s in solutions)
-    if len(solutions) > 1 and best.status not in PLANS and by_collocation:
-        best = best.told(message=f"{best.message}; from none of {len(solutions)} first guesses was a plan found")
-    return best.told(options=best.options | {"chain": chain})
+
+def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str, str]]) -> Solution:
+    """A collocated plan of a model, refined into the model's own steps: their optimum, else their nearest motion.
+
+    Far from small steps the optimum may live from their errors. A plan that no such steps repeat is not verified. One
+    whose horizon is asked for or whose jerk is limited, which jumps with an input that is held, or that the steps
+    cannot take, stays in continuous time.
+    """
+    problem = task.problem
+    has_steps = problem.has_model and problem.horizon is None and all(limit.of_inputs for limit in problem.rate_limits)
+    if not (plan.success and plan.transcribed is not None and has_steps):
+        return plan
+    refined: list[Solution] = []
+    first = asked.by("shooting", "the collocated plan in the model's own steps")
+    nearest = "the motion in the model's own steps that is nearest to the collocated plan"
+    attempts = [replace(first, max_iterations=REFINING)]
+    if not problem.optimizes_parameters:
+        attempts.append(replace(first, reason=nearest, closest=True))
+    for attempt in attempts:
+        try:
+            make = task.prepare(attempt, plan)
+        except DrakeDiffError as error:
+            chain.append({**attempt.told(False), "ended": f"not possible: {error}"})
+            continue
+        refined.append(make())
+        chain.append({**attempt.told(False), "ended": refined[-1].status.value})
+        task.report.say(f"shooting ({attempt.reason}): {refined[-1].status.value}")
+        if refined[-1].status in ENDED:
+            break
+    if not refined:
+        return plan.noted("in continuous time alone: no method takes the problem in the model's own steps")
+    if refined[-1].success:
+        return refined[-1]
+    return not_in_steps(plan, refined[0])
 
 
 def _best_of(solutions: list[Solution]) -> Solution:
-    """The one that is preferred; where a signal ended what was tried after it, its message says so."""
+    """The one that is preferred; where a signal ended what was tried after it, a note says so."""
     best = min(solutions, key=_preference) if len(solutions) > 1 else solutions[0]
     if solutions[-1].status is Status.INTERRUPTED and best is not solutions[-1]:
-        return best.told(message=f"{best.message}; what was tried after it: {Status.INTERRUPTED.sentence}")
+        return best.noted(f"what was tried after it: {Status.INTERRUPTED.sentence}")
     return best
 
 
@@ -396,13 +441,12 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> S
     options = best.options | {"chain": chain, "optima": [optimum.to_dict() for optimum in optima]}
     best = best.told(options=options, optima=tuple(optimum.solution for optimum in optima))
     if len(attempts) > 1 and attempts[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
-        best = best.told(message=f"{best.message}; the restarts were ended: {attempts[-1][0].status.sentence}")
+        best = best.noted(f"the restarts were ended: {attempts[-1][0].status.sentence}")
     if not optima:
         return best
     costs = ", ".join(f"{optimum.solution.cost:.4g} ({optimum.count})" for optimum in optima)
     verified = sum(optimum.count for optimum in optima)
-    message = f"{verified} of {len(attempts)} first guesses were verified, at cost (how many): {costs}"
-    return best.told(message=f"{best.message}; {message}")
+    return best.noted(f"{verified} of {len(attempts)} first guesses were verified, at cost (how many): {costs}")
 
 
 def _preference(solution: Solution) -> tuple[int, float, float]:

@@ -1,6 +1,7 @@
 """Decide how a solve ended: what the solver says, cut down to what the checks of its plan allow."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,10 +9,11 @@ import numpy as np
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.optimize import messages
-from drake_diff.optimize.checks import PLAN, Check
+from drake_diff.optimize.checks import PLAN, Check, Checks
 from drake_diff.optimize.measure import ASKED
+from drake_diff.optimize.messages import headline
 from drake_diff.optimize.program import NlpResult, Outcome
-from drake_diff.optimize.replay import broken_variants, deciding
+from drake_diff.optimize.replay import OPEN_LOOP, Replay, deciding
 from drake_diff.optimize.solution import Solution, Status
 
 FINER = "pass refine=True, or take more steps (num_steps)"
@@ -24,41 +26,87 @@ STATIONARY = 1e-6  # of the terms of the Lagrangian's gradient: what is left to 
 _STATUSES = {Outcome.UNBOUNDED: Status.DIVERGED, **{Outcome[name]: Status[name] for name in _ALIKE}}
 
 
+@dataclass(frozen=True)
+class Trial:
+    """A plan in one plant under one feedback, and what is checked of it there."""
+
+    plant: str
+    feedback: str | None
+    checks: Sequence[Check]
+
+    @property
+    def holds(self) -> bool:
+        """Whether every check passes."""
+        return all(c.passes for c in self.checks)
+
+    @property
+    def worst(self) -> Check:
+        """The check that is furthest from passing."""
+        return Checks(self.checks)[0]
+
+    def __str__(self) -> str:
+        return f"{self.plant} {messages.under(self.feedback)}, {self.worst}"
+
+
+def trials(s: Solution) -> list[list[Trial]]:
+    """The plan in each plant in which it has to hold, under one feedback at least; the plan's own plant comes first.
+
+    A plan by shooting has to hold open loop at its own step: its states are those of the step. A collocated plan has to
+    hold where its equations are integrated and, of a model, in the two finest steps of Drake that were taken.
+    """
+    following = [Trial("in continuous time", c.feedback, [c]) for c in s.following]
+    plants = [following] if following else []
+    if s.problem.has_model:
+        variants = deciding(s.plan, s.replays)
+        plants += [[_trial(r) for r in s.replays if r.variant == variant] for variant in variants]
+    if plants and s.method == "shooting" and s.scheme == "step":
+        plants[0] = [trial for trial in plants[0] if trial.feedback is None]
+    return plants
+
+
+def _trial(r: Replay) -> Trial:
+    plant = f"at {messages.in_milliseconds(r.time_step)}" if r.variant.startswith("in steps of ") else r.variant
+    return Trial(plant, None if r.control == OPEN_LOOP else r.control, r.checks)
+
+
 def judged(draft: Solution, result: NlpResult) -> Solution:
     """The draft with the status that the solver's outcome and the checks allow.
 
     Replays are taken of a plan only that passes all other checks.
     """
     fields = {"iterations": result.iterations, "solver_message": result.message}
-    failing = [c for c in draft.plan_checks if not c.passes]
-    complaints = [str(c) for c in failing]
+    failing = draft.plan_checks.failing
     outcome, notes = (result.outcome, ()) if failing else _by_our_measures(draft, result)
     notes = (*notes, *[result.note] * bool(result.note))
+    complaints = [str(c) for c in failing]
     if outcome in _STATUSES:
-        return ended(draft, _STATUSES[outcome], "; ".join([result.message, *complaints]), **fields)
-    if outcome is Outcome.INACCURATE:
-        complaints.insert(0, f"the solver could not reach its tolerance ({result.message})")
+        return ended(draft, _STATUSES[outcome], result.message, *complaints, **fields)
     if not np.all(np.isfinite(draft.xs)):
-        return ended(draft, Status.DIVERGED, "; ".join(complaints), **fields)
-    if not complaints:
-        if draft.following and not draft.following[-1].passes:
-            failing = draft.following
-            complaints = [messages.followed(draft.following)]
-        elif draft.problem.has_model:
-            broken = broken_variants(draft.plan, draft.replays)
-            complaints = [messages.broken_variant(variant, rows) for variant, rows in broken.items()]
+        return ended(draft, Status.DIVERGED, *complaints, **fields)
+    if outcome is Outcome.INACCURATE:
+        complaints.append(f"the solver could not reach its tolerance ({result.message})")
+    plants = [] if complaints else trials(draft)
+    broken = [plant for plant in plants if not any(trial.holds for trial in plant)]
+    complaints += [str(min(plant, key=lambda trial: trial.worst.ratio)) for plant in broken]
     if complaints:
-        sentences = [*complaints, *filter(None, [_remedy(draft, failing)]), *notes]
-        return ended(draft, Status.CONVERGED_NOT_VERIFIED, "; ".join(sentences), **fields)
-    return ended(draft, Status.CONVERGED, "; ".join(filter(None, [*_holding(draft), *notes])), **fields)
+        wrong = failing or [trial.worst for plant in broken for trial in plant]
+        sentences = [*complaints, _remedy(draft, wrong), *notes]
+        return ended(draft, Status.CONVERGED_NOT_VERIFIED, *sentences, **fields)
+    return ended(draft, Status.CONVERGED, _holding(draft, plants), *notes, **fields)
 
 
-def _holding(s: Solution) -> list[str]:
-    """Under which controls a plan holds, on the plant and where its dynamics are integrated."""
-    sentences = [f"integrated {messages.under(s.following[-1].feedback or 'open loop')}"] if s.following else []
-    if s.problem.has_model:
-        sentences.insert(0, messages.controls(s.replays, deciding(s.plan, s.replays), finest=s.plan.continuous))
-    return sentences
+def _holding(s: Solution, plants: list[list[Trial]]) -> str:
+    """Under which feedback a plan holds in each plant; where a collocated plan fails at the model's own step."""
+    by_feedback: dict[str | None, list[str]] = {}
+    for plant in plants:
+        trial = next(trial for trial in plant if trial.holds)
+        by_feedback.setdefault(trial.feedback, []).append(trial.plant)
+    parts = [f"{messages.under(feedback)} {messages.joined(where)}" for feedback, where in by_feedback.items()]
+    text = f"holds {'; '.join(parts)}" if parts else ""
+    if s.transcribed is not None and s.replays:
+        coarsest = [_trial(r) for r in s.replays if r.variant == s.replays[0].variant]
+        text += "" if any(trial.holds for trial in coarsest) else f"; not {coarsest[0].plant}"
+    return text
 
 
 def _remedy(draft: Solution, failing: list[Check]) -> str:
@@ -88,6 +136,15 @@ def _by_our_measures(draft: Solution, result: NlpResult) -> tuple[Outcome, tuple
     return Outcome.SOLVED, (f"by our own measures, where the solver says {result.message!r}: {sentence}",)
 
 
+def not_in_steps(plan: Solution, refined: Solution) -> Solution:
+    """A collocated plan that no motion in the model's own steps repeats, with the steps in which it holds."""
+    finer = [_trial(r).plant for r in plan.replays if r.holds]
+    where = f"it holds {finer[0]}" if finer else "it holds in no steps that were tried"
+    own = messages.in_milliseconds(plan.time_step)
+    text = f"in continuous time alone: at {own} no plan was verified; {where}"
+    return ended(plan, Status.CONVERGED_NOT_VERIFIED, text, plan.message, refined.message, *refined.notes)
+
+
 def may_be_too_coarse(solution: Solution) -> bool:
     """Whether a collocated plan keeps all that was asked at its nodes, and yet is none: a finer mesh may mend that."""
     motion = solution.transcribed
@@ -106,7 +163,7 @@ def unmeasured(draft: Solution, result: NlpResult) -> Solution:
     """The draft as the solver leaves it: nothing of it is measured, so that it is no success."""
     status = _STATUSES.get(result.outcome, Status.CONVERGED_NOT_VERIFIED)
     fields = {"iterations": result.iterations, "solver_message": result.message}
-    return ended(draft, status, f"{result.message}; nothing was measured yet", **fields)
+    return ended(draft, status, result.message, "nothing was measured yet", **fields)
 
 
 def refused(draft: Solution, error: Exception) -> Solution:
@@ -115,10 +172,12 @@ def refused(draft: Solution, error: Exception) -> Solution:
     return ended(draft, status, str(error))
 
 
-def ended(draft: Any, status: Status, detail: str, **fields: Any) -> Any:
-    """The draft with its final status, whose sentence and `detail` are the message."""
-    message = f"{status.sentence}: {detail}" if detail else status.sentence
-    return draft.told(status=status, message=message, **fields)
+def ended(draft: Any, status: Status, *sentences: str, **fields: Any) -> Any:
+    """The draft with its final status and the first of `sentences` as the message; those that do not fit are notes."""
+    text, *others = [s for s in sentences if s] or [""]
+    message = headline(status.words, text)
+    cut = [text] if text not in message else []
+    return draft.told(status=status, message=message, notes=(*cut, *others), **fields)
 
 
 def advice(solution: Solution, arguments: dict[str, Any], other_methods: Sequence[str]) -> str:

@@ -118,7 +118,7 @@ class Plan(ShowsItsRepr):
             f"guesses   {'; '.join(self.tried)}",
             f"solved    {s.method}, {len(s.us)} intervals in {s.horizon:.3g} s, cost {s.cost:.4g}{self._optima}",
             f"gradients {agreeing}",
-            f"plan      {s.status.value}: {s.message.split(';')[0]}",
+            f"plan      {s.message}",
             f"verified  {self.verification.verdict}: {self.verification.sentence[:200]}",
             f"wrote     {path}: {', '.join(sorted(self.record.files))}",
         )

@@ -5,7 +5,7 @@ driven; where that does not lead to the goal, the inputs alone are tried. No ver
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,8 +23,6 @@ from drake_diff.model.step import set_state
 from drake_diff.motion.continuous import replayed
 from drake_diff.motion.rollout import CONTINUOUS, Policy, rollout
 from drake_diff.optimize.checks import Check, check
-from drake_diff.optimize.problem.dynamics import units_of
-from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.replay import (
     BROKEN,
     FEEDBACK,
@@ -49,9 +47,6 @@ NOT_INSTALLED = "it is not installed: "  # the failure of a simulator begins so
 IN_CONTINUOUS_TIME = "in continuous time"
 # Another simulator has other laws of contact and of joint limits: it may end and stray twice as far.
 WIDER = 2.0
-# Of a problem that asks nothing of the end, the plan's own end is what is asked, to a replay's tolerance of x_goal, and
-# at least to this [m or rad] and, of velocities, this [m/s or rad/s]: the ranges of a plan that stands are of rounding.
-NEAR_THE_END, SLOW_AT_THE_END = 0.02, 0.1
 TOLERANCE = 1e-6  # of each step of the integration: the motion is judged to 5 %
 EVALUATIONS = 150_000  # of the equations of motion; stiffer ones are followed in the short steps instead
 SHORT = 1e-4  # [s] Drake's steps where there is no motion in continuous time
@@ -224,7 +219,7 @@ class PlanFollower:
                 if np.all(np.isfinite(motion.xs)):
                     with applied(select(model, self.plan.vector.to_dict())) as set_model:
                         asked = motion_checks(self.plan, set_model, motion, every, wider * STATE_TOLERANCE, wider)
-                        checks = [*self._end_check(motion, wider), *asked, *checks]
+                        checks = [*asked, *checks]
                 rows.append(measured_replay(self.plan, variant, control, model, motion, checks, time_step))
             except BROKEN as error:
                 row = missing_replay(self.plan, variant, control, _first_clause(error))
@@ -232,18 +227,6 @@ class PlanFollower:
             if rows[-1].holds:
                 break
         return rows
-
-    def _end_check(self, motion: MeasuredMotion, wider: float) -> Iterator[Check]:
-        """How far the last state is from the plan's, of a problem that asks nothing of it."""
-        problem, planned = self.plan.problem, self.plan.sample(1)[0][-1]
-        asked = [c for c in problem.kept_goals if not isinstance(c, ClearanceConstraint)]
-        if asked or not np.all(np.isnan(problem.goal)):
-            return
-        least = np.where(np.arange(problem.nx) < problem.model.nq, NEAR_THE_END, SLOW_AT_THE_END)
-        allowed = wider * np.maximum(STATE_TOLERANCE * self.plan.scale, least)
-        apart = np.abs(motion.xs[-1] - planned)
-        i = int(np.argmax(apart / allowed))
-        yield check("end", problem.state_names[i], apart[i], allowed[i], units_of(problem)[i])
 
     def _law(self, model: Model, control: str, parts: int) -> Policy:
         """The command of each of the plan's own steps, held over `parts` steps of a plant: for one motion."""

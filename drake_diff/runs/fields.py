@@ -236,7 +236,11 @@ class Inputs(Fields):
 
 
 class Solver(Fields):
-    """What solved the problem, and how it says it ended."""
+    """What solved the problem, and how it says it ended.
+
+    `plant` is where the plan is to hold, "steps" or "continuous", and `feedback` what it needs there: null where it
+    holds open loop. Both are null of a run that was not measured.
+    """
 
     method: str
     solver: str
@@ -244,6 +248,9 @@ class Solver(Fields):
     status: str
     message: str
     solver_message: str
+    notes: list[str] = Field(default_factory=list)
+    plant: str | None = None
+    feedback: str | None = None
     options: FiniteTable
     iterations: int
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.optimize.messages import FEW, joined
 from drake_diff.optimize.problem.cost import ConstantCost
 from drake_diff.optimize.problem.dynamics import UNKNOWN, units_of
 from drake_diff.optimize.problem.goals import (
@@ -31,7 +32,6 @@ from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.sections import COSTS, LIMITS
 
 STILL = 1e-3  # [rad/s or m/s] what is no faster is at rest
-FEW = 4  # so many goals, or coordinates of one, are named
 MOST = 8  # coordinates: of more the others are counted
 PARTS = ("fixed_contacts", "waypoints", "goals", "constraints", "couplings", *COSTS)  # of a problem, where it has them
 
@@ -205,11 +205,3 @@ def _place(position: Sequence[float | None]) -> str:
     if all(p is not None for p in position):
         return "(" + ", ".join(f"{p:.3g}" for p in position) + ") m"
     return " and ".join(f"{axis} = {p:.3g} m" for axis, p in zip("xyz", position, strict=True) if p is not None)
-
-
-def joined(words: Sequence[str]) -> str:
-    """Joined by commas and one "and"; of many the first, and how many more."""
-    words = list(dict.fromkeys(words))
-    if len(words) > FEW + 1:
-        words = [*words[:FEW], f"{len(words) - FEW} more"]
-    return ", ".join(words[:-1]) + " and " + words[-1] if len(words) > 1 else words[0]

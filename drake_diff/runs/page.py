@@ -16,12 +16,13 @@ from drake_diff._base.arrays import Array
 from drake_diff.model.contract import CoordinateTerms
 from drake_diff.optimize.goal_markers import Colour, colours_of, meaning_of
 from drake_diff.optimize.live import differ, scene_of_plan
+from drake_diff.optimize.messages import joined
 from drake_diff.optimize.solution import Status
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay
 from drake_diff.pages.scene import Scene
 from drake_diff.runs.measurement import Measurement, gradient_norms
-from drake_diff.runs.messages import asked_for, joined
+from drake_diff.runs.messages import asked_for
 
 CONTROLS = {"open loop": "Inputs alone (open loop)", "TVLQR": "With feedback (TVLQR)"}
 

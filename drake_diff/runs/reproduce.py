@@ -18,6 +18,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.files import read_plain
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
+from drake_diff.optimize.replay import OPEN_LOOP
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.runs.certificates import certify_model
 from drake_diff.runs.cross_check import NOT_INSTALLED, SIMULATORS, cross_check
@@ -52,6 +53,7 @@ CONSTRAINED = ("metrics[constraint violation]", "problem.constraints", "problem.
 JUDGED = ("holds", "failures")  # of each replay
 # Keys of a solve in phases that rest on its search, beside SEARCHED.
 SEARCHED_IN_PHASES = ("phases.search", "phases.initial_guess", "phases.phases")
+OFFSETS_SINCE = 4  # the version of records in whose replays TVLQR follows finer steps with an offset
 SAME_PLAN = 1e-6  # of the largest number of its array: plans that are no further apart are the same
 OF_RECOVERED = (
     "the run was recovered from one that was killed or failed, so whether a search ends at this plan, and what it told "
@@ -206,6 +208,12 @@ def _written(solution: Solution, records: Mapping[Path, PlanRecord], apart: floa
             recorded = records[folder.relative_to(location)]
             again, lacking = _but_for_simulators(_as_given(again, recorded), recorded)
             unchecked.extend(lacking)
+            if int(recorded.schema_version.split(".")[0]) < OFFSETS_SINCE:
+                names = {metric.name for metric in recorded.metrics}
+                metrics = [metric for metric in again.metrics if metric.name in names]
+                replays = _open_loop_alone(again.replays, recorded.replays)
+                again = again.model_copy(update={"replays": replays, "metrics": metrics})
+                unchecked.append(f"replays under TVLQR, which had no offsets in version {recorded.schema_version}")
             return again
 
         fields: dict[str, Any] = {}
@@ -233,6 +241,12 @@ def _but_for_simulators(again: PlanRecord, record: PlanRecord) -> tuple[PlanReco
             where = "was not installed where the record was made" if there else "is not installed here"
             unchecked.append(f"replays in {name}, which {where}")
     return again, tuple(unchecked)
+
+
+def _open_loop_alone(again: Sequence[Any], recorded: Sequence[Any]) -> list[Any]:
+    """The replays that are taken again open loop, and the recorded ones under feedback."""
+    taken = {r.variant: r for r in again if r.control == OPEN_LOOP}
+    return [taken.get(r.variant, r) if r.control == OPEN_LOOP else r for r in recorded]
 
 
 def _as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:

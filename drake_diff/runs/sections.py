@@ -94,13 +94,13 @@ def found(solution: Solution, *, measured: bool = True) -> dict[str, Any]:
     gradient = _gradient(solution) if measured else GradientEvidence(reason="not measured yet")
     certificates = [gradient_evidence(c) for c in solution.certificates]
     return {
-        "solver": solver_of(solution),
+        "solver": solver_of(solution, measured=measured),
         "parameters": _parameters(solution),
         "gradient": gradient.model_copy(update={"certificates": certificates}),
     }
 
 
-def solver_of(solution: Solution) -> Solver:
+def solver_of(solution: Solution, *, measured: bool = True) -> Solver:
     """What solved the problem, and how it ended; an option that is no finite number is null."""
     options = {name: value for name, value in solution.options.items() if name not in GUESS}
     return evidence(
@@ -109,6 +109,8 @@ def solver_of(solution: Solution) -> Solver:
         status=solution.status.value,
         options={k: plain(v.item() if isinstance(v, np.generic) else v) for k, v in options.items()},
         iterations=len(solution.iterations),
+        plant=solution.plant if measured else None,
+        feedback=solution.feedback if measured else None,
     )
 
 

@@ -32,7 +32,8 @@ LOOPBACK = "127.0.0.1"
 UNDER_FEEDBACK = "what moves is the plan, near which feedback keeps the robot; blue: the robot without feedback"
 CONFIGURATION = ("problem", "contract", "model", "inputs", "solver")
 # What nobody chose, of the configuration: where a file was, what the solver said.
-NO_CHOICE = ("contract.source", "solver.status", "solver.message", "solver.solver_message", "solver.iterations")
+RESULTS = ("status", "message", "solver_message", "notes", "plant", "feedback", "iterations")
+NO_CHOICE = ("contract.source", *(f"solver.{name}" for name in RESULTS))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from pydrake.systems.primitives import FirstOrderTaylorApproximation
 
 
 class Control(LeafSystem):
-    def __init__(self, plan, times, gains):  # u(t) + K(t) (x(t) - x), cut off at the limits
+    def __init__(self, plan, times, gains):  # u(t) + K(t) (x(t) - x) - l(t), cut off at the limits
         LeafSystem.__init__(self)
         self.plan, self.times, self.gains = plan, times, gains
         self.DeclareVectorInputPort("x", BasicVector(len(plan["goal"])))
@@ -22,7 +22,8 @@ class Control(LeafSystem):
         t, plan, wanted = context.get_time() + 1e-9, self.plan, self.plan["u"](context.get_time() + 1e-9)
         if self.gains is not None:
             k = min(np.searchsorted(self.times, t, side="right") - 1, len(self.gains) - 1)
-            wanted = wanted + self.gains[k] @ (plan["x"](t) - self.EvalVectorInput(context, 0).value())
+            K, offset = self.gains[k]
+            wanted = wanted + K @ (plan["x"](t) - self.EvalVectorInput(context, 0).value()) - offset
         u.SetFromVector(np.clip(wanted, plan["u_lower"], plan["u_upper"]))
 
 
@@ -47,10 +48,12 @@ def simulate(
     return np.array(seen)[:, 0], np.array(seen)[:, 1:]
 
 
-def slopes(system, context, port_in):  # A and B where the context is; by differences of what Drake cannot linearize
+def slopes(
+    system, context, port_in
+):  # A, B and the constant term where the context is; by differences of what Drake cannot linearize
     if system.ToAutoDiffXdMaybe() is not None:
         found = FirstOrderTaylorApproximation(system, context, port_in, OutputPortSelection.kNoOutput)
-        return found.A(), found.B()
+        return found.A(), found.B(), found.f0()
     x, u, h = state_of(context).CopyToVector(), system.get_input_port(port_in).Eval(context), 1e-6
 
     def rates(at):
@@ -60,20 +63,24 @@ def slopes(system, context, port_in):  # A and B where the context is; by differ
 
     at = np.concatenate([x, u])
     found = np.array([(rates(at + h * e) - rates(at - h * e)) / (2 * h) for e in np.eye(len(at))]).T
-    return found[:, : len(x)], found[:, len(x) :]
+    return found[:, : len(x)], found[:, len(x) :], None  # in continuous time, where it is not asked for
 
 
-def regulator(plan, step, times, scale):  # gains at `times` by Riccati's recursion, from the plant's linearizations
+def regulator(plan, step, times, scale):  # gains and offsets at `times` by Riccati's recursion
     system, port_in, _ = plan["build"](step)
     context, h, Q, gains = system.CreateDefaultContext(), times[1], np.diag(1 / scale**2), []
     R, P = 0.1 * np.diag(1 / np.maximum(np.ptp([plan["u"](t) for t in times], axis=0), 1e-3) ** 2), 100 * Q
-    for t in times[-2::-1]:
+    p = np.zeros(len(Q))
+    for t, after in zip(times[-2::-1], times[::-1], strict=False):
         state_of(context).SetFromVector(plan["x"](t))
         system.get_input_port(port_in).FixValue(context, plan["u"](t + 1e-9))
-        A, B = slopes(system, context, port_in)
+        A, B, constant = slopes(system, context, port_in)
         A, B = (A, B) if step else (np.eye(len(A)) + h * A + h * h / 2 * A @ A, h * (B + h / 2 * A @ B))
-        gains.append(np.linalg.solve(h * R + B.T @ P @ B, B.T @ P @ A))
-        P = h * Q + A.T @ P @ (A - B @ gains[-1])
+        defect = A @ plan["x"](t) + B @ plan["u"](t + 1e-9) + constant - plan["x"](after) if step else 0 * p
+        r, inverse = P @ defect + p, np.linalg.inv(h * R + B.T @ P @ B)
+        K = inverse @ B.T @ P @ A
+        gains.append((K, inverse @ B.T @ r))
+        P, p = h * Q + A.T @ P @ (A - B @ K), (A - B @ K).T @ r
     return gains[::-1]
 
 

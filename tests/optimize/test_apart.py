@@ -61,7 +61,7 @@ def test_balls_that_met_pass_each_other(crossing):
 def test_balls_that_do_not_meet_are_left_alone(crossing):
     solution = dd.solve(crossing(height=0.5))
     assert solution.success, solution.message
-    assert len(solution.options["chain"]) == 1
+    assert [link["method"] for link in solution.options["chain"]] == ["collocation", "shooting"]
 
 
 def test_links_that_are_near_at_an_end_are_not_kept_apart(crossing):

@@ -109,7 +109,7 @@ def test_a_minimum_at_a_jump_meets_the_conditions_of_one_on_its_side(elastic):
     solution = dd.solve(problem, method="ilqr", options=Options(continuation="auto"))
     assert solution.success, solution.message
     note = solution.options["contact_sequence"]
-    assert note in solution.message
+    assert note in repr(solution)
     assert "a minimum for its own sequence of contacts" in note
     distance = [x[1] - x[0] - 0.2 for x in solution.xs]
     (knot,) = (k for k, d in enumerate(distance) if abs(abs(d) - MARGIN) < 1e-7)

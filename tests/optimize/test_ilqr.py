@@ -200,7 +200,7 @@ def test_a_velocity_limit_is_met_and_pays():
 def test_cart_pole_swing_up_from_rest():
     """The optimum of examples/cart_pole_swing_up.py at 50 steps: 58.6088 by SNOPT and IPOPT.
 
-    In steps of 0.04 s it is no motion of the plant: in finer ones it ends elsewhere.
+    In steps of 0.04 s it is no motion of the plant: in finer ones it needs feedback.
     """
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
     problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=50, running_cost=EFFORT)
@@ -209,8 +209,7 @@ def test_cart_pole_swing_up_from_rest():
     from_a_line = dd.solve(problem, method="ilqr", initial_guess=(line, np.zeros((50, 1))))
     again = dd.solve(problem, method="ilqr", initial_guess=solution)
     for found in (solution, from_a_line, again):
-        assert found.status.value == "converged_not_verified"
-        assert "replayed in steps of 0.005 s it does not hold" in found.message
+        assert found.message == "converged: holds open loop at 40 ms and at 20 ms; under TVLQR at 5 ms"
         assert found.goal_error < 1e-6
         assert found.cost == pytest.approx(58.6088133284, rel=1e-8)
     assert len(again.iterations) < 12  # a good guess is not left
@@ -278,7 +277,7 @@ def test_a_goal_out_of_reach_is_infeasible(bounds):
     solution = dd.solve(move(**bounds), method="ilqr")
     assert solution.status is Status.INFEASIBLE, solution.message
     assert solution.iterations[-1].primal_infeasibility > 1e-3
-    assert "after" in solution.message
+    assert "after" in repr(solution)
 
 
 def test_a_goal_alone_needs_no_cost():
@@ -370,7 +369,7 @@ def test_where_no_way_goes_on_the_motion_so_far_is_kept_and_the_reason_told(monk
     without_derivatives(monkeypatch, lambda xs: np.abs(xs - still).max() > 0)
     solution = dd.solve(problem, method="ilqr")
     assert solution.status is dd.Status.NO_GRADIENT
-    assert "backed off from: no derivative here" in solution.message
+    assert "backed off from: no derivative here" in repr(solution)
     assert np.array_equal(solution.xs, still)
     assert len(solution.iterations) == 1
 

@@ -79,7 +79,7 @@ def test_a_ball_bounces_into_its_target(thrown):
     rise = solve_ivp(lambda t, x: rates(x, up(t)), (0, thrown.phases[1].horizon), begins, **tight)
     np.testing.assert_allclose(rise.y[:2, -1], [1.2, 0.9], atol=1e-5)
     assert np.min(rise.y[1]) > 0.0999
-    assert "open loop through all phases" in thrown.message
+    assert thrown.message == "converged: holds open loop in continuous time"
     assert [c.verdict for c in thrown.certificates] == ["agree"]
 
 
@@ -171,7 +171,7 @@ def test_a_plan_that_the_law_of_impact_does_not_have_is_refused(landed, seed):
         other = PhasedProblem(problem.phases, resets=[impact], names=problem.names)
         again = rejudged(landed, problem=other)
         assert again.status is dd.Status.CONVERGED_NOT_VERIFIED
-        assert reason in again.message
+        assert reason in repr(again)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -184,7 +184,7 @@ def test_a_plan_whose_impact_comes_at_another_time_is_refused(thrown, seed):
     phases[0] = replace(phases[0], xs=xs)
     again = rejudged(thrown, phases=tuple(phases))
     assert again.status is dd.Status.CONVERGED_NOT_VERIFIED
-    assert "m apart" in again.message
+    assert "m apart" in repr(again)
 
 
 def test_what_is_no_impact_is_refused_early(landed):

@@ -70,7 +70,7 @@ def test_a_wrong_derivative_of_the_users_is_named_and_no_success():
     wrong = dd.Dynamics(types.SimpleNamespace(values=BLOCK.values, linearize=linearize), 2, 1)
     solution = dd.solve(dataclasses.replace(block_move(), system=wrong), max_iterations=50)
     assert not solution.success
-    assert "d d(x1)/dt / d u0" in solution.message
+    assert "d d(x1)/dt / d u0" in repr(solution)
     honest = dd.Dynamics(own_derivatives(BLOCK), 2, 1)
     assert dd.solve(dataclasses.replace(block_move(), system=honest)).success
 
@@ -137,7 +137,7 @@ def test_a_mesh_on_which_the_plan_does_not_hold_is_refined_by_itself():
         assert found.success, found.message
         rounds = found.options["refinements"]
         assert rounds[0][0] == 4 < len(found.us) == rounds[-1][0]
-        assert f"the mesh was refined from 4 to {len(found.us)} intervals" in found.message
+        assert f"the mesh was refined from 4 to {len(found.us)} intervals" in repr(found)
         if problem is up:
             assert found.cost == pytest.approx(fine.cost, rel=0.07)  # which is refined until 1e-6
 
@@ -173,8 +173,8 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
         np.testing.assert_array_equal(solution.xs, coarse.xs)
         if outcome is Outcome.INFEASIBLE:
             assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
-            assert "intervals no motion was found" in solution.message
-            assert "that on 4 is kept" in solution.message
+            assert "intervals no motion was found" in repr(solution)
+            assert "that on 4 is kept" in repr(solution)
         else:  # without the limit it would have gone further, which is what `verify` does
             assert solution.status is dd.Status[outcome.name]
 

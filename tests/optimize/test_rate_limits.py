@@ -71,7 +71,7 @@ def test_an_arm_moves_without_jerks_and_its_motion_is_smooth_between_its_knots()
         model, x0=np.zeros(4), x_goal=[1, -1, 0, 0], num_steps=20, running_cost=dd.QuadraticCost(R=np.eye(2)),
         couplings=Jerk(60.0),
     )  # fmt: skip
-    solution = dd.solve(problem)
+    solution = dd.solve(problem, method="collocation")
     assert solution.success, solution.message
     state, given = solution.trajectory()
     times = np.linspace(0, solution.horizon, 2001)

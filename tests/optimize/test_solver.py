@@ -67,7 +67,7 @@ def test_active_input_bounds_give_the_same_optimum_by_ilqr_and_by_shooting(load)
 def test_a_coarse_collocation_is_not_called_converged(load):
     solution = dd.solve(swing_up(load, 8), method="collocation", options=Options(refine=False))
     assert not solution.success
-    assert "an accurate integration from knot" in solution.message
+    assert "an accurate integration from knot" in repr(solution)
 
 
 @pytest.mark.parametrize("method", ["collocation", "shooting"])
@@ -94,7 +94,7 @@ def test_a_refused_derivative_ends_as_no_gradient(load, monkeypatch):
     monkeypatch.setattr("drake_diff.derivatives.step.MAGNITUDE_BOUND", 1e-3)
     solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting")
     assert solution.status is Status.NO_GRADIENT
-    assert "expected a finite number of at most" in solution.message
+    assert "expected a finite number of at most" in repr(solution)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,12 @@ def test_the_same_seed_gives_the_same_bits(load):
 
 
 def test_auto_chooses_and_says_why(load):
-    assert dd.solve(swing_up(load, 40)).options["method_reason"] == "the model is smooth"
+    chain = dd.solve(swing_up(load, 40)).options["chain"]
+    steps = "the collocated plan in the model's own steps"
+    assert [(link["method"], link["reason"]) for link in chain][:2] == [
+        ("collocation", "the model is smooth"),
+        ("shooting", steps),
+    ]
     model = load("sphere_on_ground.sdf")
     free = np.zeros(13, dtype=bool)
     free[10] = True
@@ -160,9 +165,9 @@ def test_collocation_through_a_ball_between_two_knots_is_not_verified():
     solution = dd.solve(problem, method="collocation")
     assert np.abs(solution.xs[:, 0]).min() > 0.4
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
-    assert "geometries overlap by 0.2 m at 0.375 s" in solution.message
+    assert "geometries overlap by 0.2 m at 0.375 s" in repr(solution)
     aside = dd.solve(dataclasses.replace(problem, x_goal=[-0.3, 0]), method="collocation")
-    assert "geometries overlap" not in aside.message
+    assert "geometries overlap" not in repr(aside)
 
 
 @each_row(
@@ -260,6 +265,6 @@ def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, err
     monkeypatch.setattr("drake_diff.motion.intervals.derivatives_along", refusing)
     solution = dd.solve(swing_up(load, 20), method="shooting")
     assert solution.status is status
-    assert "this far and no further" in solution.message
+    assert "this far and no further" in repr(solution)
     assert "Traceback" not in solution.message
     assert np.all(np.isfinite(solution.xs))

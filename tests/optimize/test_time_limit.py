@@ -89,7 +89,7 @@ def test_what_is_found_in_time_and_not_certified_is_not_called_verified(monkeypa
         monkeypatch.setattr(run, name, late(clock, getattr(run, name), from_call=2))
     found = dd.solve(swing(), method=method, options=Options(solver=solver), time_limit=10.0)
     assert found.status is STATUS
-    assert "not made within the time limit: certificates of the result, replays and other measures" in found.message
+    assert "not made within the time limit: certificates of the result, replays and other measures" in repr(found)
     assert found.goal_error < 1e-5  # the motion is the one that was found
     assert len(found.certificates) == 3  # those of the guess
 
@@ -109,7 +109,7 @@ def test_a_limit_that_comes_before_the_search_leaves_the_guess(monkeypatch, meth
     monkeypatch.setattr(place, late(clock, function, from_call=1))
     found = dd.solve(swing(), method=method, time_limit=10.0)
     assert found.status is STATUS
-    assert "certificates of the guess, the search, certificates of the result" in found.message
+    assert "certificates of the guess, the search, certificates of the result" in repr(found)
     assert np.array_equal(found.xs[0], [0, 0])
     assert not found.certificates
     assert np.isfinite(found.cost)
@@ -209,4 +209,4 @@ def test_what_numba_compiles_is_told_and_no_limit_counts_it(monkeypatch, method,
     monkeypatch.setattr(run, "judged", late(clock, run.judged, from_call=1))
     found = dd.solve(problem, method=method, options=Options(solver=solver), time_limit=10.0)
     assert found.status is STATUS
-    assert found.message.endswith(lines[-1])
+    assert found.notes[-1] == lines[-1]

@@ -181,7 +181,7 @@ def test_a_bound_holds_between_the_nodes_wherever_they_lie(count, scheme):
     assert motion.transcribed.quadrature > 4 * (1 - 1e-7)
     # What a trapezoid calls the motion is a parabola, but not that of the block; and its rule is off by 2 % and more.
     missed = {"trapezoid": "an accurate integration from knot", "drake": "the cost that was minimized is"}
-    assert missed[scheme] in motion.message if scheme in missed else motion.success, motion.message
+    assert missed[scheme] in repr(motion) if scheme in missed else motion.success, motion.message
 
 
 def at_nodes_alone(monkeypatch):
@@ -202,7 +202,7 @@ def test_a_cost_below_the_optimum_goes_with_an_excess_between_the_nodes(monkeypa
     assert 0.9 * dense < excess.state <= dense + 1e-9
     assert (motion.transcribed.nodes[:, 0] <= 1 / 9 + 1e-8).all()
     assert not motion.success
-    assert f"between the nodes x0 is {excess.state:.3g} beyond its bound at " in motion.message
+    assert f"between the nodes x0 is {excess.state:.3g} beyond its bound at " in repr(motion)
 
 
 def test_an_input_that_is_too_large_between_the_nodes_is_no_success(monkeypatch):
@@ -217,7 +217,7 @@ def test_an_input_that_is_too_large_between_the_nodes_is_no_success(monkeypatch)
         assert motion.horizon < 2
         assert np.abs(motion.us).max() < 1 + 1e-7
         assert not motion.success
-        assert "is 0.125 beyond its bound at " in motion.message
+        assert "is 0.125 beyond its bound at " in repr(motion)
     # What the plant cuts off is missing from the motion.
     assert by_formula.integration_error < 1e-7 < 1e-4 < by_its_limits.integration_error
 
@@ -228,7 +228,7 @@ def test_a_constraint_that_is_broken_between_the_nodes_is_no_success():
     coarse, fine = (move(n, constraints=slow) for n in (4, 40))
     assert coarse.constraint_violation < 1e-7
     assert not coarse.success
-    assert "between the nodes slow is " in coarse.message
+    assert "between the nodes slow is " in repr(coarse)
     assert fine.success
     everywhere = move(4, bounds=dd.Bounds(x_upper=[np.inf, 1.25]))  # as a bound it is kept
     assert everywhere.success
@@ -366,7 +366,7 @@ def test_refinement_says_when_it_gives_up():
         10, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0, refine=True, scheme="trapezoid", max_num_steps=50
     )
     assert len(motion.xs) <= 51
-    assert "raise max_num_steps" in motion.message
+    assert "raise max_num_steps" in repr(motion)
 
 
 def test_the_cost_alone_can_ask_for_a_finer_mesh():

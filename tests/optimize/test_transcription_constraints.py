@@ -196,7 +196,7 @@ def test_an_error_of_the_dynamics_ends_the_solve_and_is_told(error, status, at):
     setattr(own, at, failing)
     motion = collocate(Dynamics(own, 2, 1), other_guesses=0, **SWING)  # from others there is no error here
     assert motion.status is status
-    assert f"{error.__name__}: here it ends" in motion.message
+    assert f"{error.__name__}: here it ends" in repr(motion)
     assert np.isfinite(motion.transcribed.nodes).all()
 
 

@@ -264,7 +264,7 @@ def test_each_signal_ends_a_search_with_its_best_plan(solutions, tmp_path, numbe
     assert np.array_equal(plan.us, solution.us)
     assert np.array_equal(plan.xs, solution.xs)
     keep_plan(plan, tmp_path / "run.partial-1-0123abcd")
-    assert "the run was interrupted" in dd.load_record(tmp_path / "run.partial-1-0123abcd").sentence
+    assert "interrupted" in dd.load_record(tmp_path / "run.partial-1-0123abcd").sentence
     assert has_plan(tmp_path / "run.partial-1-0123abcd", plan)
 
 
@@ -288,12 +288,12 @@ def test_a_signal_before_the_search_leaves_the_guess_as_a_plan(solutions, tmp_pa
     assert signal.getsignal(signal.SIGTERM) is before
     (plan,) = plans
     keep_plan(plan, tmp_path / "run.partial-1-0123abcd")
-    assert "the run was interrupted" in dd.load_record(tmp_path / "run.partial-1-0123abcd").sentence
+    assert "interrupted" in dd.load_record(tmp_path / "run.partial-1-0123abcd").sentence
     first = plan.phases[0] if method == "in phases" else plan
     assert np.array_equal(first.xs[0], [0.0, 0.0])
     if early == "as the record is begun":
         quick_pages(monkeypatch)
-        assert "the run was interrupted" in dd.save(solution, tmp_path / "run").sentence
+        assert "interrupted" in dd.save(solution, tmp_path / "run").sentence
 
 
 @each_row("method", ["collocation", "shooting", "in phases"])

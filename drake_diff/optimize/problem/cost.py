@@ -262,7 +262,8 @@ class TrackingCost(TimedCost):
         >>> swing = np.column_stack([np.sin(times), np.cos(times)])
         >>> follow = dd.optimize.TrackingCost((times, swing), Q=np.eye(2), R=[[1e-3]])
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
-        >>> solution = dd.solve(dd.Problem(model, x0=[0, 1], num_steps=20, running_cost=follow))
+        >>> problem = dd.Problem(model, x0=[0, 1], num_steps=20, running_cost=follow)
+        >>> solution = dd.solve(problem, method="collocation")
         >>> solution.success, bool(np.abs(solution.xs[:, 0] - np.sin(solution.times)).max() < 0.01)
         (True, True)
     """
