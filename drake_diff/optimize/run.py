@@ -33,7 +33,7 @@ from drake_diff.optimize.problem.design import ShootingVariables
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import SelfCollision, lacking_between, swept
 from drake_diff.optimize.problem.phases import PhasedProblem
-from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report, heard
 from drake_diff.optimize.solution import PLANS, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
@@ -556,7 +556,7 @@ def closest_to(problem: Problem, plan: Solution) -> Problem:
     """`problem` with the squared distance from `plan`, each state and input for its range, in place of its costs."""
     xs, us = plan.plan.sample(1)
     Q = np.diag(1 / plan.plan.scale**2)
-    R = np.diag(1 / np.maximum(np.max(np.abs(us), axis=0), SMALLEST_RANGE) ** 2)
+    R = np.diag(1 / problem.input_scales(us) ** 2)
     reference = plan.time_step * np.arange(len(xs)), xs, np.vstack([us, us[-1:]])
     return dataclasses.replace(
         problem,
