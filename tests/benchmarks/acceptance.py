@@ -91,7 +91,7 @@ TRUST = {
     "certificate": (3, 30),
     "rollout": (2, 30),
     "refinement": (2, 30),
-    "solve": (3, 40),
+    "plans": (3, 40),
     "avoid": (1, 30),
     "reach": (2, 30),
     "verify": (2, 30),

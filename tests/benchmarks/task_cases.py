@@ -29,7 +29,7 @@ from pydrake.systems.framework import DiagramBuilder, InputPortIndex, OutputPort
 from pydrake.systems.primitives import FirstOrderTaylorApproximation
 from referee import state_of
 from task_formulas import bicycle, dubins, planar
-from trust_solve import FOLDER, FREE, arm_file, block_file, effort, formula, loaded, plant_of, touching
+from task_plants import FOLDER, FREE, arm_file, block_file, effort, formula, loaded, plant_of, touching
 
 import drake_diff as dd
 from drake_diff.model import BodyForce

@@ -22,7 +22,7 @@ from task_cases import (
     posture,
     skeleton_enters,
 )
-from trust_solve import FOLDER, loaded, plant_of
+from task_plants import FOLDER, loaded, plant_of
 
 import drake_diff as dd
 

@@ -18,7 +18,7 @@ import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
 from referee import judge
 from task_cases import Case
-from trust_solve import NAMED
+from task_plants import NAMED
 
 import drake_diff as dd
 from drake_diff.optimize.problem.cost import ConstantCost

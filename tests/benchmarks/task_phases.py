@@ -14,7 +14,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 from pydrake.systems.framework import BasicVector, InputPortIndex, LeafSystem
-from trust_solve import FOLDER, formula, plan_of, plant_of
+from task_plants import FOLDER, formula, plan_of, plant_of
 
 import drake_diff as dd
 

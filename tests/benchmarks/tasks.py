@@ -37,7 +37,7 @@ from referee import judge, judge_phases
 from task_cases import FAMILIES, NOT_EXPRESSED, Case
 from task_cases_more import MORE
 from task_phases import PHASES, PhasedCase
-from trust_solve import NAMED, plan_of
+from task_plants import NAMED, plan_of
 
 import drake_diff as dd
 from drake_diff.exceptions import DrakeDiffError, ModelWarning

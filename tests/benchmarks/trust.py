@@ -29,7 +29,7 @@ PARTS = (
     "certificate",
     "rollout",
     "refinement",
-    "solve",
+    "plans",
     "avoid",
     "reach",
     "verify",
