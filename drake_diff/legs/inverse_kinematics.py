@@ -12,7 +12,7 @@ from pydrake.multibody.inverse_kinematics import (
     PositionConstraint,
     PositionCost,
 )
-from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
+from pydrake.solvers import MathematicalProgram, SnoptSolver, SolutionResult, SolverOptions
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError
@@ -84,20 +84,23 @@ def inverse_kinematics(
             counts = np.diag(np.broadcast_to(target.unit, 3) ** -2.0)
             program.AddCost(PositionCost(plant, world, position, target.frame, target.point, counts, context), every)
     goal, weight = _nearness(model, first, wish)
-    costs, start = [(q, goal, weight)], first if coupling is None else coupling.positions(first)
+    costs = [(q, goal, weight)]
     if wish.center_of_mass is not None:
         center = program.NewContinuousVariables(3, "center of mass")
         program.AddConstraint(ComPositionConstraint(plant, None, world, context), np.append(every, center))
         over = np.asarray(wish.center_of_mass, dtype=float)
         costs.append((center, np.nan_to_num(over), np.where(np.isnan(over), 0.0, wish.balance**-2.0)))
-        plant.SetPositions(context, start)
-        start = np.append(start, plant.CalcCenterOfMassPositionInWorld(context))
     for variables, middle, weights in costs:
         program.AddQuadraticErrorCost(np.diag(weights), middle, variables)
         for variable, counts in zip(variables, weights, strict=True):
             if counts > 0:
                 program.SetVariableScaling(variable, counts**-0.5)  # so that the cost's second derivative is even
-    result = SnoptSolver().Solve(program, start, OPTIONS)
+    for start in (first, goal):  # numerical difficulties, a singular basis above all, are those of one start
+        plant.SetPositions(context, start if coupling is None else coupling.positions(start))
+        guess = [*plant.GetPositions(context), *plant.CalcCenterOfMassPositionInWorld(context)]
+        result = SnoptSolver().Solve(program, np.array(guess[: program.num_vars()]), OPTIONS)
+        if result.get_solution_result() != SolutionResult.kSolverSpecificError:
+            break
     posture = np.array(result.GetSolution(q))
     set_state(twin, np.append(posture, np.zeros(model.nv)))
     return posture

@@ -46,13 +46,7 @@ Mask = NDArray[np.bool_]
 
 
 def scheduled_motion(
-    model: Model,
-    legs: Legs,
-    x0: Array,
-    end: Array,
-    stands: Mask,
-    clearance: float,
-    friction: float,
+    model: Model, legs: Legs, x0: Array, end: Array, stands: Mask, clearance: float, friction: float
 ) -> tuple[Array, Array]:
     """States xs (N+1, nx) and inputs us (N, nu) from x0 (nx,) to about posture `end` (nq,), at rest.
 

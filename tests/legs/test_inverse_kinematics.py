@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from helpers.legged import LEGGED, legged_model, rest
 from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.legs.feet import Legs
 from drake_diff.legs.inverse_kinematics import PointTarget, Wish, inverse_kinematics
+from drake_diff.legs.motion import LEVELLED
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 
@@ -94,6 +96,21 @@ def test_a_base_turns_and_moves_so_that_feet_and_centre_of_mass_are_where_they_a
     assert robot.points_in(q) == pytest.approx(feet, abs=2e-7)
     assert robot.center_of_mass() == pytest.approx(mass, abs=1e-4)
     assert np.linalg.norm(q[:4]) == pytest.approx(1.0, abs=1e-8)
+
+
+@pytest.mark.skipif(not LEGGED["talos"].is_installed, reason="no example-robot-data")
+@pytest.mark.parametrize(("seed", "steps", "ahead"), [(0, 60, 0.0), (10, 60, 0.0), (12, 40, 0.02)])
+def test_a_robot_on_flat_feet_rises_smoothly(seed, steps, ahead):
+    """Joints that turn by d in T accelerate by 10 / sqrt(3) d / T^2 at most; at some postures SNOPT fails."""
+    model, robot = legged_model("talos"), LEGGED["talos"]
+    first = rest("talos", model, np.array(robot.low), np.random.default_rng(seed))
+    end = rest("talos", model, np.array(robot.high))[: model.nq]
+    end[4:6] = first[4] + ahead, first[5]
+    xs, _ = dd.optimize.ContactSchedule([(steps, robot.feet)]).guess(model, first, end)
+    turned = np.max(np.abs(xs[-1, 7 : model.nq] - first[7 : model.nq]))
+    most = 10 / np.sqrt(3) * turned / (steps * model.time_step) ** 2
+    acceleration = np.diff(xs[LEVELLED:, model.nq + 6 :], axis=0) / model.time_step
+    assert np.max(np.abs(acceleration)) < 1.5 * most  # the knees turn the fastest, and not as evenly; 20 with a jump
 
 
 def test_a_foot_that_rolls_goes_as_far_as_its_ball_turns():
