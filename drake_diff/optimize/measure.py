@@ -53,7 +53,7 @@ def _knot_checks(s: Any) -> Iterator[Check]:
     """Equations, ends, bounds and constraints."""
     problem, xs = s.problem, np.asarray(s.xs)
     with np.errstate(all="ignore"):
-        scales = problem.feasibility_scales(xs, s.us, s.vector.values)
+        scales = problem.feasibility_scales(xs, s.us, s.vector.values, s.knots)
     limits = FEASIBILITY_TOLERANCE * np.array([scales[name] for name in problem.state_names])
     knots = np.flatnonzero(~np.all(s.defects_of_states <= limits, axis=1))
     worst, i = _worst(s.defects_of_states, limits)

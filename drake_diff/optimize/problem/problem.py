@@ -451,7 +451,31 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """(nx + nu,) `state_scales` and `input_scales` side by side."""
         return np.concatenate([self.state_scales(xs), self.input_scales(us)])
 
-    def feasibility_scales(self, xs: Array, us: Array, values: Array) -> dict[str, float]:
+    def search_spans(self, xs: Array, us: Array, slopes: Array, horizon: float) -> Array:
+        """(nx + nu,) how far states and inputs may go in a search from xs (M, nx), us (M, nu), in any units.
+
+        By x0, waypoints, goal and the guess. A state that is the same there has what moves another one by its way over
+        the `horizon` [s], by `slopes` (nx, nx + nu) of x', or what it is moved by; so has an input, or what the guess
+        has of it where that is more, within its bounds.
+        """
+        b, nx = self.bounds, self.nx
+        given = np.vstack([xs, np.where(self.initial_state_mask, np.nan, self.x0), *self.waypoints.values(), self.goal])
+        spans = np.concatenate([_spread(given), np.zeros(self.nu)])
+        spans[:nx][spans[:nx] <= STILL**2 * np.max(np.nan_to_num(np.abs(given)), axis=0)] = 0.0
+        for _ in spans:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                drives = spans[:nx, None] / (horizon * slopes)
+            drives = np.min(np.where((spans[:nx, None] > 0) & (slopes > 0), drives, np.inf), axis=0)
+            driven = np.concatenate([horizon * slopes @ spans, np.zeros(self.nu)])
+            spans = np.where(spans > 0, spans, np.where(np.isfinite(drives), drives, driven))
+        wide = (b.u_upper - b.u_lower) / 2
+        bounded = np.isfinite(wide) & (wide > 0)
+        inputs = np.maximum(spans[nx:], np.max(np.abs(us), axis=0, initial=0.0))
+        inputs = np.where(bounded & ((spans[nx:] == 0) | (inputs > wide)), wide, inputs)
+        spans = np.append(spans[:nx], inputs)
+        return np.where(spans > 0, spans, 1.0)
+
+    def feasibility_scales(self, xs: Array, us: Array, values: Array, knots: Indices) -> dict[str, float]:
         """The scale of each state, input, parameter (by `values` (np,)), constraint, coupling and the horizon.
 
         By the names that excesses have, along xs (M, nx) under us (M, nu). What a solver leaves is a part of these.
@@ -464,9 +488,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         scales["horizon"] = self.start_horizon
         for c in self.kept:
             scales[c.label] = max(float(np.max(c.scales(xs, us, spans))), scales.get(c.label, 0.0))
-        if len(xs) == self.num_steps + 1:
-            for bound in self.coupled_steps():
-                scales[bound.label] = float(np.max(bound.scales(xs, us, spans), initial=0.0))
+        for bound in self.coupled(input_at_end=False):
+            scales[bound.label] = float(np.max(bound.scales(xs[knots], us[knots], spans), initial=0.0))
+        scales |= {limit.label: float(np.max(limit.entries(self.system)[1])) for limit in self.rate_limits}
         return scales
 
     def goal_tolerances(self, xs: Array) -> Array:
