@@ -1,8 +1,9 @@
 """What is checked of a solution's own states and inputs, replays apart."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,14 @@ from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import applied
 from drake_diff.model.step import set_state
 from drake_diff.optimize.checks import Check, check
-from drake_diff.optimize.problem.dynamics import DiscreteMap, units_of
+from drake_diff.optimize.problem.dynamics import SAME_VALUES, DiscreteMap, probe_within, units_of
 from drake_diff.optimize.problem.obstacles import along_steps, clearances
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.transcription.between import passed_between_steps
 from drake_diff.optimize.transcription.collocation import Collocated
 from drake_diff.optimize.transcription.lead import SUBSTEPS
-from drake_diff.optimize.transcription.task import OptimalControl
+from drake_diff.optimize.transcription.task import OptimalControl, UserCost, user_costs
 
 # Of a state's scale: between two knots the transcription is a cubic, and further than this from an accurate integration
 # its motion is not the model's.
@@ -31,6 +32,10 @@ INTEGRATION_TOLERANCE = 1e-2
 # 16 times smaller, and costs of plans that are worth comparing differ by more.
 COST_TOLERANCE = 1e-2
 ASKED = ("defect", "goal", "bound", "constraint", "start", "cost")  # checks of what a solver is asked to satisfy
+BESIDE = np.linspace(-0.1, 0.1, 41)  # of the scale of a state or input: where costs are looked at beside a plan
+LOOKED_AT, MOST_BENDS = 3, 20  # knots at which costs are compared; places on a line at which they may jump
+HALVED = 24  # times, so that a jump is told from what is steep: 6e-8 of the way between two places
+SMALLEST_JUMP = 1e-6  # of the largest cost on these lines; what is smooth leaves 1e-9
 FIRST_KNOTS, BENDS = 3, 3  # of a guess; of a result, beside its first and last knot
 
 
@@ -47,6 +52,8 @@ def plan_checks(s: Any) -> Iterator[Check]:
         yield from (replace(c, plant="between the knots") for c in between)
     bad = [c for c in s.certificates if c.verdict != "agree"]
     yield from (derivative_check(c) for c in bad[:1] or s.certificates[:1])
+    if np.all(np.isfinite(s.xs)) and np.all(np.isfinite(s.us)):
+        yield from _user_checks(s)
 
 
 def _knot_checks(s: Any) -> Iterator[Check]:
@@ -114,6 +121,61 @@ def _overlap_check(s: Any, motion: Collocated) -> Check:
             depths.append(penetration(model))
     k = int(np.argmax(depths))
     return check("overlap", f"geometries at {np.append(s.times, times)[finite][k]:.4g} s", depths[k], 0.0, "m")
+
+
+def _user_checks(s: Any) -> Iterator[Check]:
+    """Whether the user's costs jump along a plan or beside it, and are what their derivatives are taken of."""
+    problem, nx, motion = s.problem, s.problem.nx, s.transcribed
+    us = s.inputs_at_knots[: len(s.xs)]
+    knots, times = np.hstack([s.xs, np.vstack([us, us[-1:]])[: len(s.xs)]]), np.asarray(s.times, dtype=float)
+    costs = user_costs(problem, probe_within(problem.bounds), final=True)
+    if not costs:
+        return
+    scale = problem.spans(s.xs, us)
+    beside, rows = scale * np.eye(len(scale)), np.append(np.linspace(0, len(us) - 1, LOOKED_AT).astype(int), -1)
+    for cost in costs:
+        lines = [
+            np.column_stack([knots[k] + BESIDE[:, None] * way, np.full(len(BESIDE), times[k])])
+            for k in rows[-2:]
+            for way in (beside if cost.name == "running cost" else beside[:nx])
+        ]
+        if cost.name == "running cost" and motion is not None and not problem.is_map:
+            lines.append(np.column_stack([motion.places.points.T, motion.places.times]))
+        elif cost.name == "running cost":
+            lines.append(np.column_stack([knots, times]))
+        k = rows[-1:] if cost.name == "final cost" else rows
+        called, (carried, _) = cost.values(knots[k], times[k]), cost.form.linearize(cost.points(knots[k], times[k]))
+        apart, (size, when, largest) = np.abs(carried[:, 0] - called), largest_jump(cost, lines)
+        i = int(np.argmax(apart))
+        yield check("traced", f"the {cost.name} at {times[k][i]:.4g} s", apart[i], SAME_VALUES * largest)
+        yield check("jump", f"the {cost.name} at {when:.4g} s", size, SMALLEST_JUMP * largest)
+
+
+def largest_jump(cost: UserCost, lines: Sequence[Array]) -> tuple[float, float, float]:
+    """By how much a cost jumps between two places [x, u, t] of one of the `lines`, each (S, nx + nu + 1), and when [s].
+
+    And how large the cost is there. Those halves between which it changes most are halved, from the places about which
+    it bends most.
+    """
+    every, begin = np.vstack(lines), np.cumsum([0, *map(len, lines)])
+    values = np.ravel(cost.values_of_many(every[:, :-1], every[:, -1]))
+    with np.errstate(invalid="ignore"):
+        bends = np.nan_to_num(np.abs(np.diff(values, n=2)), posinf=0.0)
+    starts = set[int]()
+    for i, j in pairwise(begin.tolist()):
+        most = np.argsort(-bends[i : j - 2], kind="stable")[: max(1, min(MOST_BENDS, (j - i) // 20))]
+        starts |= {min(i + k + side, j - 2) for k in most.tolist() for side in (0, 1)} if j - i > 2 else {i}
+    first, last = every[sorted(starts)], every[[k + 1 for k in sorted(starts)]]
+    a, b = (cost.values(z[:, :-1], z[:, -1]) for z in (first, last))
+    for _ in range(HALVED):
+        middle = (first + last) / 2
+        m = cost.values(middle[:, :-1], middle[:, -1])
+        left = np.abs(m - a) >= np.abs(b - m)
+        first, last = np.where(left[:, None], first, middle), np.where(left[:, None], middle, last)
+        a, b = np.where(left, a, m), np.where(left, m, b)
+    change = np.nan_to_num(np.abs(b - a), posinf=0.0)
+    i = int(np.argmax(change))
+    return float(change[i]), float(last[i, -1]), float(np.nanmax(np.abs(values), initial=0.0))
 
 
 def derivative_check(c: Certificate) -> Check:

@@ -23,6 +23,7 @@ CLAUSES = {
     "horizon": "{where} take {value} beyond the horizon, tolerance {tolerance}",
     "impact": "{where}",
     "integration": "an accurate integration from {time} misses the next in {name} by {value}, tolerance {tolerance}",
+    "jump": "{name} jumps by {value} at {time}: a derivative does not see that",
     "link": "{name} is missed by {value} in {time}, tolerance {tolerance}",
     "model": "another plant: {where}",
     "motion": "{where}",
@@ -30,6 +31,7 @@ CLAUSES = {
     "passage": "the motion goes through what {name} forbids at {time}",
     "penetration": "geometries overlap by {value} at {time}, limit {tolerance} (a quarter of {name})",
     "regulator": "the regulator of its {where} does not converge from its end",
+    "traced": "{name} with derivatives is {value} from that of plain numbers at {time}, tolerance {tolerance}",
     "start": "{where} starts {value} from x0, tolerance {tolerance}",
 }
 BETWEEN = ("between the nodes", "between the knots")

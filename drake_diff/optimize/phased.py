@@ -135,6 +135,11 @@ class PhasedSolution(Solution):
         return sum(phase.cost for phase in self.phases)
 
     @property
+    def cost_error(self) -> float:
+        """The sum of the phases' errors."""
+        return sum(phase.cost_error for phase in self.phases)
+
+    @property
     def horizon(self) -> float:
         """[s] from the first state to the last, or steps."""
         return sum(phase.horizon for phase in self.phases)

@@ -150,7 +150,13 @@ def may_be_too_coarse(solution: Solution) -> bool:
     motion = solution.transcribed
     if solution.status is not Status.CONVERGED_NOT_VERIFIED or motion is None or motion.task.is_map:
         return False
-    final = (*(what for what in ASKED if what != "cost" or not np.isfinite(solution.cost)), "overlap", "derivative")
+    final = (
+        *(what for what in ASKED if what != "cost" or not np.isfinite(solution.cost)),
+        "overlap",
+        "derivative",
+        "jump",
+        "traced",
+    )
     return all(c.passes for c in solution.plan_checks if c.plant == PLAN and c.what in final)
 
 

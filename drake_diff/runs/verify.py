@@ -373,7 +373,11 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
     fields = Compared(record.FILE)
     if again.fields:
         recorded = record.model_dump(mode="json")
-        _compare_records(fields, again.recorded or {key: recorded[key] for key in again.fields}, again.fields)
+        made = dict(again.fields)
+        if converted and "metrics" in made:  # of which it has no more than its version knew
+            names = {metric["name"] for metric in recorded["metrics"]}
+            made["metrics"] = [metric for metric in made["metrics"] if metric["name"] in names]
+        _compare_records(fields, again.recorded or {key: recorded[key] for key in again.fields}, made)
     nothing = record.subject in NOT_RERUN and not again.fields
     why = (f"every number: {NOT_RERUN[record.subject]}",) if nothing else (*UNCHECKED, *_others(record, again.written))
     compared, unchecked = [fields], [*why, *again.unchecked]

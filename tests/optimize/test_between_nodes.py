@@ -5,6 +5,7 @@ import pytest
 from helpers.plants import block
 
 import drake_diff as dd
+from drake_diff.exceptions import GradientError
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import collocated
 
@@ -139,3 +140,50 @@ def test_a_peak_of_the_cost_between_two_nodes_counts(seed):
     xs, us = np.column_stack([3 * t**2 - 2 * t**3, 6 * t * (1 - t)]), (6 - 12 * t)[:, None]
     motion = collocated(problem, "hermite_simpson", xs, us, None, 1.0, t)
     assert motion.cost == pytest.approx(12 + 40 * area / speed, rel=0.03)
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize("seed", range(4))
+def test_a_constraint_that_is_broken_within_a_narrow_range_is_seen(seed):
+    """No way from 0 to 1 m leaves out the place, or from rest to 1 m in 1 s the speed, that is forbidden."""
+    random = np.random.default_rng(seed)
+    i, at, width = int(random.integers(2)), random.uniform(0.2, 0.8), 10 ** random.uniform(-4, -3)
+    spike = dd.Constraint(lambda x: np.exp(-(((x[i] - at) / width) ** 2)), upper=0.5, name="spike")
+    t = np.linspace(0, 1, 21)
+    xs, us = np.column_stack([3 * t**2 - 2 * t**3, 6 * t * (1 - t)]), (6 - 12 * t)[:, None]
+    effort = dd.QuadraticCost(R=[[1.0]])
+    problem = dd.Problem(pushed(), x0=[0, 0], num_steps=20, running_cost=effort, constraints=spike, horizon=1.0)
+    found = violation_between_nodes(collocated(problem, "hermite_simpson", xs, us, None, 1.0, t))
+    assert found.constraint == pytest.approx(0.5, abs=0.1)
+    assert found.worst > 1
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize(
+    ("what", "cost", "jump"),
+    [
+        ("by place", lambda x, u, t: u[0] ** 2 + (5.0 if x[0] > 0.4321 else 0.0), 5.0),
+        ("by time", lambda x, u, t: u[0] ** 2 + (2.0 if t > 0.1234 else 0.0), 2.0),
+        ("beside the way", lambda x, u, t: u[0] ** 2 + (3.0 if u[0] < -6.1 else 0.0), 3.0),
+        ("a corner", lambda x, u, t: u[0] ** 2 + abs(x[1] - 1), 0.0),
+        ("steep", lambda x, u, t: u[0] ** 2 + 1e-3 * np.tanh((x[0] - 0.4321) / 1e-3), 0.0),
+    ],
+)
+def test_a_cost_that_jumps_is_reported(what, cost, jump):
+    problem = dd.Problem(pushed(), x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost, horizon=1.0)
+    solution = dd.solve(problem, options=dd.optimize.Options(refine=False))
+    (row,) = (c for c in solution.checks if c.what == "jump")
+    assert row.value == pytest.approx(jump, abs=1e-4)
+    assert row.passes == (jump == 0.0) == solution.success, (what, solution.message)
+
+
+def test_a_cost_whose_derivatives_are_of_other_values_is_refused_or_reported():
+    """1 or 2 u^2, by the kind of its numbers: everywhere, and beyond the places at which functions are tried."""
+    everywhere = lambda x, u: u[0] ** 2 * (1 + (x.dtype != float))  # noqa: E731
+    problem = dd.Problem(pushed(), x0=[0, 0], x_goal=[1, 0], num_steps=9, running_cost=everywhere, horizon=1.0)
+    with pytest.raises(GradientError, match=r"running_cost is .* with derivatives and .* with plain numbers"):
+        dd.solve(problem)
+    far = lambda x, u: u[0] ** 2 * (1 + (x.dtype != float and u[0] > 2))  # noqa: E731
+    solution = dd.solve(dd.Problem(pushed(), x0=[0, 0], x_goal=[1, 0], num_steps=9, running_cost=far, horizon=1.0))
+    assert not solution.success
+    assert [c.what for c in solution.checks.failing if c.what == "traced"]

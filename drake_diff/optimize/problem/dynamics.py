@@ -13,7 +13,7 @@ from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
+from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
 from drake_diff.mechanics.tree import tree_for
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
@@ -32,6 +32,7 @@ from drake_diff.optimize.problem.constraint import Bounds, arguments_of, carried
 SMALLEST_TRIED = 1e-3  # of a parameter's first value: where a smaller one's derivatives are certified
 SIDES = ("lower", "upper")
 UNKNOWN = "unknown"  # the unit of a number of plain dynamics
+SAME_VALUES = 1e-9  # of the largest: by what a function of numbers with derivatives may differ from that of plain ones
 PROBED = 3  # knots at which a function is tried before it is used
 ORDINARY = "a function of x and u in ordinary arithmetic and NumPy functions, without float()"
 
@@ -51,11 +52,16 @@ class Pointwise:
         try:
             with np.errstate(all="ignore"):
                 single = self.values(probe)
-                self.linearize(probe)
+                carried_values, _ = self.linearize(probe)
         except (TypeError, ValueError, IndexError, AttributeError) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(subject, got=f"{type(error).__name__}: {error}", expected=ORDINARY) from error
+        largest = SAME_VALUES * float(np.nanmax(np.abs(single), initial=0.0))
+        if not np.allclose(carried_values, single, rtol=0, atol=largest, equal_nan=True):
+            i = np.unravel_index(int(np.nanargmax(np.abs(carried_values - single))), single.shape)
+            got = f"{carried_values[i]:.6g} with derivatives and {single[i]:.6g} with plain numbers"
+            raise GradientError(f"{subject} is {got} at the same x and u: write it as {ORDINARY}")
         try:
             self.takes_columns = True
             together, _ = self.linearize(probe)
@@ -236,9 +242,7 @@ class Dynamics:
 
     def probe(self) -> Array:
         """(3, nx + nu) some knots within the bounds, to try a function at."""
-        b, rng = self.bounds, np.random.default_rng(0)
-        knots = rng.uniform(0.5, 1.5, (PROBED, self.nx + self.nu))
-        return np.clip(knots, np.concatenate([b.x_lower, b.u_lower]), np.concatenate([b.x_upper, b.u_upper]))
+        return probe_within(self.bounds)
 
     def limits(self, given: Bounds | None) -> Bounds:
         """`given` with this dynamics' own bounds where it has none, checked."""
@@ -543,6 +547,12 @@ def vectors_of(model: Model) -> list[tuple[Indices, Indices, bool]]:
             if places and moving:
                 vectors.append((np.array(places), np.array(moving), turns))
     return vectors
+
+
+def probe_within(b: Bounds) -> Array:
+    """(3, nx + nu) some knots within bounds, to try a function at."""
+    lower, upper = np.concatenate([b.x_lower, b.u_lower]), np.concatenate([b.x_upper, b.u_upper])
+    return np.clip(np.random.default_rng(0).uniform(0.5, 1.5, (PROBED, len(lower))), lower, upper)
 
 
 def units_of(problem: Any) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +11,14 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import GradientError
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.dynamics import PROBED
 from drake_diff.optimize.problem.goals import GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.transcription.collocation import Collocated
-from drake_diff.optimize.transcription.lead import SUBSTEPS
+from drake_diff.optimize.transcription.lead import MOST_PLACES, SUBSTEPS, WIDTH
+from drake_diff.optimize.transcription.task import constraint_form, values_of_many
 
 DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two knots
 # Of a number's range along the motion: how far beyond its bound it may be between nodes. The solver keeps the scheme's
@@ -103,9 +106,15 @@ def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -
         held = np.clip(np.searchsorted(times, when, side="right") - 1, 0, len(us) - 1)
         return np.array([np.interp(when, times, column) for column in xs.T]).T, us[held]
 
+    moved = np.max(np.abs(np.diff(xs, axis=0)) / spans[: xs.shape[1]], axis=1)
+    counts = np.ceil(np.clip(moved / WIDTH, 1, MOST_PLACES / len(us))).astype(np.intp)
+    dense = np.interp(np.arange(np.sum(counts)), np.append(0, np.cumsum(counts)), times)
     for c in problem.constraints:
         if c.knots is None:
-            moments, between, applied = _looked_at(c, every, *at(every), at)
+            seen = every
+            if _is_users(c):
+                seen = np.union1d(every, dense[_outside(c, *at(dense))])
+            moments, between, applied = _looked_at(c, seen, *at(seen), at)
             excess = _excess(_values(c, between, applied), c.lower, c.upper)
             through = np.any(_depth(c, between, applied, excess, spans, c.scales(xs, us, spans))[1], axis=1)
             first = int(np.argmax(through))
@@ -199,6 +208,13 @@ def _of_constraint(motion: Collocated, c: Constraint, spans: Array) -> list[_Bey
     def at(more: Array) -> tuple[Array, Array]:
         return motion.at(more)[0], motion.applied_at(more)
 
+    if _is_users(c):
+        outside = _outside(c, motion.places.points.T[:, : xs.shape[1]], motion.places.points.T[:, xs.shape[1] :])
+        more = np.setdiff1d(motion.places.times[outside], times)
+        more = more[more > (times[0] if len(times) else 0.0)]
+        every, xs = np.concatenate([times, more]), np.vstack([xs, at(more)[0]])
+        order = np.argsort(every)
+        times, xs = every[order], xs[order]
     times, xs, us = _looked_at(c, times, xs, motion.applied_at(times), at)
     values = _values(c, xs, us)
     scales = c.scales(xs, us, spans)
@@ -217,6 +233,26 @@ def _of_constraint(motion: Collocated, c: Constraint, spans: Array) -> list[_Bey
             row = _between("depth", where, float(depth[k, i]), DEPTH_TOLERANCE)
         excesses.append(_Beyond("constraint", far, float(fraction[k, i]), times[~(fraction[:, i] <= 1)], row))
     return excesses
+
+
+def _is_users(c: Constraint) -> bool:
+    """Whether nothing is known of where `c` may be broken."""
+    return not isinstance(c, GoalConstraint) and not hasattr(c.function, "linearize")
+
+
+def _outside(c: Constraint, xs: Array, us: Array) -> Any:
+    """Which of very many places in order, xs (S, nx) and us (S, nu), tell where `c` is broken.
+
+    Those are the ends and the worst place of each stretch in which it is.
+    """
+    knots = np.hstack([xs, us])
+    values = values_of_many(constraint_form(c, xs.shape[1], knots[:: max(1, len(knots) // PROBED)]), knots)
+    excess = np.max(_excess(values, c.lower, c.upper), axis=1)
+    rows = np.flatnonzero(excess > SOLVED)
+    telling = set[int]()
+    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []:
+        telling |= {max(run[0] - 1, 0), int(run[np.argmax(excess[run])]), min(run[-1] + 1, len(xs) - 1)}
+    return sorted(telling)
 
 
 def _values(c: Constraint, xs: Array, us: Array) -> Array:

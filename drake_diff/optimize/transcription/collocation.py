@@ -23,7 +23,7 @@ from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearance
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome, Report
-from drake_diff.optimize.transcription.lead import SUBSTEPS, Lead, Within
+from drake_diff.optimize.transcription.lead import SUBSTEPS, Lead, Places, Within
 from drake_diff.optimize.transcription.task import OptimalControl, Scheme
 
 SLOPED = np.linspace(0, 1, 11)  # where slopes are looked at within an interval, its ends among them
@@ -327,6 +327,11 @@ class Collocated:
         return self._within.states
 
     @cached_property
+    def places(self) -> Places:
+        """Where the functions of users are looked at between the knots."""
+        return Places(self, self._held)
+
+    @cached_property
     def _within(self) -> Within:
         return Within(self, self._held)
 
@@ -339,6 +344,7 @@ class Collocated:
         same = all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
         if same and self.task.scheme is other.task.scheme and "_within" in vars(other):
             vars(self)["_within"] = other._within
+            vars(self).update({"places": other.places} if "places" in vars(other) else {})
 
     @property
     def inputs(self) -> Array:

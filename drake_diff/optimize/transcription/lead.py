@@ -44,6 +44,8 @@ class Motion(Protocol):
     @property
     def cost_scale(self) -> float: ...
     @property
+    def places(self) -> "Places": ...
+    @property
     def input_limits(self) -> tuple[Array, Array]: ...
     def between(self, k: Any, tau: Array) -> tuple[Array, Array]: ...
     def cut_off(self, us: Array) -> Array: ...
@@ -73,7 +75,7 @@ class Places:
         theta = (part % 2 + inside) / 2
         self.counts, self.starts = counts.reshape(-1, 2).sum(axis=1), starts[::2]
         self.dt = np.repeat(np.repeat(motion.lengths / parts, parts) / counts, counts)
-        self.times = motion.times(part // parts, (part % parts + inside) / parts) if motion.task.is_timed else theta
+        self.times = motion.times(part // parts, (part % parts + inside) / parts)
         first = (2 * SUBSTEPS + 1) * np.arange(count)[:, None] + 2 * np.arange(SUBSTEPS)
         self._ends = [(first + i).ravel() for i in range(3)]
         self._weights = (1 - theta) * (1 - 2 * theta), 4 * theta * (1 - theta), theta * (2 * theta - 1)
@@ -151,7 +153,7 @@ class Within:
         functions = [f for f in (task.user_dynamics, task.user_rate) if f is not None]
         if not functions:
             return none, none
-        places = Places(motion, self.held)
+        places = motion.places
         self.width = places.width
         count, halves = len(motion.lengths), 2 * SUBSTEPS + 1
         base = self.held.reshape(count * halves, -1)

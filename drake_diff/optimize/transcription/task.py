@@ -29,6 +29,7 @@ from drake_diff.model.parameters import ParameterCoordinates
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import (
     ConstantCost,
+    CostToGo,
     QuadraticCost,
     SumOfCosts,
     TimedCost,
@@ -187,13 +188,79 @@ def values_of_many(form: Any, points: Array) -> Array:
     return np.asarray(form.values(points) if isinstance(expression, Refusal) else Traced(expression).values(points))
 
 
+def constraint_form(c: Constraint, nx: int, probe: Array) -> Pointwise:
+    """What a constraint limits at knots [x, u]; `probe` (3, nx + nu) are some. GradientError where it has no slope."""
+    function: Any = c.function if c.takes_input else lambda x, u: c.function(x)
+    size = len(c.lower)
+    return Pointwise(
+        f"constraint {c.label}",
+        lambda x, u: np.asarray(function(x, u)).reshape(size, *x.shape[1:]),
+        nx,
+        (size,),
+        probe,
+    )
+
+
+def user_rate(problem: Problem, probe: Array) -> AtPlaces | None:
+    """See `OptimalControl.user_rate`; `probe` (3, nx + nu) are knots to try functions at."""
+    parts = [_tracking(cost, problem.nx) for cost in _parts_of(problem.total_running_cost) if _is_table(cost)]
+    parts += [part.values_of_many for part in user_costs(problem, probe)]
+    return None if not parts else lambda knots, times: np.asarray(sum(part(knots, times) for part in parts))
+
+
+def _is_table(cost: Any) -> bool:
+    return isinstance(cost, TrackingCost)
+
+
+def _tracking(cost: TrackingCost, nx: int) -> AtPlaces:
+    return lambda knots, times: cost.along(times)(knots[:, :nx], knots[:, nx:])[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class UserCost:
+    """A function of the user that is a part of the cost, "running" or "final", of knots [x, u] and times [s]."""
+
+    name: str
+    form: Pointwise
+    points: Callable[[Array, Array], Array]  # what `form` takes of knots and times
+
+    def values(self, knots: Array, times: Array) -> Array:
+        """(K,) as the function is called."""
+        return self.form.values(self.points(knots, times))[:, 0]
+
+    def values_of_many(self, knots: Array, times: Array) -> Array:
+        """(K, 1) as `values_of_many`."""
+        return values_of_many(self.form, self.points(knots, times))
+
+
+def user_costs(problem: Problem, probe: Array, *, final: bool = False) -> list[UserCost]:
+    """The functions of the user in the running cost and, where they are asked for, in the final cost."""
+    nx, nu, costs = problem.nx, problem.nu, list[UserCost]()
+    for cost in _parts_of(problem.total_running_cost):
+        if isinstance(cost, TimedCost) and not _is_table(cost):
+            timed = TimedRate(cost, nx, nu, probe)
+            costs.append(UserCost("running cost", timed.inner, timed.with_known))
+        elif not _is_table(cost):
+            costs.append(
+                UserCost("running cost", Pointwise("running_cost", cost, nx, (), probe), lambda knots, _: knots)
+            )
+    for cost in _parts_of(problem.total_final_cost) if final else ():
+        form = Pointwise("final_cost", _of_state(cost), nx, (), probe)
+        costs.append(UserCost("final cost", form, lambda knots, _: knots))
+    return costs
+
+
+def _of_state(cost: Any) -> Callable[[Any, Any], Any]:
+    return lambda x, u: cost(x)
+
+
 def _parts_of(cost: Any) -> list[Any]:
     """The terms of a running cost of which nothing is known."""
     if isinstance(cost, SumOfCosts):
         return [part for term in cost.costs for part in _parts_of(term)]
     if isinstance(cost, WithGoals):
         return _parts_of(cost.own)
-    return [] if cost is None or isinstance(cost, (ConstantCost, QuadraticCost)) else [cost]
+    return [] if cost is None or isinstance(cost, (ConstantCost, CostToGo, QuadraticCost)) else [cost]
 
 
 class OptimalControl:
@@ -298,20 +365,7 @@ class OptimalControl:
     @cached_property
     def user_rate(self) -> AtPlaces | None:
         """(S, 1) what functions and tables of the user are of the running cost; None where there are none."""
-        parts = (
-            [self._user_part(cost) for cost in _parts_of(self.problem.total_running_cost)] if not self.is_map else []
-        )
-        return None if not parts else lambda knots, times: np.asarray(sum(part(knots, times) for part in parts))
-
-    def _user_part(self, cost: Any) -> AtPlaces:
-        nx, nu, probe = self.dynamics.nx, self.dynamics.nu, self.dynamics.probe()
-        if isinstance(cost, TrackingCost):
-            return lambda knots, times: cost.along(times)(knots[:, :nx], knots[:, nx:])[:, None]
-        if isinstance(cost, TimedCost):
-            timed = TimedRate(cost, nx, nu, probe)
-            return lambda knots, times: values_of_many(timed.inner, timed.with_known(knots, times))
-        plain = Pointwise("running_cost", cost, nx, (), probe)
-        return lambda knots, times: values_of_many(plain, knots)
+        return None if self.is_map else user_rate(self.problem, self.dynamics.probe())
 
     def rates(self, knots: Array, times: Array) -> Array:
         """(K,) the running cost at `knots` (K, nx + nu) and `times` (K,) [s]."""
