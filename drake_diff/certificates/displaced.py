@@ -6,16 +6,18 @@ asking the policy alone; what they do to the gradient, rollouts tell.
 
 A loss or a policy may be a staircase: rounding, a table or a whole number make a function that is flat, or nearly so,
 between jumps. Its derivative is true and worthless, and where the steps are wide no difference of a rollout meets one.
-The function alone can be asked far from the motion at next to no cost, along one line, over lengths from 1e-4 to 10
-times the scale.
+The function alone can be asked far from the motion at next to no cost, over lengths from 1e-4 to 10 times the scale:
+along one line, and a policy along each state. One jump of a policy alone, a switch, matters where the motion passes it.
 """
 
 import pickle
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from io import BytesIO
+from itertools import pairwise
 from types import CellType, FunctionType, MethodType
 from typing import Any
 
@@ -244,6 +246,9 @@ class ProbeOptions:
     remains: float = 0.125  # and those of a jump by as much as before
     rounded: float = 1e-12  # of the largest value: a smaller jump is its rounding
     spread: float = 1e-6  # of what values differ by: the same
+    moves: float = 1e-9  # of the largest state: a smaller step is rounding
+    single_parameters: int = 8  # of the policy that are asked alone
+    wide: int = 2  # lengths that are left out there, as the line through all has met steps so small
     single: float = 5e-7  # of an input: single precision is no staircase
 
 
@@ -368,46 +373,109 @@ def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
 
 
 def stairs_of_policy(policy: Callable[..., Array], g: RolloutGradient, space: TangentSpace, time_step: float) -> str:
-    """How the policy alone jumps around three states of the motion of `g`; empty where it is no staircase."""
-    asked, nu = fresh(policy), g.us.shape[1]
-    weight = line(nu, LINE)
-    for k in sorted({0, len(g.us) // 2, len(g.us) - 1}):
-        x, t, direction = g.xs[k], float(k * time_step), line(space.size, LINE)
+    """How the policy alone jumps around the motion of `g`; empty where it does not.
 
-        def u(s: float, x: Array = x, t: float = t, direction: Array = direction) -> Array:
-            return np.asarray(asked(space.plus(x, s * direction), t), dtype=float)
-
-        def along(s: float, u: Callable[[float], Array] = u) -> float:
-            return float(weight @ u(s))
-
-        if jump := _stairs(along, ASK.single * float(np.abs(g.us[k]).sum())):
-            change = u(jump[1]) - u(jump[0])
-            i = int(np.argmax(np.abs(change)))
-            return (
-                f"the policy is a staircase: at t = {t:g} s, of {ASK.cells} parts of a line through x {jump[2]} jump, "
-                f"u[{i}] by {change[i]:.3g} at {jump[0]:.3g}"
-            )
-    return ""
+    It jumps where it is a staircase at three states of the motion, along a line and each state and parameter alone; and
+    where it is switched by the motion: on the way from a state to the next, or beyond the farthest of each state by as
+    much as the motion moves it in a step. A switch farther away does no harm.
+    """
+    probe = _PolicyProbe(fresh(policy), g, space, time_step)
+    return next((text for text in (*probe.staircases(), *probe.switches()) if text), "")
 
 
-def _stairs(f: Callable[[float], float], least: float) -> tuple[float, float, int] | None:
+@dataclass(frozen=True)
+class _PolicyProbe:
+    """Asks a policy along lines through the states of the motion of `g`."""
+
+    policy: Any
+    g: RolloutGradient
+    space: TangentSpace
+    time_step: float
+
+    def staircases(self) -> Iterator[str]:
+        """At the first state, the middle one and the last along one line; at the middle one along each variable."""
+        size, parameters, middle = self.space.size, policy_parameters(self.policy), len(self.g.us) // 2
+        scale = np.concatenate([np.ones(size), np.maximum(1.0, np.abs(parameters))])
+        through, all_parameters = np.append(line(size, LINE), 0 * parameters), np.append(np.zeros(size), 0 * parameters)
+        for k in sorted({0, middle, len(self.g.us) - 1}):
+            yield self._staircase(k, through, "a line through x")
+        all_parameters[size:] = line(len(parameters), LINE)
+        names = (*self.space.names, *(f"its parameter {i}" for i in range(len(parameters))))
+        single = list(zip(np.eye(len(scale)), names, strict=True))[: size + ASK.single_parameters]
+        for way, name in (*single, *[(all_parameters, "a line through its parameters")] * bool(len(parameters))):
+            yield self._staircase(middle, way * scale, name, LENGTHS[ASK.wide :])
+
+    def switches(self) -> Iterator[str]:
+        """On the way from state to state, and beyond the extremes of each."""
+        xs, none = self.g.xs, np.zeros(len(policy_parameters(self.policy)))
+        steps = np.array([self.space.minus(after, x) for x, after in pairwise(xs)])
+        moves = np.max(np.abs(steps), axis=1) > ASK.moves * np.max(np.abs(xs))
+        for k in np.flatnonzero(moves).tolist():
+            yield self._switch(k, np.append(steps[k], none), "to the next state")
+        at = np.cumsum(np.vstack([np.zeros((1, self.space.size)), steps]), axis=0)[:-1]
+        for i, (name, reach) in enumerate(zip(self.space.names, np.max(np.abs(steps), axis=0), strict=True)):
+            for sign in (1.0, -1.0) if reach > ASK.moves * np.max(np.abs(xs)) else ():
+                k, way = int(np.argmax(sign * at[:, i])), np.zeros(self.space.size + len(none))
+                way[i] = sign * reach
+                yield self._switch(k, way, f"{name} by {sign * reach:.3g}")
+
+    def _staircase(self, k: int, way: Array, name: str, lengths: Sequence[float] = LENGTHS) -> str:
+        jump = _stairs(self._along(k, way), self._least(k), lengths)
+        where = f"of {ASK.cells} parts of {name} {jump[2]} jump, " if jump else ""
+        return f"the policy is a staircase: {self._told(k, way, jump[:2], where)} at {jump[0]:.3g}" if jump else ""
+
+    def _switch(self, k: int, way: Array, name: str) -> str:
+        least = max(self._least(k), ASK.rounded * float(np.abs(self.g.us).max()))
+        with np.errstate(all="ignore"), suppress(*OUTSIDE):
+            jumps = _jumps(self._along(k, way), np.linspace(0.0, 1.0, ASK.cells // 2 + 1), least)
+            if jumps:
+                return f"the policy jumps: {self._told(k, way, jumps[0])} on the way from there {name}"
+        return ""
+
+    def _told(self, k: int, way: Array, jump: Jump, where: str = "") -> str:
+        change = self._u(k, way, jump[1]) - self._u(k, way, jump[0])
+        i = int(np.argmax(np.abs(change)))
+        return f"at t = {k * self.time_step:g} s, {where}u[{i}] by {change[i]:.3g}"
+
+    def _least(self, k: int) -> float:
+        return ASK.single * float(np.abs(self.g.us[k]).sum())
+
+    def _along(self, k: int, way: Array) -> Callable[[float], float]:
+        weight = line(self.g.us.shape[1], LINE)
+        return lambda s: float(weight @ self._u(k, way, s))
+
+    def _u(self, k: int, way: Array, s: float) -> Array:
+        """(nu,) at a displacement `s` times `way` (size + parameters,) from the state at step k."""
+        by_state, by_parameters = np.split(s * way, [self.space.size])
+        asked = self.policy
+        if np.any(by_parameters):
+            asked = with_parameters(asked, policy_parameters(asked) + by_parameters)
+        return np.asarray(asked(self.space.plus(self.g.xs[k], by_state), k * self.time_step), dtype=float)
+
+
+def _stairs(
+    f: Callable[[float], float], least: float, lengths: Sequence[float] = LENGTHS
+) -> tuple[float, float, int] | None:
     """Where a function of one number jumps first, from and to, and in how many cells; None where it is no staircase."""
     with np.errstate(all="ignore"):
-        for length in LENGTHS:
-            ends = np.linspace(-length, length, ASK.cells + 1)
+        for length in lengths:
             try:
-                values = np.array([f(float(s)) for s in ends])
-                threshold = max(least, ASK.rounded * float(np.max(np.abs(values))), ASK.spread * float(np.ptp(values)))
-                if not np.max(np.abs(np.diff(values, 3))) > threshold:  # which is nothing where a function is smooth
-                    continue
-                jumps = [
-                    jump for i in range(ASK.cells) if (jump := _jump(f, ends[i : i + 2], values[i : i + 2], threshold))
-                ]
+                jumps = _jumps(f, np.linspace(-length, length, ASK.cells + 1), least)
             except OUTSIDE:
                 return None
             if len(jumps) >= ASK.stairs:
                 return *jumps[0], len(jumps)
     return None
+
+
+def _jumps(f: Callable[[float], float], ends: Array, least: float) -> list[Jump]:
+    """Where a function of one number jumps, of each cell between `ends` (c + 1,) the largest jump."""
+    values = np.array([f(float(s)) for s in ends])
+    threshold = max(least, ASK.rounded * float(np.max(np.abs(values))), ASK.spread * float(np.ptp(values)))
+    if not np.max(np.abs(np.diff(values, 3))) > threshold:  # which is nothing where a function is smooth
+        return []
+    cells = (_jump(f, ends[i : i + 2], values[i : i + 2], threshold) for i in range(len(ends) - 1))
+    return [jump for jump in cells if jump]
 
 
 def _jump(f: Callable[[float], float], ends: Array, values: Array, least: float) -> Jump | None:

@@ -7,7 +7,8 @@ loss and scales of it from 1e-12 to 1e8; free, and with feet on the ground by th
   and states, inputs, parameters of the policy and of the model left out, negated, or with two entries swapped.
 - Entry by entry: small robots, for which every column is a rollout or 26.
 - Policies with a fault each: parameters or states of which some are plain numbers, a derivative that is stated 8 % off,
-  a memory by time. Staircases in the loss or in the policy, of steps from 1e-5 to 0.1.
+  a memory by time. Staircases in the loss or in the policy, of steps from 1e-5 to 0.1; a switch of the policy in one
+  state, which the first step passes, or 3 beyond the start, which is no fault.
 """
 
 import dataclasses
@@ -30,6 +31,7 @@ FIXED = ("z1.urdf", "xarm7.urdf", "finger_edu.urdf", "so100.urdf", "panda.urdf")
 SMALL = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml")
 SCALES = (1e-12, 1e-8, 1e-4, 1.0, 1e8)
 FAULTS = ("detached parameter", "detached state", "wrong by hand", "memory", "loss in steps", "policy in steps")
+SWITCHES = ("switch in steps", "switch far away")
 KNOTS = 100
 PLANTED = 3  # in each plan
 
@@ -152,6 +154,8 @@ def wrong_plan(plan, fault, random):
     column = int(random.integers(nx))
     step = 10 ** random.uniform(-5, -1)
     seen = {}
+    move = dd.step(plan.model, x0, 0.3 * gains.sum(axis=1))[column] - x0[column]
+    switch = x0 + (move / 2 if fault == "switch in steps" else 3 * np.sign(move))
 
     def policy(x, t, p):
         d, values = x - x0 + 0.3, p.reshape(nu, nx)
@@ -167,6 +171,8 @@ def wrong_plan(plan, fault, random):
         elif fault == "policy in steps":
             d = step * np.array([np.round(float(entry) / step) for entry in plain(d)]) + (d - plain(d))
         u = values @ d
+        if fault in SWITCHES:
+            u = u + 0.5 * ((plain(x) - switch)[column] * move > 0)
         return by_hand(x, p, d, values, column) if fault == "wrong by hand" else u
 
     def loss(xs, us):
@@ -211,7 +217,7 @@ def measure(seed, count):
         for i in range(count):
             by_directions(random, i, add)
             entry_by_entry(random, i, add)
-            faults(random, FAULTS[i % len(FAULTS)], add)
+            faults(random, (FAULTS + SWITCHES)[i % (len(FAULTS) + len(SWITCHES))], add)
     bounds = {
         "false alarms": (0.01, False),
         "undecided": (0.03, False),
@@ -263,6 +269,9 @@ def faults(random, fault, add):
     for name, more in (("entry by entry", {}), ("20 rollouts", {"sampled": True})):
         try:
             verdict = plan.certificate(**more).verdict
+            if fault == "switch far away":
+                add(f"{name}: false alarms of a policy that switches far away", verdict != "agree")
+                continue
         except SimulationError:
             return
         except GradientError:

@@ -304,6 +304,47 @@ def test_a_switch_far_away_clipping_and_single_precision_are_no_staircase(load):
     assert "staircase" not in str(certified(load("cart_pole.urdf"), single, sampled=True))
 
 
+@pytest.mark.slow
+@each_row("state", range(4))
+@each_row("kind", ["threshold", "sign", "two steps of rounding"])
+def test_a_policy_that_switches_between_two_states_of_the_motion_is_discontinuous(load, state, kind):
+    """The switch stands halfway on the first step, whose input it does not change, so that the motion passes it."""
+    model = load("cart_pole.urdf")
+    after = dd.step(model, X0, feedback(X0, 0.0, GAINS))
+    half, move = (X0[state] + after[state]) / 2, after[state] - X0[state]
+
+    def jump(y):
+        if kind == "two steps of rounding":  # at y = 0 and far away: round(10 x) / 10, cut off
+            return np.clip(np.round(y * np.sign(move) / 10 + 0.5), 0, 2)
+        return float(y * move > 0) if kind == "threshold" else (np.sign(y * move) + 1) / 2
+
+    def policy(x, t, p):
+        return feedback(x, t, p) + 0.5 * jump(plain(x)[state] - half)
+
+    for sampled in (False, True):
+        found = certified(model, policy, sampled=sampled)
+        assert found.verdict == "discontinuous"
+        assert "the policy jumps: at t = 0 s, u[0] by " in str(found)
+        assert "on the way from there to the next state" in str(found)
+
+
+def test_a_policy_is_asked_along_each_state_and_parameter(load):
+    """A rounded state that others saturate on any line through them, and a rounded parameter."""
+    model, x0 = load("cart_pole.urdf"), np.zeros(4)
+
+    def of_a_state(x, t, p):
+        others = np.abs(plain(x)[[0, 1, 3]]).max() < 1e-3
+        return np.array([-p @ x + others * rounded(x, 0.1)[2]])
+
+    def of_a_parameter(x, t, p):
+        return np.array([-p @ x + rounded(p, 0.01)[2]])
+
+    for function, words in ((of_a_state, "parts of slide_v "), (of_a_parameter, "parts of its parameter 2 ")):
+        policy = ParametricPolicy(function, GAINS)
+        g = dd.differentiate_rollout(model, x0, None, end, policy=policy, num_steps=3)
+        assert words in stairs_of_policy(policy, g, tangent_space(model), model.time_step)
+
+
 def test_an_input_that_is_nothing_but_rounding_is_no_staircase(load):
     """Feedback around x0 itself: near it u is a rounded difference of numbers of size 1."""
     model, random = load("acrobot.xml"), np.random.default_rng(3)
