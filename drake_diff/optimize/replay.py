@@ -37,7 +37,7 @@ from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.problem.goals import GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, along_steps, clearances
-from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.problem import GOAL_PART, Problem
 from drake_diff.optimize.problem.terminal import TerminalConstraint
 from drake_diff.optimize.transcription.collocation import EFFORT_WEIGHT, FINAL_WEIGHT
 
@@ -471,10 +471,15 @@ def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, s
 
 
 def goal_check(plan: ReplayPlan, distance: Array, fraction: float = STATE_TOLERANCE) -> Check:
-    """The `distance` (nx,) from the goal of the state that is furthest from it, of that part of its range."""
-    i = int(np.argmax(np.nan_to_num(np.abs(distance) / plan.scale, nan=np.inf)))
-    name, unit = plan.problem.state_names[i], units_of(plan.problem)[i]
-    return check("goal", name, abs(distance[i]), fraction * plan.scale[i], unit)
+    """The `distance` (nx,) from the goal of the state that is furthest from it for its tolerance.
+
+    That is the problem's `goal_tolerance` where it is given, else the `fraction` of what the state has to travel.
+    """
+    problem = plan.problem
+    tolerances = problem.goal_tolerances(plan.sample(1)[0])
+    tolerances = tolerances * np.where(problem.has_goal_tolerance, 1.0, fraction / GOAL_PART)
+    i = int(np.argmax(np.nan_to_num(np.abs(distance) / tolerances, nan=np.inf)))
+    return check("goal", problem.state_names[i], abs(distance[i]), tolerances[i], units_of(problem)[i])
 
 
 def bounds_check(plan: ReplayPlan, motion: MeasuredMotion, wider: float = 1.0) -> Check:

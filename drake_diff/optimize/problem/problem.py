@@ -505,8 +505,13 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         for q, v, _ in self._vectors:
             way[q], way[v] = np.max(way[q]), np.max(way[v])
         tolerances = GOAL_PART * np.where(way > STILL * scales, way, scales)
-        given = np.nan if self.goal_tolerance is None else self.goal_tolerance
-        return np.where(np.isnan(given), tolerances, given)
+        given = tolerances if self.goal_tolerance is None else self.goal_tolerance
+        return np.where(self.has_goal_tolerance, given, tolerances)
+
+    @property
+    def has_goal_tolerance(self) -> Array:
+        """(nx,) whether `goal_tolerance` is given for each state."""
+        return ~np.isnan(np.full(self.nx, np.nan) if self.goal_tolerance is None else self.goal_tolerance)
 
     @cached_property
     def _vectors(self) -> list[tuple[Indices, Indices, bool]]:
