@@ -59,7 +59,8 @@ FINE = 8  # parts of a step: what is left of an error of O(h) from there on is a
 FINER, FINEST = 16, 64
 MOST_STEPS = 4000  # of a replay in more than FINER parts of an interval
 ANOTHER_INTEGRATION = "by another integration in continuous time"
-OPEN_LOOP, FEEDBACK = "open loop", "TVLQR"
+OPEN_LOOP, FEEDBACK, GAINS_ALONE = "open loop", "TVLQR", "TVLQR without offsets"
+ROUGHLY = 0.1  # of what a state has to travel, and twice every other tolerance, under gains alone: any such regulator
 BROKEN = (SimulationError, ModelError, GradientError, ValueError)
 
 
@@ -276,7 +277,11 @@ def _replay_in(
     plan: ReplayPlan, variant: str, make: Callable[[], Model], parts: int, known: Rollout | None = None
 ) -> list[Replay]:
     """Both replays in one variant of the plant; open loop, whose motion may be `known`, alone without inputs."""
-    controls = {OPEN_LOOP: known, FEEDBACK: None} if plan.problem.model.nu else {OPEN_LOOP: known}
+    controls: dict[str, Rollout | None] = {OPEN_LOOP: known}
+    if plan.problem.model.nu:
+        controls[FEEDBACK] = None
+        if parts > 1 and not plan.continuous and "contact" not in variant:
+            controls[GAINS_ALONE] = None
     try:
         model = make()
         with applied(select(model, plan.vector.to_dict())) as set_model:
@@ -295,6 +300,8 @@ def _replay(plan: ReplayPlan, variant: str, control: str, model: Model, parts: i
             motion = _rolled(plan.problem, model, xs[0], us, len(us))
         else:
             gains = np.repeat(plan.own_gains, parts, axis=0) if law_is_another else plan.gains(parts)
+            if control == GAINS_ALONE:
+                gains = regulator(plan, model, xs, us).gains
             motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us, gains), len(us))
     except BROKEN as error:
         return missing_replay(plan, variant, control, str(error))
@@ -302,7 +309,9 @@ def _replay(plan: ReplayPlan, variant: str, control: str, model: Model, parts: i
     fraction = STATE_TOLERANCE if control == OPEN_LOOP or law_is_another else FEEDBACK_TOLERANCE
     if variant == plan.own_plant:
         fraction = SAME
-    checks = [*motion_checks(plan, model, motion, parts, fraction)]
+    if control == GAINS_ALONE:
+        fraction = ROUGHLY
+    checks = [*motion_checks(plan, model, motion, parts, fraction, 2.0 if control == GAINS_ALONE else 1.0)]
     if plan.continuous or parts == FINE or not model.can_rebuild:  # a coarse step gains and loses some, an artefact all
         checks.append(energy_check(motion))
     return measured_replay(plan, variant, control, model, motion, checks)

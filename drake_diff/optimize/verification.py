@@ -13,7 +13,7 @@ from drake_diff.optimize.checks import PLAN, Check, Checks
 from drake_diff.optimize.measure import ASKED
 from drake_diff.optimize.messages import headline
 from drake_diff.optimize.program import NlpResult, Outcome
-from drake_diff.optimize.replay import OPEN_LOOP, Replay, deciding
+from drake_diff.optimize.replay import FEEDBACK, GAINS_ALONE, OPEN_LOOP, Replay, deciding
 from drake_diff.optimize.solution import Solution, Status
 
 FINER = "pass refine=True, or take more steps (num_steps)"
@@ -58,7 +58,11 @@ def trials(s: Solution) -> list[list[Trial]]:
     plants = [following] if following else []
     if s.problem.has_model:
         variants = deciding(s.plan, s.replays)
-        plants += [[_trial(r) for r in s.replays if r.variant == variant] for variant in variants]
+        for v in variants:
+            rows = [r for r in s.replays if r.variant == v]
+            plants.append([_trial(r) for r in rows if r.control != GAINS_ALONE])
+            if any(r.control == GAINS_ALONE for r in rows):  # open loop, or under each of the two
+                plants.append([_trial(r) for r in rows if r.control != FEEDBACK])
     if plants and s.method == "shooting" and s.scheme == "step":
         plants[0] = [trial for trial in plants[0] if trial.feedback is None]
     return plants

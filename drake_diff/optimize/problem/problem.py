@@ -57,6 +57,7 @@ OPTIMIZABLE = ("controls", "initial_state", "parameters")
 SMALLEST_PART = 1e-3
 SAME_STATE = 1e-6  # [the coupling's unit] of states that are typed by hand
 STILL = 1e-6  # of a state's largest magnitude, or of a radian: what moves less stands still
+RETURNS = 0.1
 GOAL_PART = 0.01  # of what a state has to travel: how far from its goal it may end where nothing else is given
 TRIED, NO_SLOPE = 3, 1e-9  # states at which a goal's slopes are looked at, and what counts as none: rounding
 
@@ -496,7 +497,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
     def goal_tolerances(self, xs: Array) -> Array:
         """(nx,) how far from the goal each state may end: as given, else 1 % of what it has to travel.
 
-        That is the range of its values at x0, waypoints and goal, and where these are one its own along xs (M, nx).
+        That is the range of its values at x0, waypoints and goal. A state that returns to where it was, to RETURNS of
+        its range along xs (M, nx), travels that range: a velocity from rest to rest.
         """
         scales = self.state_scales(xs)
         way = _spread(
@@ -504,7 +506,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         )
         for q, v, _ in self._vectors:
             way[q], way[v] = np.max(way[q]), np.max(way[v])
-        tolerances = GOAL_PART * np.where(way > STILL * scales, way, scales)
+        tolerances = GOAL_PART * np.where(way > RETURNS * scales, way, scales)
         given = tolerances if self.goal_tolerance is None else self.goal_tolerance
         return np.where(self.has_goal_tolerance, given, tolerances)
 
