@@ -60,7 +60,7 @@ FINER, FINEST = 16, 64
 MOST_STEPS = 4000  # of a replay in more than FINER parts of an interval
 ANOTHER_INTEGRATION = "by another integration in continuous time"
 OPEN_LOOP, FEEDBACK, GAINS_ALONE = "open loop", "TVLQR", "TVLQR without offsets"
-ROUGHLY = 0.1  # of what a state has to travel, and twice every other tolerance, under gains alone: any such regulator
+ROUGHLY = 4.0  # times the tolerances of a replay are allowed under gains alone, which stand for any such regulator
 BROKEN = (SimulationError, ModelError, GradientError, ValueError)
 
 
@@ -310,8 +310,8 @@ def _replay(plan: ReplayPlan, variant: str, control: str, model: Model, parts: i
     if variant == plan.own_plant:
         fraction = SAME
     if control == GAINS_ALONE:
-        fraction = ROUGHLY
-    checks = [*motion_checks(plan, model, motion, parts, fraction, 2.0 if control == GAINS_ALONE else 1.0)]
+        fraction = ROUGHLY * STATE_TOLERANCE
+    checks = [*motion_checks(plan, model, motion, parts, fraction, ROUGHLY if control == GAINS_ALONE else 1.0)]
     if plan.continuous or parts == FINE or not model.can_rebuild:  # a coarse step gains and loses some, an artefact all
         checks.append(energy_check(motion))
     return measured_replay(plan, variant, control, model, motion, checks)

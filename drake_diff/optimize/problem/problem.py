@@ -57,7 +57,8 @@ OPTIMIZABLE = ("controls", "initial_state", "parameters")
 SMALLEST_PART = 1e-3
 SAME_STATE = 1e-6  # [the coupling's unit] of states that are typed by hand
 STILL = 1e-6  # of a state's largest magnitude, or of a radian: what moves less stands still
-RETURNS = 0.1
+RETURNS = 0.1  # of its range along a plan: what has to travel less returns to where it was
+STAYS = 1e-2  # of its bounds, or of a radian: what a state moves that need not travel
 GOAL_PART = 0.01  # of what a state has to travel: how far from its goal it may end where nothing else is given
 TRIED, NO_SLOPE = 3, 1e-9  # states at which a goal's slopes are looked at, and what counts as none: rounding
 
@@ -431,17 +432,21 @@ class Problem(PicklesItsFields, ShowsItsRepr):
     def state_scales(self, xs: Array) -> Array:
         """(nx,) how far each state goes along xs (M, nx), the scale of its tolerances, in its unit.
 
-        That is its own range; of a joint of several directions, that of the one which moves most. A state that stands
-        still has 1e-6 of its largest magnitude, what is asked of it among them, or of a radian, and its velocity that
-        over the horizon; where all that is 0, of its bound.
+        That is its own range; of a joint of several directions, that of the one which moves most. A state that is not
+        asked to travel has at least STAYS of its bounds, or of a radian, and its velocity that over the horizon. One
+        that stands still has 1e-6 of its largest magnitude; where all that is 0, of its bound.
         """
         asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
         scales, least = np.ptp(xs, axis=0), STILL * np.max(np.nan_to_num(np.abs(asked)), axis=0)
+        way, room = self._way(xs), self.bounds.x_upper - self.bounds.x_lower
+        room[~np.isfinite(room)] = 0.0
         for q, v, turns in self._vectors:
             for places in (q, v):
                 scales[places], least[places] = np.max(scales[places]), np.max(least[places])
-            least[q] = np.maximum(least[q], STILL * turns)
-            least[v] = np.maximum(least[v], least[q[0]] / self.start_horizon)
+                room[places] = np.max(room[places])
+            room[q] = np.where(room[q] > 0, room[q], float(turns))
+            room[v] = np.where(room[v] > 0, room[v], room[q[0]] / self.start_horizon)
+        least = np.maximum(least, np.where(way == 0, STAYS * room, 0.0))
         return _not_zero(np.maximum(scales, least), self.bounds.x_lower, self.bounds.x_upper)
 
     def input_scales(self, us: Array) -> Array:
@@ -501,14 +506,18 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         its range along xs (M, nx), travels that range: a velocity from rest to rest.
         """
         scales = self.state_scales(xs)
-        way = _spread(
-            np.vstack([np.where(self.initial_state_mask, xs[0], self.x0), *self.waypoints.values(), self.goal])
-        )
-        for q, v, _ in self._vectors:
-            way[q], way[v] = np.max(way[q]), np.max(way[v])
+        way = self._way(xs)
         tolerances = GOAL_PART * np.where(way > RETURNS * scales, way, scales)
         given = tolerances if self.goal_tolerance is None else self.goal_tolerance
         return np.where(self.has_goal_tolerance, given, tolerances)
+
+    def _way(self, xs: Array) -> Array:
+        """(nx,) the range of what is asked of each state at x0, waypoints and goal; a joint's directions share it."""
+        x0 = np.where(self.initial_state_mask, xs[0], self.x0)
+        way = _spread(np.vstack([x0, *self.waypoints.values(), self.goal]))
+        for q, v, _ in self._vectors:
+            way[q], way[v] = np.max(way[q]), np.max(way[v])
+        return way
 
     @property
     def has_goal_tolerance(self) -> Array:
