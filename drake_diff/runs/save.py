@@ -416,5 +416,6 @@ def _with_the_search(made: PlanRecord, record: PlanRecord) -> PlanRecord:
         "wall_clock": made.wall_clock.model_copy(update={"duration_s": record.wall_clock.duration_s}),
     }
     if made.gradient is not None and record.gradient is not None:
-        content["gradient"] = made.gradient.model_copy(update={"certificates": record.gradient.certificates})
+        given = {name: getattr(record.gradient, name) for name in ("columns", "certificates")}
+        content["gradient"] = made.gradient.model_copy(update=given)
     return made.model_copy(update=content)

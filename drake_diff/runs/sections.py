@@ -91,7 +91,9 @@ def _search(solution: Solution) -> dict[str, Any] | None:
 
 def found(solution: Solution, *, measured: bool = True) -> dict[str, Any]:
     """The sections that say how a solution was found; norms of gradients take time, and are of what is `measured`."""
-    gradient = _gradient(solution) if measured else GradientEvidence(reason="not measured yet")
+    gradient = (
+        _gradient(solution) if measured else GradientEvidence(reason="not measured yet", columns=_columns(solution))
+    )
     certificates = [gradient_evidence(c) for c in solution.certificates]
     return {
         "solver": solver_of(solution, measured=measured),
@@ -128,23 +130,16 @@ def _parameters(solution: Solution) -> list[ParameterEvidence]:
 
 
 def _gradient(solution: Solution) -> GradientEvidence:
-    """The settings of the derivatives and the norms; states and inputs have the source of the certificates."""
-    problem, vector = solution.problem, solution.vector
+    """The settings of the derivatives and the norms."""
+    problem = solution.problem
     contact = problem.model.contract.contact if problem.has_model else None
-    methods = "; ".join(dict.fromkeys(c.method for c in solution.certificates)) or "no certificate was reached"
-    if problem.motion != STEPS:
-        methods = "continuous: saltation along the accepted steps of the integration"
-    names = (*problem.state_names, *problem.input_names, *vector.names)
-    units = (*units_of(problem), *(p.unit for p in vector.parameters for _ in p.value))
-    sources = (*[methods] * (problem.nx + problem.nu), *vector.sources)
-    columns = zip(names, units, sources, strict=True)
     regularization = "none"
     if contact is not None and contact.collision_pairs:
         regularization = f"{contact.approximation} contact, whose compliance and stiction are part of the model"
     ends, result = solution.final_state_norms, solution.optimality
     reasons = [str(value) for value in (ends, result) if isinstance(value, Refusal)]
     return GradientEvidence(
-        columns=[GradientColumn(name=name, unit=unit, source=source) for name, unit, source in columns],
+        columns=_columns(solution),
         regularization=regularization,
         solver_tolerance=None if contact is None else contact.solver_relative_tolerance,
         horizon_s=solution.horizon,
@@ -153,6 +148,18 @@ def _gradient(solution: Solution) -> GradientEvidence:
         stationarity=None if isinstance(result, Refusal) else finite(result.ratio),
         reason="; ".join(reasons) or None,
     )
+
+
+def _columns(solution: Solution) -> list[GradientColumn]:
+    """What the derivatives are by; states and inputs have the source of the certificates."""
+    problem, vector = solution.problem, solution.vector
+    methods = "; ".join(dict.fromkeys(c.method for c in solution.certificates)) or "no certificate was reached"
+    if problem.motion != STEPS:
+        methods = "continuous: saltation along the accepted steps of the integration"
+    names = (*problem.state_names, *problem.input_names, *vector.names)
+    units = (*units_of(problem), *(p.unit for p in vector.parameters for _ in p.value))
+    sources = (*[methods] * (problem.nx + problem.nu), *vector.sources)
+    return [GradientColumn(name=n, unit=u, source=s) for n, u, s in zip(names, units, sources, strict=True)]
 
 
 def describe_problem(problem: Problem) -> dict[str, Any]:
