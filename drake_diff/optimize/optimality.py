@@ -18,6 +18,7 @@ nothing of the motion beside it: it is compared with slopes of another integrati
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,10 +107,12 @@ def optimality(problem: Problem, xs: Array, us: Array, values: Array) -> Optimal
     others = np.setdiff1d(np.flatnonzero(program.lower < program.upper), steps)
     of_steps = splu(sparse.csc_matrix(every[:count, steps]).T.tocsc())
 
-    on_lower, on_upper = _sides(np.asarray(rows).ravel()[count:], *(side[count:] for side in program.sides))
+    by_variables, by_rows, _ = program.scales_at(z)
+    sides = (np.asarray(rows).ravel(), *program.sides, np.broadcast_to(by_rows, len(program.sides[0])))
+    on_lower, on_upper = _sides(*(side[count:] for side in sides))
     acting = on_lower | on_upper
     signs, of_held = [(on_lower[acting], on_upper[acting])], every[count:][acting]
-    on_lower, on_upper = _sides(z, program.lower, program.upper)
+    on_lower, on_upper = _sides(z, program.lower, program.upper, by_variables)
     states = steps[(on_lower | on_upper)[steps]]
     signs.append((on_lower[states], on_upper[states]))
     of_held = sparse.vstack([of_held, sparse.identity(program.size, format="csr")[states]], format="csr")
@@ -139,9 +142,9 @@ def optimality(problem: Problem, xs: Array, us: Array, values: Array) -> Optimal
     )
 
 
-def _sides(values: Array, lower: Array, upper: Array) -> tuple[Mask, Mask]:
-    """Which values lie on their lower bound, and which on their upper one."""
-    return values <= lower + FEASIBILITY_TOLERANCE, values >= upper - FEASIBILITY_TOLERANCE
+def _sides(values: Array, lower: Array, upper: Array, scales: Any) -> tuple[Mask, Mask]:
+    """Which values, of these `scales`, lie on their lower bound, and which on their upper one."""
+    return values <= lower + FEASIBILITY_TOLERANCE * scales, values >= upper - FEASIBILITY_TOLERANCE * scales
 
 
 def _multipliers(of_cost: Array, jacobian: Array, lowest: Array, highest: Array) -> Array:
@@ -174,22 +177,23 @@ def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
     """Which part of the goal no variable in z has an effect on, though it is not reached; empty if there is none."""
     last = final_sensitivity(variables, z)
     effect = np.abs(last).max(axis=1, initial=0.0)
-    wrong = np.abs(problem.goal_error(variables.states(z)[-1])) > FEASIBILITY_TOLERANCE
+    xs = variables.states(z)
+    wrong = np.abs(problem.goal_error(xs[-1])) > FEASIBILITY_TOLERANCE * problem.state_scales(xs)
     deaf = np.flatnonzero(wrong & (effect < NO_EFFECT))
     if not len(deaf):
-        missed = next(_unmoved_goals(problem, variables.states(z)[-1], last), "")
-        return missed and f"{missed}{_what_is_apart(problem, variables.states(z))}"
+        missed = next(_unmoved_goals(problem, xs[-1], last, problem.spans(xs, variables.unpack(z)[1])), "")
+        return missed and f"{missed}{_what_is_apart(problem, xs)}"
     name = problem.model.state_names[deaf[0]]
-    return f"no variable moves {name}, whose goal is not reached{_what_is_apart(problem, variables.states(z))}"
+    return f"no variable moves {name}, whose goal is not reached{_what_is_apart(problem, xs)}"
 
 
-def _unmoved_goals(problem: Problem, end: Array, last: Array) -> Iterator[str]:
+def _unmoved_goals(problem: Problem, end: Array, last: Array, spans: Array) -> Iterator[str]:
     """The goals at the end that are not reached there and that no variable changes, by `last` (nx, n) of them."""
     for c in problem.kept_goals:
         if problem.num_steps in problem.knots_of(c, input_at_end=False):
             none = np.zeros(problem.nu)
             values, rows = c.differentiate(end, none)
-            wrong = np.maximum(c.lower - values, values - c.upper) > FEASIBILITY_TOLERANCE
+            wrong = np.maximum(c.lower - values, values - c.upper) > FEASIBILITY_TOLERANCE * (np.abs(rows) @ spans)
             if np.any(wrong & (np.abs(rows[:, : problem.nx] @ last).max(axis=1, initial=0.0) < NO_EFFECT)):
                 yield f"no variable moves {c.label}, and {c.told(c.miss(end))}"
 

@@ -1,6 +1,9 @@
 """Tolerances and searches do not depend on the units of a task."""
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import drake_diff as dd
 from drake_diff.optimize.solution import Status
@@ -8,7 +11,7 @@ from drake_diff.optimize.solution import Status
 SLIDE = """<robot name="slide"><link name="base"/><link name="block"><inertial><mass value="{mass}"/>
 <inertia ixx="1e-12" iyy="1e-12" izz="1e-12" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="slide" type="prismatic"><parent link="base"/><child link="block"/><axis xyz="1 0 0"/>
-<limit lower="{low}" upper="{high}" effort="{effort}" velocity="1000"/></joint>
+<limit lower="{low}" upper="{high}" effort="{effort}" velocity="{fast}"/></joint>
 <transmission name="t"><type>transmission_interface/SimpleTransmission</type><joint name="slide">
 <hardwareInterface>effort</hardwareInterface></joint><actuator name="motor"/></transmission></robot>"""
 TOO_FAR = (Status.INFEASIBLE, Status.CONVERGED_NOT_VERIFIED)
@@ -17,7 +20,7 @@ TOO_FAR = (Status.INFEASIBLE, Status.CONVERGED_NOT_VERIFIED)
 def slide(tmp_path, unit, way, **changes):
     """A slide of 20 mg whose motor moves it by 1 `unit` [m] from rest to rest in 1 s, F = 4 m d / T^2."""
     path, limit = tmp_path / "slide.urdf", 4 * 2e-5 * unit
-    path.write_text(SLIDE.format(mass=2e-5, low=-1e3 * unit, high=1e3 * unit, effort=limit))
+    path.write_text(SLIDE.format(mass=2e-5, low=-1e3 * unit, high=1e3 * unit, fast=1e3 * unit, effort=limit))
     model = dd.load_model(path, time_step=0.05, base="weld")
     effort = dd.QuadraticCost(R=[[1 / limit**2]])
     return dd.Problem(model, x0=[0, 0], x_goal=[way * unit, 0], num_steps=20, running_cost=effort, **changes)
@@ -26,5 +29,72 @@ def slide(tmp_path, unit, way, **changes):
 @pytest.mark.parametrize("method", ["collocation", "ilqr", "shooting"])
 @pytest.mark.solve
 def test_what_a_motor_cannot_do_in_metres_it_cannot_in_micrometres(tmp_path, method):
-    solution = dd.solve(slide(tmp_path, 1e-6, 8.0), method=method)
+    options = dd.optimize.Options(other_guesses=0) if method == "collocation" else None
+    solution = dd.solve(slide(tmp_path, 1e-6, 8.0), method=method, options=options)
     assert solution.status in TOO_FAR, solution.message
+
+
+EXPONENTS = st.floats(-6, 6)
+
+
+def pendulum(length=1.0, time=1.0, force=1.0, cost=1.0, order=(0, 1), single=(1.0, 1.0), side=1.0):
+    """A pendulum on a cart that is pulled along a slide, as plain dynamics: x = [slide, swing, rates], u = force.
+
+    Units are `length` [m], `time` [s], `force` [N] and `cost`; a state is a `single` times its own unit.
+    """
+    unit = np.array([length, 1.0, length / time, 1 / time]) * np.array([single[0], single[1], single[0], single[1]])
+    places = np.array([order[0], order[1], 2 + order[0], 2 + order[1]])
+    scale, g = unit[places] * side, 9.81
+
+    def rates(x, u):
+        by_name = [None] * 4
+        for i, place in enumerate(places):
+            by_name[place] = x[i] / scale[i]
+        _, swing, v, w = by_name
+        s, c, pull = np.sin(swing), np.cos(swing), u[0] / (force * side)
+        a = (pull + 0.3 * s * (0.5 * w * w + g * c)) / (1 + 0.3 * s * s)
+        b = (-pull * c - 0.15 * w * w * c * s - 1.3 * g * s) / (0.5 * (1 + 0.3 * s * s))
+        slopes = [v, w, a, b]
+        return [slopes[place] * scale[i] / time for i, place in enumerate(places)]
+
+    bounds = dd.Bounds(u_lower=[-15 * force], u_upper=[15 * force])
+    goal = np.array([1.0, 0.0, 0.0, 0.0])[places] * scale
+    dynamics = dd.Dynamics(rates, nx=4, nu=1)
+    effort = dd.QuadraticCost(R=[[cost / force**2 / time]])
+    return dd.Problem(
+        dynamics, x0=np.zeros(4), x_goal=goal, num_steps=12, horizon=1.5 * time, running_cost=effort, bounds=bounds
+    )
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return dd.solve(pendulum())
+
+
+@pytest.mark.solve
+@settings(max_examples=6, deadline=None, derandomize=True)
+@given(exponents=st.tuples(EXPONENTS, EXPONENTS, EXPONENTS, EXPONENTS))
+def test_a_search_does_not_depend_on_units(plain, exponents):
+    length, time, force, cost = (10.0**e for e in exponents)
+    solution = dd.solve(pendulum(length, time, force, cost))
+    assert (solution.status, solution.cost) == (plain.status, pytest.approx(cost * plain.cost, rel=1e-4))
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize(
+    "changed", [{"order": (1, 0)}, {"single": (1e-4, 1.0)}, {"single": (1.0, 1e5)}, {"side": -1.0}], ids=str
+)
+def test_a_search_does_not_depend_on_the_names_and_scales_of_single_states(plain, changed):
+    solution = dd.solve(pendulum(**changed))
+    assert plain.success, plain.message
+    assert (solution.status, solution.cost) == (plain.status, pytest.approx(plain.cost, rel=1e-4))
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize(("unit", "method"), [(1e-6, "collocation"), (1e4, "shooting"), (1e4, "ilqr")])
+def test_a_slide_moves_at_the_same_cost_in_any_unit(tmp_path, unit, method):
+    """Half of the way that the motor can move it, at the least effort: u = 6 m d (T - 2 t) / T^3 costs 0.1875."""
+    solution = dd.solve(slide(tmp_path, unit, 0.5), method=method)
+    assert solution.success, solution.message
+    metres = 0.1875 if method == "collocation" else 0.1875 / (1 - 1 / 20**2)  # a sum over 20 steps
+    assert solution.cost == pytest.approx(metres, rel=1e-4)

@@ -82,6 +82,20 @@ class Phase:
             return self.task.parameters
         return np.clip(moved.coordinates.to_values(z[self.coordinates_at]), *problem.bounds_of_parameters())
 
+    def spans(self, z: Array) -> Array:
+        """(size,) how far its variables may go from z."""
+        (nodes, horizon), f = self.unpack(z), self.functions.dynamics
+        points = np.hstack([nodes, np.tile(z[self.coordinates_at], (len(nodes), 1))])
+        rows, columns = f.jacobian_at
+        with np.errstate(all="ignore"):
+            largest = np.nan_to_num(np.max(np.abs(f.jacobian(points)), axis=0), posinf=0.0)
+        slopes = np.zeros((self.nx, points.shape[1]))
+        np.maximum.at(slopes, (rows, columns), largest)
+        xs, us = np.split(nodes, [self.nx], axis=1)
+        of_node = self.task.problem.search_spans(xs, us, slopes[:, : self.width], horizon)
+        spans = np.ones(len(self.task.coordinates))
+        return np.concatenate([np.tile(of_node, len(nodes)), spans, [horizon] * self.free])
+
     def iterate(self, z: Array) -> Iterate:
         """The motion, for callbacks."""
         problem, (nodes, horizon) = self.task.problem, self.unpack(z)
@@ -133,6 +147,10 @@ class TranscribedProgram(BlockProgram):
     def names(self) -> tuple[str, ...]:
         """(n,) of the variables."""
         return tuple(name for phase in self.phases for name in phase.names)
+
+    def spans(self, z: Array) -> Array:
+        """(n,) see `Problem.search_spans`, of coordinates 1, and of a free duration its own."""
+        return np.concatenate([phase.spans(z) for phase in self.phases])
 
     def iterates(self, z: Array) -> tuple[Iterate, ...]:
         """The motion of each phase at z, for callbacks."""

@@ -11,7 +11,7 @@ call, and summed up: the weights of F_i in the Lagrangian's second derivative ar
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -65,6 +65,9 @@ WARM_START = {
     **dict.fromkeys([f"ipopt.warm_start_{part}" for part in ("bound_push", "bound_frac", "mult_bound_push")], 1e-6),
     **dict.fromkeys([f"ipopt.warm_start_slack_{part}" for part in ("bound_push", "bound_frac")], 1e-6),
 }
+TRIED = 0.1  # of the spans: how far from the guess the cost is looked at
+FAR_FROM_ONE = 1e4  # a scale or one over it: what a solver's own tolerances do not allow for
+PRECISE = 0.1  # of the tolerance: a motion may stay well within the spans of its first guess
 NOT_FINITE = "IPOPT: Invalid Number Detected"
 
 
@@ -93,6 +96,17 @@ class Term:
         matrix = sparse.csr_matrix((weights, (rows + 1, places)), shape=shape)
         matrix.eliminate_zeros()
         return matrix
+
+
+class Scales(NamedTuple):
+    """What the numbers of a program are divided by, so that they do not depend on units.
+
+    Of its variables (n,), its rows (m,) and its cost; without them nothing is divided.
+    """
+
+    variables: Any = 1.0
+    rows: Any = 1.0
+    cost: float = 1.0
 
 
 class BlockProgram:
@@ -245,27 +259,84 @@ class BlockProgram:
         rows, columns, count = np.minimum(first, other), np.maximum(first, other), len(first)
         return _Sums(rows, columns, np.ones(count), np.arange(count), count, (self.size, self.size))
 
-    @cached_property
-    def nlp(self) -> dict[str, Any]:
+    def spans(self, z: Array) -> Array:
+        """(n,) how far the variables may go from the guess z (n,)."""
+        return np.ones(self.size)
+
+    def scales_at(self, z: Array) -> Scales:
+        """Those of a search from z (n,): a row by its largest slope, the cost by its own change over the spans.
+
+        None where all of them are near 1.
+        """
+        spans, sparsity = self.spans(z), self._jacobian_at[1].sparsity
+        try:
+            slopes = np.abs(self.jacobian(z)) * spans[sparsity.get_col()]
+            cost, gradient = self.gradient(z)
+        except self.backs_off:
+            return Scales()
+        rows = np.zeros(len(self.sides[0]))
+        np.maximum.at(rows, sparsity.row(), np.nan_to_num(slopes, posinf=0.0))
+        changes = [abs(cost), float(np.nan_to_num(np.abs(gradient), posinf=0.0) @ spans)]
+        for side in (-1, 1):
+            with np.errstate(all="ignore"):
+                changes.append(abs(self.cost_at(z + side * TRIED * spans) - cost) / TRIED)
+        largest = max((change for change in changes if np.isfinite(change)), default=0.0)
+        rows, largest = np.where(rows > 0, rows, 1.0), largest or 1.0
+        every = np.concatenate([spans, rows, [largest]])
+        return Scales(spans, rows, largest) if np.max(np.maximum(every, 1 / every)) > FAR_FROM_ONE else Scales()
+
+    def cost_at(self, z: Array) -> float:
+        """The cost alone at z (n,); NaN where a term has none there."""
+        rows, columns, weights = self._of_linear
+        total = float(np.sum((weights * z[columns])[rows == 0]))
+        for term, pair in zip(self.terms, self._weights, strict=True):
+            for matrix, factor in zip(pair, (1.0, 1.0 if term.time_at is None else z[term.time_at]), strict=True):
+                if matrix is not None and matrix[0].nnz:
+                    try:
+                        total += factor * float(
+                            (matrix[0] @ np.asarray(term.function.values(z[term.columns])).ravel())[0]
+                        )
+                    except self.backs_off:
+                        return math.nan
+        return total
+
+    def nlp(self, scales: Scales) -> dict[str, Any]:
         """x, f and g as CasADi's nlpsol takes them."""
         dense = [ca.Sparsity.dense(1, 1), ca.Sparsity.dense(len(self.sides[0]), 1)]
-        f, g = self._callback("values", [self.size], dense, self.evaluate)(self.z)
+
+        def values(y: Array) -> tuple[float, Array]:
+            cost, rows = self.evaluate(y * scales.variables)
+            return cost / scales.cost, rows / scales.rows
+
+        f, g = self._callback("values", [self.size], dense, values)(self.z)
         return {"x": self.z, "f": f, "g": g}
 
-    def derivatives(self, exact: bool = True) -> dict[str, Any]:
-        """CasADi Functions by the names of nlpsol's options, "hess_lag" only where `exact`."""
+    def derivatives(self, exact: bool = True, scales: Scales | None = None) -> dict[str, Any]:
+        """CasADi Functions by the names of nlpsol's options, "hess_lag" only where `exact`; of the divided numbers."""
+        by_variables, by_rows, by_cost = scales or Scales()
+        columns = np.broadcast_to(by_variables, self.size)
+        slopes = self._jacobian_at[1].sparsity
+        of_slopes = columns[slopes.get_col()] / np.broadcast_to(by_rows, len(self.sides[0]))[slopes.row()]
         n, m, pace = self.size, len(self.sides[0]), Pace()
         scalar, vector, rows = (ca.Sparsity.dense(count, 1) for count in (1, n, m))
 
-        def jacobian(z: Array) -> tuple[Array, Array]:
-            return self.evaluate(z)[1], self.jacobian(z)
+        def gradient(y: Array) -> tuple[float, Array]:
+            cost, slope = self.gradient(y * columns)
+            return cost / by_cost, slope * columns / by_cost
 
-        def hessian(z: Array, sigma: Array, multipliers: Array) -> tuple[Array]:
-            return (self.hessian(z, float(sigma[0]), multipliers),)
+        def jacobian(y: Array) -> tuple[Array, Array]:
+            return self.evaluate(y * columns)[1] / by_rows, self.jacobian(y * columns) * of_slopes
+
+        def hessian(y: Array, sigma: Array, multipliers: Array) -> tuple[Array]:
+            entries, curved = (
+                self._hessian_at.sparsity,
+                self.hessian(y * columns, sigma[0] / by_cost, multipliers / by_rows),
+            )
+            return (curved * columns[entries.row()] * columns[entries.get_col()],)
 
         pace.go_on()
         functions = {
-            "grad_f": self._callback("grad_f", [n, 0], [scalar, vector], self.gradient),
+            "grad_f": self._callback("grad_f", [n, 0], [scalar, vector], gradient),
             "jac_g": self._callback("jac_g", [n, 0], [rows, self._jacobian_at[1].sparsity], jacobian),
         }
         pace.go_on()
@@ -369,16 +440,29 @@ def solve_ipopt(
         callback = _IterateCallback(program, watch, report, motions)
         try:
             with until_set(interrupted):
-                options |= program.derivatives(exact) | {"iteration_callback": callback}
+                scales = program.scales_at(guess)
+                callback.scales = scales
+                if np.ndim(scales.variables):
+                    tolerance = PRECISE * limits.tolerance
+                    options |= {"ipopt.tol": tolerance, "ipopt.constr_viol_tol": tolerance}
+                options |= program.derivatives(exact, scales) | {"iteration_callback": callback}
         except StoppedError as stopped:
             return NlpResult(guess, Outcome.INTERRUPTED, f"stopped: {stopped}", ())
-        solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
-        lower, upper = program.sides
-        known = {} if multipliers is None else {"lam_x0": multipliers.variables, "lam_g0": multipliers.rows}
+        solver = ca.nlpsol("solver", "ipopt", program.nlp(scales), options)
+        by, lower, upper = scales.variables, *(side / scales.rows for side in program.sides)
+        known = {}
+        if multipliers is not None:
+            known = {
+                "lam_x0": multipliers.variables * by / scales.cost,
+                "lam_g0": multipliers.rows * scales.rows / scales.cost,
+            }
         with until_set(interrupted):
-            solution = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper, **known)
+            solution = solver(
+                x0=guess / by, lbx=program.lower / by, ubx=program.upper / by, lbg=lower, ubg=upper, **known
+            )
         stats = solver.stats()
     columns = [stats.get("iterations", {}).get(name, ()) for name in ("obj", "inf_pr", "inf_du", "alpha_pr")]
+    columns[0] = [scales.cost * value for value in columns[0]]
     table = tuple(Iteration(i, *map(float, row)) for i, row in enumerate(zip(*columns, strict=True)))
     error = callback.error or program.error
     if error is not None:
@@ -393,22 +477,23 @@ def solve_ipopt(
     if watch.stopped_by is not None:
         return NlpResult(watch.best_of(guess), watch.stopped_by, f"stopped: {watch.stopped_by.value}", table)
     words = str(stats["return_status"])
-    outcome, left = OUTCOMES.get(words, Outcome.FAILED), _stationarity(program, options, solution)
-    z = np.asarray(solution["x"]).ravel()
-    multipliers = Multipliers(*(np.asarray(solution[name]).ravel() for name in ("lam_x", "lam_g")))
+    outcome, left = OUTCOMES.get(words, Outcome.FAILED), _stationarity(program, options, solution, scales)
+    z = np.asarray(solution["x"]).ravel() * by
+    of_variables, of_rows = (scales.cost * np.asarray(solution[name]).ravel() for name in ("lam_x", "lam_g"))
+    multipliers = Multipliers(of_variables / by, of_rows / scales.rows)
     message = f"IPOPT: {words.replace('_', ' ')}"
     return NlpResult(z, outcome, message, table, stationarity=left, multipliers=multipliers)
 
 
-def _stationarity(program: BlockProgram, derivatives: Any, solution: Any) -> float:
+def _stationarity(program: BlockProgram, derivatives: Any, solution: Any, scales: Scales) -> float:
     """What IPOPT's multipliers leave of the Lagrangian's gradient, those of what does not hold the plan left out."""
     z, slope = solution["x"], ca.DM(derivatives["grad_f"](solution["x"], [])[1])
     rows, jacobian = derivatives["jac_g"](z, [])
     of_rows, of_variables = (
         _holding(np.asarray(multiplier).ravel(), np.asarray(value).ravel(), *sides)
         for multiplier, value, sides in (
-            (solution["lam_g"], rows, program.sides),
-            (solution["lam_x"], z, (program.lower, program.upper)),
+            (solution["lam_g"], rows, [side / scales.rows for side in program.sides]),
+            (solution["lam_x"], z, [side / scales.variables for side in (program.lower, program.upper)]),
         )
     )
     left = slope + ca.mtimes(jacobian.T, ca.DM(of_rows)) + ca.DM(of_variables)
@@ -418,7 +503,7 @@ def _stationarity(program: BlockProgram, derivatives: Any, solution: Any) -> flo
 
 
 def _holding(multipliers: Array, values: Array, lower: Array, upper: Array) -> Array:
-    """The multipliers (m,) of what lies on the side that they push from, 0 of all others."""
+    """The multipliers (m,), of numbers of size 1, of what lies on the side that they push from, 0 of all others."""
     on_lower, on_upper = values <= lower + FEASIBILITY_TOLERANCE, values >= upper - FEASIBILITY_TOLERANCE
     return np.where(on_upper, np.maximum(multipliers, 0.0), 0.0) + np.where(on_lower, np.minimum(multipliers, 0.0), 0.0)
 
@@ -438,7 +523,7 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
         size = len(program.lower)
         self.sizes = {"x": size, "f": 1, "g": len(program.sides[0]), "lam_x": size}
         self.sizes |= {"lam_g": self.sizes["g"], "lam_p": 0}
-        self.iterates, self.called = 0, now()
+        self.iterates, self.called, self.scales = 0, now(), Scales()
         self.error: Exception | None = None
         self.construct("callback", {})
 
@@ -457,13 +542,14 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
     def eval_buffer(self, arguments: Any, results: Any) -> int:
         try:
             x, f, g = (np.frombuffer(a, float) for a in arguments[:3])
-            p = self.program
-            sides = (p.lower - x, x - p.upper, p.sides[0] - g, g - p.sides[1])
+            p, (variables, rows, cost) = self.program, self.scales
+            x, cost = x * variables, float(f[0]) * cost
+            sides = ((p.lower - x) / variables, (x - p.upper) / variables, p.sides[0] / rows - g, g - p.sides[1] / rows)
             violation = max(float(np.max(side, initial=0.0)) for side in sides)
             self.watch.offer(x, float(f[0]), violation)
             due = self.watch.look_up()
             if self.report:
-                row = Iteration(self.iterates, float(f[0]), violation, math.nan, math.nan)
+                row = Iteration(self.iterates, cost, violation, math.nan, math.nan)
                 self.report.row(row, lambda: self.motions(x), printed=due)
             self.iterates += 1
             before, self.called = self.called, now()

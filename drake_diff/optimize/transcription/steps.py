@@ -213,6 +213,16 @@ class StepProgram(BlockProgram):
         """The parameters of the steps at z (n,)."""
         return self.design.at(z[self.parameters_at])
 
+    def spans(self, z: Array) -> Array:
+        """(n,) see `Problem.search_spans`, of coordinates 1."""
+        xs, us, values = self.motion(z)
+        along = self.steps.along(z[self.blocks])
+        slopes = np.array([np.hstack([d.A - np.eye(len(d.A)), d.B]) for d in along]) / self.design.time_step(values)
+        spans = np.ones(self.size)
+        of_knot = self.problem.search_spans(xs, us, np.max(np.abs(slopes), axis=0), self.problem.start_horizon)
+        spans[self.states_at], spans[self.inputs_at] = np.split(of_knot, [self.problem.nx])
+        return spans
+
     def require(self, z: Array) -> None:
         """Raise GradientError or SimulationError where a step at z (n,) cannot be taken or differentiated."""
         self.steps.along(z[self.blocks])
