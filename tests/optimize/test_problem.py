@@ -157,8 +157,8 @@ def test_a_tolerance_is_of_a_state_itself_and_of_its_way(load):
     assert problem.state_scales(xs) == pytest.approx([1.0, np.pi, 3.0, 1000.0], rel=1e-12)
     assert problem.goal_tolerances(xs) == pytest.approx([0.002, 0.01 * np.pi, 0.03, 10.0], rel=1e-12)
     assert "to within 0.002 of slide_x" in str(problem)
-    still = problem.state_scales(np.zeros((11, 4)))[3]  # a millionth of the hinge's goal over the horizon
-    assert still == pytest.approx(np.pi * 1e-6 / problem.start_horizon, rel=1e-9)
+    still = problem.state_scales(np.zeros((11, 4)))[3]  # what need not travel: a hundredth of a radian over the horizon
+    assert still == pytest.approx(0.01 / problem.start_horizon, rel=1e-9)
 
 
 @each_row(

@@ -434,7 +434,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
         That is its own range; of a joint of several directions, that of the one which moves most. A state that is not
         asked to travel has at least STAYS of its bounds, or of a radian, and its velocity that over the horizon. One
-        that stands still has 1e-6 of its largest magnitude; where all that is 0, of its bound.
+        that stands still has 1e-6 of its largest magnitude, what is asked of it among them, or of a radian, and its
+        velocity that over the horizon; where all that is 0, of its bound.
         """
         asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
         scales, least = np.ptp(xs, axis=0), STILL * np.max(np.nan_to_num(np.abs(asked)), axis=0)
@@ -444,6 +445,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             for places in (q, v):
                 scales[places], least[places] = np.max(scales[places]), np.max(least[places])
                 room[places] = np.max(room[places])
+            least[q] = np.maximum(least[q], STILL * turns)
+            least[v] = np.maximum(least[v], least[q[0]] / self.start_horizon)
             room[q] = np.where(room[q] > 0, room[q], float(turns))
             room[v] = np.where(room[v] > 0, room[v], room[q[0]] / self.start_horizon)
         least = np.maximum(least, np.where(way == 0, STAYS * room, 0.0))

@@ -283,7 +283,8 @@ class BlockProgram:
         largest = max((change for change in changes if np.isfinite(change)), default=0.0)
         rows, largest = np.where(rows > 0, rows, 1.0), largest or 1.0
         every = np.concatenate([spans, rows, [largest]])
-        return Scales(spans, rows, largest) if np.max(np.maximum(every, 1 / every)) > FAR_FROM_ONE else Scales()
+        is_far = np.max(every) > FAR_FROM_ONE or np.min(every) < 1 / FAR_FROM_ONE
+        return Scales(spans, rows, largest) if is_far else Scales()
 
     def cost_at(self, z: Array) -> float:
         """The cost alone at z (n,); NaN where a term has none there."""
