@@ -281,7 +281,7 @@ class BlockProgram:
             with np.errstate(all="ignore"):
                 changes.append(abs(self.cost_at(z + side * TRIED * spans) - cost) / TRIED)
         largest = max((change for change in changes if np.isfinite(change)), default=0.0)
-        rows, largest = np.where(rows > 0, rows, 1.0), largest or 1.0
+        rows, largest = np.where(rows > 1e-150, rows, 1.0), largest or 1.0  # whose products do not overflow
         every = np.concatenate([spans, rows, [largest]])
         is_far = np.max(every) > FAR_FROM_ONE or np.min(every) < 1 / FAR_FROM_ONE
         return Scales(spans, rows, largest) if is_far else Scales()
