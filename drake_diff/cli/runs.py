@@ -181,7 +181,7 @@ def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str,
 
 
 def _show_phases(record: Any) -> None:
-    show(judged(record.verdict), f" {record.solver.status}: {record.sentence}")
+    show(judged(record.verdict), f" {record.sentence}")
     columns = ("phase", "ended", "cost", "steps" if record.phases.counts_steps else "seconds")
     show_table(columns, [(p.name, p.status, p.cost, p.duration) for p in record.phases.phases])
     for link in record.phases.links:
@@ -204,7 +204,7 @@ def _loaded(script: Path) -> ModuleType:
 
 def _show_record(record: Any) -> None:
     solver, holds = record.solver, {"pass": "holds", "info": ""}
-    show(judged(record.verdict), f" {solver.status}: {record.sentence}")
+    show(judged(record.verdict), f" {record.sentence}")
     rows = []
     for m in record.metrics:
         tolerance = "" if m.tolerance is None else f"{m.tolerance:g}"

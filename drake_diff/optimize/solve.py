@@ -29,7 +29,7 @@ from drake_diff.optimize.program import Iteration, Limits, Report
 from drake_diff.optimize.run import Run, closest_to, is_kept_apart, kept_apart
 from drake_diff.optimize.solution import PLANS, Search, Solution, Status, distinct
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
-from drake_diff.optimize.verification import advice, not_in_steps, overlaps
+from drake_diff.optimize.verification import advice, limits_of, not_in_steps, overlaps
 
 COMPILED = 0.5  # [s] that are worth a word
 DEFAULTS = Options()
@@ -197,7 +197,7 @@ def _solved(
     suggestion = advice(
         solution, arguments, [other for other in METHODS[1:] if other not in tried and _takes(problem, other)]
     )
-    notes = (suggestion,) if suggestion else ()
+    notes = (suggestion,) if suggestion else tuple(limits_of(solution, restarts))
     return solution.noted(*notes).told(search=Search(arguments, initial_guess))
 
 

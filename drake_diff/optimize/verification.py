@@ -12,6 +12,8 @@ from drake_diff.optimize import messages
 from drake_diff.optimize.checks import PLAN, Check, Checks
 from drake_diff.optimize.measure import ASKED
 from drake_diff.optimize.messages import headline
+from drake_diff.optimize.problem.cost import ConstantCost
+from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.optimize.replay import FEEDBACK, GAINS_ALONE, OPEN_LOOP, Replay, deciding
 from drake_diff.optimize.solution import Solution, Status
@@ -22,6 +24,7 @@ SHORTER = "take a smaller time step"
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
 # Where the solver stopped short of its own tolerance: our own measures say at what.
 STOPPED = (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)
+ON_A_BOUND = 1e-6  # of a horizon's bound: so near it the bound decides
 STATIONARY = 1e-6  # of the terms of the Lagrangian's gradient: what is left to gain is of its square
 _STATUSES = {Outcome.UNBOUNDED: Status.DIVERGED, **{Outcome[name]: Status[name] for name in _ALIKE}}
 
@@ -188,6 +191,23 @@ def ended(draft: Any, status: Status, *sentences: str, **fields: Any) -> Any:
     message = headline(status.words, text)
     cut = [text] if text not in message else []
     return draft.told(status=status, message=message, notes=(*cut, *others), **fields)
+
+
+def limits_of(solution: Solution, restarts: int) -> Iterator[str]:
+    """What limits a verified plan: the bound of its horizon, inputs without limits, the only guess that was tried."""
+    problem = solution.problem
+    if not solution.success or isinstance(problem, PhasedProblem):
+        return
+    if problem.horizon is not None and problem.horizon[0] < problem.horizon[1]:
+        for bound in problem.horizon:
+            if abs(solution.horizon - bound) <= ON_A_BOUND * bound:
+                yield f"the horizon is on its bound of {bound:.4g} s"
+        b = problem.bounds
+        free = [n for n, *sides in zip(problem.input_names, b.u_lower, b.u_upper, strict=True) if np.isinf(sides).any()]
+        if isinstance(problem.running_cost, ConstantCost) and free:
+            yield f"the least time of inputs without limits: {messages.joined(free)}"
+    if not restarts:
+        yield "a local optimum: no other first guess was tried (restarts=0)"
 
 
 def advice(solution: Solution, arguments: dict[str, Any], other_methods: Sequence[str]) -> str:

@@ -178,3 +178,16 @@ def test_a_goal_tolerance_is_refused_by_name(load, given, words):
 def test_no_goal_has_no_tolerance(load):
     with pytest.raises(InputError, match="goal"):
         cart_pole(load, x_goal=[1, np.nan, 0, 0], goal_tolerance=[0.1, 0.1, np.nan, np.nan])
+
+
+def test_a_quaternion_and_its_negative_are_one_goal(load):
+    """A goal on the other side is turned to the side of x0, and a state on either side is at no distance from it."""
+    model = load("sphere_on_ground.sdf")
+    x0 = np.array(model.default_state)
+    x0[:4], free = [0.8, 0.6, 0.0, 0.0], np.arange(model.nx) == 10
+    goal = x0 * np.where(np.arange(model.nx) < 4, -1.0, 1.0)
+    fields = {"num_steps": 5, "optimize": ("initial_state",), "initial_state_mask": free}
+    problem = dd.Problem(model, x0=x0, x_goal=goal, **fields)
+    for x in (x0, goal):
+        assert np.all(problem.goal_error(x) == 0)
+    np.testing.assert_array_equal(problem.x_goal, x0)

@@ -23,6 +23,7 @@ from drake_diff._base.values import PicklesItsFields, ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
+from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.intervals import Intervals, intervals_of
 from drake_diff.motion.rollout import MOTIONS, STEPS
 from drake_diff.optimize.problem.constraint import (
@@ -528,12 +529,16 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return ~np.isnan(np.full(self.nx, np.nan) if self.goal_tolerance is None else self.goal_tolerance)
 
     @cached_property
+    def _quaternions(self) -> tuple[int, ...]:
+        return () if self.moved is None else tangent_space(self.moved).quaternions
+
+    @cached_property
     def _vectors(self) -> list[tuple[Indices, Indices, bool]]:
         return [] if self.moved is None else vectors_of(self.moved)
 
     def goal_error(self, x: Array) -> Array:
-        """(nx,) the distance of `x` from the goal, 0 where the goal is free."""
-        goal = self.goal
+        """(nx,) the distance of `x` from the goal, 0 where the goal is free; by a quaternion's nearer sign."""
+        goal = self._with_the_signs_of(x, self.goal)
         return np.where(np.isnan(goal), 0.0, x - goal)
 
     def cost_of_parameters(self, values: Array) -> float:
@@ -598,7 +603,15 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         if np.any(np.isinf(state)):
             raise InputError(subject, got=state, expected="finite numbers, NaN where free")
         check_inside(subject, state, self.bounds.x_lower, self.bounds.x_upper, self.state_names)
-        return state
+        return self._with_the_signs_of(self.x0, state)
+
+    def _with_the_signs_of(self, x: Array, state: Array) -> Array:
+        """`state` (nx,) with each quaternion or its negative, the same orientation, on the side of that of `x`."""
+        signed = np.array(state)
+        for q in self._quaternions:
+            if signed[q : q + 4] @ x[q : q + 4] < 0:
+                signed[q : q + 4] = 0.0 - signed[q : q + 4]
+        return frozen(signed)
 
     def _check_goal_tolerance(self) -> Array:
         subject = "goal_tolerance"
