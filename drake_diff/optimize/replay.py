@@ -255,7 +255,7 @@ def deciding(plan: ReplayPlan, rows: Sequence[Replay]) -> list[str]:
 def judged_replay(plan: ReplayPlan, rows: Sequence[Replay]) -> Replay | None:
     """The motion that a verdict rests on: open loop where that holds, else under TVLQR; None where neither does."""
     decides = deciding(plan, rows)
-    for control in dict.fromkeys(r.control for r in rows):
+    for control in dict.fromkeys(r.control for r in rows if r.control != GAINS_ALONE):
         tried = [r for r in rows if r.control == control]
         if all(r.holds for r in tried if r.variant in decides):
             return next((r for r in tried if r.holds), None)

@@ -107,7 +107,8 @@ def _holding(s: Solution, plants: list[list[Trial]]) -> str:
     by_feedback: dict[str | None, list[str]] = {}
     for plant in plants:
         trial = next(trial for trial in plant if trial.holds)
-        by_feedback.setdefault(trial.feedback, []).append(trial.plant)
+        if trial.feedback != GAINS_ALONE:
+            by_feedback.setdefault(trial.feedback, []).append(trial.plant)
     parts = [f"{messages.under(feedback)} {messages.joined(where)}" for feedback, where in by_feedback.items()]
     text = f"holds {'; '.join(parts)}" if parts else ""
     if s.transcribed is not None and s.replays:
