@@ -354,6 +354,8 @@ def measured(
 ) -> Metric:
     """A metric that is to be at most `tolerance`, or that informs; `reason` is why where `value` is not finite."""
     known = math.isfinite(value)
+    if tolerance is not None and not math.isfinite(tolerance):
+        tolerance = 0.0  # a part of a scale that is no number: of a plan that is not finite
     return Metric(
         name=name,
         definition=definition,
@@ -362,7 +364,7 @@ def measured(
         reason=None if known else reason,
         tolerance=tolerance,
         direction="info" if tolerance is None else "at_most",
-        verdict="info" if tolerance is None else "pass" if value <= tolerance else "fail",
+        verdict="info" if tolerance is None else "pass" if known and value <= tolerance else "fail",
         t_s=t_s if known else None,
     )
 
