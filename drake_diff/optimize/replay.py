@@ -37,7 +37,7 @@ from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.problem.goals import GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, along_steps, clearances
-from drake_diff.optimize.problem.problem import GOAL_PART, Problem
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.terminal import TerminalConstraint
 from drake_diff.optimize.transcription.collocation import EFFORT_WEIGHT, FINAL_WEIGHT
 
@@ -47,6 +47,7 @@ STATE_TOLERANCE = 0.05
 # The same under TVLQR, of the goal alone: where the effort weighs a fourth, a saturated motion was seen to end three
 # times as far off. Who repeats the plan has other weights.
 FEEDBACK_TOLERANCE = 0.03
+LEAST_EFFORT = 1e-3  # of the largest input, what a regulator weighs an input by that the plan does not use
 SAME = 1e-2  # the same in the plan's own plant, of every state at every knot, and of the cost
 ANOTHER_PLANT = 0.2  # the same of positions on the way, and of the cost, in another plant, in which a goal decides
 SMALLEST_ENERGY = 1e-9  # [J] less is rounding
@@ -421,6 +422,7 @@ def regulator_weights(plan: ReplayPlan, us: Array) -> tuple[Array, Array, Array]
     """
     space = tangent_space(plan.problem.model)
     effort = plan.problem.input_scales(us)
+    effort = np.maximum(effort, LEAST_EFFORT * np.max(effort, initial=0.0))
     Q = np.diag(1 / space.scale(plan.scale) ** 2)
     smooth = any(not limit.of_inputs for limit in plan.problem.rate_limits)
     return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), (1.0 if smooth else FINAL_WEIGHT) * Q
@@ -483,11 +485,13 @@ def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, s
 def goal_check(plan: ReplayPlan, distance: Array, fraction: float = STATE_TOLERANCE) -> Check:
     """The `distance` (nx,) from the goal of the state that is furthest from it for its tolerance.
 
-    That is the problem's `goal_tolerance` where it is given, else the `fraction` of what the state has to travel.
+    That is the problem's `goal_tolerance` where it is given, else in the plan's own plant SAME of what the state has to
+    travel, in another one the `fraction` of its range along the plan.
     """
     problem = plan.problem
     tolerances = problem.goal_tolerances(plan.sample(1)[0])
-    tolerances = tolerances * np.where(problem.has_goal_tolerance, 1.0, fraction / GOAL_PART)
+    if fraction != SAME:
+        tolerances = np.where(problem.has_goal_tolerance, tolerances, fraction * plan.scale)
     i = int(np.argmax(np.nan_to_num(np.abs(distance) / tolerances, nan=np.inf)))
     return check("goal", problem.state_names[i], abs(distance[i]), tolerances[i], units_of(problem)[i])
 

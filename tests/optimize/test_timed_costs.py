@@ -74,9 +74,11 @@ def test_a_reference_is_followed_in_whatever_form_it_is_given(write_urdf, method
         cost = TrackingCost(given, **weights)
     solution = dd.solve(block(write_urdf, running_cost=cost), method=method)
     assert solution.success, solution.message
-    np.testing.assert_allclose(solution.xs, xs, atol=0.07)  # a step moves by h = 0.05 at 1 m/s
+    np.testing.assert_allclose(solution.xs[solution.knots], xs, atol=0.07)  # a step moves by h = 0.05 at 1 m/s
     if kind != "trajectory":
-        np.testing.assert_allclose(solution.us[2:], 1.0, atol=0.15)  # the first make up for half a step
+        np.testing.assert_allclose(
+            solution.us[2 * len(solution.us) // 20 :], 1.0, atol=0.15
+        )  # the first make up for half a step
 
 
 def test_the_cost_of_a_reference_is_the_sum_over_its_steps(write_urdf):

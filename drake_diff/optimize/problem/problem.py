@@ -450,7 +450,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             least[v] = np.maximum(least[v], least[q[0]] / self.start_horizon)
             room[q] = np.where(room[q] > 0, room[q], float(turns))
             room[v] = np.where(room[v] > 0, room[v], room[q[0]] / self.start_horizon)
-        least = np.maximum(least, np.where(way == 0, STAYS * room, 0.0))
+        least = np.maximum(least, np.where(way <= STILL * room, STAYS * room, 0.0))
         return _not_zero(np.maximum(scales, least), self.bounds.x_lower, self.bounds.x_upper)
 
     def input_scales(self, us: Array) -> Array:
