@@ -76,6 +76,7 @@ NOT_REPEATED = {
 }
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers of a search that diverges on its way
 def reproduce(folder: Path, record: SealedRecord, models: Path | None) -> Reproduced | None:
     """What of a directory comes out of its inputs again, `models` as in `rebuilt`; None where nothing does.
 

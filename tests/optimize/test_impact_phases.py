@@ -244,7 +244,8 @@ def test_a_landing_is_made_again_and_a_forged_one_is_not(landed, tmp_path):
     assert record.verdict == "pass", record.sentence
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
-        assert dd.verify(tmp_path / "run").verdict == "holds"
+        found = dd.verify(tmp_path / "run")
+        assert found.verdict == "holds", found.complaints
         fields = json.loads((tmp_path / "run" / "record.json").read_text())
         assert fields["phases"]["links"][0]["reset"]["impact"]["points"]["foot"] == FOOT
         fields["phases"]["links"][0]["reset"]["impact"]["restitution"] = 0.01

@@ -203,7 +203,7 @@ def test_the_length_of_steps_moves_with_the_goal(write_urdf, method):
         horizon=(0.5, 10.0),
         running_cost=lambda x, u: u[0] ** 2 + 1.0,
     )
-    solution = dd.solve(problem, method=method)
+    solution = dd.solve(problem, method=method, max_iterations=3000)
     found = dd.sensitivity(solution, "goal")
     assert found.verdict == "agree", found
     assert found.horizon[0] == pytest.approx(solution.horizon / 2, rel=1e-6)
