@@ -210,8 +210,9 @@ def _written(solution: Solution, records: Mapping[Path, PlanRecord], apart: floa
             again, lacking = _but_for_simulators(_as_given(again, recorded), recorded)
             unchecked.extend(lacking)
             if int(recorded.schema_version.split(".")[0]) < OFFSETS_SINCE:
-                names = {metric.name for metric in recorded.metrics}
-                metrics = [metric for metric in again.metrics if metric.name in names]
+                then = {metric.name: metric.tolerance for metric in recorded.metrics}  # some were absolute
+                kept = [metric for metric in again.metrics if metric.name in then]
+                metrics = [metric.model_copy(update={"tolerance": then[metric.name]}) for metric in kept]
                 replays = _open_loop_alone(again.replays, recorded.replays)
                 again = again.model_copy(update={"replays": replays, "metrics": metrics})
                 unchecked.append(f"replays under TVLQR, which had no offsets in version {recorded.schema_version}")
