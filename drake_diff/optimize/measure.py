@@ -21,13 +21,14 @@ from drake_diff.optimize.problem.obstacles import along_steps, clearances
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.transcription.between import passed_between_steps
-from drake_diff.optimize.transcription.collocation import Collocated
+from drake_diff.optimize.transcription.collocation import SMALLEST_COST, Collocated
 from drake_diff.optimize.transcription.lead import SUBSTEPS
 from drake_diff.optimize.transcription.task import OptimalControl, UserCost, user_costs
 
 # Of a state's scale: between two knots the transcription is a cubic, and further than this from an accurate integration
 # its motion is not the model's.
 INTEGRATION_TOLERANCE = 1e-2
+FEEDBACK_COST = 0.2  # of the cost, what feedback may cost more or less than the plan that it follows
 # Of the cost: by how much the quadrature that was minimized may differ from its integral. A step of refinement makes it
 # 16 times smaller, and costs of plans that are worth comparing differ by more.
 COST_TOLERANCE = 1e-2
@@ -199,10 +200,22 @@ def following_checks(s: Any, motion: Collocated) -> list[Check]:
         xs = motion.led(control)
         what, i, off, time = _furthest(s, motion, xs, ranges)
         row = check(what, f"{names[i]} at {time}", off, INTEGRATION_TOLERANCE * ranges[i], units[i])
-        rows.append(replace(row, plant="continuous time", feedback=None if control == "open loop" else control))
-        if rows[-1].passes:
+        found = [row, _cost_beside(motion, xs, control)]
+        feedback = None if control == "open loop" else control
+        rows += [replace(c, plant="continuous time", feedback=feedback) for c in found]
+        if all(c.passes for c in found):
             break
     return rows
+
+
+def _cost_beside(motion: Collocated, xs: Array, control: str) -> Check:
+    """The cost of where the dynamics lead, xs, beside the plan's; feedback costs what it has to."""
+    is_open = control == "open loop"
+    with np.errstate(all="ignore"):
+        difference = abs(motion.cost_beside(xs, None if is_open else motion.gains()[0]))
+    fraction = INTEGRATION_TOLERANCE if is_open else FEEDBACK_COST
+    tolerance = fraction * abs(motion.cost) + SMALLEST_COST * motion.cost_scale
+    return check("replayed cost", "the whole motion", difference, tolerance)
 
 
 def _furthest(s: Any, motion: Collocated, xs: Array, ranges: Array) -> tuple[str, int, float, str]:

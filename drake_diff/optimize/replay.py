@@ -15,7 +15,7 @@ are Drake's terms and the contact written out, and share nothing with those that
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -285,12 +285,22 @@ def _replay_in(
     try:
         model = make()
         with applied(select(model, plan.vector.to_dict())) as set_model:
-            return [_replay(plan, variant, control, set_model, parts, motion) for control, motion in controls.items()]
+            law = cache(lambda: regulator(plan, set_model, *plan.sample(parts)))
+            return [_replay(plan, variant, c, set_model, parts, motion, law) for c, motion in controls.items()]
     except (ModelError, InputError) as error:
         return [missing_replay(plan, variant, control, str(error)) for control in controls]
 
 
-def _replay(plan: ReplayPlan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:
+def _replay(
+    plan: ReplayPlan,
+    variant: str,
+    control: str,
+    model: Model,
+    parts: int,
+    known: Rollout | None,
+    law: Callable[[], TVLQR],
+) -> Replay:
+    """The replay under one control; `law` gives TVLQR about the plan in the steps of `model`."""
     law_is_another = model.contract.contact.approximation != plan.problem.model.contract.contact.approximation
     try:
         xs, us = plan.sample(parts)
@@ -301,19 +311,18 @@ def _replay(plan: ReplayPlan, variant: str, control: str, model: Model, parts: i
         else:
             gains = np.repeat(plan.own_gains, parts, axis=0) if law_is_another else plan.gains(parts)
             if control == GAINS_ALONE:
-                gains = regulator(plan, model, xs, us).gains
-            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us, gains), len(us))
+                gains = law().gains
+            policy = law() if gains is None else None
+            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us, gains, policy), len(us))
     except BROKEN as error:
         return missing_replay(plan, variant, control, str(error))
     # Feedback corrects what the laws of contact differ by: there nothing tighter can be asked of it.
     fraction = STATE_TOLERANCE if control == OPEN_LOOP or law_is_another else FEEDBACK_TOLERANCE
-    if variant == plan.own_plant:
-        fraction = SAME
     if control == GAINS_ALONE:  # which stand for any such regulator
         off = plan.problem.goal_error(motion.xs[-1])
-        checks = [goal_check(plan, off, ANOTHER_PLANT), *comparison_checks(plan, motion, parts, same=False)]
+        checks = [goal_check(plan, off, ANOTHER_PLANT), *comparison_checks(plan, motion, parts)]
         return measured_replay(plan, variant, control, model, motion, checks)
-    checks = [*motion_checks(plan, model, motion, parts, fraction)]
+    checks = [*motion_checks(plan, model, motion, parts, fraction, same=variant == plan.own_plant)]
     if plan.continuous or parts == FINE or not model.can_rebuild:  # a coarse step gains and loses some, an artefact all
         checks.append(energy_check(motion))
     return measured_replay(plan, variant, control, model, motion, checks)
@@ -379,13 +388,15 @@ def regulator(plan: ReplayPlan, model: Model, xs: Array, us: Array) -> TVLQR:
     return TVLQR(model, xs, us, ratio * Q, ratio * R, final, jacobians=jacobians, defects=defects)
 
 
-def track(plan: ReplayPlan, model: Model, xs: Array, us: Array, gains: Array | None = None) -> Policy:
+def track(
+    plan: ReplayPlan, model: Model, xs: Array, us: Array, gains: Array | None = None, policy: Policy | None = None
+) -> Policy:
     """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds and limits of its rate.
 
-    The latter make it remember its last input: it is for one rollout. The `gains` (N, nu, nt) may be known.
+    The latter make it remember its last input: it is for one rollout. `gains` (N, nu, nt) or `policy` may be known.
     """
     bounds = plan.problem.bounds
-    policy = regulator(plan, model, xs, us) if gains is None else _about(model, xs, us, gains)
+    policy = policy or (regulator(plan, model, xs, us) if gains is None else _about(model, xs, us, gains))
     slew, last = np.full(model.nu, np.inf), list[Array]()
     period = model.time_step if plan.continuous else plan.time_step  # a held input jumps at the plan's own knots
     for limit in plan.problem.rate_limits:
@@ -432,17 +443,25 @@ def regulator_weights(plan: ReplayPlan, us: Array) -> tuple[Array, Array, Array]
 
 
 def motion_checks(
-    plan: ReplayPlan, model: Model, motion: MeasuredMotion, parts: int, fraction: float, wider: float = 1.0
+    plan: ReplayPlan,
+    model: Model,
+    motion: MeasuredMotion,
+    parts: int,
+    fraction: float,
+    wider: float = 1.0,
+    *,
+    same: bool = False,
 ) -> Iterator[Check]:
     """All that the problem asks of `motion`, of which `parts` steps make one of the plan's; energy apart.
 
-    It may end `fraction` of each state's range from x_goal; every other tolerance is `wider` than a replay's.
+    It may end `fraction` of each state's range from x_goal, or in the `same` plant SAME of its way; every other
+    tolerance is `wider` than a replay's.
     """
     problem, law = plan.problem, model.contract.contact.approximation
     if law == problem.model.contract.contact.approximation:
-        yield from comparison_checks(plan, motion, parts, same=fraction == SAME)
+        yield from comparison_checks(plan, motion, parts, same=same)
     if not np.all(np.isnan(problem.goal)):
-        yield goal_check(plan, problem.goal_error(motion.xs[-1]), fraction)
+        yield goal_check(plan, problem.goal_error(motion.xs[-1]), fraction, same=same)
     yield bounds_check(plan, motion, wider)
     for c in problem.kept_goals:
         if not isinstance(c, ClearanceConstraint):
@@ -456,7 +475,7 @@ def motion_checks(
         yield penetration_check(model, motion)
 
 
-def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, same: bool) -> Iterator[Check]:
+def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, same: bool = False) -> Iterator[Check]:
     """The states at the plan's knots and the cost beside the plan's.
 
     In the `same` plant all states and the cost agree to SAME. In another one the goal decides where there is one. Else
@@ -482,15 +501,15 @@ def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, s
     yield check("replayed cost", "the whole motion", difference, tolerance)
 
 
-def goal_check(plan: ReplayPlan, distance: Array, fraction: float = STATE_TOLERANCE) -> Check:
+def goal_check(plan: ReplayPlan, distance: Array, fraction: float = STATE_TOLERANCE, *, same: bool = False) -> Check:
     """The `distance` (nx,) from the goal of the state that is furthest from it for its tolerance.
 
-    That is the problem's `goal_tolerance` where it is given, else in the plan's own plant SAME of what the state has to
+    That is the problem's `goal_tolerance` where it is given, else in the `same` plant SAME of what the state has to
     travel, in another one the `fraction` of its range along the plan.
     """
     problem = plan.problem
     tolerances = problem.goal_tolerances(plan.sample(1)[0])
-    if fraction != SAME:
+    if not same:
         tolerances = np.where(problem.has_goal_tolerance, tolerances, fraction * plan.scale)
     i = int(np.argmax(np.nan_to_num(np.abs(distance) / tolerances, nan=np.inf)))
     return check("goal", problem.state_names[i], abs(distance[i]), tolerances[i], units_of(problem)[i])

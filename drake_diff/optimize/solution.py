@@ -213,7 +213,8 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         Replays of the plan are taken for it. `success` says whether it holds under that feedback.
         """
         rows = self.following or [c for r in self.replays[:1] for c in r.checks]
-        return None if all(c.passes for c in rows if c.feedback is None) else "TVLQR"
+        open_loop = [c.passes for c in rows if c.feedback is None]
+        return None if open_loop and all(open_loop) else "TVLQR"
 
     @property
     def vector(self) -> ParameterVector:

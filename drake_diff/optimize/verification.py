@@ -57,7 +57,8 @@ def trials(s: Solution) -> list[list[Trial]]:
     A plan by shooting has to hold open loop at its own step: its states are those of the step. A collocated plan has to
     hold where its equations are integrated and, of a model, in the two finest steps of Drake that were taken.
     """
-    following = [Trial("in continuous time", c.feedback, [c]) for c in s.following]
+    feedbacks = dict.fromkeys(c.feedback for c in s.following)
+    following = [Trial("in continuous time", f, [c for c in s.following if c.feedback == f]) for f in feedbacks]
     plants = [following] if following else []
     if s.problem.has_model:
         variants = deciding(s.plan, s.replays)

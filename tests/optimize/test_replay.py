@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.table import each_row
+from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.model.parameters import select
@@ -351,3 +352,28 @@ def test_a_smooth_plan_that_is_wrong_is_refused_whatever_its_gains():
 
 def test_where_things_may_touch_each_replay_has_gains_of_its_own(write_urdf):
     assert plan_of(block(write_urdf, x_goal=[0.1, 0]), np.ones((COUNT, 1))).gains(8) is None
+
+
+def test_a_collocated_plan_holds_open_loop_only_where_its_motion_costs_what_is_reported():
+    """x' = 8 x + u: errors grow by exp(8), to less than 1 % of x, which a final cost of 1e6 x^2 doubles a cost by."""
+    unstable, steep = dd.Dynamics(lambda x, u: [8 * x[0] + u[0]], nx=1, nu=1), 1e6
+    fields = {"num_steps": 40, "running_cost": lambda x, u: u[0] ** 2, "final_cost": lambda x: steep * x[0] ** 2}
+    problem = dd.Problem(unstable, x0=[1.0], horizon=1.0, **fields)
+    solution = dd.solve(problem, options=Options(refine=False))
+    given = solution.trajectory().input
+    rate = lambda t, x: 8 * x + given.value(t)[0, 0]  # noqa: E731
+    end = solve_ivp(rate, (0, 1), [1.0], rtol=1e-11, atol=1e-13, max_step=0.01).y[0, -1]
+    state, cost = (c for c in solution.following if c.feedback is None)
+    assert state.passes
+    assert (cost.what, cost.passes) == ("replayed cost", False)
+    assert cost.value == pytest.approx(steep * (end**2 - solution.xs[-1, 0] ** 2), rel=0.1)  # 1e-6 a step grows too
+    assert solution.feedback == "TVLQR"
+    assert solution.message == "converged: holds under TVLQR in continuous time"
+
+
+def test_the_cost_beside_a_plans_is_by_the_integral():
+    """A motion 0.1 further on costs 0.1 (3 T + 5) more where 3 x are paid by time, and 5 x at the end."""
+    drift = dd.Dynamics(lambda x, u: [u[0]], nx=1, nu=1)
+    fields = {"running_cost": lambda x, u: u[0] ** 2 + 3 * x[0], "final_cost": lambda x: 5 * x[0]}
+    motion = dd.solve(dd.Problem(drift, x0=[0.0], num_steps=7, horizon=2.0, **fields)).transcribed
+    assert motion.cost_beside(motion.led("open loop") + 0.1, None) == pytest.approx(0.1 * (3 * 2.0 + 5), rel=1e-9)

@@ -291,7 +291,7 @@ def test_a_plan_that_its_dynamics_do_not_follow_is_no_success(scheme, follows):
     assert bool(np.max(off) < 0.01) is follows
     assert np.all(found.transcribed.gaps < 0.01 * np.minimum(np.ptp(found.xs, axis=0), 1))
     if not follows:
-        assert [(c.feedback, c.passes) for c in found.following] == [(None, False), ("TVLQR", False)]
+        assert {c.feedback for c in found.following if not c.passes} == {None, "TVLQR"}
 
 
 def test_feedback_follows_what_open_loop_loses():

@@ -26,6 +26,7 @@ from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome,
 from drake_diff.optimize.transcription.lead import SUBSTEPS, Lead, Places, Within
 from drake_diff.optimize.transcription.task import OptimalControl, Scheme
 
+SIMPSON = np.array([1.0, *[4.0, 2.0] * (SUBSTEPS // 2 - 1), 4.0, 1.0]) / (3 * SUBSTEPS)  # SUBSTEPS is even
 SLOPED = np.linspace(0, 1, 11)  # where slopes are looked at within an interval, its ends among them
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # where a plan comes too near to an obstacle between its knots
@@ -282,6 +283,24 @@ class Collocated:
     @cached_property
     def _open_loop(self) -> Array:
         return self.led_from(self.xs[0], None)
+
+    def cost_beside(self, xs: Array, gains: Array | None) -> float:
+        """What the cost of `xs` (10 N + 1, nx), see `led_from`, is above the plan's, by one quadrature of both."""
+        task, count = self.task, len(self.lengths)
+        k, tau = np.repeat(np.arange(count), SUBSTEPS + 1), np.tile(np.arange(SUBSTEPS + 1) / SUBSTEPS, count)
+        planned, us = self.between(k, tau)
+        led = xs[(k * SUBSTEPS + np.round(tau * SUBSTEPS)).astype(int)]
+        lower, upper = self.input_limits
+        moved = us if gains is None else us + np.einsum("kij,kj->ki", gains[k], planned - led)
+        times = self.times(k, tau)
+        pair = (np.hstack([led, np.clip(moved, lower, upper)]), np.hstack([planned, us]))
+        rates, plan = (np.ravel(task.rates(knots, times)).reshape(count, -1) for knots in pair)
+        weights = np.array([1.0] + [0.0] * SUBSTEPS) if task.is_map else SIMPSON
+        total = float(self.lengths @ ((rates - plan) @ weights))
+        if task.final is not None:
+            ends = np.array([np.append(x, self.nodes[-1, len(x) :]) for x in (xs[-1], self.xs[-1])])
+            total += float(np.ravel(task.final.values(ends)) @ [1.0, -1.0])
+        return total
 
     def led_from(self, x: Array, gains: Array | None) -> Array:
         """(10 N + 1, nx) where the dynamics lead from `x` (nx,), with feedback by `gains` (N, nu, nx) if there are."""
