@@ -184,13 +184,13 @@ def _beside(around: Neighbourhood, a: Array, gap: Array, codes: Codes) -> dict[t
     gap, so that what is wrong there too stays wrong. Where they have no value it is a jump alone, of which the gap
     grows as the step shrinks, and then is gone.
     """
-    steps, apart = np.array(DIFFERENCES.steps)[:, None, None], np.abs((around.forward + around.backward) / 2 - a)
+    steps, gaps = np.array(DIFFERENCES.steps)[:, None, None], np.abs((around.forward + around.backward) / 2 - a)
     scatter = LIMITS.significant * np.maximum(around.finest, DIFFERENCES.last_place * around.size)[:, None]
     last = (gap * steps > scatter).sum(axis=0) - 1
-    nearest = np.take_along_axis(apart, np.maximum(last, 0)[None], axis=0)[0]
+    nearest = np.take_along_axis(gaps, np.maximum(last, 0)[None], axis=0)[0]
     steep = (codes == DISAGREE) & (last >= 0) & (nearest <= LIMITS.nearer * gap)
-    grows = (LIMITS.nearer * apart[1:-1] > apart[:-2]) & (apart[1:-1] * steps[2:] > scatter)
-    jumps = (codes == UNDECIDED) & np.any(grows & (apart[2:] <= LIMITS.gone * apart[1:-1]), axis=0)
+    grows = (LIMITS.nearer * gaps[1:-1] > gaps[:-2]) & (gaps[1:-1] * steps[2:] > scatter)
+    jumps = (codes == UNDECIDED) & np.any(grows & (gaps[2:] <= LIMITS.gone * gaps[1:-1]), axis=0)
     why = "it is the slope over small steps and not over larger ones: {} beside the point"
     kinds = [(steep, "there is a break"), (jumps, "the value jumps")]
     return {(i, j): why.format(what) for where, what in kinds for i, j in np.argwhere(where).tolist()}

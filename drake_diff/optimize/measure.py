@@ -146,9 +146,9 @@ def _user_checks(s: Any) -> Iterator[Check]:
             lines.append(np.column_stack([knots, times]))
         k = rows[-1:] if cost.name == "final cost" else rows
         called, (carried, _) = cost.values(knots[k], times[k]), cost.form.linearize(cost.points(knots[k], times[k]))
-        apart, (size, when, largest) = np.abs(carried[:, 0] - called), largest_jump(cost, lines)
-        i = int(np.argmax(apart))
-        yield check("traced", f"the {cost.name} at {times[k][i]:.4g} s", apart[i], SAME_VALUES * largest)
+        distances, (size, when, largest) = np.abs(carried[:, 0] - called), largest_jump(cost, lines)
+        i = int(np.argmax(distances))
+        yield check("traced", f"the {cost.name} at {times[k][i]:.4g} s", distances[i], SAME_VALUES * largest)
         yield check("jump", f"the {cost.name} at {when:.4g} s", size, SMALLEST_JUMP * largest)
 
 
@@ -200,10 +200,10 @@ def following_checks(s: Any, motion: Collocated) -> list[Check]:
         xs = motion.led(control)
         what, i, off, time = _furthest(s, motion, xs, ranges)
         row = check(what, f"{names[i]} at {time}", off, INTEGRATION_TOLERANCE * ranges[i], units[i])
-        found = [row, _cost_beside(motion, xs, control)]
+        checks = [row, _cost_beside(motion, xs, control)]
         feedback = None if control == "open loop" else control
-        rows += [replace(c, plant="continuous time", feedback=feedback) for c in found]
-        if all(c.passes for c in found):
+        rows += [replace(c, plant="continuous time", feedback=feedback) for c in checks]
+        if all(c.passes for c in checks):
             break
     return rows
 

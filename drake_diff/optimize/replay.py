@@ -486,13 +486,13 @@ def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, s
     asked = [c for c in problem.kept_goals if not isinstance(c, ClearanceConstraint)]
     if not same and (asked or not np.all(np.isnan(problem.goal))):
         return  # what is asked decides: feedback costs what it has to
-    apart = np.abs(motion.xs[::parts] - wanted[: len(motion.xs[::parts])])
+    distances = np.abs(motion.xs[::parts] - wanted[: len(motion.xs[::parts])])
     if not same:
-        apart[:-1, problem.model.nq :] = 0.0
+        distances[:-1, problem.model.nq :] = 0.0
     with np.errstate(invalid="ignore"):  # a plan whose states are not finite
-        k, i = divmod(int(np.argmax(np.nan_to_num(apart / plan.scale, nan=np.inf))), apart.shape[1])
+        k, i = divmod(int(np.argmax(np.nan_to_num(distances / plan.scale, nan=np.inf))), distances.shape[1])
     where, unit = f"{problem.state_names[i]} at knot {k}", units_of(problem)[i]
-    yield check("following", where, apart[k, i], fraction * plan.scale[i], unit)
+    yield check("following", where, distances[k, i], fraction * plan.scale[i], unit)
     with np.errstate(all="ignore"):
         difference = abs(plan.cost_of(motion.xs, motion.us, parts) - plan.cost)
         tolerance = fraction * abs(plan.cost)

@@ -24,7 +24,11 @@ from drake_diff.pages.scene import Scene
 from drake_diff.runs.measurement import Measurement, gradient_norms
 from drake_diff.runs.messages import asked_for
 
-CONTROLS = {"open loop": "Inputs alone (open loop)", "TVLQR": "With feedback (TVLQR)"}
+CONTROLS = {
+    "open loop": "Inputs alone (open loop)",
+    "TVLQR": "With feedback (TVLQR)",
+    "TVLQR without offsets": "With its gains alone",
+}
 
 
 @dataclass(frozen=True)

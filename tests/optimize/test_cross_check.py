@@ -61,7 +61,7 @@ def holds(found):
 
 
 def test_a_block_under_a_constant_force_ends_where_the_sums_say(write_urdf):
-    """x = u T (T + h) / 2 in steps of h, u T^2 / 2 in continuous time: 5 % of the way are allowed, 10 % in MuJoCo."""
+    """x = u T (T + h) / 2 in steps of h, u T^2 / 2 in continuous time: 5 % of 1.05 are allowed, 10 % in MuJoCo."""
     h, count, u = 0.05, 20, 2.0
     fixed = dd.Bounds(u_lower=[u], u_upper=[u])  # feedback cannot help
     for goal, expected in ((1.05, [True, True]), (1.1, [False, True])):
@@ -74,7 +74,7 @@ def test_a_block_under_a_constant_force_ends_where_the_sums_say(write_urdf):
         assert list(holds(found).values()) == expected
     (check,) = [c for c in in_plant(found, "continuous time")[0].checks if c.what == "goal"]
     assert (check.where, check.feedback, check.verdict) == ("slide_x", "TVLQR", "fail")
-    assert (check.value, check.tolerance) == pytest.approx((0.1, 0.055), rel=1e-6)
+    assert (check.value, check.tolerance) == pytest.approx((0.1, 0.0525), rel=1e-6)
     assert check in found.checks
     assert "cross-checked in continuous time, TVLQR: slide_x ends 0.1 m from its goal" in repr(found)
 

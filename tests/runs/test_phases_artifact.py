@@ -120,7 +120,7 @@ def test_a_stance_is_made_again(tmp_path):
 
 def test_what_functions_a_run_has_is_undecided_and_said(bounced):
     found = dd.verify(bounced)
-    assert found.verdict == "undecided"
+    assert found.verdict == "undecided", found.complaints
     assert any("user's own diagram or function" in line for line in found.undecided)
     assert any("were compared" in line for line in found.unchecked)
 
@@ -130,7 +130,7 @@ def test_phases_are_made_again_where_the_reset_between_them_is_a_function(tmp_pa
     problem = dd.optimize.PhasedProblem(swinging().phases, resets=[lambda x: [x[0], x[1]]])
     assert dd.save(dd.solve(problem), tmp_path / "run").verdict == "pass"
     found = dd.verify(tmp_path / "run")
-    assert found.verdict == "undecided"
+    assert found.verdict == "undecided", found.complaints
     assert any("<lambda> is a user's function" in line for line in found.undecided)
     assert found.checked > 1000
 

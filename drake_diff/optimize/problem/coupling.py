@@ -85,8 +85,8 @@ class BoundCoupling:
         if not len(self.knots):
             return np.zeros(len(self.rows.lower))
         states, inputs = zip(*(self.packed(xs, us, knots) for knots in self.knots), strict=True)
-        apart = np.split(spans, [xs.shape[1]])
-        sides = [np.tile(side, self.knots.shape[1]) for side in apart]
+        pair = np.split(spans, [xs.shape[1]])
+        sides = [np.tile(side, self.knots.shape[1]) for side in pair]
         return self.rows.scales(np.array(states), np.array(inputs), np.concatenate(sides))
 
     def reach(self, xs: Array, us: Array) -> float:

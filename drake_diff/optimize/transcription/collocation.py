@@ -116,8 +116,8 @@ class Collocated:
         middle = self.nodes[len(self.nodes) // 2]
         spans = self.task.problem.spans(self.xs, self.us)
         knots = np.vstack([middle, *(middle + side * np.diag(spans) for side in (-1, 1))])
-        apart = self.task.rates(knots, np.full(len(knots), self.horizon / 2))
-        floor = SMALLEST_COST * self.horizon * float(np.nanmax(np.abs(apart - apart[0]), initial=0.0))
+        rates = self.task.rates(knots, np.full(len(knots), self.horizon / 2))
+        floor = SMALLEST_COST * self.horizon * float(np.nanmax(np.abs(rates - rates[0]), initial=0.0))
         parts = [float(self._node_weights @ np.abs(self._cost_rates)), *np.abs(self._other_costs), floor]
         return float(_finite(np.array(sum(parts)))) or 1.0
 
