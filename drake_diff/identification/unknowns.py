@@ -25,7 +25,7 @@ from drake_diff.model.parameters import (
     second_moment,
     to_log_cholesky,
 )
-from drake_diff.model.plant import actuators, bodies, joints, labelled
+from drake_diff.model.plant import actuators, bodies, joints, labelled, radius_of_gyration
 
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
@@ -336,8 +336,7 @@ def _size(model: Model, name: str, value: Array) -> float:
     label, quantity = name.rsplit(".", 1)
     if quantity == CENTER:
         body = labelled(bodies(model.plant))[label]
-        moments = body.default_spatial_inertia().get_unit_inertia().get_moments()
-        return max(float(np.sqrt(np.sum(moments) / 2)), float(np.linalg.norm(value)), 1e-3)
+        return max(radius_of_gyration(body), float(np.linalg.norm(value)), 1e-3)
     if quantity == INERTIA:
         return float(np.sum(value[:3]) / 3)
     if quantity == "offset":

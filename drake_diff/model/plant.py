@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 from pydrake.autodiffutils import AutoDiffXd
 from pydrake.geometry import SceneGraph_
 from pydrake.multibody.plant import MultibodyPlant
@@ -51,6 +52,12 @@ def labelled(elements: list[Any]) -> dict[str, Any]:
             name = f"{element.GetParentPlant().GetModelInstanceName(element.model_instance())}::{name}"
         by_label[name] = element
     return by_label
+
+
+def radius_of_gyration(body: Any) -> float:
+    """[m] of the file's inertia about the body's origin; 0 of a body without mass."""
+    moments = body.default_spatial_inertia().get_unit_inertia().get_moments()
+    return float(np.sqrt(np.nan_to_num(np.sum(moments)) / 2))
 
 
 # The quantities of contact by the names that parameters have, with Drake's names for them.

@@ -26,7 +26,7 @@ from drake_diff.model.parameters import (
     select,
     write_autodiff,
 )
-from drake_diff.model.plant import joints, labelled
+from drake_diff.model.plant import joints, labelled, radius_of_gyration
 from drake_diff.optimize.problem.constraint import Bounds, arguments_of, carried, plant_limits, resolve_bounds
 
 SMALLEST_TRIED = 1e-3  # of a parameter's first value: where a smaller one's derivatives are certified
@@ -532,12 +532,13 @@ def bounds_of(system: Model | Dynamics, given: Any) -> Any:
     return Bounds(**sides)
 
 
-def vectors_of(model: Model) -> list[tuple[Indices, Indices, bool]]:
+def vectors_of(model: Model) -> list[tuple[Indices, Indices, float, bool]]:
     """Where a model's state has the translation or rotation of each joint and its rate, and whether it is a rotation.
 
-    The entries of each are one quantity: which of them moves depends on the axes.
+    The entries of each are one quantity: which of them moves depends on the axes. Before the last is its natural
+    size: a radian, or the radius of gyration [m] of the body that the joint moves.
     """
-    vectors, units = list[tuple[Indices, Indices, bool]](), [c.unit for c in model.contract.positions]
+    vectors, units = list[tuple[Indices, Indices, float, bool]](), [c.unit for c in model.contract.positions]
     rates = [c.unit for c in model.contract.velocities]
     for joint in joints(model.plant):
         q, v = model.places(joint)
@@ -545,7 +546,8 @@ def vectors_of(model: Model) -> list[tuple[Indices, Indices, bool]]:
             places = [i for i in q if (units[i] != "m") == turns]
             moving = [model.nq + i for i in v if (rates[i] != "m/s") == turns]
             if places and moving:
-                vectors.append((np.array(places), np.array(moving), turns))
+                size = 1.0 if turns else radius_of_gyration(joint.child_body())
+                vectors.append((np.array(places), np.array(moving), size, turns))
     return vectors
 
 

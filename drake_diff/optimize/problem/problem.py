@@ -435,18 +435,18 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
         That is its own range; of a joint of several directions, that of the one which moves most. A state that is not
         asked to travel has at least STAYS of its bounds, or of a radian, and its velocity that over the horizon. One
-        that stands still has 1e-6 of its largest magnitude, what is asked of it among them, or of a radian, and its
-        velocity that over the horizon; where all that is 0, of its bound.
+        that stands still has 1e-6 of its largest magnitude, what is asked of it among them, or of a radian or the
+        body's radius of gyration, and its velocity that over the horizon; where all that is 0, of its bound.
         """
         asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
         scales, least = np.ptp(xs, axis=0), STILL * np.max(np.nan_to_num(np.abs(asked)), axis=0)
         way, room = self._way(xs), self.bounds.x_upper - self.bounds.x_lower
         room[~np.isfinite(room)] = 0.0
-        for q, v, turns in self._vectors:
+        for q, v, size, turns in self._vectors:
             for places in (q, v):
                 scales[places], least[places] = np.max(scales[places]), np.max(least[places])
                 room[places] = np.max(room[places])
-            least[q] = np.maximum(least[q], STILL * turns)
+            least[q] = np.maximum(least[q], STILL * size)
             least[v] = np.maximum(least[v], least[q[0]] / self.start_horizon)
             room[q] = np.where(room[q] > 0, room[q], float(turns))
             room[v] = np.where(room[v] > 0, room[v], room[q[0]] / self.start_horizon)
@@ -519,7 +519,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """(nx,) the range of what is asked of each state at x0, waypoints and goal; a joint's directions share it."""
         x0 = np.where(self.initial_state_mask, xs[0], self.x0)
         way = _spread(np.vstack([x0, *self.waypoints.values(), self.goal]))
-        for q, v, _ in self._vectors:
+        for q, v, *_ in self._vectors:
             way[q], way[v] = np.max(way[q]), np.max(way[v])
         return way
 
@@ -533,7 +533,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return () if self.moved is None else tangent_space(self.moved).quaternions
 
     @cached_property
-    def _vectors(self) -> list[tuple[Indices, Indices, bool]]:
+    def _vectors(self) -> list[tuple[Indices, Indices, float, bool]]:
         return [] if self.moved is None else vectors_of(self.moved)
 
     def goal_error(self, x: Array) -> Array:

@@ -28,7 +28,7 @@ LONGEST = 4.0  # ranges: what goes a longer way has a quarter of that for its sc
 MOST_PLACES = 400_000  # at which a motion is looked at; a longer one has a larger WIDTH
 FEATURE = 1e-5  # of a state's range, or of the cost: what is between the points of an integration and changes less
 NARROW = 8  # steps of a tenth of an interval: what needs as many is narrow there
-MOST_HALVINGS = 5  # of steps that are as short as the places at which a motion is looked at
+MOST_REFINED = 1_000_000  # evaluations in finer steps; beyond them the last change is the error that is left
 STAGE_WEIGHTS = tuple(np.array(weights) for weights in STAGES)
 
 
@@ -179,9 +179,10 @@ class Within:
 
     def _refine(self, rows: Indices, steps: Indices) -> None:
         """Integrate the intervals `rows` in `steps` (10,), in half as long ones until that changes nothing."""
-        last, finer = self._through(rows, steps)[0], steps > 1
-        for _ in range(MOST_HALVINGS):
+        last, finer, evaluated = self._through(rows, steps)[0], steps > 1, 0
+        while evaluated < MOST_REFINED:
             steps = np.where(finer, 2 * steps, steps)
+            evaluated += 4 * len(rows) * int(np.sum(steps))
             states = self._through(rows, steps)[0]
             changed = np.abs(states[-1] - last[-1])
             self.states[:, rows], self.errors[rows] = states, changed
