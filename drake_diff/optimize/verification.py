@@ -159,13 +159,7 @@ def may_be_too_coarse(solution: Solution) -> bool:
     motion = solution.transcribed
     if solution.status is not Status.CONVERGED_NOT_VERIFIED or motion is None or motion.task.is_map:
         return False
-    final = (
-        *(what for what in ASKED if what != "cost" or not np.isfinite(solution.cost)),
-        "overlap",
-        "derivative",
-        "jump",
-        "traced",
-    )
+    final = {*ASKED, "overlap", "derivative", "jump", "traced"} - ({"cost"} if np.isfinite(solution.cost) else set())
     return all(c.passes for c in solution.plan_checks if c.plant == PLAN and c.what in final)
 
 

@@ -11,17 +11,9 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.optimize.messages import FEW, joined
+from drake_diff.optimize.problem import goals
 from drake_diff.optimize.problem.cost import ConstantCost
 from drake_diff.optimize.problem.dynamics import UNKNOWN, units_of
-from drake_diff.optimize.problem.goals import (
-    CenterOfMassGoal,
-    Dwell,
-    FrameGoal,
-    FrameVelocityGoal,
-    Goal,
-    JointGoal,
-    KeepLevel,
-)
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.terminal import TerminalSet
@@ -158,29 +150,29 @@ def _end(problem: Problem) -> Iterator[str]:
         yield "be at rest at the end"
 
 
-def _of_goal(goal: Goal, problem: Problem, times: Array) -> str:
+def _of_goal(goal: goals.Goal, problem: Problem, times: Array) -> str:
     """A goal or an obstacle as what the robot was to do."""
     if isinstance(goal, SelfCollision):
         return "keep its links clear of each other"
     if isinstance(goal, (SphereObstacle, BoxObstacle)):
         return f"keep clear of obstacle {goal.label}"
-    knots = goal.knots_in(problem) if isinstance(goal, Dwell) else getattr(goal, "knots", None)
+    knots = goal.knots_in(problem) if isinstance(goal, goals.Dwell) else getattr(goal, "knots", None)
     return _act(goal) + _when(knots, problem, times)
 
 
-def _act(goal: Goal) -> str:
-    if isinstance(goal, FrameGoal):
+def _act(goal: goals.Goal) -> str:
+    if isinstance(goal, goals.FrameGoal):
         turned = " turned as asked" if goal.rotation is not None else ""
         return f"bring {goal.frame}{turned}" + (f" to {_place(goal.position)}" if goal.position is not None else "")
-    if isinstance(goal, CenterOfMassGoal):
+    if isinstance(goal, goals.CenterOfMassGoal):
         return f"bring its centre of mass to {_place(goal.position)}"
-    if isinstance(goal, FrameVelocityGoal):
+    if isinstance(goal, goals.FrameVelocityGoal):
         return f"have {goal.frame} move at a given velocity" if any(goal.velocity) else f"hold {goal.frame} still"
-    if isinstance(goal, JointGoal):
+    if isinstance(goal, goals.JointGoal):
         return "have " + joined([f"{name} = {value:.3g}" for name, value in goal.values.items()])
-    if isinstance(goal, KeepLevel):
+    if isinstance(goal, goals.KeepLevel):
         return f"keep {goal.frame} level"
-    if isinstance(goal, Dwell):
+    if isinstance(goal, goals.Dwell):
         return f"{_act(goal.goal)} for {goal.seconds:.3g} s"
     if isinstance(goal, TerminalSet):
         return "end where a linear regulator takes over"

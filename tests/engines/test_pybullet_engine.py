@@ -114,9 +114,6 @@ def test_links_are_given_what_makes_drakes_pairs_and_the_least_squares_where_pai
     assert [found[x] + found[y] for (x, y), _ in square] == pytest.approx([1.25, 1.75, 1.25, 0.75], rel=1e-12)
 
 
-# ---- refusals -------------------------------------------------------------------------------------------------------
-
-
 def test_bad_input_and_what_bullet_has_not_are_named(load):
     engine = bullet(load("pendulum.urdf"))
     with pytest.raises(ShapeError, match="x"):

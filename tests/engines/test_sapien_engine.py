@@ -143,9 +143,6 @@ def test_a_link_and_its_parent_never_touch_and_the_contract_says_so():
     assert engine.contact_depth(x) == 0  # even where their groups would
 
 
-# ---- refusals -------------------------------------------------------------------------------------------------------
-
-
 def test_bad_input_and_what_physx_has_not_are_named(load):
     engine = physx(load("pendulum.urdf"))
     with pytest.raises(ShapeError, match="x"):
