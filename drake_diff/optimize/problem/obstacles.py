@@ -29,7 +29,7 @@ from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, names_
 MARGIN = 0.01  # [m]
 TOLERANCE_PART, SMALLEST_TOLERANCE = 0.1, 1e-4  # of the margin, and [m]: what a plan may be nearer between its knots
 PARTS = 10  # in which a step is looked at, at least
-MOST_SEEN = 20_000  # states
+MOST_SEEN, MOST_HALVINGS = 20_000, 30  # states, and halvings of the time between two of them
 ARC = 1.05  # over its chord: the way of a point while all joints together turn by TURN
 TURN = 1.0  # [rad]
 RED = (0.78, 0.2, 0.16, 0.55)  # red, green, blue, opacity
@@ -71,14 +71,14 @@ class ClearanceConstraint(GoalConstraint):
             Times (S,), and the states (S, nx) that `motion` gives there.
         """
         xs, least = motion(times), self.margin - allowed
-        while True:
+        for halvings in range(MOST_HALVINGS + 1):
             values, ways = self.clearance.values(xs), ARC * self.clearance.moved(xs)
             clear = np.min((values[:-1] + values[1:] - ways) / 2, axis=1) >= least
             known = np.min(values, axis=1) < least  # and told anyway
             short = (np.max(ways, axis=1) <= allowed) | known[:-1] | known[1:]
             turns = np.sum(np.abs(np.diff(xs[:, : self.clearance.model.nq], axis=0)), axis=1) > TURN
             unseen = np.flatnonzero(~(clear | short) | turns)
-            if not len(unseen) or len(times) + len(unseen) > MOST_SEEN:
+            if not len(unseen) or len(times) + len(unseen) > MOST_SEEN or halvings == MOST_HALVINGS:
                 break
             middle = (times[unseen] + times[unseen + 1]) / 2
             times, xs = np.insert(times, unseen + 1, middle), np.insert(xs, unseen + 1, motion(middle), axis=0)

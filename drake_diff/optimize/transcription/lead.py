@@ -7,7 +7,7 @@ No integrator sees a force or cost that acts between the points at which it eval
 are looked at so often that nothing moves by more than `WIDTH` in between: of a state's or input's range along
 the motion, or of a quarter of the way that it goes where that is longer, and of the duration where the cost depends on
 time. `Within` integrates intervals in which they do something in steps as short as that. A feature that is narrower
-than `WIDTH` may be missed.
+than `WIDTH` may be missed. A motion of which an interval leads off by more than its whole range is not looked at.
 """
 
 from functools import cache
@@ -25,10 +25,9 @@ EASY = 1e-2  # of what is allowed: half as many steps would have 32 times the er
 SUBSTEPS = 10  # of the classical Runge-Kutta method in an interval in which nothing narrow is seen
 WIDTH = 1e-4  # of the scale of a state or input: the features that are seen
 LONGEST = 4.0  # ranges: what goes a longer way has a quarter of that for its scale
-MOST_PLACES = 400_000  # at which a motion is looked at; a longer one has a larger WIDTH
+MOST_PLACES = 400_000  # at which a motion is looked at (a longer one has a larger WIDTH), and evaluated in finer steps
 FEATURE = 1e-5  # of a state's range, or of the cost: what is between the points of an integration and changes less
 NARROW = 8  # steps of a tenth of an interval: what needs as many is narrow there
-MOST_REFINED = 1_000_000  # evaluations in finer steps; beyond them the last change is the error that is left
 STAGE_WEIGHTS = tuple(np.array(weights) for weights in STAGES)
 
 
@@ -114,9 +113,11 @@ class Within:
             halved = motion.lengths / SUBSTEPS / 3 * (np.array([1, *[4, 2] * (SUBSTEPS // 2 - 1), 4, 1]) @ rates)
             self.errors = np.zeros(self.states.shape[1:])
             self.errors[:, -1] = np.abs(self.states[-1, :, -1] - halved) / 15  # by Simpson's rule over twice the steps
-            rows, steps = self._seen()
-            if len(rows):
-                self._refine(rows, steps)
+            gaps = np.abs(self.states[-1, :, :-1] - motion.xs[1:])
+            if np.all(FEATURE * gaps <= self.allowed[:-1]):  # else it is not the model's motion, whatever acts there
+                rows, steps = self._seen()
+                if len(rows):
+                    self._refine(rows, steps)
 
     def _through(self, rows: Indices, steps: Indices) -> tuple[Array, Array]:
         """(11, R, nx + 1) as `states`, in so many `steps` (10,) of each tenth; and (11, R) the running cost there."""
@@ -180,7 +181,7 @@ class Within:
     def _refine(self, rows: Indices, steps: Indices) -> None:
         """Integrate the intervals `rows` in `steps` (10,), in half as long ones until that changes nothing."""
         last, finer, evaluated = self._through(rows, steps)[0], steps > 1, 0
-        while evaluated < MOST_REFINED:
+        while evaluated < MOST_PLACES:
             steps = np.where(finer, 2 * steps, steps)
             evaluated += 4 * len(rows) * int(np.sum(steps))
             states = self._through(rows, steps)[0]
