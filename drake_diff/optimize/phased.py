@@ -231,16 +231,17 @@ def _chain_check(solution: PhasedSolution) -> Check:
 
 
 def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], control: str) -> tuple[float, str]:
-    """The largest distance from the plan, or beyond a bound, as a part of the state's range, and where it is."""
-    problem = solution.problem
+    """The largest distance from the plan, or beyond a bound, as a part of the state's range, and where it is.
+
+    Where all phases have the same states, that is the largest of their ranges.
+    """
+    problem, scales = solution.problem, [m.task.problem.state_scales(m.xs) for m in motions]
+    if len({tuple(m.task.dynamics.state_names) for m in motions}) == 1:
+        scales = [np.max(scales, axis=0)] * len(motions)
     gains = [None] * len(motions) if control == OPEN_LOOP else _gains(problem, motions)
     x, worst, where = np.asarray(motions[0].xs[0]), -1.0, ""
     for i, (name, motion) in enumerate(zip(problem.names, motions, strict=True)):
-        b, ranges, names = (
-            motion.task.bounds,
-            motion.task.problem.state_scales(motion.xs),
-            motion.task.dynamics.state_names,
-        )
+        b, ranges, names = motion.task.bounds, scales[i], motion.task.dynamics.state_names
         xs, wanted = motion.led_from(x, gains[i]), motion.xs
         switch = next((s for s in problem.switches if s.before == i), None)
         impact = None if switch is None else _impact_of(switch)
@@ -261,7 +262,7 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
                 x = switch(xs[-1]) if impact is None else impact.by_drake(xs[-1])
             if switch.after == 0:
                 deviations.append((f"{{:.2g}} from its first value after {name}", np.abs(x - motions[0].xs[0])))
-                ranges = np.concatenate([ranges, motions[0].task.problem.state_scales(motions[0].xs)])
+                ranges = np.concatenate([ranges, scales[0]])
         for k, (sentence, values) in enumerate(deviations):
             scale = ranges[-len(values) :] if k == 2 else ranges[: len(values)]
             fractions = np.nan_to_num(values / scale, nan=np.inf)

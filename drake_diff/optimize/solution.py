@@ -29,7 +29,7 @@ from drake_diff.optimize.replay import OPEN_LOOP, Replay, ReplayPlan, held, judg
 from drake_diff.optimize.transcription.between import Excess, violation_between_nodes
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
-SAME_COST = 1e-2  # of the larger one, or of 1: what searches that stop at one optimum on other meshes may differ by
+SAME_COST = 1e-2  # of the larger one: what searches that stop at one optimum on other meshes may differ by
 SAME_MOTION = 5e-2  # of each state's range, the root of the mean square over the knots
 # Fields that no measure depends on.
 TOLD = ("cross_checks", "iterations", "message", "notes", "optima", "options", "search", "solver_message", "status")
@@ -604,7 +604,8 @@ def distinct(pairs: Sequence[tuple[Solution, str]]) -> list[Optimum]:
 
 def _are_same(solution: Solution, other: Solution) -> bool:
     """Whether two solutions of one problem have one cost and one motion at its knots."""
-    if abs(solution.cost - other.cost) > SAME_COST * max(1.0, abs(solution.cost), abs(other.cost)):
+    room = solution.problem.least_cost(solution.xs[0], solution.horizon / solution.problem.num_steps)
+    if abs(solution.cost - other.cost) > SAME_COST * max(abs(solution.cost), abs(other.cost)) + room:
         return False
     first, second = (np.asarray(s.xs)[s.knots] for s in (solution, other))
     apart = np.abs(first - second) / solution.problem.state_scales(np.vstack([first, second]))

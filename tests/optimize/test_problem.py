@@ -157,8 +157,11 @@ def test_a_tolerance_is_of_a_state_itself_and_of_its_way(load):
     assert problem.state_scales(xs) == pytest.approx([1.0, np.pi, 3.0, 1000.0], rel=1e-12)
     assert problem.goal_tolerances(xs) == pytest.approx([0.002, 0.01 * np.pi, 0.03, 10.0], rel=1e-12)
     assert "to within 0.002 of slide_x" in str(problem)
-    still = problem.state_scales(np.zeros((11, 4)))[3]  # what need not travel: a hundredth of a radian over the horizon
-    assert still == pytest.approx(0.01 / problem.start_horizon, rel=1e-9)
+    for limit in (math.inf, 1e30):  # as files have them that mean no limit
+        bounds = dd.Bounds(x_lower=4 * [-limit], x_upper=4 * [limit])
+        problem = cart_pole(load, bounds=bounds, x_goal=[1.0, 0, 0, 0])
+        still = problem.state_scales(np.outer([0, 1], [1.0, 0, 0, 0]))  # what need not travel: 0.01 rad, 1e-6 of 1 m
+        assert still == pytest.approx([1, 0.01, *np.array([1e-6, 0.01]) / problem.start_horizon], rel=1e-9)
 
 
 @each_row(

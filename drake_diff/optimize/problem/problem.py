@@ -60,6 +60,7 @@ SAME_STATE = 1e-6  # [the coupling's unit] of states that are typed by hand
 STILL = 1e-6  # of a state's largest magnitude, or of a radian: what moves less stands still
 RETURNS = 0.1  # of its range along a plan: what has to travel less returns to where it was
 STAYS = 1e-2  # of its bounds, or of a radian: what a state moves that need not travel
+WIDEST = 1e3  # magnitudes or sizes (of any state, where no file has them): bounds that are further apart are none
 GOAL_PART = 0.01  # of what a state has to travel: how far from its goal it may end where nothing else is given
 TRIED, NO_SLOPE = 3, 1e-9  # states at which a goal's slopes are looked at, and what counts as none: rounding
 
@@ -434,22 +435,23 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """(nx,) how far each state goes along xs (M, nx), the scale of its tolerances, in its unit.
 
         That is its own range; of a joint of several directions, that of the one which moves most. A state that is not
-        asked to travel has at least STAYS of its bounds, or of a radian, and its velocity that over the horizon. One
-        that stands still has 1e-6 of its largest magnitude, what is asked of it among them, or of a radian or the
-        body's radius of gyration, and its velocity that over the horizon; where all that is 0, of its bound.
+        asked to travel has at least STAYS of its bounds, and of a radian at most, and its velocity that over the
+        horizon; bounds of 1e30 are none, see WIDEST. One that stands still has 1e-6 of its largest magnitude, what is
+        asked of it among them, or of a radian or the body's radius of gyration, and its velocity that over the
+        horizon; where all that is 0, of its bound.
         """
         asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
-        scales, least = np.ptp(xs, axis=0), STILL * np.max(np.nan_to_num(np.abs(asked)), axis=0)
-        way, room = self._way(xs), self.bounds.x_upper - self.bounds.x_lower
-        room[~np.isfinite(room)] = 0.0
+        scales, sizes = np.ptp(xs, axis=0), np.max(np.nan_to_num(np.abs(asked)), axis=0)
+        for q, _, size, _ in self._vectors:
+            sizes[q] = np.maximum(np.max(sizes[q]), size)
+        way, room, least = self._way(xs), self.bounds.x_upper - self.bounds.x_lower, STILL * sizes
+        room[~(room / WIDEST <= (np.max(sizes) if self.moved is None else sizes))] = 0.0
         for q, v, size, turns in self._vectors:
             for places in (q, v):
                 scales[places], least[places] = np.max(scales[places]), np.max(least[places])
-                room[places] = np.max(room[places])
-            least[q] = np.maximum(least[q], STILL * size)
+            room[q] = min(np.max(room[q]) or size, size) if turns else np.max(room[q])
+            room[v] = room[q[0]] / self.start_horizon
             least[v] = np.maximum(least[v], least[q[0]] / self.start_horizon)
-            room[q] = np.where(room[q] > 0, room[q], float(turns))
-            room[v] = np.where(room[v] > 0, room[v], room[q[0]] / self.start_horizon)
         least = np.maximum(least, np.where(way <= STILL * room, STAYS * room, 0.0))
         return _not_zero(np.maximum(scales, least), self.bounds.x_lower, self.bounds.x_upper)
 
@@ -552,6 +554,12 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         length `time_step` [s], that of the model where None.
         """
         return float(np.sum(self.cost_terms(xs, inputs, time_step)))
+
+    def least_cost(self, x0: Array, time_step: float) -> float:
+        """What is nothing beside the cost of staying at `x0` (nx,) under inputs of 0, a millionth of it."""
+        return STILL * abs(
+            self.objective(np.tile(x0, (self.num_steps + 1, 1)), np.zeros((self.num_steps, self.nu)), time_step)
+        )
 
     def cost_terms(self, xs: Array, inputs: Array, time_step: float | None = None) -> Array:
         """The terms of `objective`: of the knots, of the end and of the whole motion."""
@@ -766,9 +774,13 @@ def _spread(values: Array) -> Array:
 
 
 def _not_zero(scales: Array, lower: Array, upper: Array) -> Array:
-    """`scales` (n,), and for those that are 0 the rounding of a finite bound, else of the largest of all, else of 1."""
+    """`scales` (n,), and for those that are 0 the rounding of a finite bound, else of the largest of all, else of 1.
+
+    A bound counts as WIDEST times the largest at most, where there is one.
+    """
+    largest = np.max(scales, initial=0.0)
     sides = [np.where(np.isfinite(side), np.abs(side), 0.0) for side in (lower, upper)]
-    for others in (np.max(sides, axis=0), np.max(scales, initial=0.0), 1.0):
+    for others in (np.minimum(np.max(sides, axis=0) / WIDEST, largest or np.inf) * WIDEST, largest, 1.0):
         scales = np.where(scales == 0, STILL * others, scales)
     return scales
 
