@@ -35,7 +35,7 @@ class CertifyOptions:
     """Where a step is differenced, and what around it is told."""
 
     limit_reach: float = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
-    effort_room: float = 0.02  # of max(1, |u|): twice the widest step of the differences
+    effort_room: float = 0.02  # of an input's scale: twice the widest step of the differences
     effort_part: float = 0.5  # of an effort limit at most, however small that is
     leap: float = 1e-6  # of what an entry is weighed by: of another derivative at a limit than beside it
     neighbourhood: float = 1e-4  # in scaled coordinates: how far away a change of contact mode is looked for
@@ -153,17 +153,22 @@ def _beside_limits(model: Model, at_limit: NDArray[np.bool_]) -> str:
     return f"{', '.join(np.array(model.input_names)[at_limit])} certified beside the limit of its effort"
 
 
+def _input_scale(model: Model, us: Array) -> Array:
+    """(..., nu) how far inputs (..., nu) are moved relative to the step: 1, or the effort limit where that is less."""
+    return np.maximum(np.minimum(1.0, form_of(model).cut), np.abs(us))
+
+
 def _with_room(model: Model, us: Array) -> Array:
     """Inputs (..., nu) that leave differences room to effort limits."""
     limits = form_of(model).cut
-    room = np.minimum(STEP.effort_room * np.maximum(1.0, np.abs(us)), STEP.effort_part * limits)
+    room = np.minimum(STEP.effort_room * _input_scale(model, us), STEP.effort_part * limits)
     return np.minimum(np.maximum(us, room - limits), limits - room)
 
 
 def _leap_at_limits(model: Model, x: Array, u: Array, inward: Array, parameters: Parameters) -> Array:
     """The derivative at u (nu,) less that 1e-9 of u away, to the side that the signs `inward` (nu,) say."""
     vector = select(model, parameters)
-    beside = u + LIMITS.jitter * np.maximum(1.0, np.abs(u)) * inward
+    beside = u + LIMITS.jitter * _input_scale(model, u) * inward
     with applied(vector) as model:
         space = tangent_space(model)
         both = (step_jacobians(model, vector, x, inputs, "auto") for inputs in (u, beside))
@@ -214,7 +219,7 @@ class StepAround:
     def of_point(cls, model: Model, vector: ParameterVector, x: Array, u: Array) -> StepAround:
         """Around the step from x (nx,) under u (nu,), `vector` being applied."""
         space = tangent_space(model)
-        scale = np.concatenate([state_scale(space, x), np.maximum(1.0, np.abs(u)), vector.difference_scale()])
+        scale = np.concatenate([state_scale(space, x), _input_scale(model, u), vector.difference_scale()])
         return cls(model, vector, space, np.concatenate([x, u, vector.values]), scale)
 
     @property

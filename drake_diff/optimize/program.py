@@ -19,6 +19,14 @@ from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.problem import Problem
 
 FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, of the scale of the state, input or constraint itself
+FAR_FROM_ONE = 1e4  # a scale or one over it: what a solver's own tolerances do not allow for
+
+
+def are_far_from_one(scales: Array) -> bool:
+    """Whether the numbers of a program have to be divided by its scales."""
+    return bool(np.max(scales) > FAR_FROM_ONE or np.min(scales) < 1 / FAR_FROM_ONE)
+
+
 REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluation of every constraint
 
 

@@ -428,6 +428,22 @@ def test_motors_in_the_air_are_not_called_discontinuous():
         dd.certify(model, state_in_range(model, random), random.standard_normal(model.nu)).require()
 
 
+def test_a_motor_of_a_small_limit_is_probed_within_it(tmp_path):
+    """A mass of 20 mg that is pushed by 1e-10 N at most: dv' / du is h / m."""
+    (tmp_path / "slide.urdf").write_text(
+        '<robot name="slide"><link name="rail"/><link name="block"><inertial><mass value="2e-5"/><inertia ixx="1e-12" '
+        'iyy="1e-12" izz="1e-12" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="slide" type="prismatic">'
+        '<parent link="rail"/><child link="block"/><axis xyz="1 0 0"/><limit effort="1e-10" lower="-1e30" upper="1e30" '
+        'velocity="1e30"/></joint><transmission name="t"><type>transmission_interface/SimpleTransmission</type><joint '
+        'name="slide"/><actuator name="motor"/></transmission></robot>'
+    )
+    certificate = dd.certify(dd.load_model(tmp_path / "slide.urdf", time_step=0.05, base="weld"), [0, 0], [0]).require()
+    assert certificate.derivative[1, 2] == pytest.approx(0.05 / 2e-5, rel=1e-9)
+    wrong = certificate.derivative.copy()
+    wrong[1, 2] *= 1.01
+    assert certificate.of(wrong).verdict == "disagree"
+
+
 def test_a_product_that_is_zero_in_both_factors_is_smooth():
     """As the rate of a quaternion at rest: beside the point its derivative is another number, of mixed derivatives."""
     jacobian = lambda z: np.array([[z[1], z[0], 0.0], [0.0, 0.0, 3.0]])  # noqa: E731

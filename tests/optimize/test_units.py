@@ -91,7 +91,9 @@ def test_a_search_does_not_depend_on_the_names_and_scales_of_single_states(plain
 
 
 @pytest.mark.solve
-@pytest.mark.parametrize(("unit", "method"), [(1e-6, "collocation"), (1e4, "shooting"), (1e4, "ilqr")])
+@pytest.mark.parametrize(
+    ("unit", "method"), [(1e-6, "collocation"), (1e-6, "shooting"), (1e-6, "ilqr"), (1e4, "shooting"), (1e4, "ilqr")]
+)
 def test_a_slide_moves_at_the_same_cost_in_any_unit(tmp_path, unit, method):
     """Half of the way that the motor can move it, at the least effort: u = 6 m d (T - 2 t) / T^3 costs 0.1875."""
     solution = dd.solve(slide(tmp_path, unit, 0.5), method=method)

@@ -20,7 +20,7 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
 from drake_diff.motion.smooth_roll import SmoothRoll, smooth_roll_of
-from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
+from drake_diff.optimize.ilqr.constraints import GROWTH, AugmentedLagrangian, Units
 from drake_diff.optimize.ilqr.expansion import (
     Motion,
     curvature_along,
@@ -45,6 +45,7 @@ from drake_diff.optimize.program import (
     NlpResult,
     Outcome,
     Report,
+    are_far_from_one,
 )
 
 
@@ -117,7 +118,7 @@ def solve_ilqr(
     counts; raises GradientError or SimulationError if the guess is such a motion.
     """
     search = _Search(problem, xs, us, limits, report, patience, values)
-    search.constraints.penalty = max(search.constraints.penalty, least_penalty)
+    search.constraints.penalty = max(search.constraints.penalty, least_penalty * search.units.cost)
     if multipliers is not None and multipliers.sizes == (0, len(search.constraints.forces)):
         search.constraints.forces = multipliers.rows
     with noted_interrupts() as interrupted:
@@ -161,7 +162,6 @@ class _Search:
         values: Array | None = None,
     ):
         self.problem, self.limits, self.report, self.patience = problem, limits, report, patience
-        self.constraints = AugmentedLagrangian(problem)
         lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
         self.inner = lower * (1 + OPTIONS.beside * np.sign(lower)), upper * (1 - OPTIONS.beside * np.sign(upper))
         self.start, self.design = now(), problem.design
@@ -170,8 +170,10 @@ class _Search:
         self.guess, self.tried_by = self.motion, _smooth_roll(problem)
         self.policy: AffinePolicy | None = None  # that of the last step
         self.cost = self._objective(self.motion)
-        self.constraints.start(*self.motion.point, self.cost, float(np.sum(self.motion.gaps**2)))
-        self.jacobians: Array | None = None
+        self.jacobians: Array | None = jacobians_along(problem, self.motion)
+        self.units = self._units(self.jacobians)
+        self.constraints = AugmentedLagrangian(problem, self.units)
+        self.constraints.start(*self.motion.point, self.cost, float(np.sum(self._gaps**2)))
         self.gap_weight = 0.0
         self.regularization, self.ahead = 0.0, 1.0  # how far is tried first, as a part of a step not regularized
         self.crawled = 0  # short steps that gained little, since the last better one
@@ -179,6 +181,25 @@ class _Search:
         self.stalled = False
         self.refusals, self.refusal = 0, ""  # trial motions that could not be differentiated, and why the last
         self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
+
+    def _units(self, jacobians: Array) -> Units:
+        """Those of the problem by the guess, and by the `jacobians` (N, nx, nx + nc + nu) along it."""
+        from drake_diff.optimize.knots import costs_of  # loads CasADi
+
+        problem, (xs, us), nx = self.problem, self.motion.point, self.problem.nx
+        h = self.design.time_step(self.design.values(self.motion.c))
+        by_knot = np.delete(jacobians, np.s_[nx : nx + len(self.motion.c)], axis=2) - np.eye(nx, nx + problem.nu)
+        spans = problem.search_spans(xs, us, np.max(np.abs(by_knot), axis=0) / h, h * len(us))
+        gradients, hessians = costs_of(problem, xs, us, h).expand(xs, us)
+        terms = np.abs(gradients) @ spans + np.abs(np.diagonal(hessians, axis1=1, axis2=2)) @ spans**2 / 2
+        every = np.append(spans, np.sum(terms) or 1.0)
+        if np.all(np.isfinite(every)) and are_far_from_one(every):
+            return Units(spans, float(every[-1]))
+        return Units(np.ones(len(spans)), 1.0)
+
+    @property
+    def _gaps(self) -> Array:
+        return self.motion.gaps / self.units.states(self.problem.nx)
 
     @property
     def told_of_refusals(self) -> str:
@@ -199,8 +220,9 @@ class _Search:
             motion = self._roll(self.policy, 0.0)
         except SimulationError:
             motion = self.guess
-        rounding = OPTIONS.same_motion * max(1.0, float(np.abs(motion.xs).max()))
-        same = np.abs(motion.xs - self.motion.xs).max() <= rounding
+        units = self.units.states(self.problem.nx)
+        rounding = OPTIONS.same_motion * max(1.0, float(np.abs(motion.xs / units).max()))
+        same = np.abs((motion.xs - self.motion.xs) / units).max() <= rounding
         self.motion, self.cost = motion, self._objective(motion)
         self.rows[-1] = replace(self.rows[-1], objective=self.cost, primal_infeasibility=self._infeasibility())
         if same:
@@ -225,7 +247,7 @@ class _Search:
                 return outcome
             stands = self.constraints.violation(*self.motion.point) > FEASIBILITY_TOLERANCE
             reached = not stands and self.constraints.residual(*self.motion.point) <= self.limits.tolerance
-            exhausted = self.constraints.penalty >= LARGEST_PENALTY
+            exhausted = self.constraints.is_exhausted
             if final and reached:
                 return outcome
             if final and exhausted:
@@ -271,7 +293,7 @@ class _Search:
     def _step(self, model: LinearQuadratic, final: bool) -> Outcome | None:
         """Take one step that lowers the merit; an outcome if there is none left to take."""
         merit = self._merit(self.motion, self.cost)
-        scale = 1 + abs(merit)
+        scale = self.units.cost + abs(merit)
         left_over = self.limits.tolerance**2 * scale
         if not final:
             left_over = max(left_over, OPTIONS.left_over * self.constraints.unrest(*self.motion.point))
@@ -424,4 +446,4 @@ class _Search:
         return cost + self.constraints.value(*motion.point) + self.gap_weight * motion.distance
 
     def _infeasibility(self) -> float:
-        return max(float(np.abs(self.motion.gaps).max(initial=0.0)), self.constraints.violation(*self.motion.point))
+        return max(float(np.abs(self._gaps).max(initial=0.0)), self.constraints.violation(*self.motion.point))

@@ -31,6 +31,7 @@ from drake_diff.optimize.program import (
     Outcome,
     Report,
     Watch,
+    are_far_from_one,
 )
 
 OUTCOMES = {
@@ -66,7 +67,6 @@ WARM_START = {
     **dict.fromkeys([f"ipopt.warm_start_slack_{part}" for part in ("bound_push", "bound_frac")], 1e-6),
 }
 TRIED = 0.1  # of the spans: how far from the guess the cost is looked at
-FAR_FROM_ONE = 1e4  # a scale or one over it: what a solver's own tolerances do not allow for
 PRECISE = 0.1  # of the tolerance: a motion may stay well within the spans of its first guess
 NOT_FINITE = "IPOPT: Invalid Number Detected"
 
@@ -283,8 +283,7 @@ class BlockProgram:
         largest = max((change for change in changes if np.isfinite(change)), default=0.0)
         rows, largest = np.where(rows > 1e-150, rows, 1.0), largest or 1.0  # whose products do not overflow
         every = np.concatenate([spans, rows, [largest]])
-        is_far = np.max(every) > FAR_FROM_ONE or np.min(every) < 1 / FAR_FROM_ONE
-        return Scales(spans, rows, largest) if is_far else Scales()
+        return Scales(spans, rows, largest) if are_far_from_one(every) else Scales()
 
     def cost_at(self, z: Array) -> float:
         """The cost alone at z (n,); NaN where a term has none there."""
