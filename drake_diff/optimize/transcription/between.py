@@ -203,6 +203,7 @@ def _of_constraint(motion: Collocated, c: Constraint, spans: Array) -> list[_Bey
     times, xs = times[order], xs[order]
     first = motion.horizon * (motion.mesh[0] + motion.mesh[1]) / 2
     mask = times > (first if motion.task.problem.initial_state_is_given else 0.0)  # what is given nothing can keep
+    mask &= np.isfinite(xs).all(axis=1)  # where the dynamics lead nowhere, the check of their integration fails
     times, xs = times[mask], xs[mask]
 
     def at(more: Array) -> tuple[Array, Array]:
@@ -217,6 +218,9 @@ def _of_constraint(motion: Collocated, c: Constraint, spans: Array) -> list[_Bey
         times, xs = every[order], xs[order]
     times, xs, us = _looked_at(c, times, xs, motion.applied_at(times), at)
     values = _values(c, xs, us)
+    if not len(values):
+        row = _between("bound", f"{c.label} at no moment", np.inf, 0.0)
+        return [_Beyond("constraint", np.inf, np.inf, times, row)]
     scales = c.scales(xs, us, spans)
     excess, tolerance = _excess(values, c.lower, c.upper), _tolerance(_extent(np.nan_to_num(values)), scales)
     depth, through = _depth(c, xs, us, excess, spans, scales)

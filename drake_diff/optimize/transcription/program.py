@@ -66,6 +66,7 @@ WARM_START = {
     **dict.fromkeys([f"ipopt.warm_start_{part}" for part in ("bound_push", "bound_frac", "mult_bound_push")], 1e-6),
     **dict.fromkeys([f"ipopt.warm_start_slack_{part}" for part in ("bound_push", "bound_frac")], 1e-6),
 }
+FLAT = 1e-8  # of the largest slope of a row: a row that has another one than at the guess
 TRIED = 0.1  # of the spans: how far from the guess the cost is looked at
 PRECISE = 0.1  # of the tolerance: a motion may stay well within the spans of its first guess
 NOT_FINITE = "IPOPT: Invalid Number Detected"
@@ -277,9 +278,13 @@ class BlockProgram:
         rows = np.zeros(len(self.sides[0]))
         np.maximum.at(rows, sparsity.row(), np.nan_to_num(slopes, posinf=0.0))
         changes = [abs(cost), float(np.nan_to_num(np.abs(gradient), posinf=0.0) @ spans)]
+        flat = rows <= FLAT * np.max(rows, initial=0.0)  # as the square of a velocity from rest
         for side in (-1, 1):
             with np.errstate(all="ignore"):
                 changes.append(abs(self.cost_at(z + side * TRIED * spans) - cost) / TRIED)
+                if np.any(flat):
+                    values = self.evaluate(z + side * TRIED * spans)[1] - self.evaluate(z)[1]
+                    rows = np.maximum(rows, np.where(flat, np.nan_to_num(np.abs(values), posinf=0.0), 0.0) / TRIED)
         largest = max((change for change in changes if np.isfinite(change)), default=0.0)
         rows, largest = np.where(rows > 1e-150, rows, 1.0), largest or 1.0  # whose products do not overflow
         every = np.concatenate([spans, rows, [largest]])
