@@ -27,7 +27,7 @@ from drake_diff.optimize.transcription.task import OptimalControl, UserCost, use
 
 # Of a state's scale: between two knots the transcription is a cubic, and further than this from an accurate integration
 # its motion is not the model's.
-INTEGRATION_TOLERANCE = 1e-2
+INTEGRATION_TOLERANCE = 5e-3
 FEEDBACK_COST = 0.2  # of the cost, what feedback may cost more or less than the plan that it follows
 # Of the cost: by how much the quadrature that was minimized may differ from its integral. A step of refinement makes it
 # 16 times smaller, and costs of plans that are worth comparing differ by more.

@@ -774,10 +774,11 @@ def _spread(values: Array) -> Array:
 
 
 def _not_zero(scales: Array, lower: Array, upper: Array) -> Array:
-    """`scales` (n,), and for those that are 0 the rounding of a finite bound, else of the largest of all, else of 1.
+    """`scales` (n,), and for those of square 0 the rounding of a finite bound, else of the largest of all, else of 1.
 
     A bound counts as WIDEST times the largest at most, where there is one.
     """
+    scales = np.where(np.square(scales) == 0, 0.0, scales)
     largest = np.max(scales, initial=0.0)
     sides = [np.where(np.isfinite(side), np.abs(side), 0.0) for side in (lower, upper)]
     for others in (np.minimum(np.max(sides, axis=0) / WIDEST, largest or np.inf) * WIDEST, largest, 1.0):
