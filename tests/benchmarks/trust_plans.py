@@ -30,7 +30,7 @@ from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 
-COUNT = 200
+COUNT, EVERY_BLOCK = 200, 25  # cases; one of so many seeds has a narrow force or cost
 PART = 0.01  # of what a state travels, and of a cost: what a replay may be off
 WIDE = 0.05  # the same of a state along a motion under the referee's feedback, whose weights are others
 EFFORTS, OPEN_LOOP = (0.1, 0.01, 1.0), 1e30  # what the referee's regulators weigh an input by; so much is no feedback
@@ -64,6 +64,8 @@ class Task:
     speed: float = np.inf  # the limit of the first speed
     waypoint: float = FREE  # of the first coordinate, half way
     weights: dict[str, np.ndarray] = field(default_factory=dict)  # of the cost: Q, R, F
+    peak: Any = None  # a part of the running cost, a function of the first coordinate
+    narrow: float = np.inf  # [s] in which a force or cost acts
 
     @property
     def has_model(self) -> bool:
@@ -71,7 +73,8 @@ class Task:
 
     def rate(self, x, u):
         off = x - np.nan_to_num(self.goal)
-        return 1.0 if self.kind == "free horizon" else off @ self.weights["Q"] @ off + u @ self.weights["R"] @ u
+        rate = 1.0 if self.kind == "free horizon" else off @ self.weights["Q"] @ off + u @ self.weights["R"] @ u
+        return rate if self.peak is None else rate + self.peak(x[0])
 
     def final(self, x):
         off = x - np.nan_to_num(self.goal)
@@ -96,6 +99,8 @@ class Task:
         else:
             reference = np.nan_to_num(self.goal)
             more["running_cost"] = dd.QuadraticCost(self.weights["Q"], self.weights["R"], reference)
+            if self.peak is not None:
+                more["running_cost"] = self.rate
             if np.any(self.weights["F"]):
                 more["final_cost"] = dd.QuadraticCost(self.weights["F"], None, reference)
         if self.kind != "soft":
@@ -232,13 +237,30 @@ def satellite(random, name, L, M, S):
     return Task("satellite", system, goal, natural, duration, count, limits, np.zeros(6))
 
 
+def block(random, name, L, M, S):
+    """A slide past a force or a cost that acts over a few ten-thousandths to a hundredth of its way."""
+    m, way, duration = random.uniform(0.5, 2) * M, random.uniform(0.1, 3) * L, random.uniform(0.5, 3) * S
+    width, at, is_cost = 10 ** random.uniform(-3.5, -2) * way, random.uniform(0.2, 0.8) * way, random.random() < 0.5
+    limits, speed = random.uniform(1.5, 4, 1) * 4 * m * way / duration**2, 1.5 * way / duration
+    bump = lambda q: np.exp(-(((q - at) / width) ** 2)) / (width * np.sqrt(np.pi))  # noqa: E731
+    work = 0.0 if is_cost else random.uniform(-0.5, 0.5) * m * speed**2
+    goal, natural = np.array([way, 0]), np.array([way, way / duration])
+    system, count = lambda x, u: [x[1], (u[0] + work * bump(x[0])) / m], int(random.integers(10, 40))
+    task = Task("narrow force or cost", system, goal, natural, duration, count, limits, np.zeros(2))
+    if is_cost:
+        height = random.uniform(0.05, 1) * 12 * 0.1 * (m * way / duration**2 / limits[0]) ** 2 * speed
+        task.peak = lambda q: height * bump(q)
+    task.narrow = width / speed
+    return task
+
+
 SYSTEMS = (slide, slide, pendulum, pendulum, cart_pole, double_pendulum, wheel, satellite)
 
 
 def drawn(seed):
     """The task of a seed."""
     random, units = np.random.default_rng([37, seed]), np.ones(3)
-    make = SYSTEMS[seed % len(SYSTEMS)]
+    make = block if seed % EVERY_BLOCK == EVERY_BLOCK - 1 else SYSTEMS[seed % len(SYSTEMS)]
     if random.random() < (0.7 if make is slide else 0.3):
         units[random.integers(3)] = 10 ** random.uniform(-6, 6)
         if random.random() < 0.3:
@@ -247,6 +269,8 @@ def drawn(seed):
     kinds = ["hard", "hard", "soft", "both"] if make is not double_pendulum else ["hard", "soft", "soft", "both"]
     kinds += ["free horizon"] * int(make in (slide, pendulum) and np.isnan(task.waypoint))
     task.kind = str(random.choice(kinds))
+    if make is block:
+        task.kind = "hard"
     if task.kind in ("soft", "both", "free horizon"):
         task.feasible = None
     task.method = str(random.choice(["auto", "auto", "collocation", "shooting", "ilqr"]))
@@ -331,7 +355,8 @@ class Referee:
             return h * np.append(self.rates(z[:-1], u), self.task.rate(z[:-1], u))
 
         least = 1e-12 * np.append(self.scale, max(abs(self.cost), 1e-300))
-        done = solve_ivp(slopes, (0, 1), np.append(x, 0.0), method="DOP853", rtol=1e-10, atol=least)
+        step = self.task.narrow / 3 / h
+        done = solve_ivp(slopes, (0, 1), np.append(x, 0.0), method="DOP853", rtol=1e-10, atol=least, max_step=step)
         return done.y[:, -1]
 
     def open_loop(self, plant):
@@ -371,8 +396,9 @@ class Referee:
 
     def _integrated(self, k, s, h, x, change):
         whole = self.times[k + 1] - self.times[k]
-        for i in range(2):  # Runge and Kutta's fourth order
-            d = h / 2
+        count = max(2, math.ceil(3 * h / self.task.narrow))
+        for i in range(count):  # Runge and Kutta's fourth order
+            d = h / count
             first, mid, last = (self._within(self.input(k, s + (i * d + c) / whole) + change) for c in (0, d / 2, d))
             a = self.rates(x, first)
             b = self.rates(x + d / 2 * a, mid)
