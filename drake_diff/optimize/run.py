@@ -49,6 +49,7 @@ from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.steps import solve_shooting
 from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, refused, status_of, unmeasured
 
+NEAR = "a motion near the collocated optimum, and no optimum in these steps itself"
 GRACE = 0.05  # of the time limit, beyond it: for measures of what a search found that the limit ended
 # What a solve is made of, in this order; a time limit names what it cut.
 STAGES = ("certificates of the guess", "the search", "certificates of the result", "replays and other measures")
@@ -79,6 +80,7 @@ class Run:
     options: dict[str, Any]  # what the record says of the solver
     report: Report | None
     searched: Problem | None = None  # what is solved where that is more than what is asked
+    closest: bool = False  # whether any motion near the guess will do, an optimum or not
     start: float = field(default_factory=now)
     started: float = field(default_factory=time.monotonic)
     certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
@@ -467,6 +469,9 @@ class Run:
 
     def _judge(self, draft: Solution, result: NlpResult) -> Solution:
         """`judged`, and no success where the cost asks for a motion that nothing here could have begun."""
+        if self.closest:
+            outcome = Outcome.SOLVED if result.outcome is Outcome.INACCURATE else result.outcome
+            result = dataclasses.replace(result, outcome=outcome, note=NEAR)
         self._reach(3, draft, result)
         if isinstance(draft, PhasedSolution):
             phases = tuple(judged(phase, result) for phase in draft.phases)

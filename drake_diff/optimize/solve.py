@@ -295,7 +295,9 @@ class _Task:
         if isinstance(problem, PhasedProblem):
             options = {name: options[name] for name in ("initial_guess", "seed")}
         solver = attempt.options.solver or DEFAULT_SOLVERS[method]
-        run = Run(problem, method, scheme, solver, limits, attempt.options, options, self.report, searched)
+        run = Run(
+            problem, method, scheme, solver, limits, attempt.options, options, self.report, searched, attempt.closest
+        )
 
         def make() -> Solution:
             if method == "collocation":

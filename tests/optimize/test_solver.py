@@ -46,6 +46,29 @@ SOFT = {
 }
 
 
+@pytest.mark.parametrize("outcome", [Outcome.INACCURATE, Outcome.INFEASIBLE])
+def test_where_the_optimum_in_steps_is_far_a_motion_in_them_near_the_collocated_one_will_do(load, monkeypatch, outcome):
+    """It need not be the nearest one; what is no motion is none, however near."""
+    monkeypatch.setattr("drake_diff.optimize.solve.REFINING", 1)
+    shoot = Run.shoot
+
+    def ended(run, *args, **more):
+        judge = run._judge
+        object.__setattr__(
+            run, "_judge", lambda draft, result: judge(draft, dataclasses.replace(result, outcome=outcome))
+        )
+        return shoot(run, *args, **more)
+
+    monkeypatch.setattr(Run, "shoot", ended)
+    solution = dd.solve(swing_up(load, 50))
+    assert solution.success == (outcome is Outcome.INACCURATE), solution.message
+    if solution.success:
+        assert solution.plant == "steps"
+        assert "no optimum in these steps itself" in " ".join(solution.notes)
+        replayed = dd.rollout(solution.problem.model, solution.xs[0], solution.us).xs
+        assert np.max(np.abs(replayed - solution.xs)) < 1e-6  # asked of the README's cart-pole
+
+
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])
 def test_pendulum_with_a_soft_goal(load, method):
     """J* = 1.88951695347 by a solve of the same steps beside Drake."""
