@@ -325,7 +325,7 @@ def _replay(
     fraction = STATE_TOLERANCE if control == OPEN_LOOP or law_is_another else FEEDBACK_TOLERANCE
     if control == GAINS_ALONE:  # which stand for any such regulator
         off = plan.problem.goal_error(motion.xs[-1])
-        checks = [goal_check(plan, off, ANOTHER_PLANT), *comparison_checks(plan, motion, parts)]
+        checks = [goal_check(plan, off), *comparison_checks(plan, motion, parts)]
         return measured_replay(plan, variant, control, model, motion, checks)
     checks = [*motion_checks(plan, model, motion, parts, fraction, same=variant == plan.own_plant)]
     if plan.continuous or parts == FINE or not model.can_rebuild:  # a coarse step gains and loses some, an artefact all
