@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,18 @@ def are_far_from_one(scales: Array) -> bool:
     return bool(np.max(scales) > FAR_FROM_ONE or np.min(scales) < 1 / FAR_FROM_ONE)
 
 
+class Scales(NamedTuple):
+    """What the numbers of a program are divided by, so that they do not depend on units.
+
+    Of its variables (n,), in iLQR of a knot's (nx + nu,), its rows (m,) and its cost; without them nothing is divided.
+    """
+
+    variables: Any = 1.0
+    rows: Any = 1.0
+    cost: float = 1.0
+
+
+UNSCALED = Scales()
 REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluation of every constraint
 
 

@@ -7,7 +7,6 @@ p J'J of the rows that push is kept (Gauss-Newton), which no constraint can make
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,27 +14,11 @@ import numpy as np
 from drake_diff._base.arrays import Array, slices_of
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import UNSCALED, Scales
 
 FIRST_PENALTIES = (1.0, 1e6)  # the lowest and the highest
 LARGEST_PENALTY, GROWTH = 1e9, 10.0
 SMALLEST_SLOPE = 1e-8  # of a row: below it nothing says in what unit it is to be weighed
-
-
-@dataclass(frozen=True)
-class Units:
-    """What states and inputs (nx + nu,) and the cost are divided by: 1 unless they are far from it."""
-
-    of: Array
-    cost: float
-
-    @property
-    def differ(self) -> bool:
-        """Whether they are not all 1."""
-        return self.cost != 1 or bool(np.any(self.of != 1))
-
-    def states(self, nx: int) -> Array:
-        """(nx,) those of the states."""
-        return self.of[:nx]
 
 
 class PenalizedRows:
@@ -113,12 +96,13 @@ class AugmentedLagrangian(PenalizedRows):
 
     First a row for every state coordinate at every knot, in its own unit (the bounds of x_0 are not here), then those
     of the problem's constraints. These are divided by the largest slope |dc / d(x, u)| that they were seen to have at
-    any of their knots, so that newtons beside metres weigh as the metres do that change them. Units of states, inputs
-    and cost are taken from `units` where those are given; a violation then has no unit.
+    any of their knots, so that newtons beside metres weigh as the metres do that change them. Where states, inputs and
+    cost have `scales`, a violation has no unit.
     """
 
-    def __init__(self, problem: Problem, units: Units | None = None):
-        self.problem, self.units = problem, units or Units(np.ones(problem.nx + problem.nu), 1.0)
+    def __init__(self, problem: Problem, scales: Scales = UNSCALED):
+        self.problem, self.unit, self.is_scaled = problem, scales.cost, scales is not UNSCALED
+        self.spans = np.broadcast_to(scales.variables, problem.nx + problem.nu)
         lower, upper = problem.state_limits()
         lower[0], upper[0] = -np.inf, np.inf
         self.groups = [_Rows(problem, constraint) for constraint in problem.kept]
@@ -126,7 +110,7 @@ class AugmentedLagrangian(PenalizedRows):
             np.concatenate([lower.ravel(), *(g.lower for g in self.groups)]),
             np.concatenate([upper.ravel(), *(g.upper for g in self.groups)]),
         )
-        self.scale[: lower.size] = np.tile(1 / self.units.states(problem.nx), len(lower))
+        self.scale[: lower.size] = np.tile(1 / self.spans[: problem.nx], len(lower))
         self.slices = slices_of([lower.size, *(g.size for g in self.groups)])[1:]  # where the rows of each group are
         self.any = bool(np.any(np.isfinite(self.lower) | np.isfinite(self.upper)))
 
@@ -137,20 +121,20 @@ class AugmentedLagrangian(PenalizedRows):
         """
         self._choose_scales(xs, us)
         wrong = (gaps + float(np.sum((self.scale * self.excess(xs, us)) ** 2))) / 2
-        first = abs(cost) / self.units.cost / wrong if wrong else np.inf
-        self.penalty = self.units.cost * float(np.clip(first, *FIRST_PENALTIES))
+        first = abs(cost) / self.unit / wrong if wrong else np.inf
+        self.penalty = self.unit * float(np.clip(first, *FIRST_PENALTIES))
 
     def value(self, *given: Array) -> float:
         return super().value(*given) if self.any else 0.0
 
     def violation(self, *given: Array) -> float:
-        weights = self.scale if self.units.differ else 1.0
+        weights = self.scale if self.is_scaled else 1.0
         return float(np.max(weights * self.excess(*given), initial=0.0))
 
     @property
     def is_exhausted(self) -> bool:
         """Whether the penalty is as large as it may be."""
-        return self.penalty >= LARGEST_PENALTY * self.units.cost
+        return self.penalty >= LARGEST_PENALTY * self.unit
 
     def values(self, *given: Array) -> Array:
         return np.concatenate([given[0].ravel(), *(group.values(*given) for group in self.groups)])
@@ -182,7 +166,7 @@ class AugmentedLagrangian(PenalizedRows):
 
     def _choose_scales(self, xs: Array, us: Array) -> None:
         for group, rows in zip(self.groups, self.slices, strict=True):
-            self.scale[rows] = group.scale(xs, us, self.units.of)
+            self.scale[rows] = group.scale(xs, us, self.spans)
 
 
 class _Rows:

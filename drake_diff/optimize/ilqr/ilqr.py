@@ -20,7 +20,7 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
 from drake_diff.motion.smooth_roll import SmoothRoll, smooth_roll_of
-from drake_diff.optimize.ilqr.constraints import GROWTH, AugmentedLagrangian, Units
+from drake_diff.optimize.ilqr.constraints import GROWTH, AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import (
     Motion,
     curvature_along,
@@ -38,6 +38,7 @@ from drake_diff.optimize.ilqr.riccati import (
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,
+    UNSCALED,
     Iterate,
     Iteration,
     Limits,
@@ -45,6 +46,7 @@ from drake_diff.optimize.program import (
     NlpResult,
     Outcome,
     Report,
+    Scales,
     are_far_from_one,
 )
 
@@ -118,7 +120,7 @@ def solve_ilqr(
     counts; raises GradientError or SimulationError if the guess is such a motion.
     """
     search = _Search(problem, xs, us, limits, report, patience, values)
-    search.constraints.penalty = max(search.constraints.penalty, least_penalty * search.units.cost)
+    search.constraints.penalty = max(search.constraints.penalty, least_penalty * search.constraints.unit)
     if multipliers is not None and multipliers.sizes == (0, len(search.constraints.forces)):
         search.constraints.forces = multipliers.rows
     with noted_interrupts() as interrupted:
@@ -171,8 +173,7 @@ class _Search:
         self.policy: AffinePolicy | None = None  # that of the last step
         self.cost = self._objective(self.motion)
         self.jacobians: Array | None = jacobians_along(problem, self.motion)
-        self.units = self._units(self.jacobians)
-        self.constraints = AugmentedLagrangian(problem, self.units)
+        self.constraints = AugmentedLagrangian(problem, self._scales(self.jacobians))
         self.constraints.start(*self.motion.point, self.cost, float(np.sum(self._gaps**2)))
         self.gap_weight = 0.0
         self.regularization, self.ahead = 0.0, 1.0  # how far is tried first, as a part of a step not regularized
@@ -182,7 +183,7 @@ class _Search:
         self.refusals, self.refusal = 0, ""  # trial motions that could not be differentiated, and why the last
         self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
 
-    def _units(self, jacobians: Array) -> Units:
+    def _scales(self, jacobians: Array) -> Scales:
         """Those of the problem by the guess, and by the `jacobians` (N, nx, nx + nc + nu) along it."""
         from drake_diff.optimize.knots import costs_of  # loads CasADi
 
@@ -194,12 +195,12 @@ class _Search:
         terms = np.abs(gradients) @ spans + np.abs(np.diagonal(hessians, axis1=1, axis2=2)) @ spans**2 / 2
         every = np.append(spans, np.sum(terms) or 1.0)
         if np.all(np.isfinite(every)) and are_far_from_one(every):
-            return Units(spans, float(every[-1]))
-        return Units(np.ones(len(spans)), 1.0)
+            return Scales(spans, cost=float(every[-1]))
+        return UNSCALED
 
     @property
     def _gaps(self) -> Array:
-        return self.motion.gaps / self.units.states(self.problem.nx)
+        return self.motion.gaps / self.constraints.spans[: self.problem.nx]
 
     @property
     def told_of_refusals(self) -> str:
@@ -220,7 +221,7 @@ class _Search:
             motion = self._roll(self.policy, 0.0)
         except SimulationError:
             motion = self.guess
-        units = self.units.states(self.problem.nx)
+        units = self.constraints.spans[: self.problem.nx]
         rounding = OPTIONS.same_motion * max(1.0, float(np.abs(motion.xs / units).max()))
         same = np.abs((motion.xs - self.motion.xs) / units).max() <= rounding
         self.motion, self.cost = motion, self._objective(motion)
@@ -293,7 +294,7 @@ class _Search:
     def _step(self, model: LinearQuadratic, final: bool) -> Outcome | None:
         """Take one step that lowers the merit; an outcome if there is none left to take."""
         merit = self._merit(self.motion, self.cost)
-        scale = self.units.cost + abs(merit)
+        scale = self.constraints.unit + abs(merit)
         left_over = self.limits.tolerance**2 * scale
         if not final:
             left_over = max(left_over, OPTIONS.left_over * self.constraints.unrest(*self.motion.point))

@@ -11,7 +11,7 @@ call, and summed up: the weights of F_i in the Lagrangian's second derivative ar
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -23,6 +23,7 @@ from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.optimize.knots import PointFunction
 from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,
+    UNSCALED,
     Iterate,
     Iteration,
     Limits,
@@ -30,6 +31,7 @@ from drake_diff.optimize.program import (
     NlpResult,
     Outcome,
     Report,
+    Scales,
     Watch,
     are_far_from_one,
 )
@@ -97,17 +99,6 @@ class Term:
         matrix = sparse.csr_matrix((weights, (rows + 1, places)), shape=shape)
         matrix.eliminate_zeros()
         return matrix
-
-
-class Scales(NamedTuple):
-    """What the numbers of a program are divided by, so that they do not depend on units.
-
-    Of its variables (n,), its rows (m,) and its cost; without them nothing is divided.
-    """
-
-    variables: Any = 1.0
-    rows: Any = 1.0
-    cost: float = 1.0
 
 
 class BlockProgram:
@@ -274,7 +265,7 @@ class BlockProgram:
             slopes = np.abs(self.jacobian(z)) * spans[sparsity.get_col()]
             cost, gradient = self.gradient(z)
         except self.backs_off:
-            return Scales()
+            return UNSCALED
         rows = np.zeros(len(self.sides[0]))
         np.maximum.at(rows, sparsity.row(), np.nan_to_num(slopes, posinf=0.0))
         changes = [abs(cost), float(np.nan_to_num(np.abs(gradient), posinf=0.0) @ spans)]
@@ -288,7 +279,7 @@ class BlockProgram:
         largest = max((change for change in changes if np.isfinite(change)), default=0.0)
         rows, largest = np.where(rows > 1e-150, rows, 1.0), largest or 1.0  # whose products do not overflow
         every = np.concatenate([spans, rows, [largest]])
-        return Scales(spans, rows, largest) if are_far_from_one(every) else Scales()
+        return Scales(spans, rows, largest) if are_far_from_one(every) else UNSCALED
 
     def cost_at(self, z: Array) -> float:
         """The cost alone at z (n,); NaN where a term has none there."""
