@@ -184,13 +184,18 @@ class _Search:
         self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
 
     def _scales(self, jacobians: Array) -> Scales:
-        """Those of the problem by the guess, and by the `jacobians` (N, nx, nx + nc + nu) along it."""
+        """Those of the problem by the guess, and by the `jacobians` (N, nx, nx + nc + nu) along it.
+
+        None in contact, whose stiffness says nothing of how far states go; that of a limit is met at few knots.
+        """
         from drake_diff.optimize.knots import costs_of  # loads CasADi
 
         problem, (xs, us), nx = self.problem, self.motion.point, self.problem.nx
+        if problem.model.contract.contact.collision_pairs:
+            return UNSCALED
         h = self.design.time_step(self.design.values(self.motion.c))
         by_knot = np.delete(jacobians, np.s_[nx : nx + len(self.motion.c)], axis=2) - np.eye(nx, nx + problem.nu)
-        spans = problem.search_spans(xs, us, np.max(np.abs(by_knot), axis=0) / h, h * len(us))
+        spans = problem.search_spans(xs, us, np.median(np.abs(by_knot), axis=0) / h, h * len(us))
         gradients, hessians = costs_of(problem, xs, us, h).expand(xs, us)
         terms = np.abs(gradients) @ spans + np.abs(np.diagonal(hessians, axis1=1, axis2=2)) @ spans**2 / 2
         every = np.append(spans, np.sum(terms) or 1.0)
