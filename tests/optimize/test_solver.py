@@ -60,7 +60,7 @@ def test_where_the_optimum_in_steps_is_far_a_motion_in_them_near_the_collocated_
         return shoot(run, *args, **more)
 
     monkeypatch.setattr(Run, "shoot", ended)
-    solution = dd.solve(swing_up(load, 50))
+    solution = dd.solve(swing_up(load, 100))
     assert solution.success == (outcome is Outcome.INACCURATE), solution.message
     if solution.success:
         assert solution.plant == "steps"

@@ -299,7 +299,7 @@ class _Search:
     def _step(self, model: LinearQuadratic, final: bool) -> Outcome | None:
         """Take one step that lowers the merit; an outcome if there is none left to take."""
         merit = self._merit(self.motion, self.cost)
-        scale = self.constraints.unit + abs(merit)
+        scale = min(1.0, self.constraints.unit) + abs(merit)
         left_over = self.limits.tolerance**2 * scale
         if not final:
             left_over = max(left_over, OPTIONS.left_over * self.constraints.unrest(*self.motion.point))

@@ -59,8 +59,11 @@ SMALLEST_PART = 1e-3
 SAME_STATE = 1e-6  # [the coupling's unit] of states that are typed by hand
 STILL = 1e-6  # of a state's largest magnitude, or of a radian: what moves less stands still
 RETURNS = 0.1  # of its range along a plan: what has to travel less returns to where it was
+NOTHING = 1e-150  # in any unit: its square is no number
 STAYS = 1e-2  # of its bounds, or of a radian: what a state moves that need not travel
-WIDEST = 1e3  # magnitudes or sizes (of any state, where no file has them): bounds that are further apart are none
+# Magnitudes or sizes (of any state, where no file has them): bounds that are further apart are none, and others count
+# as so many at most, those of velocities as FASTER: no bound makes a scale that is much more than what a state does.
+WIDEST, FASTER, REACH = 1e3, 300.0, 10.0
 GOAL_PART = 0.01  # of what a state has to travel: how far from its goal it may end where nothing else is given
 TRIED, NO_SLOPE = 3, 1e-9  # states at which a goal's slopes are looked at, and what counts as none: rounding
 
@@ -441,16 +444,18 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         horizon; where all that is 0, of its bound.
         """
         asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
-        scales, sizes = np.ptp(xs, axis=0), np.max(np.nan_to_num(np.abs(asked)), axis=0)
+        scales, sizes = np.ptp(xs, axis=0), np.max(np.nan_to_num(np.abs(asked), posinf=0.0), axis=0)
         for q, _, size, _ in self._vectors:
             sizes[q] = np.maximum(np.max(sizes[q]), size)
-        way, room, least = self._way(xs), self.bounds.x_upper - self.bounds.x_lower, STILL * sizes
-        room[~(room / WIDEST <= (np.max(sizes) if self.moved is None else sizes))] = 0.0
+        way, width, least = self._way(xs), self.bounds.x_upper - self.bounds.x_lower, STILL * sizes
+        near = np.max(sizes) if self.moved is None else sizes
+        room = np.where(width / WIDEST <= near, REACH * np.minimum(width / REACH, near), 0.0)
         for q, v, size, turns in self._vectors:
             for places in (q, v):
                 scales[places], least[places] = np.max(scales[places]), np.max(least[places])
             room[q] = min(np.max(room[q]) or size, size) if turns else np.max(room[q])
-            room[v] = room[q[0]] / self.start_horizon
+            limits = np.where(width[v] / WIDEST <= sizes[v], FASTER * np.minimum(width[v] / FASTER, sizes[v]), 0.0)
+            room[v] = np.max(limits) or room[q[0]] / self.start_horizon
             least[v] = np.maximum(least[v], least[q[0]] / self.start_horizon)
         least = np.maximum(least, np.where(way <= STILL * room, STAYS * room, 0.0))
         return _not_zero(np.maximum(scales, least), self.bounds.x_lower, self.bounds.x_upper)
@@ -468,7 +473,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
         By x0, waypoints, goal and the guess. A state that is the same there has what moves another one by its way over
         the `horizon` [s], by `slopes` (nx, nx + nu) of x', or what it is moved by; so has an input, or what the guess
-        has of it where that is more, within its bounds.
+        has of it where that is more, within its bounds. One of which nothing is known has 1, or its bound below that.
         """
         b, nx = self.bounds, self.nx
         given = np.vstack([xs, np.where(self.initial_state_mask, np.nan, self.x0), *self.waypoints.values(), self.goal])
@@ -481,9 +486,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             driven = np.concatenate([horizon * slopes @ spans, np.zeros(self.nu)])
             spans = np.where(spans > 0, spans, np.where(np.isfinite(drives), drives, driven))
         wide = (b.u_upper - b.u_lower) / 2
-        bounded = np.isfinite(wide) & (wide > 0)
-        inputs = np.maximum(spans[nx:], np.max(np.abs(us), axis=0, initial=0.0))
-        inputs = np.where(bounded & ((spans[nx:] == 0) | (inputs > wide)), wide, inputs)
+        wide = np.where(np.isfinite(wide) & (wide > 0), wide, np.inf)
+        known = np.where(spans[nx:] > 0, spans[nx:], np.minimum(wide, 1.0))
+        inputs = np.minimum(np.maximum(known, np.max(np.abs(us), axis=0, initial=0.0)), wide)
         spans = np.append(spans[:nx], inputs)
         return np.where(spans > 0, spans, 1.0)
 
@@ -774,11 +779,11 @@ def _spread(values: Array) -> Array:
 
 
 def _not_zero(scales: Array, lower: Array, upper: Array) -> Array:
-    """`scales` (n,), and for those of square 0 the rounding of a finite bound, else of the largest of all, else of 1.
+    """`scales` (n,), and for those below NOTHING the rounding of a finite bound, else of the largest of all, else of 1.
 
     A bound counts as WIDEST times the largest at most, where there is one.
     """
-    scales = np.where(np.square(scales) == 0, 0.0, scales)
+    scales = np.where(scales < NOTHING, 0.0, scales)
     largest = np.max(scales, initial=0.0)
     sides = [np.where(np.isfinite(side), np.abs(side), 0.0) for side in (lower, upper)]
     for others in (np.minimum(np.max(sides, axis=0) / WIDEST, largest or np.inf) * WIDEST, largest, 1.0):
