@@ -445,16 +445,17 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """
         asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
         scales, sizes = np.ptp(xs, axis=0), np.max(np.nan_to_num(np.abs(asked), posinf=0.0), axis=0)
+        sizes = np.minimum(sizes, 1 / NOTHING)
         for q, _, size, _ in self._vectors:
             sizes[q] = np.maximum(np.max(sizes[q]), size)
         way, width, least = self._way(xs), self.bounds.x_upper - self.bounds.x_lower, STILL * sizes
         near = np.max(sizes) if self.moved is None else sizes
-        room = np.where(width / WIDEST <= near, REACH * np.minimum(width / REACH, near), 0.0)
+        room = np.where(width / WIDEST <= near, np.minimum(width, REACH * near), 0.0)
         for q, v, size, turns in self._vectors:
             for places in (q, v):
                 scales[places], least[places] = np.max(scales[places]), np.max(least[places])
             room[q] = min(np.max(room[q]) or size, size) if turns else np.max(room[q])
-            limits = np.where(width[v] / WIDEST <= sizes[v], FASTER * np.minimum(width[v] / FASTER, sizes[v]), 0.0)
+            limits = np.where(width[v] / WIDEST <= sizes[v], np.minimum(width[v], FASTER * sizes[v]), 0.0)
             room[v] = np.max(limits) or room[q[0]] / self.start_horizon
             least[v] = np.maximum(least[v], least[q[0]] / self.start_horizon)
         least = np.maximum(least, np.where(way <= STILL * room, STAYS * room, 0.0))
