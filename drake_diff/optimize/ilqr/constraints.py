@@ -131,11 +131,6 @@ class AugmentedLagrangian(PenalizedRows):
         weights = self.scale if self.is_scaled else 1.0
         return float(np.max(weights * self.excess(*given), initial=0.0))
 
-    @property
-    def is_exhausted(self) -> bool:
-        """Whether the penalty is as large as it may be."""
-        return self.penalty >= LARGEST_PENALTY * self.unit
-
     def values(self, *given: Array) -> Array:
         return np.concatenate([given[0].ravel(), *(group.values(*given) for group in self.groups)])
 

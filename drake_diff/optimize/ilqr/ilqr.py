@@ -20,7 +20,7 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
 from drake_diff.motion.smooth_roll import SmoothRoll, smooth_roll_of
-from drake_diff.optimize.ilqr.constraints import GROWTH, AugmentedLagrangian
+from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import (
     Motion,
     curvature_along,
@@ -253,7 +253,7 @@ class _Search:
                 return outcome
             stands = self.constraints.violation(*self.motion.point) > FEASIBILITY_TOLERANCE
             reached = not stands and self.constraints.residual(*self.motion.point) <= self.limits.tolerance
-            exhausted = self.constraints.is_exhausted
+            exhausted = self.constraints.penalty >= LARGEST_PENALTY * self.constraints.unit
             if final and reached:
                 return outcome
             if final and exhausted:

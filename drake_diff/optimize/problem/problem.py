@@ -437,11 +437,11 @@ class Problem(PicklesItsFields, ShowsItsRepr):
     def state_scales(self, xs: Array) -> Array:
         """(nx,) how far each state goes along xs (M, nx), the scale of its tolerances, in its unit.
 
-        That is its own range; of a joint of several directions, that of the one which moves most. A state that is not
-        asked to travel has at least STAYS of its bounds, and of a radian at most, and its velocity that over the
-        horizon; bounds of 1e30 are none, see WIDEST. One that stands still has 1e-6 of its largest magnitude, what is
-        asked of it among them, or of a radian or the body's radius of gyration, and its velocity that over the
-        horizon; where all that is 0, of its bound.
+        That is its own range; of a joint of several directions, that of the one which moves most. A position that is
+        not asked to travel has at least STAYS of its bounds, an angle of a radian at most. Such a velocity has STAYS
+        of its limits, or of what moves the position so far over the horizon. Bounds of 1e30 are none, see WIDEST. A
+        state that stands still has 1e-6 of the largest of its magnitude, what is asked of it, a radian and the body's
+        radius of gyration, and its velocity that over the horizon. Where all that is 0, it has 1e-6 of its bound.
         """
         asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
         scales, sizes = np.ptp(xs, axis=0), np.max(np.nan_to_num(np.abs(asked), posinf=0.0), axis=0)

@@ -263,19 +263,21 @@ class BlockProgram:
         spans, sparsity = self.spans(z), self._jacobian_at[1].sparsity
         try:
             slopes = np.abs(self.jacobian(z)) * spans[sparsity.get_col()]
-            cost, gradient = self.gradient(z)
+            (cost, gradient), values = self.gradient(z), self.evaluate(z)[1]
         except self.backs_off:
             return UNSCALED
         rows = np.zeros(len(self.sides[0]))
         np.maximum.at(rows, sparsity.row(), np.nan_to_num(slopes, posinf=0.0))
         changes = [abs(cost), float(np.nan_to_num(np.abs(gradient), posinf=0.0) @ spans)]
         flat = rows <= FLAT * np.max(rows, initial=0.0)  # as the square of a velocity from rest
-        for side in (-1, 1):
+        for beside in (z - TRIED * spans, z + TRIED * spans):
             with np.errstate(all="ignore"):
-                changes.append(abs(self.cost_at(z + side * TRIED * spans) - cost) / TRIED)
-                if np.any(flat):
-                    values = self.evaluate(z + side * TRIED * spans)[1] - self.evaluate(z)[1]
-                    rows = np.maximum(rows, np.where(flat, np.nan_to_num(np.abs(values), posinf=0.0), 0.0) / TRIED)
+                changes.append(abs(self.cost_at(beside) - cost) / TRIED)
+                try:
+                    moved = np.abs(self.evaluate(beside)[1] - values) if np.any(flat) else values
+                except self.backs_off:  # it stays flat as far as is known
+                    continue
+            rows = np.maximum(rows, np.where(flat, np.nan_to_num(moved, posinf=0.0), 0.0) / TRIED)
         largest = max((change for change in changes if np.isfinite(change)), default=0.0)
         rows, largest = np.where(rows > 1e-150, rows, 1.0), largest or 1.0  # whose products do not overflow
         every = np.concatenate([spans, rows, [largest]])
