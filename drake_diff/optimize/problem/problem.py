@@ -61,8 +61,8 @@ STILL = 1e-6  # of a state's largest magnitude, or of a radian: what moves less 
 RETURNS = 0.1  # of its range along a plan: what has to travel less returns to where it was
 NOTHING = 1e-150  # in any unit: its square is no number
 STAYS = 1e-2  # of its bounds, or of a radian: what a state moves that need not travel
-# Magnitudes or sizes (of any state, where no file has them): bounds that are further apart are none, and others count
-# as so many at most, those of velocities as FASTER: no bound makes a scale that is much more than what a state does.
+# Of a state's magnitude or size: bounds that are further apart are none, and others count as so many at most, those of
+# velocities as FASTER: no bound makes a scale that is much more than what a state does.
 WIDEST, FASTER, REACH = 1e3, 300.0, 10.0
 GOAL_PART = 0.01  # of what a state has to travel: how far from its goal it may end where nothing else is given
 TRIED, NO_SLOPE = 3, 1e-9  # states at which a goal's slopes are looked at, and what counts as none: rounding
@@ -449,8 +449,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         for q, _, size, _ in self._vectors:
             sizes[q] = np.maximum(np.max(sizes[q]), size)
         way, width, least = self._way(xs), self.bounds.x_upper - self.bounds.x_lower, STILL * sizes
-        near = np.max(sizes) if self.moved is None else sizes
-        room = np.where(width / WIDEST <= near, np.minimum(width, REACH * near), 0.0)
+        room = np.where(width / WIDEST <= sizes, np.minimum(width, REACH * sizes), 0.0)
         for q, v, size, turns in self._vectors:
             for places in (q, v):
                 scales[places], least[places] = np.max(scales[places]), np.max(least[places])
