@@ -139,8 +139,10 @@ def start_node(monkeypatch):
 
 
 def processes(node):
-    """All of a node, by their session."""
-    listed = subprocess.run(["ps", "-o", "pid=,args=", "-s", str(node.pid)], capture_output=True, text=True).stdout
+    """All of a node, by their session; `-ww`: not cut at the columns of a terminal."""
+    listed = subprocess.run(
+        ["ps", "-ww", "-o", "pid=,args=", "-s", str(node.pid)], capture_output=True, text=True
+    ).stdout
     return [line.split(maxsplit=1) for line in listed.splitlines()]
 
 
@@ -183,8 +185,10 @@ def slow(trial):
     with open("log", "ab", buffering=0) as file:
         file.write(f"{os.environ.get('NODE', 'here')} {trial['level']} {trial['repeat']}\\n".encode())
     time.sleep(0.2)
+    while os.environ.get("NODE") == "head" and "other" not in open("log").read():
+        time.sleep(0.1)  # a node that starts late would find nothing left
     row = {"cost": trial["level"] * 100 + trial["repeat"]}
-    if trial["level"] == 1:  # too large for a reply: it stays in the memory of the node that made it
+    if trial["repeat"] % 2:  # too large for a reply: it stays in the memory of the node that made it
         row["text"] = "x" * 200_000
     return row
 """
