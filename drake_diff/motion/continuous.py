@@ -61,7 +61,7 @@ class ContinuousMotion(System):
     """The continuous motion of a model, as it is now: parameters that are applied act.
 
     `law` is that of contact, the model's own where it is not given. With `works`, three more states are the work of
-    actuators, what damping took and the work of contact [J]. Raises ModelError, which says why, where the model has no
+    inputs, what damping took and the work of contact [J]. Raises ModelError, which says why, where the model has no
     such motion: contact that is no point contact, PD controllers, constraints.
     """
 
@@ -134,7 +134,10 @@ class ContinuousMotion(System):
         push = self.contact_force(self.pushing) if self.pushing else self.still
         acceleration = np.linalg.solve(twin.mass_matrix(), self.force - twin.inverse_dynamics(self.still) + push)
         rates = v if self.moves_as_is else twin.rates(v), acceleration
-        return np.concatenate([*rates, [v @ self.force, v @ (self.damping * v), v @ push]] if self.works else rates)
+        if not self.works:
+            return np.concatenate(rates)
+        driven = self.force + twin.systems_force() if self.model.inputs.fed else self.force
+        return np.concatenate([*rates, [v @ driven, v @ (self.damping * v), v @ push]])
 
     def slopes(self, x: Array, rates: Array) -> Array:
         slopes = np.empty((len(x), len(x)))

@@ -31,6 +31,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model import BodyForce
+from drake_diff.motion.continuous import replayed
 from drake_diff.optimize.problem.dynamics import plant_dynamics
 
 H = 0.01
@@ -130,6 +131,9 @@ def test_rotors_do_work_that_the_energy_balance_has():
     thrust = 1.5 * MASS * 9.81
     assert motion.work == pytest.approx(thrust * np.append(0, np.cumsum(H * (v[1:] + v[:-1]) / 2)), abs=1e-12)
     assert abs(motion.energy_drift) < 0.02 * motion.energy_exchanged  # h g v is lost a step by semi-implicit Euler
+    smooth = replayed(model, model.default_state, us, len(us))
+    assert smooth.work[-1] == pytest.approx(thrust * 0.5 * 4.905 * (100 * H) ** 2, rel=1e-9)
+    assert abs(smooth.energy_drift) < 1e-9 * smooth.energy_exchanged
 
 
 def propelled(forces=ROTORS, *, export=True):
