@@ -557,3 +557,19 @@ def test_an_input_beyond_its_bound_is_no_success():
     beyond = dataclasses.replace(found, problem=tight)
     assert beyond.bound_violation == pytest.approx(1.0, abs=1e-6)  # |u| is 6 at the ends
     assert any(c.what == "bound" and c.value == pytest.approx(1.0, abs=1e-6) for c in beyond.plan_checks.failing)
+
+
+def test_a_users_constraint_is_not_called_where_the_dynamics_lead_nowhere():
+    """x' = x^2 from 1 is 1 / (1 - t), which has no value from 1 s on: Drake ends the process at a state without one."""
+
+    def finite(x):
+        assert np.asarray(x).dtype == object or np.isfinite(x).all()
+        return x[0]
+
+    bent = dd.Dynamics(lambda x, u: [x[0] ** 2 + 0 * u[0]], nx=1, nu=1)
+    low = dd.Constraint(finite, upper=5.0, name="low")
+    problem = dd.Problem(bent, x0=[1.0], num_steps=2, horizon=3.0, running_cost=1.0, constraints=low)
+    motion = collocated(problem, "hermite_simpson", np.ones((3, 1)), np.zeros((3, 1)), None, 3.0, np.linspace(0, 1, 3))
+    with np.errstate(all="ignore"):
+        assert not np.isfinite(motion.between_knots[1]).all()
+        assert violation_between_nodes(motion).constraint >= 0

@@ -100,3 +100,40 @@ def test_a_slide_moves_at_the_same_cost_in_any_unit(tmp_path, unit, method):
     assert solution.success, solution.message
     metres = 0.1875 if method == "collocation" else 0.1875 / (1 - 1 / 20**2)  # a sum over 20 steps
     assert solution.cost == pytest.approx(metres, rel=1e-4)
+
+
+BLOCK = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+
+
+def test_bounds_set_no_tolerance_by_the_size_of_another_state():
+    """A state that moves by 0.05 and back within +-20, beside one that moves by 1,000: 1 % of its own way."""
+    both = dd.Dynamics(lambda x, u: [u[0], u[1]], nx=2, nu=2)
+    bounds = dd.Bounds(x_lower=[-20, -2000], x_upper=[20, 2000])
+    problem = dd.Problem(both, x0=[0, 0], x_goal=[0, 1000], num_steps=4, horizon=1.0, running_cost=1.0, bounds=bounds)
+    tolerances = problem.goal_tolerances(np.array([[0, 0], [0.025, 250], [0.05, 500], [0.025, 750], [0, 1000]]))
+    np.testing.assert_allclose(tolerances, [5e-4, 10])
+
+
+@pytest.mark.solve
+def test_a_small_motor_keeps_its_limit():
+    """0.12 g moved by 1 m by 1.2e-4 N in at least 2 sqrt(d m / F) = 2 s: IPOPT would move the limit by 1e-8 N."""
+    light = dd.Dynamics(lambda x, u: [x[1], u[0] / 1.2e-4], nx=2, nu=1, u_lower=[-1.2e-4], u_upper=[1.2e-4])
+    asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10, "horizon": (0.1, 10), "running_cost": 1.0}
+    solution = dd.solve(
+        dd.Problem(light, **asked), method="collocation", options=dd.optimize.Options(scheme="trapezoid")
+    )
+    assert solution.success, solution.message
+    assert solution.horizon == pytest.approx(2, rel=0.01)  # whose jump is a line between two knots
+    assert np.abs(solution.us).max() <= 1.2e-4 * (1 + 1e-5)
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_a_row_that_is_flat_at_the_guess_is_kept_in_any_unit(unit):
+    """v^2 <= 1.25^2 has next to no slope at rest. On 1 m in 1 s it binds from 0.3 s: least effort is 8 V^2 / (3 t)."""
+    slow = dd.Constraint(lambda x: (x[1] + 1e-14 * unit) ** 2, upper=(1.25 * unit) ** 2, name="slow")
+    asked = {"x0": [0, 0], "x_goal": [unit, 0], "num_steps": 20, "horizon": 1.0, "constraints": slow}
+    problem = dd.Problem(BLOCK, running_cost=dd.QuadraticCost(R=[[1.0]]), **asked)
+    solution = dd.solve(problem, initial_guess=(np.zeros((21, 2)), np.zeros((20, 1))))
+    assert solution.success, solution.message
+    assert solution.cost / unit**2 == pytest.approx(8 * 1.25**2 / 0.9, rel=1e-3)

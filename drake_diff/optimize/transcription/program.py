@@ -68,6 +68,7 @@ WARM_START = {
     **dict.fromkeys([f"ipopt.warm_start_{part}" for part in ("bound_push", "bound_frac", "mult_bound_push")], 1e-6),
     **dict.fromkeys([f"ipopt.warm_start_slack_{part}" for part in ("bound_push", "bound_frac")], 1e-6),
 }
+RELAXED = 1e-6  # of the smallest bound: what a plan may be beyond it
 FLAT = 1e-8  # of the largest slope of a row: a row that has another one than at the guess
 TRIED = 0.1  # of the spans: how far from the guess the cost is looked at
 PRECISE = 0.1  # of the tolerance: a motion may stay well within the spans of its first guess
@@ -446,8 +447,11 @@ def solve_ipopt(
                 options |= program.derivatives(exact, scales) | {"iteration_callback": callback}
         except StoppedError as stopped:
             return NlpResult(guess, Outcome.INTERRUPTED, f"stopped: {stopped}", ())
-        solver = ca.nlpsol("solver", "ipopt", program.nlp(scales), options)
         by, lower, upper = scales.variables, *(side / scales.rows for side in program.sides)
+        bounds = np.abs(np.concatenate([program.lower / by, program.upper / by]))
+        least = np.min(bounds[bounds > 0], initial=1.0)  # IPOPT moves bounds by 1e-8: much of a motor of 1e-4 N
+        options = {"ipopt.bound_relax_factor": min(1e-8, RELAXED * least)} | options
+        solver = ca.nlpsol("solver", "ipopt", program.nlp(scales), options)
         known = {}
         if multipliers is not None:
             known = {
