@@ -81,6 +81,7 @@ def assert_free_steps_agree(model, name, step, jacobian, *, states=5):
         np.testing.assert_allclose(A2, A, rtol=0, atol=jacobian * max(1, abs(A).max()))
         np.testing.assert_allclose(two.B, one.B, rtol=0, atol=jacobian * max(1, abs(one.B).max(initial=0)))
         np.testing.assert_allclose(other.energy(x), drake.energy(x), rtol=1e-12, atol=1e-12)
+        assert other.contact_depth(x) == 0
 
 
 def exponential_gap(x, x_next, h, q_start=0, w_start=7):

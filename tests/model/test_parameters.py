@@ -459,20 +459,25 @@ def test_a_pressed_ball_by_relaxation_time(t_ball, t_ground, h, depth, v):
 
 
 @each_row("mu_ball, mu_ground", [(0.5, 0.5), (0.8, 0.3)])
-@each_row("u, v0", [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (-6.5, 0.3)])
-def test_lagged_friction_step_by_friction(u, v0, mu_ball, mu_ground):
-    """v+ = v0 + h u - mu g h v+ / r, r = sqrt(v+^2 + eps^2): by mu -g h v+ / r / D, mu = 2 ab / (a + b)."""
+@each_row("u, v0", [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (6.0, 0.0), (-6.5, 0.3)])
+def test_lagged_friction_step_and_its_derivatives(u, v0, mu_ball, mu_ground):
+    """v+ = v0 + h u - mu g h v+ / r, r = sqrt(v+^2 + e^2), mu = 2 ab / (a + b): by v0 1/D, by mu -g h v+ / r / D."""
     h, k, eps = 0.01, 1e4, 1e-4
     mu = 2 * mu_ball * mu_ground / (mu_ball + mu_ground)
     sides = [{"stiffness": 2 * k, "friction": f} for f in (mu_ball, mu_ground)]
     made = railed_ball(h, "lagged", *sides, axes=("z", "x"))
     made.plant.AddJointActuator("push", made.plant.GetJointByName("ball_x"))
     names = ("ball.friction", "world.friction")
-    d = dd.differentiate_step(made.model(), [0.1 - G / k, 0, 0, v0], [u], parameters=names)
+    point = made.model(), [0.1 - G / k, 0, 0, v0], [u]
+    d, by_autodiff = dd.differentiate_step(*point, parameters=names), dd.differentiate_step(*point, method="autodiff")
     v = d.x_next[3]
     r = math.hypot(v, eps)
-    assert v == pytest.approx(v0 + h * u - mu * G * h * v / r, abs=1e-8)
-    by_mu = -G * h * v / r / (1 + mu * G * h * eps**2 / r**3)
+    stiff = 1 + mu * G * h * eps**2 / r**3
+    assert v == pytest.approx(v0 + h * u - mu * G * h * v / r, abs=1e-9)
+    for found in (d, by_autodiff):
+        assert [found.A[3, 3], found.B[3, 0]] == pytest.approx([1 / stiff, h / stiff], rel=1e-6)
+        assert found.B[1, 0] == pytest.approx(h * found.B[3, 0], rel=1e-9)
+    by_mu = -G * h * v / r / stiff
     parts = 2 * np.array([mu_ground, mu_ball]) ** 2 / (mu_ball + mu_ground) ** 2
     assert d.C[3] == pytest.approx(by_mu * parts, rel=1e-5)  # at the edge of stiction SAP's 1e-6 grows by 1/D
     assert d.C[1] == pytest.approx(h * by_mu * parts, rel=1e-5)

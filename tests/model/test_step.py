@@ -139,44 +139,6 @@ def test_static_penetration_is_weight_over_stiffness(approximation, k_ball, k_gr
     assert motion.penetration[-1] == pytest.approx(G / k, abs=1e-8)
 
 
-def newton(f, slope, x):
-    """A root of f, with steps halved while they do not bring it nearer."""
-    for _ in range(100):
-        step = f(x) / slope(x)
-        while abs(f(x - step)) > abs(f(x)) and abs(step) > 1e-300:
-            step /= 2
-        if abs(step) < 1e-16 * max(1.0, abs(x)):
-            break
-        x -= step
-    return x
-
-
-@each_row("u, v0", [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (6.0, 0.0), (-6.5, 0.3)])
-def test_lagged_friction_step(u, v0):
-    """v = v0 + h u / m - mu g h v / sqrt(v^2 + eps^2), by Newton's method here."""
-    mu, h, k, eps = 0.5, 0.01, 1e4, 1e-4
-    plant = Plant(h, "lagged")
-    plant.ball("ball", 1.0, 0.1, contact_properties(2 * k, friction=mu), "z", "x")
-    plant.ground(contact_properties(2 * k, friction=mu))
-    plant.plant.AddJointActuator("push", plant.plant.GetJointByName("ball_x"))
-    plant.plant.set_stiction_tolerance(eps)
-    model = plant.model()
-    z = 0.1 - G / k
-    d = dd.differentiate_step(model, [z, 0, 0, v0], [u])
-
-    def residual(v):
-        return v - v0 - h * u + mu * G * h * v / math.sqrt(v**2 + eps**2)
-
-    def slope(v):
-        return 1 + mu * G * h * eps**2 / (v**2 + eps**2) ** 1.5
-
-    v = newton(residual, slope, v0 + h * u)
-    assert d.x_next[3] == pytest.approx(v, rel=1e-7, abs=1e-9)
-    assert d.B[3, 0] == pytest.approx(h / slope(v), rel=1e-6)
-    assert d.A[3, 3] == pytest.approx(1 / slope(v), rel=1e-6)
-    assert d.B[1, 0] == pytest.approx(h * d.B[3, 0], rel=1e-9)
-
-
 @each_row(
     "x, u, words",
     [
