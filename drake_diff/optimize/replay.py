@@ -1,22 +1,25 @@
-"""Replay a plan on Drake's double plant: at its own step and half of it, and in another contact approximation.
+"""Replay a plan on Drake's double plant: in its own step and finer ones, in continuous time, and under another contact.
 
-A motion that exists at one step size or in one approximation of contact only is an artefact of the numerics. A variant
-of the plant holds if the inputs, open loop or with TVLQR feedback about the plan, reach the goal and keep all limits:
-an unstable motion diverges open loop however right it is, and feedback through contact can do harm. A discrete plan has
-to hold at h, h/2 and h/8; a collocated one, whose interval need not be a step that the simulator can take, at two
-successive ones of h, h/2, ... h/64. Under feedback less is allowed, since the end then depends on its weights too. A
-discrete plan that needs feedback in finer steps also has to come near its goal under the gains alone.
-The other approximation of contact is followed by the gains of the plan's own steps: where a foot has just landed lagged
-contact has derivatives of fifty times the plan's, and its own gains throw the foot up. A step that is right for one law
-may be too long for another, whose foot then goes through the ground. So a plan that does not hold in the other law at h
-is tried in it at h/8, and that decides.
-A plan in continuous time, whose law of contact is one, has to hold in another integration of that law: its equations
-are Drake's terms and the contact written out, and share nothing with those that the plan was made by.
+A motion that exists at one step size or in one law of contact only is an artefact of the numerics. A variant of the
+plant holds if the inputs reach the goal and keep all limits, open loop or under TVLQR about the plan. An unstable
+motion diverges open loop however right it is, and feedback through contact can do harm.
+
+A plan in steps has to hold at h, h/2 and h/8 and, where nothing can touch, in continuous time. There the inputs lead
+elsewhere than the plan, for which TVLQR has offsets; a plan that does not hold open loop also has to come near its goal
+without them. A collocated plan has no steps of its own: it has to hold at two successive ones of h, h/2, ... h/64.
+Under feedback less is allowed, since the end then depends on its weights too.
+
+The other law of contact is followed by the gains of the plan's own steps: where a foot has just landed lagged contact
+has derivatives of fifty times the plan's, and its own gains throw the foot up. A step that is right for one law may be
+too long for another, whose foot then goes through the ground. So a plan that does not hold in the other law at h is
+tried in it at h/8, and that decides. A plan in continuous time with contact has to hold in another integration of its
+law: these equations are Drake's terms and the contact written out, and share nothing with those of the plan.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,10 +31,9 @@ from drake_diff.model.contact import deepest_overlap, thinnest_geometry
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import set_state
-from drake_diff.model.step import step as step_of
 from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.continuous import replayed
-from drake_diff.motion.intervals import intervals_of
+from drake_diff.motion.continuous import ContinuousMotion, replayed
+from drake_diff.motion.intervals import DrakeSteps, intervals_of, roll
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import CONTINUOUS, Policy, Rollout, rollout
 from drake_diff.optimize.checks import Check, check
@@ -48,6 +50,9 @@ STATE_TOLERANCE = 0.05
 # The same under TVLQR, of the goal alone: where the effort weighs a fourth, a saturated motion was seen to end three
 # times as far off. Who repeats the plan has other weights.
 FEEDBACK_TOLERANCE = 0.03
+# Gains alone leave the error of a coarse step where it is, and other simulators have other laws of contact and of joint
+# limits: there a motion may end, and in these also stray, twice as far.
+WIDER = 2.0
 LEAST_EFFORT = 1e-3  # of the largest input, what a regulator weighs an input by that the plan does not use
 SAME = 1e-2  # the same in the plan's own plant, of every state at every knot, and of the cost
 ANOTHER_PLANT = 0.2  # the same of positions on the way, and of the cost, in another plant, in which a goal decides
@@ -60,7 +65,9 @@ FINE = 8  # parts of a step: what is left of an error of O(h) from there on is a
 # Intervals are cut into at most that many steps: a hand that is to be within 5 mm at 1 m/s needs those of 5 ms.
 FINER, FINEST = 16, 64
 MOST_STEPS = 4000  # of a replay in more than FINER parts of an interval
-ANOTHER_INTEGRATION = "by another integration in continuous time"
+ANOTHER_INTEGRATION, IN_CONTINUOUS_TIME = "by another integration in continuous time", "in continuous time"
+TOLERANCE = 1e-6  # of each step of the integration in continuous time: the motion is judged to 5 %
+EVALUATIONS = 150_000  # of the equations of motion; stiffer ones are followed in the short steps instead
 OPEN_LOOP, FEEDBACK, GAINS_ALONE = "open loop", "TVLQR", "TVLQR without offsets"
 BROKEN = (SimulationError, ModelError, GradientError, ValueError)
 
@@ -157,39 +164,22 @@ class ReplayPlan:
         """The plant's own motion under the inputs at the plan's own step; None if it cannot be taken."""
         try:
             xs, us = self.sample(1)
-            with applied(select(self.model_at(1), self.vector.to_dict())) as model:
+            with self.applied_to(self.model_at(1)) as model:
                 return _rolled(self.problem, model, xs[0], us, len(us))
         except (SimulationError, ModelError, ValueError):
             return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
 
-    @cached_property
-    def own_gains(self) -> Array:
-        """(N, nu, nt) of TVLQR about the plan in its own steps."""
-        with applied(select(self.model_at(1), self.vector.to_dict())) as model:
-            return regulator(self, model, *self.sample(1)).gains
+    def applied_to(self, model: Model) -> AbstractContextManager[Model]:
+        """The model with the plan's parameters, until the context ends."""
+        return applied(select(model, self.vector.to_dict()))
+
+    def follower(self, parts: int = 1, pieces: int = 1) -> "PlanFollower":
+        """By a controller with `parts` steps in an interval: always the same one, which knows its gains."""
+        return self._followers.setdefault((parts, pieces), PlanFollower(self, parts, pieces))
 
     @cached_property
-    def halved_gains(self) -> Array:
-        """(2 N, nu, nt) of TVLQR about the plan in half of its steps."""
-        xs, us = self.sample(2)
-        with applied(select(self.model_at(2), self.vector.to_dict())) as model:
-            return regulator(self, model, xs, us).gains
-
-    def gains(self, parts: int) -> Array | None:
-        """(m N, nu, nt) of TVLQR in the m-th `parts` of each step, those of halves in between; None where they are own.
-
-        A motion in continuous time has gains that are smooth in time, of which finer steps have next to the same. Where
-        things touch they may be others altogether.
-        """
-        if parts == 1:
-            return self.own_gains
-        if not self.continuous:
-            return None
-        known = self.halved_gains
-        places = np.minimum(np.arange(parts * self.problem.num_steps) * 2 / parts, len(known) - 1)
-        first = np.minimum(places.astype(int), len(known) - 2)
-        ahead = (places - first)[:, None, None]
-        return np.asarray((1 - ahead) * known[first] + ahead * known[first + 1])
+    def _followers(self) -> dict[tuple[int, int], "PlanFollower"]:
+        return {}
 
     @property
     def own_plant(self) -> str:
@@ -216,29 +206,30 @@ def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
 
 def replays(plan: ReplayPlan) -> tuple[Replay, ...]:
     """`plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR."""
-    model = plan.problem.model
+    model, parts = plan.problem.model, 2
     if plan.problem.motion == CONTINUOUS:
-        return tuple(_replay_in(plan, ANOTHER_INTEGRATION, lambda: model, 1, plan.open_loop))
-    rows = list(_replay_step(plan, 1))
-    if model.can_rebuild:  # a user's diagram is one plant: there are no variants of it to try
-        parts = 2
-        rows += _replay_step(plan, parts)
-        if not plan.continuous:
-            rows += _replay_step(plan, FINE)
+        return tuple(plan.follower().in_model(ANOTHER_INTEGRATION, lambda: model))
+    rows = plan.follower().in_steps()
+    if not model.can_rebuild:  # a user's diagram is one plant: there are no variants of it to try
+        return tuple(rows)
+    rows += plan.follower(parts).in_steps()
+    if plan.continuous:
         most = finest_parts(plan)
-        while plan.continuous and parts < most and not (_any_holds(rows[-2:]) and _any_holds(rows[-4:-2])):
+        while parts < most and not (_any_holds(rows[-2:]) and _any_holds(rows[-4:-2])):
             parts *= 2
-            rows += _replay_step(plan, parts)
-        contact = model.contract.contact
-        if contact.collision_pairs and not plan.continuous:
-            other = OTHER_APPROXIMATION[contact.approximation]
-            name = f"with {other} contact"
-            tried = _replay_in(plan, name, lambda: model.with_contact(other), 1)
-            rows += tried
-            if not _any_holds(tried):
-                name = f"{name} in steps of {plan.time_step / FINE:.4g} s"
-                rows += _replay_in(plan, name, lambda: plan.model_at(FINE).with_contact(other), FINE)
-    return tuple(rows)
+            rows += plan.follower(parts).in_steps()
+        return tuple(rows)
+    rows += plan.follower(FINE).in_steps()
+    contact = model.contract.contact
+    if not contact.collision_pairs:
+        return (*rows, *plan.follower(FINE // 2, pieces=0).in_continuous_time())
+    other = OTHER_APPROXIMATION[contact.approximation]
+    name = f"with {other} contact"
+    tried = plan.follower().in_model(name, lambda: model.with_contact(other))
+    if not _any_holds(tried):
+        name = f"{name} in steps of {plan.time_step / FINE:.4g} s"
+        tried += plan.follower().in_model(name, lambda: plan.model_at(FINE).with_contact(other), FINE)
+    return (*rows, *tried)
 
 
 def finest_parts(plan: ReplayPlan) -> int:
@@ -268,69 +259,189 @@ def _any_holds(rows: Sequence[Replay]) -> bool:
     return any(r.holds for r in rows)
 
 
-def _replay_step(plan: ReplayPlan, parts: int) -> list[Replay]:
-    name = f"in steps of {plan.time_step / parts:.4g} s"
-    known = plan.open_loop if parts == 1 else None
-    return _replay_in(plan, name, lambda: plan.model_at(parts), parts, known)
+# A motion under a control, and what is checked of it besides.
+Mover = Callable[[str], tuple[MeasuredMotion, list[Check]]]
 
 
-def _replay_in(
-    plan: ReplayPlan, variant: str, make: Callable[[], Model], parts: int, known: Rollout | None = None
-) -> list[Replay]:
-    """Both replays in one variant of the plant; open loop, whose motion may be `known`, alone without inputs.
+class PlanFollower:
+    """A plan under its own controller, in any plant.
 
-    A plan in steps that does not hold open loop in finer ones is followed by gains alone as well.
+    The controller has `parts` steps of `period` [s] in an interval of the plan. Each command is held over one of them.
+    Finer steps than a plan's own do not lead from one of its states to the next (`leads_elsewhere`): TVLQR has offsets
+    for a plant that takes `pieces` of them for one of the controller's, 0 where it moves in continuous time.
     """
-    controls: dict[str, Rollout | None] = {OPEN_LOOP: known}
-    if plan.problem.model.nu:
-        controls[FEEDBACK] = None
-    try:
-        model = make()
-        with applied(select(model, plan.vector.to_dict())) as set_model:
-            law = cache(lambda: regulator(plan, set_model, *plan.sample(parts)))
-            rows = [_replay(plan, variant, c, set_model, parts, motion, law) for c, motion in controls.items()]
-            if parts > 1 and len(rows) > 1 and not (plan.continuous or "contact" in variant or rows[0].holds):
-                rows.append(_replay(plan, variant, GAINS_ALONE, set_model, parts, None, law))
+
+    def __init__(self, plan: ReplayPlan, parts: int, pieces: int):
+        self.plan, self.parts, self.period = plan, parts, plan.time_step / parts
+        self.xs, self.us = plan.sample(parts)
+        self.controls = (OPEN_LOOP, FEEDBACK) if plan.problem.model.nu else (OPEN_LOOP,)
+        self.pieces, self.leads_elsewhere = pieces, parts > 1 and not plan.continuous
+
+    @cached_property
+    def model(self) -> Model:
+        """The model in the controller's steps."""
+        return self.plan.model_at(self.parts)
+
+    @cached_property
+    def plant(self) -> Model:
+        """The model in the plant's steps."""
+        return self.plan.model_at(self.parts * self.pieces)
+
+    @cached_property
+    def gains(self) -> Array:
+        """(m N, nu, nt) of TVLQR in each of the controller's steps.
+
+        A motion in continuous time has gains that are smooth in time: those of halves, in between, are next to those of
+        finer steps.
+        """
+        if self.parts <= 2 or not self.plan.continuous:
+            return self._regulator.gains
+        known = self.plan.follower(2).gains
+        places = np.minimum(np.arange(self.parts * self.plan.problem.num_steps) * 2 / self.parts, len(known) - 1)
+        first = np.minimum(places.astype(int), len(known) - 2)
+        ahead = (places - first)[:, None, None]
+        return np.asarray((1 - ahead) * known[first] + ahead * known[first + 1])
+
+    @cached_property
+    def _regulator(self) -> TVLQR:
+        defects, space = None, tangent_space(self.model)
+        with self.plan.applied_to(self.model) as model:
+            if self.leads_elsewhere:
+                defects = [space.minus(end, x) for end, x in zip(self._ends(model), self.xs[1:], strict=True)]
+            return regulator(self.plan, model, self.xs, self.us, defects)
+
+    def _ends(self, model: Model) -> list[Array]:
+        """Where the controller's steps lead from the plan's states."""
+        points = list(zip(self.xs, self.us, strict=False))
+        if not self.pieces:
+            motion = ContinuousMotion(model)
+            return [motion.states(x, u[None])[-1] for x, u in points]
+        with self.plan.applied_to(self.plant) as plant:
+            steps = DrakeSteps(plant, self.plan.vector)
+            return [roll(steps, x, np.tile(u, (self.pieces, 1)))[-1] for x, u in points]
+
+    def law(self, control: str = FEEDBACK, pieces: int = 1) -> Policy:
+        """u(x, t) for one motion, in a plant that takes `pieces` steps for one of the controller's.
+
+        Under TVLQR it is within the bounds of inputs and the limits of their rates: it remembers its last command.
+        """
+        space, last = tangent_space(self.plan.problem.model), list[Any]()
+        bounds, slew, us = self.plan.problem.bounds, self._slew, self.us
+        gains = self.gains if control != OPEN_LOOP else None
+        if control == FEEDBACK and self.leads_elsewhere:
+            us = us - self._regulator.offsets
+
+        def command(x: Any, k: int) -> Any:
+            if gains is None:
+                return us[k]
+            wanted = us[k] - gains[k] @ space.minus(x, self.xs[k])
+            wanted = np.minimum(np.maximum(wanted, bounds.u_lower), bounds.u_upper)
+            return wanted if not last or np.all(np.isinf(slew)) else np.clip(wanted, last[0] - slew, last[0] + slew)
+
+        def law(x: Any, t: float) -> Any:
+            k, piece = divmod(round(t * pieces / self.period), pieces)
+            if not piece:
+                last[:] = [command(x, min(k, len(us) - 1))]
+            return last[0]
+
+        return law
+
+    @cached_property
+    def _slew(self) -> Array:
+        """(nu,) by how much a command may differ from the last one."""
+        slew = np.full(self.plan.problem.model.nu, np.inf)
+        period = self.period if self.plan.continuous else self.plan.time_step  # held inputs jump at the plan's knots
+        for limit in self.plan.problem.rate_limits:
+            if limit.of_inputs:
+                entries, limits = limit.entries(self.plan.problem.system)
+                slew[entries] = np.minimum(slew[entries], limits * period)
+        return slew
+
+    def in_steps(self) -> list[Replay]:
+        """By each control in the controller's own steps."""
+        return self.in_model(f"in steps of {self.period:.4g} s", lambda: self.model)
+
+    def in_model(self, variant: str, make: Callable[[], Model], pieces: int = 1) -> list[Replay]:
+        """By each control in the steps of a model, which may not be to be had."""
+        try:
+            model = make()
+        except (ModelError, InputError) as error:
+            return [missing_replay(self.plan, variant, control, str(error)) for control in self.controls]
+        # A coarse step gains and loses some energy, an artefact all.
+        with_energy = self.plan.continuous or self.parts * pieces >= FINE or not model.can_rebuild
+
+        def move(control: str) -> tuple[MeasuredMotion, list[Check]]:
+            motion = self.plan.open_loop if control == OPEN_LOOP and model is self.plan.follower().model else None
+            if motion is None:
+                law, count = self.law(control, pieces), pieces * len(self.us)
+                with self.plan.applied_to(model) as set_model:
+                    motion = _rolled(self.plan.problem, set_model, self.xs[0], law, count)
+            return motion, [energy_check(motion)] * with_energy
+
+        return self._replays(variant, model, move, pieces)
+
+    def in_continuous_time(self) -> list[Replay]:
+        """In the continuous time that Drake's steps stand for, by error control; in short steps where it has none."""
+
+        def move(control: str) -> tuple[MeasuredMotion, list[Check]]:
+            law, x0, count = self.law(control), self.xs[0], len(self.us)
+            with self.plan.applied_to(self.model) as set_model:
+                motion = replayed(set_model, x0, law, count, tolerance=TOLERANCE, evaluations=EVALUATIONS)
+            return motion, [energy_check(motion)]
+
+        rows = self._replays(IN_CONTINUOUS_TIME, self.model, move, time_step=0.0)
+        refused = [row for row in rows if row.motion is None]
+        if not refused or _any_holds(rows):
             return rows
-    except (ModelError, InputError) as error:
-        return [missing_replay(plan, variant, control, str(error)) for control in controls]
+        by = self.plan.follower(self.parts, max(1, FINEST // self.parts))
+        name = f"in steps of {by.period / by.pieces:.4g} s in place of continuous time: {refused[0].failures[0]}"
+        short = by.in_model(name, lambda: by.plant, by.pieces)
+        return short if any(row.motion is not None for row in short) else rows
+
+    def _replays(
+        self, variant: str, model: Model, move: Mover, pieces: int = 1, time_step: float | None = None
+    ) -> list[Replay]:
+        """By each control, and by gains alone where the inputs lead elsewhere and do not hold."""
+        rows = [self.replay(variant, c, model, move, pieces, time_step) for c in self.controls]
+        if self.leads_elsewhere and len(rows) > 1 and not rows[0].holds:
+            rows.append(self.replay(variant, GAINS_ALONE, model, move, pieces, time_step))
+        return rows
+
+    def replay(
+        self,
+        variant: str,
+        control: str,
+        model: Model,
+        move: Mover,
+        pieces: int = 1,
+        time_step: float | None = None,
+        wider: float = 1.0,
+    ) -> Replay:
+        """One replay in a plant, by the `move` that it makes; `model` is what has contact like the plant's.
+
+        `time_step` [s] is the plant's where it is not the model's. Tolerances are `wider` than they would be.
+        """
+        plan, every = self.plan, pieces * self.parts
+        try:
+            motion, checks = move(control)
+            if control == GAINS_ALONE:  # which stand for any such regulator
+                off = plan.problem.goal_error(motion.xs[-1])
+                near = [goal_check(plan, off, WIDER * STATE_TOLERANCE), *comparison_checks(plan, motion, every)]
+                return measured_replay(plan, variant, control, model, motion, near, time_step)
+            if np.all(np.isfinite(motion.xs)):
+                # Feedback corrects what the laws of contact differ by: there nothing tighter can be asked of it.
+                tight = control == FEEDBACK and wider == 1 and not _has_another_law(plan, model)
+                fraction = FEEDBACK_TOLERANCE if tight else wider * STATE_TOLERANCE
+                same = variant == plan.own_plant
+                with plan.applied_to(model) as set_model:
+                    checks = [*motion_checks(plan, set_model, motion, every, fraction, wider, same=same), *checks]
+            return measured_replay(plan, variant, control, model, motion, checks, time_step)
+        except BROKEN as error:
+            return missing_replay(plan, variant, control, str(error).split(", from x = ")[0], time_step)
 
 
-def _replay(
-    plan: ReplayPlan,
-    variant: str,
-    control: str,
-    model: Model,
-    parts: int,
-    known: Rollout | None,
-    law: Callable[[], TVLQR],
-) -> Replay:
-    """The replay under one control; `law` gives TVLQR about the plan in the steps of `model`."""
-    law_is_another = model.contract.contact.approximation != plan.problem.model.contract.contact.approximation
-    try:
-        xs, us = plan.sample(parts)
-        if known is not None:
-            motion = known
-        elif control == OPEN_LOOP:
-            motion = _rolled(plan.problem, model, xs[0], us, len(us))
-        else:
-            gains = np.repeat(plan.own_gains, parts, axis=0) if law_is_another else plan.gains(parts)
-            if control == GAINS_ALONE:
-                gains = law().gains
-            policy = law() if gains is None else None
-            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us, gains, policy), len(us))
-    except BROKEN as error:
-        return missing_replay(plan, variant, control, str(error))
-    # Feedback corrects what the laws of contact differ by: there nothing tighter can be asked of it.
-    fraction = STATE_TOLERANCE if control == OPEN_LOOP or law_is_another else FEEDBACK_TOLERANCE
-    if control == GAINS_ALONE:  # which stand for any such regulator
-        off = plan.problem.goal_error(motion.xs[-1])
-        checks = [goal_check(plan, off), *comparison_checks(plan, motion, parts)]
-        return measured_replay(plan, variant, control, model, motion, checks)
-    checks = [*motion_checks(plan, model, motion, parts, fraction, same=variant == plan.own_plant)]
-    if plan.continuous or parts == FINE or not model.can_rebuild:  # a coarse step gains and loses some, an artefact all
-        checks.append(energy_check(motion))
-    return measured_replay(plan, variant, control, model, motion, checks)
+def _has_another_law(plan: ReplayPlan, model: Model) -> bool:
+    return model.contract.contact.approximation != plan.problem.model.contract.contact.approximation
 
 
 def measured_replay(
@@ -340,7 +451,7 @@ def measured_replay(
     model: Model,
     motion: Any,
     checks: Iterable[Check],
-    time_step: float = -1.0,
+    time_step: float | None = None,
 ) -> Replay:
     """A replay that was taken; `time_step` [s] is the model's unless it is given."""
     bounds, feedback = plan.problem.bounds, None if control == OPEN_LOOP else control
@@ -348,7 +459,7 @@ def measured_replay(
     return Replay(
         variant=variant,
         control=control,
-        time_step=model.time_step if time_step < 0 else time_step,
+        time_step=model.time_step if time_step is None else time_step,
         approximation=model.contract.contact.approximation,
         motion=motion,
         checks=tuple(replace(c, plant=variant, feedback=feedback) for c in checks),
@@ -359,11 +470,12 @@ def measured_replay(
     )
 
 
-def missing_replay(plan: ReplayPlan, variant: str, control: str, why: str) -> Replay:
+def missing_replay(plan: ReplayPlan, variant: str, control: str, why: str, time_step: float | None = None) -> Replay:
     """A replay that could not be taken: its measures are infinite, never zero."""
     feedback = None if control == OPEN_LOOP else control
     row = replace(check("motion", why, np.inf, 0.0, verdict="undecided"), plant=variant, feedback=feedback)
-    return Replay(variant, control, plan.time_step, plan.problem.model.contract.contact.approximation, None, (row,))
+    h, contact = plan.time_step if time_step is None else time_step, plan.problem.model.contract.contact
+    return Replay(variant, control, h, contact.approximation, None, (row,))
 
 
 def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, count: int) -> Rollout:
@@ -378,57 +490,14 @@ def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, c
 # Feedback.
 
 
-def regulator(plan: ReplayPlan, model: Model, xs: Array, us: Array) -> TVLQR:
-    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan."""
+def regulator(plan: ReplayPlan, model: Model, xs: Array, us: Array, defects: Sequence[Array] | None = None) -> TVLQR:
+    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan; for `defects` see `TVLQR`."""
     Q, R, final = regulator_weights(plan, us)
     ratio = model.time_step / plan.time_step  # a running cost is summed over more steps where they are finer
     jacobians = None
     if plan.problem.motion == CONTINUOUS:
         jacobians = intervals_of(model, select(model, ()), CONTINUOUS).jacobians(xs, us)
-    defects = None
-    if not plan.continuous and ratio < 1:  # a finer step does not lead from one of the plan's states to the next
-        space = tangent_space(model)
-        ends = [step_of(model, x, u) for x, u in zip(xs, us, strict=False)]
-        defects = [space.minus(end, x) for end, x in zip(ends, xs[1:], strict=True)]
     return TVLQR(model, xs, us, ratio * Q, ratio * R, final, jacobians=jacobians, defects=defects)
-
-
-def track(
-    plan: ReplayPlan, model: Model, xs: Array, us: Array, gains: Array | None = None, policy: Policy | None = None
-) -> Policy:
-    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds and limits of its rate.
-
-    The latter make it remember its last input: it is for one rollout. `gains` (N, nu, nt) or `policy` may be known.
-    """
-    bounds = plan.problem.bounds
-    policy = policy or (regulator(plan, model, xs, us) if gains is None else _about(model, xs, us, gains))
-    slew, last = np.full(model.nu, np.inf), list[Array]()
-    period = model.time_step if plan.continuous else plan.time_step  # a held input jumps at the plan's own knots
-    for limit in plan.problem.rate_limits:
-        if limit.of_inputs:
-            entries, limits = limit.entries(plan.problem.system)
-            slew[entries] = np.minimum(slew[entries], limits * period)
-    unlimited = bool(np.all(np.isinf(slew)))
-
-    def law(x: Any, t: float) -> Any:
-        wanted = np.minimum(np.maximum(policy(x, t), bounds.u_lower), bounds.u_upper)
-        if unlimited:
-            return wanted
-        last[:] = [wanted if not last else np.clip(wanted, last[0] - slew, last[0] + slew)]
-        return last[0]
-
-    return law
-
-
-def _about(model: Model, xs: Array, us: Array, gains: Array) -> Policy:
-    """The law of `TVLQR` about xs (N+1, nx) and us (N, nu) by `gains` (N, nu, nt)."""
-    space, h = tangent_space(model), model.time_step
-
-    def law(x: Array, t: float) -> Array:
-        k = min(round(t / h), len(us) - 1)
-        return np.asarray(us[k] - gains[k] @ space.minus(x, xs[k]))
-
-    return law
 
 
 def regulator_weights(plan: ReplayPlan, us: Array) -> tuple[Array, Array, Array]:
@@ -462,8 +531,8 @@ def motion_checks(
     It may end `fraction` of each state's range from x_goal, or in the `same` plant SAME of its way; every other
     tolerance is `wider` than a replay's.
     """
-    problem, law = plan.problem, model.contract.contact.approximation
-    if law == problem.model.contract.contact.approximation:
+    problem = plan.problem
+    if not _has_another_law(plan, model):
         yield from comparison_checks(plan, motion, parts, same=same)
     if not np.all(np.isnan(problem.goal)):
         yield goal_check(plan, problem.goal_error(motion.xs[-1]), fraction, same=same)

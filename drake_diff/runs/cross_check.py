@@ -1,12 +1,12 @@
 """Replays of a solution in plants that had no part in it: continuous time, and other simulators.
 
-TVLQR with the gains of the plan's own steps follows it, and each command is held over one of them, as a robot would be
-driven; where that does not lead to the goal, the inputs alone are tried. No verdict rests on these replays.
+The plan's own controller follows it, each command of which is held over one of the controller's steps. Where TVLQR does
+not lead to the goal, the inputs alone are tried. No verdict rests on these replays.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,38 +18,28 @@ from drake_diff.engines.load import load_engine
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.model.contact import penetration
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import applied, select
+from drake_diff.model.parameters import select
 from drake_diff.model.step import set_state
-from drake_diff.motion.continuous import replayed
-from drake_diff.motion.rollout import CONTINUOUS, Policy, rollout
+from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.replay import (
-    BROKEN,
     FEEDBACK,
+    FINE,
+    GAINS_ALONE,
     OPEN_LOOP,
-    STATE_TOLERANCE,
+    WIDER,
     MeasuredMotion,
+    PlanFollower,
     Replay,
     ReplayPlan,
     deciding,
-    energy_check,
-    measured_replay,
     missing_replay,
-    motion_checks,
-    regulator,
     replays,
-    track,
 )
 from drake_diff.optimize.solution import Solution
 
 SIMULATORS = ("mujoco",)
 NOT_INSTALLED = "it is not installed: "  # the failure of a simulator begins so
-IN_CONTINUOUS_TIME = "in continuous time"
-# Another simulator has other laws of contact and of joint limits: it may end and stray twice as far.
-WIDER = 2.0
-TOLERANCE = 1e-6  # of each step of the integration: the motion is judged to 5 %
-EVALUATIONS = 150_000  # of the equations of motion; stiffer ones are followed in the short steps instead
-SHORT = 1e-4  # [s] Drake's steps where there is no motion in continuous time
 LONGEST = 1e-3  # [s] a step of another simulator
 
 
@@ -57,8 +47,9 @@ def cross_check(solution: Solution, engines: Sequence[str] = SIMULATORS) -> Solu
     """Replay a solution in continuous time and in other simulators.
 
     The motion in continuous time is the one that Drake's steps stand for, integrated with error control, or Drake's in
-    steps of 0.1 ms where there is none. Other simulators take steps of 1 ms or less, with contacts matched to Drake's.
-    What is asked is what replays are asked; in another simulator all tolerances but obstacles' are twice as wide.
+    64 steps of each interval where there is none. Other simulators take steps of 1 ms or less, with contacts matched to
+    Drake's.
+    What is asked is what replays are asked. In another simulator all tolerances but obstacles' are twice as wide.
 
     Args:
         solution: A result of `solve` for a model, of any status.
@@ -84,12 +75,13 @@ def cross_check(solution: Solution, engines: Sequence[str] = SIMULATORS) -> Solu
     if type(solution) is not Solution or not solution.problem.has_model:
         got = f"{type(solution).__name__} of plain dynamics" if type(solution) is Solution else type(solution)
         raise InputError("solution", got=got, expected="the Solution of a problem with a model")
-    follower = PlanFollower(solution.plan, solution.replays if solution.transcribed is not None else ())
-    rows = [*follower.in_continuous_time(), *(row for name in engines for row in _in_simulator(follower, name))]
+    follower = follower_of(solution.plan, solution.replays if solution.transcribed is not None else ())
+    rows = [*_until_one_holds(r for r in follower.in_continuous_time()[::-1] if r.control != GAINS_ALONE)]
+    rows += [row for name in engines for row in _in_simulator(follower, name)]
     return solution.told(cross_checks=tuple(rows), options=solution.options | {"cross_check": list(engines)})
 
 
-def _in_simulator(follower: "PlanFollower", name: str) -> list[Replay]:
+def _in_simulator(follower: PlanFollower, name: str) -> list[Replay]:
     plan, parts = follower.plan, max(1, math.ceil(follower.period / LONGEST - 1e-9))
     try:
         if not np.array_equal(plan.vector.values, select(plan.problem.model, plan.vector.names).values):
@@ -104,14 +96,56 @@ def _in_simulator(follower: "PlanFollower", name: str) -> list[Replay]:
     return [missing_replay(plan, f"in {name}", FEEDBACK if plan.problem.model.nu else OPEN_LOOP, why)]
 
 
-def replays_in(follower: "PlanFollower", engine: Engine) -> list[Replay]:
+def follower_of(plan: ReplayPlan, known: Sequence[Replay] = ()) -> PlanFollower:
+    """By a controller in quarters of its steps, with offsets for continuous time; in whole ones where things may touch.
+
+    A collocated plan is followed in the first steps in which it has to hold, by its replays (`known` or taken).
+    """
+    model = plan.problem.model
+    if not plan.continuous or plan.problem.motion == CONTINUOUS:
+        whole = plan.continuous or model.contract.contact.collision_pairs or not model.can_rebuild
+        return plan.follower() if whole else plan.follower(FINE // 2, pieces=0)
+    known = known or replays(plan)
+    named = [r for r in known if r.variant in deciding(plan, known)]
+    return plan.follower(round(plan.time_step / named[0].time_step) if named else 1)
+
+
+def replays_in(follower: PlanFollower, engine: Engine) -> list[Replay]:
     """A plan in a simulator; what its contract has otherwise than Drake's is a check that fails."""
-    model = follower.plan.problem.model
+    plan, h, x0 = follower.plan, engine.contract.time_step, follower.xs[0]
+    model, pieces = plan.problem.model, round(follower.period / h)
+    if not pieces or abs(pieces * h - follower.period) > 1e-9 * follower.period:
+        raise InputError("time_step [s]", got=h, expected=f"a whole part of {follower.period:.12g}")
     touch = bool(model.contract.contact.collision_pairs)
     lines = [line for line in match_contracts(DrakeEngine(model), engine) if line.verdict == "different"]
     wrong = [line for line in lines if is_another_model(line, touch) and line.quantity != "time step"]
-    unlike = [check("model", f"{line.quantity}: {line.detail}", np.inf, 0.0) for line in wrong]
-    return follower.in_engine(f"{engine.name} {engine.version}", engine.step, engine.contract.time_step, unlike)
+
+    def move(control: str) -> tuple[MeasuredMotion, list[Check]]:
+        checks = [check("model", f"{line.quantity}: {line.detail}", np.inf, 0.0) for line in wrong]
+        law, count = follower.law(control, pieces), pieces * len(follower.us)
+        xs, us = np.full((count + 1, len(x0)), np.nan), np.zeros((count, model.nu))
+        xs[0] = x0
+        for k in range(count):
+            us[k] = law(xs[k], k * h)
+            try:
+                xs[k + 1] = engine.step(xs[k], us[k])
+            except SimulationError as error:
+                why = f"it breaks off at {k * h:.3g} s: {str(error).split(', from x = ')[0]}"
+                checks.append(check("motion", why, np.inf, 0.0, verdict="undecided"))
+                break
+        with plan.applied_to(follower.model) as set_model:
+            return _Moved(np.asarray(h * np.arange(count + 1)), xs, us, _overlaps(set_model, xs)), checks
+
+    variant = f"in {engine.name} {engine.version} in steps of {h:.4g} s"
+    rows = (follower.replay(variant, c, follower.model, move, pieces, h, WIDER) for c in follower.controls[::-1])
+    return [*_until_one_holds(rows)]
+
+
+def _until_one_holds(rows: Iterable[Replay]) -> Iterator[Replay]:
+    for row in rows:
+        yield row
+        if row.holds:
+            return
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,127 +158,6 @@ class _Moved:
     penetration: Array
 
 
-Mover = Callable[
-    [Policy], tuple[MeasuredMotion, list[Check]]
-]  # a motion under a law, and what is checked of it besides
-
-
-class PlanFollower:
-    """Follows a plan with the feedback of its own steps in other plants.
-
-    `period` [s] is the step of the plan's own controller, and `parts` how many of them an interval of the plan has: of
-    a collocated one, whose intervals need not be steps, the first in which it has to hold (by its replays `known`).
-    """
-
-    def __init__(self, plan: ReplayPlan, known: Sequence[Replay] = ()):
-        self.plan, self.parts = plan, 1
-        if plan.continuous and plan.problem.motion != CONTINUOUS:
-            known = known or replays(plan)
-            named = [r for r in known if r.variant in deciding(plan, known)]
-            self.parts = round(plan.time_step / named[0].time_step) if named else 1
-        self.period = plan.time_step / self.parts
-        self.xs, self.us = plan.sample(self.parts)
-        self._gains: Array | None = None
-        self.controls = (FEEDBACK, OPEN_LOOP) if plan.problem.model.nu else (OPEN_LOOP,)
-
-    def in_continuous_time(self) -> list[Replay]:
-        """In the continuous time that Drake's steps stand for, by error control; in short steps where it has none."""
-
-        def move(law: Policy) -> tuple[MeasuredMotion, list[Check]]:
-            model = self.plan.model_at(self.parts)
-            with applied(select(model, self.plan.vector.to_dict())) as set_model:
-                motion = replayed(
-                    set_model, self.xs[0], law, len(self.us), tolerance=TOLERANCE, evaluations=EVALUATIONS
-                )
-            return motion, [energy_check(motion)]
-
-        rows = self._replays(IN_CONTINUOUS_TIME, 0.0, 1, move)
-        refused = [row for row in rows if row.motion is None]
-        if not refused or rows[-1].holds:
-            return rows
-        parts = max(1, math.ceil(self.period / SHORT - 1e-9))
-        name = f"in steps of {self.period / parts:.4g} s in place of continuous time: {refused[0].failures[0]}"
-        short = self._replays(name, self.period / parts, parts, self._steps(parts))
-        return short if any(row.motion is not None for row in short) else rows
-
-    def _steps(self, parts: int) -> Mover:
-        def move(law: Policy) -> tuple[MeasuredMotion, list[Check]]:
-            model = self.plan.model_at(self.parts * parts)
-            with applied(select(model, self.plan.vector.to_dict())) as set_model:
-                motion = rollout(set_model, self.xs[0], policy=law, num_steps=parts * len(self.us))
-            return motion, [energy_check(motion)]
-
-        return move
-
-    def in_engine(
-        self, name: str, step: Callable[[Array, Array], Array], time_step: float, unlike: Sequence[Check] = ()
-    ) -> list[Replay]:
-        """In another simulator, by its `step` (x, u) -> x' of `time_step` [s], a whole part of the plan's own.
-
-        `unlike` are checks of its model.
-        """
-        parts = round(self.period / time_step)
-        if not parts or abs(parts * time_step - self.period) > 1e-9 * self.period:
-            raise InputError("time_step [s]", got=time_step, expected=f"a whole part of {self.period:.12g}")
-
-        def move(law: Policy) -> tuple[MeasuredMotion, list[Check]]:
-            count, checks = parts * len(self.us), list(unlike)
-            xs, us = np.full((count + 1, self.xs.shape[1]), np.nan), np.zeros((count, self.us.shape[1]))
-            xs[0] = self.xs[0]
-            for k in range(count):
-                us[k] = law(xs[k], k * time_step)
-                try:
-                    xs[k + 1] = step(xs[k], us[k])
-                except SimulationError as error:
-                    why = f"it breaks off at {k * time_step:.3g} s: {_first_clause(error)}"
-                    checks.append(check("motion", why, np.inf, 0.0, verdict="undecided"))
-                    break
-            model = self.plan.model_at(self.parts)
-            with applied(select(model, self.plan.vector.to_dict())) as set_model:
-                return _Moved(np.asarray(time_step * np.arange(count + 1)), xs, us, _overlaps(set_model, xs)), checks
-
-        return self._replays(f"in {name} in steps of {time_step:.4g} s", time_step, parts, move, WIDER)
-
-    def _replays(self, variant: str, time_step: float, parts: int, move: Mover, wider: float = 1.0) -> list[Replay]:
-        """The plan in a plant, `parts` of whose steps make one of its own, up to the first control by which it holds.
-
-        `time_step` [s] is that of the plant.
-        """
-        rows, model, every = list[Replay](), self.plan.model_at(self.parts), parts * self.parts
-        for control in self.controls:
-            try:
-                with applied(select(model, self.plan.vector.to_dict())) as set_model:
-                    law = self._law(set_model, control, parts)
-                motion, checks = move(law)
-                if np.all(np.isfinite(motion.xs)):
-                    with applied(select(model, self.plan.vector.to_dict())) as set_model:
-                        asked = motion_checks(self.plan, set_model, motion, every, wider * STATE_TOLERANCE, wider)
-                        checks = [*asked, *checks]
-                rows.append(measured_replay(self.plan, variant, control, model, motion, checks, time_step))
-            except BROKEN as error:
-                row = missing_replay(self.plan, variant, control, _first_clause(error))
-                rows.append(replace(row, time_step=time_step))
-            if rows[-1].holds:
-                break
-        return rows
-
-    def _law(self, model: Model, control: str, parts: int) -> Policy:
-        """The command of each of the plan's own steps, held over `parts` steps of a plant: for one motion."""
-        law, plan_step, command = None, self.period / parts, [np.zeros(0)]
-        if control == FEEDBACK:
-            if self._gains is None:
-                self._gains = regulator(self.plan, model, self.xs, self.us).gains
-            law = track(self.plan, model, self.xs, self.us, self._gains)
-
-        def held(x: Array, t: float) -> Array:
-            k, within = divmod(round(t / plan_step), parts)
-            if not within:
-                command[0] = self.us[k] if law is None else np.asarray(law(x, k * self.period))
-            return command[0]
-
-        return held
-
-
 def _overlaps(model: Model, xs: Array) -> Array:
     """(n+1,) [m] of Drake's geometries at xs, NaN where these are no numbers."""
     depths = np.full(len(xs), np.nan)
@@ -254,8 +167,3 @@ def _overlaps(model: Model, xs: Array) -> Array:
             set_state(model.double, xs[k])
         depths[k] = penetration(model) if touches else 0.0
     return depths
-
-
-def _first_clause(error: Exception) -> str:
-    """What it says, without the state at which it happened."""
-    return str(error).split(", from x = ")[0]

@@ -38,7 +38,6 @@ from drake_diff.optimize.replay import (
     finest_parts,
     goal_check,
     penetration_check,
-    track,
 )
 from drake_diff.runs.fields import Label, finite
 from drake_diff.trials.perturbation import Setup, perturbation_for, perturbed
@@ -128,7 +127,7 @@ class Task:
         if callable(given):
             return self._made_by(given, model)
         if given == "tvlqr" and model.nu:
-            return track(self.plan, model, self.xs, self.us)
+            return self.plan.follower(self.parts).law()
         if given == "mpc" and model.nu:
             return MPC(self.plan.problem, horizon=MPC_HORIZON, plan=(self.xs, self.us))
         return OpenLoop(self.us, model.time_step)
@@ -150,7 +149,7 @@ class Task:
         """What follows the plan in `setup` in the controller's place, without a fallback or budget; "" for nothing."""
         bare = replace(setup, loop=replace(setup.loop, fallback=None, latency_budget=None))
         for name, make in (("the plan's own inputs", lambda model: OpenLoop(self.us, model.time_step)),
-                           ("TVLQR", lambda model: track(self.plan, model, self.xs, self.us))):  # fmt: skip
+                           ("TVLQR", lambda _: self.plan.follower(self.parts).law())):  # fmt: skip
             try:
                 with applied(select(self.model, self.plan.vector.to_dict())) as model:
                     policy = make(model)

@@ -18,7 +18,7 @@ import drake_diff as dd
 from drake_diff.engines.load import load_engine
 from drake_diff.optimize.replay import STATE_TOLERANCE
 from drake_diff.optimize.solution import Solution, Status
-from drake_diff.runs.cross_check import WIDER, PlanFollower, replays_in
+from drake_diff.runs.cross_check import WIDER, follower_of, replays_in
 
 COUNT = 120
 G, RADIUS, FREE = 9.81, 0.1, np.nan
@@ -96,7 +96,7 @@ def fallen(random, folder):
     height = by_formula(k / 2, 2 * tau, fall, steps * h)
     miss = abs(height + RADIUS - solution.xs[-1, 1])
     part = miss / (STATE_TOLERANCE * solution.plan.scale[1])
-    rows = PlanFollower(solution.plan).in_continuous_time()
+    rows = follower_of(solution.plan).in_continuous_time()
     return (None if CLEAR < part < 1 / CLEAR else bool(part <= 1)), any(row.holds for row in rows)
 
 
@@ -127,7 +127,7 @@ def slid(random, quantity, folder):
         text = planted(engine.mjcf, quantity, off)
         (folder / "other.xml").write_text(text)
         engine = load_engine("mujoco", model, path=folder / "other.xml")
-    row = replays_in(PlanFollower(solution.plan), engine)[0]
+    row = replays_in(follower_of(solution.plan), engine)[0]
     if quantity not in ("", "friction", "mass"):
         return None, row
     miss = abs(distance / (off if quantity == "friction" else 1.0) - distance)

@@ -201,8 +201,8 @@ def test_a_velocity_limit_is_met_and_pays():
 def test_cart_pole_swing_up_from_rest():
     """The optimum of examples/cart_pole_swing_up.py at 50 steps: 58.6088 by SNOPT and IPOPT.
 
-    In steps of 0.04 s it is no motion of the plant: in finer ones it needs feedback, under which the pole ends at
-    0.95 rad/s, of a range of 12.
+    In steps of 0.04 s it is no motion of the plant: in finer ones it needs feedback, under whose gains alone it ends
+    further off than 5 % of a range, and within 10 %.
     """
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
     problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=50, running_cost=EFFORT)
@@ -211,8 +211,10 @@ def test_cart_pole_swing_up_from_rest():
     from_a_line = dd.solve(problem, method="ilqr", initial_guess=(line, np.zeros((50, 1))))
     again = dd.solve(problem, method="ilqr", initial_guess=solution)
     for found in (solution, from_a_line, again):
-        assert found.message.startswith("not verified: at 5 ms open loop, slide_x ends 0.0773 m from its goal")
-        assert any(c.feedback == GAINS_ALONE and str(c).startswith("hinge_w ends 0.948") for c in found.checks.failing)
+        assert found.message.startswith("converged: holds open loop at 40 ms and at 20 ms; under TVLQR at 5 ms and in ")
+        alone = next(r for r in found.replays if r.control == GAINS_ALONE)
+        part = np.max(np.abs(problem.goal_error(alone.motion.xs[-1])) / np.ptp(found.xs, axis=0))
+        assert 0.05 < part < 0.1
         assert found.goal_error < 1e-6
         assert found.cost == pytest.approx(58.6088133284, rel=1e-8)
     assert len(again.iterations) < 12  # a good guess is not left

@@ -22,8 +22,8 @@ from drake_diff.optimize.replay import (
     deciding,
     energy_check,
     held,
+    regulator,
     replays,
-    track,
 )
 from drake_diff.optimize.solution import Status
 
@@ -65,7 +65,8 @@ def test_half_the_step_leads_a_block_elsewhere_by_the_closed_form(write_urdf):
     for h in steps:
         end = by_name(found, f"in steps of {h:g} s", "open loop").motion.xs[-1, 0]
         assert end == pytest.approx(2.0 * total * (total + h) / 2, rel=1e-9)
-    assert {r.variant for r in found} == {f"in steps of {h:g} s" for h in steps}  # nothing can touch
+    assert by_name(found, "in continuous time", "open loop").motion.xs[-1, 0] == pytest.approx(total**2, rel=1e-9)
+    assert len({r.variant for r in found}) == 4  # nothing can touch
 
 
 def test_feedback_holds_what_open_loop_loses(load):
@@ -105,7 +106,7 @@ def test_a_plan_that_misses_what_is_asked_is_told(write_urdf, fields, what, wher
     found = by_name(replays(plan), f"in steps of {H:g} s", "open loop")
     (failing,) = [c for c in found.checks if not c.passes]
     assert (failing.what, failing.where, failing.value) == (what, where, pytest.approx(value))
-    assert len(broken_variants(plan, replays(plan))) == 3
+    assert len(broken_variants(plan, replays(plan))) == 4
 
 
 @each_row("i", range(4))
@@ -164,13 +165,13 @@ def test_a_replay_is_compared_with_the_plan_where_nothing_is_asked_of_its_end(wr
 
 
 def test_what_an_eighth_of_the_step_alone_shows_is_refused(write_urdf):
-    """u = 2 ends at 1 + h: at a goal of 1.05 the miss is 2.5 hundredths in h/2, and 4.4 of 5.25 allowed in h/8."""
+    """u = 2 ends at 1 + h: at a goal of 1.05 it misses by 2.5, 4.4 and, in continuous time, 5 of 5.25 hundredths."""
     for beyond, holds in ((0.0, True), (0.01, False)):  # at 1.06 h and h/2 miss 1 and 3.5, h/8 misses 5.4 hundredths
         problem = block(write_urdf, x_goal=[1.05 + beyond, math.nan])
         plan = plan_of(problem, np.full((COUNT, 1), 2.0))
         found = [r for r in replays(plan) if r.control == "open loop"]
-        assert [r.holds for r in found] == [True, True, holds]
-        assert len(list(broken_variants(plan, found))) == (not holds)
+        assert [r.holds for r in found] == [True, True, holds, holds]
+        assert len(list(broken_variants(plan, found))) == 2 * (not holds)
 
 
 def test_the_regulator_is_the_same_in_finer_steps(write_urdf):
@@ -181,7 +182,7 @@ def test_the_regulator_is_the_same_in_finer_steps(write_urdf):
     first = []
     for parts in (16, 32):
         xs, finer = plan.sample(parts)
-        policy = track(plan, plan.model_at(parts), xs, finer)
+        policy = regulator(plan, plan.model_at(parts), xs, finer)
         away = [float(policy(xs[0] + d, 0.0)[0] - policy(xs[0], 0.0)[0]) for d in np.eye(2) * 0.01]
         first.append(away)
     assert first[0] == pytest.approx(first[1], rel=0.05)  # O(h): they would be 2 apart in a sum's weights
@@ -195,7 +196,7 @@ def test_energy_out_of_nothing_is_told(load):
     check = energy_check(plan.open_loop)
     assert (check.where, check.passes) == ("gained", False)
     found = replays(plan)  # which finer steps do not repeat
-    assert broken_variants(plan, found)[-1] == "in steps of 0.06875 s"
+    assert broken_variants(plan, found)[-2:] == ["in steps of 0.06875 s", "in continuous time"]
 
 
 def test_a_deep_overlap_is_told_and_another_approximation_is_tried(tmp_path):
@@ -320,10 +321,10 @@ def test_gains_of_half_steps_keep_a_smooth_plan_in_finer_ones_as_well_as_their_o
     ends = {}
     for parts in (2, 8):
         model, (xs, us) = plan.model_at(parts), plan.sample(parts)
-        for known in (None, plan.gains(parts)):
-            motion = dd.rollout(model, xs[0], policy=track(plan, model, xs, us, known), num_steps=len(us))
-            ends[parts, known is None] = np.abs(plan.problem.goal_error(motion.xs[-1])) / plan.scale
-    assert np.allclose(ends[2, True], ends[2, False], rtol=1e-9)
+        for known, policy in ((False, regulator(plan, model, xs, us)), (True, plan.follower(parts).law())):
+            motion = dd.rollout(model, xs[0], policy=policy, num_steps=len(us))
+            ends[parts, known] = np.abs(plan.problem.goal_error(motion.xs[-1])) / plan.scale
+    assert np.allclose(ends[2, True], ends[2, False], rtol=1e-9)  # neither reaches the limits of the input
     assert np.max(ends[8, True]) < 0.01  # of 3 % allowed
     assert np.max(ends[8, False]) < 0.01
 
@@ -350,8 +351,18 @@ def test_a_smooth_plan_that_is_wrong_is_refused_whatever_its_gains():
     assert list(broken_variants(cut, replays(cut)))
 
 
-def test_where_things_may_touch_each_replay_has_gains_of_its_own(write_urdf):
-    assert plan_of(block(write_urdf, x_goal=[0.1, 0]), np.ones((COUNT, 1))).gains(8) is None
+def test_a_command_is_held_over_a_step_of_the_controller(write_urdf):
+    """u_k - K_k (x - x_k) by the plant's state at the controller's steps, within the limits of the input."""
+    us = np.concatenate([np.full((COUNT // 2, 1), 4.0), np.full((COUNT // 2, 1), -4.0)])
+    plan = plan_of(block(write_urdf, x_goal=[1, 0], bounds=dd.Bounds(u_lower=[-4], u_upper=[4])), us)
+    motion = plan.follower().in_model("in eighths", lambda: plan.model_at(8), 8)[1].motion
+    commands, (xs, _) = motion.us.reshape(COUNT, 8), plan.sample(1)
+    assert not np.ptp(commands, axis=1).any()
+    off = motion.xs[:-1:8] - xs[:-1]
+    wanted = us[:, 0] - np.einsum("kj,kj->k", plan.follower().gains[:, 0], off)
+    np.testing.assert_allclose(commands[:, 0], np.clip(wanted, -4, 4), rtol=1e-12)
+    assert np.any(wanted > 4)
+    assert np.any(np.abs(wanted) < 3.99)
 
 
 def test_a_collocated_plan_holds_open_loop_only_where_its_motion_costs_what_is_reported():

@@ -13,7 +13,6 @@ import drake_diff as dd
 from drake_diff._base.statistics import margin, success_rate
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.parameters import list_parameters
-from drake_diff.optimize.replay import track
 from drake_diff.trials.perturbation import Setup, levels_named, parameters_of, perturbed
 from drake_diff.trials.run import PREDICTED, LoopSensitivity, trial_seed
 from drake_diff.trials.trial import Task, run_trial
@@ -247,7 +246,7 @@ def idle(plan, model, xs, us):
 
 
 def slow(plan, model, xs, us):
-    good = track(plan, model, xs, us)
+    good = plan.follower().law()
 
     def command(x, t):
         time.sleep(0.02 if t > 0.1 else 0.0)
