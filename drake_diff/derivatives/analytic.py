@@ -23,7 +23,7 @@ from drake_diff.derivatives.smooth_step import (
     differentiate_equation,
     form_of,
 )
-from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, Steps, Trial, take_steps
+from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, SourceTrial, Steps, take_steps
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
@@ -98,7 +98,7 @@ class Analytic:
             return of_whole
         values, refused = reduced.jacobians(steps, whole, of_whole.values), dict(of_whole.refused)
         refused |= {int(k): NotSmoothError("it leads elsewhere") for k in np.flatnonzero(~same)}
-        trial = model.cache("trial of reduced steps", lambda: Trial(CERTIFIED_STATES), of_structure=True)
+        trial = model.cache("trial of reduced steps", lambda: SourceTrial(CERTIFIED_STATES), of_structure=True)
         for k in range(len(steps)):
             if k not in refused:
                 _certify(steps, k, values[k], [trial], iterated=False)
@@ -197,12 +197,12 @@ def _with_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> Jacobians |
     material = material_of(model, form)
     change = material_change(form.pairs, material, vector, model.double) if vector.parameters else None
     values, known, whys, placed = contact_jacobians(form, smooth, steps, material, change)
-    trials: dict[str, Trial] = model.cache("impulse trials", dict, of_structure=True)
+    trials: dict[str, SourceTrial] = model.cache("impulse trials", dict, of_structure=True)
     kinds = form.pairs.kinds(placed, len(steps)) if touch else [{JOINT_LIMITS}] * len(steps)
     notes: dict[int, str] = {}
 
     for k in np.flatnonzero(known).tolist():
-        of_step = [trials.setdefault(kind, Trial(CERTIFIED_STATES)) for kind in sorted(kinds[k])]
+        of_step = [trials.setdefault(kind, SourceTrial(CERTIFIED_STATES)) for kind in sorted(kinds[k])]
         _certify(steps, k, values[k], of_step, iterated=any(map(is_iterated, kinds[k])))
         refusal, note = (_joined([getattr(t, name) for t in of_step]) for name in ("refusal", "note"))
         if refusal:
@@ -217,7 +217,7 @@ def _joined(texts: list[str]) -> str:
     return "; ".join(dict.fromkeys(filter(None, texts)))
 
 
-def _certify(steps: Steps, k: int, jacobian: Array, trials: list[Trial], *, iterated: bool) -> None:
+def _certify(steps: Steps, k: int, jacobian: Array, trials: list[SourceTrial], *, iterated: bool) -> None:
     """Compare a step's Jacobian for the trials that are still open."""
     if still_open := [trial for trial in trials if trial.left and not trial.refusal]:
         refusal, note = _other_jacobian(steps, k, jacobian, iterated=iterated)

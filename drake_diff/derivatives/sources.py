@@ -27,7 +27,7 @@ from drake_diff.derivatives import METHODS
 from drake_diff.derivatives.analytic import Analytic
 from drake_diff.derivatives.refine_step import refine_steps, solves_the_step
 from drake_diff.derivatives.smooth_step import Implicit, form_of
-from drake_diff.derivatives.steps import Jacobians, Source, Steps, Trial, take_step, take_steps
+from drake_diff.derivatives.steps import Jacobians, Source, SourceTrial, Steps, take_step, take_steps
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, write_autodiff
@@ -225,12 +225,12 @@ class CertifiedImplicit(Implicit):
         return Refusal(trial.refusal) if trial.refusal else answer
 
 
-def implicit_trial(model: Model) -> Trial:
+def implicit_trial(model: Model) -> SourceTrial:
     """Of comparing implicit with autodiff, at the first smooth step that is met."""
-    return model.cache("implicit trial", lambda: Trial(1), of_structure=True)
+    return model.cache("implicit trial", lambda: SourceTrial(1), of_structure=True)
 
 
-def _compare(trial: Trial, steps: Steps, k: int, jacobian: Array) -> None:
+def _compare(trial: SourceTrial, steps: Steps, k: int, jacobian: Array) -> None:
     trial.left = 0
     if not steps.taken:  # the caller's ends are less exact than parity asks for
         steps, k = take_step(steps.model, steps.vector, steps.xs[k], steps.us[k]), 0

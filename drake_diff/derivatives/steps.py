@@ -121,7 +121,7 @@ class Jacobians:
 
 
 @dataclass
-class Trial:
+class SourceTrial:
     """How many steps of one kind a source is still to be compared on, or why it knows none of them."""
 
     left: int

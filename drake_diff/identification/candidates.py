@@ -16,7 +16,7 @@ from scipy import stats
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
-from drake_diff.identification.fit import Fit, Point, Reduced, Solved
+from drake_diff.identification.fit import Fit, FittedMotion, Reduced, Solved
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import (
     HOPELESS,
@@ -28,8 +28,8 @@ from drake_diff.identification.judge import (
     noise_of,
 )
 from drake_diff.identification.messages import changed_to
-from drake_diff.identification.motion import LONGEST, ContinuousMotion, EulerMotion, Law
-from drake_diff.identification.recordings import Chart, Piece, noise_by_differences
+from drake_diff.identification.motion import LONGEST, EulerMotion, Law, TreeMotion
+from drake_diff.identification.recordings import Chart, Excerpt, noise_by_differences
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import ORDER_4, Tree
 from drake_diff.identification.unknowns import (
@@ -73,7 +73,7 @@ class Ranking:
 
     model: Model
     chart: Chart
-    pieces: list[Piece]
+    pieces: list[Excerpt]
     stated: Array  # (2 nv,) the noise, NaN where it is not known
     evidence: dict[str, float] = field(default_factory=dict)
     begun: float = field(default_factory=time.process_time)
@@ -99,7 +99,7 @@ class Ranking:
     def scatter(self) -> Array:
         return noise_by_differences(self.chart, self.pieces, jumps=self.jumps)
 
-    def problem(self, unknowns: Unknowns, pieces: Sequence[Piece]) -> Problem:
+    def problem(self, unknowns: Unknowns, pieces: Sequence[Excerpt]) -> Problem:
         return Problem(self.model, self.chart, unknowns, list(pieces), self.stated, self.scatter, jumps=self.jumps)
 
     def judge(self, names: tuple[str, ...], problem: Problem, fit: Fit, solved: Solved) -> Tried:
@@ -191,7 +191,7 @@ TOLD_APART = 20.0  # of the squares: what leaves so much more than a change that
 class WithLimits:
     """A law whose steps also change by what a limit at CUT takes off an input."""
 
-    law: ContinuousMotion
+    law: TreeMotion
     unknowns: Unknowns
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
@@ -342,11 +342,11 @@ class Candidates(Ranking):
         shifting = (replace(unknown, shifts=unknown.quantity == DELAY) for unknown in chosen)
         return Unknowns(tuple(shifting), as_in_files=True)
 
-    def law(self, unknowns: Unknowns, longest: float, *, smooth: bool = True) -> ContinuousMotion:
+    def law(self, unknowns: Unknowns, longest: float, *, smooth: bool = True) -> TreeMotion:
         """By Euler steps where they stand for the motion; Coulomb friction that is not smooth holds."""
         if self.step is not None:
             return EulerMotion(self.model, self.tree, unknowns, self.step)
-        return ContinuousMotion(self.model, self.tree, unknowns, longest, smooth=smooth, frozen=True)
+        return TreeMotion(self.model, self.tree, unknowns, longest, smooth=smooth, frozen=True)
 
     @property
     def period(self) -> float:
@@ -365,7 +365,7 @@ class Candidates(Ranking):
         """Steps, pieces and starts of segments with which the model as it is follows what was measured."""
         nothing = self.of(())
         fit, starts = self.problem(nothing, self.pieces).prepared(self.law(nothing, LONGEST))
-        self.longest = fit.law.longest if isinstance(fit.law, ContinuousMotion) else LONGEST
+        self.longest = fit.law.longest if isinstance(fit.law, TreeMotion) else LONGEST
         self.cut = list(fit.segments.pieces)
         self.starts = self.settled(fit, nothing.z_start, starts)
 
@@ -409,13 +409,13 @@ class Candidates(Ranking):
             known[delay] = self.settled(problem.fit(law, self.cut, problem.first_noise), np.array([delay]), starts)
         return known[delay]
 
-    def view(self, pieces: Sequence[Piece], z: Array, starts: Array) -> View | None:
+    def view(self, pieces: Sequence[Excerpt], z: Array, starts: Array) -> View | None:
         """What everything promises there; None where there is no motion. Where z has a delay, inputs act later."""
         unknowns = self.unknowns
         if any(unknown.quantity == DELAY and z[s][0] > 0 for unknown, s in unknowns.items()):
             unknowns = self.of([unknown.name for unknown in unknowns.each])
         problem = self.problem(unknowns, pieces)
-        law = cast(ContinuousMotion, WithLimits(self.law(self.unknowns, self.longest), unknowns))
+        law = cast(TreeMotion, WithLimits(self.law(self.unknowns, self.longest), unknowns))
         fit = problem.fit(law, pieces, problem.first_noise)
         point = fit.at(z, starts)
         reduced = None if point is None else fit.reduce(point)
@@ -587,6 +587,6 @@ class Candidates(Ranking):
         return fit
 
 
-def _squares(point: Point) -> Array:
+def _squares(point: FittedMotion) -> Array:
     """(K,) what is left of each segment."""
     return np.array([float(np.nansum(r**2)) for r in point.residuals])

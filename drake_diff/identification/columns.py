@@ -18,8 +18,8 @@ from drake_diff.exceptions import DrakeDiffError
 from drake_diff.identification.fit import cut_segments
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import HOPELESS, likelihood_of, noise_of
-from drake_diff.identification.motion import ContinuousMotion, EulerMotion, Law
-from drake_diff.identification.recordings import Chart, Piece, guess_states, noise_by_differences
+from drake_diff.identification.motion import EulerMotion, Law, TreeMotion
+from drake_diff.identification.recordings import Chart, Excerpt, guess_states, noise_by_differences
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import Tree
 from drake_diff.identification.unknowns import Unknowns
@@ -43,17 +43,17 @@ class Mistake:
     order: Indices  # (nx + nu,)
     factors: Array  # (nx + nu,)
 
-    def mended(self, piece: Piece) -> Piece:
+    def mended(self, piece: Excerpt) -> Excerpt:
         """The piece as it would be without the mistake."""
         nx = piece.ys.shape[1]
         us = piece.us[:, self.order[nx:] - nx] * self.factors[nx:]
         return replace(piece, ys=piece.ys[:, self.order[:nx]] * self.factors[:nx], us=us)
 
 
-Fitted = Callable[[Sequence[Piece]], tuple[float, bool]]  # (-2 log of the likelihood, whether noise is left)
+Fitted = Callable[[Sequence[Excerpt]], tuple[float, bool]]  # (-2 log of the likelihood, whether noise is left)
 
 
-def mistakes(model: Model, chart: Chart, pieces: Sequence[Piece]) -> list[Mistake]:
+def mistakes(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> list[Mistake]:
     """Everything that is tried; of what was not measured, and of quaternions, nothing."""
     nq, nx = model.nq, model.nx
     seen = np.any([np.isfinite(piece.ys).any(axis=0) for piece in pieces], axis=0)
@@ -102,7 +102,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def mistaken_columns(
-    model: Model, chart: Chart, pieces: Sequence[Piece], law: Law, fits: Sequence[Fitted]
+    model: Model, chart: Chart, pieces: Sequence[Excerpt], law: Law, fits: Sequence[Fitted]
 ) -> Explanation | None:
     """The mistake of columns that alone explains recordings; None where they are explained as they are, or by none.
 
@@ -134,7 +134,7 @@ def mistaken_columns(
 
 
 def mistaken_in_the_air(
-    model: Model, tree: Tree, chart: Chart, pieces: Sequence[Piece], stated: Array
+    model: Model, tree: Tree, chart: Chart, pieces: Sequence[Excerpt], stated: Array
 ) -> Explanation | None:
     """The same of motions in which nothing touches, in continuous time or by the model's own Euler steps.
 
@@ -144,7 +144,7 @@ def mistaken_in_the_air(
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
     whole = np.round(periods)
     steps = not chart.coordinates.free and np.all(whole > 0) and np.all(np.abs(periods - whole) < CLOCK_TOLERANCE)
-    law = ContinuousMotion(*arguments)
+    law = TreeMotion(*arguments)
     fits = [partial(_fitted, model, law, chart, stated)]
     if steps:
         euler = EulerMotion(*arguments, model.time_step)
@@ -152,7 +152,9 @@ def mistaken_in_the_air(
     return mistaken_columns(model, chart, pieces, law, fits)
 
 
-def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], candidates: Sequence[Mistake]) -> list[float]:
+def _left(
+    model: Model, law: Law, chart: Chart, pieces: Sequence[Excerpt], candidates: Sequence[Mistake]
+) -> list[float]:
     """What some short segments leave without each mistake, from states that are guessed: mean log of 1 + squares."""
     s, nx, losses = cut_segments(law, pieces, model.nu), model.nx, list[float]()
     some = np.unique(np.linspace(0, len(s.first) - 1, SEGMENTS).round().astype(int))
@@ -173,7 +175,7 @@ def _left(model: Model, law: Law, chart: Chart, pieces: Sequence[Piece], candida
     return losses
 
 
-def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequence[Piece]) -> tuple[float, bool]:
+def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequence[Excerpt]) -> tuple[float, bool]:
     """(-2 log of the likelihood with the noise that is left, whether what is left is noise).
 
     Where a few steps leave far more than noise, no more are taken.

@@ -16,11 +16,11 @@ from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.exceptions import DrakeDiffError, SimulationError
 from drake_diff.identification.candidates import Ranking, Tried
 from drake_diff.identification.columns import mistaken_columns
-from drake_diff.identification.fit import Fit, Point, Solved
+from drake_diff.identification.fit import Fit, FittedMotion, Solved
 from drake_diff.identification.judge import HOPELESS
 from drake_diff.identification.messages import NO_CHANGE
 from drake_diff.identification.motion import DiscreteMotion, discrete_motion
-from drake_diff.identification.recordings import Chart, Piece, guess_states
+from drake_diff.identification.recordings import Chart, Excerpt, guess_states
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.unknowns import BIAS, CENTER, MASS, Unknown, Unknowns, choose_unknowns
 from drake_diff.model.model import Model
@@ -44,7 +44,7 @@ LARGER = 1.2  # radii with which bodies are looked at that nearly touch
 NOTHING = Unknowns(())
 
 
-def may_touch(model: Model, chart: Chart, pieces: Sequence[Piece]) -> bool:
+def may_touch(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> bool:
     """Whether bodies would touch with a higher ground and larger spheres, where samples are whole steps apart."""
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
     stride = np.round(np.median(periods))
@@ -61,7 +61,7 @@ def may_touch(model: Model, chart: Chart, pieces: Sequence[Piece]) -> bool:
     return False
 
 
-class Stage(NamedTuple):
+class FitStage(NamedTuple):
     """How a change fits the recordings up to a stage."""
 
     stage: int
@@ -71,7 +71,7 @@ class Stage(NamedTuple):
 
 
 @dataclass(eq=False)
-class Touching(Ranking):
+class ContactExplanation(Ranking):
     """The search for one change that explains recordings in which bodies touch."""
 
     least_left: dict[int, float] = field(default_factory=dict)  # by stage, of the changes that explain
@@ -139,8 +139,8 @@ class Touching(Ranking):
         return problem.fit(law, parts, problem.first_noise)
 
     def stages_of(
-        self, unknowns: Unknowns, first: int, z: Array, starts: Array | None, before: Stage | None = None
-    ) -> Iterator[Stage]:
+        self, unknowns: Unknowns, first: int, z: Array, starts: Array | None, before: FitStage | None = None
+    ) -> Iterator[FitStage]:
         """How a change fits stage after stage, for as long as it leaves no more than HOPELESS."""
         law = self.law(unknowns)
         for stage in range(first, len(self.stages)):
@@ -160,22 +160,22 @@ class Touching(Ranking):
             if now.left > HOPELESS**2 or self.is_behind(now):
                 return
 
-    def is_behind(self, now: Stage) -> bool:
+    def is_behind(self, now: FitStage) -> bool:
         """Whether a change leaves clearly more in a stage than one that explains."""
         best = self.least_left.get(now.stage, np.inf)
         return (now.left - best) * now.fit.count > TOLD_APART * max(best, 1.0)
 
     @staticmethod
-    def solved(fit: Fit, stage: int, z: Array, starts: Array, most: int) -> Stage | None:
+    def solved(fit: Fit, stage: int, z: Array, starts: Array, most: int) -> FitStage | None:
         """Where the least squares of a stage lead; None where there is no motion."""
         try:
             solved = fit.solve(z, starts, most)
         except SimulationError:
             return None
         residuals = np.concatenate([rows[np.isfinite(rows)] for rows in solved.reduced.residuals])
-        return Stage(stage, fit, solved, float(np.mean(residuals**2)))
+        return FitStage(stage, fit, solved, float(np.mean(residuals**2)))
 
-    def other_starts(self, fit: Fit, z: Array, before: Stage) -> list[Array]:
+    def other_starts(self, fit: Fit, z: Array, before: FitStage) -> list[Array]:
         """The best of first states that the stage before allows too: through impacts steps by slopes may stop early."""
         random, size = np.random.default_rng(0), np.sqrt(max(before.left, 1.0))
         spreads = [np.linalg.pinv(R, rcond=LEAST_SEEN) for R, _, _ in before.solved.reduced.own]
@@ -186,12 +186,12 @@ class Touching(Ranking):
         best = sorted((point for point in points if point is not None), key=lambda point: point.value)
         return [point.starts for point in best[:BEST]]
 
-    def to_end(self, unknowns: Unknowns, first: int, z: Array, starts: Array | None) -> Stage | None:
+    def to_end(self, unknowns: Unknowns, first: int, z: Array, starts: Array | None) -> FitStage | None:
         """The last stage, if the change reaches the end of the recordings."""
         stages = list(self.stages_of(unknowns, first, z, starts))
         return stages[-1] if stages and stages[-1].stage == len(self.stages) - 1 else None
 
-    def first_points(self, begin: Stage) -> Iterator[tuple[Unknown, list[Point]]]:
+    def first_points(self, begin: FitStage) -> Iterator[tuple[Unknown, list[FittedMotion]]]:
         """Where changes may begin, best first."""
         for unknown in self.changes:
             unknowns = Unknowns((unknown,))
@@ -201,7 +201,7 @@ class Touching(Ranking):
             if there:
                 yield unknown, there
 
-    def tried(self, unknown: Unknown, begin: Stage, points: Sequence[Point]) -> Tried | None:
+    def tried(self, unknown: Unknown, begin: FitStage, points: Sequence[FittedMotion]) -> Tried | None:
         """A change where it fits, from where it leaves least that comes to the end; None where none does."""
         unknowns, stage = Unknowns((unknown,)), min(begin.stage + 1, len(self.stages) - 1)
         for point in points[:BEST]:
@@ -223,7 +223,7 @@ class Touching(Ranking):
             return [none]
         return [none, *(scales if unknown.quantity == MASS else unknown.start * np.expm1(scales))]
 
-    def judged(self, names: tuple[str, ...], unknowns: Unknowns, stage: Stage) -> Tried:
+    def judged(self, names: tuple[str, ...], unknowns: Unknowns, stage: FitStage) -> Tried:
         """With the noise that is left; of a change that did not come to the end, one that does not explain."""
         solved = replace(stage.solved, converged=True)  # on ragged ground the last step is judged by what it leaves
         candidate = self.judge(names, self.problem(unknowns, stage.fit.segments.pieces), stage.fit, solved)
@@ -231,9 +231,9 @@ class Touching(Ranking):
             return candidate
         return candidate._replace(score=np.inf, doubt="its motion leaves the recordings")
 
-    def unchanged(self, pieces: Sequence[Piece]) -> tuple[float, bool]:
+    def unchanged(self, pieces: Sequence[Excerpt]) -> tuple[float, bool]:
         """How well the model as it is goes through other pieces."""
-        other = Touching(self.model, self.chart, list(pieces), self.stated)
+        other = ContactExplanation(self.model, self.chart, list(pieces), self.stated)
         end = other.to_end(NOTHING, 0, np.zeros(0), None)
         base = None if end is None else other.judged((), NOTHING, end)
         return (np.inf, False) if base is None else (base.score, base.explains)

@@ -21,9 +21,9 @@ from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.fit import Fit, growth_cuts
 from drake_diff.identification.judge import deviations_of, known_of
 from drake_diff.identification.messages import excitation_sentence, unidentifiable
-from drake_diff.identification.motion import ContinuousMotion
-from drake_diff.identification.recordings import LEAST, Chart, Piece, given_noise
-from drake_diff.identification.tree import ORDER_4, Dynamics, Tree, numbers_of, tree_for_identification
+from drake_diff.identification.motion import TreeMotion
+from drake_diff.identification.recordings import LEAST, Chart, Excerpt, given_noise
+from drake_diff.identification.tree import ORDER_4, Tree, TreeDynamics, numbers_of, tree_for_identification
 from drake_diff.identification.unknowns import FAR, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
@@ -182,16 +182,16 @@ class _Design:
         return np.linspace(0, self.duration, max(2 * LEAST, min(most, round(self.duration / COARSE))) + 1)
 
     @cached_property
-    def law(self) -> ContinuousMotion:
-        return ContinuousMotion(self.model, self.tree, self.unknowns)
+    def law(self) -> TreeMotion:
+        return TreeMotion(self.model, self.tree, self.unknowns)
 
     @cached_property
-    def rough(self) -> ContinuousMotion:
+    def rough(self) -> TreeMotion:
         return replace(self.law, longest=1.01 * COARSE, method=ORDER_4)
 
     @cached_property
-    def own(self) -> Dynamics:
-        return Dynamics(self.tree, self.tree.numbers)
+    def own(self) -> TreeDynamics:
+        return TreeDynamics(self.tree, self.tree.numbers)
 
     @cached_property
     def follows(self) -> bool:
@@ -258,7 +258,7 @@ class _Design:
         W, S, B = window[:, None], slope[:, None], bend[:, None]
         return W * waves, S * waves + W * first, B * waves + 2 * S * first + W * second
 
-    def planned(self, law: ContinuousMotion, c: Array, times: Array) -> tuple[Array, Array, Array | None]:
+    def planned(self, law: TreeMotion, c: Array, times: Array) -> tuple[Array, Array, Array | None]:
         """xs (K, n, nx) and us (K, n - 1, nu) by coefficients c (K, m), and accelerations (K, n, nv) where planned."""
         middle, half = self.reach
         K, n = len(c), len(times)
@@ -314,10 +314,10 @@ class _Design:
         first = np.searchsorted(self.times[:-1], self.few[:-1] - 1e-9)
         return np.maximum.reduceat(every, first, axis=1) + MARGIN
 
-    def fit(self, law: ContinuousMotion, xs: Array, us: Array, times: Array) -> tuple[Fit, Array]:
+    def fit(self, law: TreeMotion, xs: Array, us: Array, times: Array) -> tuple[Fit, Array]:
         """Of K motions (K, n, nx), each a piece of its own; and where its segments start."""
         pieces = [
-            Piece("planned", times, x, u, held_out=False, recording=k)
+            Excerpt("planned", times, x, u, held_out=False, recording=k)
             for k, (x, u) in enumerate(zip(xs, us, strict=True))
         ]
         fit = Fit(self.model, law, self.chart, self.unknowns, pieces, self.noise)
@@ -546,7 +546,7 @@ def _effects(model: Model, tree: Tree, count: int) -> list[Array]:
     q = random.uniform(-np.pi, np.pi, (N, model.nq))
     v, a = random.standard_normal((2, N, model.nv))
     E = tree.spread
-    by_links = Dynamics(tree, numbers).regressors(tree.joint_positions(q), v @ E.T, a @ E.T)
+    by_links = TreeDynamics(tree, numbers).regressors(tree.joint_positions(q), v @ E.T, a @ E.T)
     return [(E.T @ by_links[:, :, i]).reshape(-1, 10) for i in range(len(tree.links))]
 
 

@@ -30,7 +30,7 @@ from drake_diff.identification.candidates import (
     View,
 )
 from drake_diff.identification.columns import mistaken_in_the_air
-from drake_diff.identification.contact import Touching, may_touch
+from drake_diff.identification.contact import ContactExplanation, may_touch
 from drake_diff.identification.identify import TOUCH, what_acts
 from drake_diff.identification.messages import NO_CHANGE
 from drake_diff.identification.recordings import Chart, given_noise, read_pieces
@@ -103,13 +103,13 @@ def explain(
             return columns
     why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces) if motion == "auto" else ""
     if why == TOUCH:
-        return Touching(model, chart, pieces, given_noise(model, chart, noise)).explanation()
+        return ContactExplanation(model, chart, pieces, given_noise(model, chart, noise)).explanation()
     if why or isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: causes are looked for in motions in continuous time only, and {why}")
     explanation = _Search(model, chart, pieces, given_noise(model, chart, noise), tree=tree).found()
     if explanation.explained or motion != "auto" or not may_touch(model, chart, pieces):
         return explanation
-    touched = Touching(model, chart, pieces, given_noise(model, chart, noise)).explanation()
+    touched = ContactExplanation(model, chart, pieces, given_noise(model, chart, noise)).explanation()
     if touched.explained:
         return touched
     more = f"Where bodies touch, none that was tried explains it either{touched.sentence.removeprefix(NO_CHANGE)}"

@@ -21,8 +21,8 @@ from scipy.optimize import lsq_linear
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, SimulationError
-from drake_diff.identification.motion import ContinuousMotion, DiscreteMotion, Law
-from drake_diff.identification.recordings import LEAST, Chart, Piece
+from drake_diff.identification.motion import DiscreteMotion, Law, TreeMotion
+from drake_diff.identification.recordings import LEAST, Chart, Excerpt
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
@@ -46,7 +46,7 @@ NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures f
 class Segments:
     """All segments of all pieces side by side, in the order of time."""
 
-    pieces: list[Piece]
+    pieces: list[Excerpt]
     of_piece: NDArray[np.intp]  # (K,)
     first: NDArray[np.intp]  # (K,) the sample that each starts at
     hs: Array  # (K, M), padded with steps of length 0
@@ -57,7 +57,7 @@ class Segments:
     by_delay: Array  # (K, M) the lengths of the steps by a delay of inputs
 
 
-def steps_between(law: Law, piece: Piece, k: int, delay: float | None) -> tuple[Array, Array, Array]:
+def steps_between(law: Law, piece: Excerpt, k: int, delay: float | None) -> tuple[Array, Array, Array]:
     """From sample k to the next: lengths of the steps (m,) [s], inputs (m, nu), and the lengths by the delay (m,).
 
     With a delay, steps end where an input changes too; before the first input it is as if that had always acted. An
@@ -85,7 +85,7 @@ def steps_between(law: Law, piece: Piece, k: int, delay: float | None) -> tuple[
     )
 
 
-def cut_segments(law: Law, pieces: Sequence[Piece], nu: int, delay: float | None = None) -> Segments:
+def cut_segments(law: Law, pieces: Sequence[Excerpt], nu: int, delay: float | None = None) -> Segments:
     """The last sample of a piece belongs to its last segment, any other to the segment that it starts or is within."""
     of_piece, first, hs, us, samples, offsets, by_delay = [], [], [], [], [], [], []
     for p, piece in enumerate(pieces):
@@ -147,7 +147,7 @@ class Fit:
         law: Law,
         chart: Chart,
         unknowns: Unknowns,
-        pieces: Sequence[Piece],
+        pieces: Sequence[Excerpt],
         noise: Array,
         *,
         sensors: Sensors | None = None,
@@ -184,7 +184,7 @@ class Fit:
         every = np.hstack([self.chart.minus(piece.ys, piece.ys), *([] if piece.outs is None else [piece.outs])])
         return np.where(np.isfinite(self.noise), every, np.nan)
 
-    def at(self, z: Array, starts: Array) -> "Point | None":
+    def at(self, z: Array, starts: Array) -> "FittedMotion | None":
         """The motion there; None where there is none."""
         values = self.unknowns.values(z)
         if not isinstance(self.law, DiscreteMotion) and not self.law.is_possible(values):
@@ -208,7 +208,7 @@ class Fit:
         if len(inner):
             gaps[inner] = self.chart.minus(xs[inner, s.counts[inner]], starts[inner + 1])
         value = sum(float(np.nansum(r**2)) for r in residuals) + self._pull(z)
-        return Point(z, starts, xs, residuals, gaps, value, float(np.linalg.norm(gaps / self.gap_scale)), s)
+        return FittedMotion(z, starts, xs, residuals, gaps, value, float(np.linalg.norm(gaps / self.gap_scale)), s)
 
     def states(self, solved: "Solved") -> list[Array]:
         """(n, nx) of each piece: the motion at its samples."""
@@ -238,7 +238,7 @@ class Fit:
             return self._split(s, self.sensors.read(self._continuous.dynamics(values), *self._samples(s, xs)))
 
     @property
-    def _continuous(self) -> ContinuousMotion:
+    def _continuous(self) -> TreeMotion:
         """The law, which has rates between its steps."""
         if isinstance(self.law, DiscreteMotion):
             raise ModelError("sensors and delays of inputs are of motion in continuous time")
@@ -270,7 +270,7 @@ class Fit:
         return float(weak + np.sum(self.unknowns.prior_rows(z)[0] ** 2))
 
     @np.errstate(over="ignore", invalid="ignore")  # of motions that grow beyond all bounds
-    def reduce(self, point: "Point", reach: float = 1.0) -> Reduced:
+    def reduce(self, point: "FittedMotion", reach: float = 1.0) -> Reduced:
         """Linearize, close the gaps to first order, and take the first states out; `reach` lets these move farther."""
         z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
         s, nt, nz = point.segments, self.chart.size, len(z)
@@ -393,15 +393,15 @@ class Fit:
             here = ahead
         return Solved(here.z, here.starts, reduced, False, most, "it took too many steps")
 
-    def _promised(self, here: "Point", reduced: Reduced) -> tuple[Array, float]:
+    def _promised(self, here: "FittedMotion", reduced: Reduced) -> tuple[Array, float]:
         """The step dz (np,), and how much less of |r|^2 it leaves by the linearized motion."""
         dz = self.step_of(here.z, reduced)
         then = reduced.rest + float(np.sum((reduced.b - reduced.R @ dz) ** 2)) + self._pull(here.z + dz)
         return dz, reduced.now + self._pull(here.z) - then
 
     def _ahead(
-        self, here: "Point", reduced: Reduced, dz: Array, merit: float, gain: float
-    ) -> tuple[float, "Point | None"]:
+        self, here: "FittedMotion", reduced: Reduced, dz: Array, merit: float, gain: float
+    ) -> tuple[float, "FittedMotion | None"]:
         """The largest part of a step that does well, halved as often as needed, and where it leads."""
         for fraction in (0.5**k for k in range(HALVINGS + 1)):
             ahead = self.at(
@@ -414,7 +414,7 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class FittedMotion:
     """A motion of all segments from their starts."""
 
     z: Array
@@ -451,14 +451,14 @@ class Solved:
         return self.why == STUCK
 
 
-def growth_cuts(fit: Fit, z: Array, starts: Array) -> list[Piece]:
+def growth_cuts(fit: Fit, z: Array, starts: Array) -> list[Excerpt]:
     """The pieces, cut where a small motion of their start has grown by GROWTH."""
     s, nt = fit.segments, fit.chart.size
     point = fit.at(z, starts)
     if point is None:
         return list(s.pieces)
     reduced = fit.reduce(point)
-    pieces: list[Piece] = []
+    pieces: list[Excerpt] = []
     scale = fit.gap_scale
     for p, piece in enumerate(s.pieces):
         begin, base = 0, np.eye(nt)

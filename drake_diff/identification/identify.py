@@ -27,10 +27,10 @@ from drake_diff.identification.judge import (
     score_of,
 )
 from drake_diff.identification.messages import unidentifiable
-from drake_diff.identification.motion import ContinuousMotion, Law, discrete_motion
+from drake_diff.identification.motion import Law, TreeMotion, discrete_motion
 from drake_diff.identification.recordings import (
     Chart,
-    Piece,
+    Excerpt,
     columns_of,
     given_noise,
     guess_states,
@@ -141,9 +141,7 @@ def identify(
         found = fit_through_impacts(model, pieces, parameters, problem.first_noise)
     else:
         law: Law = (
-            discrete_motion(model, unknowns, pieces)
-            if own_tree is None
-            else ContinuousMotion(model, own_tree, unknowns)
+            discrete_motion(model, unknowns, pieces) if own_tree is None else TreeMotion(model, own_tree, unknowns)
         )
         fit, solved = problem.solve(law, max_iterations)
         found = problem.judged(fit, solved, why if motion == "auto" else "")
@@ -164,7 +162,7 @@ def identify(
     return replace(found, asked=asked)
 
 
-def what_acts(model: Model, chart: Chart, pieces: Sequence[Piece]) -> str:
+def what_acts(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> str:
     """What acts in the recordings that motion in continuous time leaves out; empty where nothing does."""
     lower, upper = model.position_limits
     for piece in pieces:
@@ -188,7 +186,7 @@ class Problem:
     model: Model
     chart: Chart
     unknowns: Unknowns
-    pieces: list[Piece]
+    pieces: list[Excerpt]
     stated: Array  # (2 nv + m,) the noise as it was given, NaN where it was not
     scatter: Array  # (2 nv + m,) that of neighbouring samples
     sensors: Sensors | None = None
@@ -199,7 +197,7 @@ class Problem:
         """A name for each number of a sample."""
         return (*tangent_space(self.model).names, *(() if self.sensors is None else self.sensors.columns))
 
-    def fit(self, law: Law, pieces: Sequence[Piece], noise: Array, *, fixed: bool = False) -> Fit:
+    def fit(self, law: Law, pieces: Sequence[Excerpt], noise: Array, *, fixed: bool = False) -> Fit:
         return Fit(self.model, law, self.chart, self.unknowns, pieces, noise, sensors=self.sensors, fixed=fixed)
 
     def guess(self, fit: Fit) -> Array:
@@ -212,7 +210,7 @@ class Problem:
         return np.where(np.isfinite(self.stated), self.stated, self.scatter)
 
     @property
-    def fitted(self) -> list[Piece]:
+    def fitted(self) -> list[Excerpt]:
         return [piece for piece in self.pieces if not piece.held_out]
 
     def prepared(self, law: Law) -> tuple[Fit, Array]:
@@ -272,7 +270,7 @@ class Problem:
         gap = self.chart.minus(*ends) / fit.gap_scale
         return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= STEP_ERROR)
 
-    def shortened(self, fit: Fit, pieces: Sequence[Piece], noise: Array) -> Fit:
+    def shortened(self, fit: Fit, pieces: Sequence[Excerpt], noise: Array) -> Fit:
         law = fit.shorter
         if law is None or np.max(fit.segments.hs) < SHORTEST:
             raise ModelError(f"{self.model.name}: its motion is too stiff: {fit.law.words} does not follow it")

@@ -28,7 +28,7 @@ from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.identification.judge import SCATTER
 from drake_diff.identification.motion import DiscreteMotion, discrete_motion
-from drake_diff.identification.recordings import Chart, Piece, noise_by_differences, read_pieces
+from drake_diff.identification.recordings import Chart, Excerpt, noise_by_differences, read_pieces
 from drake_diff.identification.results import Followed, Identification, identification
 from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, Unknown, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
@@ -70,7 +70,7 @@ class Start(NamedTuple):
         return [chart.plus(self.x, self.spread @ random.standard_normal(self.spread.shape[1])) for _ in range(count)]
 
 
-def start_of(model: Model, chart: Chart, piece: Piece, scale: Array) -> Start:
+def start_of(model: Model, chart: Chart, piece: Excerpt, scale: Array) -> Start:
     """The state whose motion goes through the positions of a piece in which nothing touches.
 
     By least squares, each position in units of its `scale` (nv,). Its spread is that of the scatter of what is left.
@@ -96,7 +96,7 @@ def start_of(model: Model, chart: Chart, piece: Piece, scale: Array) -> Start:
     return Start(np.asarray(x), inverse * np.tile(left, len(e)))
 
 
-def steps_between(model: Model, piece: Piece) -> int:
+def steps_between(model: Model, piece: Excerpt) -> int:
     """How many of the model's steps lie between two samples. InputError where it is no whole number."""
     periods = np.diff(piece.times)
     count = max(1, round(float(np.median(periods)) / model.time_step))
@@ -107,7 +107,7 @@ def steps_between(model: Model, piece: Piece) -> int:
     return count
 
 
-def millisecond(chart: Chart, pieces: list[Piece]) -> Array:
+def millisecond(chart: Chart, pieces: list[Excerpt]) -> Array:
     """(nv,) how far each position moves in a millisecond: what an impact that much earlier or later changes."""
     speeds = np.sqrt(np.mean(np.concatenate([p.ys[:, chart.coordinates.nq :] ** 2 for p in pieces]), axis=0))
     for _, j in chart.coordinates.free:  # along one axis it may not have moved
@@ -264,7 +264,7 @@ class ImpactSearch:
     def __init__(
         self,
         model: Model,
-        pieces: Sequence[Piece],
+        pieces: Sequence[Excerpt],
         names: Sequence[str] | str,
         lengths: Mapping[str, float] | None = None,
         build: Build | None = None,
@@ -496,7 +496,7 @@ def _spread_between(plane: Plane, segments: Sequence[Segment], count: int) -> tu
 
 def fit_through_impacts(
     model: Model,
-    pieces: Sequence[Piece],
+    pieces: Sequence[Excerpt],
     names: Sequence[str] | str,
     noise: Array,
     *,

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
 
-class System(NamedTuple):
+class TreeSystem(NamedTuple):
     """A tree of n joint coordinates, of which some may follow others, and what acts on it."""
 
     tree: Tree
@@ -37,7 +37,7 @@ class System(NamedTuple):
 
 
 @inner
-def _load(s: System, x: Array, q: Array, v: Array) -> None:
+def _load(s: TreeSystem, x: Array, q: Array, v: Array) -> None:
     """q and v (n,) of all joints at x (nx,)."""
     n, nv = s.spread.shape
     nq = len(x) - nv
@@ -50,7 +50,7 @@ def _load(s: System, x: Array, q: Array, v: Array) -> None:
 
 
 @inner
-def _add_forces(s: System, q: Array, v: Array, push: Array, turn: Array, mass: Array, tau: Array) -> None:
+def _add_forces(s: TreeSystem, q: Array, v: Array, push: Array, turn: Array, mass: Array, tau: Array) -> None:
     """tau (n,) becomes the force that accelerates, and mass (n, n) has the reflected inertia too."""
     for i in range(len(v)):
         slide = 0.0
@@ -66,7 +66,7 @@ def _add_forces(s: System, q: Array, v: Array, push: Array, turn: Array, mass: A
 
 
 @inner
-def _reduce(s: System, mass: Array, tau: Array, M: Array, force: Array) -> None:
+def _reduce(s: TreeSystem, mass: Array, tau: Array, M: Array, force: Array) -> None:
     """M (nv, nv) = E' mass E and force (nv,) = E' tau of the joints that move independently."""
     n, nv = s.spread.shape
     M[:], force[:] = 0.0, 0.0
@@ -82,7 +82,7 @@ def _reduce(s: System, mass: Array, tau: Array, M: Array, force: Array) -> None:
 
 
 @compiled
-def accelerate(s: System, x: Array, push: Array, turn: Array, held: Array, a: Array, holding: Array) -> None:
+def accelerate(s: TreeSystem, x: Array, push: Array, turn: Array, held: Array, a: Array, holding: Array) -> None:
     """At x (N, nx) fill a (N, nv) under generalized forces push (N, n), NaN where M is not positive definite.
 
     And holding (N, nv), the force on each joint that is held still; turn (N, nv) is 1 or -1 of those that slide.
@@ -118,7 +118,7 @@ def accelerate(s: System, x: Array, push: Array, turn: Array, held: Array, a: Ar
 
 
 @inner
-def _rate(s: System, x: Array, a: Array, out: Array) -> None:
+def _rate(s: TreeSystem, x: Array, a: Array, out: Array) -> None:
     """out (nx,) = dx/dt."""
     nq = len(x) - len(a)
     for k in range(len(s.single)):
@@ -138,7 +138,7 @@ def _rate(s: System, x: Array, a: Array, out: Array) -> None:
 
 @compiled
 def step(
-    s: System, stages: Array, weights: Array, x: Array, h: Array, push: Array, turn: Array, held: Array, out: Array
+    s: TreeSystem, stages: Array, weights: Array, x: Array, h: Array, push: Array, turn: Array, held: Array, out: Array
 ) -> None:
     """Fill out (N, nx) with where x (N, nx) is after steps of h (N,) by the method of these stages and weights."""
     N, nx = x.shape

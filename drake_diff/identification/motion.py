@@ -22,8 +22,8 @@ from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.derivatives.contact.laws import QUANTITIES
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError
-from drake_diff.identification.recordings import Piece
-from drake_diff.identification.tree import ORDER_8, Dynamics, Grip, Method, Tree
+from drake_diff.identification.recordings import Excerpt
+from drake_diff.identification.tree import ORDER_8, Grip, Method, Tree, TreeDynamics
 from drake_diff.identification.unknowns import (
     BIAS,
     COULOMB,
@@ -40,7 +40,7 @@ SEARCHED, MET = 99, 1e-9  # steps of the search for an end; [rad/s, m/s] or of t
 SHORT = 1e-13  # [s] between which an end is known well enough, however steep it is there
 
 
-class Phase(NamedTuple):
+class SlidingPhase(NamedTuple):
     """Of some steps, a time in which each joint slides one way or is held."""
 
     rows: Indices  # of the steps
@@ -52,11 +52,11 @@ class Phase(NamedTuple):
     before: Grip  # of the phase before
 
 
-def step_with_friction(dynamics: Dynamics, x: Array, h: Array, u: Array) -> tuple[Array, list[Phase]]:
+def step_with_friction(dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> tuple[Array, list[SlidingPhase]]:
     """Where steps from x (N, nx) of lengths h (N,) end, and their phases."""
     nv = dynamics.nv
     nq, nothing = x.shape[1] - nv, np.zeros((len(x), nv))
-    x, left, phases, released = x.copy(), h.copy(), list[Phase](), nothing.copy()
+    x, left, phases, released = x.copy(), h.copy(), list[SlidingPhase](), nothing.copy()
     stopped, before = np.full(len(x), -1), Grip(nothing.copy(), nothing.copy())
     for _ in range(MOST_PHASES):
         rows = np.flatnonzero(left > 0)
@@ -75,7 +75,7 @@ def step_with_friction(dynamics: Dynamics, x: Array, h: Array, u: Array) -> tupl
                 dynamics, begin[last], inputs[last], some, lengths[last], room[last]
             )
             _, holding = dynamics.accelerate_and_hold(ends[last], inputs[last], some)
-        phases.append(Phase(rows, here, lengths, inputs, grip, stopped[rows], before.some(rows)))
+        phases.append(SlidingPhase(rows, here, lengths, inputs, grip, stopped[rows], before.some(rows)))
         released[rows], stopped[rows] = 0.0, -1
         before.turn[rows], before.held[rows] = grip.turn, grip.held
         left[rows] -= lengths
@@ -91,7 +91,7 @@ def step_with_friction(dynamics: Dynamics, x: Array, h: Array, u: Array) -> tupl
     return x, phases
 
 
-def friction_jacobians(dynamics: Dynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
+def friction_jacobians(dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
     """(N, nx, nx + P) of these steps; `by` (count, P) is how the numbers change with parameters."""
     nx = x.shape[1]
     total = np.zeros((len(x), nx, nx + by.shape[1]))
@@ -105,14 +105,14 @@ def friction_jacobians(dynamics: Dynamics, x: Array, h: Array, u: Array, by: Arr
     return total
 
 
-def _begin(dynamics: Dynamics, x: Array, grip: Grip) -> Array:
+def _begin(dynamics: TreeDynamics, x: Array, grip: Grip) -> Array:
     """x with joints at rest that are held."""
     begin = x.copy()
     begin[:, -dynamics.nv :][grip.held > 0] = 0.0
     return begin
 
 
-def _room(dynamics: Dynamics, x: Array, u: Array, grip: Grip) -> Array:
+def _room(dynamics: TreeDynamics, x: Array, u: Array, grip: Grip) -> Array:
     """(N, nv) by how much each joint slides or is held as it should at x, negative beyond; infinite of others."""
     room = np.where(grip.turn != 0, grip.turn * x[:, -dynamics.nv :], np.inf)
     some = np.flatnonzero(np.any(grip.held > 0, axis=1))
@@ -123,7 +123,7 @@ def _room(dynamics: Dynamics, x: Array, u: Array, grip: Grip) -> Array:
     return room
 
 
-def _end(dynamics: Dynamics, x: Array, u: Array, grip: Grip, h: Array, room: Array) -> tuple[Array, Array, Indices]:
+def _end(dynamics: TreeDynamics, x: Array, u: Array, grip: Grip, h: Array, room: Array) -> tuple[Array, Array, Indices]:
     """(when a phase ends that has this room (N, nv) at h (N,), where, by which joint): regula falsi of Illinois.
 
     Looked at are the joints that are beyond at h; every third step halves what is left.
@@ -155,7 +155,7 @@ def _end(dynamics: Dynamics, x: Array, u: Array, grip: Grip, h: Array, room: Arr
     return t, ends, which
 
 
-def _jump(dynamics: Dynamics, phase: Phase) -> Array:
+def _jump(dynamics: TreeDynamics, phase: SlidingPhase) -> Array:
     """(n, nx, nx) what becomes of a small change of the state where a phase begins.
 
     Of a joint that has come to 0 it has changed when: what is accelerated otherwise from then on is moved by that.
@@ -183,7 +183,7 @@ FINITE_DIFFERENCE, DIFFERENCE = "finite_difference", 1e-5  # of a parameter, rel
 
 
 @dataclass(frozen=True, eq=False)
-class ContinuousMotion:
+class TreeMotion:
     """dq/dt = N(q) v, dv/dt = a of a tree whose numbers are set by unknowns.
 
     Coulomb friction holds the joints of which it is an unknown, unless it is `smooth`, which turns over a small speed.
@@ -221,7 +221,7 @@ class ContinuousMotion:
         count = max(1, int(np.ceil(period / self.longest - 1e-9)))
         return (period / count,) * count
 
-    def shorter(self, than: float) -> "ContinuousMotion | None":
+    def shorter(self, than: float) -> "TreeMotion | None":
         """By steps of at most half of a length [s]."""
         return replace(self, longest=than / 2)
 
@@ -229,10 +229,10 @@ class ContinuousMotion:
         """Whether there are bodies with these values."""
         return self.unknowns.consistent(values, self.tree)
 
-    def dynamics(self, values: Array) -> Dynamics:
+    def dynamics(self, values: Array) -> TreeDynamics:
         """The tree that unknowns of these values make."""
         numbers = set_numbers(self.model, self.tree, self.unknowns, values)
-        return Dynamics(self.tree, numbers, self.dry, self.method, self.frozen)
+        return TreeDynamics(self.tree, numbers, self.dry, self.method, self.frozen)
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
@@ -270,7 +270,7 @@ class ContinuousMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class EulerMotion(ContinuousMotion):
+class EulerMotion(TreeMotion):
     """Steps of the length `longest`, of which a whole number lies between samples; of hinges and slides."""
 
     smooth: bool = True
@@ -287,7 +287,7 @@ class EulerMotion(ContinuousMotion):
         """There is none: the step is what is looked for."""
         return
 
-    def dynamics(self, values: Array) -> Dynamics:
+    def dynamics(self, values: Array) -> TreeDynamics:
         """With damping at the end of the step."""
         dynamics = super().dynamics(values)
         numbers = dynamics.numbers
@@ -401,10 +401,10 @@ def _differences(vector: ParameterVector, parameter: Parameter, entries: slice, 
     return np.stack(columns, axis=-1)
 
 
-Law = ContinuousMotion | DiscreteMotion
+Law = TreeMotion | DiscreteMotion
 
 
-def discrete_motion(model: Model, unknowns: Unknowns, pieces: Sequence[Piece]) -> DiscreteMotion:
+def discrete_motion(model: Model, unknowns: Unknowns, pieces: Sequence[Excerpt]) -> DiscreteMotion:
     """Of steps as long as the model's, or shortened so that a whole number of them lies between samples.
 
     InputError where samples are not the same time apart; ModelError where the model came from a diagram, which has but

@@ -101,7 +101,7 @@ MAD = 1.4826  # of the median of normal deviations: their standard deviation
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class Excerpt:
     """A stretch of a recording."""
 
     name: str
@@ -121,10 +121,10 @@ class Piece:
         times, us = self.earlier
         return np.concatenate([times, self.times[:-1]]), np.concatenate([us, self.us])
 
-    def part(self, first: int, last: int) -> "Piece":
+    def part(self, first: int, last: int) -> "Excerpt":
         """From one sample to another, both included."""
         span = slice(first, last + 1)
-        earlier = Piece(self.name, self.times[: first + 1], self.ys, self.us[:first], False, 0, self.earlier).switches
+        earlier = Excerpt(self.name, self.times[: first + 1], self.ys, self.us[:first], False, 0, self.earlier).switches
         outs = None if self.outs is None else self.outs[span]
         return replace(
             self, times=self.times[span], ys=self.ys[span], us=self.us[first:last], earlier=earlier, outs=outs
@@ -136,7 +136,7 @@ def read_pieces(
     recordings: Recording | str | Path | Sequence[Recording | str | Path],
     held_out: float | str,
     columns: Sequence[str] = (),
-) -> list[Piece]:
+) -> list[Excerpt]:
     """Each recording's first part to fit, and its last to be held out: a part of the samples, or a recording by name.
 
     `columns` are those of sensors that are read.
@@ -198,7 +198,7 @@ def columns_of(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for recording in recordings for name in recording.outputs))
 
 
-def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Piece:
+def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Excerpt:
     subject = f"recording {recording.name}"
     times = finite_array(f"{subject}: times", recording.times, ("n",))
     if len(times) < LEAST:
@@ -231,7 +231,7 @@ def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Piec
     if np.any(np.isinf(outs)):
         k, j = (int(i) for i in np.argwhere(np.isinf(outs))[0])
         raise InputError(f"{subject}: {columns[j]} at sample {k}", got=outs[k, j], expected="a number or NaN")
-    return Piece(recording.name, times - times[0], ys, us, held_out=False, outs=outs)
+    return Excerpt(recording.name, times - times[0], ys, us, held_out=False, outs=outs)
 
 
 def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, columns: Sequence[str] = ()) -> Array:
@@ -250,7 +250,7 @@ def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, c
     return deviations
 
 
-def noise_by_differences(chart: Chart, pieces: Sequence[Piece], *, jumps: bool = False) -> Array:
+def noise_by_differences(chart: Chart, pieces: Sequence[Excerpt], *, jumps: bool = False) -> Array:
     """(2 nv + m,) an upper estimate of the noise of each entry: of differences of orders 1 to ORDERS, the least one.
 
     White noise s makes the difference of order d vary by s sqrt(binomial(2 d, d)); what moves adds to that. Where the
@@ -280,7 +280,7 @@ def noise_by_differences(chart: Chart, pieces: Sequence[Piece], *, jumps: bool =
     return np.where(seen, np.maximum(least, NO_NOISE * np.maximum(reach, 1e-3)), np.nan)
 
 
-def guess_states(model: Model, chart: Chart, piece: Piece, samples: NDArray[np.intp]) -> Array:
+def guess_states(model: Model, chart: Chart, piece: Excerpt, samples: NDArray[np.intp]) -> Array:
     """(len(samples), nx) states at some samples: cubics through the samples around each.
 
     A velocity that was not measured is the slope of its position; a position that was not measured is the model's own.

@@ -9,7 +9,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.comparison.recordings import Recording
 from drake_diff.identification.messages import NOISE_IS_LEFT, identification_sentence
-from drake_diff.identification.recordings import Piece
+from drake_diff.identification.recordings import Excerpt
 from drake_diff.identification.unknowns import Unknowns
 from drake_diff.model.model import Model
 
@@ -35,7 +35,7 @@ class Request:
 class Followed:
     """A stretch of a recording beside the model's motion."""
 
-    piece: Piece
+    piece: Excerpt
     xs: Array  # (n, nx) with the values that were found
     xs_before: (
         Array | None

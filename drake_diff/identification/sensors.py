@@ -13,7 +13,7 @@ from pydrake.math import RollPitchYaw
 from drake_diff._base.arrays import Array, cross, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.recordings import Chart
-from drake_diff.identification.tree import Dynamics, Tree
+from drake_diff.identification.tree import Tree, TreeDynamics
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
 
@@ -120,7 +120,7 @@ class Sensors:
     def count(self) -> int:
         return len(self.columns)
 
-    def read(self, dynamics: Dynamics, x: Array, u: Array) -> Array:
+    def read(self, dynamics: TreeDynamics, x: Array, u: Array) -> Array:
         """(N, m) at x (N, nx) under u (N, nu)."""
         q, v, a = x[:, : x.shape[1] - dynamics.nv], x[:, -dynamics.nv :], dynamics.accelerate(x, u)
         read = self._of_links(dynamics, q, v, a)
@@ -128,7 +128,7 @@ class Sensors:
             read[:, i] = dynamics.inverse_dynamics(q, v, a)[0][:, k]
         return read
 
-    def slopes(self, dynamics: Dynamics, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
+    def slopes(self, dynamics: TreeDynamics, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
         """(N, m, 2 nv) by small motions of the state, and (N, m, np) by parameters, of which `by` moves the numbers."""
         nv, plus = dynamics.nv, Chart(dynamics.tree.coordinates).plus
         a, by_state = dynamics.acceleration_jacobians(x, u, by)
@@ -153,12 +153,12 @@ class Sensors:
             moved[:, i], by_a[:, i], by_parameters[:, i] = slopes[:, k, : 2 * nv], mass[:, k], slopes[:, k, 2 * nv :]
         return moved + by_a @ by_state[..., : 2 * nv], by_parameters + by_a @ by_state[..., 2 * nv :]
 
-    def _forces(self, dynamics: Dynamics) -> list[tuple[int, int]]:
+    def _forces(self, dynamics: TreeDynamics) -> list[tuple[int, int]]:
         """(column, degree of freedom) of each force."""
         forces = (sensor for sensor in self.each if sensor.quantity == FORCE)
         return [(self.columns.index(f"{s.label}.{FORCE}"), int(dynamics.tree.first[s.link])) for s in forces]
 
-    def _of_links(self, dynamics: Dynamics, q: Array, v: Array, a: Array) -> Array:
+    def _of_links(self, dynamics: TreeDynamics, q: Array, v: Array, a: Array) -> Array:
         """(N, m) but for forces, which are 0."""
         frames, columns = dynamics.frames(q, v, a), dict[str, Array]()
         for sensor in self.each:

@@ -138,7 +138,7 @@ class Tree:
 
 
 @dataclass(frozen=True, eq=False)
-class Dynamics:
+class TreeDynamics:
     """A tree with these numbers; Coulomb friction holds the coordinates that are `dry`, else it turns over a speed."""
 
     tree: Tree
@@ -174,7 +174,7 @@ class Dynamics:
             follow = (coupling.of_q, coupling.ratio_q, coupling.offset)
         numbers = (getattr(self.numbers, name) for name in OF_JOINTS)
         arrays = (*follow, tree.spread, *reversed(tree.coordinates.starts), tree.springs, *numbers)
-        return kernel(KERNEL).System(self.links.tables, *map(_array, arrays), 0.0 if self.dry else SLIP_SPEED)
+        return kernel(KERNEL).TreeSystem(self.links.tables, *map(_array, arrays), 0.0 if self.dry else SLIP_SPEED)
 
     def _push(self, u: Array) -> Array:
         """(N, n) the forces of inputs u (N, nu)."""

@@ -27,7 +27,7 @@ from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.realtime.rolling import Rolling, Staying
-from drake_diff.optimize.realtime.step import Step, Stretch, roll, take_step
+from drake_diff.optimize.realtime.step import RealtimeStep, Stretch, roll, take_step
 from drake_diff.optimize.replay import ReplayPlan, held, regulator_weights
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
@@ -120,7 +120,7 @@ class MPC:
     def start(self, x0: Array) -> None:
         """Forget all but the first plan; the first call plans from its own estimate, whatever `x0` (nx,) is."""
         self._begin, self._last, self._fresh = 0, self._reference, True
-        self._step: Step | None = None
+        self._step: RealtimeStep | None = None
         self._solved_at = 0
         self._latencies: list[float] = []
         self.missed = 0  # answers that took longer than the budget
@@ -239,7 +239,7 @@ class MPC:
                 x[entries] *= -1
         return x
 
-    def _told(self, step: Step, k: int) -> str:
+    def _told(self, step: RealtimeStep, k: int) -> str:
         """What is to be said of a step at the problem's step `k`."""
         remarks = []
         if not step.size and not step.is_reached:

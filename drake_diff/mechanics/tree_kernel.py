@@ -52,7 +52,7 @@ class Forces(NamedTuple):
     limit: Array  # (nu,) of inputs that are clipped
 
 
-class Bounds(NamedTuple):
+class SaturationBounds(NamedTuple):
     """(nu,) each: from `lowest` down an input is on its lower bound, from `highest` up on its upper one."""
 
     lowest: Array
@@ -515,7 +515,7 @@ def differentiate_acceleration(
 def roll(
     tree: Tree,
     forces: Forces,
-    bounds: Bounds,
+    bounds: SaturationBounds,
     old: Array,
     gaps: Array,
     wanted: Array,

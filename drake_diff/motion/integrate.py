@@ -106,7 +106,7 @@ class System:
 
 
 @dataclass(frozen=True)
-class Event:
+class SwitchEvent:
     """The number of a switch that turned, and the pairs that push from then on."""
 
     switch: int
@@ -121,7 +121,7 @@ class Step:
     ahead: Array
     h: float
     pushing: Pairs
-    events: tuple[Event, ...]
+    events: tuple[SwitchEvent, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,9 +290,9 @@ class Integrator:
         self.system.check(end.x)
         return Step(start, end.x, end.h, pushing, self._settle(end.values > 0))
 
-    def _settle(self, on: Flags) -> tuple[Event, ...]:
+    def _settle(self, on: Flags) -> tuple[SwitchEvent, ...]:
         """Take the switches as they are now; the events, pair by pair."""
-        changed, events, between = on != self._on, list[Event](), self._on.copy()
+        changed, events, between = on != self._on, list[SwitchEvent](), self._on.copy()
         if not changed.any():
             return ()
         width, before = self.system.per_pair, self.system.pushing
@@ -300,7 +300,7 @@ class Integrator:
         for pair in dict.fromkeys((turned // width).tolist()):
             both = slice(width * pair, width * (pair + 1))
             between[both] = on[both]
-            events.append(Event(int(turned[turned // width == pair][0]), self.system.pushing_where(between)))
+            events.append(SwitchEvent(int(turned[turned // width == pair][0]), self.system.pushing_where(between)))
         self._set(on)
         if self.system.pushing != before:
             self._choose_method()

@@ -31,15 +31,15 @@ class SmoothRoll:
     ) -> tuple[Array, Array] | None:
         """(xs (N+1, nx), us (N, nu)), us = wanted + gains (xs - old) within bounds, each step less its gap (N, nx).
 
-        `gains` (N, nu, nx), `bounds` a `tree_kernel.Bounds`. None where a joint comes to its limit, or anything
-        is not finite.
+        `gains` (N, nu, nx), `bounds` a `tree_kernel.SaturationBounds`. None where a joint comes to its limit, or
+        anything is not finite.
         """
         (count, nu), nx = wanted.shape, len(x0)
         xs, us = np.empty((count + 1, nx)), np.empty((count, nu))
         xs[0] = x0
         stepped(count)
         old, gaps, wanted, gains = (np.array(array, float, order="C") for array in (old, gaps, wanted, gains))
-        limits = tree_kernel.Bounds(*(np.array(array, float, order="C") for array in bounds))
+        limits = tree_kernel.SaturationBounds(*(np.array(array, float, order="C") for array in bounds))
         is_solved = tree_kernel.roll(self.tree, self.forces, limits, old, gaps, wanted, gains, xs, us)
         if not is_solved or not np.isfinite(xs).all():
             return None

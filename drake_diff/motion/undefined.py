@@ -79,7 +79,7 @@ class Undefined(ShowsItsRepr):
     widths: tuple[float, ...]
     slopes: tuple[float, ...]
     reason: str
-    _along: "Line" = field(repr=False)
+    _along: "LossLine" = field(repr=False)
 
     def __repr__(self) -> str:
         over = ", ".join(f"{s:.5g} over +-{w:.3g}" for w, s in zip(self.widths, self.slopes, strict=True))
@@ -211,14 +211,14 @@ class Beside:
         given = totals.inputs.ravel() if self.policy is None else totals.policy
         return by_start + float(np.concatenate([given, totals.parameters]) @ way[self.space.size :])
 
-    def lines(self, totals: Totals) -> "Iterator[Line]":
+    def lines(self, totals: Totals) -> "Iterator[LossLine]":
         """A line for each column."""
         size, given, (count, nu) = self.space.size, len(self.given), self.us.shape
         by_start = totals.states[0] @ self.space.derivative_of_plus(self.x0)
         eye = np.eye(size + given + len(self.vector.values))
 
-        def line(name: str, way: Array, unit: float = 1.0) -> Line:
-            return Line(self, name, way, unit, self._flat(totals, by_start @ way[:size], way))
+        def line(name: str, way: Array, unit: float = 1.0) -> LossLine:
+            return LossLine(self, name, way, unit, self._flat(totals, by_start @ way[:size], way))
 
         yield from (line(f"{name}[0]", eye[j]) for j, name in enumerate(self.space.names))
         if self.policy is None:
@@ -237,7 +237,7 @@ class Beside:
 
 
 @dataclass(eq=False)
-class Line:
+class LossLine:
     """The loss along one column; `unit` is what widths are parts of, `slope` the derivative at the point."""
 
     beside: Beside
@@ -293,10 +293,10 @@ class _Judge:
     least: float  # [of the loss by one unit of a column] what is smaller is judged as if it were that large
     noise: float  # of the loss, by the tolerance
 
-    def follow(self, beside: Beside, lines: Sequence[Line]) -> bool:
+    def follow(self, beside: Beside, lines: Sequence[LossLine]) -> bool:
         """Whether the loss follows several columns that are moved together."""
         vector = sum((line.unit * (-1 if line.slope < 0 else 1) * line.vector for line in lines), np.zeros(1))
-        together = Line(beside, "", np.asarray(vector), 1.0, sum(abs(line.change) for line in lines))
+        together = LossLine(beside, "", np.asarray(vector), 1.0, sum(abs(line.change) for line in lines))
         largest = max(self.least, *(abs(line.change) for line in lines))
         try:
             off = together.over(WIDE, COARSE) - together.slope
@@ -306,7 +306,7 @@ class _Judge:
             return False
         return abs(off) <= RIGHT * largest + self.noise * COARSE / WIDE
 
-    def column(self, line: Line) -> Undefined | None:
+    def column(self, line: LossLine) -> Undefined | None:
         """What is said of one column; None where it has a slope."""
         slopes_by_width: dict[float, float] = {}
         try:
@@ -321,7 +321,7 @@ class _Judge:
         widths, slopes = tuple(w * line.unit for w in slopes_by_width), tuple(slopes_by_width.values())
         return Undefined(line.column, line.slope, widths, slopes, reason, line)
 
-    def _reason(self, line: Line, slopes: dict[float, float], scale: float = 1.0) -> str:
+    def _reason(self, line: LossLine, slopes: dict[float, float], scale: float = 1.0) -> str:
         """Why the column has no slope over `scale` times the widths, or nothing. Puts them into `slopes`."""
         widest, tolerance = scale * WIDE, COARSE if scale == 1 else TOLERANCE
 

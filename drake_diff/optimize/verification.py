@@ -30,7 +30,7 @@ _STATUSES = {Outcome.UNBOUNDED: Status.DIVERGED, **{Outcome[name]: Status[name] 
 
 
 @dataclass(frozen=True)
-class Trial:
+class PlantTrial:
     """A plan in one plant under one feedback, and what is checked of it there."""
 
     plant: str
@@ -51,14 +51,14 @@ class Trial:
         return f"{self.plant} {messages.under(self.feedback)}, {self.worst}"
 
 
-def trials(s: Solution) -> list[list[Trial]]:
+def trials(s: Solution) -> list[list[PlantTrial]]:
     """The plan in each plant in which it has to hold, under one feedback at least; the plan's own plant comes first.
 
     A plan by shooting has to hold open loop at its own step: its states are those of the step. A collocated plan has to
     hold where its equations are integrated and, of a model, in the two finest steps of Drake that were taken.
     """
     feedbacks = dict.fromkeys(c.feedback for c in s.following)
-    following = [Trial("in continuous time", f, [c for c in s.following if c.feedback == f]) for f in feedbacks]
+    following = [PlantTrial("in continuous time", f, [c for c in s.following if c.feedback == f]) for f in feedbacks]
     plants = [following] if following else []
     if s.problem.has_model:
         variants = deciding(s.plan, s.replays)
@@ -72,9 +72,9 @@ def trials(s: Solution) -> list[list[Trial]]:
     return plants
 
 
-def _trial(r: Replay) -> Trial:
+def _trial(r: Replay) -> PlantTrial:
     plant = f"at {messages.in_milliseconds(r.time_step)}" if r.variant.startswith("in steps of ") else r.variant
-    return Trial(plant, None if r.control == OPEN_LOOP else r.control, r.checks)
+    return PlantTrial(plant, None if r.control == OPEN_LOOP else r.control, r.checks)
 
 
 def judged(draft: Solution, result: NlpResult) -> Solution:
@@ -103,7 +103,7 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
     return ended(draft, Status.CONVERGED, _holding(draft, plants), *notes, **fields)
 
 
-def _holding(s: Solution, plants: list[list[Trial]]) -> str:
+def _holding(s: Solution, plants: list[list[PlantTrial]]) -> str:
     """Under which feedback a plan holds in each plant; where a collocated plan fails at the model's own step."""
     by_feedback: dict[str | None, list[str]] = {}
     for plant in plants:

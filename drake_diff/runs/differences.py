@@ -68,7 +68,7 @@ class Difference:
 
 
 @dataclass
-class Compared:
+class FileDifferences:
     """How many values were compared in a file, and those that differ."""
 
     file: str
@@ -139,7 +139,7 @@ def _labels(entries: Sequence[Any]) -> list[str]:
     return [str(i) for i in range(len(entries))]
 
 
-def compare_fields(compared: Compared, recorded: Mapping[str, Any], again: Mapping[str, Any]) -> None:
+def compare_fields(compared: FileDifferences, recorded: Mapping[str, Any], again: Mapping[str, Any]) -> None:
     """Two JSON objects, value by value."""
     compared.count += sum(1 for _ in leaves(again))
     for key, old, new in differences(dict(recorded), dict(again)):
@@ -158,14 +158,14 @@ def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield from leaves(piece, f"{path}.{key}" if path else str(key))
 
 
-def compare_bytes(compared: Compared, recorded: bytes, again: bytes) -> None:
+def compare_bytes(compared: FileDifferences, recorded: bytes, again: bytes) -> None:
     """Two files of bytes, exactly."""
     compared.count += 1
     if recorded != again:
         compared.differ("its bytes", sha256(recorded).hexdigest()[:16], sha256(again).hexdigest()[:16])
 
 
-def compare_text(compared: Compared, recorded: bytes, again: bytes) -> None:
+def compare_text(compared: FileDifferences, recorded: bytes, again: bytes) -> None:
     """Two pages. Where only digits and drawings differ, that is allowed: what is drawn there is not compared."""
     compared.count += 1
     if recorded == again:
@@ -178,7 +178,7 @@ def compare_text(compared: Compared, recorded: bytes, again: bytes) -> None:
 
 
 def compare_traces(
-    compared: Compared, recorded: bytes, again: bytes, *, alike: Sequence[str] = (), skip: Sequence[str] = ()
+    compared: FileDifferences, recorded: bytes, again: bytes, *, alike: Sequence[str] = (), skip: Sequence[str] = ()
 ) -> None:
     """Two MCAP files: attachments, metadata, schemas and channels exactly, every message field by field.
 
@@ -200,7 +200,7 @@ def compare_traces(
         compare_bytes(compared, recorded, again)  # what stands beside the data: indexes, empty space
 
 
-def _compare_messages(compared: Compared, topic: str, old: McapLog, new: McapLog) -> None:
+def _compare_messages(compared: FileDifferences, topic: str, old: McapLog, new: McapLog) -> None:
     """The messages of one channel, field by field; a number may be off by a part of the largest of its field."""
     kinds = [log.message_types[topic].DESCRIPTOR.file.serialized_pb for log in (old, new)]
     if kinds[0] != kinds[1]:

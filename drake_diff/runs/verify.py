@@ -16,8 +16,8 @@ from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, Mis
 from drake_diff.model.step import step
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs.differences import (
-    Compared,
     Difference,
+    FileDifferences,
     Reproduced,
     compare_bytes,
     compare_fields,
@@ -370,7 +370,7 @@ def _refuse(folder: Path, problems: Sequence[str]) -> None:
 def _compared(verification: Verification, record: SealedRecord, again: Reproduced) -> Verification:
     """Record and files of a directory beside the same made again."""
     converted = record.schema_version != SCHEMA_VERSION
-    fields = Compared(record.FILE)
+    fields = FileDifferences(record.FILE)
     if again.fields:
         recorded = record.model_dump(mode="json")
         made = dict(again.fields)
@@ -394,14 +394,14 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
     return _told_of_a_solve(verification, again, [*_odd_schema(record), *again.problems], compared, unchecked)
 
 
-def _compare_records(compared: Compared, recorded: Mapping[str, Any], again: Mapping[str, Any]) -> None:
+def _compare_records(compared: FileDifferences, recorded: Mapping[str, Any], again: Mapping[str, Any]) -> None:
     """Two records, but for their version, and the hashes of files, which are compared by themselves."""
     old, new = ({key: v for key, v in side.items() if key not in HASHED} for side in (recorded, again))
     compare_fields(compared, old, new)
 
 
-def _compared_file(folder: Path, name: str, again: Reproduced) -> Compared:
-    compared, made = Compared(name), again.files[name]
+def _compared_file(folder: Path, name: str, again: Reproduced) -> FileDifferences:
+    compared, made = FileDifferences(name), again.files[name]
     if Path(name).name == SealedRecord.FILE:
         recorded = parse_record(folder / name, read_fields(folder / name)).model_dump(mode="json")
         _compare_records(compared, recorded, json.loads(made))
@@ -435,7 +435,7 @@ def _told_of_a_solve(
     verification: Verification,
     again: Reproduced,
     problems: list[str],
-    compared: Sequence[Compared],
+    compared: Sequence[FileDifferences],
     unchecked: list[str],
 ) -> Verification:
     """The verdict on what differs, by what it rests on."""
@@ -485,7 +485,7 @@ def _odd_contract(record: PlanRecord, again: dict[str, Any]) -> Iterator[str]:
     """Where the rebuilt model is another than the recorded contract; where the file was, and notes, do not matter."""
     apart = ("source", "notes")
     old, new = ({key: value for key, value in c.items() if key not in apart} for c in (record.contract, again))
-    compared = Compared(record.FILE)
+    compared = FileDifferences(record.FILE)
     compare_fields(compared, {"contract": old}, {"contract": new})
     yield from (str(d) for d in compared.differing if not d.allowed)
 

@@ -7,7 +7,7 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
-from drake_diff.identification.motion import ContinuousMotion
+from drake_diff.identification.motion import TreeMotion
 from drake_diff.identification.sensors import choose_sensors
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns
@@ -124,7 +124,7 @@ def test_derivatives_go_through_a_stop_that_lets_another_joint_go(load):
     """Random steps of two joints, whose stops, turns and releases follow each other: as by differences."""
     model, random, count = load("double_pendulum.urdf"), np.random.default_rng(0), 300
     tree, names = tree_for_identification(model), ["shoulder.coulomb_friction", "elbow.coulomb_friction"]
-    law = ContinuousMotion(model, tree, choose_unknowns(model, tree, names), 0.02)
+    law = TreeMotion(model, tree, choose_unknowns(model, tree, names), 0.02)
     z, hs, us = np.full(2, 2.0), np.full((count, 1), 0.02), random.uniform(-4, 4, (count, 1, 2))
     starts = random.uniform(-1, 1, (count, 4)) * [1, 1, 0.3, 0.3]
     starts[::2, 3] = 0.0
@@ -148,7 +148,7 @@ def test_readings_of_held_joints_are_those_of_joints_that_stand(load):
     model = load("double_pendulum.urdf")
     tree, names = tree_for_identification(model), ["elbow.coulomb_friction", "lower.mass", "elbow.offset"]
     unknowns = choose_unknowns(model, tree, names)
-    law = ContinuousMotion(model, tree, unknowns, 0.01)
+    law = TreeMotion(model, tree, unknowns, 0.01)
     columns = ("elbow.force", "lower.accel_x", "lower.accel_z", "shoulder.force")
     sensors = choose_sensors(model, tree, columns, None)
     q, v, u = np.array([[0.4, -0.3], [0.4, -0.3]]), np.array([[0.7, 0.0], [0.7, -0.9]]), np.array([[0.1, 0.2]] * 2)
@@ -177,7 +177,7 @@ def test_the_force_on_a_block_is_what_friction_leaves_of_the_push(write_urdf):
     model, push = write_urdf(mass=MASS), np.array([[9.0], [3.0], [9.0]])
     tree = tree_for_identification(model)
     unknowns = choose_unknowns(model, tree, ["slide.coulomb_friction"])
-    law = ContinuousMotion(model, tree, unknowns, 0.01)
+    law = TreeMotion(model, tree, unknowns, 0.01)
     x = np.array([[0, 0.5], [0, 0], [0, 0]])
     sensors = choose_sensors(model, tree, ("slide.force",), None)
     read = sensors.read(law.dynamics(np.array([FRICTION])), x, push)
@@ -187,7 +187,7 @@ def test_the_force_on_a_block_is_what_friction_leaves_of_the_push(write_urdf):
 def test_a_step_in_which_a_block_stops_has_no_motion_after_it(write_urdf):
     model = write_urdf(mass=MASS)
     tree = tree_for_identification(model)
-    law = ContinuousMotion(model, tree, choose_unknowns(model, tree, ["slide.coulomb_friction"]), 0.02)
+    law = TreeMotion(model, tree, choose_unknowns(model, tree, ["slide.coulomb_friction"]), 0.02)
     given = np.array([FRICTION]), np.array([[0.0, 0.02]]), np.full((1, 1), 0.02), np.zeros((1, 1, 1))
     (stopped,) = law.run(*given)[:, 1]
     np.testing.assert_allclose(stopped, [0.02**2 / 2 / (FRICTION / MASS), 0.0], atol=1e-12)

@@ -17,7 +17,7 @@ import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification.candidates import FALSE_NAME
-from drake_diff.identification.motion import ContinuousMotion
+from drake_diff.identification.motion import TreeMotion
 from drake_diff.identification.recordings import Chart
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns, set_numbers
@@ -131,7 +131,7 @@ def test_dry_friction_stops_and_holds_and_lets_go(load):
     tree, _chart = tree_for_identification(model), Chart(coordinates_of(model))
     tree = replace(tree, numbers=replace(tree.numbers, gravity=np.zeros(3), damping=np.zeros(1)))
     unknowns = choose_unknowns(model, tree, ["hinge.coulomb_friction"])
-    law = ContinuousMotion(model, tree, unknowns, 0.04)
+    law = TreeMotion(model, tree, unknowns, 0.04)
     times, torques = 0.04 * np.arange(31), np.repeat([0.0, 0.4, -1.0], 10)
     xs = law.run(np.array([0.5]), np.array([[0.1, 0.7]]), np.full((1, 30), 0.04), torques[None, :, None])[0]
     slides = np.minimum(times, 0.35)  # by -2 rad/s^2 until 0.7 / 2 s; 0.4 N m do not move it; -1 N m do, by -2 rad/s^2
@@ -166,7 +166,7 @@ def test_chance_names_a_change_of_a_right_arm_in_less_than_0_3_percent():
     model = example_robot("ur5_robot.urdf")
     tree, _chart, period = tree_for_identification(model), Chart(coordinates_of(model)), 0.01
     us = np.random.default_rng(0).uniform(-3, 3, (40, model.nu))
-    law = ContinuousMotion(model, tree, Unknowns(()), period)
+    law = TreeMotion(model, tree, Unknowns(()), period)
     xs = law.run(np.zeros(0), model.default_state[None], np.full((1, 40), period), us[None])[0]
     xs[:, : model.nq] += 2e-4 * np.random.default_rng(1).standard_normal((41, model.nq))
     xs[:, model.nq :] = np.nan

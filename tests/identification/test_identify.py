@@ -13,8 +13,8 @@ from drake_diff.comparison import read_recording
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.identification.judge import colour_of
 from drake_diff.identification.messages import unidentifiable
-from drake_diff.identification.motion import ContinuousMotion
-from drake_diff.identification.tree import Dynamics, tree_for_identification
+from drake_diff.identification.motion import TreeMotion
+from drake_diff.identification.tree import TreeDynamics, tree_for_identification
 from drake_diff.identification.unknowns import Unknown, Unknowns, choose_unknowns, set_numbers
 from drake_diff.model.step import set_state
 
@@ -159,7 +159,7 @@ def test_a_chaotic_motion_is_fitted(load):
     truth = {"lower.mass": 0.6, "elbow.damping": 0.03}
     tree = tree_for_identification(model)
     unknowns = choose_unknowns(model, tree, list(truth))
-    dynamics = Dynamics(tree, set_numbers(model, tree, unknowns, np.array(list(truth.values()))))
+    dynamics = TreeDynamics(tree, set_numbers(model, tree, unknowns, np.array(list(truth.values()))))
 
     def rates(t, x):
         return np.concatenate([x[2:], dynamics.accelerate(x[None], np.zeros((1, model.nu)))[0]])
@@ -185,15 +185,15 @@ def test_accelerations_are_drakes_and_steps_have_the_slopes_of_differences(name)
     wanted = np.linalg.solve(
         model.double.mass_matrix(), model.actuation @ u - model.double.inverse_dynamics(np.zeros(model.nv))
     )
-    found = Dynamics(tree, tree.numbers).accelerate(x[None], u[None])[0]
+    found = TreeDynamics(tree, tree.numbers).accelerate(x[None], u[None])[0]
     np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
     numbers = tree.numbers
     by = np.eye(len(numbers.flat))
-    by_numbers = Dynamics(tree, numbers).acceleration_jacobians(x[None], u[None], by)[1][0, :, 2 * model.nv :]
+    by_numbers = TreeDynamics(tree, numbers).acceleration_jacobians(x[None], u[None], by)[1][0, :, 2 * model.nv :]
     direction = random.uniform(-1, 1, len(by)) * np.clip(np.abs(numbers.flat), 1e-3, 1e3)
 
     def moved(size):
-        return Dynamics(tree, numbers.moved(size * direction)).accelerate(x[None], u[None])[0]
+        return TreeDynamics(tree, numbers.moved(size * direction)).accelerate(x[None], u[None])[0]
 
     difference = (moved(1e-5) - moved(-1e-5)) / 2e-5
     # Differences over 1e-5 of light links are good to 1e-6 of the largest.
@@ -205,7 +205,7 @@ def test_steps_have_the_slopes_of_differences_by_unknowns(load):
     tree = tree_for_identification(model)
     names = ["upper.mass", "lower.mass", "lower.center_of_mass", "elbow.offset", "elbow.damping", "model.gravity"]
     unknowns = choose_unknowns(model, tree, [*names, "elbow.coulomb_friction", "elbow_motor.strength"][:-1])
-    law = ContinuousMotion(model, tree, unknowns, 0.01)
+    law = TreeMotion(model, tree, unknowns, 0.01)
     z = unknowns.z_start + 0.05
     start, hs = np.array([[0.4, -0.3, 1.0, -2.0]]), np.array([[0.01]])
     us = np.full((1, 1, model.nu), 0.3)

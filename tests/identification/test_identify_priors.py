@@ -10,8 +10,8 @@ import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.identification.fit import Fit, cut_segments
-from drake_diff.identification.motion import ContinuousMotion
-from drake_diff.identification.recordings import Chart, Piece
+from drake_diff.identification.motion import TreeMotion
+from drake_diff.identification.recordings import Chart, Excerpt
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
@@ -59,9 +59,9 @@ def test_the_derivative_by_a_delay_is_that_of_differences(load):
     unknowns = choose_unknowns(model, tree, ["model.input_delay", "lower.mass"])
     random = np.random.default_rng(0)
     times = np.cumsum(random.uniform(0.005, 0.03, 40))
-    whole = Piece("lab", times, np.zeros((40, 4)), random.uniform(-1, 1, (39, 2)), held_out=False)
+    whole = Excerpt("lab", times, np.zeros((40, 4)), random.uniform(-1, 1, (39, 2)), held_out=False)
     piece = whole.part(8, 30)
-    law = ContinuousMotion(model, tree, unknowns, 0.01)
+    law = TreeMotion(model, tree, unknowns, 0.01)
     fit = Fit(model, law, chart, unknowns, [piece], np.array([1e-3, 1e-3, np.nan, np.nan]))
     s = fit.segments
     starts = 0.3 * np.sin(np.arange(4 * len(s.first))).reshape(-1, 4)

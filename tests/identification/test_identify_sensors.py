@@ -14,7 +14,7 @@ from drake_diff.comparison import read_recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.recordings import Chart
 from drake_diff.identification.sensors import choose_sensors
-from drake_diff.identification.tree import Dynamics, tree_for_identification
+from drake_diff.identification.tree import TreeDynamics, tree_for_identification
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.step import set_state
 
@@ -36,7 +36,7 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
     sensors = choose_sensors(model, tree, [*columns("imu"), f"{joint}.force"], {"imu": (body, POSE)})
     x, u = state_in_range(model, random), random.uniform(-1, 1, model.nu)
     nq, nv, numbers = model.nq, model.nv, tree.numbers
-    dynamics = Dynamics(tree, numbers)
+    dynamics = TreeDynamics(tree, numbers)
     read = sensors.read(dynamics, x[None], u[None])[0]
     context = plant.CreateDefaultContext()
     plant.SetPositionsAndVelocities(context, x)
@@ -68,7 +68,7 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
 
     def at(h):
         moved = chart.plus(x[None], h * direction[None])
-        return sensors.read(Dynamics(tree, numbers.moved(h * change)), moved, u[None])[0]
+        return sensors.read(TreeDynamics(tree, numbers.moved(h * change)), moved, u[None])[0]
 
     difference = (at(1e-5) - at(-1e-5)) / 2e-5
     found = by_x[0] @ direction + by_numbers[0] @ change

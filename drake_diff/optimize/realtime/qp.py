@@ -33,7 +33,7 @@ DEAREST = 1e4  # price: dearer ones cost PIQP its digits, so that the cost is ta
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class RowLimits:
     """Rows lower <= f(z) <= upper at the K knots from `first` on, infinite where there is no limit."""
 
     labels: tuple[str, ...]  # (m,)
@@ -49,7 +49,7 @@ class Limits:
     @classmethod
     def unpriced(
         cls, labels: tuple[str, ...], function: PointFunction, first: int, lower: Array, upper: Array
-    ) -> "Limits":
+    ) -> "RowLimits":
         """At prices of 1."""
         has_lower, has_upper = (np.any(np.isfinite(side), axis=0) for side in (lower, upper))
         return cls(labels, function, first, lower, upper, has_lower, has_upper, *np.ones((2, len(labels))))
@@ -77,9 +77,9 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Limited:
-    """`Limits` around a motion: Jacobians (K, m, nx + nu), and how far the limits are from the values (K, m)."""
+    """`RowLimits` around a motion: Jacobians (K, m, nx + nu), and how far the limits are from the values (K, m)."""
 
-    limits: Limits
+    limits: RowLimits
     jacobians: Array
     lower: Array
     upper: Array
@@ -106,7 +106,7 @@ class Moves:
 class SoftProgram:
     """The program for `count` steps; its structure never changes, and is set up once."""
 
-    def __init__(self, nx: int, nu: int, count: int, rows: Sequence[Limits]):
+    def __init__(self, nx: int, nu: int, count: int, rows: Sequence[RowLimits]):
         self.nx, self.nu, self.count = nx, nu, count
         n, moves = nx + nu, count * (nx + nu)
         self.slack_at = np.cumsum([moves, *(r.lower.size for r in rows)])
@@ -148,7 +148,7 @@ class SoftProgram:
         positions = np.where(j < self.nx, (k - 1) * n + self.nu + j, k * n + j - self.nx)
         return np.where((k == 0) & (j < self.nx), -1, positions)
 
-    def _soft(self, i: int, r: Limits, bounded: Indices, first: int) -> tuple[Indices, Indices]:
+    def _soft(self, i: int, r: RowLimits, bounded: Indices, first: int) -> tuple[Indices, Indices]:
         """(rows, columns) of one side's Jacobian, then of its slacks."""
         count, m = r.lower.shape
         k, a = _all(count, len(bounded))

@@ -14,7 +14,7 @@ from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST, GoalConstraint
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.realtime.qp import Limits, SoftProgram
+from drake_diff.optimize.realtime.qp import RowLimits, SoftProgram
 from drake_diff.optimize.realtime.step import OPTIONS, Stretch, expand
 
 
@@ -78,7 +78,7 @@ class Rolling:
             yield Stage(self._final, slice(last - begin, last - begin + 1), times[last - begin :][:1], 1.0, final=True)
         yield Stage(final, slice(count, count + 1), times[count:], 1.0, final=True)
 
-    def _limits(self, probe: Array) -> Iterator[Limits]:
+    def _limits(self, probe: Array) -> Iterator[RowLimits]:
         """At the knots 0 ... N of the problem, and in a last row at all that come after; without prices."""
         problem, b, rows = self.problem, self.problem.bounds, (self.problem.num_steps + 2, 1)
         lower, upper = np.tile(b.x_lower, rows), np.tile(b.x_upper, rows)
@@ -88,7 +88,7 @@ class Rolling:
         which = np.flatnonzero(np.any(np.isfinite(lower) | np.isfinite(upper), axis=0))
         if len(which):
             labels, states = tuple(problem.state_names[i] for i in which), Selected(which, self.nx + self.nu)
-            yield Limits.unpriced(labels, states, 1, lower[:, which], upper[:, which])
+            yield RowLimits.unpriced(labels, states, 1, lower[:, which], upper[:, which])
         for c in problem.kept:
             if self.staying is not None and isinstance(c, GoalConstraint) and c.knots == LAST:
                 continue  # the plan keeps it, and its end is stayed at
@@ -97,9 +97,9 @@ class Rolling:
                 away = np.setdiff1d(np.arange(rows[0]), problem.knots_of(c, input_at_end=False))
                 lower[away], upper[away] = -np.inf, np.inf
             function = knot_function(c, self.nx, self.nu, probe)
-            yield Limits.unpriced(_labels(c), function, 0 if c.takes_input else 1, lower, upper)
+            yield RowLimits.unpriced(_labels(c), function, 0 if c.takes_input else 1, lower, upper)
 
-    def _select(self, limits: Limits, begin: int, count: int) -> Limits:
+    def _select(self, limits: RowLimits, begin: int, count: int) -> RowLimits:
         """Those of the steps `begin` ... `begin` + `count`."""
         knots = np.minimum(begin + limits.first + np.arange(count), len(limits.lower) - 1)
         return replace(limits, lower=limits.lower[knots], upper=limits.upper[knots])
@@ -134,7 +134,7 @@ class Rolling:
         self.limits = tuple(_priced(limits, looked, worth, spans, unit) for limits in self.limits)
 
 
-def _priced(limits: Limits, knots: Array, worth: Array, spans: Array, unit: float | None) -> Limits:
+def _priced(limits: RowLimits, knots: Array, worth: Array, spans: Array, unit: float | None) -> RowLimits:
     with np.errstate(all="ignore"):
         slopes = np.abs(limits.function.linearize(knots)[1])
     slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))]

@@ -33,7 +33,7 @@ from drake_diff.optimize.ilqr.riccati import (
 from drake_diff.optimize.knots import Costs
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import CostToGo
-from drake_diff.optimize.realtime.qp import Limited, Limits, Moves, SoftProgram
+from drake_diff.optimize.realtime.qp import Limited, Moves, RowLimits, SoftProgram
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Stretch:
     model: Model
     bounds: Bounds
     costs: Costs
-    limits: Sequence[Limits]
+    limits: Sequence[RowLimits]
     program: SoftProgram
     rolls: bool = False  # whether each motion is rolled out on the plant, see `along`
 
@@ -97,7 +97,7 @@ class Stretch:
         """That of a motion xs (N+1, nx), us (N, nu)."""
         return float(np.sum(self.costs.values(xs, us)))
 
-    def paid(self, motion: Motion, rows: Sequence[Limits | Limited]) -> float:
+    def paid(self, motion: Motion, rows: Sequence[RowLimits | Limited]) -> float:
         """The cost of a motion, and what it pays for what is beyond limits at the prices of `rows`."""
         with np.errstate(all="ignore"):
             beyond = (limit.beyond(*motion.point) for limit in self.limits)
@@ -122,7 +122,7 @@ class Expansion:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class RealtimeStep:
     """One step: where it leads, and how much of it was taken.
 
     `size` is 0 where none was. `promised` is the decrease of the merit that a full step promised, `slacks` are those of
@@ -184,7 +184,7 @@ class Step:
         return passed
 
 
-def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) -> Step | Refusal:
+def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) -> RealtimeStep | Refusal:
     """One step from `motion`, whose first state is given; a Refusal where the quadratic program is not solved.
 
     `damping` (nx + nu,) is added to the curvature of each knot, for shorter steps (Levenberg and Marquardt).
@@ -208,7 +208,7 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
         slope -= float(np.sum(rows.prices * (rows.beyond - slack)))
     promised = -(slope + curvature / 2)
     rounding = OPTIONS.rounding * (1 + abs(before))
-    step = Step(stretch, motion, 0.0, promised, before, expansion, moves, whole, feedback)
+    step = RealtimeStep(stretch, motion, 0.0, promised, before, expansion, moves, whole, feedback)
     if stretch.rolls and not motion.is_rollout:
         return _first_rollout(step)
     for size in OPTIONS.rolled_sizes if stretch.rolls else OPTIONS.step_sizes:
@@ -223,7 +223,7 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
     return step
 
 
-def _is_doubtful(step: Step, before: Motion) -> bool:
+def _is_doubtful(step: RealtimeStep, before: Motion) -> bool:
     """Whether the plant departs from its derivatives by an error that does not shrink with the step."""
     dxs, dus = step.motion.xs - before.xs, step.motion.us - before.us
     linear = np.einsum("kij,kj->ki", step.expansion.quadratic.F, np.hstack([dxs[:-1], dus]))
@@ -244,7 +244,7 @@ def merit(stretch: Stretch, expansion: Expansion, motion: Motion, gap_prices: Ar
     return stretch.paid(motion, expansion.limited) + float(np.sum(gap_prices * np.abs(motion.gaps)))
 
 
-def _moved(step: Step, size: float) -> Motion:
+def _moved(step: RealtimeStep, size: float) -> Motion:
     """A part of the step from its motion: rolled out where shapes touch."""
     motion, stretch = step.motion, step.stretch
     xs, us = motion.xs + size * step.moves.dxs, motion.us + size * step.moves.dus
@@ -264,7 +264,7 @@ def roll(stretch: Stretch, x: Array, xs: Array, us: Array, feedback: Array) -> M
     return Motion(states, inputs, np.zeros_like(states[1:]))
 
 
-def _first_rollout(step: Step) -> Step:
+def _first_rollout(step: RealtimeStep) -> RealtimeStep:
     """From a motion with gaps: the plant's own, the whole step or none of it, whichever costs less."""
     best = None
     for size in (1.0, 0.0):

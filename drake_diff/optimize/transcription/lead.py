@@ -31,7 +31,7 @@ NARROW = 8  # steps of a tenth of an interval: what needs as many is narrow ther
 STAGE_WEIGHTS = tuple(np.array(weights) for weights in STAGES)
 
 
-class Motion(Protocol):
+class PiecewiseMotion(Protocol):
     """A motion between N+1 knots, xs (N+1, nx), whose input is a polynomial in each interval."""
 
     @property
@@ -58,7 +58,7 @@ class Places:
     middle. `width` is that of the features that are seen.
     """
 
-    def __init__(self, motion: Motion, held: Array):
+    def __init__(self, motion: PiecewiseMotion, held: Array):
         """`held` (N, 21, nx + nu) is the motion at every half of an interval's ten steps."""
         count, parts = len(motion.lengths), 2 * SUBSTEPS
         moved = np.abs(np.diff(held, axis=1))
@@ -97,7 +97,7 @@ class Within:
         width: of the features that are seen, see above.
     """
 
-    def __init__(self, motion: Motion, held: Array):
+    def __init__(self, motion: PiecewiseMotion, held: Array):
         self.motion, self.held, task, count = motion, held, motion.task, len(motion.lengths)
         self.nx, self.width, self.least = task.dynamics.nx, 0.0, np.ones(count, dtype=np.intp)
         self.narrow = np.zeros(count, dtype=bool)
@@ -196,7 +196,7 @@ class Within:
 class Lead:
     """Where `motion` leads at every `substeps`-th part of its intervals, which start and end at its knots."""
 
-    def __init__(self, motion: Motion, substeps: int, least: Any = None):
+    def __init__(self, motion: PiecewiseMotion, substeps: int, least: Any = None):
         """`least` (N,) are the fewest steps in each interval, 1 where None."""
         self.motion, self.substeps = motion, substeps
         self.least = np.ones(len(motion.lengths), dtype=np.intp) if least is None else least
