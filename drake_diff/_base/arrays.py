@@ -101,7 +101,7 @@ def seconds(subject: str, value: Any) -> float:
     return number
 
 
-def part(subject: str, value: float) -> float:
+def fraction(subject: str, value: float) -> float:
     """`value` where it is at least 0 and less than 1."""
     if not 0 <= value < 1:
         raise InputError(subject, got=value, expected="a number from 0 to less than 1")

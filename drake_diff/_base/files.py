@@ -130,13 +130,13 @@ def move(source: Path, target: Path) -> None:
         os.replace(source, target)
 
 
-def exchange(one: Path, other: Path) -> bool:
+def exchange(first: Path, other: Path) -> bool:
     """Give each of two folders the other's name at once; False, and nothing is done, where the file system cannot."""
     function = _renameat2()
     with doing("write", other):
         if function is None:
             return False
-        if function(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0:
+        if function(AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0:
             return True
         number = ctypes.get_errno()
         if number in CANNOT_EXCHANGE:
@@ -153,10 +153,10 @@ def _renameat2() -> Any:
     return function
 
 
-def take_mode(folder: Path, of: Path) -> None:
+def take_mode(folder: Path, other: Path) -> None:
     """Give `folder` the permissions of another."""
     with doing("write", folder):
-        folder.chmod(stat.S_IMODE(of.stat().st_mode))
+        folder.chmod(stat.S_IMODE(other.stat().st_mode))
 
 
 def remove_folder(path: Path) -> None:

@@ -412,27 +412,27 @@ class _PolicyProbe:
         moves = np.max(np.abs(steps), axis=1) > ASK.moves * np.max(np.abs(xs))
         for k in np.flatnonzero(moves).tolist():
             yield self._switch(k, np.append(steps[k], none), "to the next state")
-        at = np.cumsum(np.vstack([np.zeros((1, self.space.size)), steps]), axis=0)[:-1]
+        offsets = np.cumsum(np.vstack([np.zeros((1, self.space.size)), steps]), axis=0)[:-1]
         for i, (name, reach) in enumerate(zip(self.space.names, np.max(np.abs(steps), axis=0), strict=True)):
             for sign in (1.0, -1.0) if reach > ASK.moves * np.max(np.abs(xs)) else ():
-                k, way = int(np.argmax(sign * at[:, i])), np.zeros(self.space.size + len(none))
+                k, way = int(np.argmax(sign * offsets[:, i])), np.zeros(self.space.size + len(none))
                 way[i] = sign * reach
                 yield self._switch(k, way, f"{name} by {sign * reach:.3g}")
 
     def _staircase(self, k: int, way: Array, name: str, lengths: Sequence[float] = LENGTHS) -> str:
         jump = _stairs(self._along(k, way), self._least(k), lengths)
         where = f"of {ASK.cells} parts of {name} {jump[2]} jump, " if jump else ""
-        return f"the policy is a staircase: {self._told(k, way, jump[:2], where)} at {jump[0]:.3g}" if jump else ""
+        return f"the policy is a staircase: {self._jump_text(k, way, jump[:2], where)} at {jump[0]:.3g}" if jump else ""
 
     def _switch(self, k: int, way: Array, name: str) -> str:
         least = max(self._least(k), ASK.rounded * float(np.abs(self.g.us).max()))
         with np.errstate(all="ignore"), suppress(*OUTSIDE):
             jumps = _jumps(self._along(k, way), np.linspace(0.0, 1.0, ASK.cells // 2 + 1), least)
             if jumps:
-                return f"the policy jumps: {self._told(k, way, jumps[0])} on the way from there {name}"
+                return f"the policy jumps: {self._jump_text(k, way, jumps[0])} on the way from there {name}"
         return ""
 
-    def _told(self, k: int, way: Array, jump: Jump, where: str = "") -> str:
+    def _jump_text(self, k: int, way: Array, jump: Jump, where: str = "") -> str:
         change = self._u(k, way, jump[1]) - self._u(k, way, jump[0])
         i = int(np.argmax(np.abs(change)))
         return f"at t = {k * self.time_step:g} s, {where}u[{i}] by {change[i]:.3g}"

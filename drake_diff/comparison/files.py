@@ -90,13 +90,13 @@ def write_comparison(
     return record.write(folder)
 
 
-def _kept(comparison: Comparison) -> tuple[Recording, ...]:
+def _saved_recordings(comparison: Comparison) -> tuple[Recording, ...]:
     """All recordings, or none where they are too large together."""
     return comparison.recordings if sum(map(size_of, comparison.recordings)) <= LARGEST else ()
 
 
 def _keep(folder: Path, comparison: Comparison) -> None:
-    recordings = _kept(comparison)
+    recordings = _saved_recordings(comparison)
     for i, recording in enumerate(recordings):
         write_arrays(folder / place_of(i), recording)
     source = comparison.model.source
@@ -118,7 +118,7 @@ def record_of(
             records.RecordedEvidence(
                 name=r.name, version=r.version, facts=dict(r.facts), path=place_of(i), samples=len(r.times)
             )
-            for i, r in enumerate(_kept(comparison))
+            for i, r in enumerate(_saved_recordings(comparison))
         ],
         "refused": [records.RefusedEvidence(**vars(refused)) for refused in comparison.refused],
         "wall_clock": WallClock(

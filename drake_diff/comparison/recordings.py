@@ -353,7 +353,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
         motion, facts = _read_mcap(path, model)
     else:
         raise InputError("recording", got=str(path), expected=SUFFIXES)
-    facts = {**facts, **_told(path)}
+    facts = {**facts, **_contract_facts(path)}
     name, version = name or facts.get("engine", path.stem), facts.get("version", "(version unknown)")
     times, xs, us = (frozen(array) for array in motion)
     recording = Recording(name, version, times, xs, us, facts, outputs)
@@ -389,7 +389,7 @@ def write_csv(recording: Recording, model: Model, path: Path) -> None:
     write_whole(path, text.getvalue().encode())
 
 
-def _told(path: Path) -> dict[str, str]:
+def _contract_facts(path: Path) -> dict[str, str]:
     """What stands beside the recording; numbers stay JSON."""
     beside = path.with_name((path.name if path.is_dir() else path.stem) + ".contract.json")
     if not beside.exists():

@@ -97,7 +97,7 @@ def compare(
     refused: list[Refused] = []
     for wanted in default_engines(model) if engines is None else engines:
         try:
-            engine = load_spec(wanted, model) if isinstance(wanted, str) else _of(wanted, reference)
+            engine = load_spec(wanted, model) if isinstance(wanted, str) else _checked_engine(wanted, reference)
             if engines is None:
                 _check_contact(reference, engine)
             loaded.append(engine)
@@ -151,7 +151,7 @@ def default_engines(model: Model) -> tuple[str, ...]:
     return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
 
 
-def _of(engine: Engine, reference: DrakeEngine) -> Engine:
+def _checked_engine(engine: Engine, reference: DrakeEngine) -> Engine:
     """InputError for a closed form of other coordinates than the reference's."""
     if isinstance(engine, ClosedForm):
         ours, theirs = reference.contract, engine.contract

@@ -107,17 +107,17 @@ class Jacobians:
     notes: Mapping[int, str] = field(default_factory=dict)
     timed: bool = False
 
-    def put(self, which: NDArray[np.intp], part: "Jacobians | Refusal") -> None:
+    def put(self, which: NDArray[np.intp], result: "Jacobians | Refusal") -> None:
         """Take over those of some of the steps, or why these are refused."""
         steps = which.tolist()
-        if isinstance(part, Refusal):
-            self.refused |= {k: NotSmoothError(part.reason) for k in steps}
+        if isinstance(result, Refusal):
+            self.refused |= {k: NotSmoothError(result.reason) for k in steps}
             return
-        self.values[which] = part.values
+        self.values[which] = result.values
         for k in steps:
             self.refused.pop(k, None)
-        self.refused |= {steps[k]: why for k, why in part.refused.items()}
-        self.notes = {**self.notes, **{steps[k]: note for k, note in part.notes.items()}}
+        self.refused |= {steps[k]: why for k, why in result.refused.items()}
+        self.notes = {**self.notes, **{steps[k]: note for k, note in result.notes.items()}}
 
 
 @dataclass

@@ -110,7 +110,7 @@ class PybulletEngine(RigidEngine):
             q[i : i + 4] *= np.sign(q[i : i + 4] @ x[i : i + 4])  # of the two, that which x goes on to
             q[i + 4 : i + 7] = np.array(position) - R @ center
             v[j + 3 : j + 6], v[j : j + 3] = self.bullet.getBaseVelocity(base)
-        x_next = self._found("Bullet", q, v, x, u)
+        x_next = self._drake_state("Bullet", q, v, x, u)
         self.status = "ok" if used < room else f"the solver used all of its {room} iterations"
         return x_next
 

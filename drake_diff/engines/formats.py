@@ -156,7 +156,7 @@ def _add_joint(root: Element, name: str, kind: str, sides: tuple[str, str], X: R
     joint = SubElement(root, "joint", name=name, type=kind)
     SubElement(joint, "parent", link=sides[0])
     SubElement(joint, "child", link=sides[1])
-    _place(joint, X)
+    _add_origin(joint, X)
     return joint
 
 
@@ -172,7 +172,7 @@ def _add_freedom(joint: Element, axis: Array, damping: float, effort: float, sid
 def _add_inertial(body: Element, mass: float, center: RigidTransform, inertia: Array) -> None:
     """`inertia` (3, 3) is about `center` and in its axes."""
     inertial = SubElement(body, "inertial")
-    _place(inertial, center)
+    _add_origin(inertial, center)
     SubElement(inertial, "mass", value=row(mass))
     places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     SubElement(inertial, "inertia", {name: row(inertia[index]) for name, index in places.items()})
@@ -181,14 +181,14 @@ def _add_inertial(body: Element, mass: float, center: RigidTransform, inertia: A
 def _add_collision(body: Element, geometry: Geometry, X: RigidTransform) -> Element:
     kind, sizes = shape_of(geometry)
     collision = SubElement(body, "collision", name=geometry.name)
-    _place(collision, X)
+    _add_origin(collision, X)
     element = SubElement(SubElement(collision, "geometry"), kind.lower())
     for name, values in sizes.items():
         element.set(name, row(values))
     return collision
 
 
-def _place(element: Element, X: RigidTransform) -> None:
+def _add_origin(element: Element, X: RigidTransform) -> None:
     rpy: Array = RollPitchYaw(X.rotation()).vector()
     SubElement(element, "origin", xyz=row(X.translation()), rpy=row(rpy))
 

@@ -296,7 +296,7 @@ class RigidEngine(PlantEngine):
         super().__init__(model)
         self.tree = rigid_links(self.description)
 
-    def _found(self, who: str, q: Array, v: Array, x: ArrayLike, u: ArrayLike) -> Array:
+    def _drake_state(self, who: str, q: Array, v: Array, x: ArrayLike, u: ArrayLike) -> Array:
         """Drake's state (nx,) of q and the velocities of centres of mass; SimulationError where it is not finite."""
         if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
             raise SimulationError(f"{who} cannot take this step, from x = {np.asarray(x)}, u = {np.asarray(u)}")

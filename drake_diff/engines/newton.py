@@ -109,14 +109,14 @@ class NewtonEngine(RigidEngine):
 
     def energy(self, x: ArrayLike) -> float:
         _, q, v = self._state(x)
-        state = self._at(q)
+        state = self._state_at_rest(q)
         fallen = float(_numbers(self.newton.body_mass) @ _centers_of_mass(self.newton, state) @ self._gravity())
         stretch, stiffness = self._native_springs(state)
         springs = float(stretch @ (stiffness * stretch)) / 2
         return float(v @ self.mass_matrix(q) @ v) / 2 - fallen + springs + self.tree.anchored_energy
 
     def contact_depth(self, x: ArrayLike) -> float:
-        state = self._at(self._state(x)[1])
+        state = self._state_at_rest(self._state(x)[1])
         contacts = self._contacts(state)
         if contacts is None:
             return 0.0
@@ -127,7 +127,7 @@ class NewtonEngine(RigidEngine):
     def mass_matrix(self, q: ArrayLike) -> Array:
         q = self._positions(q)
         Q = self.centers.turn(q)
-        return np.asarray(Q.T @ self._mass(self._at(q)) @ Q)
+        return np.asarray(Q.T @ self._mass(self._state_at_rest(q)) @ Q)
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         q, v = self._motion(q, v)
@@ -148,7 +148,7 @@ class NewtonEngine(RigidEngine):
             how.append("free bodies by v' of the centre of mass, quaternions by their rate, then of norm 1")
         return EngineContract(
             **self._plant_fields(), engine=self.name,
-            joints=_read_joints(self.newton, self._at(self._zero()[: self.nq]), self.tree),
+            joints=_read_joints(self.newton, self._state_at_rest(self._zero()[: self.nq]), self.tree),
             native_order=tuple(self.newton.joint_label),
             state="position of the body's origin, quaternion x y z w after it; velocity of a free body linear of its "
             "centre of mass then angular, in world",
@@ -171,7 +171,7 @@ class NewtonEngine(RigidEngine):
     def _gravity(self) -> Array:
         return np.asarray(_numbers(self.newton.gravity)[0])
 
-    def _at(self, q: Array) -> Any:
+    def _state_at_rest(self, q: Array) -> Any:
         return self._given(np.concatenate([q, np.zeros(self.nv)]), np.zeros(self.nu))[0]
 
     def _given(self, x: Array, u: Array) -> tuple[Any, Any]:
@@ -189,7 +189,7 @@ class NewtonEngine(RigidEngine):
 
     def _drakes(self, after: Any, x: ArrayLike, u: ArrayLike) -> Array:
         q, v = _numbers(after.joint_q)[self.positions], _numbers(after.joint_qd)[self.dofs]
-        return self._found("Newton", q, v, x, u)
+        return self._drake_state("Newton", q, v, x, u)
 
     def _mass(self, state: Any) -> Array:
         """(nv, nv) of Newton's velocities in Drake's order."""

@@ -89,7 +89,7 @@ class SapienEngine(RigidEngine):
                 i, j = root.joint.q_start, root.joint.v_start
                 q[i : i + 4], q[i + 4 : i + 7] = tree.root_pose.q, tree.root_pose.p
                 v[j + 3 : j + 6], v[j : j + 3] = tree.root_linear_velocity, tree.root_angular_velocity
-        return self._found("PhysX", q, v, x, u)
+        return self._drake_state("PhysX", q, v, x, u)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         raise NotOfferedError("PhysX has no derivatives of its step")
@@ -179,7 +179,7 @@ class SapienEngine(RigidEngine):
         q = unit(self.coordinates, x[: self.nq])
         v = self.centers.turn(q) @ x[self.nq :]
         for tree, members in zip(trees, self.tree.trees, strict=True):
-            self._place(tree, members, q, v, force)
+            self._set_tree_state(tree, members, q, v, force)
         return World(system, scene, links, trees)
 
     def _links(self, scene: Any) -> list[Any]:
@@ -228,7 +228,7 @@ class SapienEngine(RigidEngine):
         shape.set_collision_groups([*self.groups[geometry.name], 0, 0])
         return shape
 
-    def _place(self, tree: Any, members: range, q: Array, v: Array, force: Array) -> None:
+    def _set_tree_state(self, tree: Any, members: range, q: Array, v: Array, force: Array) -> None:
         tree.set_solver_position_iterations(ITERATIONS)
         tree.sleep_threshold = 0.0
         rigid = {self.tree.links[i].joint.joint: self.tree.links[i] for i in members}

@@ -319,7 +319,7 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
         name=model.name, target=target, file=f"model{SUFFIX[form]}", about_usd=about_usd,
         settings=(COMMON + OF_TARGET.get(target, "")).format(**facts), left_out=", ".join(left_out) or "none",
         header=",".join(["time", *model.state_names, *model.input_names]),
-        followers=_told(description.followers), **facts, **made,
+        followers=_followers_text(description.followers), **facts, **made,
     )  # fmt: skip
     facts_of_model = {
         **asdict(contract),
@@ -343,7 +343,7 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     return [directory / name for name in files]
 
 
-def _told(followers: Sequence[Follower]) -> str:
+def _followers_text(followers: Sequence[Follower]) -> str:
     """In the README."""
     if not followers:
         return "none."

@@ -47,7 +47,7 @@ def usd(description: Description) -> str:
     zero = AtZero(description)
     for link in description.links:
         form = UsdGeom.Xform.Define(stage, f"{ROOT}/{link.body}")
-        _place(form, zero.frames[link.body])
+        _set_pose(form, zero.frames[link.body])
         if link.body not in anchored:
             _add_inertia(form.GetPrim(), link, zero)
     for link in moving:
@@ -105,7 +105,7 @@ def _quaternion(wxyz: Any) -> Any:
     return Gf.Quatf(*(float(value) for value in wxyz))
 
 
-def _place(shape: Any, X: RigidTransform) -> None:
+def _set_pose(shape: Any, X: RigidTransform) -> None:
     w, *xyz = (float(value) for value in X.rotation().ToQuaternion().wxyz())
     shape.AddTranslateOp().Set(Gf.Vec3d(*(float(p) for p in X.translation())))
     shape.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, *xyz))
@@ -188,7 +188,7 @@ def _add_geometry(stage: Any, number: int, geometry: Geometry, X: RigidTransform
     else:
         form = UsdGeom.Plane.Define(stage, path)
         form.CreateAxisAttr("Z")
-    _place(form, X)
+    _set_pose(form, X)
     if kind == "Box":
         form.AddScaleOp().Set(_vector(sizes["size"]))
     UsdPhysics.CollisionAPI.Apply(form.GetPrim())

@@ -62,12 +62,12 @@ def mistakes(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> list[Mist
     along += [(i + 4 + k, nq + j + 3 + k) for i, j in chart.coordinates.free for k in range(3)]
     turning = [(i, nq + j) for i, j in chart.coordinates.single if i not in sliding]
     spins = [nq + j + k for _, j in chart.coordinates.free for k in range(3)]
-    inputs, names, found = range(nx, nx + model.nu), (*model.state_names, *model.input_names), list[Mistake]()
+    inputs, names, hypotheses = range(nx, nx + model.nu), (*model.state_names, *model.input_names), list[Mistake]()
 
     def add(words: str, columns: Sequence[int], sources: Sequence[int], factor: float = 1.0) -> None:
         order, factors = np.arange(len(names)), np.ones(len(names))
         order[list(columns)], factors[list(columns)] = sources, factor
-        found.append(Mistake(words, order, factors))
+        hypotheses.append(Mistake(words, order, factors))
 
     for first, second in (pair for alike in (along, turning) for pair in combinations(alike, 2)):
         pairs = [pair for pair in zip(first, second, strict=True) if seen[list(pair)].all()]
@@ -84,7 +84,7 @@ def mistakes(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> list[Mist
     rates = [i for i in (*(j for _, j in turning), *spins) if seen[i]]
     for group in _sets((angles + rates, angles, rates)):
         add(f"{_listed([names[i] for i in group])} degrees, not radians", group, group, np.pi / 180)
-    return found
+    return hypotheses
 
 
 def _sets(*groups: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:

@@ -135,7 +135,7 @@ def excite(
         noise = dict.fromkeys(names, NOISE)
     stated, first = given_noise(model, chart, noise), _first(model, x0)
     design = _Design(model, tree, chart, unknowns, stated, first, duration, limits, period, harmonics)
-    return design.found(max_iterations, seed, dict(noise))
+    return design.excitation(max_iterations, seed, dict(noise))
 
 
 def _first(model: Model, x0: Any) -> Array:
@@ -190,13 +190,13 @@ class _Design:
         return replace(self.law, longest=1.01 * COARSE, method=ORDER_4)
 
     @cached_property
-    def own(self) -> TreeDynamics:
+    def dynamics(self) -> TreeDynamics:
         return TreeDynamics(self.tree, self.tree.numbers)
 
     @cached_property
     def follows(self) -> bool:
         """Whether any motion of the joints has inputs."""
-        reach = np.linalg.matrix_rank(self.own.efforts)
+        reach = np.linalg.matrix_rank(self.dynamics.efforts)
         return not self.chart.coordinates.free and self.model.nu > 0 and int(reach) == self.model.nv
 
     @cached_property
@@ -276,7 +276,7 @@ class _Design:
         xs = np.concatenate([q + middle, v], axis=2)
         between = (xs[:, 1:] + xs[:, :-1]) / 2
         flat = between.reshape(-1, self.model.nx)
-        us = self.own.inputs_for(flat, ((a[:, 1:] + a[:, :-1]) / 2).reshape(len(flat), -1))
+        us = self.dynamics.inputs_for(flat, ((a[:, 1:] + a[:, :-1]) / 2).reshape(len(flat), -1))
         return xs, us.reshape(K, n - 1, -1), a
 
     def simulated(self, c: Array) -> tuple[Array, Array]:
@@ -292,7 +292,7 @@ class _Design:
             rate = min(FASTEST, 0.2 / h)
             off = planned[0, k] - xs[k]
             wanted = (a[0, k] + a[0, k + 1]) / 2 + rate**2 * off[:nq] + 2 * rate * off[nq:]
-            us[k] = self.own.inputs_for(xs[k, None], wanted[None])[0]
+            us[k] = self.dynamics.inputs_for(xs[k, None], wanted[None])[0]
             hs = np.array([self.law.cut(float(h))])
             xs[k + 1] = self.law.run(values, xs[k, None], hs, np.tile(us[k], (1, hs.shape[1], 1)))[0, -1]
         return xs, us
@@ -338,7 +338,7 @@ class _Design:
             Rs = fit.reduce(point).each
         return [R if np.all(np.isfinite(R)) else np.zeros_like(R) for R in Rs]
 
-    def told(self, xs: Array, us: Array) -> tuple[Array, tuple[str, ...]]:
+    def identifiability(self, xs: Array, us: Array) -> tuple[Array, tuple[str, ...]]:
         """(R of one motion as `identify` would cut it, what stays open)."""
         z = self.unknowns.z_start
         fit, starts = self.fit(self.law, xs[None], us[None], self.times)
@@ -355,7 +355,7 @@ class _Design:
         s = np.linalg.svd(np.vstack([R * scale, np.diag(pull)]), compute_uv=False)
         return 2 * float(np.sum(np.log(s)))
 
-    def found(self, most: int, seed: int, noise: dict[str, float]) -> Excitation:
+    def excitation(self, most: int, seed: int, noise: dict[str, float]) -> Excitation:
         size = len(self.reach[0]) * 2 * self.harmonics
         random = np.random.default_rng(seed).standard_normal((RANDOM, size)) / np.sqrt(2 * self.harmonics)
         starts = [c for c in map(self.within, random) if c is not None]
@@ -367,15 +367,15 @@ class _Design:
         scale = np.where(np.isfinite(widths), widths / FAR, 1 / np.where(norms > 0, norms, 1.0))
         order = np.argsort([-self.worth(R, scale) for R in Rs], kind="stable")
         tried = self.searched(starts[order[0]], scale, most) if most else []
-        best = next((motion for motion in map(self.kept, [*tried, *(starts[i] for i in order)]) if motion), None)
+        best = next((motion for motion in map(self.feasible, [*tried, *(starts[i] for i in order)]) if motion), None)
         middle = next(
-            (motion for motion in map(self.kept, (starts[i] for i in order[len(order) // 2 :])) if motion), None
+            (motion for motion in map(self.feasible, (starts[i] for i in order[len(order) // 2 :])) if motion), None
         )
         if best is None or middle is None:
             raise ModelError(f"{self.model.name}: no motion from x0 was found that keeps the limits at every sample")
-        R, open_ = self.told(*best)
-        R_random, _ = self.told(*middle)
-        R_rest, _ = self.told(*self.simulated(np.zeros(size)))
+        R, open_ = self.identifiability(*best)
+        R_random, _ = self.identifiability(*middle)
+        R_rest, _ = self.identifiability(*self.simulated(np.zeros(size)))
         gain = float(np.exp((self.worth(R, scale) - self.worth(R_random, scale)) / (2 * len(scale))))
         deviations = [self.deviations(root) for root in (R, R_random, R_rest)]
         units = {unknown.name: unknown.unit for unknown in self.unknowns.each}
@@ -408,7 +408,7 @@ class _Design:
                 return True
         return False
 
-    def kept(self, c: Array) -> tuple[Array, Array] | None:
+    def feasible(self, c: Array) -> tuple[Array, Array] | None:
         """The motion, where it, or one that is a little smaller, keeps all limits at every sample."""
         for fraction in SMALLER:
             xs, us = self.simulated(fraction * c)
@@ -419,7 +419,7 @@ class _Design:
     def searched(self, c: Array, scale: Array, most: int) -> list[Array]:
         """Where the search has been, best first: linear programs by differences, within a box that follows success."""
 
-        def of(many: Array) -> tuple[Array, Array]:
+        def evaluate(many: Array) -> tuple[Array, Array]:
             xs, us, _ = self.planned(self.rough, many, self.few)
             worth, alive = np.full(len(many), -np.inf), np.isfinite(xs).all(axis=(1, 2))
             if np.any(alive):
@@ -428,9 +428,9 @@ class _Design:
 
         bounded = np.flatnonzero(np.isfinite(np.concatenate(self.limits)))
         been, box = [c], BOX
-        worth, over = (values[0] for values in of(c[None]))
+        worth, over = (values[0] for values in evaluate(c[None]))
         for _ in range(most):
-            moved, moved_over = of(c + DIFFERENCE * np.eye(len(c)))
+            moved, moved_over = evaluate(c + DIFFERENCE * np.eye(len(c)))
             gradient, J = (moved - worth) / DIFFERENCE, (moved_over - over).T / DIFFERENCE
             if not np.all(np.isfinite(gradient)):
                 break
@@ -438,7 +438,7 @@ class _Design:
             while box >= LEAST_BOX:
                 near = over + box * np.sum(np.abs(J), axis=1) > 0
                 step = linprog(-gradient, A_ub=J[near], b_ub=np.maximum(-over[near], 0.0), bounds=(-box, box)).x
-                worths, overs = of(c + PARTS[:, None] * step)
+                worths, overs = evaluate(c + PARTS[:, None] * step)
                 worths[np.max(overs, axis=1) > MARGIN / 10] = -np.inf
                 k = int(np.argmax(worths))
                 if worths[k] > worth and not self.touches(

@@ -106,7 +106,7 @@ def explain(
         return ContactExplanation(model, chart, pieces, given_noise(model, chart, noise)).explanation()
     if why or isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: causes are looked for in motions in continuous time only, and {why}")
-    explanation = _Search(model, chart, pieces, given_noise(model, chart, noise), tree=tree).found()
+    explanation = _Search(model, chart, pieces, given_noise(model, chart, noise), tree=tree).explanation()
     if explanation.explained or motion != "auto" or not may_touch(model, chart, pieces):
         return explanation
     touched = ContactExplanation(model, chart, pieces, given_noise(model, chart, noise)).explanation()
@@ -122,7 +122,7 @@ class _Search(Candidates):
 
     nearest: Tried | None = None
 
-    def found(self) -> Explanation:
+    def explanation(self) -> Explanation:
         self.prepare()
         explanation, base, alone, runners = self.by_one()
         if explanation is None and not base.explains and not self.is_late:

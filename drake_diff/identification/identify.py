@@ -138,13 +138,13 @@ def identify(
     if motion == "impacts":
         if priors or bounds:
             raise InputError("priors and bounds", got="some", expected='none with motion="impacts"')
-        found = fit_through_impacts(model, pieces, parameters, problem.first_noise)
+        result = fit_through_impacts(model, pieces, parameters, problem.first_noise)
     else:
         law: Law = (
             discrete_motion(model, unknowns, pieces) if own_tree is None else TreeMotion(model, own_tree, unknowns)
         )
         fit, solved = problem.solve(law, max_iterations)
-        found = problem.judged(fit, solved, why if motion == "auto" else "")
+        result = problem.judged(fit, solved, why if motion == "auto" else "")
     names = parameters if isinstance(parameters, str) else tuple(parameters)
     asked = Request(
         model,
@@ -159,7 +159,7 @@ def identify(
         dict(bounds or {}),
         dict(sensors or {}),
     )
-    return replace(found, asked=asked)
+    return replace(result, asked=asked)
 
 
 def what_acts(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> str:

@@ -293,7 +293,7 @@ class _Corrected:
         self.xml.set(origin, "xyz", xyz)
 
 
-def _own(model: Model, e: Identification) -> dict[str, Any]:
+def _parameter_values(model: Model, e: Identification) -> dict[str, Any]:
     """The values that are parameters of the model."""
     known = {p.name for p in list_parameters(model)}
     return {name: value for name, value in e.values.items() if name in known}
@@ -301,7 +301,7 @@ def _own(model: Model, e: Identification) -> dict[str, Any]:
 
 def _inertia(model: Model, e: Identification, label: str) -> tuple[float, Array, Array]:
     """Mass, centre of mass (3,) and inertia (3, 3) about it, in the body's frame, as the plant has them there."""
-    with applied(select(model, _own(model, e))):
+    with applied(select(model, _parameter_values(model, e))):
         spatial = model.double.body(label).CalcSpatialInertiaInBodyFrame(model.double.context)
     mass, center = float(spatial.get_mass()), np.asarray(spatial.get_com(), dtype=float)
     inertia = np.array(spatial.Shift(center).CalcRotationalInertia().CopyToFullMatrix3())
@@ -313,10 +313,10 @@ def _check(e: Identification, model: Model, path: Path) -> None:
     """ModelError where the file, loaded as the model was, has another parameter than the model with what was found."""
     options: dict[str, Any] = dict(model.options or {})
     new = {p.name: p.value for p in list_parameters(load_model(path, **options))}
-    with applied(select(model, _own(model, e))):
+    with applied(select(model, _parameter_values(model, e))):
         for p in list_parameters(model):
             label, quantity = p.name.rsplit(".", 1)
-            wanted = np.atleast_1d(_own(model, e).get(p.name, p.value))
+            wanted = np.atleast_1d(_parameter_values(model, e).get(p.name, p.value))
             size = float(np.max(np.abs(wanted)))
             if quantity in (MASS, CENTER, INERTIA):
                 body = model.double.body(label).CalcSpatialInertiaInBodyFrame(model.double.context)

@@ -190,17 +190,17 @@ def state_channel(
     rows = (
         (nanoseconds(t), kind.cls(time=t, q=x[:nq], v=x[nq:])) for t, x in zip(times.tolist(), xs.tolist(), strict=True)
     )
-    return Channel(topic, kind.cls, rows, _told(parts))
+    return Channel(topic, kind.cls, rows, _column_metadata(parts))
 
 
 def input_channel(topic: str, times: Array, us: Array, inputs: Sequence[Coordinate]) -> Channel:
     """drake_diff.Input of inputs (n, nu) at `times` (n,) [s]."""
     kind = TYPES["Input"]
     rows = ((nanoseconds(t), kind.cls(time=t, u=u)) for t, u in zip(times.tolist(), us.tolist(), strict=True))
-    return Channel(topic, kind.cls, rows, _told({"u": inputs}))
+    return Channel(topic, kind.cls, rows, _column_metadata({"u": inputs}))
 
 
-def _told(parts: Mapping[str, Sequence[Coordinate]]) -> dict[str, Any]:
+def _column_metadata(parts: Mapping[str, Sequence[Coordinate]]) -> dict[str, Any]:
     units = {piece: {c.name: c.unit for c in coordinates} for piece, coordinates in parts.items()}
     names = {piece: [c.name for c in coordinates] for piece, coordinates in parts.items()}
     return {"units": {"time": "s", **units}, "names": names}

@@ -188,7 +188,7 @@ class MPC:
                     self.status = f"{FOLLOWED}: {step.reason}"
                     break
                 self._step, self._solved_at, motion = step, k, step.motion
-                self.status = self._told(step, k)
+                self.status = self._status_of(step, k)
                 now = self._clock()
                 is_late = self.budget is not None and now - start + (now - begin) > self.budget
                 if step.is_reached or not step.size or is_late:  # the next one would be late
@@ -239,7 +239,7 @@ class MPC:
                 x[entries] *= -1
         return x
 
-    def _told(self, step: RealtimeStep, k: int) -> str:
+    def _status_of(self, step: RealtimeStep, k: int) -> str:
         """What is to be said of a step at the problem's step `k`."""
         remarks = []
         if not step.size and not step.is_reached:
@@ -305,7 +305,7 @@ class MPC:
             step = step if isinstance(outcome, Refusal) else outcome
         apart = float(np.max(np.abs(motion.gaps) / ranges))
         if apart > GAP or step.given_way is not None:
-            got = f"steps that are {apart:.2g} of a range off" if apart > GAP else self._told(step, 0)
+            got = f"steps that are {apart:.2g} of a range off" if apart > GAP else self._status_of(step, 0)
             raise InputError("plan", got=got, expected="a plan near which a motion keeps all that the problem asks for")
         if step.tails is None:
             raise InputError("running_cost", got="no positive curvature by the inputs", expected="one with a minimum")

@@ -25,8 +25,8 @@ from drake_diff._base.arrays import (
     array_with_gaps,
     count,
     finite_array,
+    fraction,
     frozen,
-    part,
     positive_float,
     scale,
 )
@@ -77,7 +77,7 @@ class Sensor:
     def __post_init__(self) -> None:
         count("Sensor.delay", self.delay, 0)
         count("Sensor.every", self.every, 1)
-        part("Sensor.dropout", self.dropout)
+        fraction("Sensor.dropout", self.dropout)
 
     def start(self, space: TangentSpace, random: np.random.Generator) -> Reader:
         """A function of (k, x_k) that gives what arrives at step k, None where nothing does."""

@@ -136,8 +136,8 @@ def fixed_contact_plant(
         return Refusal("parameters are applied that are not the model's own")
     tree = tree_for(model)
     if tree is None:
-        found = tree_of(model)
-        return found if isinstance(found, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
+        result = tree_of(model)
+        return result if isinstance(result, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
     if tree.coupling is not None:
         return Refusal("its mimic joints are reduced")
     random, here, n = np.random.default_rng(2), model.double.state(), model.nv

@@ -237,7 +237,7 @@ def center_of_mass(model: Model) -> OfState:
     def center(x: Any) -> Any:
         if _is_symbolic(x):
             return _tree_of(model, BALANCE).center_of_mass(x)
-        twin, _ = _at(model, BALANCE, x)
+        twin, _ = _twin_at(model, BALANCE, x)
         return np.array(twin.plant.CalcCenterOfMassPositionInWorld(twin.context))
 
     return recorded(center, "center_of_mass")
@@ -273,7 +273,7 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
     index = known[body].index()
 
     def force(x: Any, u: Any) -> Any:
-        twin, (x, u) = _at(model, model.other_quantities, x, u)
+        twin, (x, u) = _twin_at(model, model.other_quantities, x, u)
         advance(twin, x, u)
         total = np.array([twin.scalar(0.0)] * 3)
         for a, b, on_a, _ in contact_forces(twin):
@@ -316,7 +316,7 @@ def _pose(model: Model, x: Any, here: FrameIndex, base: FrameIndex) -> tuple[Any
         tree = _tree_of(model, PLACE)
         moving, origin = (tree.frame(x, model.plant.get_frame(i)) for i in (here, base))
         return origin.R.T @ moving.R, origin.R.T @ (moving.p - origin.p)
-    twin, _ = _at(model, PLACE, x)
+    twin, _ = _twin_at(model, PLACE, x)
     pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
     return pose.rotation().matrix(), pose.translation()
 
@@ -326,14 +326,14 @@ def _velocities(model: Model, x: Any, here: FrameIndex, point: Any) -> tuple[Any
     if _is_symbolic(x):
         moving = _tree_of(model, PLACE).frame(x, model.plant.get_frame(here), speeds=True).shifted(np.eye(3), point)
         return moving.w, moving.v
-    twin, _ = _at(model, PLACE, x)
+    twin, _ = _twin_at(model, PLACE, x)
     frame = twin.plant.get_frame(here)
     arm = frame.CalcPose(twin.context, twin.plant.world_frame()).rotation().matrix() @ point
     velocity = frame.CalcSpatialVelocityInWorld(twin.context).Shift(arm)
     return velocity.rotational(), velocity.translational()
 
 
-def _at(model: Model, depends_on: frozenset[str], x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:
+def _twin_at(model: Model, depends_on: frozenset[str], x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:
     """The twin for these numbers, its state set to `x`, and x and the inputs as its scalars.
 
     InputError where parameters are applied that the result would depend on.

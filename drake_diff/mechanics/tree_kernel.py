@@ -86,9 +86,9 @@ def _turned(R: Array, axis: Array, angle: float, out: Array) -> None:
 
 
 @compiled
-def _orientation(q: Array, at: int, out: Array) -> None:
-    """Of a quaternion (w, x, y, z) of any norm that begins at q[at]."""
-    w, x, y, z = q[at], q[at + 1], q[at + 2], q[at + 3]
+def _orientation(q: Array, start: int, out: Array) -> None:
+    """Of a quaternion (w, x, y, z) of any norm that begins at q[start]."""
+    w, x, y, z = q[start], q[start + 1], q[start + 2], q[start + 3]
     d = 2.0 / (w * w + x * x + y * y + z * z)
     out[0, 0], out[0, 1], out[0, 2] = 1 - d * (y * y + z * z), d * (x * y - w * z), d * (x * z + w * y)
     out[1, 0], out[1, 1], out[1, 2] = d * (x * y + w * z), 1 - d * (x * x + z * z), d * (y * z - w * x)
@@ -106,7 +106,7 @@ def _axis_through(S: Array, i: int, axis: Array, p: Array) -> None:
 
 @compiled
 def _through_joint(
-    kind: int, local: Array, q: Array, at: int, R: Array, p: Array, R_child: Array, p_child: Array, S: Array, v: int
+    kind: int, local: Array, q: Array, start: int, R: Array, p: Array, R_child: Array, p_child: Array, S: Array, v: int
 ) -> None:
     """The frame after a joint with the axis `local` (3,), (R, p) being that before it, and its motions from S[v] on."""
     for a in range(3):
@@ -115,9 +115,9 @@ def _through_joint(
             R_child[a, b] = R[a, b]
     if kind == FREE:
         axis = np.zeros(3)
-        _orientation(q, at, R_child)
+        _orientation(q, start, R_child)
         for a in range(3):
-            p_child[a] = q[at + 4 + a]
+            p_child[a] = q[start + 4 + a]
         for a in range(3):
             axis[a] = 1.0
             _axis_through(S, v + a, axis, p_child)
@@ -128,17 +128,17 @@ def _through_joint(
         for a in range(3):
             axis[a] = R[a, 0] * local[0] + R[a, 1] * local[1] + R[a, 2] * local[2]
         if kind == HINGE:
-            _turned(R, local, q[at], R_child)
+            _turned(R, local, q[start], R_child)
             _axis_through(S, v, axis, p)
         else:
             for a in range(3):
                 S[v, 3 + a] = axis[a]
-                p_child[a] = p[a] + q[at] * axis[a]
+                p_child[a] = p[a] + q[start] * axis[a]
 
 
 @compiled
-def _add_inertia(m: float, center: Array, inertia: Array, X: Array, own: Array) -> None:
-    """Add a link's inertia where its pose is X (3, 4) to own (10,).
+def _add_inertia(m: float, center: Array, inertia: Array, X: Array, out: Array) -> None:
+    """Add a link's inertia where its pose is X (3, 4) to out (10,).
 
     That is mass, moment of mass (3) and xx yy zz xy xz yz about the world's origin.
     """
@@ -146,32 +146,32 @@ def _add_inertia(m: float, center: Array, inertia: Array, X: Array, own: Array) 
     for a in range(3):
         c[a] = X[a, 0] * center[0] + X[a, 1] * center[1] + X[a, 2] * center[2] + X[a, 3]
         squared += c[a] * c[a]
-    own[0] += m
+    out[0] += m
     for a in range(3):
-        own[1 + a] += m * c[a]
-        own[4 + a] += m * (squared - c[a] * c[a]) + _rotated(X, inertia, a, a)
-    own[7] += _rotated(X, inertia, 0, 1) - m * c[0] * c[1]
-    own[8] += _rotated(X, inertia, 0, 2) - m * c[0] * c[2]
-    own[9] += _rotated(X, inertia, 1, 2) - m * c[1] * c[2]
+        out[1 + a] += m * c[a]
+        out[4 + a] += m * (squared - c[a] * c[a]) + _rotated(X, inertia, a, a)
+    out[7] += _rotated(X, inertia, 0, 1) - m * c[0] * c[1]
+    out[8] += _rotated(X, inertia, 0, 2) - m * c[0] * c[2]
+    out[9] += _rotated(X, inertia, 1, 2) - m * c[1] * c[2]
 
 
 @compiled
-def _place(t: Tree, q: Array, poses: Array, S: Array, own: Array) -> None:
+def _forward_kinematics(t: Tree, q: Array, poses: Array, S: Array, inertias: Array) -> None:
     """The links' poses (L, 3, 4), the motions S (nv, 6), and the inertia (J, 10) that each joint carries itself."""
     R, p, R_child, p_child = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     R_world, p_world = np.eye(3), np.zeros(3)
-    S[:], own[:] = 0.0, 0.0
+    S[:], inertias[:] = 0.0, 0.0
     for i in range(len(t.kind)):
         up, j = t.link_parent[i], t.joint[i]
         if up < 0:
             _compose(R_world, p_world, t.frame[i], R, p)
         else:
             _compose(poses[up, :, :3], poses[up, :, 3], t.frame[i], R, p)
-        at, v = t.q_start[i], t.v_start[i]
-        _through_joint(t.kind[i], t.axis[i], q, at, R, p, R_child, p_child, S, v)
+        start, v = t.q_start[i], t.v_start[i]
+        _through_joint(t.kind[i], t.axis[i], q, start, R, p, R_child, p_child, S, v)
         _compose(R_child, p_child, t.back[i], poses[i, :, :3], poses[i, :, 3])
         if j >= 0:
-            _add_inertia(t.mass[i], t.center[i], t.inertia[i], poses[i], own[j])
+            _add_inertia(t.mass[i], t.center[i], t.inertia[i], poses[i], inertias[j])
 
 
 @compiled
@@ -270,7 +270,7 @@ def differentiate_tree(
     """
     nv, J = v.shape[1], len(t.parent)
     parent, first, size = t.parent, t.first, t.size
-    own, carried, work = np.empty((J, 10)), np.empty((J, 10)), np.empty((4, 6))
+    inertias, carried, work = np.empty((J, 10)), np.empty((J, 10)), np.empty((4, 6))
     V, A, F, B = np.empty((J + 1, 6)), np.empty((J + 1, 6)), np.empty((J, 6)), np.empty((J, 6, 6))
     before, P, Q, T = np.empty((nv, 6)), np.empty((nv, 6)), np.empty((nv, 6)), np.empty((nv, 6))
     S_I, S_B, of_q, of_v = np.empty((1, 6)), np.empty(6), np.empty((1, 6)), np.empty((1, 6))
@@ -279,7 +279,7 @@ def differentiate_tree(
         A[J, 3 + i] = -t.gravity[i]
     for n in range(len(q)):
         S = motions[n]
-        _place(t, q[n], poses[n], S, own)
+        _forward_kinematics(t, q[n], poses[n], S, inertias)
         for j in range(J):
             up = parent[j] if parent[j] >= 0 else J
             for i in range(6):
@@ -292,12 +292,12 @@ def differentiate_tree(
                     V[j, i] += S[s, i] * v[n, s]
                     A[j, i] += S[s, i] * a[n, s] + before[s, i] * v[n, s]
             for i in range(10):
-                carried[j, i] = own[j, i]
-            _times(own, j, A, j, F, j)
-            _times(own, j, V, j, S_I, 0)
+                carried[j, i] = inertias[j, i]
+            _times(inertias, j, A, j, F, j)
+            _times(inertias, j, V, j, S_I, 0)
             _add_cross_force(V, j, S_I, 0, F, j)
             if derivatives:
-                _force_rates(own, j, V, S_I, B, work)
+                _force_rates(inertias, j, V, S_I, B, work)
         for j in range(J - 1, -1, -1):
             up = parent[j]
             if up >= 0:
@@ -371,9 +371,9 @@ def _factor(M: Array) -> bool:
             M[i, j] = total  # L times D
         d = M[i, i]
         for j in range(i):
-            part = M[i, j]
-            M[i, j] = part / M[j, j]
-            d -= part * M[i, j]
+            entry = M[i, j]
+            M[i, j] = entry / M[j, j]
+            d -= entry * M[i, j]
         if not d > 0:
             return False
         M[i, i] = d
@@ -505,10 +505,10 @@ def differentiate_acceleration(
             for c in range(n):
                 by_q[k, i, c], by_v[k, i, c] = 0.0, 0.0
             for j in range(n):
-                part = inverse[k, i, j]
+                entry = inverse[k, i, j]
                 for c in range(n):
-                    by_q[k, i, c] -= part * tau_q[0, j, c]
-                    by_v[k, i, c] -= part * tau_v[0, j, c]
+                    by_q[k, i, c] -= entry * tau_q[0, j, c]
+                    by_v[k, i, c] -= entry * tau_v[0, j, c]
 
 
 @compiled
@@ -531,7 +531,7 @@ def roll(
     nx = xs.shape[1]
     n, J, h = nx // 2, len(tree.parent), forces.time_step
     parent, first = tree.parent, tree.first
-    poses, S, own = np.empty((len(tree.kind), 3, 4)), np.empty((n, 6)), np.empty((J, 10))
+    poses, S, inertias = np.empty((len(tree.kind), 3, 4)), np.empty((n, 6)), np.empty((J, 10))
     V, A, F, momentum = np.empty((J + 1, 6)), np.empty((J + 1, 6)), np.empty((J, 6)), np.empty((1, 6))
     M, a = np.zeros((n, n)), np.empty((n, 1))
     V[J], A[J] = 0.0, 0.0  # the world's
@@ -548,7 +548,7 @@ def roll(
             elif u >= bounds.highest[i]:
                 u = bounds.upper[i]
             us[k, i] = u
-        _place(tree, x[:n], poses, S, own)
+        _forward_kinematics(tree, x[:n], poses, S, inertias)
         for j in range(J):
             s, up = first[j], parent[j] if parent[j] >= 0 else J
             speed = x[n + s]
@@ -558,8 +558,8 @@ def roll(
             for i in range(6):
                 V[j, i] += S[s, i] * speed
                 A[j, i] += momentum[0, i] * speed
-            _times(own, j, A, j, F, j)
-            _times(own, j, V, j, momentum, 0)
+            _times(inertias, j, A, j, F, j)
+            _times(inertias, j, V, j, momentum, 0)
             _add_cross_force(V, j, momentum, 0, F, j)
         for j in range(J - 1, -1, -1):
             s, up = first[j], parent[j]
@@ -567,7 +567,7 @@ def roll(
             for i in range(nu):
                 total += forces.actuation[s, i] * min(max(us[k, i], -forces.limit[i]), forces.limit[i])
             a[s, 0] = total
-            _times(own, j, S, s, momentum, 0)
+            _times(inertias, j, S, s, momentum, 0)
             M[s, s] = _dot(momentum, 0, S, s) + forces.armature[s]
             above = up
             while above >= 0:
@@ -576,7 +576,7 @@ def roll(
                 above = parent[above]
             if up >= 0:
                 for i in range(10):
-                    own[up, i] += own[j, i]
+                    inertias[up, i] += inertias[j, i]
                 for i in range(6):
                     F[up, i] += F[j, i]
         if not _factor(M):

@@ -49,7 +49,7 @@ class EquationsOfMotion:
     def values(self, knots: Array) -> Array:
         """(K, nx) dx/dt at `knots` (K, nx + nu), rows [x, u]; NaN where a knot is not finite."""
         if len(knots) == 1:
-            return self._at(knots[0])[None]
+            return self._rates_at(knots[0])[None]
         model, twin = self.model, self.model.double
         finite = np.isfinite(knots).all(axis=1)
         rates, still = np.full((len(knots), model.nx), np.nan), np.zeros(model.nv)
@@ -66,7 +66,7 @@ class EquationsOfMotion:
         rates[finite, model.nq :] = np.linalg.solve(mass, force[..., None])[finite, :, 0]
         return rates
 
-    def _at(self, knot: Array) -> Array:
+    def _rates_at(self, knot: Array) -> Array:
         """(nx,) dx/dt at one `knot`, without the arrays of many."""
         twin, nx, nq = self.model.double, self.model.nx, self.model.nq
         if not np.isfinite(knot).all():

@@ -96,7 +96,7 @@ def read_meshes(meshes: FileMeshes, xml: XmlText, path: Path, packages: PackageM
         mesh = next(element.iter("mesh"), None)
         if mesh is not None:
             try:
-                _change(meshes, xml, element, mesh, _place(_uri(mesh), path, packages))
+                _change(meshes, xml, element, mesh, _resolve_uri(_uri(mesh), path, packages))
             except ModelError as error:
                 raise ModelError(f"{path}:{mesh.line}: {error}") from error
 
@@ -225,7 +225,7 @@ def _file(location: Path | None) -> Path | None:
     return None if location is None else in_any_case(location) or in_any_case(Path(unquote(str(location))))
 
 
-def _place(uri: str, path: Path, packages: PackageMap) -> Path | None:
+def _resolve_uri(uri: str, path: Path, packages: PackageMap) -> Path | None:
     """Where `uri` leads, letter by letter; None where that is not on this disk."""
     package = re.match(r"(?:package|model)://+([^/]+)/(.*)", uri, re.DOTALL)
     if not package:
@@ -300,7 +300,7 @@ def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMe
             between = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet(became), pg.GeometrySet(filtered))
             scene_graph.collision_filter_manager().Apply(between)
         known += became[1:]
-    return [_told(became_other, meshes.treatment)] if became_other else []
+    return [_describe_meshes(became_other, meshes.treatment)] if became_other else []
 
 
 def _put_back(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMeshes) -> None:
@@ -350,7 +350,7 @@ def _put_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: An
     ]
 
 
-def _told(meshes: list[CollisionMesh], treatment: str) -> str:
+def _describe_meshes(meshes: list[CollisionMesh], treatment: str) -> str:
     """One sentence for all meshes, and one for each kind of link, those that are met worst first."""
     kinds: dict[tuple[Path, Scale], list[str]] = {}
     for mesh in meshes:

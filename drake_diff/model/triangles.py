@@ -129,7 +129,7 @@ def _read(path: Path, _changed: int, _size: int) -> Triangles:
     try:
         data, beside = BytesIO(path.read_bytes()), _Materials(path.parent)
         scene: Any = trimesh.load_scene(data, file_type=kind[1:], resolver=beside, process=False)
-        nodes = [_part(scene, node, coloured=kind != ".stl") for node in scene.graph.nodes_geometry]
+        nodes = [_mesh_of_node(scene, node, coloured=kind != ".stl") for node in scene.graph.nodes_geometry]
     except Exception as error:  # a reader of strangers' files raises whatever it runs into
         message = str(error) or type(error).__name__
         raise ModelError(f"{path}: expected a mesh that can be read; trimesh says: {message}") from error
@@ -178,7 +178,7 @@ class _Materials:
         return path.read_bytes()
 
 
-def _part(scene: Any, node: str, *, coloured: bool) -> Triangles | None:
+def _mesh_of_node(scene: Any, node: str, *, coloured: bool) -> Triangles | None:
     """A mesh of a scene in the scene's frame, in metres; None for what is no mesh (lines, points)."""
     X, name = scene.graph[node]
     mesh = scene.geometry[name]

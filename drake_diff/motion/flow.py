@@ -71,11 +71,11 @@ class FlowSystem(System):
     def push(self, pairs: Pairs) -> None:
         super().push(pairs)
         if pairs not in self._parts:
-            part = self.plant.part(pairs)
+            functions = self.plant.part(pairs)
             self._parts[pairs] = (
-                _bind(part.rates, self._point, (self._rates,)),
-                _bind(part.slopes, self._point, (self._rates, self._slopes)),
-                _bind(part.step, (*self._point, self._h), (self._ahead, self._rates, self._summary)),
+                _bind(functions.rates, self._point, (self._rates,)),
+                _bind(functions.slopes, self._point, (self._rates, self._slopes)),
+                _bind(functions.step, (*self._point, self._h), (self._ahead, self._rates, self._summary)),
             )
         self._run_rates, self._run_slopes, self._run_step = self._parts[pairs]
 
@@ -264,7 +264,7 @@ class FlowSteps:
             for change in (next(changes) for _ in steps):
                 total = change[:, :nx] @ total
                 total[:, nx:] += change[:, nx:]
-            A, B, C = (frozen(part) for part in np.split(total, [nx, nx + nu], axis=1))
+            A, B, C = (frozen(block) for block in np.split(total, [nx, nx + nu], axis=1))
             reason, sources = f"the flow by {len(steps)} steps", (METHOD,) * len(names)
             derivatives.append(StepDerivatives(frozen(steps[-1].ahead), A, B, C, names, sources, METHOD, reason))
         return derivatives

@@ -158,7 +158,7 @@ class _Stages:
             try:
                 xs = roll_states(softer.model, x0, us)
                 result, xs, us = solve_ilqr(softer, xs, us, limits=short, report=self.report, patience=PATIENCE)
-                x0, outcome, record = xs[0], result.outcome, _told(softer, result, xs, us)
+                x0, outcome, record = xs[0], result.outcome, _stage_record(softer, result, xs, us)
             except (GradientError, SimulationError) as error:
                 outcome, record = Outcome.NO_GRADIENT, (f"refused: {error}", 0, None, None, None)
             self.log(contact.distance, contact.stiffness, *record, kind="softened")
@@ -221,7 +221,7 @@ class _Stages:
             outcome = Outcome.NO_GRADIENT if isinstance(error, GradientError) else Outcome.DIVERGED
             message = f"iLQR: the motion that the stages lead to is refused on the true plant: {error}"
             return NlpResult(self.us.ravel(), outcome, message, ())
-        self.log(None, None, *_told(problem, result, xs, us))
+        self.log(None, None, *_stage_record(problem, result, xs, us))
         if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
             result = replace(result, message=result.message + where_it_jumps(problem, xs))
         self.xs, self.us = xs, us
@@ -336,7 +336,7 @@ def follow(problem: Problem, xs: Array, us: Array, weight: float) -> tuple[Array
     return (states, inputs) if np.all(np.isfinite(states)) else None
 
 
-def _told(
+def _stage_record(
     problem: Problem, result: NlpResult, xs: Array, us: Array
 ) -> tuple[str, int, float | None, float | None, float | None]:
     """Status, iterations, cost, goal error and gradient of a stage, for its log."""

@@ -345,15 +345,15 @@ class _Function:
         self.timed = cost if isinstance(cost, TimedCost) else None
         self.nx, self.n = nx, nx + nu
 
-        def of(x: Any, rest: Any) -> Any:
+        def evaluate(x: Any, rest: Any) -> Any:
             if self.timed is not None:
                 return self.timed.of(x, rest[:nu], rest[nu:])
             return cost(x, rest) if nu else cost(x)
 
-        self.of, self.mapped = of, None
+        self.evaluate, self.mapped = evaluate, None
         knots = self._with_known(probe, np.zeros(len(probe)))
         with np.errstate(all="ignore"):
-            function = trace(of, nx, knots, self._called(knots)[:, None])
+            function = trace(evaluate, nx, knots, self._called(knots)[:, None])
         if isinstance(function, Refusal):
             return
         z, known = ca.SX.sym("z", self.n), ca.SX.sym("known", knots.shape[1] - self.n)
@@ -369,7 +369,7 @@ class _Function:
         return knots if self.timed is None else np.hstack([knots, self.timed.known_at(times)])
 
     def _called(self, rows: Array) -> Array:
-        return np.array([float(self.of(row[: self.nx], row[self.nx :])) for row in rows])
+        return np.array([float(self.evaluate(row[: self.nx], row[self.nx :])) for row in rows])
 
     def values(self, knots: Array, times: Array) -> Array:
         rows = self._with_known(knots, times)
@@ -386,7 +386,7 @@ class _Function:
         for k, (z, row) in enumerate(zip(knots, rows, strict=True)):
 
             def at_knot(z: Any, known: Array = row[self.n :]) -> Any:
-                return self.of(z[: self.nx], np.concatenate([z[self.nx :], known]))
+                return self.evaluate(z[: self.nx], np.concatenate([z[self.nx :], known]))
 
             gradients[k] = differentiate_final_cost(at_knot, z)[1]
             hessians[k] = final_cost_hessian(at_knot, z)

@@ -67,11 +67,11 @@ class LiveSearch:
                 report.callback(row)
 
         def line(text: str) -> None:
-            self._told(line=text)
+            self._update_page(line=text)
             report.say(text)
 
         def plan(plan: Any) -> None:
-            self._told(state="measuring", line="a search has ended, and its plan is measured")
+            self._update_page(state="measuring", line="a search has ended, and its plan is measured")
             if report.plan is not None:
                 report.plan(plan)
 
@@ -88,7 +88,7 @@ class LiveSearch:
         if self.page is None:
             return
         self.page.add(self.number, row.iteration, row.objective, row.primal_infeasibility)
-        self._told(state="searching")
+        self._update_page(state="searching")
         if not self.is_due() or len(row.motions) != 1 or not np.all(np.isfinite(row.motions[0].xs)):
             return
         begin = time.monotonic()
@@ -104,7 +104,7 @@ class LiveSearch:
             with np.errstate(over="ignore", invalid="ignore"):  # of motions that leave every finite number
                 self.page.show(self.number, scene(), end=end)
         except Exception as error:  # whatever Drake says of a state: nobody asked for a search to end by it
-            self._told(line=f"the motion cannot be drawn: {type(error).__name__}: {error}")
+            self._update_page(line=f"the motion cannot be drawn: {type(error).__name__}: {error}")
 
     def _scene(self, motion: Iterate) -> Scene:
         """Of some of its states, which are enough to see it by."""
@@ -117,7 +117,7 @@ class LiveSearch:
                 for index, points in zip(seen, motion.contacts_in(knots[seen].tolist()), strict=True):
                     contacts[index] = points
             except DrakeDiffError as error:
-                self._told(line=f"contact forces are not drawn: {error}")
+                self._update_page(line=f"contact forces are not drawn: {error}")
         with applied(self.problem.parameters.at(parameters)) as model:
             xs, us, shown = (
                 motion.xs[knots],
@@ -138,7 +138,7 @@ class LiveSearch:
         try:
             yield start
         except BaseException as error:
-            self._told(state="ended by an error", verdict="fail", message=f"{type(error).__name__}: {error}")
+            self._update_page(state="ended by an error", verdict="fail", message=f"{type(error).__name__}: {error}")
             raise
 
     def end(self, solution: Solution) -> None:
@@ -149,16 +149,16 @@ class LiveSearch:
         state = solution.status
         open_ = (Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT, Status.ITERATION_LIMIT)
         verdict = "pass" if solution.success else "open" if state in open_ else "fail"
-        self._told(state=state.value, verdict=verdict, message=solution.message)
+        self._update_page(state=state.value, verdict=verdict, message=solution.message)
         self.page.wait()
 
     def _scene_at_the_end(self, solution: Solution) -> Scene:
         scene = scene_of_plan(solution, _shown(solution))
         colours = colours_of(plan=bool(scene.ghosts), contacts=any(scene.contacts), thrusts=any(scene.thrusts))
-        self._told(colours=[*colours, *meaning_of(self.problem.goals)])
+        self._update_page(colours=[*colours, *meaning_of(self.problem.goals)])
         return scene
 
-    def _told(self, **facts: Any) -> None:
+    def _update_page(self, **facts: Any) -> None:
         if self.page is not None:
             self.page.tell(self.number, **facts)
 

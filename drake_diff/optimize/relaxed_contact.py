@@ -209,7 +209,7 @@ def _of_one_tree(pairs: ContactPairs, rows: Array, topology: Topology) -> NDArra
     return np.asarray(first[pairs.sphere_body] == first[pairs.other_body])
 
 
-def _part(pairs: ContactPairs, mask: NDArray[np.bool_]) -> ContactPairs:
+def _select_pairs(pairs: ContactPairs, mask: NDArray[np.bool_]) -> ContactPairs:
     ids = tuple(pair for pair, keep in zip(pairs.ids, mask, strict=True) if keep)
     arrays = {f.name: getattr(pairs, f.name)[mask] for f in fields(pairs) if f.name not in ("bodies", "ids")}
     return replace(pairs, ids=ids, **arrays)
@@ -234,7 +234,7 @@ def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
     all_pairs = read_pairs(model)
     names = [labels[body.index()] for body in all_pairs.bodies]
     rows = np.array([topology.bodies[name] for name in names]).reshape(-1, model.nv)
-    pairs = _part(all_pairs, ~_of_one_tree(all_pairs, rows, topology))
+    pairs = _select_pairs(all_pairs, ~_of_one_tree(all_pairs, rows, topology))
     return RelaxedPlant(
         model=model,
         tree=tree,
@@ -451,9 +451,9 @@ class RelaxedSearch:
 
     def _sizes(self, hessians: Array, first: Array, second: Array) -> Array:
         """(nv,) the mean curvature of the cost by one q_k alone, which changes v_k and v_(k+1) too."""
-        none, one = np.zeros_like(first), np.broadcast_to(np.eye(self.nv), first.shape)
+        none, identity = np.zeros_like(first), np.broadcast_to(np.eye(self.nv), first.shape)
         after, beyond = np.concatenate([first[1:], none[:1]]), np.zeros((1, *hessians.shape[1:]))
-        moved = (none, none, second), (one, second, after), (none, after, none)
+        moved = (none, none, second), (identity, second, after), (none, after, none)
         blocks = zip(moved, (hessians[:-1], hessians[1:], np.concatenate([hessians[2:], beyond])), strict=True)
         parts = ((np.concatenate(by_q, axis=1), block) for by_q, block in blocks)
         size = sum(np.einsum("kia,kij,kja->a", by_q, block, by_q, optimize=True) for by_q, block in parts) / self.count

@@ -387,7 +387,7 @@ class Run:
         variables = ShootingVariables(self.problem, around=ends)
         try:
             with until_set(interrupted):
-                xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values), found=False)
+                xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values), solved=False)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us), error)
         xs = first_states if around else xs
@@ -404,7 +404,7 @@ class Run:
                 drawn = variables.states(z), variables.unpack(z)[1]
                 self._offer(self._draft(*drawn, **self._design_of(variables, z)), result)
             after_search()
-            xs, us, after, blindness = self._look_at(variables, z, found=True)
+            xs, us, after, blindness = self._look_at(variables, z, solved=True)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us, certificates=before), error)
         if result.note:
@@ -508,11 +508,11 @@ class Run:
         return Solution(*by, frozen(xs), frozen(us), **fields)
 
     def _look_at(
-        self, variables: ShootingVariables, z: Array, *, found: bool
+        self, variables: ShootingVariables, z: Array, *, solved: bool
     ) -> tuple[Array, Array, tuple[Certificate, ...], str]:
         """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach.
 
-        Of what a search `found` these are the steps that tell most.
+        Where z was `solved` for, these are the steps that tell most.
         """
         us = variables.unpack(z)[1]
         xs, parameters = variables.states(z), variables.parameters(z).to_dict()
@@ -522,7 +522,7 @@ class Run:
 
         keys: dict[int, bytes] = {}
         if self.problem.motion == STEPS:  # else see `slope`, of the whole plan
-            knots = telling_knots(self.problem, xs[: len(us) + 1]) if found else first_knots(us)
+            knots = telling_knots(self.problem, xs[: len(us) + 1]) if solved else first_knots(us)
             keys = {k: xs[k].tobytes() + us[k].tobytes() + repr(parameters).encode() for k in knots.tolist()}
         # That of a search which ends where it began is known.
         new = [k for k, key in keys.items() if key not in self.certified]

@@ -99,7 +99,7 @@ class _Arrows:
             turned = RollPitchYaw(np.pi, 0.0, 0.0)
             meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(turned, [0.0, 0.0, 4 * radius]))
 
-    def place(self, meshcat: Meshcat, k: int, time: float | None) -> None:
+    def show_step(self, meshcat: Meshcat, k: int, time: float | None) -> None:
         """The forces in the step from state k, or in the last step."""
         step = self.steps[min(k, len(self.steps) - 1)] if self.steps else ()
         pushing = [item for item in step if np.linalg.norm(item.force) > 0]
@@ -175,7 +175,7 @@ class Stills:
             if arrows.slots > self.made[root]:
                 arrows.make(self.meshcat, radius)
             self.made[root] = max(self.made[root], arrows.slots)
-            arrows.place(self.meshcat, 0, None)
+            arrows.show_step(self.meshcat, 0, None)
             for slot in range(arrows.slots, self.made[root]):
                 self.meshcat.SetProperty(f"{root}/{slot}", "visible", False)
 
@@ -205,9 +205,9 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
     rate = (len(frames) - 1) / float(scene.times[-1])
     meshcat.StartRecording(frames_per_second=rate, set_visualizations_while_recording=False)
     for time, k in frames:
-        _place(meshcat, motions, arrows, k, time)
+        _show_state(meshcat, motions, arrows, k, time)
     meshcat.StopRecording()
-    _place(meshcat, motions, arrows, 0, None)  # what is seen before play
+    _show_state(meshcat, motions, arrows, 0, None)  # what is seen before play
     animation = meshcat.get_mutable_recording()
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     animation.set_repetitions(REPETITIONS)
@@ -304,7 +304,7 @@ def _only(poses: Poses, shaped: set[str]) -> Poses:
     return {path: result for path, result in poses.items() if path in shaped}
 
 
-def _place(
+def _show_state(
     meshcat: Meshcat, motions: Mapping[str, Poses], arrows: Sequence[_Arrows], k: int, time: float | None
 ) -> None:
     """Bodies and ghosts as in state k, and the forces of the step from there."""
@@ -312,7 +312,7 @@ def _place(
         for path, result in poses.items():
             meshcat.SetTransform(f"{root}/{path}", result[k], time_in_recording=time)
     for some in arrows:
-        some.place(meshcat, k, time)
+        some.show_step(meshcat, k, time)
 
 
 def camera_of(scene: Scene) -> tuple[Array, Array]:

@@ -160,8 +160,8 @@ def _skeleton(plant: Any, context: Any, drawn: Sequence[Any], bare: Sequence[Any
     result = {}
     for body in [b for b in bare if int(b.index()) in seen] or bare:
         index, path = int(body.index()), body_path(body)
-        start = next((_place(j.frame_on_child(), context) for j, _, child in tree if child == index), np.zeros(3))
-        ends = [_place(j.frame_on_parent(), context) for j, parent, c in tree if parent == index and c in seen]
+        start = next((_origin(j.frame_on_child(), context) for j, _, child in tree if child == index), np.zeros(3))
+        ends = [_origin(j.frame_on_parent(), context) for j, parent, c in tree if parent == index and c in seen]
         if not ends and body.default_mass() > 0:
             ends = [np.asarray(body.default_com())]
         ends = [end for end in ends if np.linalg.norm(end - start) > SHORTEST_BONE * size]
@@ -170,7 +170,7 @@ def _skeleton(plant: Any, context: Any, drawn: Sequence[Any], bare: Sequence[Any
     return result
 
 
-def _place(frame: Any, context: Any) -> Array:
+def _origin(frame: Any, context: Any) -> Array:
     """(3,) where a frame is on its body."""
     return np.asarray(frame.CalcPoseInBodyFrame(context).translation())
 

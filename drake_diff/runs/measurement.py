@@ -109,8 +109,8 @@ class Measurement(ShowsItsRepr):
     def __str__(self) -> str:
         broken = [m.name for m in (*self.metrics, *self.invariants) if m.verdict in ("fail", "undecided")]
         decided = sum(m.verdict != "info" for m in (*self.metrics, *self.invariants))
-        kept = f"{decided - len(broken)} of {decided} bounds are kept"
-        return f"{self.solution.status.value}: {kept}" + (f", not those of {', '.join(broken)}" if broken else "")
+        summary = f"{decided - len(broken)} of {decided} bounds are kept"
+        return f"{self.solution.status.value}: {summary}" + (f", not those of {', '.join(broken)}" if broken else "")
 
     def __repr__(self) -> str:
         lines = [f"Measurement: {self}", *(f"{f.label}: {f.message}" for f in self.failures)]

@@ -163,9 +163,9 @@ def _of_goal(goal: goals.Goal, problem: Problem, times: Array) -> str:
 def _act(goal: goals.Goal) -> str:
     if isinstance(goal, goals.FrameGoal):
         turned = " turned as asked" if goal.rotation is not None else ""
-        return f"bring {goal.frame}{turned}" + (f" to {_place(goal.position)}" if goal.position is not None else "")
+        return f"bring {goal.frame}{turned}" + (f" to {_position(goal.position)}" if goal.position is not None else "")
     if isinstance(goal, goals.CenterOfMassGoal):
-        return f"bring its centre of mass to {_place(goal.position)}"
+        return f"bring its centre of mass to {_position(goal.position)}"
     if isinstance(goal, goals.FrameVelocityGoal):
         return f"have {goal.frame} move at a given velocity" if any(goal.velocity) else f"hold {goal.frame} still"
     if isinstance(goal, goals.JointGoal):
@@ -193,7 +193,7 @@ def _when(knots: Any, problem: Problem, times: Array) -> str:
     )
 
 
-def _place(position: Sequence[float | None]) -> str:
+def _position(position: Sequence[float | None]) -> str:
     if all(p is not None for p in position):
         return "(" + ", ".join(f"{p:.3g}" for p in position) + ") m"
     return " and ".join(f"{axis} = {p:.3g} m" for axis, p in zip("xyz", position, strict=True) if p is not None)

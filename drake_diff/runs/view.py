@@ -282,8 +282,8 @@ def _curves(record: PlanRecord, folder: Path) -> tuple[dict[str, _Curve], dict[s
 
     def curves(topic: str, parts: str, lower: list[Any], upper: list[Any]) -> dict[str, _Curve]:
         columns, metadata = log.arrays(topic), log.channel_metadata[topic]
-        values = np.hstack([columns[part] for part in parts])
-        pairs = [(name, metadata["units"][part][name]) for part in parts for name in metadata["names"][part]]
+        values = np.hstack([columns[symbol] for symbol in parts])
+        pairs = [(name, metadata["units"][symbol][name]) for symbol in parts for name in metadata["names"][symbol]]
         return {
             name: _Curve(unit, columns["time"], values[:, i], (lower[i], upper[i]))
             for i, (name, unit) in enumerate(pairs)
@@ -300,7 +300,7 @@ def _plots(group: str, names: Sequence[str], both: Sequence[dict[str, _Curve]], 
         known = [c for c in curves if c is not None]
         times = np.unique(np.concatenate([c.times for c in known]))
         lines = [
-            Line(name, np.full(len(times), np.nan) if c is None else _at(times, c, held), held=held)
+            Line(name, np.full(len(times), np.nan) if c is None else _curve_values(times, c, held), held=held)
             for name, c in zip(names, curves, strict=True)
         ]
         limits = known[0].limits if all(c.limits == known[0].limits for c in known) else (None, None)
@@ -310,7 +310,7 @@ def _plots(group: str, names: Sequence[str], both: Sequence[dict[str, _Curve]], 
         yield Plot(heading, unit, times, lines, limits=limits, percent=held and not odd, group=group)
 
 
-def _at(times: Array, curve: _Curve, held: bool) -> Array:
+def _curve_values(times: Array, curve: _Curve, held: bool) -> Array:
     """A curve at other times: along straight lines between its knots, or held from each; NaN after its end."""
     if held:
         result = curve.values[np.searchsorted(curve.times, times, side="right") - 1]
@@ -326,7 +326,7 @@ def _sentence(names: Sequence[str], states: Sequence[dict[str, _Curve]]) -> str:
     for name in shared:
         item, other = states[0][name], states[1][name]
         times = np.unique(np.concatenate([item.times, other.times]))
-        gap = np.abs(_at(times, item, False) - _at(times, other, False))
+        gap = np.abs(_curve_values(times, item, False) - _curve_values(times, other, False))
         if not np.any(np.isfinite(gap)):
             continue
         k = int(np.nanargmax(gap))

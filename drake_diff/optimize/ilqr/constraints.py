@@ -178,11 +178,11 @@ class _Rows:
 
     def values(self, xs: Array, us: Array) -> Array:
         """(size,)"""
-        return self._at("values", xs, us, self.constraint.along).ravel()
+        return self._cached("values", xs, us, self.constraint.along).ravel()
 
     def jacobians(self, xs: Array, us: Array) -> Array:
         """(knots, rows, nx + nu)"""
-        return self._at("jacobians", xs, us, self.constraint.slopes)
+        return self._cached("jacobians", xs, us, self.constraint.slopes)
 
     def scale(self, xs: Array, us: Array, spans: Array) -> Array:
         """(size,): one over the largest slope so far of each row by (x, u) / `spans` (nx + nu,), 1 if it has none."""
@@ -191,7 +191,7 @@ class _Rows:
         steep = self._steepest > SMALLEST_SLOPE
         return np.tile(np.where(steep, 1 / np.where(steep, self._steepest, 1.0), 1.0), len(self.knots))
 
-    def _at(self, what: str, xs: Array, us: Array, evaluate: Callable[[Array, Array], Array]) -> Array:
+    def _cached(self, what: str, xs: Array, us: Array, evaluate: Callable[[Array, Array], Array]) -> Array:
         key = xs.tobytes() + us.tobytes()
         if self._kept.get(what, (b"", xs))[0] != key:
             self._kept[what] = key, evaluate(xs[self.knots], us[np.minimum(self.knots, len(us) - 1)])

@@ -113,7 +113,7 @@ def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: fl
     F[:, nx:, nx : nx + nc] = np.eye(nc)
     gradients, hessians = np.zeros((count + 1, nx + nc + nu)), np.zeros((count + 1, nx + nc + nu, nx + nc + nu))
     gradients[:, columns], hessians[:, columns[:, None], columns] = model.gradients, model.hessians
-    own = np.arange(nx, nx + nc)
+    design_columns = np.arange(nx, nx + nc)
     if design.moves_step and problem.total_running_cost is not None:  # h(c) L(x, u): h is linear in c
         from drake_diff.optimize.knots import costs_of  # loads CasADi
 
@@ -121,18 +121,18 @@ def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: fl
         by_step[design.own_count] = 1.0
         slope = design.pull_back(c, by_step)
         costs = costs_of(problem, *motion.point, h)
-        gradients[:-1, own] = costs.values(*motion.point)[:-1, None] / h * slope
+        gradients[:-1, design_columns] = costs.values(*motion.point)[:-1, None] / h * slope
         across = costs.expand(*motion.point)[0][:-1, :, None] / h * slope
-        hessians[:-1, columns[:, None], own] += across
-        hessians[:-1, own[:, None], columns] += across.swapaxes(1, 2)
+        hessians[:-1, columns[:, None], design_columns] += across
+        hessians[:-1, design_columns[:, None], columns] += across.swapaxes(1, 2)
     if problem.parameter_cost is not None:
         cost = problem.parameter_cost
 
         def of_coordinates(coordinates: Any) -> Any:
             return cost(design.own_at(coordinates))
 
-        gradients[-1, own] = differentiate_final_cost(of_coordinates, c)[1]
-        hessians[-1, own[:, None], own] = final_cost_hessian(of_coordinates, c)
+        gradients[-1, design_columns] = differentiate_final_cost(of_coordinates, c)[1]
+        hessians[-1, design_columns[:, None], design_columns] = final_cost_hessian(of_coordinates, c)
     lower, upper = design.limits
     return replace(
         model,

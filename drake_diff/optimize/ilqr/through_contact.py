@@ -103,10 +103,10 @@ def solve_through_jumps(
     for _ in range(MOST_SEQUENCES):
         if holds and report:
             report.say("held: " + "; ".join(map(str, holds)))
-        kept = (*problem.constraints, *(hold.constraint(problem.model) for hold in holds))
+        constraints = (*problem.constraints, *(hold.constraint(problem.model) for hold in holds))
         left = max(limits.max_iterations - max(len(rows) - 1, 0), 1)
         result, xs, us = solve_ilqr(
-            replace(problem, constraints=kept),
+            replace(problem, constraints=constraints),
             xs,
             us,
             limits=replace(limits, time_limit=deadline - now(), max_iterations=left),

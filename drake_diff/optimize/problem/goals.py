@@ -236,7 +236,7 @@ class FrameGoal(Goal):
     def marks(self) -> tuple[Mark, ...]:
         label, centre = f"target of {self.frame}", _filled(self.position or FREE)
         axes = () if self.rotation is None else (Mark(label, "axes", (0.1,), centre, self.rotation),)
-        return axes if self.position is None else (*_place(label, self.position, self.tolerance), *axes)
+        return axes if self.position is None else (*_target_marks(label, self.position, self.tolerance), *axes)
 
 
 @dataclass(frozen=True, repr=False)
@@ -364,7 +364,7 @@ class CenterOfMassGoal(Goal):
         yield Target(center_of_mass(model), self.position, self.tolerance, "m", "centre of mass")
 
     def marks(self) -> tuple[Mark, ...]:
-        return _place("target of the centre of mass", self.position, self.tolerance)
+        return _target_marks("target of the centre of mass", self.position, self.tolerance)
 
 
 @dataclass(frozen=True, repr=False)
@@ -525,7 +525,7 @@ class WithGoals:
         return total
 
 
-def _place(label: str, position: Any, tolerance: float) -> tuple[Mark, ...]:
+def _target_marks(label: str, position: Any, tolerance: float) -> tuple[Mark, ...]:
     """A ball at a position, or a slab where some of its entries are free."""
     centre, free = _filled(position), [p is None for p in position]
     if any(free):

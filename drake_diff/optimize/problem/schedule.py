@@ -241,13 +241,13 @@ class _Soles:
 
     def values(self, xs: Array) -> list[tuple[Array, Array]]:
         """Heights (n,) [m] over the ground and slides (2 n,) [m/s] along it at each of xs (K, nx)."""
-        return self._at(xs, self._values)
+        return self._cached(xs, self._values)
 
     def slopes(self, xs: Array) -> list[tuple[Array, Array]]:
         """(n, nx) and (2 n, nx) the derivatives of the same."""
-        return self._at(xs, self._slopes)
+        return self._cached(xs, self._slopes)
 
-    def _at(self, xs: Array, evaluate: Callable[[Array, Soles], tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+    def _cached(self, xs: Array, evaluate: Callable[[Array, Soles], tuple[Array, Array]]) -> list[tuple[Array, Array]]:
         known = self.known[evaluate]
         for memory in (known, self.read):
             if len(memory) > KEPT:

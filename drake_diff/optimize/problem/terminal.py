@@ -150,7 +150,7 @@ class TerminalSet(Goal):
         key, known = (self, vector.names, vector.values.tobytes(), *sides), _KNOWN.setdefault(model, {})
         if key not in known:
             with applied(vector) as set_model:
-                known[key] = _found(self, set_model, bounds)
+                known[key] = _make_region(self, set_model, bounds)
         return known[key]
 
     def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
@@ -178,7 +178,7 @@ class TerminalConstraint(GoalConstraint):
     region: Any = None
 
 
-def _found(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
+def _make_region(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
     """The region of `asked`, by formula and then by sampling; InputError where there is none."""
     x_goal = finite_array("TerminalSet.x_goal", asked.x_goal, (model.nx,))
     if tangent_space(model).quaternions:

@@ -206,7 +206,7 @@ class SoftProgram:
         return Moves(
             dxs=np.concatenate([np.zeros((1, nx)), moves[:, nu:]]),
             dus=moves[:, :nu],
-            slacks=tuple(part.reshape(rows.lower.shape) for part, rows in slacks),
+            slacks=tuple(slack.reshape(rows.lower.shape) for slack, rows in slacks),
             multipliers=tuple(multipliers),
             bounds=by_variable[: count * n].reshape(count, n)[:, :nu],
             dynamics=-by_row[: count * nx].reshape(count, nx),

@@ -102,7 +102,7 @@ def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -
     )
     spans = problem.spans(xs, us)
 
-    def at(when: Array) -> tuple[Array, Array]:
+    def motion_at(when: Array) -> tuple[Array, Array]:
         held = np.clip(np.searchsorted(times, when, side="right") - 1, 0, len(us) - 1)
         return np.array([np.interp(when, times, column) for column in xs.T]).T, us[held]
 
@@ -113,8 +113,8 @@ def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -
         if c.knots is None:
             seen = every
             if _is_users(c):
-                seen = np.union1d(every, dense[_outside(c, *at(dense))])
-            moments, between, applied = _looked_at(c, seen, *at(seen), at)
+                seen = np.union1d(every, dense[_outside(c, *motion_at(dense))])
+            moments, between, applied = _looked_at(c, seen, *motion_at(seen), motion_at)
             excess = _excess(_values(c, between, applied), c.lower, c.upper)
             through = np.any(_depth(c, between, applied, excess, spans, c.scales(xs, us, spans))[1], axis=1)
             first = int(np.argmax(through))
@@ -206,17 +206,17 @@ def _of_constraint(motion: Collocated, c: Constraint, spans: Array) -> list[_Bey
     mask &= np.isfinite(xs).all(axis=1)  # where the dynamics lead nowhere, the check of their integration fails
     times, xs = times[mask], xs[mask]
 
-    def at(more: Array) -> tuple[Array, Array]:
+    def motion_at(more: Array) -> tuple[Array, Array]:
         return motion.at(more)[0], motion.applied_at(more)
 
     if _is_users(c):
         outside = _outside(c, motion.places.points.T[:, : xs.shape[1]], motion.places.points.T[:, xs.shape[1] :])
         more = np.setdiff1d(motion.places.times[outside], times)
         more = more[more > (times[0] if len(times) else 0.0)]
-        every, xs = np.concatenate([times, more]), np.vstack([xs, at(more)[0]])
+        every, xs = np.concatenate([times, more]), np.vstack([xs, motion_at(more)[0]])
         order = np.argsort(every)
         times, xs = every[order], xs[order]
-    times, xs, us = _looked_at(c, times, xs, motion.applied_at(times), at)
+    times, xs, us = _looked_at(c, times, xs, motion.applied_at(times), motion_at)
     values = _values(c, xs, us)
     if not len(values):
         row = _between("bound", f"{c.label} at no moment", np.inf, 0.0)

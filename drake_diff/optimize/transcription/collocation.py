@@ -79,14 +79,14 @@ class Collocated:
             us = parts * np.einsum("sj,sju->su", weights, inputs[k])
         else:
             ends = np.arange(parts * count + 1) / (parts * count)
-            us, (k, tau) = self.means(ends), self._place(ends[:-1])
+            us, (k, tau) = self.means(ends), self._locate(ends[:-1])
         return np.vstack([self.between(k, tau)[0], self.xs[-1]]), us
 
     def means(self, ends: Array) -> Array:
         """(M, nu) the mean inputs between `ends` (M+1,), fractions of the horizon, which may lie within intervals."""
         scheme, lengths = self.task.scheme, np.diff(self.mesh)[:, None]
         inputs = scheme.per_interval(self.nodes[:, self.task.dynamics.nx :])
-        k, tau = self._place(ends)
+        k, tau = self._locate(ends)
         whole = lengths * np.einsum("j,nju->nu", scheme.integrated(np.ones(1))[0], inputs)
         before = np.vstack([np.zeros(whole.shape[1]), np.cumsum(whole, axis=0)])[k]
         within = lengths[k] * np.einsum("sj,sju->su", scheme.integrated(tau), inputs[k])
@@ -214,7 +214,7 @@ class Collocated:
 
     def at(self, times: Any) -> tuple[Array, Array]:
         """xs (S, nx) and us (S, nu) at `times` (S,) [s] by the scheme's own polynomials."""
-        return self.between(*self._place(np.asarray(times, dtype=float) / self.horizon))
+        return self.between(*self._locate(np.asarray(times, dtype=float) / self.horizon))
 
     def on(self, mesh: Array, task: OptimalControl) -> Array:
         """(K, nx + nu) the motion at the nodes of a mesh in the scheme of `task`, inputs within its bounds."""
@@ -251,9 +251,9 @@ class Collocated:
 
     def interval_at(self, times: Array) -> Indices:
         """(S,) the number of the interval that each of `times` (S,) [s] lies in."""
-        return self._place(times / self.horizon)[0]
+        return self._locate(times / self.horizon)[0]
 
-    def _place(self, fractions: Array) -> tuple[Indices, Array]:
+    def _locate(self, fractions: Array) -> tuple[Indices, Array]:
         """The interval that each of `fractions` (S,) of the horizon lies in, and where in it, from 0 to 1."""
         k = np.clip(np.searchsorted(self.mesh, fractions, side="right") - 1, 0, len(self.mesh) - 2)
         return k, (fractions - self.mesh[k]) / np.diff(self.mesh)[k]

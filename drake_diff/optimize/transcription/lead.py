@@ -69,12 +69,12 @@ class Places:
         every = far.ravel() / WIDTH
         self.width = WIDTH * max(1.0, float(np.sum(every)) / MOST_PLACES)
         counts = np.maximum(np.ceil(every * WIDTH / self.width), 1).astype(np.intp)
-        part, starts = np.repeat(np.arange(count * parts), counts), np.cumsum(counts) - counts
-        inside = (np.arange(len(part)) - starts[part] + 0.5) / counts[part]
-        theta = (part % 2 + inside) / 2
+        half, starts = np.repeat(np.arange(count * parts), counts), np.cumsum(counts) - counts
+        inside = (np.arange(len(half)) - starts[half] + 0.5) / counts[half]
+        theta = (half % 2 + inside) / 2
         self.counts, self.starts = counts.reshape(-1, 2).sum(axis=1), starts[::2]
         self.dt = np.repeat(np.repeat(motion.lengths / parts, parts) / counts, counts)
-        self.times = motion.times(part // parts, (part % parts + inside) / parts)
+        self.times = motion.times(half // parts, (half % parts + inside) / parts)
         first = (2 * SUBSTEPS + 1) * np.arange(count)[:, None] + 2 * np.arange(SUBSTEPS)
         self._ends = [(first + i).ravel() for i in range(3)]
         self._weights = (1 - theta) * (1 - 2 * theta), 4 * theta * (1 - theta), theta * (2 * theta - 1)

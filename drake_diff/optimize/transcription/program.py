@@ -65,8 +65,8 @@ FAR = dict.fromkeys(["ipopt.bound_push", "ipopt.bound_frac"], 0.2)
 WARM_START = {
     "ipopt.warm_start_init_point": "yes",
     "ipopt.mu_init": 1e-6,
-    **dict.fromkeys([f"ipopt.warm_start_{part}" for part in ("bound_push", "bound_frac", "mult_bound_push")], 1e-6),
-    **dict.fromkeys([f"ipopt.warm_start_slack_{part}" for part in ("bound_push", "bound_frac")], 1e-6),
+    **dict.fromkeys([f"ipopt.warm_start_{option}" for option in ("bound_push", "bound_frac", "mult_bound_push")], 1e-6),
+    **dict.fromkeys([f"ipopt.warm_start_slack_{option}" for option in ("bound_push", "bound_frac")], 1e-6),
 }
 RELAXED = 1e-6  # of the smallest bound: what a plan may be beyond it
 FLAT = 1e-8  # of the largest slope of a row: a row that has another one than at the guess
@@ -153,7 +153,7 @@ class BlockProgram:
     @cached_property
     def _of_linear(self) -> tuple[Indices, Indices, Array]:
         parts = self._linear or [[np.zeros(0, dtype=int)] * 2 + [np.zeros(0)]]
-        rows, columns, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
+        rows, columns, weights = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         nonzero = weights != 0
         return rows[nonzero] + 1, columns[nonzero], weights[nonzero]
 
@@ -221,7 +221,7 @@ class BlockProgram:
                 by = timed.tocoo()
                 entries.append((by.row, np.full(by.nnz, term.time_at), by.data, first + by.col))
                 first += count
-        rows, columns, weights, sources = (np.concatenate(part) for part in zip(*entries, strict=True))
+        rows, columns, weights, sources = (np.concatenate(arrays) for arrays in zip(*entries, strict=True))
         cost = rows == 0
         gradient = sparse.csr_matrix((weights[cost], (columns[cost], sources[cost])), shape=(self.size, first))
         shape, others = (len(self.sides[0]), self.size), ~cost
@@ -248,7 +248,7 @@ class BlockProgram:
                 columns = term.columns[:, term.function.jacobian_at[1]].ravel()
                 ends.append((columns, np.full(len(columns), term.time_at)))
             ends.append(tuple(term.columns[:, side].ravel() for side in term.function.hessian_at))
-        first, other = (np.concatenate(part) for part in zip(*ends, strict=True))
+        first, other = (np.concatenate(arrays) for arrays in zip(*ends, strict=True))
         rows, columns, count = np.minimum(first, other), np.maximum(first, other), len(first)
         return _Sums(rows, columns, np.ones(count), np.arange(count), count, (self.size, self.size))
 

@@ -167,10 +167,10 @@ class StepProgram(BlockProgram):
             by_values = np.append(slope, np.zeros(len(values) - len(slope)))
             return np.array([[value]]), self.design.pull_back(points[0], by_values)[None, None]
 
-        def at(points: Array) -> Array:
+        def value_at(points: Array) -> Array:
             return np.array([[self.problem.cost_of_parameters(self.design.own(self.design.values(points[0])))]])
 
-        return Called("", at, linearize, 1, self.design.count)
+        return Called("", value_at, linearize, 1, self.design.count)
 
     @property
     def horizon_at(self) -> int | None:

@@ -204,8 +204,8 @@ def constraint_form(c: Constraint, nx: int, probe: Array) -> Pointwise:
 def user_rate(problem: Problem, probe: Array) -> AtPlaces | None:
     """See `OptimalControl.user_rate`; `probe` (3, nx + nu) are knots to try functions at."""
     parts = [_tracking(cost, problem.nx) for cost in _parts_of(problem.total_running_cost) if _is_table(cost)]
-    parts += [part.values_of_many for part in user_costs(problem, probe)]
-    return None if not parts else lambda knots, times: np.asarray(sum(part(knots, times) for part in parts))
+    parts += [cost.values_of_many for cost in user_costs(problem, probe)]
+    return None if not parts else lambda knots, times: np.asarray(sum(term(knots, times) for term in parts))
 
 
 def _is_table(cost: Any) -> bool:
@@ -257,7 +257,7 @@ def _of_state(cost: Any) -> Callable[[Any, Any], Any]:
 def _parts_of(cost: Any) -> list[Any]:
     """The terms of a running cost of which nothing is known."""
     if isinstance(cost, SumOfCosts):
-        return [part for term in cost.costs for part in _parts_of(term)]
+        return [leaf for term in cost.costs for leaf in _parts_of(term)]
     if isinstance(cost, WithGoals):
         return _parts_of(cost.own)
     return [] if cost is None or isinstance(cost, (ConstantCost, CostToGo, QuadraticCost)) else [cost]
