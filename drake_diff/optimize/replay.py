@@ -1,26 +1,24 @@
 """Replay a plan on Drake's double plant: in its own step and finer ones, in continuous time, and under another contact.
 
-A motion that exists at one step size or in one law of contact only is an artefact of the numerics. A variant of the
-plant holds if the inputs reach the goal and keep all limits, open loop or under TVLQR about the plan. An unstable
-motion diverges open loop however right it is, and feedback through contact can do harm.
+A motion that exists at one step size or in one law of contact only is an artefact of the numerics. A plan holds in a
+variant of the plant if its inputs reach the goal and keep all limits, open loop or under TVLQR about the plan.
 
 A plan in steps has to hold at h, h/2 and h/8 and, where nothing can touch, in continuous time. There the inputs lead
-elsewhere than the plan, for which TVLQR has offsets; a plan that does not hold open loop also has to come near its goal
-without them. A collocated plan has no steps of its own: it has to hold at two successive ones of h, h/2, ... h/64.
-Under feedback less is allowed, since the end then depends on its weights too.
+elsewhere than the plan, for which TVLQR has offsets. A plan that does not hold open loop there also has to come near
+its goal without them. A collocated plan has no steps of its own: it has to hold at two successive ones of h, h/2, ...
+h/64. Under feedback less is allowed, since the end then depends on its weights too.
 
-The other law of contact is followed by the gains of the plan's own steps: where a foot has just landed lagged contact
+The other law of contact is followed by the gains of the plan's own steps: where a foot has just landed, lagged contact
 has derivatives of fifty times the plan's, and its own gains throw the foot up. A step that is right for one law may be
 too long for another, whose foot then goes through the ground. So a plan that does not hold in the other law at h is
-tried in it at h/8, and that decides. A plan in continuous time with contact has to hold in another integration of its
-law: these equations are Drake's terms and the contact written out, and share nothing with those of the plan.
+tried in it at h/8, which decides. A plan in continuous time with contact has to hold in another integration of its law.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Protocol
+from functools import cache, cached_property, partial
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -173,13 +171,15 @@ class ReplayPlan:
         """The model with the plan's parameters, until the context ends."""
         return applied(select(model, self.vector.to_dict()))
 
-    def follower(self, parts: int = 1, pieces: int = 1) -> "PlanFollower":
-        """By a controller with `parts` steps in an interval: always the same one, which knows its gains."""
-        return self._followers.setdefault((parts, pieces), PlanFollower(self, parts, pieces))
-
     @cached_property
-    def _followers(self) -> dict[tuple[int, int], "PlanFollower"]:
-        return {}
+    def follower(self) -> "Callable[..., PlanFollower]":
+        """Of `PlanFollower`'s parts and pieces: always the same one, which knows its gains."""
+        return cache(partial(PlanFollower, self))
+
+    @property
+    def follower_in_continuous_time(self) -> "PlanFollower":
+        """Of a plan in steps of a model that cannot touch: by a controller in quarters of its steps."""
+        return self.follower(FINE // 2, 0)
 
     @property
     def own_plant(self) -> str:
@@ -215,18 +215,18 @@ def replays(plan: ReplayPlan) -> tuple[Replay, ...]:
     rows += plan.follower(parts).in_steps()
     if plan.continuous:
         most = finest_parts(plan)
-        while parts < most and not (_any_holds(rows[-2:]) and _any_holds(rows[-4:-2])):
+        while parts < most and not (any(r.holds for r in rows[-2:]) and any(r.holds for r in rows[-4:-2])):
             parts *= 2
             rows += plan.follower(parts).in_steps()
         return tuple(rows)
     rows += plan.follower(FINE).in_steps()
     contact = model.contract.contact
     if not contact.collision_pairs:
-        return (*rows, *plan.follower(FINE // 2, pieces=0).in_continuous_time())
+        return (*rows, *plan.follower_in_continuous_time.in_continuous_time())
     other = OTHER_APPROXIMATION[contact.approximation]
     name = f"with {other} contact"
     tried = plan.follower().in_model(name, lambda: model.with_contact(other))
-    if not _any_holds(tried):
+    if not any(r.holds for r in tried):
         name = f"{name} in steps of {plan.time_step / FINE:.4g} s"
         tried += plan.follower().in_model(name, lambda: plan.model_at(FINE).with_contact(other), FINE)
     return (*rows, *tried)
@@ -255,12 +255,23 @@ def judged_replay(plan: ReplayPlan, rows: Sequence[Replay]) -> Replay | None:
     return None
 
 
-def _any_holds(rows: Sequence[Replay]) -> bool:
-    return any(r.holds for r in rows)
-
-
 # A motion under a control, and what is checked of it besides.
 Mover = Callable[[str], tuple[MeasuredMotion, list[Check]]]
+
+
+class FollowedPlant(NamedTuple):
+    """Where a plan is followed: the motion that a plant makes, and the model whose contact is like the plant's.
+
+    The plant takes `pieces` steps for one of the controller's, of the model's `time_step` [s] where none is given.
+    Tolerances are `wider` than they would be.
+    """
+
+    variant: str
+    model: Model
+    move: Mover
+    pieces: int = 1
+    time_step: float | None = None
+    wider: float = 1.0
 
 
 class PlanFollower:
@@ -271,7 +282,7 @@ class PlanFollower:
     for a plant that takes `pieces` of them for one of the controller's, 0 where it moves in continuous time.
     """
 
-    def __init__(self, plan: ReplayPlan, parts: int, pieces: int):
+    def __init__(self, plan: ReplayPlan, parts: int = 1, pieces: int = 1):
         self.plan, self.parts, self.period = plan, parts, plan.time_step / parts
         self.xs, self.us = plan.sample(parts)
         self.controls = (OPEN_LOOP, FEEDBACK) if plan.problem.model.nu else (OPEN_LOOP,)
@@ -284,8 +295,8 @@ class PlanFollower:
 
     @cached_property
     def plant(self) -> Model:
-        """The model in the plant's steps."""
-        return self.plan.model_at(self.parts * self.pieces)
+        """The model in the plant's steps; in continuous time in the controller's."""
+        return self.plan.model_at(self.parts * max(1, self.pieces))
 
     @cached_property
     def gains(self) -> Array:
@@ -305,25 +316,23 @@ class PlanFollower:
     @cached_property
     def _regulator(self) -> TVLQR:
         defects, space = None, tangent_space(self.model)
+        if self.leads_elsewhere:
+            defects = [space.minus(end, x) for end, x in zip(self._ends(), self.xs[1:], strict=True)]
         with self.plan.applied_to(self.model) as model:
-            if self.leads_elsewhere:
-                defects = [space.minus(end, x) for end, x in zip(self._ends(model), self.xs[1:], strict=True)]
             return regulator(self.plan, model, self.xs, self.us, defects)
 
-    def _ends(self, model: Model) -> list[Array]:
+    def _ends(self) -> list[Array]:
         """Where the controller's steps lead from the plan's states."""
-        points = list(zip(self.xs, self.us, strict=False))
-        if not self.pieces:
-            motion = ContinuousMotion(model)
-            return [motion.states(x, u[None])[-1] for x, u in points]
+        us = [np.tile(u, (max(1, self.pieces), 1)) for u in self.us]
         with self.plan.applied_to(self.plant) as plant:
             steps = DrakeSteps(plant, self.plan.vector)
-            return [roll(steps, x, np.tile(u, (self.pieces, 1)))[-1] for x, u in points]
+            states = partial(roll, steps) if self.pieces else ContinuousMotion(plant).states
+            return [states(x, held_us)[-1] for x, held_us in zip(self.xs, us, strict=False)]
 
     def law(self, control: str = FEEDBACK, pieces: int = 1) -> Policy:
-        """u(x, t) for one motion, in a plant that takes `pieces` steps for one of the controller's.
+        """u(x, t) for one motion at a time, in a plant that takes `pieces` steps for one of the controller's.
 
-        Under TVLQR it is within the bounds of inputs and the limits of their rates: it remembers its last command.
+        Under TVLQR it is within the bounds of inputs and the limits of their rates, from the first command on.
         """
         space, last = tangent_space(self.plan.problem.model), list[Any]()
         bounds, slew, us = self.plan.problem.bounds, self._slew, self.us
@@ -336,7 +345,7 @@ class PlanFollower:
                 return us[k]
             wanted = us[k] - gains[k] @ space.minus(x, self.xs[k])
             wanted = np.minimum(np.maximum(wanted, bounds.u_lower), bounds.u_upper)
-            return wanted if not last or np.all(np.isinf(slew)) else np.clip(wanted, last[0] - slew, last[0] + slew)
+            return wanted if k == 0 or np.all(np.isinf(slew)) else np.clip(wanted, last[0] - slew, last[0] + slew)
 
         def law(x: Any, t: float) -> Any:
             k, piece = divmod(round(t * pieces / self.period), pieces)
@@ -361,8 +370,8 @@ class PlanFollower:
         """By each control in the controller's own steps."""
         return self.in_model(f"in steps of {self.period:.4g} s", lambda: self.model)
 
-    def in_model(self, variant: str, make: Callable[[], Model], pieces: int = 1) -> list[Replay]:
-        """By each control in the steps of a model, which may not be to be had."""
+    def in_model(self, variant: str, make: Callable[[], Model], pieces: int = 1, enough: bool = False) -> list[Replay]:
+        """`replays` in the steps of a model, which may not be to be had."""
         try:
             model = make()
         except (ModelError, InputError) as error:
@@ -378,10 +387,10 @@ class PlanFollower:
                     motion = _rolled(self.plan.problem, set_model, self.xs[0], law, count)
             return motion, [energy_check(motion)] * with_energy
 
-        return self._replays(variant, model, move, pieces)
+        return self.replays(FollowedPlant(variant, model, move, pieces), enough=enough)
 
-    def in_continuous_time(self) -> list[Replay]:
-        """In the continuous time that Drake's steps stand for, by error control; in short steps where it has none."""
+    def in_continuous_time(self, *, enough: bool = False) -> list[Replay]:
+        """`replays` in the continuous time that Drake's steps stand for; in short steps where there is none."""
 
         def move(control: str) -> tuple[MeasuredMotion, list[Check]]:
             law, x0, count = self.law(control), self.xs[0], len(self.us)
@@ -389,46 +398,39 @@ class PlanFollower:
                 motion = replayed(set_model, x0, law, count, tolerance=TOLERANCE, evaluations=EVALUATIONS)
             return motion, [energy_check(motion)]
 
-        rows = self._replays(IN_CONTINUOUS_TIME, self.model, move, time_step=0.0)
+        rows = self.replays(FollowedPlant(IN_CONTINUOUS_TIME, self.model, move, time_step=0.0), enough=enough)
         refused = [row for row in rows if row.motion is None]
-        if not refused or _any_holds(rows):
+        if not refused or any(r.holds for r in rows if r.control != GAINS_ALONE):
             return rows
         by = self.plan.follower(self.parts, max(1, FINEST // self.parts))
         name = f"in steps of {by.period / by.pieces:.4g} s in place of continuous time: {refused[0].failures[0]}"
-        short = by.in_model(name, lambda: by.plant, by.pieces)
+        short = by.in_model(name, lambda: by.plant, by.pieces, enough)
         return short if any(row.motion is not None for row in short) else rows
 
-    def _replays(
-        self, variant: str, model: Model, move: Mover, pieces: int = 1, time_step: float | None = None
-    ) -> list[Replay]:
-        """By each control, and by gains alone where the inputs lead elsewhere and do not hold."""
-        rows = [self.replay(variant, c, model, move, pieces, time_step) for c in self.controls]
-        if self.leads_elsewhere and len(rows) > 1 and not rows[0].holds:
-            rows.append(self.replay(variant, GAINS_ALONE, model, move, pieces, time_step))
+    def replays(self, plant: FollowedPlant, *, enough: bool = False) -> list[Replay]:
+        """By each control, and by gains alone where the inputs lead elsewhere and do not hold.
+
+        With `enough` by TVLQR, and by the inputs alone where that does not hold.
+        """
+        rows = list[Replay]()
+        for control in self.controls[::-1] if enough else self.controls:
+            rows.append(self.replay(plant, control))
+            if enough and rows[-1].holds:
+                break
+        if self.leads_elsewhere and not enough and len(rows) > 1 and not rows[0].holds:
+            rows.append(self.replay(plant, GAINS_ALONE))
         return rows
 
-    def replay(
-        self,
-        variant: str,
-        control: str,
-        model: Model,
-        move: Mover,
-        pieces: int = 1,
-        time_step: float | None = None,
-        wider: float = 1.0,
-    ) -> Replay:
-        """One replay in a plant, by the `move` that it makes; `model` is what has contact like the plant's.
-
-        `time_step` [s] is the plant's where it is not the model's. Tolerances are `wider` than they would be.
-        """
-        plan, every = self.plan, pieces * self.parts
+    def replay(self, plant: FollowedPlant, control: str) -> Replay:
+        """The replay in a plant under one control."""
+        plan, (variant, model, move, pieces, time_step, wider) = self.plan, plant
+        every = pieces * self.parts
         try:
             motion, checks = move(control)
             if control == GAINS_ALONE:  # which stand for any such regulator
                 off = plan.problem.goal_error(motion.xs[-1])
-                near = [goal_check(plan, off, WIDER * STATE_TOLERANCE), *comparison_checks(plan, motion, every)]
-                return measured_replay(plan, variant, control, model, motion, near, time_step)
-            if np.all(np.isfinite(motion.xs)):
+                checks = [goal_check(plan, off, WIDER * STATE_TOLERANCE), *comparison_checks(plan, motion, every)]
+            elif np.all(np.isfinite(motion.xs)):
                 # Feedback corrects what the laws of contact differ by: there nothing tighter can be asked of it.
                 tight = control == FEEDBACK and wider == 1 and not _has_another_law(plan, model)
                 fraction = FEEDBACK_TOLERANCE if tight else wider * STATE_TOLERANCE

@@ -5,7 +5,7 @@ not lead to the goal, the inputs alone are tried. No verdict rests on these repl
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,10 +24,9 @@ from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.replay import (
     FEEDBACK,
-    FINE,
-    GAINS_ALONE,
     OPEN_LOOP,
     WIDER,
+    FollowedPlant,
     MeasuredMotion,
     PlanFollower,
     Replay,
@@ -48,8 +47,8 @@ def cross_check(solution: Solution, engines: Sequence[str] = SIMULATORS) -> Solu
 
     The motion in continuous time is the one that Drake's steps stand for, integrated with error control, or Drake's in
     64 steps of each interval where there is none. Other simulators take steps of 1 ms or less, with contacts matched to
-    Drake's.
-    What is asked is what replays are asked. In another simulator all tolerances but obstacles' are twice as wide.
+    Drake's. The checks are those of replays. In another simulator all tolerances but those of obstacles are twice as
+    wide.
 
     Args:
         solution: A result of `solve` for a model, of any status.
@@ -76,7 +75,7 @@ def cross_check(solution: Solution, engines: Sequence[str] = SIMULATORS) -> Solu
         got = f"{type(solution).__name__} of plain dynamics" if type(solution) is Solution else type(solution)
         raise InputError("solution", got=got, expected="the Solution of a problem with a model")
     follower = follower_of(solution.plan, solution.replays if solution.transcribed is not None else ())
-    rows = [*_until_one_holds(r for r in follower.in_continuous_time()[::-1] if r.control != GAINS_ALONE)]
+    rows = follower.in_continuous_time(enough=True)
     rows += [row for name in engines for row in _in_simulator(follower, name)]
     return solution.told(cross_checks=tuple(rows), options=solution.options | {"cross_check": list(engines)})
 
@@ -97,14 +96,16 @@ def _in_simulator(follower: PlanFollower, name: str) -> list[Replay]:
 
 
 def follower_of(plan: ReplayPlan, known: Sequence[Replay] = ()) -> PlanFollower:
-    """By a controller in quarters of its steps, with offsets for continuous time; in whole ones where things may touch.
+    """The controller of a plan in other plants.
 
-    A collocated plan is followed in the first steps in which it has to hold, by its replays (`known` or taken).
+    It has a quarter of the steps of the plan, with offsets for continuous time, or these steps where bodies can touch.
+    Of a collocated plan it has the first steps in which that has to hold, by its replays (`known` or taken).
     """
     model = plan.problem.model
     if not plan.continuous or plan.problem.motion == CONTINUOUS:
-        whole = plan.continuous or model.contract.contact.collision_pairs or not model.can_rebuild
-        return plan.follower() if whole else plan.follower(FINE // 2, pieces=0)
+        can_touch = bool(model.contract.contact.collision_pairs)
+        only_own_steps = plan.continuous or can_touch or not model.can_rebuild
+        return plan.follower() if only_own_steps else plan.follower_in_continuous_time
     known = known or replays(plan)
     named = [r for r in known if r.variant in deciding(plan, known)]
     return plan.follower(round(plan.time_step / named[0].time_step) if named else 1)
@@ -137,15 +138,7 @@ def replays_in(follower: PlanFollower, engine: Engine) -> list[Replay]:
             return _Moved(np.asarray(h * np.arange(count + 1)), xs, us, _overlaps(set_model, xs)), checks
 
     variant = f"in {engine.name} {engine.version} in steps of {h:.4g} s"
-    rows = (follower.replay(variant, c, follower.model, move, pieces, h, WIDER) for c in follower.controls[::-1])
-    return [*_until_one_holds(rows)]
-
-
-def _until_one_holds(rows: Iterable[Replay]) -> Iterator[Replay]:
-    for row in rows:
-        yield row
-        if row.holds:
-            return
+    return follower.replays(FollowedPlant(variant, follower.model, move, pieces, h, WIDER), enough=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,12 +39,8 @@ from pydrake.multibody.tree import (
 import drake_diff as dd
 from drake_diff.engines.closed_form import (
     BY_MODEL,
-    CartPole,
-    DoublePendulum,
-    MassSpringDamper,
     NumpyEngine,
     Pendulum,
-    Projectile,
 )
 from drake_diff.exceptions import (
     ModelError,
@@ -59,68 +55,6 @@ from drake_diff.model.tangent import tangent_space
 pytestmark = pytest.mark.solve
 
 # ---- hand calculations -------------------------------------------------------------------------------------------
-
-
-def test_a_pendulums_step_and_jacobian_are_their_formulas():
-    """m l^2 (v' - v) = h (u - m g l sin q - b v') and q' = q + h v', with m = 1 kg, l = 0.5 m, b = 0.1 N m s."""
-    engine = NumpyEngine(Pendulum(), time_step=0.01)
-    x_next = engine.step([0.7, -1.2], [0.3])
-    A, B, _ = engine.differentiate_step([0.7, -1.2], [0.3])
-    # The formulas above by hand, to the 12 decimals written here; below the Jacobian's to rounding.
-    np.testing.assert_allclose(x_next, [0.686908411253, -1.309158874737], rtol=0, atol=6e-13)
-    h, gl, s = 0.01, G / 0.5, 1 / (1 + 0.01 * 0.1 / 0.25)
-    c = np.cos(0.7)
-    np.testing.assert_allclose(A, [[1 - h * h * s * gl * c, h * s], [-h * s * gl * c, s]], rtol=1e-14)
-    np.testing.assert_allclose(B.ravel(), [h * h * s / 0.25, h * s / 0.25], rtol=1e-14)
-
-
-def test_a_double_pendulums_step_and_jacobian_are_lagranges():
-    """Two thin rods of 1 and 0.7 kg, 0.8 and 0.5 m: Lagrange's equations, evaluated to the digits written here."""
-    engine = NumpyEngine(DoublePendulum(), time_step=0.005)
-    x, u = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
-    M = [[0.89371745778245, 0.14535872889123], [0.14535872889123, 0.05833333333333]]
-    np.testing.assert_allclose(engine.mass_matrix(x[:2]), M, rtol=0, atol=6e-15)  # written to 14 decimals
-    x_next = [0.40628355157782, -0.902092759011, 1.25671031556302, -0.41855180220094]
-    np.testing.assert_allclose(engine.step(x, u), x_next, rtol=0, atol=1e-12)  # its 12
-    A, B, _ = engine.differentiate_step(x, u)
-    lower = [
-        [-0.0604564179632879, -0.0182224978032518, 0.994554043826923, -0.00144431914674947],
-        [0.0215128929057214, -0.0149505999112984, 0.0380103812989330, 1.00359904677631],
-    ]
-    np.testing.assert_allclose(A[2:], lower, rtol=1e-13)  # 15 digits of numbers near 1
-    by_u = [[0.00940727957631641, -0.02344166059779], [-0.02344166059779, 0.144127714073045]]
-    np.testing.assert_allclose(B[2:], by_u, rtol=1e-12)
-    assert engine.energy(x) == pytest.approx(0.6523114432910162 - 10.18077388024687, rel=1e-14)
-
-
-def test_a_mass_spring_dampers_step_and_jacobian_are_their_formulas():
-    """m (v' - v) = h (u - k (q - rest) - c v') with m = 2 kg, k = 50 N/m, rest = 0.1 m, c = 1.5 N s/m."""
-    engine = NumpyEngine(MassSpringDamper(), time_step=0.01)
-    np.testing.assert_allclose(engine.step([0.35, -0.4], [1]), [0.34545905707196, -0.45409429280397], rtol=1e-13)
-    A, B, _ = engine.differentiate_step([0.35, -0.4], [1])
-    expected = [[0.997518610421836, 0.00992555831265509], [-0.248138957816377, 0.992555831265509]]
-    np.testing.assert_allclose(A, expected, rtol=1e-14)
-    np.testing.assert_allclose(B.ravel(), [4.96277915632754e-5, 4.96277915632754e-3], rtol=1e-14)
-
-
-def test_a_projectile_flies_a_parabola_of_steps():
-    """z_N = z_0 + v_0 h N - g h^2 N (N + 1) / 2, and d p_N / d v_0 = h N."""
-    engine = NumpyEngine(Projectile(), time_step=0.01)
-    x = np.array([1.0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 2, 1, 5])
-    total = np.eye(13)
-    for _ in range(100):
-        total = engine.differentiate_step(x, []).A @ total
-        x = engine.step(x, [])
-    np.testing.assert_allclose(x[4:7], [2, 1, 1.04595], rtol=1e-12)
-    np.testing.assert_allclose(total[4:7, 10:13], np.eye(3), atol=1e-12)
-
-
-def test_a_cart_poles_acceleration_is_its_formula():
-    """(m + b) a + b l (cos q alpha - sin q w^2) = u and l alpha + cos q a + g sin q = 0; m = 1, b = 0.3, l = 0.5."""
-    engine = NumpyEngine(CartPole(), time_step=1e-3)
-    x = np.array([0.1, 0.7, -0.3, 1.1])
-    acceleration = (engine.step(x, [2])[2:] - x[2:]) / 1e-3
-    np.testing.assert_allclose(acceleration, [3.172075726216, -17.491825696946], rtol=1e-12)
 
 
 @each_row("form", BY_MODEL.values())

@@ -10,7 +10,7 @@ from helpers.table import each_row
 from helpers.transcription import BLOCK, own_derivatives
 
 import drake_diff as dd
-from drake_diff.exceptions import ArtifactError, InputError, ModelError
+from drake_diff.exceptions import ArtifactError, GradientError, InputError, ModelError
 from drake_diff.optimize import Options
 from drake_diff.optimize.problem.dynamics import Pointwise
 from drake_diff.optimize.program import Outcome
@@ -240,3 +240,13 @@ def test_rounding_of_terms_that_cancel_is_no_other_value():
     function = Pointwise("sum", lambda x, u: np.sum(np.full(1000, 0.1) * x[0]) - 70, 1, (), kept)
     plain, carried = function.values(kept), function.linearize(kept)[0]
     assert np.all(np.abs(carried - plain) > 1e-9 * np.abs(carried))
+
+
+def test_other_values_are_seen_beside_an_infinite_slope():
+    """The root of x - 1 has one at 1; a function with another value under derivatives is refused all the same."""
+
+    def other(x, u):
+        return (x[0] - 1) ** 0.5 + (0.0 if isinstance(x[0], float) else 1e-3)
+
+    with pytest.raises(GradientError, match="with derivatives and"):
+        Pointwise("root", other, 1, (), np.array([[1.0], [1.5], [2.0]]))

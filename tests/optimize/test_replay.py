@@ -136,18 +136,18 @@ def test_one_coordinate_off_is_refused_and_named(load, i):
 
 def test_the_plans_own_step_allows_one_percent_and_finer_ones_five_or_three_under_feedback(write_urdf):
     """u = 2 for 1 s ends at 1 + h in steps of h: 1.05 in the plan's own, 1.025 in halves."""
-    us, own, halves = np.full((COUNT, 1), 2.0), f"in steps of {H:g} s", f"in steps of {H / 2:g} s"
+    us, own, finer = np.full((COUNT, 1), 2.0), f"in steps of {H:g} s", f"in steps of {H / 2:g} s"
     for variant, control, end, tolerance in (
         (own, "open loop", 1.05, SAME),
         (own, "TVLQR", 1.05, SAME),
-        (halves, "open loop", 1.025, STATE_TOLERANCE),
+        (finer, "open loop", 1.025, STATE_TOLERANCE),
     ):
         for factor, holds in ((0.9, True), (1.1, False)):
             off = end - end / (1 + factor * SAME) if tolerance == SAME else 1.05 * factor * tolerance
             plan = plan_of(block(write_urdf, x_goal=[end - off, math.nan]), us)
             assert by_name(replays(plan), variant, control).holds is holds
     assert FEEDBACK_TOLERANCE < STATE_TOLERANCE
-    row = by_name(replays(plan), halves, "TVLQR").checks[0]
+    row = by_name(replays(plan), finer, "TVLQR").checks[0]
     assert row.tolerance == pytest.approx(1.05 * FEEDBACK_TOLERANCE)
 
 
@@ -388,3 +388,26 @@ def test_the_cost_beside_a_plans_is_by_the_integral():
     fields = {"running_cost": lambda x, u: u[0] ** 2 + 3 * x[0], "final_cost": lambda x: 5 * x[0]}
     motion = dd.solve(dd.Problem(drift, x0=[0.0], num_steps=7, horizon=2.0, **fields)).transcribed
     assert motion.cost_beside(motion.led("open loop") + 0.1, None) == pytest.approx(0.1 * (3 * 2.0 + 5), rel=1e-9)
+
+
+def test_finer_steps_have_the_gains_of_the_plans_own_parameters(load):
+    """A rod of 3 kg where the file has another mass: gains of halves, beside which offsets are looked for."""
+    model = load("pendulum.urdf", time_step=0.02)
+    heavy = select(model, {"pole.mass": 3.0})
+    us, x0 = np.full((20, 1), 2.0), np.array([0.1, 0.0])
+    problem = dd.Problem(model, x0=x0, num_steps=20, x_goal=[0.5, 0])
+    xs = dd.rollout(model, x0, us, parameters={"pole.mass": 3.0}).xs
+    plan = ReplayPlan(problem, heavy, 0.02, held(xs, us), False, 0.0)
+    with plan.applied_to(plan.model_at(2)) as halved:
+        expected = regulator(plan, halved, *plan.sample(2)).gains
+    np.testing.assert_allclose(plan.follower(2).gains, expected, rtol=1e-12)
+    assert not np.allclose(regulator(plan, plan.model_at(2), *plan.sample(2)).gains, expected, rtol=1e-2)
+
+
+def test_a_law_with_limits_of_rates_begins_each_motion_anew(write_urdf):
+    limits = dd.optimize.InputRate(1.0)
+    plan = plan_of(block(write_urdf, x_goal=[1, 0], couplings=limits), np.full((COUNT, 1), 2.0))
+    law = plan.follower().law()
+    first, *_, far = (law(np.array([-9.0 * k, 0.0]), k * H) for k in range(6))
+    assert far[0] - first[0] == pytest.approx(5 * H)
+    assert law(np.zeros(2), 0.0) == first

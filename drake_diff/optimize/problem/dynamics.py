@@ -57,8 +57,8 @@ class Pointwise:
             if isinstance(error, InputError):
                 raise
             raise InputError(subject, got=f"{type(error).__name__}: {error}", expected=ORDINARY) from error
-        terms = np.einsum("kri,ki->kr", np.abs(slopes), np.abs(probe))  # which may cancel
-        largest = SAME_VALUES * float(np.nanmax([np.abs(single), terms], initial=0.0))
+        terms = np.einsum("kri,ki->kr", np.abs(slopes), np.abs(probe))  # they may cancel, and be infinite at a root
+        largest = SAME_VALUES * float(np.max(np.nan_to_num([np.abs(single), terms], posinf=0.0), initial=0.0))
         if not np.allclose(carried_values, single, rtol=0, atol=largest, equal_nan=True):
             i = np.unravel_index(int(np.nanargmax(np.abs(carried_values - single))), single.shape)
             got = f"{carried_values[i]:.6g} with derivatives and {single[i]:.6g} with plain numbers"
