@@ -67,7 +67,7 @@ class ContinuousMotion(System):
 
     contact_is_stiff = True
 
-    def __init__(self, model: Model, law: str | None = None, *, works: bool = False):
+    def __init__(self, model: Model, law: str | None = None, *, works: bool = False, sizes: Any = 1.0):
         plant, contact = model.plant, model.contract.contact
         if contact.collision_pairs and contact.model != "point":
             raise ModelError(f"{contact.model} contact has none here")
@@ -76,7 +76,7 @@ class ContinuousMotion(System):
         if model.num_constraints:
             raise ModelError("constraints have none")
         self.model, self.twin, self.time_step, self.works = model, model.double, model.time_step, works
-        self.law = law or compliance.limit_law(model)
+        self.law, self.sizes = law or compliance.limit_law(model), sizes
         self.limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in actuators(plant)])
         self.position_limits, self.damping = model.position_limits, model.double.damping()
         self.moves_as_is, self.still = plant.IsVelocityEqualToQDot(), np.zeros(model.nv)
@@ -134,10 +134,8 @@ class ContinuousMotion(System):
         push = self.contact_force(self.pushing) if self.pushing else self.still
         acceleration = np.linalg.solve(twin.mass_matrix(), self.force - twin.inverse_dynamics(self.still) + push)
         rates = v if self.moves_as_is else twin.rates(v), acceleration
-        if not self.works:
-            return np.concatenate(rates)
-        driven = self.force + twin.systems_force() if self.model.inputs.fed else self.force
-        return np.concatenate([*rates, [v @ driven, v @ (self.damping * v), v @ push]])
+        driven = self.force + twin.systems_force() if self.works and self.model.inputs.fed else self.force
+        return np.concatenate([*rates, [v @ driven, v @ (self.damping * v), v @ push]] if self.works else rates)
 
     def slopes(self, x: Array, rates: Array) -> Array:
         slopes = np.empty((len(x), len(x)))
@@ -288,15 +286,16 @@ def replayed(
     x0: Array,
     inputs: Array | Policy,
     count: int,
-    *,
     tolerance: float = TOLERANCE,
     evaluations: int | None = None,
+    sizes: Array | None = None,
 ) -> Rollout:
     """The motion over `count` of the model's steps under us (N, nu) or a policy; raises what `ContinuousMotion` does.
 
     It is too stiff where it takes more than `evaluations` of the equations of motion to the `tolerance` of each step.
     """
-    motion, nx = ContinuousMotion(model, works=True), model.nx
+    all_sizes = 1.0 if sizes is None else np.append(sizes, np.ones(3))  # of works 1 J
+    motion, nx = ContinuousMotion(model, works=True, sizes=all_sizes), model.nx
     motion.most = evaluations or motion.most
 
     def choose(x: Array, k: int) -> Array:

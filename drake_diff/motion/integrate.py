@@ -32,7 +32,7 @@ from drake_diff.motion.tableaus import (
     factor,
 )
 
-TOLERANCE = 1e-9  # of each step, relative to max(1, |x|)
+TOLERANCE = 1e-9  # of each step, relative to max(sizes, |x|)
 SHORTEST = 1e-14  # [s] a step that is shorter does not move time
 ROOT = 1e-13  # of a step: how near to its event it ends
 SHALLOW = 1e-13  # [m] overlap that begins and ends within a step and is not looked for
@@ -57,6 +57,7 @@ class System:
     contact_is_stiff = False  # whether steps are implicit wherever a pair pushes
     used = 0  # evaluations of the rates
     most = 1_000_000  # of these
+    sizes: Any = 1.0  # (n,) of the states: errors are relative to these at least
 
     def push(self, pairs: Pairs) -> None:
         """Take the equations where `pairs` push."""
@@ -102,7 +103,7 @@ class System:
         with np.errstate(over="ignore", invalid="ignore"):
             apart = float(np.linalg.norm(state - before))
             stiffness = float(np.linalg.norm(slopes[-1] - slopes[-2])) / apart if apart else 0.0
-        return state, slopes[-1], relative(h * (ERROR @ np.array(slopes)), x, state), stiffness
+        return state, slopes[-1], relative(h * (ERROR @ np.array(slopes)), x, state, self.sizes), stiffness
 
 
 @dataclass(frozen=True)
@@ -207,7 +208,7 @@ class Integrator:
             value = system.rates(state) if i else rates
             stages[i] = inverse @ (value + couplings @ stages[:i] / h)
         ahead = state + stages[-1]
-        return ahead, system.rates(ahead), relative(stages[-1], x, ahead)
+        return ahead, system.rates(ahead), relative(stages[-1], x, ahead, system.sizes)
 
     def _reach(self, h: float) -> _Reach:
         x, rates, _, stiffness = self._take(h)
@@ -323,10 +324,10 @@ class Integrator:
         self._jacobian = None
 
 
-def relative(error: Array, x: Array, ahead: Array) -> float:
-    """The root mean square of an error, relative to max(1, |x|)."""
+def relative(error: Array, x: Array, ahead: Array, sizes: Any = 1.0) -> float:
+    """The root mean square of an error, relative to max(sizes, |x|)."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.sqrt(np.mean((error / np.maximum(1.0, np.maximum(np.abs(x), np.abs(ahead)))) ** 2)))
+        return float(np.sqrt(np.mean((error / np.maximum(sizes, np.maximum(np.abs(x), np.abs(ahead)))) ** 2)))
 
 
 def deepest_contacts(system: System, steps: Sequence[Step]) -> tuple[ContactPoint, ...]:

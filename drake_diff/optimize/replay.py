@@ -326,7 +326,7 @@ class PlanFollower:
         us = [np.tile(u, (max(1, self.pieces), 1)) for u in self.us]
         with self.plan.applied_to(self.plant) as plant:
             steps = DrakeSteps(plant, self.plan.vector)
-            states = partial(roll, steps) if self.pieces else ContinuousMotion(plant).states
+            states = partial(roll, steps) if self.pieces else ContinuousMotion(plant, sizes=self.plan.scale).states
             return [states(x, held_us)[-1] for x, held_us in zip(self.xs, us, strict=False)]
 
     def law(self, control: str = FEEDBACK, pieces: int = 1) -> Policy:
@@ -395,7 +395,7 @@ class PlanFollower:
         def move(control: str) -> tuple[MeasuredMotion, list[Check]]:
             law, x0, count = self.law(control), self.xs[0], len(self.us)
             with self.plan.applied_to(self.model) as set_model:
-                motion = replayed(set_model, x0, law, count, tolerance=TOLERANCE, evaluations=EVALUATIONS)
+                motion = replayed(set_model, x0, law, count, TOLERANCE, EVALUATIONS, self.plan.scale)
             return motion, [energy_check(motion)]
 
         rows = self.replays(FollowedPlant(IN_CONTINUOUS_TIME, self.model, move, time_step=0.0), enough=enough)

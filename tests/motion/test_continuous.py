@@ -9,8 +9,10 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
+import drake_diff as dd
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.motion.continuous import replayed
 
 
 def test_kellys_cart_pole(load):
@@ -70,3 +72,18 @@ def test_values_and_derivatives_are_those_of_drakes_continuous_plant(load, name)
 def test_pd_control_has_no_continuous_form():
     with pytest.raises(ModelError, match="PD-controlled"):
         EquationsOfMotion(pd_pendulum())
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_an_oscillator_is_followed_in_any_unit(tmp_path, unit):
+    """x = A cos(10 t) at 3 s, in steps of 0.15 s: a tolerance of 1e-6 of a metre says nothing of 1e-6 m."""
+    path = tmp_path / "spring.sdf"
+    path.write_text(
+        '<sdf version="1.7"><model name="m"><link name="b"/><joint name="j" type="prismatic"><parent>world</parent>'
+        "<child>b</child><axis><xyz>1 0 0</xyz><dynamics><spring_stiffness>100</spring_stiffness></dynamics></axis>"
+        "</joint></model></sdf>"
+    )
+    model = dd.load_model(path, time_step=0.15)
+    sizes = unit * np.array([1.0, 10.0])
+    motion = replayed(model, np.array([unit, 0.0]), np.zeros((20, model.nu)), 20, 1e-6, sizes=sizes)
+    assert motion.xs[-1, 0] / unit == pytest.approx(np.cos(30), abs=1e-4)
