@@ -6,7 +6,6 @@ Their derivatives are complex steps of M(q) a + bias(q, v) at fixed a, which hav
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 from numpy import cos, sin
@@ -33,7 +32,6 @@ class HandForm(ABC):
     input_names: tuple[str, ...] = ()
     joint_damping: tuple[float, ...] = ()
     effort_limits: tuple[float, ...] = ()
-    contact_law: str = "none"
     limits: Mapping[str, Limits] = field(default_factory=dict)
 
     @property
@@ -67,10 +65,6 @@ class HandForm(ABC):
     def potential_energy(self, q: Array) -> float:
         """[J]."""
 
-    def contact_depth(self, q: Array) -> float:
-        """[m]."""
-        return 0.0
-
     @abstractmethod
     def joints(self) -> tuple[JointContract, ...]:
         """What the contract says of the joints."""
@@ -96,27 +90,6 @@ def _complex_steps(function: Callable[[Array], Array], z: Array) -> Array:
     """(m, n) the derivative of an analytic function of z (n,)."""
     columns = [np.imag(function(z + 1j * TINY * e)) / TINY for e in np.eye(len(z))]
     return np.array(columns).T.astype(float)
-
-
-@dataclass(frozen=True)
-class Slider(HandForm):
-    """A body on one slide; `inertia` is that about its centre, about every axis, for the contract."""
-
-    mass: float = 1.0
-    inertia: float = 0.0
-    axis: ClassVar[Array] = X
-
-    def mass_matrix(self, q: Array) -> Array:
-        return np.array([[self.mass]])
-
-    def bias(self, q: Array, v: Array) -> Array:
-        return np.array([-self.mass * float(self.gravity_vector @ self.axis)])
-
-    def potential_energy(self, q: Array) -> float:
-        return -self.mass * float(self.gravity_vector @ self.axis) * float(q[0])
-
-    def joints(self) -> tuple[JointContract, ...]:
-        return (self._joint(0, "prismatic", self.axis, ORIGIN, self.mass, ORIGIN, self.inertia * np.eye(3)),)
 
 
 @dataclass(frozen=True)
@@ -146,7 +119,7 @@ class Projectile(HandForm):
 
 
 @dataclass(frozen=True)
-class MassSpringDamper(Slider):
+class MassSpringDamper(HandForm):
     """A block on a horizontal rail: m a = u - k (q - rest) - c v'."""
 
     joint_names: tuple[str, ...] = ("slide",)
@@ -157,6 +130,9 @@ class MassSpringDamper(Slider):
     inertia: float = 0.0033
     stiffness: float = 50.0
     rest: float = 0.1
+
+    def mass_matrix(self, q: Array) -> Array:
+        return np.array([[self.mass]])
 
     def bias(self, q: Array, v: Array) -> Array:
         return self.stiffness * (q - self.rest)
@@ -302,9 +278,6 @@ class NumpyEngine(EulerEngine):
         _, q, v = self._state(x)
         return float(v @ self.form.mass_matrix(q) @ v) / 2 + self.form.potential_energy(q)
 
-    def contact_depth(self, x: ArrayLike) -> float:
-        return self.form.contact_depth(self._state(x)[1])
-
     def mass_matrix(self, q: ArrayLike) -> Array:
         return self.form.mass_matrix(self._positions(q))
 
@@ -317,10 +290,10 @@ class NumpyEngine(EulerEngine):
             engine=self.name, joints=self.form.joints(), native_order=self.form.joint_names,
             inputs=self.form.input_names, actuation=float_rows(self.form.actuation),
             effort_limits=self.form.effort_limits, time_step=self.time_step, gravity=floats(self.form.gravity_vector),
-            contact_law=self.form.contact_law, derivatives="by every entry of x and u",
+            contact_law="none", derivatives="by every entry of x and u",
             reasons={
                 "limit law": "the hand calculation has no joint limits",
-                "contact pairs": "the hand calculation has its one contact in its law",
+                "contact pairs": "a hand calculation has no contact",
                 "solver tolerance": "nothing is solved iteratively",
             },
         )  # fmt: skip
