@@ -17,6 +17,7 @@ from drake_diff.model.contract import CoordinateTerms
 from drake_diff.optimize.goal_markers import Colour, colours_of, meaning_of
 from drake_diff.optimize.live import differ, scene_of_plan
 from drake_diff.optimize.messages import joined
+from drake_diff.optimize.replay import OPEN_LOOP
 from drake_diff.optimize.solution import Status
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay
@@ -116,7 +117,7 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
         replayed=m.shown[0] is not None,
         control="open loop" if judged is None else judged.control,
         variant=f"in steps of {m.solution.time_step:g} s" if judged is None else judged.variant,
-        open_loop_holds=all(r["holds"] for r in record["replays"] if r["control"] == "open loop"),
+        leaves=next((r["variant"] for r in record["replays"] if r["control"] == OPEN_LOOP and not r["holds"]), ""),
         colours=colours,
     )
 
