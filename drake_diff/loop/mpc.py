@@ -110,8 +110,9 @@ class MPC:
         self.replan_every = positive_int("replan_every", replan_every)
         self.iterations = positive_int("iterations", iterations)
         self.budget = None if budget is None else positive_float("budget [s]", budget)
-        self._clock, self._problem = clock, problem
+        self._clock, self.problem = clock, problem
         xs, us = _first_plan(problem, plan)
+        self.first_plan = frozen(xs), frozen(us)  # what the plan of the whole was made from
         self._rolling = Rolling(problem, _staying(problem, xs, us), xs, us)
         self._reference = self._plan_the_whole(xs, us)
         self._get_ready()
@@ -127,7 +128,7 @@ class MPC:
         self.status = OK
 
     def __call__(self, x: Any, t: float) -> Array:
-        start, k = self._clock(), max(round(t / self._problem.model.time_step), 0)
+        start, k = self._clock(), max(round(t / self.problem.model.time_step), 0)
         if self._fresh or not self._begin <= k < self._begin + self.replan_every:
             before = self._row(k, 1)
             self._replan(x, k, start)
@@ -138,6 +139,15 @@ class MPC:
                 self.status = f"{LATE}: {taken:.3g} s, expected at most {self.budget:.3g} s"
                 return np.array(before)
         return np.array(self._row(k, 1))
+
+    def __repr__(self) -> str:
+        h, every = self.problem.model.time_step, self.replan_every
+        steps = f"{self.iterations} step{'s' * (self.iterations > 1)} of optimization"
+        when = "a call" if every == 1 else f"each {every} steps"
+        budget = "" if self.budget is None else f", within {self.budget:g} s"
+        return (
+            f"MPC of {self.problem.name}: horizon {self.horizon} steps, {self.horizon * h:g} s, {steps} {when}{budget}"
+        )
 
     @property
     def latencies(self) -> Array:
@@ -178,7 +188,7 @@ class MPC:
         motion = Motion(xs, us, np.zeros_like(xs[1:]))
         self.status = OK
         try:
-            x = self._same_sign(finite_array("x", x, (self._problem.nx,)), xs[0])
+            x = self._same_sign(finite_array("x", x, (self.problem.nx,)), xs[0])
             stretch = self._rolling.stretch(k, count).along(np.vstack([x, xs[1:]]))
             motion = self._followed(x, k, xs, us, stretch) if stretch.rolls else self._measured(x, k, xs, us)
             for _ in range(self.iterations):
@@ -199,7 +209,7 @@ class MPC:
 
     def _measured(self, x: Array, k: int, xs: Array, us: Array) -> Motion:
         """The plan xs, us from step `k` on, from the state measured."""
-        twin, last = self._problem.model.double, self._last
+        twin, last = self.problem.model.double, self._last
         xs[0] = x
         known = range(self._begin + (k == self._begin), self._begin + len(last.us))
         ends = [last.ends[k + j - self._begin] if j and k + j in known else advance(twin, xs[j], us[j])
@@ -233,7 +243,7 @@ class MPC:
     def _same_sign(self, x: Array, planned: Array) -> Array:
         """`x` with its quaternions as near to those of `planned` as they can be: either sign is the same rotation."""
         x = np.array(x)
-        for start in tangent_space(self._problem.model).quaternions:
+        for start in tangent_space(self.problem.model).quaternions:
             entries = slice(start, start + 4)
             if x[entries] @ planned[entries] < 0:
                 x[entries] *= -1
@@ -250,17 +260,17 @@ class MPC:
             remarks.append(f"a step of {step.size:g}: the plant does not follow its derivatives further")
         if step.given_way is not None:
             label, far, knot = step.given_way
-            remarks.append(f"{label} gives way by {far:.3g} at {(k + knot) * self._problem.model.time_step:.4g} s")
+            remarks.append(f"{label} gives way by {far:.3g} at {(k + knot) * self.problem.model.time_step:.4g} s")
         return "; ".join(remarks) or OK
 
     def _get_ready(self) -> None:
         """Do once what each length of a plan needs once, so that no call has to."""
-        counts = {self._rolling.count(k, self.horizon) for k in range(self._problem.num_steps + 1)}
+        counts = {self._rolling.count(k, self.horizon) for k in range(self.problem.num_steps + 1)}
         for count in counts:
             xs, us = self._reference.xs[-count - 1 :], self._reference.us[-count:]
             if len(us) == count:
                 take_step(
-                    self._rolling.stretch(self._problem.num_steps - count, count), Motion(xs, us, np.zeros_like(xs[1:]))
+                    self._rolling.stretch(self.problem.num_steps - count, count), Motion(xs, us, np.zeros_like(xs[1:]))
                 )
             else:
                 self._rolling.stretch(0, count)
@@ -276,7 +286,7 @@ class MPC:
 
     def _plan_the_whole(self, xs: Array, us: Array) -> Motion:
         """A minimum near the given plan, whose costs-to-go are the tails."""
-        problem, rolling = self._problem, self._rolling
+        problem, rolling = self.problem, self._rolling
         stretch, paid = rolling.stretch(0, problem.num_steps), np.inf
         xs, us = np.array(xs), np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
         xs[0] = problem.x0

@@ -41,6 +41,7 @@ from drake_diff.motion.rollout import Meter, Rollout
 
 Controller = Callable[[Array, float], Any]  # u (nu,) = controller(x (nx,), t [s])
 OK, LATE = "ok", "late"
+FAILED, UNSEEN = "the controller failed:", "nothing was seen for"  # how its status begins
 MODES = ("hold", "damp", "stop")
 Reader = Callable[[int, Array], Array | None]
 Drive = Callable[[int, Array], Array]
@@ -125,6 +126,9 @@ class Hold:
         self._last = self._last if observation is None else observation
         return self._last
 
+    def __repr__(self) -> str:
+        return "Hold: the last sample"
+
 
 class Predictor:
     """The estimator that rolls the last sample forward through a model, under the commands since it was taken.
@@ -165,6 +169,9 @@ class Predictor:
         for command in self._since:
             x = np.asarray(advance(self.model.double, x, command))
         return x
+
+    def __repr__(self) -> str:
+        return f"Predictor of {self.model.name}: samples {self.delay} steps old"
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,33 +322,49 @@ class LoopEvent(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ClosedLoop(ShowsItsRepr):
-    """What happened in a loop: one row for each step of the controller, in read-only arrays.
+class LoopRows:
+    """What a loop recorded: a row for each step of the controller, of `xs` and `us` for each of the plant's."""
 
-    `motion` has the plant's own steps. `ended` is "" or says when and why the run broke off. `failed_part` is "" or the
-    part of the loop whose exception ended it: "controller", "sensor" or "estimator"; `controller_error` is the type and
-    message of the controller's.
-
-    Example:
-        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
-        >>> run = dd.loop.closed_loop(model, lambda x, t: [-x[0] - x[1]], x0=[0.1, 0], num_steps=50)
-        >>> run.commands.shape, run.motion.xs.shape, run.ended
-        ((50, 1), (51, 2), '')
-    """
-
-    motion: Rollout
-    times: Array  # (N,) [s] of the controller's steps
+    xs: Array  # (n+1, nx)
+    us: Array  # (n, nu)
     observations: Array  # (N, nx), NaN where nothing arrived
     estimates: Array  # (N, nx)
     commands: Array  # (N, nu)
     applied: Array  # (N, nu)
     controller_status: tuple[str, ...]  # "ok", "late", or why the fallback was in charge
-    events: tuple[LoopEvent, ...]
     latencies: Array  # (N,) [s] that the controller took, on this machine
-    latency_budget: float | None
     ended: str
     failed_part: str
     controller_error: str
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop(LoopRows, ShowsItsRepr):
+    """What happened in a loop: one row for each step of the controller, in read-only arrays; `save` writes it.
+
+    `xs` and `us` are the plant's own steps, and `motion` has what was measured along them. `ended` is "" or says when
+    and why the run broke off. `failed_part` is "" or the part of the loop whose exception ended it: "controller",
+    "sensor" or "estimator"; `controller_error` is the type and message of the controller's.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> run = dd.loop.closed_loop(model, lambda x, t: [-x[0] - x[1]], x0=[0.1, 0], num_steps=50)
+        >>> run.commands.shape, run.xs.shape, run.us.shape, run.ended
+        ((50, 1), (51, 2), (50, 1), '')
+    """
+
+    motion: Rollout
+    times: Array  # (N,) [s] of the controller's steps
+    events: tuple[LoopEvent, ...]
+    model: Model
+    controller: Controller
+    loop: Loop
+    seed: int
+
+    @property
+    def latency_budget(self) -> float | None:
+        """[s] that the controller was given for an answer; None where every answer was waited for."""
+        return self.loop.latency_budget
 
     @property
     def late(self) -> int:
@@ -351,11 +374,19 @@ class ClosedLoop(ShowsItsRepr):
     def __repr__(self) -> str:
         ok = self.controller_status.count(OK)
         lines = [
-            f"closed loop: {len(self.times)} steps of the controller, {len(self.motion.us)} of the plant",
+            f"closed loop of {self.model.name} under {name_of(self.controller)}",
+            f"  {len(self.times)} steps of the controller, {len(self.us)} of the plant",
             f"  controller: ok in {ok} steps, otherwise in {len(self.times) - ok}; {len(self.events)} events",
-            f"  last state: {np.array2string(self.motion.xs[-1], precision=4, threshold=20)}",
+            f"  last state: {np.array2string(self.xs[-1], precision=4, threshold=20)}",
         ]
         return "\n".join(lines + ([f"  broke off {self.ended}"] if self.ended else []))
+
+
+def name_of(component: Any) -> str:
+    """What a controller, sensor or estimator is called: of a user's function or class its name alone."""
+    if type(component).__module__.split(".")[0] == __name__.split(".")[0]:
+        return repr(component)
+    return str(getattr(component, "__qualname__", type(component).__qualname__))
 
 
 def closed_loop(
@@ -390,8 +421,16 @@ def closed_loop(
         array([0.5, 0.5, 0.5])
     """
     x0, steps = finite_array("x0", x0, (model.nx,)), count("num_steps", num_steps, 1)
-    noise = np.random.default_rng(count("seed", seed, 0, LARGEST_SEED))
-    return _LoopRun(model, controller, loop or Loop(), noise).result(x0, steps)
+    return _LoopRun(model, controller, loop or Loop(), seed).result(x0, steps)
+
+
+def replayed(rows: LoopRows, model: Model, controller: Controller | None, loop: Loop, seed: int) -> ClosedLoop:
+    """Each part of a loop with the recorded `rows` as its inputs: what it makes of them, for comparison.
+
+    So no error of a part reaches another one, nor the next step of the plant. What was recorded is not executed but
+    given where `controller` is None, and where `loop` has `Recorded` parts.
+    """
+    return _Replay(rows, model, controller, loop, seed).result(rows.xs[0], len(rows.commands))
 
 
 class OpenLoop:
@@ -418,12 +457,33 @@ class OpenLoop:
     def __call__(self, x: Any, t: float) -> Any:
         return self.us[min(max(round(t / self.time_step), 0), len(self.us) - 1)]
 
+    def __repr__(self) -> str:
+        return f"OpenLoop of {len(self.us) * self.time_step:g} s in steps of {self.time_step:g} s"
+
+
+class Recorded:
+    """A sensor, estimator or actuator that gives what one of a user's gave: `rows`, one for each step."""
+
+    def __init__(self, rows: Array):
+        self.rows, self.count = rows, 0
+
+    def start(self, *_: Any) -> Callable[[int, Any], Array | None]:
+        """Begin with the first row; a function of (k, ...) that gives row k, None where it is all NaN."""
+        self.count = 0
+        return lambda k, _: None if self.rows.shape[1] and np.all(np.isnan(self.rows[k])) else self.rows[k]
+
+    def estimate(self, *_: Any) -> Array:
+        """The next row."""
+        self.count += 1
+        return self.rows[self.count - 1]
+
 
 class _LoopRun:
     """One run under way."""
 
-    def __init__(self, model: Model, controller: Controller, loop: Loop, random: np.random.Generator):
-        self.model, self.controller, self.loop = model, controller, loop
+    def __init__(self, model: Model, controller: Controller, loop: Loop, seed: int):
+        random = np.random.default_rng(count("seed", seed, 0, LARGEST_SEED))
+        self.model, self.controller, self.loop, self.seed = model, controller, loop, seed
         self.period = count("Loop.substeps", loop.substeps, 1) * model.time_step
         if loop.latency_budget is not None:
             positive_float("Loop.latency_budget [s]", loop.latency_budget)
@@ -453,11 +513,11 @@ class _LoopRun:
         meter, xs = Meter(self.model), [x0]
         us: list[Array] = []
         for k in range(num_steps):
-            u = self._decide(k, xs[-1])
+            u = self._decide(k, self._given("xs", len(us), xs[-1]))
             if u is None:
                 break
             for _ in range(self.loop.substeps):
-                x = self._pushed(len(us), xs[-1])
+                x = self._pushed(len(us), self._given("xs", len(us), xs[-1]))
                 try:
                     after = np.asarray(advance(self.model.double, x, u))
                 except SimulationError as error:
@@ -468,15 +528,20 @@ class _LoopRun:
                 us.append(u)
             if self.ended:
                 break
-        set_state(self.model.double, xs[-1])
-        meter.measure_state(xs[-1])
+        self._finish()
+        last = self._given("xs", len(us), xs[-1])
+        set_state(self.model.double, last)
+        meter.measure_state(last)
+        motion = meter.result(np.array(xs), np.array(us).reshape(len(us), self.model.nu))
         steps, nx, nu = len(self.rows), self.model.nx, self.model.nu
 
         def column(i: int, size: int) -> Array:
             return frozen(np.array([row[i] for row in self.rows], dtype=float).reshape(steps, size))
 
         return ClosedLoop(
-            motion=meter.result(np.array(xs), np.array(us).reshape(len(us), nu)),
+            xs=motion.xs,
+            us=motion.us,
+            motion=motion,
             times=frozen(self.period * np.arange(steps)),
             observations=column(0, nx),
             estimates=column(1, nx),
@@ -485,31 +550,43 @@ class _LoopRun:
             controller_status=tuple(row[4] for row in self.rows),
             events=tuple(self.events),
             latencies=frozen([row[5] for row in self.rows]),
-            latency_budget=self.loop.latency_budget,
             ended=self.ended,
             failed_part=self.failed_part,
             controller_error=self.controller_error,
+            model=self.model,
+            controller=self.controller,
+            loop=self.loop,
+            seed=self.seed,
         )
+
+    def _given(self, name: str, k: int, made: Any) -> Any:
+        """What goes on to the next part of the loop: what was made."""
+        return made
+
+    def _finish(self) -> None:
+        """Say of a run that has ended what none of its parts says again."""
 
     def _decide(self, k: int, x: Array) -> Array | None:
         """What the actuator applies in step k; None where the run ends."""
         fallback, t = self.loop.fallback, k * self.period
-        last, component = self.rows[-1][2] if self.rows else None, "sensor"
+        last, component = self._given("commands", k - 1, self.rows[-1][2]) if self.rows else None, "sensor"
         try:  # they may be a user's code, as the controller
             seen = self.read(k, x)
             if seen is not None:
                 seen = array_with_gaps("the measurement", seen, x.shape)
-            component = "estimator"
+            shown = np.full(self.model.nx, np.nan) if seen is None else seen
+            seen, component = self._given("observations", k, seen), "estimator"
             if component in self.start_errors:
                 raise self.start_errors[component]
-            estimate = array_with_gaps("the estimate", self.loop.estimator.estimate(seen, last), x.shape)
+            made = array_with_gaps("the estimate", self.loop.estimator.estimate(seen, last), x.shape)
+            estimate = self._given("estimates", k, made)
         except Exception as error:
             self.failed_part = component
             self._end(k, f"the {component} failed: {type(error).__name__}: {error}")
             return None
         self.unseen = 0 if seen is not None else self.unseen + 1
         if fallback is not None and self.unseen > fallback.patience:
-            command, status, taken = None, f"nothing was seen for {self.unseen} steps", 0.0
+            command, status, taken = None, f"{UNSEEN} {self.unseen} steps", 0.0
         else:
             command, status, taken = self._command(estimate, t)
             budget = self.loop.latency_budget
@@ -531,10 +608,9 @@ class _LoopRun:
                 return None
             self.controller_error = ""
             command = fallback.command(self.model, estimate, np.zeros(self.model.nu) if last is None else last)
-        applied = self.drive(k, command)
-        shown = np.full(self.model.nx, np.nan) if seen is None else seen
-        self.rows.append((shown, estimate, command, applied, status, taken))
-        return applied
+        applied = self.drive(k, self._given("commands", k, command))
+        self.rows.append((shown, made, command, applied, status, taken))
+        return np.asarray(self._given("applied", k, applied))
 
     def _command(self, estimate: Array, t: float) -> tuple[Array | None, str, float]:
         """The controller's answer, or None where it has none; its status; and the time that it took [s]."""
@@ -547,7 +623,7 @@ class _LoopRun:
         except Exception as error:  # it is a user's code: whatever it raises is a failure of the controller, not ours
             self.controller_error = f"{type(error).__name__}: {error}"
             reason = "it is not finite" if isinstance(error, NonFiniteError) else self.controller_error
-            return None, f"the controller failed: {reason}", perf_counter() - begin
+            return None, f"{FAILED} {reason}", perf_counter() - begin
         return command, status, perf_counter() - begin
 
     def _end(self, k: int, why: str) -> None:
@@ -569,3 +645,31 @@ class _LoopRun:
                 message = f"{body.name()} is pushed by {np.linalg.norm(impulse):.3g} N s"
                 self.events.append(LoopEvent(k * self.model.time_step, "push", message))
         return x
+
+
+class _Replay(_LoopRun):
+    """A run whose parts are given what was recorded."""
+
+    def __init__(self, rows: LoopRows, model: Model, controller: Controller | None, loop: Loop, seed: int):
+        self.recorded, self.is_given = rows, controller is None
+        super().__init__(model, controller or OpenLoop(np.zeros((1, model.nu)), model.time_step), loop, seed)
+
+    def _given(self, name: str, k: int, made: Any) -> Any:
+        row = getattr(self.recorded, name)[k]
+        return None if name == "observations" and np.all(np.isnan(row)) else row
+
+    def _command(self, estimate: Array, t: float) -> tuple[Array | None, str, float]:
+        k, rows = len(self.rows), self.recorded
+        taken = float(rows.latencies[k])
+        if not self.is_given:
+            command, status, _ = super()._command(estimate, t)
+            return command, status, taken
+        status = rows.controller_status[k]
+        if status == LATE or status.startswith(UNSEEN):  # which follow from the other rows
+            status = OK
+        return None if status.startswith(FAILED) else rows.commands[k], status, taken
+
+    def _finish(self) -> None:
+        if not self.ended and self.recorded.failed_part:
+            self.failed_part, self.controller_error = self.recorded.failed_part, self.recorded.controller_error
+            self._end(len(self.rows), self.recorded.ended.partition(": ")[2])

@@ -1,5 +1,6 @@
 """Loops against closed forms: delays, lags, rates, noise, pushes; and what is done where the controller fails."""
 
+import dataclasses
 import re
 import time
 
@@ -11,7 +12,20 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
-from drake_diff.loop.run import Actuator, Fallback, Loop, Predictor, Push, Sensor, closed_loop
+from drake_diff.loop.run import (
+    Actuator,
+    Fallback,
+    Hold,
+    Loop,
+    OpenLoop,
+    Predictor,
+    Push,
+    Recorded,
+    Sensor,
+    closed_loop,
+    name_of,
+    replayed,
+)
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion import LQR
 
@@ -323,3 +337,53 @@ def test_a_cart_pole_is_kept_upright_by_lqr_and_falls_without():
     assert np.abs(kept.motion.xs[-1, 1] - np.pi) < 0.1
     fallen = closed_loop(model, lambda x, t: np.zeros(1), start, 800)
     assert np.abs(fallen.motion.xs[:, 1] - np.pi).max() > 1
+
+
+ROWS = ("xs", "us", "observations", "estimates", "commands", "applied")
+
+
+def test_each_part_makes_the_recorded_rows_again_and_a_changed_row_is_that_parts_alone(cart):
+    sensor = Sensor(noise=0.01, delay=2, every=2, dropout=0.1)
+    loop = Loop(
+        sensor, Predictor(cart, 2), Actuator(delay=1, lag=0.02, upper=5.0), pushes=[Push("cart", [1, 0, 0], 0.1)]
+    )
+    controller = gain(30, 8)
+    run = closed_loop(cart, controller, [1.0, 0.0], 60, loop, seed=4)
+    assert run.xs is run.motion.xs
+    assert run.us is run.motion.us
+    given = dataclasses.replace(
+        loop, sensor=Recorded(run.observations), estimator=Recorded(run.estimates), actuator=Recorded(run.applied)
+    )
+    for parts, law in ((loop, controller), (loop, None), (given, None)):
+        made = replayed(run, cart, law, parts, 4)
+        assert all(np.array_equal(getattr(made, row), getattr(run, row), equal_nan=True) for row in ROWS)
+        assert (made.events, made.controller_status, made.ended) == (run.events, run.controller_status, run.ended)
+        assert np.array_equal(made.motion.energy, run.motion.energy)
+    changed = np.array(run.commands)
+    changed[20] += 0.1
+    made = replayed(dataclasses.replace(run, commands=changed), cart, controller, loop, 4)
+    wrong = [row for row in ROWS if not np.array_equal(getattr(made, row), getattr(run, row), equal_nan=True)]
+    assert wrong == ["estimates", "applied"]  # which follow from commands; the controller's own are as they were
+    assert np.array_equal(made.xs, run.xs)
+
+
+def test_a_run_that_broke_off_breaks_off_again(cart):
+    for parts, controller in (({}, Broken("call")), ({"estimator": Broken("shape")}, lambda x, t: [1.0])):
+        run = closed_loop(cart, controller, [0.0, 0.0], 20, Loop(**parts))
+        loop = Loop(estimator=Recorded(run.estimates))
+        made = replayed(run, cart, None, loop, 0)
+        told = [(r.ended, r.failed_part, r.controller_error, r.events, r.controller_status) for r in (made, run)]
+        assert told[0] == told[1]
+        assert run.ended
+
+
+def test_parts_say_what_they_are(cart):
+    assert repr(OpenLoop([[1.0], [2.0]], 0.1)) == "OpenLoop of 0.2 s in steps of 0.1 s"
+    assert repr(Predictor(cart, 3)) == "Predictor of cart: samples 3 steps old"
+    assert repr(Hold()) == "Hold: the last sample"
+    assert name_of(Broken("call")) == "Broken"
+    assert name_of(gain(1, 1)) == "gain.<locals>.<lambda>"
+    run = closed_loop(cart, OpenLoop([[1.0]], 0.1), [0.0, 0.0], 2)
+    assert repr(run).startswith(
+        "closed loop of cart under OpenLoop of 0.1 s in steps of 0.1 s\n  2 steps of the controller"
+    )

@@ -62,6 +62,7 @@ def test_after_the_end_the_goal_is_stayed_at_by_lqr():
     problem = dd.Problem(block(time_step=0.1), x0=[1, 0], x_goal=[0, 0], num_steps=20, running_cost=EFFORT)
     plan = dd.solve(problem, method="ilqr")
     mpc = dd.loop.MPC(problem, horizon=5, plan=plan)
+    assert repr(mpc) == f"MPC of {problem.name}: horizon 5 steps, 0.5 s, 1 step of optimization a call"
     A, B = np.array([[1, 0.1], [0, 1]]), np.array([[0.01], [0.1]])
     K, _ = DiscreteTimeLinearQuadraticRegulator(A, B, *regulator_weights(plan.plan, plan.us)[:2])
     for k in (20, 21, 90):
