@@ -7,6 +7,7 @@ script that got into the page all the same is refused.
 """
 
 import base64
+import html
 import math
 import re
 import shlex
@@ -33,6 +34,9 @@ SCRIPTS = ("uPlot.iife.min.js", "report.js")
 APART = ("wall_clock", "files", "record_sha256")
 
 _SCRIPT = re.compile(r"<script(?![^>]*application/json)[^>]*>(.*?)</script>", re.DOTALL)
+_VIEW = re.compile(r'(?<= srcdoc=")[^"]*')
+_COMMAND = re.compile(r'(?<=fetch\("data:application/octet-binary;base64,)[A-Za-z0-9+/=]*(?="\))')
+_POLICY = re.compile(r"(?<='sha256-)[A-Za-z0-9+/=]*(?=')")
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +192,34 @@ def script_hashes(*pages: str) -> list[str]:
     """SHA-256 in base64 of every script in `pages`, as a content policy names them; JSON is no script."""
     scripts = dict.fromkeys(script for page in pages for script in _SCRIPT.findall(page) if script)
     return [base64.b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
+
+
+@dataclass(frozen=True)
+class PagePieces:
+    """A page by what it consists of, the page of a replay in it included.
+
+    `text` has all but the `scripts`, and hashes of these, which a content policy has; `scene` are the commands to a
+    viewer that the scripts have, in base64.
+    """
+
+    text: str
+    scripts: tuple[str, ...]
+    scene: tuple[str, ...]
+
+
+def pieces_of(page: str) -> PagePieces:
+    """A page in pieces, any text being a page."""
+    views = [html.unescape(view) for view in _VIEW.findall(page)]
+    inner = [pieces_of(view) for view in views]
+    hashes = {name: f"script {i}" for i, name in enumerate(script_hashes(*views, page))}
+    outer = _VIEW.sub("view", page)
+    scripts = _SCRIPT.findall(outer)
+    text = _POLICY.sub(lambda match: hashes.get(match[0], match[0]), _SCRIPT.sub("script", outer))
+    return PagePieces(
+        "".join([*(view.text for view in inner), text]),
+        (*(script for view in inner for script in view.scripts), *(_COMMAND.sub("", script) for script in scripts)),
+        (*(command for view in inner for command in view.scene), *_COMMAND.findall("".join(scripts))),
+    )
 
 
 def asset(name: str) -> str:

@@ -8,6 +8,8 @@ a text is such a number too. Whatever differs at all is told, whether it is allo
 import json
 import math
 import re
+import struct
+from base64 import b64decode
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -15,6 +17,7 @@ from itertools import zip_longest
 from typing import Any
 
 from drake_diff.logs.mcap_file import McapLog, fields_of, parse_mcap
+from drake_diff.pages.html import PagePieces, pieces_of
 
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 READ = (1e-9, 1e-15)  # the same of what is read out of a file and not computed along a motion
@@ -26,8 +29,10 @@ READ_SECTIONS = (
     "phases",
     "problem",
 )
-NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
-BLOB = re.compile(r"[A-Za-z0-9+/=_-]{40,}")  # hashes, and what a page draws: base64
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?!\w)")  # digits in a hash or a name are none
+
+
+DRAWN = ("scripts", "scene")  # of a page
 
 
 @dataclass(frozen=True)
@@ -165,16 +170,73 @@ def compare_bytes(compared: FileDifferences, recorded: bytes, again: bytes) -> N
         compared.differ("its bytes", sha256(recorded).hexdigest()[:16], sha256(again).hexdigest()[:16])
 
 
-def compare_text(compared: FileDifferences, recorded: bytes, again: bytes) -> None:
-    """Two pages. Where only digits and drawings differ, that is allowed: what is drawn there is not compared."""
+def compare_pages(compared: FileDifferences, recorded: bytes, again: bytes) -> None:
+    """Two pages: scripts and styles exactly; numbers in the text, and in what a scene draws, by how machines round."""
     compared.count += 1
     if recorded == again:
         return
-    old, new = recorded.decode(errors="replace"), again.decode(errors="replace")
-    position = next((i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b), min(len(old), len(new)))
-    near = is_near_text(BLOB.sub("", old), BLOB.sub("", new))
-    key = f"the text from character {position} on" if not near else "digits and drawings"
-    compared.differ(key, old[position : position + 60], new[position : position + 60], allowed=near)
+    old, new = (pieces_of(page.decode(errors="replace")) for page in (recorded, again))
+    before = len(compared.differing)
+    _compare_pieces(compared, old, new)
+    if len(compared.differing) == before:
+        compare_bytes(compared, recorded, again)
+
+
+def _compare_pieces(compared: FileDifferences, old: PagePieces, new: PagePieces) -> None:
+    if old.text != new.text:
+        pairs = enumerate(zip(old.text, new.text, strict=False))
+        i = next((i for i, (a, b) in pairs if a != b), min(len(old.text), len(new.text)))
+        near = is_near_text(old.text, new.text)
+        compared.differ(f"the text from character {i} on", old.text[i : i + 60], new.text[i : i + 60], allowed=near)
+    for name in DRAWN:
+        theirs, ours = getattr(old, name), getattr(new, name)
+        if len(theirs) != len(ours):
+            compared.differ(f"{name}, how many", len(theirs), len(ours))
+            continue
+        compared.count += len(ours)
+        for i, (a, b) in enumerate(zip(theirs, ours, strict=True)):
+            if a != b:
+                near = name == "scene" and _is_near_drawing(a, b)
+                hashes = (sha256(side.encode()).hexdigest()[:16] for side in (a, b))
+                compared.differ(f"{name} {i} of {len(ours)}", *hashes, allowed=near)
+
+
+def _is_near_drawing(recorded: str, again: str) -> bool:
+    """Whether two commands to a viewer, in base64, are the same but for numbers that are near for the largest one."""
+    try:
+        old, new = (list(_values_of(b64decode(text, validate=True))) for text in (recorded, again))
+    except (ValueError, IndexError, struct.error):
+        return False
+    largest = max((abs(v) for v in new if isinstance(v, float) and math.isfinite(v)), default=0.0)
+    return len(old) == len(new) and all(a == b or _is_near_value(a, b, largest) for a, b in zip(old, new, strict=True))
+
+
+# By the head of a value in MessagePack: the bytes that give its length, and the bytes beside that length.
+SIZED = {0xC4: (1, 0), 0xC5: (2, 0), 0xC6: (4, 0), 0xC7: (1, 1), 0xC8: (2, 1), 0xC9: (4, 1)}
+SIZED |= {0xD9: (1, 0), 0xDA: (2, 0), 0xDB: (4, 0)}
+FIXED = {0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8, 0xDC: 2, 0xDD: 4, 0xDE: 2, 0xDF: 4}
+FIXED |= {0xD4 + i: 1 + 2**i for i in range(5)}
+FLOATS = 0x17  # the type of an array of single precision
+
+
+def _values_of(data: bytes) -> Iterator[float | bytes]:
+    """The values of MessagePack one after the other: numbers that are not whole, and the bytes of all else."""
+    i = 0
+    while i < len(data):
+        head, start = data[i], i + 1
+        if head in (0xCA, 0xCB):
+            i = start + (4 if head == 0xCA else 8)
+            yield float(struct.unpack(">f" if head == 0xCA else ">d", data[start:i])[0])
+            continue
+        width, more = SIZED.get(head, (0, 0))
+        begin = start + width + more
+        size = int.from_bytes(data[start : start + width])
+        i = begin + (size if width else FIXED.get(head, head & 0x1F if 0xA0 <= head < 0xC0 else 0))
+        if 0xC7 <= head <= 0xC9 and data[begin - 1] == FLOATS:
+            yield data[start:begin]
+            yield from struct.unpack(f"<{size // 4}f", data[begin:i])
+        else:
+            yield data[start - 1 : i]
 
 
 def compare_traces(

@@ -16,12 +16,13 @@ from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, Mis
 from drake_diff.model.step import step
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs.differences import (
+    DRAWN,
     Difference,
     FileDifferences,
     Reproduced,
     compare_bytes,
     compare_fields,
-    compare_text,
+    compare_pages,
     compare_traces,
 )
 from drake_diff.runs.directory import FILES as OLD_FILES
@@ -56,6 +57,7 @@ UNCHECKED = (
     "provenance: the versions, the commit, the machine and the command that made it",
     "name and contract.source: what it was called, and where the model file was",
 )
+UNREAD = "hashes match, contents not checked"
 WAITED = 60.0  # [s] for a run to be made again, where nobody says else
 HASHED = ("schema_version", "files", "record_sha256")  # of a record
 OF_FUNCTIONS = (
@@ -381,16 +383,21 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
     nothing = record.subject in NOT_RERUN and not again.fields
     why = (f"every number: {NOT_RERUN[record.subject]}",) if nothing else (*UNCHECKED, *_others(record, again.written))
     compared, unchecked = [fields], [*why, *again.unchecked]
-    unchecked += [f"sentences, pages and whatever else schema {SCHEMA_VERSION} has otherwise"] * converted
+    unchecked += [f"whatever else schema {SCHEMA_VERSION} has otherwise"] * converted
     for name in dict.fromkeys((*again.files, *again.written)):
         if name not in record.files:
             unchecked += [f"{name}: the directory has none"] * (name in again.files)
         elif name not in again.files:
             unchecked += [f"{name}: it has what was not run again"] * bool(again.files)
-        elif not (converted and name.endswith((".html", record.SCHEMA_FILE))):
+        else:
             compared.append(_compared_file(verification.directory, name, again))
+    undecided = list(again.undecided)
     for item in compared if converted else ():
-        item.differing = [d for d in item.differing if d.key.split(".")[-1] not in WORDS]
+        worded = [d for d in item.differing if d.file.endswith(".html") or d.key.split(".")[-1] in WORDS]
+        item.differing = [d for d in item.differing if d not in worded]
+        if worded:
+            undecided.append(f"{item.file}: {UNREAD}: schema {record.schema_version} has {worded[0].key} otherwise")
+    again = replace(again, undecided=tuple(undecided))
     return _told_of_a_solve(verification, again, [*_odd_schema(record), *again.problems], compared, unchecked)
 
 
@@ -410,7 +417,7 @@ def _compared_file(folder: Path, name: str, again: Reproduced) -> FileDifference
         alike = (SealedRecord.FILE, CONFIGURATION) if again.unrepeated else (SealedRecord.FILE,)
         compare_traces(compared, read_plain(folder / name), made, alike=alike, skip=skip)
     elif name.endswith(".html"):
-        compare_text(compared, read_plain(folder / name), made)
+        compare_pages(compared, read_plain(folder / name), made)
     else:
         compare_bytes(compared, read_plain(folder / name), made)
     return compared
@@ -470,6 +477,8 @@ def _is_searched(d: Difference) -> bool:
     """Whether a difference is in what the search tells of itself, or in a page, which shows that too."""
     if d.file.endswith(SealedRecord.FILE):
         return is_below(d.key, (*SEARCHED, *SEARCHED_IN_PHASES))
+    if d.key.startswith(DRAWN):
+        return False
     return not d.file.endswith(TRACE) or d.key.startswith((*SEARCH_TOPICS, "attachment ", "metadata "))
 
 

@@ -35,11 +35,12 @@ import _one_thread  # noqa: F401 (before NumPy)
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np
+from helpers.forgery import rewrite, seal
 from helpers.models import MODELS
 from helpers.strange import FILES, broken
 from mcap.reader import NonSeekingReader
 from mcap.writer import Writer
-from trust_verify import leaves, rewrite, seal
+from trust_verify import leaves
 
 import drake_diff as dd
 from drake_diff.cli import main as cli

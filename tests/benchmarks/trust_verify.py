@@ -10,21 +10,19 @@ import json
 import shutil
 import tempfile
 from collections import Counter
-from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from helpers.forgery import rewrite, seal
 from helpers.models import MODELS
 from mcap.reader import NonSeekingReader
-from mcap.writer import CompressionType, Writer
 from solving import solve_with
 from trust import Figure
 
 import drake_diff as dd
 
 COUNT = 1000
-APART = ("wall_clock", "files", "record_sha256")
 # By the words of `Verification.unchecked`: what nothing can make again, and what was asked.
 UNCHECKED = ("wall_clock", "provenance", "name", "contract.source")
 ASKED = ("problem.", "model.", "inputs.search.")
@@ -60,55 +58,6 @@ def save_runs(folder, rng):
     for name, (problem, options) in tasks.items():
         dd.save(solve_with(problem, **options), folder / name)
     return list(tasks)
-
-
-def canonical(fields):
-    return json.dumps(fields, sort_keys=True, indent=2) + "\n"
-
-
-def seal(folder, fields, *, attach=True):
-    """Write `fields` as the record, with the hashes of all other files and its own; the trace carries it too."""
-    if attach:
-        carried = canonical({k: v for k, v in fields.items() if k not in APART}).encode()
-        rewrite(folder / "trace.mcap", attachments={"record.json": carried})
-    files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    files.pop("record.json")
-    fields["files"] = {
-        name: {"path": name, "bytes": len(data), "sha256": sha256(data).hexdigest(), "reason": None}
-        for name, data in sorted(files.items())
-    }
-    fields["record_sha256"] = ""
-    fields["record_sha256"] = sha256(canonical(fields).encode()).hexdigest()
-    (folder / "record.json").write_text(canonical(fields))
-
-
-def rewrite(path, *, attachments=None, message=None, metadata=None, drop=None):
-    """Write a trace again with some attachments, message, metadata changed, or messages dropped."""
-    data, out = path.read_bytes(), BytesIO()
-    writer = Writer(
-        out, chunk_size=64 * 1024, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
-    )
-    writer.start(profile="", library="drake_diff")
-    for record in NonSeekingReader(BytesIO(data)).iter_metadata():
-        writer.add_metadata(record.name, {**record.metadata, **(metadata or {})})
-    for a in NonSeekingReader(BytesIO(data)).iter_attachments():
-        content = (attachments or {}).get(a.name, a.data)
-        writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, content)
-    schemas, channels = {}, {}
-    summary = NonSeekingReader(BytesIO(data)).get_summary()
-    for number, channel in sorted(summary.channels.items()):
-        schema = summary.schemas[channel.schema_id]
-        if schema.id not in schemas:
-            schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-        encoding = channel.message_encoding
-        channels[number] = writer.register_channel(channel.topic, encoding, schemas[schema.id], channel.metadata)
-    for i, (_, channel, m) in enumerate(NonSeekingReader(BytesIO(data)).iter_messages()):
-        if i != drop:
-            times = {"log_time": m.log_time, "publish_time": m.publish_time, "sequence": m.sequence}
-            content = message(i, channel, m) if message else m.data
-            writer.add_message(channels[channel.id], data=content, **times)
-    writer.finish()
-    path.write_bytes(out.getvalue())
 
 
 def leaves(value, path=()):

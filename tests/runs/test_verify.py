@@ -5,16 +5,15 @@ import json
 import math
 import random
 import shutil
+import struct
 from hashlib import sha256
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.forgery import rewrite, seal, with_commands, with_scene_of, with_scripts
 from helpers.models import MODELS, ROOT
 from helpers.table import each_row, slow_after
-from mcap.reader import NonSeekingReader
-from mcap.writer import Writer
 
 import drake_diff as dd
 import drake_diff.runs.save as evidence
@@ -27,6 +26,7 @@ from drake_diff.runs.fields import reproducible
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.save import begin
 from drake_diff.runs.trace import write_trace
+from drake_diff.runs.verify import verify_own
 from drake_diff.runs.view import list_runs
 from drake_diff.trials import save_robustness
 
@@ -264,38 +264,81 @@ def test_exchanged_pages_are_found_although_all_hashes_are_right_and_a_file_more
             dd.load_record(copy).write(copy)
             found = dd.verify(copy)
             assert found.verdict == "broken"
-            assert [line.split(":")[0] for line in found.complaints] == [name]
+            assert {line.split(":")[0] for line in found.complaints} == {name}
         (copy / name).write_bytes(honest)
     (copy / "certificate.pdf").write_text("all is well")
     dd.load_record(copy).write(copy)
     assert "certificate.pdf: nothing that drake_diff writes there" in dd.verify(copy).require().unchecked
 
 
-@pytest.mark.parametrize(
-    ("dropped", "told"),
-    slow_after(1, [("message", "/"), ("metadata", "metadata run"), ("attachment", "attachment configuration")]),
+def numbers_changed(by):
+    """Every number of double precision in the commands to a viewer changed `by` a function."""
+
+    def change(_, data):
+        for i in range(len(data) - 8):
+            if data[i] == 0xCB and 1e-3 < abs(value := struct.unpack(">d", data[i + 1 : i + 9])[0]) < 1e3:
+                data = data[: i + 1] + struct.pack(">d", by(value)) + data[i + 9 :]
+        return data
+
+    return lambda page, _: with_commands(page, change)
+
+
+@each_row(
+    "forge, verdict",
+    [
+        (with_scene_of, "broken"),
+        (numbers_changed(lambda value: value * (1 + 1e-4)), "broken"),
+        (numbers_changed(lambda value: value * (1 + 1e-9)), "holds"),  # as machines round
+        (lambda page, _: with_commands(page, lambda i, data: b"" if i == 3 else data), "broken"),
+        (lambda page, _: with_commands(page, lambda i, data: data[:-1] if i == 3 else data), "broken"),
+        (lambda page, _: with_scripts(page, lambda script: script + "//" + "a" * 50), "broken"),
+        (lambda page, _: page.replace("'sha256-", f"'sha256-{'a' * 43}=' 'sha256-"), "broken"),
+        (lambda page, _: page.replace("6b3d943b", "6b3d943c"), "broken"),  # of the model, in the record in the report
+    ],
 )
-def test_a_trace_with_something_left_out_is_found(copy, dropped, told):
+def test_a_scene_that_is_not_the_runs_is_found_although_all_hashes_are_right(run, other_run, copy, forge, verdict):
+    names = []
+    for name in ("replay.html", "report.html"):
+        honest = (run / name).read_text()
+        assert with_scene_of(honest, honest) == honest
+        (copy / name).write_text(forge(honest, (other_run / name).read_text()))
+        names += [name] * ((copy / name).read_text() != honest)
+    dd.load_record(copy).write(copy)
+    found = verify_own(copy)
+    assert (found.verdict, names != []) == (verdict, True), found.lines
+    differing = found.complaints if verdict == "broken" else found.rounded
+    assert list(dict.fromkeys(line.split(":")[0] for line in differing)) == names
+
+
+def test_an_older_schema_is_no_excuse_for_another_page_or_sentence(run, other_run, copy):
+    """What versions word otherwise cannot be told from a forgery: it is not checked, and does not hold."""
+    record = dd.load_record(copy).model_copy(update={"schema_version": "3.1.0"})
+    seal(copy, record.model_dump(mode="json"))
+    found = verify_own(copy)
+    assert found.verdict == "holds", found.lines
+    seal(copy, {**record.model_dump(mode="json"), "sentence": "it is safe for people"})
+    assert verify_own(copy).verdict == "undecided"
+    (copy / "replay.html").write_text((other_run / "replay.html").read_text())
+    seal(copy, record.model_dump(mode="json"))
+    found = verify_own(copy)
+    assert found.verdict == "undecided"
+    assert any("replay.html: hashes match, contents not checked" in line for line in found.undecided), found.lines
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    slow_after(
+        1,
+        [
+            ({"drop": 3}, "/"),
+            ({"metadata": {"status": "best"}}, "metadata run"),
+            ({"attachments": {"configuration.json": b"{}"}}, "attachment configuration"),
+        ],
+    ),
+)
+def test_a_trace_with_something_left_out_is_found(copy, change, told):
     """Written again by the mcap package alone, as whole as before."""
-    data, out = (copy / "trace.mcap").read_bytes(), BytesIO()
-    writer = Writer(out, enable_data_crcs=True)
-    writer.start(profile="", library="drake_diff")
-    for record in NonSeekingReader(BytesIO(data)).iter_metadata():
-        writer.add_metadata(record.name, {**record.metadata, **({"status": "best"} if dropped == "metadata" else {})})
-    for a in NonSeekingReader(BytesIO(data)).iter_attachments():
-        content = b"{}" if (dropped, a.name) == ("attachment", "configuration.json") else a.data
-        writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, content)
-    summary = NonSeekingReader(BytesIO(data)).get_summary()
-    schemas, channels = {}, {}
-    for number, channel in sorted(summary.channels.items()):
-        schema = summary.schemas[channel.schema_id]
-        schemas[schema.id] = schemas.get(schema.id) or writer.register_schema(schema.name, "protobuf", schema.data)
-        channels[number] = writer.register_channel(channel.topic, "protobuf", schemas[schema.id], channel.metadata)
-    for i, (_, channel, m) in enumerate(NonSeekingReader(BytesIO(data)).iter_messages()):
-        if (dropped, i) != ("message", 3):
-            writer.add_message(channels[channel.id], m.log_time, m.data, m.publish_time, m.sequence)
-    writer.finish()
-    (copy / "trace.mcap").write_bytes(out.getvalue())
+    rewrite(copy / "trace.mcap", **change)
     dd.load_record(copy).write(copy)
     found = dd.verify(copy)
     assert found.verdict == "broken"
