@@ -19,6 +19,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from drake_diff.exceptions import ArtifactError, DrakeDiffError
+
 GIB = 2**30
 LARGEST_ANSWER = 64 * 2**20  # bytes, also of any other file that the child writes
 START_UP = 180.0  # [s] in which Python has imported Drake and Numba has compiled, on a busy machine too
@@ -27,6 +29,8 @@ COMMAND = "from drake_diff._base.sandbox import serve; serve()"
 REQUEST, ANSWER, OUTPUT = "request.json", "answer.json", "output.txt"
 USED = "/proc/self/statm"  # in pages; the sixth number is that of data and stack
 NEARLY = 0.9  # of the memory that a process may have
+NO_MEMORY = 99  # the exit status of a child that got none
+MOST_TAKEN = GIB  # bytes that reading one file may take
 
 
 class CallOutcome(NamedTuple):
@@ -123,11 +127,11 @@ def _last_line(output: bytes) -> str:
     return f" ({last})" if last else ""
 
 
-def crash_of(action: Callable[[], object]) -> str:
-    """The signal that ended a process forked from this one to call `action()`, and its last words; "" where none did.
+def crash_of(action: Callable[[], object], seconds: float = 60.0, memory: float = 1.0) -> str:
+    """What ended a process forked from this one to call `action()`: a signal and last words, a limit; "" if nothing.
 
     For a file of the user's own: it takes as long as `action()`, and some milliseconds. Only for a process without
-    threads of Python, as a command is.
+    threads of Python, as a command is. The limits are as those of `call`, the memory beside what this process has.
     """
     parent, child = os.getpid(), 0
     with tempfile.TemporaryFile() as output:
@@ -138,18 +142,27 @@ def crash_of(action: Callable[[], object]) -> str:
             if child == 0:
                 os.dup2(output.fileno(), 1)
                 os.dup2(output.fileno(), 2)
-                resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+                _limit(resource.RLIMIT_CORE, 0)
+                _limit(resource.RLIMIT_DATA, _used() + int(memory * GIB))
+                signal.signal(signal.SIGALRM, signal.SIG_DFL)
+                signal.setitimer(signal.ITIMER_REAL, seconds)
                 faulthandler.disable()  # its words would be the last ones
                 action()
             status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) if child else 0
-        except BaseException:  # Ctrl-C; in the child, whatever `action` raises is for the caller to meet
+        except BaseException as error:  # Ctrl-C; in the child, whatever `action` raises is for the caller to meet
             if child:
                 os.kill(child, signal.SIGKILL)
                 os.waitpid(child, 0)
+            elif os.getpid() != parent and isinstance(error, MemoryError):
+                os._exit(NO_MEMORY)
             raise
         finally:
             if os.getpid() != parent:
                 os._exit(0)
+        if status == -signal.SIGALRM:
+            return f"the limit of {seconds:g} s"
+        if status == NO_MEMORY:
+            return f"the limit of {memory:g} GiB"
         if status >= 0:
             return ""
         output.seek(0)
@@ -159,20 +172,45 @@ def crash_of(action: Callable[[], object]) -> str:
 @contextmanager
 def memory_at_most(bytes_: int) -> Iterator[None]:
     """Let this process have at most so much of its own memory while the block runs; MemoryError where it needs more."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    least = min(most for most in (bytes_, soft, hard) if most != resource.RLIM_INFINITY)
-    resource.setrlimit(resource.RLIMIT_DATA, (least, hard))
+    with _at_most(resource.RLIMIT_DATA, bytes_):
+        yield
+
+
+@contextmanager
+def _at_most(kind: int, most: int) -> Iterator[None]:
+    soft, hard = resource.getrlimit(kind)
+    least = min(limit for limit in (most, soft, hard) if limit != resource.RLIM_INFINITY)
+    resource.setrlimit(kind, (least, hard))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+        resource.setrlimit(kind, (soft, hard))
+
+
+@contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Parse a stranger's file with no more than `MOST_TAKEN` bytes of memory beside what is used, and of files.
+
+    ArtifactError, "{path} is not {what}", of whatever a parser raises, or where it needs more; our errors stay.
+    """
+    try:
+        with memory_at_most(_used() + MOST_TAKEN), _at_most(resource.RLIMIT_FSIZE, MOST_TAKEN):
+            yield
+    except DrakeDiffError:
+        raise
+    except MemoryError as error:
+        raise ArtifactError(f"{path}: reading it takes more than {MOST_TAKEN / GIB:g} GiB of memory") from error
+    except Exception as error:  # parsers fail in many ways on what is damaged
+        raise ArtifactError(f"{path} is not {what}: {type(error).__name__}: {error!s:.300}") from error
+
+
+def _used() -> int:
+    """Bytes of data and stack that this process has; 0 where the system does not say."""
+    return int(Path(USED).read_text().split()[5]) * resource.getpagesize() if os.path.exists(USED) else 0
 
 
 def check_memory() -> None:
     """MemoryError where this process has used nearly all that it may have: libraries in C crash where they get none."""
     most, _ = resource.getrlimit(resource.RLIMIT_DATA)
-    if most == resource.RLIM_INFINITY or not os.path.exists(USED):
-        return
-    pages = int(Path(USED).read_text().split()[5])
-    if pages * resource.getpagesize() > NEARLY * most:
+    if most != resource.RLIM_INFINITY and _used() > NEARLY * most:
         raise MemoryError

@@ -29,6 +29,7 @@ from drake_diff.certificates.contact_checks import (
     unread_compliance,
 )
 from drake_diff.certificates.finding import SEVERITIES, Finding, Findings, Point, Severity, listed
+from drake_diff.derivatives.sources import too_large_for_autodiff
 from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.model import Model
@@ -139,8 +140,9 @@ def _saturated_effort(point: Point) -> Found:
     twin.set_input(point.u)
     # The efforts nearest to what no acceleration at rest takes.
     hold = np.linalg.lstsq(model.actuation[:, is_effort], twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
+    every = actuators(plant)
     for i, u, effort, rest in zip(index, point.u[is_effort], efforts, hold, strict=True):
-        actuator = actuators(plant)[i]
+        actuator = every[i]
         limit = float(actuator.effort_limit())
         if abs(effort) >= limit:
             corner = abs(u) == limit and not actuator.has_controller()
@@ -164,6 +166,12 @@ def _zero_effort(point: Point) -> Found:
 
 def _jacobian(point: Point) -> Found:
     if point.step_error is not None:
+        return
+    if too_large := too_large_for_autodiff(point.model):
+        remedy = (
+            "load_model(..., fix_joints=) with what need not move, or accept `dd.differentiate_step` by differences"
+        )
+        yield Finding("warning", "too_large", "step", f"its Jacobian is not looked at: {too_large}", remedy)
         return
     result = point.by_autodiff
     if isinstance(result, ModelError):

@@ -12,18 +12,21 @@ import io
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff._base.files import arrays_of, make_folder, write_whole
+from drake_diff._base.files import MOST_TEXT, arrays_of, json_of, make_folder, plain_file, read_plain, write_whole
+from drake_diff._base.sandbox import reading
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError, UnknownNameError
-from drake_diff.logs.mcap_file import read_mcap
+from drake_diff.logs.mcap_file import read_mcap, records
 from drake_diff.mechanics.coordinates import rotation
 from drake_diff.mechanics.description import Link, describe_whole
 from drake_diff.model.model import Model
@@ -79,18 +82,16 @@ def _messages(path: Path) -> tuple[list[tuple[str, str, bytes]], Mapping[str, st
     from mcap.reader import make_reader
     from rosbags.rosbag2 import Reader
 
-    try:
-        if path.is_dir():
-            with Reader(path) as bag:
-                return [(c.topic, c.msgtype, data) for c, _, data in bag.messages() if c.msgtype in USED], {}
-        with path.open("rb") as file:
-            reader = make_reader(file, validate_crcs=True)
-            rows = [(c.topic, s.name, m.data) for s, c, m in reader.iter_messages() if s and s.name in USED]
-            metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-            return rows, metadata.get("contract", {})
-    except Exception as error:  # a damaged file makes readers fail in many ways
-        what = "a ROS 2 bag" if path.is_dir() else "a complete MCAP file"
-        raise ArtifactError(f"{path} is not {what}: {error}") from error
+    if path.is_dir():
+        with Reader(path) as bag:
+            wanted = [c for c in bag.connections if c.msgtype in USED]
+            return [(c.topic, c.msgtype, data) for c, _, data in bag.messages(wanted)] if wanted else [], {}
+    data = read_plain(path, links=True)
+    deque(records(data), maxlen=0)  # which refuses what unpacks to too much
+    reader = make_reader(io.BytesIO(data), validate_crcs=True)
+    rows = [(c.topic, s.name, m.data) for s, c, m in reader.iter_messages() if s and s.name in USED]
+    metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+    return rows, metadata.get("contract", {})
 
 
 class _Found:
@@ -270,7 +271,10 @@ def check_recording(recording: Recording, model: Model) -> None:
         before = f"more than {times[k - 1]} s before it"
         raise InputError(f"{subject}: time of sample {k}", got=f"{times[k]} s", expected=before)
     xs = finite_array(f"{subject}: xs", recording.xs, (len(times), model.nx))
-    finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
+    us = finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
+    check_sizes(f"{subject}: times", times[:, None], ["s"])
+    check_sizes(f"{subject}: xs", xs, model.state_names)
+    check_sizes(f"{subject}: us", us, model.input_names)
     for start in tangent_space(model).quaternions:
         norms = np.linalg.norm(xs[:, start : start + 4], axis=1)
         k = int(np.argmax(np.abs(norms - 1)))
@@ -280,6 +284,13 @@ def check_recording(recording: Recording, model: Model) -> None:
     for quantity in recording.facts:
         if quantity not in FACTS:
             raise UnknownNameError(f"{subject}: fact", got=quantity, known=FACTS)
+
+
+def check_sizes(subject: str, values: Array, names: Sequence[str]) -> None:
+    """InputError, naming sample and column, where one of `values` (n, len(names)) is beyond `LARGEST_NUMBER`."""
+    for k, j in np.argwhere(np.abs(values) > LARGEST_NUMBER)[:1]:
+        expected = f"at most {LARGEST_NUMBER:g} in magnitude"
+        raise InputError(f"{subject}: {names[j]} at sample {k}", got=values[k, j], expected=expected)
 
 
 def steps_between(recording: Recording, time_step: float) -> int:
@@ -301,6 +312,15 @@ def steps_between(recording: Recording, time_step: float) -> int:
 
 
 Motion = tuple[Array, Array, Array]  # times (n,) [s], xs (n, nx), us (n - 1, nu)
+LARGEST_NUMBER = 1e12  # of a recording, in any unit: of more, what is computed from squares and products overflows
+LONGEST_LINE = 2**20  # characters of a line of a CSV file
+MOST_NUMBERS = 2**25  # of a recording: 256 MiB
+BLOCK = 10_000  # rows that are read at once
+PACKED = {
+    b"\x1f\x8b": "a file packed by gzip", b"PK\x03\x04": "a zip archive", b"\x28\xb5\x2f\xfd": "a file packed by zstd",
+    b"\xfd7zXZ": "a file packed by xz", b"BZh": "a file packed by bzip2", b"\xff\xfe": "text in UTF-16",
+    b"\xfe\xff": "text in UTF-16", b"\x89MCAP": "an MCAP file", b"SQLite": "an SQLite file",
+}  # fmt: skip
 SUFFIXES = "a .csv file, an .mcap file or the directory of a ROS 2 bag"
 
 
@@ -345,15 +365,16 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
         raise InputError("recording", got=f"{path}, which is not there", expected=SUFFIXES)
     facts: Mapping[str, str] = {}
     outputs: dict[str, Array] = {}
-    if path.suffix == ".csv":
-        motion, outputs = _read_csv(path, model, gaps)
-    elif path.is_dir() or (path.suffix == ".mcap" and is_ros2(path)):
-        motion, facts = read_ros2(path, model)
-    elif path.suffix == ".mcap":
-        motion, facts = _read_mcap(path, model)
-    else:
-        raise InputError("recording", got=str(path), expected=SUFFIXES)
-    facts = {**facts, **_contract_facts(path)}
+    with reading(path, "a ROS 2 bag" if path.is_dir() else f"a complete {path.suffix} file"):
+        if path.suffix == ".csv":
+            motion, outputs = _read_csv(path, model, gaps)
+        elif path.is_dir() or (path.suffix == ".mcap" and is_ros2(path)):
+            motion, facts = read_ros2(path, model)
+        elif path.suffix == ".mcap":
+            motion, facts = _read_mcap(path, model)
+        else:
+            raise InputError("recording", got=str(path), expected=SUFFIXES)
+        facts = {**facts, **_contract_facts(path)}
     name, version = name or facts.get("engine", path.stem), facts.get("version", "(version unknown)")
     times, xs, us = (frozen(array) for array in motion)
     recording = Recording(name, version, times, xs, us, facts, outputs)
@@ -395,7 +416,7 @@ def _contract_facts(path: Path) -> dict[str, str]:
     if not beside.exists():
         return {}
     try:
-        facts = json.loads(beside.read_text())
+        facts = json_of(read_plain(beside, MOST_TEXT, links=True))
     except ValueError as error:
         raise InputError(str(beside), got=str(error), expected="a JSON object") from error
     if not isinstance(facts, dict):
@@ -409,41 +430,97 @@ def is_output(column: str) -> bool:
 
 
 def _read_csv(path: Path, model: Model, gaps: bool) -> tuple[Motion, dict[str, Array]]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        rows = [(line, row) for line, row in enumerate(csv.reader(file), start=1) if row]
-    if not rows:
+    rows = _rows_of_csv(path)
+    _, header = next(rows, (0, []))
+    if not header:
         raise InputError(str(path), got="an empty file", expected="a header row and samples")
-    outputs = tuple(text.strip() for text in rows[0][1] if gaps and is_output(text.strip()))
+    outputs = tuple(text.strip() for text in header if gaps and is_output(text.strip()))
     wanted = ("time", *model.state_names, *model.input_names, *outputs)
-    places = _columns(path, model, rows[0][1], wanted, model.state_names if gaps else ())
-    last = 1 + model.nx + model.nu
-    table = np.zeros((len(rows) - 1, len(wanted)))
-    for k, (line, row) in enumerate(rows[1:]):
-        if len(row) != len(rows[0][1]):
-            raise InputError(f"{path} line {line}", got=f"{len(row)} cells", expected=f"{len(rows[0][1])}")
-        for j, (column, index) in enumerate(zip(wanted, places, strict=True)):
-            if k == len(table) - 1 and model.nx < j < last and not row[index].strip():
-                continue  # no step begins at the last sample
-            if index < 0 or (gaps and (0 < j <= model.nx or j >= last) and not row[index].strip()):
-                table[k, j] = np.nan
-                continue
-            table[k, j] = _number(f"{path} line {line}, column {column}", row[index])
-    if np.any(np.diff(table[:, 0]) <= 0):
-        k = int(np.flatnonzero(np.diff(table[:, 0]) <= 0)[0]) + 1
-        got, before = table[k, 0], table[k - 1, 0]
-        raise InputError(f"{path} line {rows[k + 1][0]}, column time", got=got, expected=f"more than {before}")
+    places = np.array(_columns(path, model, header, wanted, model.state_names if gaps else ()))
+    last, given = 1 + model.nx + model.nu, np.flatnonzero(places >= 0)
+    lines, cells = _numbers_of(path, rows, [(wanted[j], int(places[j])) for j in given], len(header))
+    table = np.full((len(cells), len(wanted)), np.nan)
+    table[:, given] = cells
+    may_lack = np.zeros(table.shape, dtype=bool)
+    may_lack[-1:, model.nx + 1 : last] = True  # no step begins at the last sample
+    may_lack[:, 1 : model.nx + 1] = may_lack[:, last:] = gaps
+    for k, j in np.argwhere(np.isnan(table) & ~may_lack)[:1]:
+        raise InputError(f"{path} line {lines[k]}, column {wanted[j]}", got="''", expected="a finite number")
+    for k in np.flatnonzero(np.diff(table[:, 0]) <= 0)[:1]:
+        expected = f"more than {table[k, 0]}"
+        raise InputError(f"{path} line {lines[k + 1]}, column time", got=table[k + 1, 0], expected=expected)
     motion = table[:, 0], table[:, 1 : model.nx + 1], table[:-1, model.nx + 1 : last]
     return motion, {name: frozen(table[:, last + i]) for i, name in enumerate(outputs)}
 
 
+def _rows_of_csv(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """The number of the last line and the cells of each row that is not empty; InputError where it is no such text."""
+    with plain_file(path, links=True) as file:
+        start = file.peek(len(max(PACKED, key=len)))
+        for kind in (kind for first, kind in PACKED.items() if start.startswith(first)):
+            raise InputError(str(path), got=kind, expected="a CSV file: text in UTF-8, not packed")
+        rows = csv.reader(_lines(path, io.TextIOWrapper(file, encoding="utf-8-sig", newline="")))
+        try:
+            yield from ((rows.line_num, row) for row in rows if row)
+        except csv.Error as error:
+            raise InputError(f"{path} line {rows.line_num}", got=str(error), expected="a row of a CSV file") from error
+        except UnicodeDecodeError as error:
+            raise _no_text(path) from error
+
+
+def _lines(path: Path, text: io.TextIOWrapper) -> Iterator[str]:
+    for number, line in enumerate(iter(lambda: text.readline(LONGEST_LINE + 1), ""), start=1):
+        if len(line) > LONGEST_LINE:
+            raise InputError(f"{path} line {number}", got="more", expected=f"at most {LONGEST_LINE} characters")
+        yield line
+
+
+def _no_text(path: Path) -> InputError:
+    """What to raise of a file that is not in UTF-8, with the line and the byte in it."""
+    with plain_file(path, links=True) as file:
+        for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), start=1):
+            try:
+                line.decode()
+            except UnicodeDecodeError as error:
+                subject = f"{path} line {number}, byte {error.start + 1}"
+                return InputError(subject, got=f"{line[error.start]:#04x}", expected="text in UTF-8")
+    return InputError(str(path), got="other bytes", expected="text in UTF-8")
+
+
+def _numbers_of(
+    path: Path, rows: Iterator[tuple[int, list[str]]], columns: list[tuple[str, int]], width: int
+) -> tuple[list[int], Array]:
+    """(n,) the lines, and (n, len(columns)) the numbers in some columns, by name and place; NaN of an empty cell."""
+    lines, blocks = list[int](), [np.zeros((0, len(columns)))]
+    while block := list(islice(rows, BLOCK)):
+        for line, row in block:
+            if len(row) != width:
+                raise InputError(f"{path} line {line}", got=f"{len(row)} cells", expected=f"{width}")
+        try:
+            values = np.array([[float(row[i]) for _, i in columns] for _, row in block])
+            plain = bool((np.abs(values) <= LARGEST_NUMBER).all())
+        except ValueError:
+            plain = False
+        if not plain:
+            values = np.array(
+                [[_number(f"{path} line {k}, column {name}", row[i]) for name, i in columns] for k, row in block]
+            )
+        blocks.append(values)
+        lines += [line for line, _ in block]
+        if len(lines) * len(columns) > MOST_NUMBERS:
+            raise InputError(f"{path} line {lines[-1]}", got="more", expected=f"at most {MOST_NUMBERS} numbers in all")
+    return lines, np.vstack(blocks)
+
+
 def _number(subject: str, text: str) -> float:
     try:
-        value = float(text)
+        value = float(text) if text.strip() else 0.0
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise InputError(subject, got=repr(text), expected="a finite number")
-    return value
+    if not abs(value) <= LARGEST_NUMBER:
+        expected = "a finite number" if not math.isfinite(value) else f"a number of at most {LARGEST_NUMBER:g}"
+        raise InputError(subject, got=f"{text!r:.80}", expected=expected)
+    return value if text.strip() else math.nan
 
 
 def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str], spared: Sequence[str]) -> list[int]:
@@ -457,12 +534,14 @@ def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str],
     names = [by_joint.get(text.strip(), text.strip()) for text in header]
     for given, column in zip(header, names, strict=True):
         if column not in wanted:
-            raise UnknownNameError(f"{path} line 1, column", got=given, known=[*wanted, *by_joint])
+            raise UnknownNameError(f"{path} line 1, column", got=given[:80], known=[*wanted, *by_joint])
         if names.count(column) > 1:
             raise InputError(f"{path} line 1, column {column}", got="twice", expected="once")
     for column in wanted:
         if column not in names and column not in spared:
-            raise InputError(f"{path} line 1, column {column}", got=f"none, of {', '.join(header)}", expected="one")
+            raise InputError(
+                f"{path} line 1, column {column}", got=f"none, of {', '.join(header):.200}", expected="one"
+            )
     return [names.index(column) if column in names else -1 for column in wanted]
 
 

@@ -41,6 +41,8 @@ DIFFERENCE_STEP = 1e-5
 # Friction turns within 1e-4 m/s, so that it is smaller where impulses act; 1e-5 was up to 20 times off there.
 REFINED_STEP = 3e-7
 TIME_STEP_DIFFERENCE = 4e-4  # of a step's length, which a step depends on smoothly where contact lasts
+# Mass matrices with derivatives in a step (2.3, of a chain of 500 links), and the most numbers in them: 1 GiB.
+COPIES, MOST_CARRIED = 2.5, 2**27
 # Two ways to the same smooth Jacobian differ by rounding, which the inverse of a mass matrix may magnify.
 SAME_JACOBIAN = 1e-10
 # Below so many degrees of freedom AutoDiffXd takes a step with contact in less time than NumPy's calls for one take:
@@ -74,6 +76,8 @@ class Autodiff:
 
 def _by_autodiff(steps: Steps, k: int) -> Array:
     model, vector, u = steps.model, steps.vector, steps.us[k]
+    if too_large := too_large_for_autodiff(model, len(vector.values)):
+        raise GradientError(f"{too_large}: method analytic or finite_difference needs less")
     at_limit = np.abs(u) == form_of(model).cut
     if at_limit.any():  # which side Drake's derivative is of depends on the limit's sign and on its version
         u = np.where(at_limit, np.nextafter(u, 0.0), u)
@@ -88,6 +92,18 @@ def _by_autodiff(steps: Steps, k: int) -> Array:
         if not solves_the_step(model, steps.xs[k], steps.us[k], value):
             raise
     return gradient_rows(result, len(variables))
+
+
+def too_large_for_autodiff(model: Model, num_parameters: int = 0) -> str:
+    """Why a step with AutoDiffXd would take more than `MOST_CARRIED` numbers of memory; "" where it does not."""
+    width = model.nx + model.nu + num_parameters
+    count = COPIES * model.nv**2 * width
+    if count <= MOST_CARRIED:
+        return ""
+    return (
+        f"AutoDiffXd carries {width} derivatives with each entry of the mass matrix of {model.nv} degrees of freedom, "
+        f"{count * 8 / 2**30:.2g} GiB"
+    )
 
 
 def check_parity(model: Model, autodiff: Array, double: Array) -> None:

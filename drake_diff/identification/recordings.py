@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, array_with_gaps, finite_array
-from drake_diff.comparison.recordings import Recording, read_recording
+from drake_diff.comparison.recordings import Recording, check_sizes, read_recording
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.model.model import Model
@@ -91,6 +91,7 @@ def _product(a: Array, b: Array) -> Array:
 
 
 LEAST = 8  # samples of a piece
+MOST_STEPS = 10_000_000  # of the model, over a recording
 WINDOW = 9  # samples that a cubic is laid through, at least
 WINDOW_TIME = 0.05  # [s] and over this time at least
 ORDERS = 8  # of differences of neighbouring samples that tell the noise
@@ -208,9 +209,13 @@ def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Exce
         raise InputError(f"{subject}: time of sample {k}", got=f"{times[k]} s", expected="later than the one before")
     ys = np.array(array_with_gaps(f"{subject}: xs", recording.xs, (len(times), model.nx)))
     us = finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
-    if np.any(np.isinf(ys)):
-        k, j = (int(i) for i in np.argwhere(np.isinf(ys))[0])
-        raise InputError(f"{subject}: {model.state_names[j]} at sample {k}", got=ys[k, j], expected="a number or NaN")
+    check_sizes(f"{subject}: times", times[:, None], ["s"])
+    check_sizes(f"{subject}: xs", ys, model.state_names)
+    check_sizes(f"{subject}: us", us, model.input_names)
+    if times[-1] - times[0] > MOST_STEPS * model.time_step:
+        k = int(np.argmax(np.diff(times)))
+        got = f"{times[-1] - times[0]:.6g} s, of which {times[k + 1] - times[k]:.6g} s from sample {k} to {k + 1}"
+        raise InputError(f"{subject}: times", got=got, expected=f"at most {MOST_STEPS} steps of {model.time_step:g} s")
     for start in tangent_space(model).quaternions:
         turn = ys[:, start : start + 4]
         turn[np.isnan(turn).any(axis=1)] = np.nan
@@ -228,9 +233,7 @@ def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Exce
     for j, name in enumerate(columns):
         if name in recording.outputs:
             outs[:, j] = array_with_gaps(f"{subject}: {name}", recording.outputs[name], (len(times),))
-    if np.any(np.isinf(outs)):
-        k, j = (int(i) for i in np.argwhere(np.isinf(outs))[0])
-        raise InputError(f"{subject}: {columns[j]} at sample {k}", got=outs[k, j], expected="a number or NaN")
+    check_sizes(subject, outs, columns)
     return Excerpt(recording.name, times - times[0], ys, us, held_out=False, outs=outs)
 
 
@@ -287,17 +290,17 @@ def guess_states(model: Model, chart: Chart, piece: Excerpt, samples: NDArray[np
     """
     nq, default = model.nq, model.default_state
     states = np.empty((len(samples), model.nx))
+    seen = [(piece.times[known], y[known]) for y in piece.ys.T for known in [np.isfinite(y)]]
     for row, k in enumerate(samples):
-        t = piece.times - piece.times[k]
         q, q_dot, v = default[:nq].copy(), np.zeros(nq), np.full(model.nv, np.nan)
         for i in range(nq):
-            fitted = _cubic(t, piece.ys[:, i])
+            fitted = _cubic(*seen[i], piece.times[k])
             if fitted is not None:
                 q[i], q_dot[i] = fitted
         for i, _ in chart.coordinates.free:
             q[i : i + 4] /= np.linalg.norm(q[i : i + 4])
         for i in range(model.nv):
-            fitted = _cubic(t, piece.ys[:, nq + i])
+            fitted = _cubic(*seen[nq + i], piece.times[k])
             if fitted is not None:
                 v[i] = fitted[0]
         slope = chart.coordinates.motion(q) @ q_dot
@@ -305,15 +308,16 @@ def guess_states(model: Model, chart: Chart, piece: Excerpt, samples: NDArray[np
     return states
 
 
-def _cubic(t: Array, y: Array) -> Any:
-    """(value, slope) at t = 0 of a cubic through the samples around; None where there are none."""
-    known = np.flatnonzero(np.isfinite(y))
-    if len(known) < 2:
+def _cubic(times: Array, y: Array, time: float) -> Any:
+    """(value, slope) at `time` of a cubic through the measured `y` (n,) around it; None where there are none."""
+    if len(times) < 2:
         return None
-    order = known[np.argsort(np.abs(t[known]), kind="stable")]
-    within = int(np.sum(np.abs(t[order]) <= WINDOW_TIME))
-    used = order[: max(WINDOW, within)]
+    begin, here, end = np.searchsorted(times, time + np.array([-WINDOW_TIME, 0.0, WINDOW_TIME]))
+    near = slice(max(0, min(begin - 1, here - WINDOW)), max(end, here + WINDOW) + 1)
+    t = times[near] - time
+    order = np.argsort(np.abs(t), kind="stable")
+    used = order[: max(WINDOW, int(np.sum(np.abs(t) <= WINDOW_TIME)))]
     degree = min(3, len(used) - 1)
     size = float(np.max(np.abs(t[used]))) or 1.0
-    fitted = np.linalg.lstsq(np.vander(t[used] / size, degree + 1, increasing=True), y[used], rcond=None)[0]
+    fitted = np.linalg.lstsq(np.vander(t[used] / size, degree + 1, increasing=True), y[near][used], rcond=None)[0]
     return fitted[0], fitted[1] / size

@@ -19,6 +19,7 @@ from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_diff._base.arrays import finite_array, positive_float, seconds
+from drake_diff._base.sandbox import call
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.model.contact_geometry import (
@@ -444,6 +445,7 @@ def load_model(
     near_rigid: float | None = None,
     stiffness: float | None = None,
     dissipation: float | None = None,
+    isolated: bool = False,
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
@@ -486,6 +488,8 @@ def load_model(
             own default is 1e6. Where two shapes touch it is k1 k2 / (k1 + k2): half of it, where both have it.
         dissipation: [s/m] Hunt and Crossley's, of similar and lagged contact, of shapes for which the file gives none;
             Drake's own default is 50.
+        isolated: Whether the file is first read, and a step made, in a process of its own with at most 60 s and 1 GiB:
+            Drake's parsers crash on some damaged meshes, and would end this process. It takes a few seconds.
 
     Returns:
         The Model. What was left out of the file (such as meshes in formats that Drake cannot use) and what was added
@@ -493,14 +497,15 @@ def load_model(
 
     Raises:
         InputError: The file is missing or of an unknown kind, or an option is wrong.
-        ModelError: Drake cannot read the file, or nothing in it can move.
+        ModelError: Drake cannot read the file, or nothing in it can move; or, `isolated`, the process that reads it
+            first crashes or reaches a limit.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
         >>> print(model)
         Model 'pendulum': nq=1, nv=1, nu=1, time step 0.01 s
     """
-    options = {option: value for option, value in locals().items() if option != "path"}
+    options = {option: value for option, value in locals().items() if option not in ("path", "isolated")}
     time_step = seconds("time_step [s]", time_step)
     _check_choice("contact_model", contact_model, CONTACT_MODELS)
     _check_choice("contact_approximation", contact_approximation, CONTACT_APPROXIMATIONS)
@@ -510,10 +515,7 @@ def load_model(
     check_contact(contact)
     check_mimic(mimic)
     body_forces = check_body_forces(body_forces)
-    try:
-        source = Path(path)
-    except TypeError as error:
-        raise InputError("model file", got=repr(path), expected="a path") from error
+    source = _as_path(path)
     config = MultibodyPlantConfig(
         time_step=time_step,
         contact_model=contact_model,
@@ -535,6 +537,8 @@ def load_model(
         "packages": as_packages(packages),
         "body_forces": body_forces,
     }
+    if isolated:
+        check_apart(source, options)
     read = read_into(plant, source, options["packages"], meshes)
     repairs, mimics = _repaired(plant, scene_graph, source, read.facts, options)
     notes = read.notes + repairs
@@ -571,6 +575,36 @@ def load_model(
     model.options = options
     model.file_facts = read.facts
     return model
+
+
+def _as_path(path: Any) -> Path:
+    try:
+        return Path(path)
+    except TypeError as error:
+        raise InputError("model file", got=repr(path), expected="a path") from error
+
+
+def check_apart(source: Path, options: Mapping[str, Any]) -> None:
+    """ModelError where a limited process that loads the file and makes a step crashes, or reaches a limit."""
+    folders = {name: str(Path(folder).absolute()) for name, folder in (options["packages"] or {}).items()}
+    given = {"path": str(source.absolute()), "options": said({**options, "packages": folders or None})}
+    outcome = call("drake_diff.model.step:try_to_read", given)
+    if outcome.error:
+        raise ModelError(f"{source}: {outcome.error}")
+
+
+UNSAID = (None, (), "skip")  # options of `load_model` that change nothing
+
+
+def said(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a model that say something, for JSON; `load_model` takes them."""
+    return {key: _plain(value) for key, value in options.items() if value not in UNSAID}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple) and isinstance(value[0], BodyForce):
+        return [force.to_dict() for force in value]
+    return value if isinstance(value, str | bool | dict) else np.asarray(value).tolist()
 
 
 def _load_again(path: str, digest: str, options: dict[str, Any]) -> Model:

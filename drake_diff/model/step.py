@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import Any
 
@@ -12,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array
-from drake_diff.exceptions import SimulationError
-from drake_diff.model.model import Model
+from drake_diff.exceptions import DrakeDiffError, SimulationError
+from drake_diff.model.model import Model, load_model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.twin import Twin
 
@@ -147,3 +148,11 @@ def stepped(steps: int = 1) -> None:
     count = _counting.get()
     if count is not None:
         count.add(steps)
+
+
+def try_to_read(path: str, options: Mapping[str, Any]) -> None:
+    """Load a model and make a step of it, in a process apart: what is wrong with the file is for the caller to meet."""
+    with warnings.catch_warnings(), suppress(DrakeDiffError):
+        warnings.simplefilter("ignore")
+        model = load_model(path, **options)
+        advance(model.double, model.default_state, np.zeros(model.nu))

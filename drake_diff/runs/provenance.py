@@ -16,15 +16,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from drake_diff.certificates.certificate import VERDICTS, Certificate
 from drake_diff.exceptions import ModelError
 from drake_diff.model.file_facts import with_includes
-from drake_diff.model.inputs import BodyForce
 from drake_diff.model.load_file import FORMATS, files_of_directives, package_above
 from drake_diff.model.meshes import in_any_case
-from drake_diff.model.model import Model
+from drake_diff.model.model import Model, said
 from drake_diff.model.xml_text import XmlText
 from drake_diff.runs.fields import (
     Certified,
@@ -39,7 +36,6 @@ from drake_diff.runs.fields import (
 MESHES = (".obj", ".mtl", ".vtk", ".gltf", ".glb", ".bin", ".stl", ".dae", ".ply", ".off", ".msh", ".png", ".jpg")
 OF_MJCF = (".xml", ".mjcf")  # all that such a file includes is read with it
 LIBRARIES = (".so", ".dll", ".dylib")  # plugins of Gazebo, which Drake does not read
-UNSAID = (None, (), "skip")  # options of `load_model` that change nothing are not recorded
 READABLE = (*MESHES, *FORMATS)
 WRITERS = ("mcap", "mcap-protobuf-support", "protobuf", "foxglove-schemas-protobuf", "pydantic")
 PACKAGES = ("drake", "drake-diff", "numpy", "casadi", "pin", "numba", "mujoco", *WRITERS)
@@ -75,15 +71,8 @@ def model_input(model: Model | None) -> ModelInput:
     return ModelInput(
         file=file_evidence(source, source.name),
         named=named_files(source, packages),
-        options={key: _plain(value) for key, value in options.items() if value not in UNSAID},
+        options=said(options),
     )
-
-
-def _plain(value: Any) -> Any:
-    """An option of `load_model` for JSON."""
-    if isinstance(value, tuple) and isinstance(value[0], BodyForce):
-        return [force.to_dict() for force in value]
-    return value if isinstance(value, str | bool | dict) else np.asarray(value).tolist()
 
 
 def written_now() -> str:

@@ -1,5 +1,6 @@
 """The audit names what cannot be differentiated, or will be differentiated wrongly, before anything runs."""
 
+import resource
 import warnings
 
 import numpy as np
@@ -25,8 +26,9 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 import drake_diff as dd
+from drake_diff._base.sandbox import memory_at_most
 from drake_diff.certificates.audit import audit
-from drake_diff.exceptions import ModelWarning, NonFiniteError, ShapeError, SimulationError
+from drake_diff.exceptions import GradientError, ModelWarning, NonFiniteError, ShapeError, SimulationError
 from drake_diff.model.plant import actuators, joints
 
 
@@ -99,6 +101,22 @@ def test_a_bad_point_is_refused(load):
         audit(model, [0.0, 0.0], [1.0, 2.0])
     with pytest.raises(NonFiniteError, match=r"x\[1\]"):
         audit(model, [0.0, np.nan])
+
+
+def test_a_chain_of_many_links_is_audited_within_a_limit_of_memory():
+    """With AutoDiffXd a step of it takes 2.4 GB."""
+    plant = Plant(0.01)
+    parent = plant.plant.world_frame()
+    for i in range(400):
+        link = plant.plant.AddRigidBody(f"link_{i}", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        add_slide(plant.plant, f"slide_{i}", parent, link, "xyz"[i % 3])
+        parent = link.body_frame()
+    model, kept = plant.model(), resource.getrlimit(resource.RLIMIT_DATA)
+    with memory_at_most(3 * 2**30):
+        assert "2.4 GiB" in only(audit(model), "too_large").message
+    assert resource.getrlimit(resource.RLIMIT_DATA) == kept
+    with pytest.raises(GradientError, match="of 400 degrees of freedom"):
+        dd.differentiate_step(model, model.default_state, [], method="autodiff")
 
 
 def test_a_plant_without_a_scene_graph_is_audited():

@@ -1,5 +1,6 @@
 """Recorded motions: read from every kind of file, compared step by step, and told as if what they had been stepped."""
 
+import gzip
 import json
 from pathlib import Path
 
@@ -165,6 +166,8 @@ def test_a_recording_by_hand_is_checked_too(load):
         compared(model, dd.Recording("r", "1", good.times, bad, good.us))
     with pytest.raises(InputError, match="sample 2"):
         compared(model, dd.Recording("r", "1", np.array([0, 0.01, 0.01, 0.02]), good.xs, good.us))
+    with pytest.raises(InputError, match=r"xs: .* at sample 0: expected at most 1e\+12"):
+        compared(model, dd.Recording("r", "1", good.times, np.where(np.eye(4, 13, k=5), 1e300, good.xs), good.us))
     with pytest.raises(ShapeError, match=r"\(4, 13\)"):
         compared(model, dd.Recording("r", "1", good.times, good.xs[:, :7], good.us))
 
@@ -215,6 +218,47 @@ def changed(row, column, value):
 def test_a_bad_csv_is_named_by_line_and_column(load, tmp_path, header, rows, match):
     with pytest.raises(InputError, match=match):
         read_recording(write_csv(tmp_path / "bad.csv", header, rows), load("cart_pole.urdf"))
+
+
+TEXT = "\n".join(",".join(map(str, row)) for row in [HEADER, *ROWS]) + "\n"
+
+
+@each_row(
+    "data, match",
+    [
+        (TEXT.encode("utf-16"), "got text in UTF-16"),
+        (gzip.compress(TEXT.encode()), "got a file packed by gzip"),
+        (TEXT.replace("1.4", "\u00e9").encode("latin-1"), r"line 3, byte 18: expected text in UTF-8, got 0xe9"),
+        (f"{TEXT[:-1]}{'0' * 2_000_000}\n".encode(), r"line 4: expected at most 1048576 characters"),
+        (f"{TEXT[:-1]}{'0' * 200_000}\n".encode(), r"line 4: expected a row of a CSV file, got field larger"),
+        (TEXT.replace("1.4", "1e308").encode(), r"line 3, column hinge_w: expected a number of at most 1e\+12"),
+        (TEXT.replace("0.02,", "1e308,").encode(), r"line 4, column time: expected a number of at most 1e\+12"),
+        (TEXT.replace("time", "x" * 100_000).encode(), r"line 1, column: expected one of .*, got 'x{80}'$"),
+    ],
+)
+def test_bytes_that_are_no_csv_are_named_by_line(load, tmp_path, data, match):
+    (tmp_path / "bad.csv").write_bytes(data)
+    for gaps in (False, True):
+        with pytest.raises(InputError, match=match):
+            read_recording(tmp_path / "bad.csv", load("cart_pole.urdf"), gaps=gaps)
+
+
+def test_what_a_parser_raises_is_an_error_that_names_the_file(load, tmp_path, monkeypatch):
+    def takes_too_much(*_):
+        return bytes(2**31)
+
+    def fails(*_):
+        raise RecursionError("too deep")
+
+    write_csv(tmp_path / "run.csv", HEADER, ROWS)
+    ends = {
+        takes_too_much: r"csv: reading it takes more than 1 GiB",
+        fails: r"not a complete \.csv file: RecursionError",
+    }
+    for parser, match in ends.items():
+        monkeypatch.setattr("drake_diff.comparison.recordings._read_csv", parser)
+        with pytest.raises(ArtifactError, match=match):
+            read_recording(tmp_path / "run.csv", load("cart_pole.urdf"))
 
 
 def test_what_is_no_recording_is_refused(load, tmp_path):

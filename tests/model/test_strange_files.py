@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 
 import pytest
 from helpers.strange import DIRECTIVES, FILES, MJCF, URDF, broken, ends, put
@@ -129,3 +130,25 @@ def test_only_a_crash_is_told_of_what_was_tried_apart():
 
     assert crash_of(aborts) == "SIGABRT (free(): invalid pointer)"
     assert [crash_of(raises), crash_of(list)] == ["", ""]
+    assert crash_of(lambda: bytes(2**31)) == "the limit of 1 GiB"
+    assert crash_of(lambda: time.sleep(30), seconds=0.1) == "the limit of 0.1 s"
+
+
+def test_an_isolated_load_refuses_what_would_end_the_process(tmp_path):
+    (tmp_path / "mesh.vtk").write_text(WRONG_INDEX["vtk"])
+    path = tmp_path / "robot.urdf"
+    path.write_text(URDF.replace('<sphere radius="0.1"/>', '<mesh filename="package://here/mesh.vtk"/>'))
+    with pytest.raises(ModelError, match=f"{path}: the model cannot be read or run: the process .* ended by SIG"):
+        dd.load_model(path, time_step=0.01, packages={"here": os.path.relpath(tmp_path)}, isolated=True)
+    path.write_text("<robot")
+    with pytest.raises(ModelError, match=r"no element|Drake says"):  # as without isolation
+        dd.load_model(path, time_step=0.01, isolated=True)
+
+
+def test_a_model_that_loads_isolated_is_the_same(tmp_path):
+    force = dd.model.BodyForce("push", "b", upper=3.0)
+    put(tmp_path)
+    options = {"time_step": 0.01, "gravity": [0, 0, -1], "actuators": {"j": 2.0}, "body_forces": [force]}
+    isolated, plain = (dd.load_model(tmp_path / "r.urdf", isolated=i, **options) for i in (True, False))
+    assert isolated.options == plain.options
+    assert str(isolated.contract) == str(plain.contract)
