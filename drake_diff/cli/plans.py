@@ -11,6 +11,7 @@ from drake_diff.cli.text import (
     ModelFolder,
     RunDirectory,
     Seed,
+    WithoutMeshes,
     conclude,
     console,
     floats_in,
@@ -54,6 +55,7 @@ def plan(
     out: Annotated[Path | None, out_option("artifacts/plan_<robot>")] = None,
     seed: Seed = 0,
     restarts: Annotated[int, typer.Option(min=0, help="More first guesses, to list other optima.")] = 0,
+    without_meshes: WithoutMeshes = False,
 ) -> None:
     """Plan a motion of ROBOT: mend its file, solve, write the run directory and verify it.
 
@@ -85,6 +87,7 @@ def plan(
                 "out": out,
                 "seed": seed,
                 "restarts": restarts,
+                "meshes": not without_meshes,
             }
             done = planned(file, **asked, report=lambda stage, sentence: report(f"{stage:9} {sentence}"))
     except KeyboardInterrupt as error:

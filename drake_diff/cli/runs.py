@@ -17,6 +17,7 @@ from drake_diff._base.sandbox import memory_at_most
 from drake_diff.cli.text import (
     ModelFolder,
     RunDirectory,
+    WithoutMeshes,
     conclude,
     judged,
     out_option,
@@ -49,6 +50,7 @@ def run(
     view: Annotated[
         bool, typer.Option("--view", help="Show the search in a browser on this machine, and its plan until Ctrl-C.")
     ] = False,
+    without_meshes: WithoutMeshes = False,
 ) -> None:
     """Solve the problem that SCRIPT defines, measure the solution again, and write the run directory.
 
@@ -67,7 +69,7 @@ def run(
         addresses.append(address)
         typer.echo(f"the search is shown at {address}")
 
-    record = _run_into(directory, script, cross_check, {"view": show_address} if view else {})
+    record = _run_into(directory, script, cross_check, {"view": show_address} if view else {}, not without_meshes)
     (_show_record if record.phases is None else _show_phases)(record)
     show_written(directory, record)
     if addresses:
@@ -75,7 +77,7 @@ def run(
     conclude(record.verdict == "pass")
 
 
-def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[str, Any]) -> Any:
+def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[str, Any], meshes: bool) -> Any:
     """Set up the problem and write the record of its solution; what is interrupted takes no other run's place."""
     from drake_diff.runs.directory import written_whole  # only here: a missing script is refused before Drake is loaded
     from drake_diff.runs.save import record_without_problem
@@ -91,7 +93,7 @@ def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[st
                     record_without_problem(directory.name, sentence).begin(folder)
                 show(f"{sentence}; a record that says so is in {folder}")
                 raise typer.Exit(INTERRUPTED) from None
-            return _solved_into(directory, folder, problem, asked | options, cross_check)
+            return _solved_into(directory, folder, problem, asked | options, cross_check, meshes)
     except KeyboardInterrupt:
         if folder is not None:
             raise
@@ -135,7 +137,9 @@ def _wait_at(location: str) -> None:
         typer.echo("ended")
 
 
-def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str, Any], checked: bool) -> Any:
+def _solved_into(
+    directory: Path, folder: Path, problem: Any, options: dict[str, Any], checked: bool, meshes: bool
+) -> Any:
     """Solve, measure and write `folder`, which is to be `directory`; what is interrupted takes no other run's place."""
     from drake_diff.optimize.options import Options
     from drake_diff.optimize.solve import solve
@@ -161,7 +165,7 @@ def _solved_into(directory: Path, folder: Path, problem: Any, options: dict[str,
             with progress_line("replaying it in other plants"):
                 solution = cross_check(solution)
         with plan_kept(solution, directory.name, folder):
-            record: Any = write_run(solution, folder)
+            record: Any = write_run(solution, folder, meshes=meshes)
     except KeyboardInterrupt:
         with held_interrupts():
             begin_interrupted(folder, problem)

@@ -26,6 +26,9 @@ RunDirectory = Annotated[Path, typer.Argument(metavar="RUN", help="A run directo
 ModelFolder = Annotated[
     Path | None, typer.Option("--models", help="A folder below which meshes and models that RUN names may be read.")
 ]
+WithoutMeshes = Annotated[
+    bool, typer.Option("--without-meshes", help="Leave the meshes where they are; verify needs --models then.")
+]
 Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same draws.")]
 
 
@@ -240,7 +243,7 @@ def conclude(holds: bool) -> NoReturn:
 
 def show_written(directory: Path, record: Any) -> None:
     """Say what of a record is in a directory."""
-    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
+    show(f"wrote {directory}: {record.FILE}, {', '.join(record.file_names)}")
 
 
 @contextmanager

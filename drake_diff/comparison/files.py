@@ -26,7 +26,14 @@ from drake_diff.runs import other_records as records
 from drake_diff.runs.directory import name_of, written_whole
 from drake_diff.runs.fields import DataBoundary, DataUse, WallClock
 from drake_diff.runs.other_records import ComparisonRecord
-from drake_diff.runs.provenance import gradient_evidence, model_input, provenance_of, written_now
+from drake_diff.runs.provenance import (
+    contract_of,
+    gradient_evidence,
+    model_input,
+    provenance_of,
+    write_bundle,
+    written_now,
+)
 
 TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
 MOTION = "motion"  # among the data: the name of what every engine was given
@@ -102,6 +109,7 @@ def _keep(folder: Path, comparison: Comparison) -> None:
     source = comparison.model.source
     if recordings and source is not None:
         write_whole(folder / source.name, source.read_bytes())
+        write_bundle(folder, comparison.model)
 
 
 def record_of(
@@ -137,9 +145,9 @@ def _begun(name: str, model: Model) -> ComparisonRecord:
         name=name, verdict="incomplete",
         sentence="the comparison is still running, or it was killed or failed before its end",
         tolerances={**steps, **jacobians}, model=model_input(model),
-        contract=model.contract.to_dict(),
+        contract=contract_of(model),
         time_step_s=model.time_step, state_names=list(model.state_names), input_names=list(model.input_names),
-        states=[], engines=[], refused=[], provenance=provenance_of(),
+        states=[], engines=[], refused=[], provenance=provenance_of(model),
         wall_clock=WallClock(written_utc=written_now()),
     )  # fmt: skip
 

@@ -37,7 +37,7 @@ from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import name_of, written_whole
 from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, finite, reproducible
 from drake_diff.runs.other_records import FitRecord
-from drake_diff.runs.provenance import model_input, provenance_of, written_now
+from drake_diff.runs.provenance import contract_of, model_input, provenance_of, write_bundle, written_now
 from drake_diff.runs.rebuild import TRACE, rebuilt
 from drake_diff.runs.reproduce import contract_as, model_as
 
@@ -51,16 +51,16 @@ MOST_PLOTS = 12  # of coordinates
 MOST_COLUMNS = 16  # of the table of correlations
 
 
-def save_identification(identification: Identification, directory: str | Path) -> FitRecord:
+def save_identification(identification: Identification, directory: str | Path, *, meshes: bool = True) -> FitRecord:
     """Write the directory of an identification: record, recordings, model file, trace and report; see `save`.
 
     Raises InputError where it did not come from `identify`, ArtifactError where a recording's file has changed since.
     """
     with written_whole(directory) as folder:
-        return write_identification(identification, folder)
+        return write_identification(identification, folder, meshes=meshes)
 
 
-def write_identification(identification: Identification, folder: Path) -> FitRecord:
+def write_identification(identification: Identification, folder: Path, *, meshes: bool = True) -> FitRecord:
     """Write what `save_identification` does into `folder`, which `written_whole` gave."""
     asked, name = _asked(identification), name_of(folder)
     stored = (folder.with_name(name) / RECORDINGS).resolve()
@@ -82,6 +82,7 @@ def write_identification(identification: Identification, folder: Path) -> FitRec
     write_made(folder, identification, record)
     if asked.model.source is not None:
         write_whole(folder / asked.model.source.name, asked.model.source.read_bytes())
+        write_bundle(folder, asked.model, meshes=meshes)
     return record.write(folder)
 
 
@@ -125,10 +126,10 @@ def _begun(name: str, asked: Request) -> FitRecord:
         verdict="incomplete",
         sentence="it is still being written, or that was killed or broke off",
         model=model_input(asked.model),
-        contract=asked.model.contract.to_dict(),
+        contract=contract_of(asked.model),
         inputs=inputs,
         recordings=[],
-        provenance=provenance_of(),
+        provenance=provenance_of(asked.model),
         wall_clock=WallClock(written_utc=written_now()),
     )
 
@@ -263,13 +264,14 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
         raise ArtifactError(f"{record.FILE}: it names no parameters or no recordings")
     carried = "" if record.model.file is None else record.model.file.path
     attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
-    with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
+    with rebuilt(folder, record, attachments, models) as model:
         given, files = zip(*(_stored(folder, record, i, model) for i in range(len(record.recordings))), strict=True)
         again = identify(model, given, record.inputs.parameters, **_options(record.inputs))
         again = replace(again, asked=replace(_asked(again), files=files))
         made = record_of(again, record.name)
+        as_was = {"model": model_as(made.model, record), "contract": contract_as(made.contract, record)}
+        made = made.model_copy(update=as_was)
     fields = {name: getattr(record, name) for name in ("provenance", "wall_clock", "files", "record_sha256")}
-    fields |= {"contract": contract_as(made.contract, record.contract), "model": model_as(made.model, record.model)}
     made = made.model_copy(update=fields)
     with TemporaryDirectory() as location:
         write_made(Path(location), again, made)

@@ -26,7 +26,7 @@ from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.model import Model
 from drake_diff.runs.differences import ABSOLUTE, NUMBER, Reproduced, is_near
 from drake_diff.runs.other_records import CauseEvidence, ComparisonRecord, Numbers
-from drake_diff.runs.provenance import model_input
+from drake_diff.runs.provenance import contract_of, model_input
 from drake_diff.runs.rebuild import rebuilt
 from drake_diff.runs.reproduce import contract_as, model_as
 
@@ -59,7 +59,7 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
         return Reproduced({}, {}, problems=tuple(problems), written=written)
     given = [read_arrays(folder / r.path, r.name, r.version, r.facts) for r in record.recordings]
     attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
-    with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
+    with rebuilt(folder, record, attachments, models) as model:
         compared = compare_recordings(model, given)
         rows = [e for e in record.engines if not e.jacobians]
         names = [[e.engine for e in engines] for engines in (rows, compared.engines)]
@@ -108,8 +108,8 @@ def _odd_recordings(record: ComparisonRecord) -> Iterator[str]:
 def _of_the_model(record: ComparisonRecord, model: Model) -> dict[str, Any]:
     """What the record says of the model, of the model in the directory."""
     changed: dict[str, Any] = {
-        "model": model_as(model_input(model), record.model),
-        "contract": contract_as(model.contract.to_dict(), record.contract),
+        "model": model_as(model_input(model), record),
+        "contract": contract_as(contract_of(model), record),
         "time_step_s": model.time_step,
         "state_names": list(model.state_names),
         "input_names": list(model.input_names),

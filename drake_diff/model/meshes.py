@@ -96,7 +96,7 @@ def read_meshes(meshes: FileMeshes, xml: XmlText, path: Path, packages: PackageM
         mesh = next(element.iter("mesh"), None)
         if mesh is not None:
             try:
-                _change(meshes, xml, element, mesh, _resolve_uri(_uri(mesh), path, packages))
+                _change(meshes, xml, element, mesh, resolve_uri(_uri(mesh), path, packages))
             except ModelError as error:
                 raise ModelError(f"{path}:{mesh.line}: {error}") from error
 
@@ -107,7 +107,7 @@ def _convert_assets(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
     It computes masses by them, as MuJoCo does; `put_meshes` then puts back what was there.
     """
     for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
-        file = in_any_case(_asset(xml, mesh, path)) if mesh.get("file") else None
+        file = in_any_case(asset_of(xml, mesh, path)) if mesh.get("file") else None
         if file is None:
             continue  # which Drake says
         if file.suffix.lower() not in (*NOT_OBJ, OF_MUJOCO):
@@ -124,14 +124,15 @@ def _convert_assets(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
         xml.set(mesh, "file", str(obj))
 
 
-def _asset(xml: XmlText, mesh: Element, path: Path) -> Path:
-    """Where the file of a mesh of MJCF should be, by the folders that <compiler> says."""
+def asset_of(xml: XmlText, mesh: Element, path: Path) -> Path:
+    """Where the file of a mesh or texture of MJCF should be, by the folders that <compiler> says."""
     name, folders = mesh.get("file"), dict[str, str]()
+    kind = "texturedir" if mesh.tag == "texture" else "meshdir"
     for compiler in xml.root.findall("compiler"):
         folders |= compiler.attributes
     if folders.get("strippath") == "true":
         name = Path(name).name
-    return (path.parent / folders.get("meshdir", folders.get("assetdir", "")) / name).absolute()
+    return (path.parent / folders.get(kind, folders.get("assetdir", "")) / name).absolute()
 
 
 def _change(meshes: FileMeshes, xml: XmlText, element: Element, mesh: Element, location: Path | None) -> None:
@@ -139,14 +140,14 @@ def _change(meshes: FileMeshes, xml: XmlText, element: Element, mesh: Element, l
     uri, link = _uri(mesh), element.parent.get("name", "?") if element.parent else "?"
     if f"//{DOWNLOADED}/" in uri and not location:
         return
-    file, label = _file(location), f"{link} {element.tag} {uri}"
+    file, label = file_at(location), f"{link} {element.tag} {uri}"
     scale = _scale(mesh, label)
     ending = Path(uri).suffix.lower()
-    if file is None:
-        meshes.missing.append(label)
-        xml.remove(element)
-    elif ending not in (*USABLE_MESHES, *READ_BY_TRIMESH):
+    if ending not in (*USABLE_MESHES, *READ_BY_TRIMESH):
         meshes.unusable.append(f"{label} (a format that is not known)")
+        xml.remove(element)
+    elif file is None:
+        meshes.missing.append(label)
         xml.remove(element)
     elif element.tag == "visual" or (meshes.treatment == "skip" and ending in USABLE_MESHES):
         if location is None or not location.is_file() or ":///" in uri.removeprefix("file"):  # Drake would not find it
@@ -211,7 +212,7 @@ def make_absolute(xml: XmlText, path: Path) -> None:
     if xml.root.tag == "mujoco":
         for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
             if mesh.get("file") and not Path(mesh.get("file")).is_absolute():
-                xml.set(mesh, "file", str(_asset(xml, mesh, path)))
+                xml.set(mesh, "file", str(asset_of(xml, mesh, path)))
         for include in xml.root.iter("include"):  # what is left is missing
             xml.set(include, "file", str((path.parent / include.get("file")).absolute()))
         return
@@ -221,16 +222,17 @@ def make_absolute(xml: XmlText, path: Path) -> None:
             set_uri(xml, element, f"file://{(path.parent / uri).resolve()}")
 
 
-def _file(location: Path | None) -> Path | None:
+def file_at(location: Path | None) -> Path | None:
+    """The file there, its name in any case and with or without escapes."""
     return None if location is None else in_any_case(location) or in_any_case(Path(unquote(str(location))))
 
 
-def _resolve_uri(uri: str, path: Path, packages: PackageMap) -> Path | None:
+def resolve_uri(uri: str, path: Path, packages: PackageMap) -> Path | None:
     """Where `uri` leads, letter by letter; None where that is not on this disk."""
     package = re.match(r"(?:package|model)://+([^/]+)/(.*)", uri, re.DOTALL)
     if not package:
         start, name = path.parent.absolute(), uri.removeprefix("file://")
-    elif packages.Contains(package[1]) and package[1] != DOWNLOADED:
+    elif packages.Contains(package[1]):
         start, name = Path(packages.GetPath(package[1])), package[2]
     else:  # what `read_into` has not seen: package:///NAME/
         above = next((p for p in path.resolve().parents if p.name == package[1]), None)
@@ -286,7 +288,7 @@ def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMe
         try:
             hull, spheres = _became(mesh, meshes.treatment)
         except ModelError as error:  # of URDF and SDF these are left out before
-            meshes.unusable.append(f"{mesh.link} collision {mesh.path} ({error})")
+            meshes.unusable.append(f"{mesh.link} collision {mesh.path.name} ({error})")
             scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
             continue
         became_other.append(mesh)

@@ -120,7 +120,7 @@ class Plan(ShowsItsRepr):
             f"gradients {agreeing}",
             f"plan      {s.message}",
             f"verified  {self.verification.verdict}: {self.verification.sentence[:200]}",
-            f"wrote     {path}: {', '.join(sorted(self.record.files))}",
+            f"wrote     {path}: {', '.join(self.record.file_names)}",
         )
 
     @property
@@ -148,6 +148,7 @@ def plan(
     out: str | Path | None = None,
     seed: int = 0,
     restarts: int = 0,
+    meshes: bool = True,
     report: Report | None = None,
 ) -> Plan:
     """Load a robot file, mend what it leaves out, plan a motion to a goal, write the run and verify it.
@@ -161,6 +162,7 @@ def plan(
         out: The directory to write; `artifacts/plan_<robot>` where not given.
         seed: Of what is drawn; the same seed gives the same plan.
         restarts: How many more first guesses each search is given, to list other optima and to keep the cheapest.
+        meshes: Whether the directory gets a copy of the meshes; see `save`.
         report: Gets a stage and a sentence now and then.
 
     Returns:
@@ -215,7 +217,7 @@ def plan(
         best = solutions[-1] if apart else min(solutions, key=lambda s: s.defect + s.goal_error)
         note("save", best.status.value)
         with plan_kept(best, directory.name, folders[0]):
-            record = write_run(best, folders[0])
+            record = write_run(best, folders[0], meshes=meshes)
         if best.status is Status.INTERRUPTED and is_taken(directory):
             raise KeyboardInterrupt  # it stays beside the earlier run
         stack.close()  # it takes its place

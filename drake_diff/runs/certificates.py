@@ -19,7 +19,7 @@ from drake_diff.model.tangent import SampledState, sample_states
 from drake_diff.runs.directory import written_whole
 from drake_diff.runs.fields import Passed
 from drake_diff.runs.plan_record import CertificationSection, CertifiedState, PlanRecord
-from drake_diff.runs.provenance import gradient_evidence, header
+from drake_diff.runs.provenance import contract_of, gradient_evidence, header, write_bundle
 
 
 def certify_model(
@@ -41,7 +41,7 @@ def certify_model(
         seed: Seed of the states.
         parameters: Names of parameters whose derivatives are certified too.
         method: How the derivative is taken: "auto", "autodiff", "implicit", "analytic" or "finite_difference".
-        directory: Where to write record.json and a copy of the model file; nothing is written without one. An
+        directory: Where to write record.json and a copy of the model's files; nothing is written without one. An
             earlier run there is replaced when the last state is done.
 
     Returns:
@@ -68,7 +68,7 @@ def certify_model(
     def record(verdict: Passed, sentence: str, certified: Sequence[CertifiedState] = ()) -> PlanRecord:
         section = CertificationSection(seed=int(seed), method=method, parameters=names, states=list(certified))
         fields = header(model.name, model, time.monotonic() - start)
-        contract = model.contract.to_dict()
+        contract = contract_of(model)
         return PlanRecord(verdict=verdict, sentence=sentence, certification=section, contract=contract, **fields)
 
     def certified() -> PlanRecord:
@@ -85,6 +85,7 @@ def certify_model(
         made = certified()
         if model.source is not None and made.model.file is not None:
             write_whole(folder / model.source.name, model.source.read_bytes())  # to certify it again
+            write_bundle(folder, model)
         return made.write(folder)
 
 

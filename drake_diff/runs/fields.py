@@ -21,7 +21,7 @@ from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError
 
 # A new major one where a field goes or changes its meaning, a minor one where one is added.
-SCHEMA_VERSION = "4.0.0"
+SCHEMA_VERSION = "4.1.0"
 # How others are read, word for word in every published schema.
 READING = (
     f"This is version {SCHEMA_VERSION}. An earlier minor version of the same major one is read with what it lacks "
@@ -30,6 +30,7 @@ READING = (
 )
 SCHEMAS = Path(__file__).parent.parent / "schema"
 MOST_NAMES = 5  # of files, in a printed record
+BUNDLE = "model"  # the folder of a run directory with what the model file names
 APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run
 Passed = Literal["pass", "fail", "incomplete"]
 NOTHING_SOLVED = "nothing was solved"
@@ -172,20 +173,26 @@ class Certified(Fields):
 
 
 class Provenance(Fields):
-    """With what the run was made."""
+    """With what the run was made.
+
+    `model_file` is where the model file was, and `model_packages` are the folders that `load_model` was given.
+    """
 
     python: str
     platform: str
     packages: dict[str, str]
     git: dict[str, str | bool] | None
     command: list[str]
+    model_file: str | None = None
+    model_packages: dict[str, str] = Field(default_factory=dict)
 
 
 class ModelInput(Fields):
     """What the model was made from, and how; no `file` and no `options` where it is a user's own diagram.
 
-    `named` are the files that the model file names (meshes, included models), by the name that they have in it. Those
-    whose name is neither that of a mesh nor of a robot file are not read.
+    `named` are the files that the model file names (meshes, included models) and their licences, by the name that they
+    have in it. Those whose name is neither that of a mesh nor of a robot file are not read. The content of one is in
+    the directory, called model/SHA256, or in the directory above that of a phase.
     """
 
     file: FileEvidence | None
@@ -357,9 +364,21 @@ class SealedRecord(ShowsItsRepr, Fields):
         return self.kind
 
     @property
+    def file_names(self) -> list[str]:
+        """The files beside the record; those of the model, whose names are hashes, as how many they are."""
+        sizes = [file.bytes or 0 for name, file in self.files.items() if name.startswith(f"{BUNDLE}/")]
+        names = sorted(name for name in self.files if not name.startswith(f"{BUNDLE}/"))
+        size = f"{sum(sizes) / 1e6:.2g} MB in {BUNDLE}/" if sizes else ""
+        return names + [f"{len(sizes)} files that the model names, {size}"] * bool(sizes)
+
+    @property
     def state(self) -> Literal["incomplete", "complete"]:
         """Whether the run has ended, well or not."""
         return "incomplete" if self.verdict == "incomplete" else "complete"
+
+    def is_before(self, *version: int) -> bool:
+        """Whether it was written by an earlier version of the schema, of which the first numbers are given."""
+        return tuple(map(int, self.schema_version.split(".")[: len(version)])) < version
 
     @classmethod
     def published_schema(cls) -> bytes:
@@ -395,7 +414,7 @@ class SealedRecord(ShowsItsRepr, Fields):
 
     def facts(self) -> dict[str, str]:
         """A few lines about the record, for a reader; each kind adds its own."""
-        names = sorted(self.files)
+        names = self.file_names
         more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
         made = f"{self.wall_clock.written_utc} with Drake {self.provenance.packages.get('drake', '?')}"
         return {"made": made, "files": ", ".join(names[:MOST_NAMES]) + more}

@@ -5,6 +5,7 @@ A weaker claim can be just as true as a stronger one, so a reader has to see it.
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,9 @@ def claims_of(record: SealedRecord) -> tuple[str, ...]:
     if record.subject != "phases":  # each phase has its own
         file, options = record.model.file, _table(record.model.options, "")
         source = "a user's own diagram or function" if file is None else f"{file.path} ({(file.sha256 or '')[:12]})"
+        hashes = "".join(sorted(f"{named.path} {named.sha256}\n" for named in record.model.named if named.sha256))
+        if hashes:
+            source += f" with {hashes.count(chr(10))} files ({sha256(hashes.encode()).hexdigest()[:12]})"
         lines.append(f"of the model {source}" + f", {options}" * bool(options))
     if isinstance(record, PlanRecord):
         lines += _of_a_plan(record)

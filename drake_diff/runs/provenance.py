@@ -1,14 +1,12 @@
 """Where a record comes from: packages, commit, command, and the model file with all files that it names.
 
-Those files (meshes, included models) are hashed, never copied. A name can lead anywhere (`../../etc/passwd`), and a
-model file may be a stranger's: what is not called like a mesh or a robot file is not opened at all.
+Those files (meshes, included models, licences) are copied into the run directory, each under the hash of its content.
+A record calls them as the model file does, wherever they are: only its provenance says where that was.
 """
 
 import platform
-import re
 import subprocess
 import sys
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -16,14 +14,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from drake_diff._base.files import make_folder, write_whole
+from drake_diff._base.sandbox import LARGEST_ANSWER
 from drake_diff.certificates.certificate import VERDICTS, Certificate
-from drake_diff.exceptions import ModelError
-from drake_diff.model.file_facts import with_includes
-from drake_diff.model.load_file import FORMATS, files_of_directives, package_above
-from drake_diff.model.meshes import in_any_case
 from drake_diff.model.model import Model, said
-from drake_diff.model.xml_text import XmlText
+from drake_diff.model.named_files import NamedFile, named_files
 from drake_diff.runs.fields import (
+    BUNDLE,
     Certified,
     FileEvidence,
     ModelInput,
@@ -33,10 +30,7 @@ from drake_diff.runs.fields import (
     file_evidence,
 )
 
-MESHES = (".obj", ".mtl", ".vtk", ".gltf", ".glb", ".bin", ".stl", ".dae", ".ply", ".off", ".msh", ".png", ".jpg")
-OF_MJCF = (".xml", ".mjcf")  # all that such a file includes is read with it
-LIBRARIES = (".so", ".dll", ".dylib")  # plugins of Gazebo, which Drake does not read
-READABLE = (*MESHES, *FORMATS)
+MOST_BUNDLED = LARGEST_ANSWER  # bytes of such a file: as much as the process that reads it again may write
 WRITERS = ("mcap", "mcap-protobuf-support", "protobuf", "foxglove-schemas-protobuf", "pydantic")
 PACKAGES = ("drake", "drake-diff", "numpy", "casadi", "pin", "numba", "mujoco", *WRITERS)
 
@@ -57,22 +51,76 @@ def header(name: str, model: Model | None = None, seconds: float | None = None, 
     return {
         "name": name,
         "model": model_input(model),
-        "provenance": provenance_of(),
+        "provenance": provenance_of(model),
         "wall_clock": WallClock(written_utc=written_now(), duration_s=seconds, **clock),
     }
 
 
 def model_input(model: Model | None) -> ModelInput:
     """The model file with what it names, and the options it was loaded with."""
-    source, options = (None, None) if model is None else (model.source, model.options)
-    if source is None or options is None:
+    if model is None or model.source is None or model.options is None:
         return ModelInput(file=None, options=None)
-    packages = options["packages"]
+    options = {name: value for name, value in model.options.items() if name != "packages"}
     return ModelInput(
-        file=file_evidence(source, source.name),
-        named=named_files(source, packages),
+        file=file_evidence(model.source, model.source.name),
+        named=evidence_of(model.source, model.options["packages"]),
         options=said(options),
     )
+
+
+def contract_of(model: Model | None) -> dict[str, Any]:
+    """The contract of a model as it stands in a record: files by their names, wherever they are."""
+    if model is None:
+        return {}
+    contract = model.contract.to_dict()
+    if model.source is None:
+        return contract
+    paths = [model.source, *(file.path for file in _files_of(model) if file.path)] if contract["notes"] else []
+    names = {str(location): path.name for path in paths for location in (path, path.absolute(), path.resolve())}
+    notes = [_with_names(str(note), names) for note in contract["notes"]]
+    return {**contract, "source": model.source.name, "notes": notes}
+
+
+def _with_names(note: str, names: dict[str, str]) -> str:
+    for location in sorted(names, key=lambda location: (-len(location), location)):
+        note = note.replace(location, names[location])
+    return note
+
+
+def _files_of(model: Model) -> list[NamedFile]:
+    if model.source is None or model.options is None:
+        return []
+    return named_files(model.source, model.options["packages"])
+
+
+def evidence_of(path: Path, packages: Mapping[str, str] | None) -> list[FileEvidence]:
+    """What the model file at `path` names, by the name it has there, sorted; `packages` as `load_model` takes them."""
+    return [_evidence(file) for file in named_files(path, packages)]
+
+
+def _evidence(file: NamedFile) -> FileEvidence:
+    try:
+        if file.path is not None:
+            return file_evidence(file.path, file.name)
+        reason = file.reason
+    except OSError as error:
+        reason = f"it cannot be read: {error.strerror}"
+    return FileEvidence(path=file.name, bytes=None, sha256=None, reason=reason)
+
+
+def write_bundle(folder: Path, *models: Model | None, meshes: bool = True) -> None:
+    """Copy what the files of `models` name into the run directory `folder`, its meshes only where they are wanted.
+
+    What is larger than MOST_BUNDLED stays where it is.
+    """
+    for file in (file for model in models if model is not None for file in _files_of(model)):
+        described = _evidence(file)
+        size, target = described.bytes, folder / BUNDLE / str(described.sha256)
+        if file.path is None or size is None or size > MOST_BUNDLED or (file.is_mesh and not meshes):
+            continue
+        if not target.exists():
+            make_folder(target.parent)
+            write_whole(target, file.path.read_bytes())
 
 
 def written_now() -> str:
@@ -89,19 +137,26 @@ def packages_here() -> dict[str, str]:
     return packages
 
 
-def provenance_of() -> Provenance:
-    """With which versions, from which commit and by which command something is made.
+def provenance_of(model: Model | None = None) -> Provenance:
+    """With which versions, from which commit and by which command something is made, and where its model is.
 
     Git runs what the settings of a checkout say: this is for what one makes oneself, not for a stranger's directory.
     """
     words = (Path(sys.argv[0]).name, *sys.argv[1:])
+    source, options = (None, None) if model is None else (model.source, model.options)
     return Provenance(
+        model_file=None if source is None else _text(str(source)),
+        model_packages=dict((options or {}).get("packages") or {}),
         python=platform.python_version(),
         platform=f"{platform.system()} {platform.machine()}",
         packages=packages_here(),
         git=_git(),
-        command=[w.encode("utf-8", "replace").decode() for w in words],  # a file's name may have bytes that are no text
+        command=[_text(word) for word in words],
     )
+
+
+def _text(word: str) -> str:
+    return word.encode("utf-8", "replace").decode()  # a file's name may have bytes that are no text
 
 
 def _git() -> dict[str, str | bool] | None:
@@ -114,84 +169,3 @@ def _git() -> dict[str, str | bool] | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return {"commit": run[0], "dirty": bool(run[1])}
-
-
-def named_files(
-    path: Path, packages: Mapping[str, Any] | None = None, above: tuple[Path, ...] = ()
-) -> list[FileEvidence]:
-    """What the model file at `path` names, by the name it has there, sorted; `packages` as `load_model` takes them.
-
-    What is named by a robot file that it names, in turn, is called by both names. `above` are the files that lead here.
-    Where they cannot be read out of it (Drake's parser forgives more than Python's) its own name has the reason.
-    """
-    result = []
-    try:
-        names = sorted(_names(path))
-    except (OSError, UnicodeDecodeError, ET.ParseError, ModelError) as error:
-        return [_unread(path.name, f"the files that it names cannot be listed: {error}")]
-    for name, folder in names:
-        if not name.lower().endswith(READABLE):
-            result.append(_unread(name, "not read: its name is not that of a mesh or a robot file"))
-            continue
-        target = _resolve(path, name, folder, packages or {})
-        target = target and (in_any_case(target.absolute()) or target)
-        try:
-            result.append(file_evidence(target, name) if target and target.is_file() else _unread(name, "no such file"))
-        except OSError as error:
-            result.append(_unread(name, f"it cannot be read: {error.strerror}"))
-            continue
-        here = (*above, path.resolve())
-        if target and target.is_file() and target.name.endswith(FORMATS) and target.resolve() not in here:
-            inner = [] if path.name.endswith(OF_MJCF) else named_files(target, packages, here)
-            result += [evidence.model_copy(update={"path": f"{name}: {evidence.path}"}) for evidence in inner]
-    return result
-
-
-def names_in(path: Path) -> list[str]:
-    """The files that the model file at `path` itself names, as it names them; no other file is opened.
-
-    What cannot be read out of it (Drake's parser forgives more than Python's) is the reason, as one name.
-    """
-    try:
-        if path.name.endswith(".dmd.yaml"):
-            return sorted(files_of_directives(path))
-        root = ET.fromstring(path.read_text())
-    except (OSError, UnicodeDecodeError, ET.ParseError, ModelError) as error:
-        return [f"what cannot be listed: {error}"]
-    return sorted({name for name, _ in _named_in(root)})
-
-
-def _unread(name: str, reason: str) -> FileEvidence:
-    return FileEvidence(path=name, bytes=None, sha256=None, reason=reason)
-
-
-def _names(path: Path) -> set[tuple[str, str]]:
-    """(name, folder that it starts from) of every file that is named."""
-    if path.name.endswith(".dmd.yaml"):
-        return {(name, "") for name in files_of_directives(path)}
-    root = ET.fromstring(path.read_text())
-    if root.tag == "mujoco":  # whose files start from the first one's folder, wherever they are named
-        names = {(element.get("file", ""), "") for element in root.iter("include")}
-        return names | _named_in(ET.fromstring(str(with_includes(XmlText(path.read_bytes()), path))))
-    return _named_in(root)
-
-
-def _named_in(root: ET.Element) -> set[tuple[str, str]]:
-    folders = {key: element.get(key, "") for element in root.iter("compiler") for key in ("assetdir", "meshdir")}
-    folder = folders.get("meshdir") or folders.get("assetdir") or ""
-    result = {(element.get(key, ""), folder) for element in root.iter() for key in ("filename", "file")}
-    result |= {((element.text or "").strip(), "") for element in root.iter("uri")}
-    return {(name, start) for name, start in result if name and not name.endswith(LIBRARIES)}
-
-
-def _resolve(path: Path, name: str, folder: str, packages: Mapping[str, Any]) -> Path | None:
-    """Where `name` leads, by the rules of `model_file.read_into`."""
-    package = re.match(r"(?:package|model)://([^/]+)/(.*)", name, re.DOTALL)
-    if package:
-        if package[1] in packages:
-            return Path(str(packages[package[1]])) / package[2]
-        above = package_above(path, package[1])
-        return None if above is None else above / package[2]
-    if "\0" in name or "\0" in folder:
-        return None
-    return path.parent / folder / name.removeprefix("file://")

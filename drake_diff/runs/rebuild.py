@@ -1,11 +1,13 @@
 """A plan written to plan.npz, exact to the bit, and a solution rebuilt from its run directory alone.
 
-The model is built from the file that trace.mcap carries, in a folder of its own. One that names other files (meshes) is
-built where it stood, and only if it and all of them are still what the record says: the artifact has their hashes, not
-their bytes. As a record may name any file, this is only done below a folder that the caller gives.
+The model is built from the file that trace.mcap carries and from those in the folder `BUNDLE`, all of them copied into
+a folder of its own. Where one is missing there, it is built where it stood, and only if it and all that it names are
+still what the record says. As a record may name any file, this is only done below a folder that the caller gives.
 """
 
 import io
+import os
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -18,10 +20,11 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, positive_float
-from drake_diff._base.files import arrays_of, write_whole
+from drake_diff._base.files import arrays_of, read_plain, write_whole
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
+from drake_diff.model.named_files import lay_out
 from drake_diff.optimize.options import Options
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.fixed_contacts import FixedContacts, Impact
@@ -31,9 +34,9 @@ from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.solve import solve
 from drake_diff.runs.directory import load_plan_record
-from drake_diff.runs.fields import ModelInput, file_evidence
+from drake_diff.runs.fields import BUNDLE, SealedRecord, file_evidence
 from drake_diff.runs.plan_record import PhasesSection, PlanRecord
-from drake_diff.runs.provenance import named_files, names_in
+from drake_diff.runs.provenance import MOST_BUNDLED, evidence_of
 from drake_diff.runs.sections import rebuild_problem
 from drake_diff.runs.trace import read_trace
 
@@ -108,54 +111,81 @@ def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
 
 @contextmanager
 def rebuilt(
-    given: ModelInput, source: Any, attachments: dict[str, bytes] | None, models: Path | None
+    folder: Path, record: SealedRecord, attachments: dict[str, bytes] | None, models: Path | None
 ) -> Iterator[Model]:
-    """The model of a record, for as long as the block runs, from the files `attachments` that the directory carries.
+    """The model of the record in `folder`, for as long as the block runs, from the model file in `attachments`.
 
-    Where there are none, or the model names other files, it is built from `source`, if that is below the folder
-    `models` and all of them are unchanged.
+    Where there is none, or the directory lacks a file that it names, it is built where it was, if that is below the
+    folder `models` and all of them are unchanged.
 
     Raises ModelError, saying why, where it cannot be built again, ArtifactError where the artifact is damaged.
     """
+    given = record.model
     if given.file is None or given.options is None:
         raise ModelError("the system is a user's own diagram or function, which no artifact can hold")
-    if given.named or attachments is None:
-        yield _load(*_source_if_unchanged(given, str(source), models))
+    if attachments is None or (given.named and not _is_bundled(folder, record)):
+        yield _load(*_source_if_unchanged(record, models))
         return
     name, data = given.file.path, attachments.get(given.file.path)
     if data is None or sha256(data).hexdigest() != given.file.sha256:
         raise ArtifactError(f"{TRACE}: the model file {name} in it is not the one that the record describes")
     if Path(name).name != name or not name.endswith(FORMATS):
         raise ArtifactError(f"record.json: {name!r} is not the name of a model file")
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / name
-        path.write_bytes(data)
-        if names_in(path):
-            raise ArtifactError(f"record.json: it does not list the files that {name} names")
-        yield _load(path, {**given.options, "packages": None})
+    hashes = {file.path: file.sha256 for file in given.named}
+
+    def content(label: str) -> bytes | None:
+        sha = hashes[label]
+        return None if sha is None else _bundled(folder, sha)
+
+    with TemporaryDirectory() as location:
+        path, packages = lay_out(Path(location), name, data, hashes, content)
+        yield _load(path, {**given.options, "packages": packages})
 
 
-def _source_if_unchanged(given: ModelInput, location: str, models: Path | None) -> tuple[Path, dict[str, Any]]:
+def _is_bundled(folder: Path, record: SealedRecord) -> bool:
+    """Whether the directory has what the model file names; before version 4.1 none has."""
+    needed = [file.sha256 for file in record.model.named if file.sha256 is not None]
+    return not record.is_before(4, 1) and all(_place_of(folder, sha) is not None for sha in needed)
+
+
+def _place_of(folder: Path, sha: str) -> Path | None:
+    """The file of that content; of a phase it may be in the directory above."""
+    if not re.fullmatch("[0-9a-f]{64}", sha):
+        raise ArtifactError(f"record.json: {sha!r} is no hash of a file")
+    return next((p for f in (folder, folder.parent) if os.path.lexists(p := f / BUNDLE / sha)), None)
+
+
+def _bundled(folder: Path, sha: str) -> bytes:
+    place = _place_of(folder, sha)
+    data = b"" if place is None else read_plain(place, MOST_BUNDLED)
+    if sha256(data).hexdigest() != sha:
+        raise ArtifactError(f"{BUNDLE}/{sha}: it is not the file that the record describes")
+    return data
+
+
+def _source_if_unchanged(record: SealedRecord, models: Path | None) -> tuple[Path, dict[str, Any]]:
     """The model file where it stood, and its options; ModelError where a file is not the recorded one."""
+    given, was, options = record.model, record.provenance, dict(record.model.options or {})
+    folders, location = options.pop("packages", was.model_packages), was.model_file
+    if location is None:  # before version 4.1, which has packages among the options too
+        location = record.model_dump()["contract"].get("source")
     if models is None:
         what = f"names {len(given.named)} files, which the artifact does not hold" if given.named else "is not in it"
         raise ModelError(
             f"the model {what}: models=FOLDER, or --models, lets them be read below a folder that you give"
         )
-    source, options = _below(models, location, "the model's file"), dict(given.options or {})
+    source = _below(models, str(location), "the model's file")
     if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
         raise ModelError(f"the model's file {source} is gone, and the artifact has no copy that could be used")
     if file_evidence(source, given.file.path) != given.file:
         raise ModelError(f"the model's file {source} is not what it was")
-    packages = options.get("packages")
-    if isinstance(packages, dict):
-        packages = {name: str(_below(models, str(folder), "the package's folder")) for name, folder in packages.items()}
-        options["packages"] = packages
-    now = named_files(source, packages if isinstance(packages, dict) else None)
-    changed = [was.path for was in given.named if was not in now]
+    folders = folders if isinstance(folders, dict) else {}
+    packages = {n: str(_below(models, str(folder), "the package's folder")) for n, folder in folders.items()}
+    now = evidence_of(source, packages)
+    changed = [file.path for file in given.named if file.sha256 is not None and file not in now]
     if changed:
         raise ModelError(f"the model names {changed[0]}, which is not what it was")
-    return source, options
+    return source, {**options, "packages": packages or None}
 
 
 def _below(models: Path, location: str, what: str) -> Path:
@@ -214,7 +244,7 @@ def recorded_solution(folder: Path, record: PlanRecord, models: Path | None) -> 
         phases = []
         for inner, phase in phase_records(folder, record):
             attachments = read_trace(inner / TRACE).attachments
-            model = stack.enter_context(rebuilt(phase.model, phase.contract.get("source"), attachments, models))
+            model = stack.enter_context(rebuilt(inner, phase, attachments, models))
             phases.append(resolve(phase, model, read_plan(inner / PLAN)))
         if record.phases is None:
             yield phases[0]

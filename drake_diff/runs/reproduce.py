@@ -5,6 +5,7 @@ clock and the machine that made the record is there again. On a machine that rou
 steps to the same end: then the recorded plan is measured, and what the search tells of itself is compared apart.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -39,7 +40,7 @@ from drake_diff.runs.rebuild import (
     search_of,
     solve_again,
 )
-from drake_diff.runs.save import RECOVERED, REPLAY, REPORT, write_measured
+from drake_diff.runs.save import RECOVERED, REPLAY, REPORT, fields_of, write_measured
 from drake_diff.runs.sections import COSTS, unknown_functions
 from drake_diff.runs.trace import read_trace
 
@@ -105,16 +106,16 @@ def _run_again(folder: Path, record: PlanRecord, models: Path | None) -> Reprodu
     with recorded_solution(folder, record, models) as recorded:
         reasons = why_not_repeated(record, records.values())
         if reasons:
-            return _without_the_search(recorded, records, reasons)
+            return _without_the_search(recorded, folder, records, reasons)
         solution = solve_again(record, recorded, read_plan(folder / PLAN) if record.phases is None else {})
         apart = max(_distance(s, r) for s, r in zip(solution.phases, recorded.phases, strict=True))
         if apart == 0:
-            return _written(solution, records, apart)
+            return _written(solution, folder, records, apart)
         ways = [(s.method, s.scheme, s.solver) for s in (solution, recorded)]
         if apart == np.inf or ways[0] != ways[1]:
             was, now = (f"{s.method} ({s.scheme}, {s.solver}) in {len(s.us)} intervals" for s in (recorded, solution))
-            return _without_the_search(recorded, records, (f"recorded by {was}, this version takes {now}",))
-        return _written(_with_plan(solution, recorded), records, apart)
+            return _without_the_search(recorded, folder, records, (f"recorded by {was}, this version takes {now}",))
+        return _written(_with_plan(solution, recorded), folder, records, apart)
 
 
 def contradictions(folder: Path, record: PlanRecord) -> Iterator[str]:
@@ -135,7 +136,7 @@ def _certified(folder: Path, record: PlanRecord, section: CertificationSection, 
     carried = record.model.file.path if record.model.file is not None else ""
     attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
     asked = {name: getattr(section, name) for name in ("seed", "parameters", "method")}
-    with rebuilt(record.model, record.contract.get("source"), attachments, models) as model:
+    with rebuilt(folder, record, attachments, models) as model:
         made = _as_given(certify_model(model, states=len(section.states), **asked), record)
     return Reproduced(made.model_dump(mode="json"), {}, written=(carried,))
 
@@ -195,8 +196,8 @@ def _distance(solution: Solution, other: Solution) -> float:
     return largest
 
 
-def _written(solution: Solution, records: Mapping[Path, PlanRecord], apart: float) -> Reproduced:
-    """All files of `solution`, made in a folder of their own; `records` are those recorded, by their folder."""
+def _written(solution: Solution, folder: Path, records: Mapping[Path, PlanRecord], apart: float) -> Reproduced:
+    """All files of `solution`, made in a folder of their own; `records` are those in `folder`, by their place there."""
     solver, unchecked = records[Path()].solver, list[str]()
     engines = None if solver is None else solver.options.get("cross_check")
     if isinstance(engines, list):
@@ -208,7 +209,7 @@ def _written(solution: Solution, records: Mapping[Path, PlanRecord], apart: floa
             recorded = records[folder.relative_to(location)]
             again, lacking = _but_for_simulators(_as_given(again, recorded), recorded)
             unchecked.extend(lacking)
-            if int(recorded.schema_version.split(".")[0]) < OFFSETS_SINCE:
+            if recorded.is_before(OFFSETS_SINCE):
                 then = {metric.name: metric.tolerance for metric in recorded.metrics}  # some were absolute
                 shared = [metric for metric in again.metrics if metric.name in then]
                 metrics = [metric.model_copy(update={"tolerance": then[metric.name]}) for metric in shared]
@@ -217,12 +218,18 @@ def _written(solution: Solution, records: Mapping[Path, PlanRecord], apart: floa
                 unchecked.append(f"replays under TVLQR, which had no offsets in version {recorded.schema_version}")
             return again
 
+        def dump(again: PlanRecord, made: Path) -> dict[str, Any]:
+            place = made.relative_to(location)
+            if records[place].is_before(OFFSETS_SINCE):
+                return fields_of(again)
+            return as_written(fields_of(again), read_fields(folder / place / PlanRecord.FILE))
+
         fields: dict[str, Any] = {}
         if _unknown_resets(records[Path()]):  # what leads from one phase to the next is not here
             for i, phase in enumerate(solution.phases):
-                write_measured(phase, location / directory_of(i), amend)
+                write_measured(phase, location / directory_of(i), amend, dump)
         else:
-            fields = write_measured(solution, location, amend).model_dump(mode="json")
+            fields = write_measured(solution, location, amend, dump).model_dump(mode="json")
         paths = [path for path in location.rglob("*") if path.is_file()]
         files = {path.relative_to(location).as_posix(): path.read_bytes() for path in paths}
     for name in (PlanRecord.FILE, PlanRecord.SCHEMA_FILE):
@@ -252,9 +259,11 @@ def _open_loop_alone(again: Sequence[Any], recorded: Sequence[Any]) -> list[Any]
 
 def _as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:
     """With what nothing can make again as `record` says it."""
-    contract, model = contract_as(again.contract, record.contract), model_as(again.model, record.model)
     given = {name: getattr(record, name) for name in GIVEN}
-    made = again.model_copy(update={**given, "contract": contract, "model": model})
+    if not record.is_before(OFFSETS_SINCE):  # an earlier minor version has no more than less
+        given["schema_version"] = record.schema_version
+    contract = contract_as(again.contract, record)
+    made = again.model_copy(update={**given, "model": model_as(again.model, record), "contract": contract})
     if made.phases is None or record.phases is None:
         return made
     links = [  # records of 2.x do not have the values of an impact
@@ -264,26 +273,36 @@ def _as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:
     return made.model_copy(update={"phases": made.phases.model_copy(update={"links": links})})
 
 
-def model_as(again: ModelInput, recorded: ModelInput) -> ModelInput:
-    """The input of a model that was loaded again, with the folders of its packages as they were given."""
-    if again.options is None or recorded.options is None or "packages" not in recorded.options:
-        return again
-    return again.model_copy(update={"options": {**again.options, "packages": recorded.options["packages"]}})
+def contract_as(again: Mapping[str, Any], record: SealedRecord) -> dict[str, Any]:
+    """The contract of a model loaded again; before version 4.1 it and its notes had the path of the model file."""
+    recorded = record.model_dump().get("contract") or {}
+    source = recorded.get("source")
+    if not record.is_before(4, 1) or not again or source is None:
+        return dict(again)
+    name = Path(source).name
+    paths = re.compile(rf"{re.escape(source)}|[^\s'\"(]*/{re.escape(name)}")
+    notes = [paths.sub(lambda _: name, str(note)) for note in recorded["notes"]]
+    return {**again, "source": source, "notes": recorded["notes"] if notes == again["notes"] else again["notes"]}
 
 
-def contract_as(again: Mapping[str, Any], recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """The contract of a model that was loaded again, with its file where it was; its notes name that place too."""
-    if not again:  # each phase has its own
-        return {}
-    source, was = str(again.get("source")), recorded.get("source")
-    return {**again, "source": was, "notes": [str(note).replace(source, str(was)) for note in again["notes"]]}
+def as_written(fields: Any, recorded: Any) -> Any:
+    """What a record would be in the version that wrote another: without empty fields that it does not have."""
+    if not (isinstance(fields, dict) and isinstance(recorded, dict)):
+        return fields
+    known = {key: value for key, value in fields.items() if key in recorded or value not in (None, [], {}, "")}
+    return {key: as_written(value, recorded.get(key)) for key, value in known.items()}
+
+
+def model_as(again: ModelInput, record: SealedRecord) -> ModelInput:
+    """The input of a model loaded again; of earlier records, which list fewer files, theirs, which `rebuilt` checks."""
+    return record.model if record.is_before(4, 1) else again
 
 
 def _without_the_search(
-    recorded: Solution, records: Mapping[Path, PlanRecord], unrepeated: tuple[str, ...]
+    recorded: Solution, folder: Path, records: Mapping[Path, PlanRecord], unrepeated: tuple[str, ...]
 ) -> Reproduced:
     """What can be made of the plan alone; what rests on the search is left out of the comparison."""
-    again = _written(recorded, records, 0.0)
+    again = _written(recorded, folder, records, 0.0)
     missing = [*SEARCHED, *SEARCHED_IN_PHASES]
     for record in records.values():
         costs, constraints = unknown_functions(record)

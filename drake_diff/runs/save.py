@@ -47,7 +47,7 @@ from drake_diff.runs.fields import (
 from drake_diff.runs.measurement import Measurement, failure_of, measure, replay_evidence
 from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.plan_record import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesSection, PlanRecord
-from drake_diff.runs.provenance import gradient_evidence, header
+from drake_diff.runs.provenance import gradient_evidence, header, write_bundle
 from drake_diff.runs.rebuild import (
     ANYWHERE,
     PLAN,
@@ -67,7 +67,7 @@ def unfinished_record(folder: Path, problem: Problem | PhasedProblem, sentence: 
     if isinstance(problem, PhasedProblem):
         fields |= {"phases": PhasesSection(**_asked_of_all(problem)), **header(name_of(folder))}
         return PlanRecord(verdict="incomplete", sentence=sentence, **fields)
-    return _record(folder, verdict="incomplete", sentence=sentence, **asked(problem), **fields)
+    return _record(folder, problem, verdict="incomplete", sentence=sentence, **asked(problem), **fields)
 
 
 def _asked_of_all(problem: PhasedProblem) -> dict[str, Any]:
@@ -148,10 +148,10 @@ def begin(folder: Path, problem: Problem | PhasedProblem, sentence: str = UNDER_
 
 
 @overload
-def save(solution: Solution | PhasedSolution, directory: str | Path) -> PlanRecord: ...
+def save(solution: Solution | PhasedSolution, directory: str | Path, *, meshes: bool = True) -> PlanRecord: ...
 @overload
-def save(solution: Any, directory: str | Path) -> FitRecord: ...
-def save(solution: Any, directory: str | Path) -> PlanRecord | FitRecord:
+def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> FitRecord: ...
+def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> PlanRecord | FitRecord:
     """Measure a solution and write its directory: record, plan, trace, replay and report.
 
     All of it is written beside `directory`, in a folder that is called `directory`.partial-..., and takes its place at
@@ -165,7 +165,9 @@ def save(solution: Any, directory: str | Path) -> PlanRecord | FitRecord:
             are written, and "pass" says that the values found explain the recordings.
         directory: Where to write record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html.
             It is made where there is none, and replaced where a run wrote it. Plain dynamics have nothing to draw in
-            3D, and so no replay.html.
+            3D, and so no replay.html. What the model file names (meshes, included files, their licences) is copied to
+            `directory`/model, so that `verify` needs nothing else.
+        meshes: False leaves the meshes where they are.
 
     Returns:
         The record that was written. Its verdict is "pass" only where the solver converged and every metric keeps its
@@ -186,22 +188,24 @@ def save(solution: Any, directory: str | Path) -> PlanRecord | FitRecord:
         ('pass', ['plan.npz', 'record.schema.json', 'replay.html', 'report.html', 'trace.mcap'])
     """
     if not isinstance(solution, Solution):
-        return _save_other(solution, directory)
+        return _save_other(solution, directory, meshes)
     with plan_kept(solution, Path(directory).resolve().name), written_whole(directory) as folder:
-        return write_run(solution, folder)
+        return write_run(solution, folder, meshes=meshes)
 
 
-def _save_other(result: Any, directory: str | Path) -> FitRecord:
+def _save_other(result: Any, directory: str | Path, meshes: bool) -> FitRecord:
     fits = import_module("drake_diff.identification.files")  # above this package, and not loaded to save a solve
     if not isinstance(result, fits.Identification):
         raise InputError("solution", got=type(result).__name__, expected="a result of solve or of identify")
-    record: FitRecord = fits.save_identification(result, directory)
+    record: FitRecord = fits.save_identification(result, directory, meshes=meshes)
     return record
 
 
-def write_run(solution: Solution | PhasedSolution, folder: Path) -> PlanRecord:
+def write_run(solution: Solution | PhasedSolution, folder: Path, *, meshes: bool = True) -> PlanRecord:
     """Write what `save` does into `folder`, which `written_whole` gave."""
     keep_plan(solution, folder)  # what is measured next may take long
+    phases = solution.phases if isinstance(solution, PhasedSolution) else (solution,)
+    write_bundle(folder, *(phase.problem.moved for phase in phases), meshes=meshes)
     return write_measured(solution, folder)
 
 
@@ -209,16 +213,20 @@ def write_measured(
     solution: Solution | PhasedSolution,
     folder: Path,
     amend: Callable[[PlanRecord, Path], PlanRecord] = lambda record, folder: record,
+    dump: Callable[[PlanRecord, Path], dict[str, Any]] = lambda record, folder: fields_of(record),
 ) -> PlanRecord:
-    """Measure `solution` and write it to `folder`; `amend` changes each record before anything has it."""
+    """Measure `solution` and write it to `folder`; `amend` changes each record before anything has it.
+
+    `dump` gives the fields of a record as pages and trace have them.
+    """
     if isinstance(solution, PhasedSolution):
         for i, phase in enumerate(solution.phases):
-            write_measured(phase, folder / directory_of(i), amend)
+            write_measured(phase, folder / directory_of(i), amend, dump)
         return amend(record_of_phases(folder, solution), folder).write(folder)
     measurement = measure(solution)
     record = amend(record_of(measurement, folder), folder)
     make_folder(folder)
-    write_files(folder, measurement, record)
+    write_files(folder, measurement, dump(record, folder))
     return record.write(folder)
 
 
@@ -247,7 +255,8 @@ def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
         make_folder(folder)
         write_plan(folder / PLAN, solution, partial=True)
         sections = asked(solution.problem, solution) | found(solution, measured=False)
-        _record(folder, solution.wall_time, verdict="incomplete", sentence=sentence, **sections).begin(folder)
+        incomplete: dict[str, Any] = {"verdict": "incomplete", "sentence": sentence, **sections}
+        _record(folder, solution.problem, solution.wall_time, **incomplete).begin(folder)
 
 
 @contextmanager
@@ -285,14 +294,19 @@ def _kept_elsewhere(solution: Solution | PhasedSolution, name: str) -> str:
     return "the plan could be kept nowhere: no temporary folder can be written"
 
 
-def write_files(folder: Path, measurement: Measurement, record: PlanRecord) -> None:
-    """Write `FILES`, all but the record and its schema."""
+def fields_of(record: PlanRecord) -> dict[str, Any]:
+    """The fields of a record in the order in which it is written."""
+    fields: dict[str, Any] = json.loads(canonical(record.model_dump(mode="json")))
+    return fields
+
+
+def write_files(folder: Path, measurement: Measurement, fields: dict[str, Any]) -> None:
+    """Write `FILES`, all but the record and its schema, of a record with these `fields`."""
     from drake_diff.runs.page import write_pages
     from drake_diff.runs.trace import write_trace  # what a script that saves nothing need not load
 
-    fields = json.loads(canonical(record.model_dump(mode="json")))  # in the order in which the record is written
     write_plan(folder / PLAN, measurement.solution)
-    write_trace(folder / TRACE, measurement, {record.FILE: ("application/json", reproducible(fields).encode())})
+    write_trace(folder / TRACE, measurement, {PlanRecord.FILE: ("application/json", reproducible(fields).encode())})
     write_pages(folder / REPLAY, folder / REPORT, measurement, fields)
 
 
@@ -318,6 +332,7 @@ def record_of(m: Measurement, folder: Path) -> PlanRecord:
     replays = [replay_evidence(r) for r in (*m.replays, *m.solution.cross_checks)]
     return _record(
         folder,
+        m.solution.problem,
         m.solution.wall_time,
         verdict="fail" if m.failures else "pass",
         sentence=m.solution.message,
@@ -331,8 +346,8 @@ def record_of(m: Measurement, folder: Path) -> PlanRecord:
     )
 
 
-def _record(folder: Path, duration: float | None = None, **fields: Any) -> PlanRecord:
-    return PlanRecord(**{**header(name_of(folder), seconds=duration), **fields})
+def _record(folder: Path, problem: Problem, duration: float | None = None, /, **fields: Any) -> PlanRecord:
+    return PlanRecord(**header(name_of(folder), problem.moved, duration), **fields)
 
 
 def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecord:
@@ -399,11 +414,11 @@ def _measured(folder: Path, record: PlanRecord, target: Path) -> PlanRecord:
         )
         raise ArtifactError(f"{folder}: {content}")
     plan = read_plan(folder / PLAN, partial=True)
-    source = record.contract.get("source")
-    with rebuilt(record.model, source, None, ANYWHERE) as model, written_whole(target) as whole:
+    with rebuilt(folder, record, None, ANYWHERE) as model, written_whole(target) as whole:
         measurement = measure(resolve(record, model, plan).told(iterations=rows_of(plan)))
         made = _with_the_search(record_of(measurement, whole), record)
-        write_files(whole, measurement, made)
+        write_files(whole, measurement, fields_of(made))
+        write_bundle(whole, model)
         return made.write(whole)
 
 

@@ -45,7 +45,7 @@ from drake_diff.runs.fields import (
     plain,
 )
 from drake_diff.runs.plan_record import PlanRecord
-from drake_diff.runs.provenance import gradient_evidence, model_input
+from drake_diff.runs.provenance import contract_of, gradient_evidence
 
 COSTS = ("running_cost", "final_cost", "trajectory_cost", "parameter_cost")
 LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
@@ -75,8 +75,7 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
             search=None if solution is None else _search(solution),
         ),
         "problem": describe_problem(problem),
-        "contract": {} if problem.moved is None else problem.moved.contract.to_dict(),
-        "model": model_input(problem.moved),
+        "contract": contract_of(problem.moved),
     }
 
 

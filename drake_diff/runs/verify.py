@@ -27,11 +27,11 @@ from drake_diff.runs.differences import (
 )
 from drake_diff.runs.directory import FILES as OLD_FILES
 from drake_diff.runs.directory import is_partial, load_plan_record, load_record, parse_record, read_checked, record_path
-from drake_diff.runs.fields import SCHEMA_VERSION, SealedRecord, read_fields
+from drake_diff.runs.fields import BUNDLE, SCHEMA_VERSION, SealedRecord, read_fields
 from drake_diff.runs.messages import claims_of
 from drake_diff.runs.other_records import ComparisonRecord, FitRecord, is_trial_file
 from drake_diff.runs.plan_record import PlanRecord
-from drake_diff.runs.provenance import packages_here
+from drake_diff.runs.provenance import contract_of, packages_here
 from drake_diff.runs.rebuild import ANYWHERE, PLAN, TRACE, phase_records, read_plan, recorded_solution
 from drake_diff.runs.reproduce import (
     OF_RECOVERED,
@@ -47,15 +47,15 @@ from drake_diff.runs.reproduce import (
 from drake_diff.runs.trace import CONFIGURATION
 
 MOST = 16  # lines of a kind that are printed
-SAME_VALUES = ("3.1.", SCHEMA_VERSION)  # versions of the schema whose values are those of this one
+SAME_VALUES = ("3.1.", "4.0.", SCHEMA_VERSION)  # versions of the schema whose values are those of this one
 WORDS = ("sentence", "message", "statement", "definition", "reason", "told")  # which versions choose
 OLD_SCHEMAS = tuple(name.replace(".json", ".schema.json") for name in OLD_FILES)
 MADE_APART = ("complaints", "undecided", "unchecked", "rounded")  # of a verification: told by the process apart
 # What nothing can make again, in every record, by key.
 UNCHECKED = (
     "wall_clock: when the record was made, and how long that took",
-    "provenance: the versions, the commit, the machine and the command that made it",
-    "name and contract.source: what it was called, and where the model file was",
+    "provenance: the versions, the commit, the machine and the command that made it, and where the model file was",
+    "name: what it was called",
 )
 UNREAD = "hashes match, contents not checked"
 WAITED = 60.0  # [s] for a run to be made again, where nobody says else
@@ -320,7 +320,7 @@ def _without_its_model(verification: Verification, record: SealedRecord, error: 
     if not isinstance(record, PlanRecord) or record.subject not in ("plan", "phases"):
         return replace(verification, undecided=content, unchecked=("everything but the hashes",))
     try:
-        problems = [*_odd_schema(record), *contradictions(folder, record)]
+        problems = [*_odd_schema(record), *_odd_bundle(folder, record), *contradictions(folder, record)]
         for inner, phase in phase_records(folder, record):
             problems += odd_metrics(phase, read_plan(inner / PLAN))
     except (ArtifactError, KeyError, LookupError, TypeError, ValueError) as wrong:
@@ -360,7 +360,7 @@ def _recalled(folder: Path, models: Path | None) -> Iterator[Solution]:
     _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
     _refuse(folder, tuple(contradictions(folder, record)))
     with recorded_solution(folder, record, models) as solution:
-        _refuse(folder, tuple(_odd_contract(record, solution.problem.model.contract.to_dict())))
+        _refuse(folder, tuple(_odd_contract(record, contract_of(solution.problem.model))))
         yield solution
 
 
@@ -398,7 +398,8 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
         if worded:
             undecided.append(f"{item.file}: {UNREAD}: schema {record.schema_version} has {worded[0].key} otherwise")
     again = replace(again, undecided=tuple(undecided))
-    return _told_of_a_solve(verification, again, [*_odd_schema(record), *again.problems], compared, unchecked)
+    problems = [*_odd_schema(record), *_odd_bundle(verification.directory, record), *again.problems]
+    return _told_of_a_solve(verification, again, problems, compared, unchecked)
 
 
 def _compare_records(compared: FileDifferences, recorded: Mapping[str, Any], again: Mapping[str, Any]) -> None:
@@ -426,7 +427,17 @@ def _compared_file(folder: Path, name: str, again: Reproduced) -> FileDifference
 def _others(record: SealedRecord, known: Sequence[str]) -> Iterator[str]:
     """Files that were in the directory and are none that drake_diff writes there."""
     for name in sorted(record.files.keys() - {*known, record.SCHEMA_FILE, *OLD_SCHEMAS}):
-        yield f"{name}: nothing that drake_diff writes there"
+        if not name.startswith(f"{BUNDLE}/"):  # see `_odd_bundle`
+            yield f"{name}: nothing that drake_diff writes there"
+
+
+def _odd_bundle(folder: Path, record: SealedRecord) -> Iterator[str]:
+    """What is beside the files that the model names, or is not what its name says."""
+    phases = phase_records(folder, record) if isinstance(record, PlanRecord) else []
+    named = {file.sha256 for _, phase in phases for file in phase.model.named} | {f.sha256 for f in record.model.named}
+    for name, file in record.files.items():
+        if name.startswith(f"{BUNDLE}/") and not (file.sha256 in named and name == f"{BUNDLE}/{file.sha256}"):
+            yield f"{name}: it is no file that the model names"
 
 
 def _odd_schema(record: SealedRecord) -> Iterator[str]:
@@ -491,7 +502,7 @@ def _judged(verification: Verification, problems: Sequence[str], undecided: Sequ
 
 
 def _odd_contract(record: PlanRecord, again: dict[str, Any]) -> Iterator[str]:
-    """Where the rebuilt model is another than the recorded contract; where the file was, and notes, do not matter."""
+    """Where the rebuilt model is another than the recorded contract; its file's name, and notes, do not matter."""
     apart = ("source", "notes")
     old, new = ({key: value for key, value in c.items() if key not in apart} for c in (record.contract, again))
     compared = FileDifferences(record.FILE)

@@ -33,7 +33,7 @@ UNDER_FEEDBACK = "what moves is the plan, near which feedback keeps the robot; b
 CONFIGURATION = ("problem", "contract", "model", "inputs", "solver")
 # What nobody chose, of the configuration: where a file was, what the solver said.
 RESULTS = ("status", "message", "solver_message", "notes", "plant", "feedback", "iterations")
-NO_CHOICE = ("contract.source", *(f"solver.{name}" for name in RESULTS))
+NO_CHOICE = tuple(f"solver.{name}" for name in RESULTS)
 
 
 @dataclass(frozen=True)

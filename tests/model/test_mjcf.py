@@ -12,8 +12,8 @@ from pydrake.multibody.tree import MultibodyForces
 
 import drake_diff as dd
 from drake_diff.exceptions import ModelError
+from drake_diff.model.named_files import named_files
 from drake_diff.model.plant import actuators, joints
-from drake_diff.runs.provenance import named_files
 
 GEOM = '<geom size="0.1" mass="1"/>'
 AGREE = 1e-9  # relative: both sum up a chain of a few bodies in double precision
@@ -296,7 +296,7 @@ def test_a_record_knows_every_file_that_the_robot_is_made_of(tmp_path):
     (tmp_path / "assets.xml").write_text('<mujoco><asset><mesh file="part.stl"/></asset></mujoco>')
     write(tmp_path, HINGE.format("", '<geom type="mesh" mesh="part"/>'), more='<include file="assets.xml"/>')
     (tmp_path / "two.dmd.yaml").write_text("directives:\n- add_model: {name: one, file: package://here/m.xml}\n")
-    names = {e.path: e.reason for e in named_files(tmp_path / "two.dmd.yaml", {"here": str(tmp_path)})}
+    names = {file.name: file.reason for file in named_files(tmp_path / "two.dmd.yaml", {"here": str(tmp_path)})}
     inner = "package://here/m.xml"
     assert names == {inner: None, f"{inner}: assets.xml": None, f"{inner}: part.stl": None}
 

@@ -21,7 +21,7 @@ from drake_diff.runs import measure
 from drake_diff.runs.directory import KINDS, parse_record
 from drake_diff.runs.fields import SCHEMA_VERSION, DataBoundary, Metric, canonical, own_sha256
 from drake_diff.runs.plan_record import CONTRACT_UNITS, PROBLEM_UNITS, PlanRecord
-from drake_diff.runs.provenance import named_files
+from drake_diff.runs.provenance import evidence_of
 
 pytestmark = pytest.mark.solve
 
@@ -261,7 +261,7 @@ def test_a_mesh_name_that_leads_elsewhere_is_not_read(tmp_path):
     names = ("../../etc/passwd", "/etc/passwd", "mesh.obj", "gone.obj", "package://nowhere/a.stl", "x" * 5000 + ".obj")
     visuals = "".join(f'<visual><geometry><mesh filename="{n}"/></geometry></visual>' for n in names)
     (tmp_path / "m.urdf").write_text(f'<robot name="m"><link name="l">{visuals}</link></robot>')
-    found = {file.path: file for file in named_files(tmp_path / "m.urdf")}
+    found = {file.path: file for file in evidence_of(tmp_path / "m.urdf", None)}
     assert set(found) == set(names)
     assert found["mesh.obj"].sha256 == sha256(b"v 0 0 0\n").hexdigest()
     for name in set(names) - {"mesh.obj"}:
@@ -283,7 +283,7 @@ def test_meshes_of_packages_folders_and_included_models_are_found(tmp_path):
         ("m.dmd.yaml", "directives:\n- add_model:\n    name: a\n    file: package://robot/arm.sdf\n"),
     ):
         (tmp_path / "robot" / name).write_text(text)
-        found = named_files(tmp_path / "robot" / name)
+        found = evidence_of(tmp_path / "robot" / name, None)
         assert [file.reason for file in found] == [None], name
         assert found[0].bytes in (1, 6)
 

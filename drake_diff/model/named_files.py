@@ -1,0 +1,239 @@
+"""What a robot file is made of: the files that it names, what those name in turn, and a copy of all of them elsewhere.
+
+A name can lead anywhere (`../../etc/passwd`), and a robot file may be a stranger's: what is not called like a mesh or a
+robot file is not opened at all. The licence that is nearest above a file goes with it.
+"""
+
+import json
+import os
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from pydrake.multibody.parsing import PackageMap
+
+from drake_diff.exceptions import ArtifactError, ModelError
+from drake_diff.model.file_facts import with_includes
+from drake_diff.model.load_file import FORMATS, add_packages, files_of_directives
+from drake_diff.model.meshes import asset_of, file_at, resolve_uri
+from drake_diff.model.xml_text import XmlText
+
+MESHES = (
+    ".obj", ".mtl", ".vtk", ".gltf", ".glb", ".bin", ".stl", ".dae", ".ply", ".off", ".msh", ".png", ".jpg", ".jpeg",
+    ".ktx2", ".webp",
+)  # fmt: skip
+OF_MJCF = (".xml", ".mjcf")  # all that such a file includes is read with it
+LIBRARIES = (".so", ".dll", ".dylib")  # plugins of Gazebo, which Drake does not read
+LIST_OF_MODELS = "model.config"  # of a folder that SDF includes
+READABLE = (*MESHES, *FORMATS, LIST_OF_MODELS)
+LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt", "COPYING", "NOTICE")
+PACKAGE = re.compile(r"((?:package|model)://+([^/]+))/([^:]*)")
+LEVELS = 16  # folders above a copy of a robot file, into which its names may lead
+
+Put = Callable[[str, Path], None]
+
+
+@dataclass(frozen=True)
+class NamedFile:
+    """A file by the name that a robot file gives it, "INCLUDED: NAME" where one that it names does.
+
+    `path` is where it is; without one `reason` says why. `is_list` is of a robot file whose own names are not known.
+    """
+
+    name: str
+    path: Path | None
+    reason: str | None = None
+    is_list: bool = False
+
+    @property
+    def is_mesh(self) -> bool:
+        """Whether it belongs to a shape."""
+        return self.name.lower().endswith(MESHES)
+
+
+def named_files(path: Path, packages: Mapping[str, str] | None = None, put: Put | None = None) -> list[NamedFile]:
+    """What the robot file at `path` names, sorted; `packages` are folders by name, as `load_model` takes them.
+
+    `put` is called with each name and where it leads, before that is looked at. Raises ModelError where a file includes
+    itself.
+    """
+    known = PackageMap()
+    add_packages(known, path, packages)
+    return sorted(_named(path, path, known, put or (lambda name, location: None), ()), key=lambda file: file.name)
+
+
+def _named(
+    path: Path, first: Path, packages: PackageMap, put: Put, above: tuple[tuple[str, Path], ...]
+) -> Iterator[NamedFile]:
+    """What a file names; its relative names start from the folder of `first`. `above` are what leads here."""
+    before, there = "".join(f"{name}: " for name, _ in above), dict[str, Path]()
+    inside = {path.resolve(), *(file.resolve() for _, file in above)}
+
+    def place(name: str, location: Path) -> None:
+        put(before + name, location)
+
+    try:
+        for name, location in _names(path, first, packages, place):
+            if location is not None:
+                place(name, location)
+            if not name.lower().endswith(READABLE):
+                yield NamedFile(before + name, None, "not read: its name is not that of a mesh or a robot file")
+                continue
+            found = _found(location)
+            yield NamedFile(before + name, found, None if found else "no such file")
+            if found is None or location is None:
+                continue
+            there[name] = location
+            if found.resolve() not in inside and not (path.name.endswith(OF_MJCF) and name.endswith(FORMATS)):
+                start = first if path.suffix == found.suffix == ".sdf" else found  # as Drake has it
+                yield from _named(found, start, packages, put, (*above, (name, found)))
+    except _NotListedError as error:
+        yield NamedFile(before + path.name, None, f"the files that it names cannot be listed: {error}", is_list=True)
+    if path.name.endswith(FORMATS):
+        for name, location in _licences(first, packages, place, there):
+            yield NamedFile(before + name, location)
+
+
+def _found(location: Path | None) -> Path | None:
+    """The file there, called as there where it is a link: what that leads to need not have an ending."""
+    found = file_at(location)
+    return location if location is not None and found == location.resolve() else found
+
+
+class _NotListedError(Exception):
+    """Why it is not known what a file names."""
+
+
+Names = Iterator[tuple[str, Path | None]]  # each once, and where it leads, letter by letter; None: not on this disk
+
+
+def _names(path: Path, first: Path, packages: PackageMap, place: Put) -> Names:
+    try:
+        yield from _all_names(path, first, packages, place)
+    except (AttributeError, OSError, TypeError, ValueError, ModelError) as error:  # Drake's parser forgives more
+        raise _NotListedError(str(error).replace(str(path), path.name)) from error
+
+
+def _all_names(path: Path, first: Path, packages: PackageMap, place: Put) -> Names:
+    kind, folders = path.name.lower(), set[str]()
+    if kind.endswith(".dmd.yaml"):
+        names = files_of_directives(path)
+    elif kind.endswith(".obj"):  # of which the list of materials beside it is read
+        words = re.findall(rb"^\s*mtllib\s+(.*\S)", path.read_bytes(), re.MULTILINE)
+        names = [Path(word.decode(errors="replace")).name for word in words]
+    elif kind.endswith(".gltf"):
+        document = json.loads(path.read_bytes())
+        parts = [part for key in ("buffers", "images") for part in document.get(key, ())]
+        names = [str(part["uri"]) for part in parts if not str(part.get("uri", "data:")).startswith("data:")]
+    elif kind.endswith(FORMATS):
+        xml = XmlText(path.read_bytes())
+        if xml.root.tag == "mujoco":
+            yield from _names_of_mjcf(xml, path)
+            return
+        elements = list(xml.root.iter())
+        names = [element.get(key) for element in elements for key in ("filename", "file")]
+        names += [element.text.strip() for element in elements if element.tag == "uri" or element.tag.endswith("map")]
+        folders = {uri.text.strip() for e in elements if e.tag == "include" and (uri := e.find("uri"))}
+    else:
+        names = []
+    for name in sorted(set(names)):
+        if name and not name.endswith(LIBRARIES):
+            location = resolve_uri(name, first, packages)
+            yield name, location
+            if location is not None and name in folders and not name.endswith(FORMATS):
+                yield from _names_of_folder(name, location, place)
+
+
+def _names_of_folder(name: str, location: Path, place: Put) -> Names:
+    """Of a folder that SDF includes: the list of its models, and these."""
+    listed = location / LIST_OF_MODELS
+    place(f"{name}/{LIST_OF_MODELS}", listed)
+    if listed.is_file():
+        yield f"{name}/{LIST_OF_MODELS}", listed
+        files = {model.text.strip() for model in XmlText(listed.read_bytes()).root.iter("sdf")}
+        yield from ((f"{name}/{file}", location / file) for file in sorted(files - {""}))
+
+
+def _names_of_mjcf(xml: XmlText, path: Path) -> Names:
+    """Of MJCF, whose names start from the first file's folder, wherever they stand."""
+    waiting, seen = [xml], set[str]()
+    while waiting:
+        for name in sorted({element.get("file") for element in waiting.pop().root.iter("include")} - seen - {""}):
+            seen.add(name)
+            yield name, path.parent.absolute() / name
+            if name.endswith(OF_MJCF) and (path.parent / name).is_file():
+                waiting.append(XmlText((path.parent / name).read_bytes()))
+    whole = with_includes(XmlText(path.read_bytes()), path)
+    elements = [element for element in whole.root.iter() if element.get("file") and element.get("file") not in seen]
+    yield from sorted({element.get("file"): asset_of(whole, element, path) for element in elements}.items())
+
+
+def _licences(first: Path, packages: PackageMap, place: Put, there: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
+    """The nearest licence above each file, in its package, or as far as a folder above the one of `first`."""
+    seen: dict[str, Path] = {}
+    for name, location in there.items():
+        package = PACKAGE.match(name)
+        start, inner = (f"{package[1]}/", package[3]) if package else ("", os.path.relpath(location, first.parent))
+        if inner.count("../") > LEVELS or PurePosixPath(name).is_absolute():
+            continue
+        folders = [str(folder) for folder in PurePosixPath(inner).parents] + [".."] * (not package)
+        for candidate in (start + os.path.normpath(f"{folder}/{file}") for folder in folders for file in LICENCES):
+            target = resolve_uri(candidate, first, packages)
+            if target is not None:
+                place(candidate, target)
+                if target.is_file():
+                    seen[candidate] = target
+                    break
+    yield from seen.items()
+
+
+def lay_out(
+    folder: Path, name: str, data: bytes, names: Collection[str], content: Callable[[str], bytes | None]
+) -> tuple[Path, dict[str, str]]:
+    """Write the robot file `data`, and all that it names, so that every name leads below `folder`, which is empty.
+
+    Args:
+        folder: Where to write.
+        name: What the robot file is called.
+        data: What is in it.
+        names: What it names, and what those files name, as `named_files` calls it.
+        content: Gives what is in the file of such a name, None where there was none.
+
+    Returns:
+        Where the robot file is, and the folders of its packages.
+
+    Raises:
+        ArtifactError: It names something else.
+        ModelError: A name leads elsewhere, as an absolute one does, or its names cannot be listed.
+    """
+    root = folder.resolve()
+    deep = [root.joinpath(str(i), *["d"] * LEVELS) for i in range(1 + len(names))]
+    used = sorted({package[2] for n in names for package in PACKAGE.finditer(n)})
+    path, packages = deep[0] / name, {package: str(inner) for package, inner in zip(used, deep[1:], strict=False)}
+    for inner in (path.parent, *map(Path, packages.values())):
+        inner.mkdir(parents=True)
+    path.write_bytes(data)
+
+    def put(label: str, location: Path) -> None:
+        if not Path(os.path.normpath(location)).is_relative_to(root):
+            raise ModelError(f"{name} names {label}, which is not below its own folder or a package")
+        wanted = content(label) if label in names else None
+        if wanted is None:
+            return
+        if location.is_file() and location.read_bytes() != wanted:
+            raise ArtifactError(f"record.json: {label} is where another file is")
+        location.parent.mkdir(parents=True, exist_ok=True)
+        location.write_bytes(wanted)
+
+    try:
+        files = named_files(path, packages, put)
+    except OSError as error:
+        raise ArtifactError(f"{name}: a file that it names cannot be written: {error}") from error
+    unlisted = next((file.reason for file in files if file.is_list), None)
+    if unlisted is not None:
+        raise ModelError(f"{name}: {unlisted}")
+    odd = {file.name for file in files} ^ set(names)
+    if odd:
+        raise ArtifactError(f"record.json: it does not list the files that {name} names: {min(odd)}")
+    return path, packages
