@@ -400,7 +400,8 @@ class PlanFollower:
 
         rows = self.replays(FollowedPlant(IN_CONTINUOUS_TIME, self.model, move, time_step=0.0), enough=enough)
         refused = [row for row in rows if row.motion is None]
-        if not refused or any(r.holds for r in rows if r.control != GAINS_ALONE):
+        others = {GAINS_ALONE, FEEDBACK}.intersection(row.control for row in rows)
+        if not refused or all(any(r.holds for r in rows if r.control in (OPEN_LOOP, other)) for other in others):
             return rows
         by = self.plan.follower(self.parts, max(1, FINEST // self.parts))
         name = f"in steps of {by.period / by.pieces:.4g} s in place of continuous time: {refused[0].failures[0]}"

@@ -558,13 +558,16 @@ def kept_apart(problem: Problem) -> Problem:
 
 
 def closest_to(problem: Problem, plan: Solution) -> Problem:
-    """`problem` with the squared distance from `plan`, each state and input for its range, in place of its costs."""
+    """`problem` with the squared distance from `plan`, each value for its range, in place of its costs."""
     xs, us = plan.plan.sample(1)
     Q = np.diag(1 / plan.plan.scale**2)
     R = np.diag(1 / problem.input_scales(us) ** 2)
     reference = plan.time_step * np.arange(len(xs)), xs, np.vstack([us, us[-1:]])
+    values = plan.step_vector.values
+    weights = plan.time_step * len(us) / np.maximum(np.abs(values), np.finfo(float).tiny) ** 2
     return dataclasses.replace(
         problem,
+        parameter_cost=(lambda p: weights @ (p - values) ** 2) if problem.optimizes_parameters else None,
         running_cost=TrackingCost(reference, Q=Q, R=R),
         final_cost=QuadraticCost(Q=plan.time_step * Q, x_ref=xs[-1]),
         goals=tuple(goal for goal in problem.goals if goal.weight is None),

@@ -381,10 +381,7 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
     refined: list[Solution] = []
     first = asked.by("shooting", "the collocated plan in the model's own steps")
     nearest = "the motion in the model's own steps that is nearest to the collocated plan"
-    attempts = [replace(first, max_iterations=REFINING)]
-    if not problem.optimizes_parameters:
-        attempts.append(replace(first, reason=nearest, closest=True))
-    for attempt in attempts:
+    for attempt in (replace(first, max_iterations=REFINING), replace(first, reason=nearest, closest=True)):
         try:
             make = task.prepare(attempt, plan)
         except DrakeDiffError as error:

@@ -14,8 +14,9 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.mechanics.casadi_tree import symbolic_plant
 from drake_diff.model.parameters import ParameterCoordinates, applied, select
-from drake_diff.optimize import Options
+from drake_diff.optimize import Options, solve
 from drake_diff.optimize.problem.dynamics import MovedDynamics, plant_dynamics
+from drake_diff.optimize.run import closest_to
 
 pytestmark = pytest.mark.solve
 
@@ -387,3 +388,29 @@ def test_what_is_linearized_has_the_parameters_that_are_applied(name, parameters
         assert found == pytest.approx(wanted, abs=1e-8)
     own = dd.linearize(model, xs, us, "autodiff")[0][0]
     assert own == pytest.approx(dd.differentiate_step(model, xs[0], us[0]).A, abs=1e-12)
+
+
+def test_parameters_are_near_a_plan_where_the_nearest_motion_in_steps_is_searched(monkeypatch):
+    """Where refining finds nothing, the mass of the collocated plan is nearly that of the plan in steps."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    problem = dd.Problem(
+        model,
+        x0=[0, 0],
+        x_goal=[0.5, 0],
+        num_steps=30,
+        running_cost=EFFORT,
+        parameters=("pole.mass",),
+        parameter_bounds={"pole.mass": (0.5, 2.0)},
+        parameter_cost=lambda p: 10 * (p[0] - 1.5) ** 2,
+        optimize=BOTH,
+    )
+    plan = dd.solve(problem, method="collocation")
+    mass = plan.parameters[0]
+    searched = closest_to(problem, plan)
+    assert searched.cost_of_parameters(np.array([mass])) == 0.0
+    assert searched.cost_of_parameters(np.array([1.1 * mass])) == pytest.approx(0.01 * 0.6)  # the horizon
+    monkeypatch.setattr(solve, "REFINING", 1)
+    found = dd.solve(problem)
+    assert [link["ended"] for link in found.options["chain"]] == ["converged", "iteration_limit", "converged"]
+    assert found.parameters[0] == pytest.approx(mass, rel=0.02)
+    assert found.scheme == "step"

@@ -18,6 +18,7 @@ import drake_diff.runs.save as evidence
 from drake_diff.cli.main import app
 from drake_diff.engines.load import load_engine
 from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.optimize import replay
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.runs import cross_check
 from drake_diff.runs.cross_check import follower_of, replays_in
@@ -156,6 +157,26 @@ def test_a_plan_that_reaches_a_joint_limit_is_followed_in_short_steps_instead(tm
     assert (
         row.variant == "in steps of 0.0001563 s in place of continuous time: it reaches a joint limit, which has none"
     )
+
+
+def test_where_only_offsets_keep_off_a_joint_limit_all_are_followed_in_short_steps(tmp_path, monkeypatch):
+    """The inputs and gains alone reach it: with them the plan is judged in one plant."""
+    path = tmp_path / "stop.urdf"
+    path.write_text(STOP)
+    model = dd.load_model(path, time_step=0.01)
+    solution = given(model, [0, 0], np.full((50, 1), 0.1), x_goal=[0.0125, 0.05])
+    follower = solution.plan.follower_in_continuous_time
+    taken = replay.PlanFollower.replay
+
+    def stopped(self, plant, control):
+        row = taken(self, plant, control)
+        refused = plant.variant == replay.IN_CONTINUOUS_TIME and control != replay.FEEDBACK
+        return replay.missing_replay(self.plan, plant.variant, control, "a joint limit", 0.0) if refused else row
+
+    monkeypatch.setattr(replay.PlanFollower, "replay", stopped)
+    rows = follower.in_continuous_time()
+    assert {row.variant for row in rows} == {"in steps of 0.0001563 s in place of continuous time: a joint limit"}
+    assert all(row.holds for row in rows)
 
 
 STOP = """<robot name="stop"><link name="world"/><link name="block"><inertial><mass value="1"/>
