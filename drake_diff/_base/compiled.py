@@ -6,6 +6,7 @@ A compilation that takes long enough to be noticed is a line of the logger "drak
 """
 
 import logging
+import os
 import signal
 import sys
 import time
@@ -15,16 +16,17 @@ from importlib import import_module
 from typing import Any, TypeVar, cast
 
 from drake_diff._base.clock import uncounted
+from drake_diff.exceptions import InputError
 
 NOTICED = 1.0  # [s]
+NUMBA_SETTINGS = ".numba_config.yaml"
 LOGGER = logging.getLogger("drake_diff")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
     """The function, of numbers and arrays alone, compiled; a division by zero gives what NumPy's does."""
-    from numba import njit
-
+    njit = import_numba().njit
     time_compilations()
     try:
         dispatcher = njit(cache=True, error_model="numpy")(function)
@@ -50,9 +52,26 @@ def ignore_unreadable_index(dispatcher: Any) -> None:
 
 def inner(function: Function) -> Function:
     """As `compiled`, of a function that compiled functions alone call: a shell for Python takes longest to compile."""
-    from numba import njit
+    return cast(
+        Function, import_numba().njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
+    )
 
-    return cast(Function, njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function))
+
+def import_numba() -> Any:
+    """Numba, without the settings that it reads from the working directory: they say where it loads code from."""
+    if "numba" not in sys.modules:
+        if os.path.lexists(NUMBA_SETTINGS):
+            raise InputError(
+                NUMBA_SETTINGS,
+                got="a file in the working directory",
+                expected="none: it can make Numba run code of others; use NUMBA_ variables of the environment instead",
+            )
+        from numba.core import config
+
+        config._config_fname = os.devnull  # it is read before each compilation
+    import numba
+
+    return numba
 
 
 @cache

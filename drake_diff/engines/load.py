@@ -1,6 +1,8 @@
 """Load engines by name, imported when they are asked for, on the whole plant or on its independent coordinates."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from typing import Any
@@ -15,6 +17,7 @@ from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.repairs import JointCoupling
 
+SAFE_PATH = "PYTHONSAFEPATH"
 ENGINES = {
     "numpy": ("engines.closed_form", "NumpyEngine"),
     "drake": ("engines.drake", "DrakeEngine"),
@@ -72,8 +75,23 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
                 f'{name} does not take mimic joints that are reduced: {", ".join(TAKEN)} do, or mimic="fix"'
             )
         return ReducedEngine(load_engine(name, model.whole, **options), model)
-    engine: Engine = getattr(import_module(f"drake_diff.{module}"), kind)(model, **options)
+    with _safe_children():
+        engine: Engine = getattr(import_module(f"drake_diff.{module}"), kind)(model, **options)
     return engine
+
+
+@contextmanager
+def _safe_children() -> Iterator[None]:
+    """Let no `python -c` that a library starts import from the working directory, as glfw's does for MuJoCo."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
 
 
 def load_spec(spec: str, model: Model) -> Engine:

@@ -4,10 +4,12 @@ Those files (meshes, included models, licences) are copied into the run director
 A record calls them as the model file does, wherever they are: only its provenance says where that was.
 """
 
+import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -32,6 +34,8 @@ from drake_diff.runs.fields import (
 
 MOST_BUNDLED = LARGEST_ANSWER  # bytes of such a file: as much as the process that reads it again may write
 WRITERS = ("mcap", "mcap-protobuf-support", "protobuf", "foxglove-schemas-protobuf", "pydantic")
+TRACKED = ("--porcelain", "--untracked-files=no", "--ignore-submodules=all")
+LONGEST_PATH = 4096
 PACKAGES = ("drake", "drake-diff", "numpy", "casadi", "pin", "numba", "mujoco", *WRITERS)
 
 
@@ -138,10 +142,7 @@ def packages_here() -> dict[str, str]:
 
 
 def provenance_of(model: Model | None = None) -> Provenance:
-    """With which versions, from which commit and by which command something is made, and where its model is.
-
-    Git runs what the settings of a checkout say: this is for what one makes oneself, not for a stranger's directory.
-    """
+    """With which versions, from which commit and by which command something is made, and where its model is."""
     words = (Path(sys.argv[0]).name, *sys.argv[1:])
     source, options = (None, None) if model is None else (model.source, model.options)
     return Provenance(
@@ -160,12 +161,48 @@ def _text(word: str) -> str:
 
 
 def _git() -> dict[str, str | bool] | None:
-    """Commit and dirty flag of the working directory, None where it is no git checkout or there is no git."""
+    """Commit of the working directory's checkout, and whether tracked files differ; None where git cannot tell.
+
+    Settings of a checkout can name commands (`core.fsmonitor`, filters, hooks). Git reads its references and objects
+    by way of a folder with settings of ours instead, and no settings from elsewhere.
+    """
+    here = Path.cwd()
+    root = next((folder for folder in (here, *here.parents) if (folder / ".git").exists()), None)
+    if root is None:
+        return None
     try:
-        run = [
-            subprocess.run(["git", *words], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-            for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
-        ]
+        with tempfile.TemporaryDirectory(prefix="drake_diff_") as name:
+            git = _git_folder(root, Path(name))
+            return {"commit": git("rev-parse", "HEAD"), "dirty": bool(git("status", *TRACKED))}
     except (OSError, subprocess.SubprocessError):
         return None
-    return {"commit": run[0], "dirty": bool(run[1])}
+
+
+def _git_folder(root: Path, folder: Path) -> Callable[..., str]:
+    """Make `folder` a git folder of the checkout `root`, but for its settings, and return git's output there."""
+    source = root / ".git"
+    if source.is_file():
+        source = root / _short_text(source).removeprefix("gitdir:").strip()  # of a worktree or a submodule
+    common = source / _short_text(source / "commondir")
+    for name in ("objects", "refs", "packed-refs"):
+        (folder / name).symlink_to((common / name).absolute())
+    (folder / "index").symlink_to((source / "index").absolute())
+    (folder / "HEAD").write_text(f"{_short_text(source / 'HEAD')}\n")
+    (folder / "config").write_text("[core]\nrepositoryformatversion = 0\nbare = false\n")
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
+    environment |= {"GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_SYSTEM": os.devnull}
+
+    def run(*words: str) -> str:
+        command = ["git", "--no-optional-locks", f"--git-dir={folder}", f"--work-tree={root}", *words]
+        options: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace", "env": environment}
+        return subprocess.run(command, cwd=root, timeout=10, check=True, **options).stdout.strip()
+
+    return run
+
+
+def _short_text(path: Path) -> str:
+    """The text of a small file, without line ends; "" where there is no plain file."""
+    if not path.is_file():
+        return ""
+    with path.open(errors="replace") as file:
+        return file.read(LONGEST_PATH).strip()

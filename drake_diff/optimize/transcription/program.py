@@ -57,6 +57,7 @@ OPTIONS = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.print_user_options": "no",
+    "ipopt.option_file_name": "",  # else it reads ipopt.opt in the working directory, which can name files to write
 }
 # From a line whose time is free: a search that begins well within its limits is quicker, and seldom ends in a motion
 # that takes half as long again as another one.
