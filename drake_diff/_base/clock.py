@@ -18,6 +18,7 @@ LONGEST_PIECE = 0.4  # of what the pieces before it took, as CasADi's take on ch
 DEADLINE: ContextVar[float | None] = ContextVar("DEADLINE", default=None)  # of `now`
 STOP: ContextVar[threading.Event | None] = ContextVar("STOP", default=None)
 _uncounted = 0.0  # [s]
+_interrupted = False
 
 
 def uncounted(seconds: float = 0.0) -> float:
@@ -91,9 +92,23 @@ PRINTS_WHAT_IS_RAISED = {
 
 
 def interrupt(number: int, frame: Any) -> None:
-    """A handler that does what Python does at Ctrl-C."""
+    """A handler that does what Python does at Ctrl-C; amid an import it ends the process.
+
+    Extensions in C++ print what is raised while they are imported and go on, or abort.
+    """
+    global _interrupted
+    _interrupted = True
     _hush(number)
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "importlib._bootstrap":
+            os._exit(INTERRUPTED)
+        frame = frame.f_back
     raise KeyboardInterrupt
+
+
+def was_interrupted() -> bool:
+    """Whether a signal has interrupted this process."""
+    return _interrupted
 
 
 class _Flag(threading.Event):
@@ -125,9 +140,9 @@ def _handled(handler: Any, numbers: Iterable[int]) -> Iterator[None]:
 
 
 def interrupt_alike() -> None:
-    """From here on SIGTERM and SIGHUP raise KeyboardInterrupt, where they would have ended the process."""
-    for number in ALIKE:
-        if signal.getsignal(number) is signal.SIG_DFL:
+    """From here on `interrupt` handles Ctrl-C, and SIGTERM and SIGHUP where they would have ended the process."""
+    for number in (signal.SIGINT, *ALIKE):
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, interrupt)
 
 

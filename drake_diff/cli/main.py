@@ -1,16 +1,18 @@
 """The command `drake-diff`.
 
 Exit status: 0 what was asked for holds, 1 a check failed, 2 wrong usage or input, 3 a solver or engine is missing,
-4 an internal error. A run or panel that was ended by Ctrl-C, SIGTERM or SIGHUP exits with 130.
+4 an internal error, 130 ended by Ctrl-C, SIGTERM or SIGHUP. A reader of the output that goes away changes nothing.
 """
 
+import os
 import sys
 import traceback
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import typer
 
-from drake_diff._base.clock import interrupt_alike
+from drake_diff._base.clock import INTERRUPTED, interrupt_alike, was_interrupted
 from drake_diff.cli import models, plans, runs
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 
@@ -47,26 +49,71 @@ def about(
     """
 
 
+class _Output:
+    """A stream that takes all that is written: what its file does not take, as a closed pipe, goes nowhere.
+
+    So a run goes on, and is written, when nobody reads what the command says of it. `error` is what its file said.
+    """
+
+    def __init__(self, stream: Any):
+        self.stream = stream
+        self.error: OSError | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        self._try(self.stream.write, text)
+        return len(text)
+
+    def flush(self) -> None:
+        self._try(self.stream.flush)
+
+    def _try(self, action: Callable[..., Any], *given: Any) -> None:
+        try:
+            action(*given)
+        except OSError as error:
+            self.error = error
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self.stream.fileno())
+            os.close(nowhere)
+
+
 def main() -> None:
     """The entry point: every error of ours becomes a sentence and an exit status."""
     interrupt_alike()
+    output = _Output(sys.stdout)
+    sys.stdout, sys.stderr = output, _Output(sys.stderr)
+    status = _status_of_app()
+    output.flush()
+    if was_interrupted() and status == 1:  # as Typer has it
+        status = INTERRUPTED
+    if output.error is not None and not isinstance(output.error, BrokenPipeError):
+        print(f"drake-diff: the output could not be written: {output.error}", file=sys.stderr)
+        status = status or USAGE
+    sys.exit(status)
+
+
+def _status_of_app() -> Any:
+    """The exit status of the command, after what it has to say of its error."""
     try:
         app()
+    except SystemExit as end:
+        return end.code
     except DrakeDiffError as error:
         words = "; ".join((str(error), *getattr(error, "__notes__", ())))
         print(f"drake-diff: {type(error).__name__}: {words}", file=sys.stderr)
-        sys.exit(MISSING if isinstance(error, MissingDependencyError) else USAGE)
+        return MISSING if isinstance(error, MissingDependencyError) else USAGE
     except MemoryError:
-        print(
-            "drake-diff: MemoryError: it needs more memory than there is, or than this command may take",
-            file=sys.stderr,
-        )
-        sys.exit(USAGE)
+        text = "drake-diff: MemoryError: it needs more memory than there is, or than this command may take"
+        print(text, file=sys.stderr)
+        return USAGE
     except Exception:
         traceback.print_exc()
         advice = "the last lines above say where it failed: mend your script there, or report a bug in drake-diff"
         print(f"drake-diff: {advice}", file=sys.stderr)
-        sys.exit(INTERNAL)
+        return INTERNAL
+    return 0
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from typing import Any
 from drake_diff._base.files import make_folder, write_whole
 from drake_diff._base.sandbox import LARGEST_ANSWER
 from drake_diff.certificates.certificate import VERDICTS, Certificate
+from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model, said
 from drake_diff.model.named_files import NamedFile, named_files
 from drake_diff.runs.fields import (
@@ -51,9 +52,13 @@ def gradient_evidence(certificate: Certificate) -> Certified:
 
 
 def header(name: str, model: Model | None = None, seconds: float | None = None, **clock: Any) -> dict[str, Any]:
-    """The fields of every record: its name and model, the versions, when it was made, and how long that took."""
+    """The fields of every record: its name and model, the versions, when it was made, and how long that took.
+
+    Raises:
+        InputError: a name is no text: files and pages of a run are written in UTF-8.
+    """
     return {
-        "name": name,
+        "name": _checked_name("name", name),
         "model": model_input(model),
         "provenance": provenance_of(model),
         "wall_clock": WallClock(written_utc=written_now(), duration_s=seconds, **clock),
@@ -66,10 +71,18 @@ def model_input(model: Model | None) -> ModelInput:
         return ModelInput(file=None, options=None)
     options = {name: value for name, value in model.options.items() if name != "packages"}
     return ModelInput(
-        file=file_evidence(model.source, model.source.name),
+        file=file_evidence(model.source, _checked_name("model file", model.source.name)),
         named=evidence_of(model.source, model.options["packages"]),
         options=said(options),
     )
+
+
+def _checked_name(subject: str, name: str) -> str:
+    try:
+        name.encode()
+    except UnicodeEncodeError as error:
+        raise InputError(subject, got=ascii(name), expected="a name in UTF-8") from error
+    return name
 
 
 def contract_of(model: Model | None) -> dict[str, Any]:

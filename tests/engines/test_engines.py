@@ -483,7 +483,10 @@ def test_a_model_that_other_engines_would_simulate_otherwise_is_refused(name, ki
 
 
 @pytest.mark.slow
-@each_row("name, module, extra", [(name, m, extra) for name, (modules, extra) in NEEDED.items() for m in modules])
+@each_row(
+    "name, module, extra",
+    [(name, m, "engines" if m == "mujoco" else extra) for name, (modules, extra) in NEEDED.items() for m in modules],
+)
 def test_a_missing_engine_is_named_with_its_extra(name, module, extra):
     needs(name)
     code = f"""import sys; sys.modules[{module!r}] = None

@@ -1,0 +1,72 @@
+"""The command as a process: signals, closed pipes, full disks and names that are no text."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from helpers.models import MODELS
+
+pytestmark = pytest.mark.solve
+
+COMMAND = [sys.executable, "-P", "-m", "drake_diff.cli.main"]
+PROBLEM = f"""import drake_diff as dd
+def problem():
+    model = dd.load_model({str(MODELS / "pendulum.urdf")!r}, time_step=0.05)
+    return dd.Problem(model, x0=[0, 0], x_goal=[0.5, 0], num_steps=10, running_cost=dd.QuadraticCost(R=[[1.0]]))
+"""
+SIGNAL = "import os, signal\nos.kill(os.getpid(), signal.{})\n"
+
+
+@pytest.fixture
+def python(tmp_path):
+    def run(code):
+        return subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+
+    return run
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_amid_an_import_ends_the_process_without_a_traceback(python, tmp_path, name):
+    """Drake's extension aborts, or prints the exception and goes on, where one is raised while it is imported."""
+    (tmp_path / "trap.py").write_text(SIGNAL.format(name))
+    code = "from drake_diff._base.clock import interrupt_alike\ninterrupt_alike()\n"
+    done = python(f"{code}try:\n    import trap\nfinally:\n    print('went on')")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_ctrl_c_in_any_command_is_status_130(python):
+    code = "import sys\nfrom drake_diff.cli import main\n@main.app.command()\ndef trap():\n    {}\n"
+    code += "sys.argv = ['drake-diff', 'trap']\nmain.main()"
+    assert python(code.format("import os; os.kill(os.getpid(), 2)")).returncode == 130
+    assert python(code.format("sys.exit(1)")).returncode == 1
+
+
+@pytest.mark.parametrize(("reader", "status"), [("pipe", 0), ("/dev/full", 2)])
+def test_a_run_is_written_although_its_output_is_not(tmp_path, reader, status):
+    (tmp_path / "problem.py").write_text(PROBLEM)
+    if reader == "pipe":
+        end, file = os.pipe()
+        os.close(end)
+    else:
+        file = os.open(reader, os.O_WRONLY)
+    command = [*COMMAND, "run", "problem.py", "--out", "run"]
+    done = subprocess.run(command, cwd=tmp_path, stdout=file, stderr=subprocess.PIPE, text=True, timeout=300)
+    os.close(file)
+    assert done.returncode == status, done.stderr
+    assert ("the output could not be written: [Errno 28]" in done.stderr) == (status == 2)
+    assert subprocess.run([*COMMAND, "verify", "run"], cwd=tmp_path, capture_output=True).returncode == 0
+
+
+def test_names_that_are_no_text_are_refused_by_name(tmp_path):
+    name = os.fsdecode(b"\xff.urdf")
+    (tmp_path / name).write_bytes((MODELS / "pendulum.urdf").read_bytes())
+    (tmp_path / "problem.py").write_text(PROBLEM)
+    for words, subject in (
+        (("certify", name), "model file"),
+        (("run", "problem.py", "--out", os.fsdecode(b"\xff")), "name"),
+    ):
+        done = subprocess.run([*COMMAND, *words], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 2
+        assert f"{subject}: expected a name in UTF-8, got '\\udcff" in done.stderr
+    assert subprocess.run([*COMMAND, "audit", name], cwd=tmp_path, capture_output=True).returncode == 0
